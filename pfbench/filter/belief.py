@@ -1,0 +1,117 @@
+"""Belief (what the next step needs) and info (what the report wants). Both are flat NamedTuples of tensors."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.draws import Draws
+from pfbench.model.base import StateSpaceModel
+from pfbench.record import Record
+
+
+class Cloud(NamedTuple):
+    """Weighted particles.
+
+    Attributes:
+        x: particles [R, N, D]; kept component-major in memory, that is as the transpose of a contiguous [R, D, N].
+        log_w: log weights [R, N], logsumexp 0; -inf is an empty slot (adaptive particle number).
+        log_z: log evidence so far [R]; -inf where the run is lost.
+        window: what moves need of the past, [R, N, L, ...], gathered with the particles.
+        memory: the proposal's own, [R, N or 1, ...], gathered with the particles.
+    """
+
+    x: Tensor
+    log_w: Tensor
+    log_z: Tensor
+    window: dict[str, Tensor] = {}  # noqa: RUF012 (a NamedTuple default, never written to)
+    memory: dict[str, Tensor] = {}  # noqa: RUF012
+
+
+class Gaussian(NamedTuple):
+    """A normal law in the chart about `mean`.
+
+    Attributes:
+        mean: [R, D].
+        covariance: [R, d, d].
+        log_z: log evidence so far [R]; -inf where the run is lost.
+        memory: what adaptations carry, [R, ...].
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    log_z: Tensor
+    memory: dict[str, Tensor] = {}  # noqa: RUF012
+
+
+class Info(NamedTuple):
+    """What a step tells the report.
+
+    Attributes:
+        mean: estimate [R, D].
+        variance: [R, d].
+        blocks: covariance of each of the model's groups, {group: [R, k, k]}.
+        trace: anything per run, {name: [R]}, such as `ess` or `resampled`.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    blocks: dict[str, Tensor]
+    trace: dict[str, Tensor]
+
+
+class Filter(Protocol):
+    """A recipe that turns a belief and what was seen into the next belief. It holds no state."""
+
+    @property
+    def exact(self) -> bool:
+        """Does the belief target p(x_t | y_1:t): as N grows, or, for a Gaussian filter, on linear-Gaussian models?"""
+
+    def init(self, model: StateSpaceModel, runs: int, draws: Draws) -> Cloud | Gaussian: ...
+
+    def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud | Gaussian, Info]: ...
+
+
+def gather(cloud: Cloud, ancestors: Tensor) -> Cloud:
+    """The cloud of the given ancestors [R, N]; everything that belongs to a particle goes with it."""
+    x = cloud.x.transpose(1, 2)
+    x = x.gather(2, ancestors.unsqueeze(1).expand(-1, x.shape[1], -1)).transpose(1, 2)
+    return cloud._replace(
+        x=x,
+        log_w=cloud.log_w.gather(1, ancestors),
+        window={k: _gather_rows(v, ancestors) for k, v in cloud.window.items()},
+        memory={k: _gather_rows(v, ancestors) for k, v in cloud.memory.items()},
+    )
+
+
+def where(hit: Tensor, new: Cloud, old: Cloud) -> Cloud:
+    """Run by run: `new` where hit [R], else `old`; the evidence is `new`'s."""
+
+    def choose(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(hit.reshape(-1, *[1] * (a.dim() - 1)), a, b)
+
+    return Cloud(
+        x=torch.where(hit[:, None, None], new.x.transpose(1, 2), old.x.transpose(1, 2)).transpose(1, 2),
+        log_w=choose(new.log_w, old.log_w),
+        log_z=new.log_z,
+        window={k: choose(v, old.window[k]) for k, v in new.window.items()},
+        memory={k: choose(v, old.memory[k]) for k, v in new.memory.items()},
+    )
+
+
+def weights(log_w: Tensor) -> Tensor:
+    """Normalised weights [R, N] of log weights whose logsumexp need not be 0."""
+    return torch.softmax(log_w, dim=-1)
+
+
+def ess(log_w: Tensor) -> Tensor:
+    """Effective sample size 1 / sum w^2 [R]."""
+    return 1.0 / weights(log_w).square().sum(-1)
+
+
+def _gather_rows(a: Tensor, ancestors: Tensor) -> Tensor:
+    if a.shape[1] == 1:  # shared by all particles of a run
+        return a
+    return a.gather(1, ancestors.reshape(*ancestors.shape, *[1] * (a.dim() - 2)).expand(-1, -1, *a.shape[2:]))

@@ -1,0 +1,105 @@
+"""The particle filter: refresh, move, propose, weigh. Every method is a choice of stages."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.draws import Draws
+from pfbench.filter.belief import Cloud, Info, ess, weights
+from pfbench.filter.preferences import Preference, Weights
+from pfbench.filter.proposals import Bootstrap, Proposal
+from pfbench.filter.resamplers import Resample, Resampler, Systematic
+from pfbench.filter.sizes import Fixed, Size
+from pfbench.filter.weights import Bayes, Weighing
+from pfbench.model.base import StateSpaceModel
+from pfbench.record import Record
+
+
+class Move(Protocol):
+    """A rejuvenation of the runs that were refreshed, from what the cloud carries in its window; acceptance rate [R]."""
+
+    @property
+    def exact(self) -> bool: ...
+
+    def __call__(self, model: StateSpaceModel, cloud: Cloud, hit: Tensor, draws: Draws) -> tuple[Cloud, Tensor]: ...
+
+
+@dataclass(frozen=True)
+class ParticleFilter:
+    """A recipe; it holds no particles.
+
+    Resampling comes at the START of a step, so the belief handed out is always the weighted one and the log evidence is the
+    sum of one line.
+
+    Args:
+        particles: N, the number of slots.
+        resampler, size, preference, moves, proposal, weigh: the stages; the defaults make the SIR filter.
+
+    Raises:
+        ValueError: fewer than two particles.
+    """
+
+    particles: int
+    resampler: Resampler = field(default_factory=lambda: Resample(Systematic()))
+    size: Size = field(default_factory=Fixed)
+    preference: Preference = field(default_factory=Weights)
+    moves: tuple[Move, ...] = ()
+    proposal: Proposal = field(default_factory=Bootstrap)
+    weigh: Weighing = field(default_factory=Bayes)
+
+    def __post_init__(self) -> None:
+        if self.particles < 2:
+            raise ValueError(f"filter.particles={self.particles}: give at least 2 particles")
+
+    @property
+    def exact(self) -> bool:
+        """Does the weighted cloud target p(x_t | y_1:t) as N grows? True if every stage says so."""
+        return all(stage.exact for stage in (self.resampler, *self.moves, self.proposal, self.weigh))
+
+    def init(self, model: StateSpaceModel, runs: int, draws: Draws) -> Cloud:
+        """N equally weighted particles of the initial law, drawn by its Cholesky factor or its scales."""
+        law = model.initial(runs)
+        z = draws.normal("initial", self.particles, model.chart.dimension)
+        if isinstance(law, torch.distributions.MultivariateNormal):
+            spread = z @ law.scale_tril.mT
+        else:
+            spread = z * law.stddev.unsqueeze(1)
+        x = model.chart.add(model.origin.expand(1, 1, -1), law.mean.unsqueeze(1) + spread)
+        log_w = torch.full(x.shape[:2], -math.log(self.particles), dtype=x.dtype, device=x.device)
+        return Cloud(x=x, log_w=log_w, log_z=torch.zeros_like(log_w[:, 0], dtype=torch.float64))
+
+    def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud, Info]:
+        """The cloud at t-1 and what is seen at t -> the weighted cloud at t."""
+        trace: dict[str, Tensor] = {}
+        log_a = self.preference(model, belief, seen)
+        cloud, trace["resampled"] = self.resampler(model, belief, log_a, self.size(belief), draws)
+        for i, move in enumerate(self.moves):
+            cloud, trace[f"accepted_{i}"] = move(model, cloud, trace["resampled"], draws)
+        x, log_ratio, memory = self.proposal(model, cloud, seen, draws)
+        log_w = self.weigh(model, cloud.log_w, x, log_ratio, seen)
+        total = log_w.logsumexp(1)
+        lost = ~torch.isfinite(total)
+        # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
+        log_w = torch.where(lost[:, None], -math.log(self.particles), log_w - total[:, None])
+        log_z = torch.where(lost, -torch.inf, belief.log_z + total)
+        cloud = Cloud(x, log_w, log_z, cloud.window, memory)
+        trace["ess"] = ess(log_w)
+        return cloud, summarise(model, cloud, trace)
+
+
+def summarise(model: StateSpaceModel, cloud: Cloud, trace: dict[str, Tensor]) -> Info:
+    """Estimate and spread of a cloud, for the report: sums over particles, no copy of the cloud is kept."""
+    w = weights(cloud.log_w)
+    mean = model.chart.mean(cloud.x, w)
+    d = model.chart.subtract(cloud.x, mean.unsqueeze(1))
+    weighted = w.unsqueeze(-1) * d
+    blocks = {}
+    for name, parts in model.groups.items():
+        index = list(parts)
+        blocks[name] = weighted[..., index].mT @ d[..., index]
+    return Info(mean, (weighted * d).sum(1), blocks, trace)

@@ -1,0 +1,53 @@
+"""Where particles are sent. A proposal owns its density ratio: nobody else computes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.draws import Draws
+from pfbench.filter.belief import Cloud
+from pfbench.model.base import StateSpaceModel
+from pfbench.record import Record
+
+
+class Proposed(NamedTuple):
+    """x [R, N, D]; log_ratio [R, N] = log p(w) - log q(w) of the noise that led there; memory as in Cloud."""
+
+    x: Tensor
+    log_ratio: Tensor
+    memory: dict[str, Tensor]
+
+
+class Proposal(Protocol):
+    @property
+    def exact(self) -> bool: ...
+
+    def __call__(self, model: StateSpaceModel, cloud: Cloud, seen: Record, draws: Draws) -> Proposed: ...
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """The model's own noise: x = propagate(x, u, w), ratio 0 [Gordon, Salmond, Smith 1993]."""
+
+    exact = True
+
+    def __call__(self, model: StateSpaceModel, cloud: Cloud, seen: Record, draws: Draws) -> Proposed:
+        w = draw_noise(model, cloud.x.shape[1], draws)
+        return Proposed(model.propagate(cloud.x, seen.u, w), torch.zeros_like(cloud.log_w), cloud.memory)
+
+
+def draw_noise(model: StateSpaceModel, n: int, draws: Draws) -> Tensor:
+    """w [R, n, W] from the model's noise law: normals scaled and shifted, any other law by inversion.
+
+    Raises:
+        NotImplementedError: from torch, where the law has no inverse distribution function.
+    """
+    law = model.noise
+    base = law.base_dist if isinstance(law, torch.distributions.Independent) else law
+    if isinstance(base, torch.distributions.Normal):
+        return base.loc + base.scale * draws.normal("noise", n, model.noise_dim)
+    return base.icdf(draws.uniform("noise", n, model.noise_dim).to(model.anchor.dtype))

@@ -1,0 +1,241 @@
+"""Refreshing a cloud: which particles go on, and with what weights.
+
+A resampler returns particles, not indices, since some (regularised, aggregating) do not copy. Every scheme gives each
+particle on average n a copies for probabilities a. All are batched, work by counting or sorted search, and never index out
+of range: cumulative sums are float64 from N = 1e5 on and their last value is set, not trusted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.draws import Draws
+from pfbench.filter import belief
+from pfbench.filter.belief import Cloud
+from pfbench.filter.moments import factor, moments
+from pfbench.model.base import StateSpaceModel
+
+_DOUBLE_FROM = 100_000  # particles; in float32 one ancestor in 500 is wrong there, and the evidence drifts
+
+
+class Scheme(Protocol):
+    """Probabilities a [R, N] and the number n [R, 1] wanted of N slots -> ancestors [R, N]; slots from n on are ignored."""
+
+    def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor: ...
+
+
+class Resampler(Protocol):
+    """log_a: log resampling probabilities [R, N], n: wanted particles [R, 1] -> the cloud and which runs were touched [R]."""
+
+    @property
+    def exact(self) -> bool: ...
+
+    def __call__(
+        self, model: StateSpaceModel, cloud: Cloud, log_a: Tensor, n: Tensor, draws: Draws
+    ) -> tuple[Cloud, Tensor]: ...
+
+
+@dataclass(frozen=True)
+class Resample:
+    """Copies particles by a scheme where the effective sample size has fallen.
+
+    Args:
+        scheme: how ancestors are drawn.
+        threshold: resample the runs with ESS < threshold n; 1 resamples always, 0 never.
+
+    Raises:
+        ValueError: threshold outside [0, 1].
+    """
+
+    scheme: Scheme
+    threshold: float = 0.5
+    exact = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.threshold <= 1.0:
+            raise ValueError(f"resampler.threshold={self.threshold}: give a ratio of ESS to N between 0 (never) and 1 (always)")
+
+    def __call__(
+        self, model: StateSpaceModel, cloud: Cloud, log_a: Tensor, n: Tensor, draws: Draws
+    ) -> tuple[Cloud, Tensor]:
+        a = belief.weights(log_a)
+        hit = torch.ones_like(cloud.log_z, dtype=torch.bool)
+        if self.threshold < 1.0:
+            hit = 1.0 / a.square().sum(-1) < self.threshold * n.squeeze(1)
+        ancestors = self.scheme(a, n, draws)
+        slots = torch.arange(a.shape[1], device=a.device)
+        carried = (cloud.log_w - log_a).gather(1, ancestors) - torch.log(n.to(a.dtype))
+        fresh = belief.gather(cloud, ancestors)._replace(log_w=torch.where(slots < n, carried, -torch.inf))
+        return belief.where(hit, fresh, cloud), hit
+
+
+@dataclass(frozen=True)
+class Regularise:
+    """Draws from a kernel estimate of the cloud: copies by `inner`, then adds h A e in the chart to the runs it touched.
+
+    Covariance A A' is that of the weighted cloud before resampling; h is the Gaussian kernel's optimal bandwidth
+    (4/(d+2))^(1/(d+4)) N^(-1/(d+4)) [Silverman 1986; Musso, Oudjane, Le Gland 2001] times `scale`.
+
+    Args:
+        inner: the resampler that copies.
+        scale: factor on the optimal bandwidth; 1/2 for clouds of several modes.
+        shrink: pull particles to the mean first, so that the covariance is kept [West 1993; Liu and West 2001]; without it
+            each refresh multiplies the covariance by 1 + h^2.
+    """
+
+    inner: Resample
+    scale: float = 1.0
+    shrink: bool = False
+    exact = False
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0.0:
+            raise ValueError(f"resampler.scale={self.scale}: give a positive factor on the optimal bandwidth")
+
+    def __call__(
+        self, model: StateSpaceModel, cloud: Cloud, log_a: Tensor, n: Tensor, draws: Draws
+    ) -> tuple[Cloud, Tensor]:
+        mean, covariance = moments(model.chart, cloud)
+        fresh, hit = self.inner(model, cloud, log_a, n, draws)
+        d = covariance.shape[-1]
+        h = self.scale * (4.0 / (d + 2)) ** (1.0 / (d + 4)) * n.to(covariance.dtype) ** (-1.0 / (d + 4))  # [R, 1]
+        step = h.unsqueeze(-1) * (draws.normal("regularise", fresh.x.shape[1], d) @ factor(covariance)[0].mT)
+        centre = mean.unsqueeze(1)
+        if self.shrink:
+            pulled = torch.sqrt(1.0 - (h * h).clamp(max=1.0)).unsqueeze(-1) * model.chart.subtract(fresh.x, centre)
+            x = model.chart.add(centre, pulled + step)
+        else:
+            x = model.chart.add(fresh.x, step)
+        return fresh._replace(x=torch.where(hit[:, None, None], x, fresh.x)), hit
+
+
+@dataclass(frozen=True)
+class Systematic:
+    """One uniform for all slots, positions (j + u) / n. Counts are within 1 of n a."""
+
+    def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
+        reach = _cumulative(a) * n
+        below = torch.ceil(reach - draws.uniform("resample", 1, 1).squeeze(1).to(reach.dtype))
+        return _ancestors(below.long(), n)
+
+
+@dataclass(frozen=True)
+class Stratified:
+    """One uniform for each slot, positions (j + u_j) / n."""
+
+    def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
+        u = draws.uniform("resample", a.shape[1], 1).squeeze(2)
+        reach = _cumulative(a) * n
+        whole = torch.floor(reach).long().clamp(max=a.shape[1] - 1)
+        inside = u.gather(1, whole) <= reach - whole  # does the position in the slot that the sum ends in lie below it?
+        return _ancestors(whole + inside, n)
+
+
+@dataclass(frozen=True)
+class Multinomial:
+    """Independent draws. The highest variance of all; the textbook scheme."""
+
+    def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
+        return _pick(_cumulative(a), draws.uniform("resample", a.shape[1], 1).squeeze(2))
+
+
+@dataclass(frozen=True)
+class Residual:
+    """floor(n a) copies for certain, the rest multinomial on what is left [Liu and Chen 1998]."""
+
+    def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
+        wanted = a * n
+        sure = torch.floor(wanted)
+        missing = n - sure.sum(1, keepdim=True).long()
+        left = wanted - sure
+        left = left / left.sum(1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny)
+        drawn = _pick(_cumulative(left), draws.uniform("resample", a.shape[1], 1).squeeze(2))
+        slots = torch.arange(a.shape[1], device=a.device)
+        counts = sure.long().scatter_add(1, drawn, (slots < missing).long())
+        return _ancestors(counts.cumsum(1), n)
+
+
+@dataclass(frozen=True)
+class Ssp:
+    """Srinivasan's sampling process: every count is floor(n a) or one more, negatively associated [Gerber, Chopin, Whiteley 2019].
+
+    Pairs of fractional parts are resolved in a tournament, so that N particles take log2 N batched rounds, not N steps; the
+    order of pairing is free [Srinivasan 2001].
+    """
+
+    def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
+        wanted = a.double() * n
+        counts = torch.floor(wanted)
+        width = 1 << max(1, (a.shape[1] - 1).bit_length())
+        pad = width - a.shape[1]
+        p = torch.nn.functional.pad(wanted - counts, (0, pad))
+        holder = torch.arange(width, device=a.device).expand(a.shape[0], -1)
+        u = draws.uniform("resample", width, 1).squeeze(2)
+        extra = torch.zeros_like(p)
+        used = 0
+        while p.shape[1] > 1:
+            first, second = p[:, 0::2], p[:, 1::2]
+            toss = u[:, used : used + first.shape[1]]
+            used += first.shape[1]
+            p, settled, leaves = _settle(first, second, toss)
+            out = torch.where(leaves, holder[:, 0::2], holder[:, 1::2])
+            holder = torch.where(leaves, holder[:, 1::2], holder[:, 0::2])
+            extra = extra.scatter_add(1, out, settled)
+        extra = extra.scatter_add(1, holder, p.round())  # the fractions sum to a whole number
+        counts = (counts + extra[:, : a.shape[1]]).long()
+        return _ancestors(counts.cumsum(1), n)
+
+
+@dataclass(frozen=True)
+class Killing:
+    """A particle survives with probability a / max a, or is replaced by a multinomial draw [Del Moral 2004].
+
+    Slots keep their particles, so it needs the number of particles to stay as it is.
+    """
+
+    def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
+        u = draws.uniform("resample", a.shape[1], 2)
+        survives = u[..., 0] * a.max(1, keepdim=True).values < a
+        slots = torch.arange(a.shape[1], device=a.device).expand_as(survives)
+        return torch.where(survives, slots, _pick(_cumulative(a), u[..., 1].contiguous()))
+
+
+def _settle(first: Tensor, second: Tensor, toss: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """One round of the tournament for pairs of fractions.
+
+    Returns: the fraction carried on, the count (0 or 1) of the member that leaves, and whether the first member leaves.
+    """
+    both = first + second
+    over = both >= 1.0
+    # sum below 1: one leaves with 0, the other carries the sum; above: one leaves with 1, the other carries the rest
+    chance = torch.where(over, (1.0 - second) / (2.0 - both).clamp(min=1e-300), second / both.clamp(min=1e-300))
+    return both - over.to(both.dtype), over.to(both.dtype), toss < chance
+
+
+def _cumulative(a: Tensor) -> Tensor:
+    """Cumulative sums [R, N] whose last value is 1, whatever rounding did."""
+    sums = (a.double() if a.shape[1] >= _DOUBLE_FROM else a).cumsum(1)
+    return sums / sums[:, -1:]
+
+
+def _pick(cumulative: Tensor, u: Tensor) -> Tensor:
+    """Independent draws from the law with these cumulative sums, by inversion: [R, N], [R, M] -> [R, M]."""
+    return torch.searchsorted(cumulative, u.to(cumulative.dtype)).clamp(max=cumulative.shape[1] - 1)
+
+
+def _ancestors(below: Tensor, n: Tensor) -> Tensor:
+    """Ancestors [R, N] from the number of slots filled up to and including each particle, int64 [R, N], non-decreasing.
+
+    Slot j belongs to the first particle with more than j slots below it: count particles by where they end, and sum.
+    """
+    slots = below.shape[1]
+    wanted = n.long()
+    ends = torch.minimum(below, wanted)
+    ends[:, -1] = wanted.squeeze(1)
+    counts = torch.zeros(below.shape[0], slots + 1, dtype=torch.long, device=below.device)
+    counts.scatter_add_(1, ends, torch.ones_like(ends))
+    return counts.cumsum(1)[:, :slots].clamp(max=slots - 1)

@@ -1,0 +1,176 @@
+"""Measures of a filter on arrays with leading axes [R, T]: R Monte Carlo runs, T instants.
+
+Three figures go by the name of RMSE in the literature; here each has its own name. Errors are estimate minus truth, NaN
+where there is no truth (flights of unequal length are padded so); an instant at which any component is NaN is left out.
+A lost run never enters an average, and never leaves without a trace: its own loss is infinite and every average says
+how many runs it is over.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+class Average(NamedTuple):
+    """An average over runs.
+
+    Attributes:
+        value: a number, or one per component [K]; NaN when no run entered.
+        runs: how many runs entered; the others were lost or had no truth.
+    """
+
+    value: Array
+    runs: int
+
+
+class Consistency(NamedTuple):
+    """The average NEES over runs and the band in which it lies for a consistent filter.
+
+    Attributes:
+        average: over the runs at hand, at each instant [T]; chi-square with dof * runs_at degrees, divided
+            by runs_at.
+        low, high: two-sided band at each instant [T].
+        runs_at: runs at each instant [T].
+        mean: over runs and time; dof for a consistent filter.
+        inside: share of the instants at which the average lies in the band.
+        runs: runs that entered.
+    """
+
+    average: Array
+    low: Array
+    high: Array
+    runs_at: NDArray[np.intp]
+    mean: float
+    inside: float
+    runs: int
+
+
+def rmse_per_run(error: Array, lost: Flags) -> Array:
+    """Root of the mean over time of the squared norm, for each run [R].
+
+    Args:
+        error: [R, T, K], the components of one group.
+        lost: [R].
+
+    Returns:
+        [R]; infinite for a lost run (what it did before it was lost is no measure of it), NaN for a run without truth.
+    """
+    return _with_lost(np.sqrt(_mean(_square(error), axis=1)), lost)
+
+
+def rmse_run_mean(error: Array, lost: Flags) -> Average:
+    """Mean over runs of the RMSE of each run. Arguments as `rmse_per_run`."""
+    each = rmse_per_run(error, lost)
+    used = ~np.isnan(each) & ~np.asarray(lost, dtype=bool)
+    return Average(_mean(each[used], axis=0), int(used.sum()))
+
+
+def rmse_norm(error: Array, lost: Flags) -> Average:
+    """Root of the mean over runs and time of the squared norm. Arguments as `rmse_per_run`."""
+    square = _square(error)[~lost]
+    return Average(np.sqrt(_mean(square.ravel(), axis=0)), _seen(square))
+
+
+def rmse_component(error: Array, lost: Flags) -> Average:
+    """Root of the mean square over runs and time of each component, value [K]. Arguments as `rmse_per_run`."""
+    kept = np.asarray(error, dtype=np.float64)[~lost]
+    square = np.where(np.isnan(_square(kept))[..., None], np.nan, kept**2)
+    return Average(np.sqrt(_mean(square.reshape(-1, kept.shape[-1]), axis=0)), _seen(square[..., 0]))
+
+
+def max_error(error: Array, lost: Flags) -> Array:
+    """Largest norm of the error over time, for each run [R]; infinite when lost. Arguments as `rmse_per_run`."""
+    square = _square(error)
+    largest = np.max(np.where(np.isnan(square), -np.inf, square), axis=1, initial=-np.inf)
+    return _with_lost(np.sqrt(np.where(largest < 0, np.nan, largest)), lost)
+
+
+def mean_per_run(trace: Array, lost: Flags) -> Array:
+    """Mean over time of a trace [R, T] (ESS, NEES), for each run [R]; NaN for a lost run."""
+    each = _mean(np.asarray(trace, dtype=np.float64), axis=1)
+    return np.where(lost, np.nan, each)
+
+
+def nees_band(dof: int, runs: int | NDArray[np.intp], alpha: float = 0.05) -> tuple[Array, Array]:
+    """Two-sided band of the NEES averaged over independent runs [Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2].
+
+    Args:
+        dof: components of the group.
+        runs: number of runs averaged; any shape; 0 gives NaN.
+        alpha: probability outside the band for a consistent filter.
+    """
+    n = np.where(np.asarray(runs) > 0, runs, np.nan)
+    low, high = (stats.chi2.ppf(q, dof * n) / n for q in (alpha / 2, 1 - alpha / 2))
+    return low, high
+
+
+def consistency(nees: Array, lost: Flags, dof: int, alpha: float = 0.05) -> Consistency:
+    """Whether the errors are as large as the filter says.
+
+    Args:
+        nees: normalised squared error of one group [R, T].
+        lost: [R].
+        dof: components of the group.
+        alpha: probability outside the band for a consistent filter.
+    """
+    kept = np.asarray(nees, dtype=np.float64)[~lost]
+    count = (~np.isnan(kept)).sum(axis=0)
+    average = _mean(kept, axis=0)
+    low, high = nees_band(dof, count, alpha)
+    known = count > 0
+    inside = ((average >= low) & (average <= high))[known]
+    share = float(inside.mean()) if inside.size else np.nan
+    return Consistency(average, low, high, count, float(_mean(kept.ravel(), axis=0)), share, _seen(kept))
+
+
+def lost_share(lost: Flags) -> Average:
+    """Share of the runs that were lost."""
+    return Average(_mean(np.asarray(lost, dtype=np.float64), axis=0), int(np.size(lost)))
+
+
+def convergence_time(time: Array, error: Array, lost: Flags, bound: float) -> Array:
+    """First instant from which on the norm of the error stays at or below `bound`, for each run [R].
+
+    Args:
+        time: seconds [T].
+        error: [R, T, K].
+        lost: [R].
+        bound: in the unit of the error.
+
+    Returns:
+        Seconds [R]; infinite when the last known error is above the bound or the run was lost, NaN without truth.
+    """
+    norm = np.sqrt(_square(error))
+    known = ~np.isnan(norm)
+    # The last violation counts backwards from the end; the answer is the first known instant after it.
+    after = ~np.logical_or.accumulate((norm > bound)[:, ::-1], axis=1)[:, ::-1] & known
+    first = np.where(after.any(axis=1), np.asarray(time, dtype=np.float64)[after.argmax(axis=1)], np.inf)
+    return _with_lost(np.where(known.any(axis=1), first, np.nan), lost)
+
+
+def _square(error: Array) -> Array:
+    # In double precision: float32 overflows where a diverged filter is squared.
+    return np.sum(np.asarray(error, dtype=np.float64) ** 2, axis=-1)
+
+
+def _mean(values: Array, axis: int) -> Array:
+    """Mean of what is not NaN, NaN where there is nothing; numpy's nanmean warns there."""
+    known = ~np.isnan(values)
+    count = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _seen(values: Array) -> int:
+    return int((~np.isnan(values)).any(axis=1).sum())
+
+
+def _with_lost(each: Array, lost: Flags) -> Array:
+    return np.where(lost, np.inf, each)

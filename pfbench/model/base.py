@@ -1,0 +1,184 @@
+"""The one abstract class of the house: a model is a map driven by explicit noise and a law of what is seen."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any
+
+import torch
+from pyro.distributions import Independent, MultivariateNormal, Normal
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from pfbench.chart import Chart, Euclidean
+from pfbench.record import Record
+
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+class StateSpaceModel(nn.Module, ABC):
+    """x_t = propagate(x_{t-1}, u_t, w_t), y_t ~ observation(x_t, u_t).
+
+    Axes everywhere: R runs, N particles (or sigma points, or tangents), D state. By convention the first measurement is of the
+    state after the first propagation; a model that measures its initial state sets `observes_initial`, and the evidence
+    changes with it.
+
+    Attributes:
+        names, units: of the d components of a difference of states, in which errors and spreads are told (SI, rad).
+        groups: components of a difference that a report shows together, by name.
+        noise_dim: W, the dimension of the driving noise.
+        observes_initial: the first measurement is of x_0, nothing is propagated before it.
+        choices: readings of ours that a report must mention.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    groups: dict[str, tuple[int, ...]]
+    noise_dim: int
+    observes_initial: bool = False
+    choices: tuple[str, ...] = ()
+
+    @property
+    def chart(self) -> Chart:
+        """How states add, subtract and average; plain numbers unless the model says otherwise."""
+        return Chart((Euclidean(len(self.names)),))
+
+    @property
+    def origin(self) -> Tensor:
+        """The state [D] about which `initial` is laid out in the chart; zero unless the model says otherwise."""
+        return self.anchor.new_zeros(self.chart.size)
+
+    @property
+    def anchor(self) -> Tensor:
+        """Some tensor of the model: tells dtype and device."""
+        return next(iter(self.buffers()))
+
+    @property
+    def noise(self) -> Distribution:
+        """Law of w, event [W], components independent; standard normal unless the model says otherwise."""
+        zero = self.anchor.new_zeros(self.noise_dim)
+        return Normal(zero, torch.ones_like(zero), validate_args=False).to_event(1)
+
+    @abstractmethod
+    def initial(self, runs: int) -> Distribution:
+        """Law of x_0 in the chart about `origin`: batch [R], event [d]."""
+
+    @abstractmethod
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        """One step, deterministic: [R, N, D], inputs of the step, [R, N, W] -> [R, N, D]."""
+
+    @abstractmethod
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        """Law of y given x: batch [R, N], event [Dy]; Independent over components, or a MultivariateNormal."""
+
+    def transition(self, x: Tensor, u: Any) -> Distribution | None:
+        """Law of x_t given x_{t-1}, batch [R, N], event [D]; None where it is singular, and never faked."""
+        return None
+
+    def noise_gain(self, u: Any) -> Tensor | None:
+        """L [R or 1, D, W] where the noise enters as x + L w; None where it enters otherwise."""
+        return None
+
+    def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
+        """y - y_hat, the short way round where a measurement is an angle."""
+        return y - y_hat
+
+    def prepare(self, record: Record) -> Record:
+        """What can be computed once for all steps and filters' stages: a record whose inputs the model likes better."""
+        return record
+
+    def error(self, mean: Tensor, truth: Tensor) -> Tensor:
+        """Error of an estimate as a report shows it, in the chart: [..., D], [..., D] -> [..., d]."""
+        return self.chart.subtract(mean, truth)
+
+    def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
+        """log p(y | x) over the components that were seen: y [R, Dy], x [R, N, D] -> [R, N].
+
+        Raises:
+            TypeError: the observation law is neither Independent nor MultivariateNormal.
+        """
+        law = self.observation(x, u)
+        y_hat = law.mean
+        seen = ~torch.isnan(y).unsqueeze(1)
+        r = torch.where(seen, self.residual(y.unsqueeze(1), y_hat), 0.0)
+        if isinstance(law, torch.distributions.Independent):
+            return (law.base_dist.log_prob(y_hat + r) * seen).sum(-1)
+        if isinstance(law, torch.distributions.MultivariateNormal):
+            return gaussian_log_density(r, law.covariance_matrix, seen)
+        raise TypeError(f"{type(self).__name__}.observation returned {type(law).__name__}: return Independent or MultivariateNormal")
+
+
+class AtRest(StateSpaceModel):
+    """A model whose state does not move in this step: the first one of a model that observes its initial state."""
+
+    def __init__(self, model: StateSpaceModel) -> None:
+        super().__init__()
+        self.model = model
+        self.names, self.units, self.groups, self.noise_dim = model.names, model.units, model.groups, model.noise_dim
+
+    @property
+    def chart(self) -> Chart:
+        return self.model.chart
+
+    @property
+    def noise(self) -> Distribution:
+        return self.model.noise
+
+    def initial(self, runs: int) -> Distribution:
+        return self.model.initial(runs)
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return x
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return self.model.observation(x, u)
+
+    def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
+        return self.model.residual(y, y_hat)
+
+    def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
+        return self.model.log_likelihood(y, x, u)
+
+
+def gaussian_log_density(r: Tensor, covariance: Tensor, seen: Tensor) -> Tensor:
+    """log N(r; 0, covariance) over the components seen: r [..., D], covariance [..., D, D], seen [..., D] -> [...].
+
+    A component that was not seen gets unit variance, no correlation and no residual, and its constant is taken back. A
+    covariance that is not positive gives NaN.
+    """
+    both = seen.unsqueeze(-1) & seen.unsqueeze(-2)
+    eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
+    factor, info = torch.linalg.cholesky_ex(torch.where(both, covariance, eye))
+    z = torch.linalg.solve_triangular(factor, r.unsqueeze(-1), upper=False).squeeze(-1)
+    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    value = -0.5 * (z * z).sum(-1) - log_det - 0.5 * _LOG_2PI * seen.sum(-1)
+    return torch.where(info == 0, value, torch.nan)
+
+
+def independent_normal(mean: Tensor, sd: Tensor) -> Independent:
+    """Independent normal components, event in the last axis; sd broadcasts against mean."""
+    return Normal(mean, sd.expand_as(mean), validate_args=False).to_event(1)
+
+
+def normal_batch(runs: int, sd: Tensor, mean: Tensor | None = None) -> Independent:
+    """The same independent normal law for each of `runs` runs: batch [R], event [d]."""
+    centre = torch.zeros_like(sd) if mean is None else mean
+    return independent_normal(centre.expand(runs, -1), sd)
+
+
+def dense_normal(mean: Tensor, factor: Tensor) -> MultivariateNormal:
+    """A normal law from its Cholesky factor, which is not checked again."""
+    return MultivariateNormal(mean, scale_tril=factor, validate_args=False)
+
+
+def positive(name: str, values: Any) -> Tensor:
+    """A float64 tensor of strictly positive numbers.
+
+    Raises:
+        ValueError: names the key, the value and the remedy.
+    """
+    tensor = torch.as_tensor(values, dtype=torch.float64)
+    if not bool((tensor > 0).all()):
+        raise ValueError(f"{name}={values}: give positive, finite numbers (a standard deviation or variance cannot be 0 or negative)")
+    return tensor

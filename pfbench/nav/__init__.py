@@ -1,0 +1,1 @@
+"""Strapdown navigation: Earth, attitude, trajectories, inertial sensors, mechanisation, error dynamics."""

@@ -1,0 +1,120 @@
+"""What all figures share: size, palette, legends, ticks, quantiles over runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import cycle
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib import ticker
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+
+COLUMN = 3.5  # inches
+_INSTANTS = 1000  # drawn at most; more only makes files large
+RC: Any = {
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.alpha": 0.35,
+    "grid.linewidth": 0.5,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.3,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "savefig.dpi": 220,
+    "svg.hashsalt": "pfbench",  # identifiers of an SVG are random otherwise
+}
+# Okabe and Ito 2008, without the yellow that white paper swallows.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
+_DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+
+
+class Look(NamedTuple):
+    """How one filter is drawn in all figures of a study."""
+
+    colour: str
+    dash: str | tuple[int, tuple[float, ...]]
+    marker: str
+
+
+def looks(labels: Sequence[str]) -> dict[str, Look]:
+    """Colour, dash and marker of each filter; all three differ for neighbours, so that one suffices in grey."""
+    each = zip(sorted(set(labels)), cycle(_COLOURS), cycle(_DASHES), cycle(_MARKERS), strict=False)
+    return {label: Look(colour, dash, marker) for label, colour, dash, marker in each}
+
+
+def stack(n: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(COLUMN, 0.6 + height * n), layout="constrained")
+    return figure, list(figure.subplots(n, 1, squeeze=False, sharex=sharex)[:, 0])
+
+
+def legend(figure: Figure, axis: Axes, columns: int = 2) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(columns, len(labels)))
+
+
+def labelled(what: str, unit: str) -> str:
+    return f"{what} in {unit}" if unit else what
+
+
+def slug(text: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in text).strip("_")
+
+
+def thinned(size: int) -> np.ndarray:
+    return np.unique(np.linspace(0, size - 1, min(size, _INSTANTS)).astype(int))
+
+
+def quantiles(values: np.ndarray, q: Sequence[float]) -> np.ndarray:
+    """Over runs [R, T] -> [len(q), T], NaN where no run is known."""
+    found = np.full((len(q), values.shape[1]), np.nan)
+    known = ~np.isnan(values)
+    whole, some = known.all(axis=0) & bool(len(values)), known.any(axis=0) & ~known.all(axis=0)
+    if whole.any():
+        found[:, whole] = np.quantile(values[:, whole], q, axis=0)
+    if some.any():
+        found[:, some] = np.nanquantile(values[:, some], q, axis=0)
+    return found
+
+
+def jitter(n: int) -> np.ndarray:
+    """Offsets that spread points, the same at every drawing: the fractional parts of multiples of the golden ratio."""
+    return 0.4 * ((np.arange(n) * 0.6180339887) % 1 - 0.5)
+
+
+def _finite(values: Sequence[np.ndarray]) -> np.ndarray:
+    flat = np.concatenate([np.ravel(np.asarray(v, dtype=np.float64)) for v in values]) if values else np.empty(0)
+    return flat[np.isfinite(flat)]
+
+
+def log_if_wide(axis: Axes, side: Axis, values: Sequence[np.ndarray]) -> None:
+    flat = _finite(values)
+    flat = flat[flat > 0]
+    if flat.size and np.quantile(flat, 0.995) > 30 * np.quantile(flat, 0.005):
+        (axis.set_xscale if side is axis.xaxis else axis.set_yscale)("log")
+        plain_ticks(side, flat)
+
+
+def plain_ticks(side: Axis, values: Sequence[float] | np.ndarray) -> None:
+    """Plain numbers on a logarithmic axis: 1, 2, 5 where it is short, decades where it is long."""
+    flat = _finite([np.asarray(values)])
+    flat = flat[flat > 0]
+    long = bool(flat.size) and flat.max() > 100 * flat.min()
+    side.set_major_locator(ticker.LogLocator(subs=(1.0,) if long else (1.0, 2.0, 5.0), numticks=8))
+    side.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    side.set_minor_formatter(ticker.NullFormatter())
+
+
+def zoom(axis: Axes, curves: Sequence[np.ndarray]) -> None:
+    flat = np.abs(_finite(curves))
+    if flat.size and flat.max() > 8 * np.quantile(flat, 0.8) > 0:
+        limit = 1.25 * float(np.quantile(flat, 0.8)) * 2
+        axis.set_ylim(-limit, limit)

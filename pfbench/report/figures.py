@@ -1,0 +1,300 @@
+"""Figures of a cell, in physical units: each is one column of a paper wide and survives printing in grey."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import seaborn as sns
+from matplotlib.figure import Figure
+
+from pfbench import metrics, store
+from pfbench.report.canvas import (
+    COLUMN,
+    RC,
+    Look,
+    jitter,
+    labelled,
+    legend,
+    log_if_wide,
+    plain_ticks,
+    quantiles,
+    slug,
+    stack,
+    thinned,
+    zoom,
+)
+from pfbench.report.frame import Block, blocks
+
+Results = Mapping[str, store.Result]
+
+class Drawing(NamedTuple):
+    """One figure, drawn when asked for.
+
+    Attributes:
+        name: of its files, without folder and ending.
+        caption: what is seen.
+        make: draws it.
+    """
+
+    name: str
+    caption: str
+    make: Callable[[], Figure]
+
+
+def drawings(
+    results: Results, runs: pd.DataFrame, style: Mapping[str, Look], groups: Sequence[str], alpha: float = 0.05
+) -> list[Drawing]:
+    """All figures that a cell has data for.
+
+    Args:
+        results: by label, whole.
+        runs: rows of `frame` of this cell.
+        style: from `looks`.
+        groups: names of the blocks shown.
+        alpha: probability outside the NEES band.
+    """
+    shown = [block for block in _all_blocks(results) if block.group in groups]
+    wholes = list(dict.fromkeys(block.whole for block in shown))
+    kept = "runs that were not lost"
+    found = []
+    row = _common_run(results)
+    if row is not None and any("track" in result.arrays for result in results.values()):
+        number = row + int(next(iter(results.values())).meta.get("first_run", 0))
+        text = f"True and estimated track of run {number}, the first that no filter lost: plan view and height."
+        found.append(Drawing("track", text, partial(track, results, row, style)))
+    for block in shown:
+        text = f"Absolute error of {block.group} over time, median of the {kept}."
+        found.append(Drawing(f"error_{slug(block.group)}", text, partial(error, results, block, style)))
+    for label, result in results.items():
+        text = (
+            f"{label}: error over time, median and 5 to 95 % of the {kept} (shaded), and three times the filter's own "
+            f"standard deviation, median over runs (dashed). The vertical axis may cut the first instants."
+        )
+        found.append(Drawing(f"spread_{slug(label)}", text, partial(spread, result, groups, style[label])))
+    text = f"RMSE of each run: quartiles, whiskers to 1.5 quartile ranges, one point for each of the {kept}."
+    found.append(Drawing("rmse", text, partial(rmse, runs, [block.group for block in shown], style)))
+    text = "Time per step against the root of the mean over runs and time of the squared error."
+    found.append(Drawing("cost", text, partial(cost, results, shown, style)))
+    text = f"NEES averaged over the {kept}, with its two-sided {100 * (1 - alpha):g} % chi-square band."
+    found.append(Drawing("nees", text, partial(nees, results, wholes, style, alpha)))
+    if any("ess" in result.arrays for result in results.values()):
+        text = f"Effective sample size of the particle filters, median and 5 to 95 % of the {kept}."
+        found.append(Drawing("ess", text, partial(ess, results, style)))
+    return found
+
+
+def save(drawing: Drawing, folder: Path, formats: Sequence[str]) -> list[Path]:
+    """Draws and writes one file per format; the same drawing gives the same bytes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    date = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    with matplotlib.rc_context(RC):
+        figure = drawing.make()
+        paths = [folder / f"{drawing.name}.{ending}" for ending in formats]
+        for path, ending in zip(paths, formats, strict=True):
+            figure.savefig(path, metadata=date.get(ending))
+    return paths
+
+
+def track(results: Results, row: int, style: Mapping[str, Look]) -> Figure:
+    """Plan view and height over time of one run, row of the arrays."""
+    figure = Figure(figsize=(COLUMN, 5.2), layout="constrained")
+    plan, height = figure.subplots(2, 1, height_ratios=(2.2, 1))
+    first = next(result for result in results.values() if "track" in result.arrays)
+    time, truth = first.arrays["time"], first.arrays["track"][row].astype(np.float64)
+    plan.plot(truth[:, 0], truth[:, 1], color="0.75", lw=4, solid_capstyle="round", label="truth")
+    height.plot(time, truth[:, 2], color="0.75", lw=4, solid_capstyle="round")
+    plan.plot(*truth[0, :2], marker="o", mfc="white", color="0.3", ls="none", zorder=5, label="start")
+    for label, result in results.items():
+        axes = _east_north_up(result.meta["state"])
+        if axes is None or "track" not in result.arrays:
+            continue
+        off = result.arrays["error"][row][:, axes[0]].astype(np.float64) * axes[1]
+        estimate = result.arrays["track"][row] + off
+        line = {"color": style[label].colour, "ls": style[label].dash, "lw": 1.1}
+        plan.plot(estimate[:, 0], estimate[:, 1], label=label, **line)
+        height.plot(result.arrays["time"], estimate[:, 2], **line)
+    plan.set(xlabel="east in m", ylabel="north in m")
+    plan.set_aspect("equal", adjustable="datalim")
+    height.set(xlabel="time in s", ylabel="height in m")
+    legend(figure, plan)
+    return figure
+
+
+def error(results: Results, block: Block, style: Mapping[str, Look]) -> Figure:
+    """Median absolute error over time, one panel per component, all filters."""
+    figure, panels = stack(len(block.components), 1.15)
+    for label, result in results.items():
+        time, values = _kept(result, "error")
+        for name, axis in zip(block.components, panels, strict=True):
+            own = result.meta["state"]["names"]
+            if name in own:
+                middle = quantiles(np.abs(values[..., own.index(name)]) * block.scale, [0.5])[0]
+                axis.plot(time, middle, color=style[label].colour, ls=style[label].dash, label=label)
+    for name, axis in zip(block.components, panels, strict=True):
+        axis.set(title=name, ylabel=labelled("|error|", block.unit))
+        log_if_wide(axis, axis.yaxis, [np.asarray(line.get_ydata()) for line in axis.lines])
+    panels[-1].set_xlabel("time in s")
+    legend(figure, panels[0])
+    return figure
+
+
+def spread(result: store.Result, groups: Sequence[str], look: Look) -> Figure:
+    """Error of one filter over time with its own three-sigma bounds, one panel per component, a row per group."""
+    rows = [
+        (block, range(start, min(start + 3, len(block.places))))
+        for block in blocks(result.meta["state"])
+        if block.group in groups
+        for start in range(0, len(block.places), 3)
+    ]
+    columns = max(len(own) for _, own in rows)
+    figure = Figure(figsize=(max(COLUMN, 2.4 * columns), 0.4 + 1.45 * len(rows)), layout="constrained")
+    panels = figure.subplots(len(rows), columns, squeeze=False, sharex=True)
+    time, errors = _kept(result, "error")
+    _, sd = _kept(result, "sd")
+    for line, (block, own) in zip(panels, rows, strict=True):
+        for axis, k in zip(line, own, strict=False):
+            place = block.places[k]
+            low, middle, high = quantiles(errors[..., place] * block.scale, [0.05, 0.5, 0.95])
+            bound = 3 * quantiles(sd[..., place] * block.scale, [0.5])[0]
+            axis.fill_between(time, low, high, color=look.colour, alpha=0.3, lw=0, label="5 to 95 % of runs")
+            axis.plot(time, middle, color=look.colour, lw=1, label="median error")
+            axis.plot(time, bound, color="0.15", ls="--", lw=0.9, label="3 sigma of the filter")
+            axis.plot(time, -bound, color="0.15", ls="--", lw=0.9)
+            axis.set_title(block.components[k])
+            # The start can be a thousand times larger than all that follows and would hide it.
+            zoom(axis, [low, high, bound, -bound])
+        line[0].set_ylabel(labelled("error", block.unit))
+        for axis in line[len(own) :]:
+            axis.set_visible(False)
+    for axis in panels[-1]:
+        axis.set_xlabel("time in s")
+    legend(figure, panels[0][0], columns=3)
+    return figure
+
+
+def rmse(runs: pd.DataFrame, groups: Sequence[str], style: Mapping[str, Look]) -> Figure:
+    """RMSE of the norm of each group, one box per filter and one point per run."""
+    rows = runs[(runs.metric == "rmse") & (runs.component == "norm")]
+    labels = sorted(rows.label.unique())
+    figure, panels = stack(len(groups), 0.55 + 0.3 * len(labels), sharex=False)
+    for group, axis in zip(groups, panels, strict=True):
+        own = rows[rows.group == group]
+        kept = own[np.isfinite(own.value)]
+        colours = {label: style[label].colour for label in labels}
+        sns.boxplot(
+            kept, x="value", y="label", hue="label", order=labels, hue_order=labels, palette=colours, legend=False,
+            orient="h", width=0.6, fliersize=0, linewidth=0.8, saturation=1, boxprops={"alpha": 0.45}, ax=axis,
+        )  # fmt: skip
+        for place, label in enumerate(labels):
+            value = kept.value[kept.label == label].to_numpy()
+            axis.scatter(value, place + jitter(value.size), s=5, color="0.15", alpha=0.55, lw=0, zorder=3)
+            lost = int(own.lost[own.label == label].sum())
+            if lost:
+                place_of = axis.get_yaxis_transform()
+                axis.text(1.01, place, f"{lost} lost", transform=place_of, ha="left", va="center", fontsize=7)
+        unit = str(own.unit.iloc[0]) if len(own) else ""
+        axis.set(title=group, xlabel=labelled("RMSE per run", unit), ylabel="")
+        log_if_wide(axis, axis.xaxis, [kept.value.to_numpy()])
+    return figure
+
+
+def cost(results: Results, shown: Sequence[Block], style: Mapping[str, Look]) -> Figure:
+    """Time per step against RMSE, one panel per group."""
+    figure, panels = stack(len(shown), 1.6)
+    times = [1e3 * result.meta["seconds"]["per_step"] for result in results.values()]
+    for block, axis in zip(shown, panels, strict=True):
+        errors = []
+        for (label, result), time in zip(results.items(), times, strict=True):
+            if any(own.group == block.group for own in blocks(result.meta["state"])):
+                value = metrics.rmse_norm(result.arrays["error"][..., block.places], result.arrays["lost"]).value
+                errors.append(float(value) * block.scale)
+                look = style[label]
+                axis.scatter(time, errors[-1], s=38, color=look.colour, marker=look.marker, label=label, zorder=3)
+        axis.set(title=block.group, ylabel=labelled("RMSE", block.unit))
+        axis.set_yscale("log")
+        axis.set_xscale("log")
+        axis.margins(0.15)
+        plain_ticks(axis.yaxis, errors)
+    plain_ticks(panels[-1].xaxis, times)
+    panels[-1].set_xlabel("time per step in ms")
+    legend(figure, panels[0])
+    return figure
+
+
+def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alpha: float = 0.05) -> Figure:
+    """NEES averaged over runs with the chi-square band of as many runs, one panel per group."""
+    figure, panels = stack(len(groups), 1.4)
+    for group, axis in zip(groups, panels, strict=True):
+        lines, bands = [], []
+        for label, result in results.items():
+            own = result.meta["state"]["groups"]
+            if group in own:
+                dof = len(own[group])
+                place = list(own).index(group)
+                found = metrics.consistency(result.arrays["nees"][..., place], result.arrays["lost"], dof, alpha)
+                thin = thinned(result.arrays["time"].size)
+                time = result.arrays["time"][thin]
+                axis.plot(time, found.average[thin], color=style[label].colour, ls=style[label].dash, lw=1, label=label)
+                lines.append(found.average)
+                bands.append((found.runs, time, found.low[thin], found.high[thin], dof))
+        _, time, low, high, dof = max(bands, key=lambda band: band[0])
+        axis.fill_between(time, low, high, color="0.8", lw=0, zorder=0)
+        axis.axhline(dof, color="0.45", lw=0.7, zorder=1)
+        axis.set(title=f"{group}, {dof} degrees of freedom", ylabel="mean NEES")
+        log_if_wide(axis, axis.yaxis, lines)
+    panels[-1].set_xlabel("time in s")
+    legend(figure, panels[0])
+    return figure
+
+
+def ess(results: Results, style: Mapping[str, Look]) -> Figure:
+    """Effective sample size over time as a share of the particles."""
+    figure, (axis,) = stack(1, 2.2)
+    for label, result in results.items():
+        if "ess" in result.arrays and result.meta.get("particles"):
+            time, values = _kept(result, "ess")
+            low, middle, high = quantiles(100 * values / result.meta["particles"], [0.05, 0.5, 0.95])
+            axis.fill_between(time, low, high, color=style[label].colour, alpha=0.18, lw=0)
+            axis.plot(time, middle, color=style[label].colour, ls=style[label].dash, label=label)
+    axis.set(xlabel="time in s", ylabel="effective sample size in % of N")
+    axis.set_ylim(bottom=0)
+    legend(figure, axis)
+    return figure
+
+
+def _kept(result: store.Result, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Instants and values of the runs that were not lost, thinned."""
+    thin = thinned(result.arrays["time"].size)
+    return result.arrays["time"][thin], result.arrays[name][~result.arrays["lost"]][:, thin].astype(np.float64)
+
+
+def _all_blocks(results: Results) -> list[Block]:
+    found: dict[str, Block] = {}
+    for result in results.values():
+        for block in blocks(result.meta["state"]):
+            found.setdefault(block.group, block)
+    return list(found.values())
+
+
+def _common_run(results: Results) -> int | None:
+    """Row of the first run that no filter lost, or None."""
+    lost = [result.arrays["lost"] for result in results.values()]
+    if len({flags.size for flags in lost}) > 1 or np.any(lost, axis=0).all():
+        return None
+    return int(np.argmin(np.any(lost, axis=0)))
+
+
+def _east_north_up(state: Mapping[str, Any]) -> tuple[list[int], np.ndarray] | None:
+    """Where position_E, position_N and position_U (or D, with its sign) stand in the state."""
+    names = {str(name): i for i, name in enumerate(state["names"])}
+    up = "position_U" if "position_U" in names else "position_D"
+    wanted = ["position_E", "position_N", up]
+    if not all(name in names for name in wanted):
+        return None
+    return [names[name] for name in wanted], np.array([1.0, 1.0, 1.0 if up == "position_U" else -1.0])

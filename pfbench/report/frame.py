@@ -1,0 +1,255 @@
+"""A study as one tidy table: what ran, on which run of which world, how far off it was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pfbench import metrics, store
+
+# The one door from SI to what people read.
+_DISPLAY = {
+    "rad": ("arcmin", 60 * 180 / np.pi),
+    "rad/s": ("deg/h", 3600 * 180 / np.pi),
+    "m/s^2": ("mg", 1e3 / 9.80665),
+}
+
+
+class Job(NamedTuple):
+    """One file of a cell; its arrays are read when asked for.
+
+    Attributes:
+        path: the file.
+        label: the filter's name, with what sets it apart where a cell holds the filter more than once.
+        meta: see `store.Result`.
+    """
+
+    path: Path
+    label: str
+    meta: dict[str, Any]
+
+    def load(self) -> store.Result:
+        return store.load(self.path)
+
+
+class Cell(NamedTuple):
+    """All filters that saw the same worlds."""
+
+    scenario: str
+    noise: str
+    model: str
+    jobs: tuple[Job, ...]
+
+    @property
+    def name(self) -> str:
+        return f"{self.scenario} / {self.noise} / {self.model}"
+
+
+class Block(NamedTuple):
+    """Components of one unit whose error has a norm.
+
+    Attributes:
+        group: name; a group of mixed units is cut by unit, as "clock [m]" and "clock [m/s]".
+        whole: the group that it is or is cut from; NEES is of that.
+        places: of the components in the state.
+        components: names.
+        unit: the unit shown.
+        scale: from SI to the unit shown.
+    """
+
+    group: str
+    whole: str
+    places: list[int]
+    components: list[str]
+    unit: str
+    scale: float
+
+
+def frame(
+    study: str,
+    results: str | Path = "results",
+    *,
+    from_time: float = 0.0,
+    mixed: bool = False,
+    converged: Mapping[str, float] | None = None,
+) -> pd.DataFrame:
+    """Every figure of every run of a study, one per row.
+
+    Args:
+        study: name of the folder in `results`.
+        results: folder of all studies.
+        from_time: leave out what came before, seconds.
+        mixed: accept files of several versions, and several seeds, runs or lengths within a cell.
+        converged: bounds by group in the unit shown; adds the metric "converged", seconds.
+
+    Returns:
+        Columns study, key, scenario, noise, model, filter, label, particles, seed, run, lost, group, component, unit,
+        metric, value. Metrics: rmse (each component, and "norm" of the group), max_error, nees, ess (share of the
+        particles), log_evidence, seconds_per_step, converged. A lost run has infinite errors and NaN elsewhere.
+
+    Raises:
+        FileNotFoundError: the study has no result; the message says which studies have.
+        ValueError: files that do not belong together; the message names them.
+    """
+    study_cells = cells(study, results, mixed=mixed)
+    parts = [tidy(cell, job, job.load(), from_time, converged or {}) for cell in study_cells for job in cell.jobs]
+    return pd.concat(parts, ignore_index=True)
+
+
+def cells(study: str, results: str | Path = "results", *, mixed: bool = False) -> list[Cell]:
+    """The cells of a study, by scenario, noise and model; arguments and errors as `frame`."""
+    folder = Path(results) / study
+    found = [(path, store.describe(path)) for path in sorted(folder.glob("*.npz"))]
+    if not found:
+        raise FileNotFoundError(_nothing(study, Path(results)))
+    if not mixed:
+        _one(found, ("versions.pfbench", "versions.commit"), "the study")
+    found.sort(key=lambda item: (_cell(item[1]), item[1]["label"], item[1]["seed"], item[1]["key"]))
+    together = [list(items) for _, items in groupby(found, key=lambda item: _cell(item[1]))]
+    if not mixed:
+        for items in together:
+            _one(items, ("seed", "first_run", "runs", "steps"), f"the cell {' / '.join(_cell(items[0][1]))}")
+    return [Cell(*_cell(items[0][1]), _labelled(items)) for items in together]
+
+
+def blocks(state: Mapping[str, Any]) -> list[Block]:
+    """The groups of a state, `meta["state"]`, in the units shown."""
+    found = []
+    for group, index in state["groups"].items():
+        units = [state["units"][i] for i in index]
+        for unit in dict.fromkeys(units):
+            own = [i for i in index if state["units"][i] == unit]
+            shown, scale = _DISPLAY.get(unit, (unit, 1.0))
+            name = group if len(set(units)) == 1 else f"{group} [{shown or '1'}]"
+            found.append(Block(name, group, own, [state["names"][i] for i in own], shown, scale))
+    return found
+
+
+def later(result: store.Result, from_time: float) -> store.Result:
+    """The same result without the instants before `from_time`, seconds.
+
+    Raises:
+        ValueError: nothing would be left.
+    """
+    time = result.arrays["time"]
+    kept = time >= from_time
+    if not kept.any():
+        raise ValueError(f"from_time={from_time} s leaves nothing of {result.meta['key']}, which ends at {time[-1]} s")
+    if kept.all():
+        return result
+    shared = {name: result.arrays[name] for name in ("log_evidence", "lost")}
+    traces = {name: a[:, kept] for name, a in result.arrays.items() if name not in ("time", *shared)}
+    return store.Result(result.meta, {"time": time[kept], **traces, **shared})
+
+
+def tidy(cell: Cell, job: Job, result: store.Result, from_time: float, converged: Mapping[str, float]) -> pd.DataFrame:
+    """The rows of one job; see `frame`."""
+    lost = result.arrays["lost"]
+    rows = pd.concat(list(_rows(later(result, from_time), converged)), ignore_index=True)
+    first, runs = job.meta.get("first_run", 0), lost.size
+    repeats = len(rows) // runs
+    head = {
+        "study": job.meta["study"],
+        "key": job.meta["key"],
+        "scenario": cell.scenario,
+        "noise": cell.noise,
+        "model": cell.model,
+        "filter": job.meta["choices"]["filter"],
+        "label": job.label,
+        "particles": pd.array([job.meta.get("particles")] * len(rows), dtype="Int64"),
+        "seed": job.meta["seed"],
+        "run": np.tile(np.arange(first, first + runs), repeats),
+        "lost": np.tile(lost, repeats),
+    }
+    return pd.concat([pd.DataFrame(head, index=rows.index), rows], axis=1)
+
+
+def _rows(result: store.Result, converged: Mapping[str, float]) -> Iterator[pd.DataFrame]:
+    """One small table of R rows for each metric."""
+    arrays, lost, meta = result.arrays, result.arrays["lost"], result.meta
+    for block in blocks(meta["state"]):
+        error = arrays["error"][..., block.places].astype(np.float64) * block.scale
+        for k, name in enumerate(block.components):
+            yield _column("rmse", metrics.rmse_per_run(error[..., [k]], lost), block.group, name, block.unit)
+        yield _column("rmse", metrics.rmse_per_run(error, lost), block.group, "norm", block.unit)
+        yield _column("max_error", metrics.max_error(error, lost), block.group, "norm", block.unit)
+        if block.group in converged:
+            when = metrics.convergence_time(arrays["time"], error, lost, converged[block.group])
+            yield _column("converged", when, block.group, "norm", "s")
+    for g, group in enumerate(meta["state"]["groups"]):
+        yield _column("nees", metrics.mean_per_run(arrays["nees"][..., g], lost), group, "norm")
+    if "ess" in arrays and meta.get("particles"):
+        yield _column("ess", metrics.mean_per_run(arrays["ess"], lost) / meta["particles"])
+    yield _column("log_evidence", np.where(lost, np.nan, arrays["log_evidence"]))
+    yield _column("seconds_per_step", np.full(lost.size, meta["seconds"]["per_step"]), unit="s")
+
+
+def _column(metric: str, value: np.ndarray, group: str = "", component: str = "", unit: str = "") -> pd.DataFrame:
+    return pd.DataFrame(
+        {"group": group, "component": component, "unit": unit, "metric": metric, "value": value.astype(np.float64)}
+    )
+
+
+def _cell(meta: Mapping[str, Any]) -> tuple[str, str, str]:
+    choices = meta["choices"]
+    return str(choices["scenario"]), str(choices["noise"]), str(choices.get("model", ""))
+
+
+def _labelled(items: Sequence[tuple[Path, dict[str, Any]]]) -> tuple[Job, ...]:
+    names = [str(meta["label"]) for _, meta in items]
+    jobs = []
+    for (path, meta), name in zip(items, names, strict=True):
+        twins = [other for (_, other), label in zip(items, names, strict=True) if label == name]
+        jobs.append(Job(path, _told_apart(meta, twins), meta))
+    return tuple(sorted(jobs, key=lambda job: job.label))
+
+
+def _told_apart(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> str:
+    """The label, with the settings in which jobs of that label differ: those of the filter alone where they suffice."""
+    if len(twins) == 1:
+        return str(meta["label"])
+    flat = [_flat(twin["config"]) for twin in twins]
+    names = sorted(name for name in set().union(*flat) if len({repr(one.get(name)) for one in flat}) > 1)
+    of_filter = [name for name in names if name.startswith("filter.")]
+    if len({tuple(repr(one.get(name)) for name in of_filter) for one in flat}) == len(flat):
+        names = of_filter
+    own = _flat(meta["config"])
+    told = ",".join(f"{name.removeprefix('filter.')}={own.get(name, '-')}" for name in names)
+    return f"{meta['label']}[{told or meta['key']}]"
+
+
+def _flat(config: Any, path: str = "") -> dict[str, Any]:
+    if not isinstance(config, Mapping):
+        return {path: config}
+    return {k: v for name, below in config.items() for k, v in _flat(below, f"{path}.{name}" if path else name).items()}
+
+
+def _one(items: Sequence[tuple[Path, dict[str, Any]]], names: tuple[str, ...], where: str) -> None:
+    """Raises ValueError where jobs that are to be compared differ in one of `names`."""
+    for name in names:
+        by_value: dict[str, list[str]] = {}
+        for path, meta in items:
+            by_value.setdefault(str(_flat(meta).get(name)), []).append(path.name)
+        if len(by_value) > 1:
+            listed = "; ".join(
+                f"{value}: {', '.join(files[:3])}{f' and {len(files) - 3} more' if len(files) > 3 else ''}"
+                for value, files in sorted(by_value.items())
+            )
+            raise ValueError(
+                f"{where} holds results that differ in {name} ({listed}); delete the files that do not belong and run "
+                f"them again, or pass mixed=True to put them side by side"
+            )
+
+
+def _nothing(study: str, results: Path) -> str:
+    folder = results / study
+    others = sorted({path.parent.name for path in results.glob("*/*.npz")})
+    notes = store.failures(folder)
+    failures = f" ({len(notes)} jobs failed, the first with {notes[0]['message']})" if notes else ""
+    there = f"studies with results in {results}: {', '.join(others)}" if others else f"{results} has no results yet"
+    return f"no results in {folder}{failures}; {there}. Make them with: pfbench run -m +experiment={study}"

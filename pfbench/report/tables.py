@@ -1,0 +1,176 @@
+"""Tables of a cell as pandas frames of plain numbers, and how they are printed: HTML, Markdown, LaTeX, CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pfbench import metrics, store
+from pfbench.report.frame import Block, blocks
+from pfbench.report.significance import Verdict
+
+Results = Mapping[str, store.Result]
+
+
+def overview(results: Results) -> pd.DataFrame:
+    """What ran: one row per filter.
+
+    Args:
+        results: by label, without the instants that are left out.
+    """
+    return pd.DataFrame([_ran(label, result) for label, result in results.items()])
+
+
+def accuracy(results: Results, group: str, alpha: float = 0.05, bound: float | None = None) -> pd.DataFrame:
+    """How far off one group was, in the unit shown: one row per filter that has the group.
+
+    Args:
+        results: as `overview`.
+        group: name of a block.
+        alpha: probability outside the NEES band.
+        bound: adds the median time from which the error stays within it, seconds.
+    """
+    rows = []
+    for label, result in results.items():
+        for block in blocks(result.meta["state"]):
+            if block.group == group:
+                rows.append({"filter": label, **_accuracy(result, block, alpha, bound)})
+    return pd.DataFrame(rows)
+
+
+def decisions(verdicts: Sequence[Verdict]) -> pd.DataFrame:
+    """All pairs of one group of one cell, one row per verdict."""
+    return pd.DataFrame(
+        [
+            {
+                "a": v.a,
+                "b": v.b,
+                "pairs": v.pairs,
+                "lost a": v.lost_a,
+                "lost b": v.lost_b,
+                "RMSE a / b in %": 100 * v.ratio,
+                "low": 100 * v.low,
+                "high": 100 * v.high,
+                "interval": v.interval,
+                "effect": v.effect,
+                "T": v.statistic,
+                "p": v.p,
+                f"p Holm ({v.family})": v.p_holm,
+                "better": v.winner,
+            }
+            for v in verdicts
+        ]
+    )
+
+
+def html(table: pd.DataFrame) -> str:
+    """An HTML table; numbers are marked so that the style sheet can set them right."""
+    kinds = [' class="number"' if _is_number(table[name]) else "" for name in table]
+
+    def row(tag: str, texts: Iterable[str]) -> str:
+        cells = (f"<{tag}{kind}>{escape(text)}</{tag}>" for text, kind in zip(texts, kinds, strict=True))
+        return f"<tr>{''.join(cells)}</tr>"
+
+    head = row("th", map(str, table.columns))
+    body = "\n".join(row("td", map(number, values)) for values in table.itertuples(index=False))
+    return f'<div class="wide"><table>\n<thead>{head}</thead>\n<tbody>{body}</tbody>\n</table></div>'
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A pipe table, columns padded to equal width."""
+    cells = [[str(name) for name in table], *([number(v) for v in row] for row in table.itertuples(index=False))]
+    cells = [[text.replace("|", r"\|") for text in row] for row in cells]
+    width = [max(3, *(len(row[j]) for row in cells)) for j in range(len(table.columns))]
+    right = [_is_number(table[name]) for name in table]
+    rows = [
+        "| " + " | ".join(t.rjust(w) if r else t.ljust(w) for t, w, r in zip(row, width, right, strict=True)) + " |"
+        for row in cells
+    ]
+    rule = "|" + "|".join("-" * (w + 1) + (":" if r else "-") for w, r in zip(width, right, strict=True)) + "|"
+    return "\n".join([rows[0], rule, *rows[1:]])
+
+
+def latex(table: pd.DataFrame) -> str:
+    """A booktabs tabular."""
+    layout = "".join("r" if _is_number(table[name]) else "l" for name in table)
+    style = table.style.format(number, escape="latex").format_index(escape="latex", axis=1).hide(axis="index")
+    return style.to_latex(hrules=True, column_format=layout)
+
+
+def csv(table: pd.DataFrame) -> str:
+    """All digits."""
+    return table.to_csv(index=False, lineterminator="\n")
+
+
+def number(value: Any) -> str:
+    """Three significant digits, plain where that is readable; counts and texts as they are."""
+    if value is None or value is pd.NA or (isinstance(value, float | np.floating) and np.isnan(value)):
+        return "–"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if not isinstance(value, float | np.floating):
+        return str(value)
+    if np.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    size = abs(float(value))
+    if size != 0 and not 1e-3 <= size < 1e5:
+        return f"{value:.2e}"
+    digits = 2 - int(np.floor(np.log10(float(f"{size:.2e}")))) if size else 0
+    return f"{value:.{max(digits, 0)}f}"
+
+
+def _ran(label: str, result: store.Result) -> dict[str, Any]:
+    meta, arrays = result.meta, result.arrays
+    lost, particles = arrays["lost"], meta.get("particles")
+    ess = metrics.mean_per_run(arrays["ess"], lost) / particles if "ess" in arrays and particles else np.array([np.nan])
+    evidence = arrays["log_evidence"][~lost]
+    return {
+        "filter": label,
+        "exact": bool(meta.get("exact")),
+        "told the noise": bool(meta.get("told")),
+        "particles": str(particles or "–"),
+        "runs": int(lost.size),
+        "lost": int(lost.sum()),
+        "lost in %": 100 * float(metrics.lost_share(lost).value),
+        "time per step in ms": 1e3 * meta["seconds"]["per_step"],
+        "ESS in %": 100 * _mean(ess),
+        "log evidence": _mean(evidence),
+    }
+
+
+def _accuracy(result: store.Result, block: Block, alpha: float, bound: float | None) -> dict[str, Any]:
+    arrays, lost, groups = result.arrays, result.arrays["lost"], result.meta["state"]["groups"]
+    error = arrays["error"][..., block.places].astype(np.float64) * block.scale
+    norm, each = metrics.rmse_norm(error, lost), metrics.rmse_component(error, lost).value
+    largest = metrics.max_error(error, lost)[~lost]
+    dof = len(groups[block.whole])
+    found = metrics.consistency(arrays["nees"][..., list(groups).index(block.whole)], lost, dof, alpha)
+    low, high = metrics.nees_band(dof, found.runs, alpha)
+    unit = f" in {block.unit}" if block.unit else ""
+    row: dict[str, Any] = {
+        "runs used": norm.runs,
+        f"RMSE norm{unit}": float(norm.value),
+        f"RMSE run mean{unit}": float(metrics.rmse_run_mean(error, lost).value),
+        **{f"RMSE {name}{unit}": float(value) for name, value in zip(block.components, each, strict=True)},
+        f"largest error{unit}": float(np.max(largest[~np.isnan(largest)])) if norm.runs else np.nan,
+        f"NEES (dof {dof})": found.mean,
+        "band at an instant": f"{number(float(low))} to {number(float(high))}",
+        "instants in band in %": 100 * found.inside,
+    }
+    if bound is not None:
+        when = metrics.convergence_time(arrays["time"], error, lost, bound)
+        row[f"median time to {bound:g} {block.unit} in s"] = float(np.median(when[~np.isnan(when)]))
+    return row
+
+
+def _mean(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else np.nan
+
+
+def _is_number(column: pd.Series) -> bool:
+    return bool(pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column))
