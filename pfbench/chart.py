@@ -45,7 +45,7 @@ class Euclidean:
 
 @dataclass(frozen=True)
 class Angles:
-    """`size` angles in radians, kept in [-pi, pi)."""
+    """`size` angles in radians, kept in [-pi, pi]."""
 
     size: int
 
@@ -127,5 +127,6 @@ class Chart:
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Angle in radians to [-pi, pi)."""
-    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+    """Angle in radians to [-pi, pi]; an angle already there keeps all its digits."""
+    # not remainder(angle + pi, 2 pi) - pi: in float32 that leaves an arcsecond two digits
+    return angle - 2 * torch.pi * torch.round(angle / (2 * torch.pi))

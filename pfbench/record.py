@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -14,14 +14,26 @@ class Record(NamedTuple):
     Attributes:
         y: measurements [R, T, Dy]; NaN is a component that was not seen.
         u: inputs, a NamedTuple of tensors with leading axes [R, T] or [1, T] (shared by all runs), or () for none.
+        start: the state [R, D] about which each run's initial law is laid out, where runs start from different states; None
+            where the model's `origin` serves all of them.
     """
 
     y: Tensor
     u: Any = ()
+    start: Tensor | None = None
 
     def at(self, t: int) -> Record:
         """Step t alone: y [R, Dy], inputs [R or 1, ...]."""
         return Record(self.y[:, t], map_inputs(lambda a: a[:, t], self.u))
+
+    def to(self, like: Tensor) -> Record:
+        """On the device of `like`, floating-point numbers in its dtype."""
+
+        def moved(a: Tensor) -> Tensor:
+            return a.to(like) if a.is_floating_point() else a.to(like.device)
+
+        start = None if self.start is None else moved(self.start)
+        return Record(moved(self.y), map_inputs(moved, self.u), start)
 
 
 def map_inputs(f: Any, u: Any) -> Any:
@@ -39,11 +51,11 @@ class Episode:
         truth: true state by group of components, each [R, T, k]; a group that has no truth is left out, an instant without
             truth is NaN (after the end of a short flight, say).
         track: true position East, North, Up in metres from the start [R, T, 3], or None where there is no map.
-        aids: names of instants or choices that a report should mention.
+        notes: readings and choices of this world that a report must mention.
     """
 
     record: Record
     time: Tensor
     truth: dict[str, Tensor]
     track: Tensor | None = None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()

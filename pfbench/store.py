@@ -13,6 +13,7 @@ import traceback
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -84,7 +85,8 @@ def save(path: str | Path, meta: Mapping[str, Any], arrays: Mapping[str, Any]) -
     plain: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
     _check_meta(path, full)
     _check_arrays(path, full, plain)
-    text = np.array(json.dumps(full, sort_keys=True))
+    # Unsorted: the order of the groups is the order of the last axis of nees.
+    text = np.array(json.dumps(full))
     _write(path, lambda file: np.savez_compressed(file, meta=text, **plain))
     _note(path).unlink(missing_ok=True)
     for stale in path.parent.glob(f"{path.stem}.*.tmp"):
@@ -182,16 +184,19 @@ def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _opened(path: Path) -> np.lib.npyio.NpzFile:
+@contextmanager
+def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
     if not path.exists():
         raise FileNotFoundError(f"no result at {path}")
-    try:
-        file = np.load(path, allow_pickle=False)
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is damaged or no npz file ({error}); delete it and run the job again") from error
-    if not isinstance(file, np.lib.npyio.NpzFile):
-        raise ValueError(f"{path} holds a single array and is not a result of pfbench; move it away")
-    return file
+    # Opened here and not by numpy, which leaves a damaged file open.
+    with path.open("rb") as raw:
+        try:
+            file = np.load(raw, allow_pickle=False)
+        except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} is damaged or no npz file ({error}); delete it and run the job again") from error
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise ValueError(f"{path} holds a single array and is not a result of pfbench; move it away")
+        yield file
 
 
 def _member(path: Path, file: np.lib.npyio.NpzFile, name: str) -> np.ndarray:

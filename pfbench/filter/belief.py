@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from pfbench.chart import Chart
 from pfbench.draws import Draws
 from pfbench.model.base import StateSpaceModel
 from pfbench.record import Record
@@ -69,7 +70,10 @@ class Filter(Protocol):
     def exact(self) -> bool:
         """Does the belief target p(x_t | y_1:t): as N grows, or, for a Gaussian filter, on linear-Gaussian models?"""
 
-    def init(self, model: StateSpaceModel, runs: int, draws: Draws) -> Cloud | Gaussian: ...
+    def init(
+        self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None
+    ) -> Cloud | Gaussian:
+        """The belief before anything is seen, about `start` [R, D] or, without one, about the model's `origin`."""
 
     def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud | Gaussian, Info]: ...
 
@@ -109,6 +113,14 @@ def weights(log_w: Tensor) -> Tensor:
 def ess(log_w: Tensor) -> Tensor:
     """Effective sample size 1 / sum w^2 [R]."""
     return 1.0 / weights(log_w).square().sum(-1)
+
+
+def moments(chart: Chart, cloud: Cloud) -> tuple[Tensor, Tensor]:
+    """Weighted mean [R, D] and covariance [R, d, d] of a cloud, the latter in the chart about the mean."""
+    w = weights(cloud.log_w)
+    mean = chart.mean(cloud.x, w)
+    d = chart.subtract(cloud.x, mean.unsqueeze(1))
+    return mean, (w.unsqueeze(-1) * d).mT @ d
 
 
 def _gather_rows(a: Tensor, ancestors: Tensor) -> Tensor:

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter.belief import Gaussian, Info
-from pfbench.filter.moments import factor
 from pfbench.filter.rules import Linearised, Rule, Space
 from pfbench.model.base import StateSpaceModel
 from pfbench.record import Record
@@ -57,12 +57,13 @@ class GaussianFilter:
     adaptations: tuple[Adaptation, ...] = ()
     exact = False  # on nonlinear or non-Gaussian models; on linear-Gaussian ones it is the Kalman filter
 
-    def init(self, model: StateSpaceModel, runs: int, draws: Draws) -> Gaussian:
+    def init(self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None) -> Gaussian:
         """The moments of the initial law."""
         law = model.initial(runs)
         dense = isinstance(law, torch.distributions.MultivariateNormal)
         covariance = law.covariance_matrix if dense else torch.diag_embed(law.variance)
-        mean = model.chart.add(model.origin.expand(runs, -1), law.mean)
+        origin = model.origin.expand(runs, -1) if start is None else start
+        mean = model.chart.add(origin, law.mean)
         return Gaussian(mean, covariance, torch.zeros(runs, dtype=torch.float64, device=mean.device))
 
     def step(self, model: StateSpaceModel, belief: Gaussian, seen: Record, draws: Draws) -> tuple[Gaussian, Info]:
@@ -108,7 +109,7 @@ class GaussianFilter:
             return law.mean, law.covariance_matrix if dense else torch.diag_embed(law.variance)
 
         space = Space(model.residual, around_first(model.residual))
-        y_hat, m, omega = self.rule(through, mean, mean.shape[-1], space)
+        y_hat, m, omega = self.rule(through, mean, root.shape[-1], space)
         there = ~torch.isnan(seen.y)
         r = torch.where(there, model.residual(seen.y, y_hat), 0.0)
         both = there.unsqueeze(-1) & there.unsqueeze(-2)
@@ -122,13 +123,15 @@ def update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
     root, ok = factor(omega)
     white = torch.linalg.solve_triangular(root, torch.cat([m, r.unsqueeze(-1)], -1), upper=False)
     a, z = white[..., :-1], white[..., -1:]  # Omega^-1/2 M and Omega^-1/2 r
-    eye = torch.eye(a.shape[-1], dtype=a.dtype, device=a.device)
-    information = torch.linalg.cholesky_ex(eye + a.mT @ a)[0]
-    score = torch.linalg.solve_triangular(information, a.mT @ z, upper=False)
-    back = torch.linalg.solve_triangular(information.mT, torch.cat([score, eye.expand_as(information)], -1), upper=True)
-    log_det = root.diagonal(dim1=-2, dim2=-1).log().sum(-1) + information.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    distance = (z * z).sum((-2, -1)) - (score * score).sum((-2, -1))
-    log_like = -0.5 * distance - log_det - 0.5 * _LOG_2PI * seen.sum(-1)
+    eye = torch.eye(a.shape[-1], dtype=a.dtype, device=a.device).expand(a.shape[0], -1, -1)
+    # I + A' A is never formed: a prior 1e8 times as wide as the measurement's noise would drown the 1
+    information = torch.linalg.qr(torch.cat([a, eye], -2), mode="r")[1]  # upper triangular, of either sign
+    score = torch.linalg.solve_triangular(information.mT, a.mT @ z, upper=False)
+    back = torch.linalg.solve_triangular(information, torch.cat([score, eye], -1), upper=True)
+    log_det = root.diagonal(dim1=-2, dim2=-1).log().sum(-1) + information.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+    shift = back[..., :1]
+    distance = (z - a @ shift).square().sum((-2, -1)) + shift.square().sum((-2, -1))  # z'z - score'score would cancel
+    log_like = -0.5 * distance - log_det - 0.5 * _LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float would be float32
     return back[..., 0], back[..., 1:], torch.where(ok, log_like, torch.nan)
 
 

@@ -62,8 +62,9 @@ def run_filter(
         raise ValueError("record: no measurements; give at least one time step")
     if bool(torch.isinf(record.y).any()):
         raise ValueError("record.y holds infinite values: mark a missing component as NaN")
-    record = model.prepare(record)
-    belief = method.init(model, record.y.shape[0], draws.at(0))
+    start = record.start
+    record = model.prepare(record).to(model.anchor)
+    belief = method.init(model, record.y.shape[0], draws.at(0), start)
     means, variances, traces = [], [], []
     for t in range(record.y.shape[1]):
         stage = AtRest(model) if t == 0 and model.observes_initial else model

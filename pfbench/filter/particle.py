@@ -61,7 +61,7 @@ class ParticleFilter:
         """Does the weighted cloud target p(x_t | y_1:t) as N grows? True if every stage says so."""
         return all(stage.exact for stage in (self.resampler, *self.moves, self.proposal, self.weigh))
 
-    def init(self, model: StateSpaceModel, runs: int, draws: Draws) -> Cloud:
+    def init(self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None) -> Cloud:
         """N equally weighted particles of the initial law, drawn by its Cholesky factor or its scales."""
         law = model.initial(runs)
         z = draws.normal("initial", self.particles, model.chart.dimension)
@@ -69,7 +69,8 @@ class ParticleFilter:
             spread = z @ law.scale_tril.mT
         else:
             spread = z * law.stddev.unsqueeze(1)
-        x = model.chart.add(model.origin.expand(1, 1, -1), law.mean.unsqueeze(1) + spread)
+        origin = model.origin.expand(1, -1) if start is None else start
+        x = model.chart.add(origin.unsqueeze(1), law.mean.unsqueeze(1) + spread)
         log_w = torch.full(x.shape[:2], -math.log(self.particles), dtype=x.dtype, device=x.device)
         return Cloud(x=x, log_w=log_w, log_z=torch.zeros_like(log_w[:, 0], dtype=torch.float64))
 

@@ -13,10 +13,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter import belief
-from pfbench.filter.belief import Cloud
-from pfbench.filter.moments import factor, moments
+from pfbench.filter.belief import Cloud, moments
 from pfbench.model.base import StateSpaceModel
 
 _DOUBLE_FROM = 100_000  # particles; in float32 one ancestor in 500 is wrong there, and the evidence drifts
@@ -119,7 +119,9 @@ class Systematic:
 
     def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
         reach = _cumulative(a) * n
-        below = torch.ceil(reach - draws.uniform("resample", 1, 1).squeeze(1).to(reach.dtype))
+        u = draws.uniform("resample", 1, 1).squeeze(1).to(reach.dtype)
+        # where, since n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0
+        below = torch.where(reach < n, torch.ceil(reach - u), n)
         return _ancestors(below.long(), n)
 
 
@@ -148,10 +150,11 @@ class Residual:
     """floor(n a) copies for certain, the rest multinomial on what is left [Liu and Chen 1998]."""
 
     def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
-        wanted = a * n
-        sure = torch.floor(wanted)
+        wanted = _wanted(a, n)
+        # 49 (1/49) is less than 1: without a few roundings of grace, equal weights would all be drawn by lot
+        sure = torch.floor(wanted * (1.0 + 4.0 * torch.finfo(a.dtype).eps))
         missing = n - sure.sum(1, keepdim=True).long()
-        left = wanted - sure
+        left = (wanted - sure).clamp(min=0.0)
         left = left / left.sum(1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny)
         drawn = _pick(_cumulative(left), draws.uniform("resample", a.shape[1], 1).squeeze(2))
         slots = torch.arange(a.shape[1], device=a.device)
@@ -168,7 +171,7 @@ class Ssp:
     """
 
     def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
-        wanted = a.double() * n
+        wanted = _wanted(a, n)
         counts = torch.floor(wanted)
         width = 1 << max(1, (a.shape[1] - 1).bit_length())
         pad = width - a.shape[1]
@@ -216,6 +219,11 @@ def _settle(first: Tensor, second: Tensor, toss: Tensor) -> tuple[Tensor, Tensor
     return both - over.to(both.dtype), over.to(both.dtype), toss < chance
 
 
+def _wanted(a: Tensor, n: Tensor) -> Tensor:
+    """Expected copies [R, N], float64: a float32 softmax of 1e6 particles sums to 1 only within 5e-6, that is 5 slots."""
+    return a.double() * (n / a.sum(1, keepdim=True, dtype=torch.float64))
+
+
 def _cumulative(a: Tensor) -> Tensor:
     """Cumulative sums [R, N] whose last value is 1, whatever rounding did."""
     sums = (a.double() if a.shape[1] >= _DOUBLE_FROM else a).cumsum(1)
@@ -234,7 +242,7 @@ def _ancestors(below: Tensor, n: Tensor) -> Tensor:
     """
     slots = below.shape[1]
     wanted = n.long()
-    ends = torch.minimum(below, wanted)
+    ends = torch.minimum(below, wanted).clamp(min=0)  # in float32 the largest uniform is 1 and ends a weight of 0 at -1
     ends[:, -1] = wanted.squeeze(1)
     counts = torch.zeros(below.shape[0], slots + 1, dtype=torch.long, device=below.device)
     counts.scatter_add_(1, ends, torch.ones_like(ends))

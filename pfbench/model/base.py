@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -12,9 +11,8 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from pfbench.chart import Chart, Euclidean
+from pfbench.covariance import gaussian_log_density
 from pfbench.record import Record
-
-_LOG_2PI = math.log(2.0 * math.pi)
 
 
 class StateSpaceModel(nn.Module, ABC):
@@ -77,7 +75,7 @@ class StateSpaceModel(nn.Module, ABC):
         return None
 
     def noise_gain(self, u: Any) -> Tensor | None:
-        """L [R or 1, D, W] where the noise enters as x + L w; None where it enters otherwise."""
+        """L [R or 1, d, W] where the noise enters as x (+) L w in the chart; None where it enters otherwise."""
         return None
 
     def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
@@ -87,6 +85,24 @@ class StateSpaceModel(nn.Module, ABC):
     def prepare(self, record: Record) -> Record:
         """What can be computed once for all steps and filters' stages: a record whose inputs the model likes better."""
         return record
+
+    def assemble(self, truth: dict[str, Tensor]) -> Tensor:
+        """The true state of an Episode's groups, NaN where a group has no truth: {group: [R, T, k]} -> [R, T, D].
+
+        Here the groups are laid out as the components of a difference; a model whose states are not differences (a
+        quaternion, say) lays them out itself.
+
+        Raises:
+            ValueError: no group of this model has a truth.
+        """
+        known = [name for name in self.groups if name in truth]
+        if not known:
+            raise ValueError(f"truth has {sorted(truth)}, the model's groups are {sorted(self.groups)}: none has a truth")
+        some = truth[known[0]]
+        state = some.new_full((*some.shape[:-1], self.chart.size), torch.nan)
+        for name in known:
+            state[..., list(self.groups[name])] = truth[name]
+        return state
 
     def error(self, mean: Tensor, truth: Tensor) -> Tensor:
         """Error of an estimate as a report shows it, in the chart: [..., D], [..., D] -> [..., d]."""
@@ -122,6 +138,10 @@ class AtRest(StateSpaceModel):
         return self.model.chart
 
     @property
+    def origin(self) -> Tensor:
+        return self.model.origin
+
+    @property
     def noise(self) -> Distribution:
         return self.model.noise
 
@@ -139,21 +159,6 @@ class AtRest(StateSpaceModel):
 
     def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
         return self.model.log_likelihood(y, x, u)
-
-
-def gaussian_log_density(r: Tensor, covariance: Tensor, seen: Tensor) -> Tensor:
-    """log N(r; 0, covariance) over the components seen: r [..., D], covariance [..., D, D], seen [..., D] -> [...].
-
-    A component that was not seen gets unit variance, no correlation and no residual, and its constant is taken back. A
-    covariance that is not positive gives NaN.
-    """
-    both = seen.unsqueeze(-1) & seen.unsqueeze(-2)
-    eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
-    factor, info = torch.linalg.cholesky_ex(torch.where(both, covariance, eye))
-    z = torch.linalg.solve_triangular(factor, r.unsqueeze(-1), upper=False).squeeze(-1)
-    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    value = -0.5 * (z * z).sum(-1) - log_det - 0.5 * _LOG_2PI * seen.sum(-1)
-    return torch.where(info == 0, value, torch.nan)
 
 
 def independent_normal(mean: Tensor, sd: Tensor) -> Independent:
@@ -179,6 +184,6 @@ def positive(name: str, values: Any) -> Tensor:
         ValueError: names the key, the value and the remedy.
     """
     tensor = torch.as_tensor(values, dtype=torch.float64)
-    if not bool((tensor > 0).all()):
+    if not bool(((tensor > 0) & torch.isfinite(tensor)).all()):
         raise ValueError(f"{name}={values}: give positive, finite numbers (a standard deviation or variance cannot be 0 or negative)")
     return tensor

@@ -1,9 +1,9 @@
 """Attitude: direction cosine matrices, Euler angles, quaternions, rotation vectors, and what an attitude error is.
 
-Body axes are right, forward, up; the level frame is East, North, Up. Euler angles are (pitch, roll, yaw) in rad: yaw is
-counter-clockwise from North, so heading = -yaw, and a positive roll puts the right wing down. C = Rz(yaw) Rx(pitch) Ry(roll)
-turns body vectors into level ones [Yan Gongmin, PSINS]. Quaternions are scalar first, Hamilton's product, v_n = q v_b q*.
-Every function broadcasts over leading axes.
+Body axes are right, forward, up; the level frame is East, North, Up. Euler angles are (pitch, roll, yaw) in rad: yaw
+is counter-clockwise from North, so heading = -yaw, and a positive roll puts the right wing down.
+C = Rz(yaw) Rx(pitch) Ry(roll) turns body vectors into level ones [Yan Gongmin, PSINS]. Quaternions are scalar first,
+Hamilton's product, v_n = q v_b q*. Every function broadcasts over leading axes.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def dcm_from_rotation_vector(r: Tensor) -> Tensor:
     """Rodrigues: exp(skew(r)), [..., 3] -> [..., 3, 3]."""
     turn = torch.linalg.vector_norm(r, dim=-1)[..., None, None] / torch.pi
     # torch.sinc(x) = sin(pi x) / (pi x) is exact at 0; half-angle form, since 1 - cos cancels for small angles
-    k = skew(r)
-    return torch.eye(3, dtype=r.dtype, device=r.device) + torch.sinc(turn) * k + 0.5 * torch.sinc(turn / 2) ** 2 * (k @ k)
+    k, unit = skew(r), torch.eye(3, dtype=r.dtype, device=r.device)
+    return unit + torch.sinc(turn) * k + 0.5 * torch.sinc(turn / 2) ** 2 * (k @ k)
 
 
 def quaternion_from_rotation_vector(r: Tensor) -> Tensor:
@@ -81,7 +81,8 @@ def dcm_from_quaternion(q: Tensor) -> Tensor:
 def quaternion_from_dcm(c: Tensor) -> Tensor:
     """C [..., 3, 3] -> unit quaternion [..., 4] with scalar part >= 0.
 
-    Of the four rows of 4 q q^T the one with the largest diagonal is normalised, so nothing small is divided by [Shepperd 1978].
+    Of the four rows of 4 q q^T the one with the largest diagonal is normalised, so nothing small is divided by
+    [Shepperd 1978].
     """
     xx, yy, zz = c[..., 0, 0], c[..., 1, 1], c[..., 2, 2]
     ax, ay, az = c[..., 2, 1] - c[..., 1, 2], c[..., 0, 2] - c[..., 2, 0], c[..., 1, 0] - c[..., 0, 1]

@@ -1,7 +1,7 @@
 """The Earth of WGS-84: radii, normal gravity, rates of the local level frame, metres.
 
-Positions are pos [..., 3] = (latitude, longitude, height) in rad, rad, m; velocities v [..., 3] = (East, North, Up) in m/s.
-Every function broadcasts over leading axes.
+Positions are pos [..., 3] = (latitude, longitude, height) in rad, rad, m; velocities v [..., 3] = (East, North, Up) in
+m/s. Every function broadcasts over leading axes.
 """
 
 from __future__ import annotations
@@ -81,13 +81,15 @@ def ecef(pos: Tensor) -> Tensor:
     lat, lon, h = pos.unbind(-1)
     _, r_n = radii(lat)
     across = (r_n + h) * torch.cos(lat)
-    return torch.stack([across * torch.cos(lon), across * torch.sin(lon), (r_n * (1 - E2) + h) * torch.sin(lat)], dim=-1)
+    z = (r_n * (1 - E2) + h) * torch.sin(lat)
+    return torch.stack([across * torch.cos(lon), across * torch.sin(lon), z], dim=-1)
 
 
 def geodetic(xyz: Tensor, passes: int = 6) -> Tensor:
     """Position of Earth-centred Earth-fixed points [..., 3]; the inverse of `ecef`.
 
-    Iterates on the reduced latitude [Bowring 1976]; six passes reach the last digit from 10 km below to 1000 km above ground.
+    Iterates on the reduced latitude [Bowring 1976]; six passes reach the last digit from 10 km below the ground to
+    1000 km above.
     """
     x, y, z = xyz.unbind(-1)
     across = torch.hypot(x, y)

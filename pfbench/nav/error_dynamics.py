@@ -1,11 +1,12 @@
 """How errors of an INS grow: the exact nonlinear equations, and the linear blocks.
 
-Errors are INS minus truth: x [..., 9] = attitude (East, North, Up; `attitude.attitude_error`, of any size), velocity (East, North,
-Up), position. Position errors are in (rad, rad, m) wherever rates or F matrices are spoken of, and in metres (North, East, Up)
-in what goes over an interval: `propagate` and `in_metres`. Nominal quantities are the INS's own, with its errors. Everything
-broadcasts: errors [R, N, 9] with nominals [R, 1, 3], say.
+Errors are INS minus truth: x [..., 9] = attitude (East, North, Up; `attitude.attitude_error`, of any size), velocity
+(East, North, Up), position. Position errors are in (rad, rad, m) wherever rates or F matrices are spoken of, and in
+metres (North, East, Up) in what goes over an interval: `propagate` and `in_metres`. Nominal quantities are the INS's
+own, with its errors. Everything broadcasts: errors [R, N, 9] with nominals [R, 1, 3], say.
 
-[Yan Gongmin, postdoctoral report, eqs 4-17 to 4-21, for large misalignment angles; linear blocks as in any inertial text]
+[Yan Gongmin, postdoctoral report, eqs 4-17 to 4-21, for large misalignment angles; linear blocks as in any inertial
+text]
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Nominal(NamedTuple):
 
 
 def mid_interval(intervals: Intervals) -> Nominal:
-    """Nominal quantities at the middle of intervals; the mean of two attitudes is good to second order in their distance."""
+    """Nominal quantities at the middle of intervals; the mean of two attitudes is good to second order."""
     return Nominal((intervals.dcm + intervals.dcm_end) / 2, intervals.vel, intervals.pos, intervals.f)
 
 
@@ -78,11 +79,12 @@ def propagate(
 ) -> Tensor:
     """Errors over one interval by the exact equations; position in metres (North, East, Up), before and after.
 
-    Classical Runge-Kutta with the nominal of mid-interval: second order in the interval's length because the nominal is frozen.
+    Classical Runge-Kutta with the nominal of mid-interval: second order in the interval's length, because the nominal
+    is frozen.
 
     Args:
         x: errors at the start [..., 9].
-        interval: fields [..., 3] that broadcast with x: `map_inputs(lambda a: a[:, t, None], intervals)` for x [R, N, 9].
+        interval: one that broadcasts with x: `map_inputs(lambda a: a[:, t, None], intervals)` for x [R, N, 9].
         gyro: gyro errors during the interval, body axes [..., 3] rad/s.
         accelerometer: accelerometer errors, body axes [..., 3] m/s^2.
         passes: Runge-Kutta steps within the interval.
@@ -107,8 +109,8 @@ def propagate(
 def coupling_matrix(pos: Tensor, vel: Tensor) -> Tensor:
     """Linear error dynamics F [..., 9, 9] of velocity and position errors, position in (rad, rad, m).
 
-    Blocks F12, F13, F22, F23, F32, F33; the attitude's own columns F11 and F21 are 0 here, for models that treat attitude
-    nonlinearly; `small_angle_matrix` fills them.
+    Blocks F12, F13, F22, F23, F32, F33; the attitude's own columns F11 and F21 are 0 here, for models that treat
+    attitude nonlinearly; `small_angle_matrix` fills them.
 
     Args:
         pos: [..., 3] rad, rad, m.
@@ -137,7 +139,7 @@ def coupling_matrix(pos: Tensor, vel: Tensor) -> Tensor:
 
 
 def small_angle_matrix(pos: Tensor, vel: Tensor, f: Tensor) -> Tensor:
-    """Linear error dynamics F [..., 9, 9] for small attitude errors: `coupling_matrix` with F11 = -skew(w_in), F21 = skew(f).
+    """Linear error dynamics F [..., 9, 9] for small attitude errors: F11 = -skew(w_in), F21 = skew(f) are filled in.
 
     Position in (rad, rad, m). Sensor errors in body axes enter with -C into attitude (gyros) and +C into velocity.
 
@@ -153,10 +155,10 @@ def small_angle_matrix(pos: Tensor, vel: Tensor, f: Tensor) -> Tensor:
 
 
 def in_metres(transition: Tensor, pos_start: Tensor, pos_end: Tensor) -> Tensor:
-    """A transition matrix over an interval, position in (rad, rad, m), to one with position in metres (North, East, Up).
+    """A transition matrix over an interval with position in (rad, rad, m) to one in metres (North, East, Up).
 
-    S_k Phi S_(k-1)^-1, each scale taken at its own end of the interval. Only rows and columns 6 to 8 change, so the matrix
-    may be larger than 9 x 9 (sensor states after the position).
+    S_k Phi S_(k-1)^-1, each scale taken at its own end of the interval. Only rows and columns 6 to 8 change, so the
+    matrix may be larger than 9 x 9 (sensor states after the position).
 
     Args:
         transition: [..., D, D], D >= 9.

@@ -1,7 +1,7 @@
 """Errors of gyros and accelerometers: constant, first-order Markov, white; all axes independent.
 
-The white noise is the random walk of the integrated output: angular random walk N_g for gyros, velocity random walk N_a for
-accelerometers. Markov parts are sampled exactly and start in their stationary law [Maybeck 1979, section 4.11].
+The white noise is the random walk of the integrated output: angular random walk N_g for gyros, velocity random walk N_a
+for accelerometers. Markov parts are sampled exactly and start in their stationary law [Maybeck 1979, section 4.11].
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class ImuErrors:
         accelerometer_markov_ug: stationary sigma of the Markov part, micro-g.
         accelerometer_markov_time: its correlation time, s.
         accelerometer_random_walk_ug_sqrt_hz: velocity random walk, micro-g/sqrt(Hz).
-        drawn_biases: True draws the constant parts from N(0, sigma^2) for each run and axis; False gives every run and axis the
-            stated value itself.
+        drawn_biases: True draws the constant parts from N(0, sigma^2) for each run and axis; False gives every run and
+            axis the stated value itself.
         gyro_misalignment: M_g in w~ = (I + M_g) w + errors: scale factors on the diagonal, misalignments beside it.
         accelerometer_misalignment: M_a likewise.
 
@@ -146,9 +146,9 @@ def corrupt(dtheta: Tensor, dv: Tensor, dt: float, errors: ImuErrors, draws: Dra
 
 
 def markov(purpose: str, n: int, sigma: float, time: float, dt: float, draws: Draws) -> Tensor:
-    """Three independent first-order Markov processes [R, n, 3]: x' = -x / time + white, stationary sigma, sampled every dt.
+    """Three independent first-order Markov processes [R, n, 3]: x' = -x / time + white, of stationary sigma.
 
-    Exact: x_k = e^(-dt/time) x_(k-1) + sigma sqrt(1 - e^(-2 dt/time)) N(0, 1), x_0 in the stationary law.
+    Exact at every dt: x_k = e^(-dt/time) x_(k-1) + sigma sqrt(1 - e^(-2 dt/time)) N(0, 1), x_0 in the stationary law.
     """
     if sigma == 0:
         return torch.zeros_like(draws.normal(purpose, 1, 3)).expand(-1, n, 3)
@@ -160,8 +160,8 @@ def markov(purpose: str, n: int, sigma: float, time: float, dt: float, draws: Dr
 def _autoregression(noise: Tensor, decay: float) -> Tensor:
     """x_k = e^(-decay) x_(k-1) + noise_k along the last axis, x_(-1) = 0.
 
-    Within a block by a triangular matrix of powers; the blocks' last values obey the same law with a decay `_BLOCK` times as
-    large, hence the recursion. A loop over samples would take a second for 50 000 of them, whatever the batch.
+    Within a block by a triangular matrix of powers; the blocks' last values obey the same law with a decay `_BLOCK`
+    times as large, hence the recursion. A loop over samples would take a second for 50 000 of them, whatever the batch.
     """
     n = noise.shape[-1]
     k = torch.arange(min(n, _BLOCK), dtype=noise.dtype, device=noise.device)

@@ -3,9 +3,9 @@
 Two-sample (or one-sample) mechanisation in East, North, Up with coning, rotation and sculling corrections
 [Savage 1998, "Strapdown inertial navigation integration algorithm design", parts 1 and 2; Yan Gongmin, PSINS].
 
-This is the hot loop of every simulation. What does not depend on the navigation state (coning, sculling, body rotations) is
-done for many steps at once; the step itself works component-major, [3, R] and [3, 4, R], so that R runs cost little more than
-one: eager torch spends its time on the number of operations, not on their size.
+This is the hot loop of every simulation. What does not depend on the navigation state (coning, sculling, body
+rotations) is done for many steps at once; the step itself works component-major, [3, R] and [3, 4, R], so that R runs
+cost little more than one: eager torch spends its time on the number of operations, not on their size.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def navigate(
         ins: state at the start.
         dtheta: angle increments, body axes [R, n, 3] (or [1, n, 3]) rad.
         dv: velocity increments, body axes [R, n, 3] (or [1, n, 3]) m/s.
-        dt: sampling interval in s: a number, or one per sample, [n] or [R, n]. The corrections allow for unequal samples; one
-            of no duration and no increment does nothing, so ragged intervals can be filled up with such.
+        dt: sampling interval in s: a number, or one per sample, [n] or [R, n]. The corrections allow for unequal
+            samples; one of no duration and no increment does nothing, so ragged intervals can be filled up with such.
         samples_per_interval: IMU samples in a filter interval; divides n.
         samples_per_step: 2, or 1, which uses the sample before (of this call) for coning and sculling.
 
@@ -107,9 +107,8 @@ def navigate(
     runs = torch.broadcast_shapes(ins.vel.shape[:-1], dtheta.shape[:-2], dv.shape[:-2])
     d = torch.as_tensor(dt, dtype=dv.dtype, device=dv.device)
     d = d.expand(n)[None] if d.dim() < 2 else d
-    state, nodes, forces = _start(ins, runs), [], []
-    nodes.append(state)
-    impulse = torch.zeros_like(state.v)
+    state = _start(ins, runs)
+    nodes, forces, impulse = [state], [], torch.zeros_like(state.v)
     for k, (turn, push, span) in enumerate(_steps(dtheta, dv, d, samples_per_step), start=1):
         state, force = _advance(state, turn, push, span)
         impulse = impulse + force
@@ -117,7 +116,7 @@ def navigate(
             nodes.append(state)
             forces.append(impulse)
             impulse = torch.zeros_like(impulse)
-    end = Ins(state.c.permute(2, 0, 1).contiguous(), state.v.T.contiguous(), state.p.T.contiguous(), state.a.T.contiguous())
+    end = Ins(state.c.permute(2, 0, 1), state.v.T, state.p.T, state.a.T)
     return end, _intervals(nodes, forces, d.unflatten(-1, (-1, per_interval)).sum(-1))
 
 
@@ -163,8 +162,8 @@ def _steps(dtheta: Tensor, dv: Tensor, d: Tensor, per_step: int) -> Iterator[tup
     for begin in range(0, n, _CHUNK * per_step):
         stop = min(begin + _CHUNK * per_step, n)
         first = max(begin - 1, 0) if per_step == 1 else begin
-        chunk = _corrected(dtheta[..., first:stop, :], dv[..., first:stop, :], d[..., first:stop], per_step, first < begin)
-        turn, push, t = chunk
+        taken = (dtheta[..., first:stop, :], dv[..., first:stop, :], d[..., first:stop])
+        turn, push, t = _corrected(*taken, per_step, has_previous=first < begin)
         inverse = torch.where(t > 0, 1 / t, torch.zeros_like(t))  # a filled-up step of no duration has no acceleration
         spans = torch.stack([t / 2, t, inverse], dim=-1)
         turns = attitude.dcm_from_rotation_vector(turn).permute(1, 2, 3, 0).contiguous()
@@ -177,8 +176,9 @@ def _corrected(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Rotation vector and velocity increment [R, s, 3] of s steps, and durations [R or 1, s].
 
-    With rates linear in time over two samples of d1 and d2 seconds, both the coning and the sculling integral are cross products
-    of the samples times (d1 + d2)^2 / (6 d1 d2): 2/3 for equal ones. Over the second alone it is d2^2 / (6 d1 (d1 + d2)): 1/12.
+    With rates linear in time over two samples of d1 and d2 seconds, both the coning and the sculling integral are cross
+    products of the samples times (d1 + d2)^2 / (6 d1 d2), 2/3 for equal ones; over the second sample alone, times
+    d2^2 / (6 d1 (d1 + d2)), 1/12.
     """
     if per_step == 2:
         w1, w2, f1, f2, d1, d2 = *_pair(dtheta, -2), *_pair(dv, -2), *_pair(d, -1)
@@ -238,7 +238,7 @@ def _advance(s: _State, turn: Tensor, push: Tensor, spans: Tensor) -> tuple[_Sta
 
 
 def _local(s2: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """1 / (R_M + h), 1 / (R_N + h) and gravity from sin^2 of the latitude: earth.radii and earth.gravity with shared terms."""
+    """1 / (R_M + h), 1 / (R_N + h) and gravity from sin^2 of the latitude, sharing terms."""
     w = torch.rsub(s2, 1.0, alpha=earth.E2)
     root = torch.rsqrt(w)
     r_n = root * earth.A
@@ -259,7 +259,7 @@ def _intervals(nodes: list[_State], forces: list[Tensor], duration: Tensor) -> I
     dcm = torch.stack([s.c for s in nodes]).permute(3, 0, 1, 2).contiguous()  # [R, T + 1, 3, 3]
     vel = torch.stack([s.v for s in nodes]).permute(2, 0, 1).contiguous()  # [R, T + 1, 3]
     pos = torch.stack([s.p for s in nodes]).permute(2, 0, 1).contiguous()
-    f = torch.stack(forces).permute(2, 0, 1) / duration.unsqueeze(-1)
+    f = torch.stack(forces).permute(2, 0, 1) / torch.where(duration > 0, duration, 1.0).unsqueeze(-1)
     pos_mid, vel_mid = (pos[:, :-1] + pos[:, 1:]) / 2, (vel[:, :-1] + vel[:, 1:]) / 2
     w_in = earth.earth_rate(pos_mid[..., 0]) + earth.transport_rate(pos_mid[..., 0], pos_mid[..., 2], vel_mid)
     return Intervals(

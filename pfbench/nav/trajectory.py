@@ -1,11 +1,12 @@
 """Trajectories from manoeuvres, and what ideal inertial sensors report along them.
 
-Three scalar profiles define the motion: speed, climb (flight-path) angle, heading. A segment changes each of them by a given
-amount: speed linearly, the angles by the quintic u^3 (10 - 15 u + 6 u^2), so that angular rate and angular acceleration are
-continuous and vanish at the joints. Roll follows from coordinated turns. Everything is closed form or Gauss-Legendre quadrature,
-vectorised over time [ours].
+Three scalar profiles define the motion: speed, climb (flight-path) angle, heading. A segment changes each of them by a
+given amount: speed linearly, the angles by the quintic u^3 (10 - 15 u + 6 u^2), so that angular rate and angular
+acceleration are continuous and vanish at the joints. Roll follows from coordinated turns. Everything is closed form or
+Gauss-Legendre quadrature, vectorised over time [ours].
 
-Manoeuvres speak degrees in their argument names, because they are written in yaml; a Segment is in SI and radians.
+Manoeuvres speak degrees where their argument names say so, because they are written in yaml; a Segment is in SI and
+radians.
 """
 
 from __future__ import annotations
@@ -200,15 +201,16 @@ def _profile(plan: list[Segment], counts: list[int], start: Start | _Reached, ra
 
 def _velocity(m: _Motion) -> Tensor:
     """East, North, Up [..., 3]."""
-    level = m.speed * torch.cos(m.climb)
-    return torch.stack([level * torch.sin(m.heading), level * torch.cos(m.heading), m.speed * torch.sin(m.climb)], dim=-1)
+    level, up = m.speed * torch.cos(m.climb), m.speed * torch.sin(m.climb)
+    return torch.stack([level * torch.sin(m.heading), level * torch.cos(m.heading), up], dim=-1)
 
 
 def _acceleration(m: _Motion) -> Tensor:
     """Time derivative of the velocity's components [..., 3]."""
     sg, cg, sc, cc = torch.sin(m.climb), torch.cos(m.climb), torch.sin(m.heading), torch.cos(m.heading)
     along, across = m.speed1 * cg - m.speed * sg * m.climb1, m.speed * cg * m.heading1
-    return torch.stack([along * sc + across * cc, along * cc - across * sc, m.speed1 * sg + m.speed * cg * m.climb1], dim=-1)
+    up = m.speed1 * sg + m.speed * cg * m.climb1
+    return torch.stack([along * sc + across * cc, along * cc - across * sc, up], dim=-1)
 
 
 def _bank(m: _Motion) -> Tensor:
@@ -261,7 +263,7 @@ def _hermite(y: Tensor, y1: Tensor, d: float) -> Tensor:
 
 
 def _sensed(m: _Motion, pos: Tensor) -> tuple[Tensor, Tensor]:
-    """Angular rate and specific force in body axes [n, 3 nodes, 3 axes]: the strapdown equations solved for the sensors."""
+    """Angular rate and specific force, body axes [n, 3 nodes, 3 axes]: strapdown equations solved for the sensors."""
     v, lat, h = _velocity(m), pos[..., 0], pos[..., 2]
     to_body = attitude.dcm_from_euler(_euler(m)).transpose(-1, -2)
     w_ie, w_en = earth.earth_rate(lat), earth.transport_rate(lat, h, v)

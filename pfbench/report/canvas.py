@@ -13,7 +13,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 
 COLUMN = 3.5  # inches
-_INSTANTS = 1000  # drawn at most; more only makes files large
+_INSTANTS = 300  # drawn at most: a column of print resolves no more
 RC: Any = {
     "font.size": 8,
     "axes.titlesize": 8,
@@ -28,12 +28,13 @@ RC: Any = {
     "lines.linewidth": 1.3,
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
-    "savefig.dpi": 220,
+    "savefig.dpi": 180,
     "svg.hashsalt": "pfbench",  # identifiers of an SVG are random otherwise
 }
 # Okabe and Ito 2008, without the yellow that white paper swallows.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
-_DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
+_Dash = str | tuple[int, tuple[float, ...]]
+_DASHES: tuple[_Dash, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
@@ -41,24 +42,28 @@ class Look(NamedTuple):
     """How one filter is drawn in all figures of a study."""
 
     colour: str
-    dash: str | tuple[int, tuple[float, ...]]
+    dash: _Dash
     marker: str
 
 
 def looks(labels: Sequence[str]) -> dict[str, Look]:
     """Colour, dash and marker of each filter; all three differ for neighbours, so that one suffices in grey."""
-    each = zip(sorted(set(labels)), cycle(_COLOURS), cycle(_DASHES), cycle(_MARKERS), strict=False)
+    each = zip(dict.fromkeys(labels), cycle(_COLOURS), cycle(_DASHES), cycle(_MARKERS), strict=False)
     return {label: Look(colour, dash, marker) for label, colour, dash, marker in each}
 
 
 def stack(n: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(COLUMN, 0.6 + height * n), layout="constrained")
+    figure = Figure(figsize=(COLUMN, 0.3 + height * n), layout="constrained")
     return figure, list(figure.subplots(n, 1, squeeze=False, sharex=sharex)[:, 0])
 
 
 def legend(figure: Figure, axis: Axes, columns: int = 2) -> None:
+    """A legend below the figure, which grows by the height of it."""
     handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(columns, len(labels)))
+    columns = min(columns, len(labels))
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + 0.1 + 0.16 * -(-len(labels) // columns))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
 def labelled(what: str, unit: str) -> str:
@@ -98,7 +103,7 @@ def _finite(values: Sequence[np.ndarray]) -> np.ndarray:
 def log_if_wide(axis: Axes, side: Axis, values: Sequence[np.ndarray]) -> None:
     flat = _finite(values)
     flat = flat[flat > 0]
-    if flat.size and np.quantile(flat, 0.995) > 30 * np.quantile(flat, 0.005):
+    if flat.size and np.quantile(flat, 0.995) > 10 * np.quantile(flat, 0.005):
         (axis.set_xscale if side is axis.xaxis else axis.set_yscale)("log")
         plain_ticks(side, flat)
 
@@ -107,14 +112,17 @@ def plain_ticks(side: Axis, values: Sequence[float] | np.ndarray) -> None:
     """Plain numbers on a logarithmic axis: 1, 2, 5 where it is short, decades where it is long."""
     flat = _finite([np.asarray(values)])
     flat = flat[flat > 0]
-    long = bool(flat.size) and flat.max() > 100 * flat.min()
-    side.set_major_locator(ticker.LogLocator(subs=(1.0,) if long else (1.0, 2.0, 5.0), numticks=8))
+    reach = flat.max() / flat.min() if flat.size else 1.0
+    if reach < 10:
+        side.set_major_locator(ticker.MaxNLocator(4, steps=[1, 2, 5, 10]))
+    else:
+        side.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0) if reach < 100 else (1.0,), numticks=8))
     side.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     side.set_minor_formatter(ticker.NullFormatter())
 
 
 def zoom(axis: Axes, curves: Sequence[np.ndarray]) -> None:
-    flat = np.abs(_finite(curves))
-    if flat.size and flat.max() > 8 * np.quantile(flat, 0.8) > 0:
-        limit = 1.25 * float(np.quantile(flat, 0.8)) * 2
-        axis.set_ylim(-limit, limit)
+    """Symmetric limits that leave out the first fifth where it dwarfs the rest; never what comes later."""
+    rest = np.abs(_finite([curve[len(curve) // 5 :] for curve in curves])).max(initial=0.0)
+    if np.abs(_finite(curves)).max(initial=0.0) > 3 * rest > 0:
+        axis.set_ylim(-1.1 * rest, 1.1 * rest)

@@ -71,12 +71,6 @@ def drawings(
     for block in shown:
         text = f"Absolute error of {block.group} over time, median of the {kept}."
         found.append(Drawing(f"error_{slug(block.group)}", text, partial(error, results, block, style)))
-    for label, result in results.items():
-        text = (
-            f"{label}: error over time, median and 5 to 95 % of the {kept} (shaded), and three times the filter's own "
-            f"standard deviation, median over runs (dashed). The vertical axis may cut the first instants."
-        )
-        found.append(Drawing(f"spread_{slug(label)}", text, partial(spread, result, groups, style[label])))
     text = f"RMSE of each run: quartiles, whiskers to 1.5 quartile ranges, one point for each of the {kept}."
     found.append(Drawing("rmse", text, partial(rmse, runs, [block.group for block in shown], style)))
     text = "Time per step against the root of the mean over runs and time of the squared error."
@@ -86,6 +80,12 @@ def drawings(
     if any("ess" in result.arrays for result in results.values()):
         text = f"Effective sample size of the particle filters, median and 5 to 95 % of the {kept}."
         found.append(Drawing("ess", text, partial(ess, results, style)))
+    for label, result in results.items():
+        text = (
+            f"{label}: error over time, median and 5 to 95 % of the {kept} (shaded), and three times the filter's own "
+            f"standard deviation, median over runs (dashed). The first fifth is cut where it dwarfs the rest."
+        )
+        found.append(Drawing(f"spread_{slug(label)}", text, partial(spread, result, groups, style[label])))
     return found
 
 
@@ -103,7 +103,7 @@ def save(drawing: Drawing, folder: Path, formats: Sequence[str]) -> list[Path]:
 
 def track(results: Results, row: int, style: Mapping[str, Look]) -> Figure:
     """Plan view and height over time of one run, row of the arrays."""
-    figure = Figure(figsize=(COLUMN, 5.2), layout="constrained")
+    figure = Figure(figsize=(COLUMN, 4.8), layout="constrained")
     plan, height = figure.subplots(2, 1, height_ratios=(2.2, 1))
     first = next(result for result in results.values() if "track" in result.arrays)
     time, truth = first.arrays["time"], first.arrays["track"][row].astype(np.float64)
@@ -128,7 +128,7 @@ def track(results: Results, row: int, style: Mapping[str, Look]) -> Figure:
 
 def error(results: Results, block: Block, style: Mapping[str, Look]) -> Figure:
     """Median absolute error over time, one panel per component, all filters."""
-    figure, panels = stack(len(block.components), 1.15)
+    figure, panels = stack(len(block.components), 1.3)
     for label, result in results.items():
         time, values = _kept(result, "error")
         for name, axis in zip(block.components, panels, strict=True):
@@ -153,7 +153,7 @@ def spread(result: store.Result, groups: Sequence[str], look: Look) -> Figure:
         for start in range(0, len(block.places), 3)
     ]
     columns = max(len(own) for _, own in rows)
-    figure = Figure(figsize=(max(COLUMN, 2.4 * columns), 0.4 + 1.45 * len(rows)), layout="constrained")
+    figure = Figure(figsize=(max(COLUMN, 2.4 * columns), 0.2 + 1.45 * len(rows)), layout="constrained")
     panels = figure.subplots(len(rows), columns, squeeze=False, sharex=True)
     time, errors = _kept(result, "error")
     _, sd = _kept(result, "sd")
@@ -167,7 +167,6 @@ def spread(result: store.Result, groups: Sequence[str], look: Look) -> Figure:
             axis.plot(time, bound, color="0.15", ls="--", lw=0.9, label="3 sigma of the filter")
             axis.plot(time, -bound, color="0.15", ls="--", lw=0.9)
             axis.set_title(block.components[k])
-            # The start can be a thousand times larger than all that follows and would hide it.
             zoom(axis, [low, high, bound, -bound])
         line[0].set_ylabel(labelled("error", block.unit))
         for axis in line[len(own) :]:
@@ -181,7 +180,7 @@ def spread(result: store.Result, groups: Sequence[str], look: Look) -> Figure:
 def rmse(runs: pd.DataFrame, groups: Sequence[str], style: Mapping[str, Look]) -> Figure:
     """RMSE of the norm of each group, one box per filter and one point per run."""
     rows = runs[(runs.metric == "rmse") & (runs.component == "norm")]
-    labels = sorted(rows.label.unique())
+    labels = [label for label in style if (rows.label == label).any()]
     figure, panels = stack(len(groups), 0.55 + 0.3 * len(labels), sharex=False)
     for group, axis in zip(groups, panels, strict=True):
         own = rows[rows.group == group]
@@ -245,7 +244,8 @@ def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alp
                 bands.append((found.runs, time, found.low[thin], found.high[thin], dof))
         _, time, low, high, dof = max(bands, key=lambda band: band[0])
         axis.fill_between(time, low, high, color="0.8", lw=0, zorder=0)
-        axis.axhline(dof, color="0.45", lw=0.7, zorder=1)
+        for edge in (low, high):
+            axis.plot(time, edge, color="0.35", lw=0.7, zorder=4)
         axis.set(title=f"{group}, {dof} degrees of freedom", ylabel="mean NEES")
         log_if_wide(axis, axis.yaxis, lines)
     panels[-1].set_xlabel("time in s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -130,6 +131,12 @@ def blocks(state: Mapping[str, Any]) -> list[Block]:
     return found
 
 
+def natural(text: str) -> list[tuple[int, int, str]]:
+    """Sorting key by which 400 comes before 1600."""
+    parts = re.split(r"(\d+)", text)
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+
+
 def later(result: store.Result, from_time: float) -> store.Result:
     """The same result without the instants before `from_time`, seconds.
 
@@ -206,7 +213,7 @@ def _labelled(items: Sequence[tuple[Path, dict[str, Any]]]) -> tuple[Job, ...]:
     for (path, meta), name in zip(items, names, strict=True):
         twins = [other for (_, other), label in zip(items, names, strict=True) if label == name]
         jobs.append(Job(path, _told_apart(meta, twins), meta))
-    return tuple(sorted(jobs, key=lambda job: job.label))
+    return tuple(sorted(jobs, key=lambda job: natural(job.label)))
 
 
 def _told_apart(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> str:

@@ -90,12 +90,12 @@ def verdicts(table: pd.DataFrame, alpha: float = 0.05) -> list[Verdict]:
         alpha: level after Holm's correction.
 
     Returns:
-        By scenario, noise, model, group (as in the table) and pair. Pairs without a common run are left out.
+        In the order of the table. Pairs without a common run are left out.
     """
     rows = table[(table.metric == "rmse") & (table.component == "norm")]
     found: list[Verdict] = []
     for (scenario, noise, model, group), part in rows.groupby(["scenario", "noise", "model", "group"], sort=False):
-        wide = part.pivot(index=["seed", "run"], columns="label", values="value").sort_index()
+        wide = part.pivot(index=["seed", "run"], columns="label", values="value").sort_index()[part.label.unique()]
         family = list(_pairs(wide, (str(scenario), str(noise), str(model), str(group)), alpha))
         found += corrected(family, alpha)
     return found

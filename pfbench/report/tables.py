@@ -11,7 +11,7 @@ import pandas as pd
 
 from pfbench import metrics, store
 from pfbench.report.frame import Block, blocks
-from pfbench.report.significance import Verdict
+from pfbench.report.significance import NO_DIFFERENCE, Verdict
 
 Results = Mapping[str, store.Result]
 
@@ -25,12 +25,15 @@ def overview(results: Results) -> pd.DataFrame:
     return pd.DataFrame([_ran(label, result) for label, result in results.items()])
 
 
-def accuracy(results: Results, group: str, alpha: float = 0.05, bound: float | None = None) -> pd.DataFrame:
+def accuracy(
+    results: Results, group: str, verdicts: Sequence[Verdict] = (), alpha: float = 0.05, bound: float | None = None
+) -> pd.DataFrame:
     """How far off one group was, in the unit shown: one row per filter that has the group.
 
     Args:
         results: as `overview`.
         group: name of a block.
+        verdicts: of this group; adds how many filters each one beats and is beaten by.
         alpha: probability outside the NEES band.
         bound: adds the median time from which the error stays within it, seconds.
     """
@@ -38,7 +41,8 @@ def accuracy(results: Results, group: str, alpha: float = 0.05, bound: float | N
     for label, result in results.items():
         for block in blocks(result.meta["state"]):
             if block.group == group:
-                rows.append({"filter": label, **_accuracy(result, block, alpha, bound)})
+                row = {"filter": label, **_accuracy(result, block, alpha, bound)}
+                rows.append({**row, **_standing(label, verdicts)} if verdicts else row)
     return pd.DataFrame(rows)
 
 
@@ -165,6 +169,12 @@ def _accuracy(result: store.Result, block: Block, alpha: float, bound: float | N
         when = metrics.convergence_time(arrays["time"], error, lost, bound)
         row[f"median time to {bound:g} {block.unit} in s"] = float(np.median(when[~np.isnan(when)]))
     return row
+
+
+def _standing(label: str, verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    met = [v for v in verdicts if label in (v.a, v.b)]
+    beaten = sum(v.winner not in (label, NO_DIFFERENCE) for v in met)
+    return {"beats": sum(v.winner == label for v in met), "beaten by": beaten}
 
 
 def _mean(values: np.ndarray) -> float:

@@ -1,0 +1,5 @@
+"""`python -m pfbench` is `pfbench`."""
+
+from pfbench.cli import main
+
+main()

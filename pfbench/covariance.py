@@ -1,0 +1,44 @@
+"""Square roots and densities of covariances, batched, that never raise: what has no root is reported."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+def factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Lower triangular A with A A' = covariance, and whether it exists: [..., d, d] -> [..., d, d], bool [...].
+
+    Works on the correlation matrix, so that metres beside radians do no harm. Where rounding has left it slightly
+    indefinite, a relative 1e-12 (1e-6 in float32) is added to the diagonal; a covariance that this does not heal is
+    reported, never repaired in silence. A component without spread has none in the root either.
+    """
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    sd = torch.sqrt(torch.where(variance > 0, variance, 1.0))
+    correlation = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
+    jitter = 1e-6 if covariance.dtype == torch.float32 else 1e-12
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    plain, info = torch.linalg.cholesky_ex(correlation)
+    healed, still = torch.linalg.cholesky_ex(correlation + jitter * eye)
+    lower = torch.where((info == 0)[..., None, None], plain, healed)
+    ok = ((info == 0) | (still == 0)) & (variance >= 0).all(-1)
+    return torch.where(variance > 0, sd, 0.0).unsqueeze(-1) * lower, ok
+
+
+def gaussian_log_density(r: Tensor, covariance: Tensor, seen: Tensor) -> Tensor:
+    """log N(r; 0, covariance) over the components seen: r [..., D], covariance [..., D, D], seen [..., D] -> [...].
+
+    A component that was not seen gets unit variance, no correlation and no residual, and its constant is taken back. A
+    covariance that is not positive gives NaN.
+    """
+    both = seen.unsqueeze(-1) & seen.unsqueeze(-2)
+    eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
+    factor, info = torch.linalg.cholesky_ex(torch.where(both, covariance, eye))
+    z = torch.linalg.solve_triangular(factor, r.unsqueeze(-1), upper=False).squeeze(-1)
+    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    value = -0.5 * (z * z).sum(-1) - log_det - 0.5 * _LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float would be float32
+    return torch.where(info == 0, value, torch.nan)

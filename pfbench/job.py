@@ -1,0 +1,221 @@
+"""One job: one cell (scenario, noise, filter) with all its Monte Carlo runs. Seeds, build, run, measure, save."""
+
+from __future__ import annotations
+
+import logging
+import math
+import platform
+import subprocess
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+from tqdm import tqdm
+
+import pfbench
+from pfbench import store
+from pfbench.draws import Fill, MonteCarlo, blocked_normals, compiled_normals
+from pfbench.filter.belief import Info
+from pfbench.filter.loop import Estimate, run_filter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.model.base import StateSpaceModel
+from pfbench.record import Episode
+
+log = logging.getLogger("pfbench")
+
+# what changes where and how fast a job runs, not what it computes
+PLACES = ("results", "worlds", "data", "study", "threads", "engine", "fresh", "report", "scenario.root", "scenario.cache")
+_COMPILE_FROM = 5e8  # normals; compiling their kernel costs some seconds and saves 15 ms for each million
+
+
+def run(cfg: DictConfig) -> float:
+    """Runs one job and saves it, or finds that it is done; returns the headline error (rms of the main group's norm).
+
+    Raises:
+        Exception: whatever stopped the job, after a note of it has been left beside the results.
+    """
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    path = Path(cfg.results) / cfg.study / f"{store.key(config, PLACES)}.npz"
+    choices = _choices()
+    name = " ".join(choices[part] for part in ("scenario", "noise", "filter"))
+    if path.exists() and not cfg.fresh:
+        log.info("%s: done already (%s)", name, path)
+        return _headline(store.load(path).arrays, store.describe(path))
+    try:
+        meta, arrays = compute(cfg, name)
+    except Exception as error:
+        store.failed(path, choices, error)
+        raise
+    store.save(path, {"key": path.stem, "study": cfg.study, "choices": choices, "config": config, **meta}, arrays)
+    headline = _headline(arrays, meta)
+    seconds, lost = meta["seconds"], int(arrays["lost"].sum())
+    log.info(
+        "%s: rms error %.4g, %d of %d runs lost, %.3g ms per step, %.1f s in all",
+        name, headline, lost, meta["runs"], 1e3 * seconds["per_step"], seconds["world"] + seconds["filter"],
+    )  # fmt: skip
+    return headline
+
+
+def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Draws the worlds, runs the filter on them and measures: what `store.save` wants, but for the job's identity.
+
+    Raises:
+        ValueError: bad values in the configuration.
+    """
+    settings(cfg)
+    scenario, noise, model, method = (build(cfg[part]) for part in ("scenario", "noise", "model", "filter"))
+    runs = torch.arange(cfg.first_run, cfg.first_run + cfg.runs)
+    started = time.perf_counter()
+    episode: Episode = scenario.draw(noise, runs, cfg.seed)
+    drawn = time.perf_counter()
+    dtype = getattr(torch, cfg.dtype)
+    model = model.to(cfg.device, dtype)
+    truth = model.assemble(episode.truth).to(cfg.device, dtype)
+    steps = episode.record.y.shape[1]
+    draws = MonteCarlo(cfg.seed, runs.to(cfg.device), dtype, fill=fill(cfg.engine, method, model, cfg.runs * steps))
+    with torch.no_grad(), tqdm(total=steps, desc=name, unit="step", delay=2, disable=None, leave=False) as bar:
+        estimate = run_filter(method, model, episode.record, draws, judge(model, truth), bar.update)
+    if cfg.device != "cpu":
+        torch.cuda.synchronize()
+    ended = time.perf_counter()
+    seconds = {"world": drawn - started, "filter": ended - drawn, "per_step": (ended - drawn) / steps}
+    return describe(cfg, model, method, steps, seconds, episode.notes), _arrays(episode, estimate)
+
+
+def settings(cfg: DictConfig) -> None:
+    """The one door for global things: threads, and the checks of what concerns the whole job.
+
+    Raises:
+        ValueError: names the key, the value and the remedy.
+    """
+    if cfg.runs < 1:
+        raise ValueError(f"runs={cfg.runs}: give at least 1 Monte Carlo run")
+    if cfg.first_run < 0:
+        raise ValueError(f"first_run={cfg.first_run}: run numbers start at 0")
+    if cfg.dtype not in ("float32", "float64"):
+        raise ValueError(f"dtype={cfg.dtype}: give float64 (the default) or float32")
+    if cfg.threads < 1:
+        raise ValueError(f"threads={cfg.threads}: give at least 1 thread")
+    if cfg.engine not in ("auto", "eager", "compiled"):
+        raise ValueError(f"engine={cfg.engine}: give auto, eager or compiled")
+    if torch.device(cfg.device).type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device={cfg.device}: this machine has no CUDA device that torch can use; give device=cpu")
+    torch.set_num_threads(cfg.threads)
+
+
+def build(node: Any) -> Any:
+    """The object that a configuration node names by `_target_`; lists and dicts below it become plain ones."""
+    return hydra.utils.instantiate(node, _convert_="all")
+
+
+def fill(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> Fill:
+    """The kernel that makes normals: compiled where asked for, or where a job is large enough to pay for the compilation."""
+    numbers = run_steps * method.particles * model.noise_dim if isinstance(method, ParticleFilter) else 0
+    if engine == "eager" or (engine == "auto" and numbers < _COMPILE_FROM):
+        return blocked_normals
+    one = torch.ones(2, dtype=torch.int64)
+    try:
+        compiled_normals()(one, one[0], one, one, one)
+    except Exception as error:  # torch raises many kinds where no C++ compiler is at hand
+        log.warning("engine=%s: the noise kernel does not compile here (%s); going on eagerly", engine, type(error).__name__)
+        return blocked_normals
+    return compiled_normals()
+
+
+def judge(model: StateSpaceModel, truth: Tensor) -> Callable[[int, Info], dict[str, Tensor]]:
+    """What is measured at each step against the truth [R, T, D]: error [R, d] and normalised error squared of each group."""
+
+    def watch(t: int, info: Info) -> dict[str, Tensor]:
+        error = model.error(info.mean, truth[:, t])
+        nees = []
+        for name, parts in model.groups.items():
+            e = error[:, list(parts)].unsqueeze(-1)
+            nees.append((e.mT @ torch.linalg.solve_ex(info.blocks[name], e)[0]).flatten())
+        return {"error": error, "nees": torch.stack(nees, 1)}
+
+    return watch
+
+
+def describe(
+    cfg: DictConfig, model: StateSpaceModel, method: Any, steps: int, seconds: dict[str, float], notes: tuple[str, ...]
+) -> dict[str, Any]:
+    """What ran: everything that a report may have to say."""
+    return {
+        "label": _choices()["filter"],
+        "seed": cfg.seed,
+        "first_run": cfg.first_run,
+        "runs": cfg.runs,
+        "particles": method.particles if isinstance(method, ParticleFilter) else None,
+        "steps": steps,
+        "dtype": cfg.dtype,
+        "device": cfg.device if cfg.device == "cpu" else torch.cuda.get_device_name(cfg.device),
+        "threads": cfg.threads,
+        "exact": method.exact,
+        "told": False,
+        "choices_made": [*model.choices, *notes],
+        "versions": versions(),
+        "host": platform.node(),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": seconds,
+        "state": {
+            "names": list(model.names),
+            "units": list(model.units),
+            "groups": {name: list(parts) for name, parts in model.groups.items()},
+        },
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides the numbers; `commit` is empty outside a checkout."""
+    where = Path(pfbench.__file__).parent
+    command = ["git", "-C", str(where), "describe", "--always", "--dirty", "--exclude", "*"]
+    try:
+        commit = subprocess.run(command, capture_output=True, text=True, check=False, timeout=10).stdout.strip()
+    except (OSError, subprocess.TimeoutExpired):
+        commit = ""
+    return {
+        "pfbench": pfbench.__version__,
+        "commit": commit,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+    }
+
+
+def _choices() -> dict[str, str]:
+    chosen = HydraConfig.get().runtime.choices
+    return {part: str(chosen[part]) for part in ("scenario", "noise", "filter", "model")}
+
+
+def _arrays(episode: Episode, estimate: Estimate) -> dict[str, np.ndarray]:
+    trace = dict(estimate.trace)
+    gone = torch.isnan(estimate.mean).any(-1, keepdim=True)
+    arrays = {
+        "time": episode.time,
+        "error": torch.where(gone, torch.nan, trace.pop("error")).float(),
+        "sd": torch.where(gone, torch.nan, estimate.variance.clamp(min=0).sqrt()).float(),
+        "nees": torch.where(gone, torch.nan, trace.pop("nees")).float(),
+        "log_evidence": estimate.log_evidence.double(),
+        "lost": estimate.lost,
+        **{name: value if value.dtype == torch.bool else value.float() for name, value in trace.items()},
+    }
+    if episode.track is not None:
+        arrays["track"] = episode.track.float()
+    return {name: value.cpu().numpy() for name, value in arrays.items()}
+
+
+def _headline(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> float:
+    """Root mean square of the norm of the main group: position where there is one, else the first."""
+    groups = meta["state"]["groups"]
+    parts = groups.get("position", next(iter(groups.values())))
+    square = (arrays["error"][..., parts].astype(float) ** 2).sum(-1)[~arrays["lost"]]
+    return math.sqrt(np.nanmean(square)) if np.isfinite(square).any() else math.inf

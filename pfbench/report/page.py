@@ -1,0 +1,243 @@
+"""The report of a study: a page that works offline, the same in Markdown, figures, tables and verdicts beside them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import pandas as pd
+from tqdm import tqdm
+
+from pfbench import store
+from pfbench.report import figures, tables
+from pfbench.report.canvas import looks, slug
+from pfbench.report.frame import Cell, blocks, cells, later, natural, tidy
+from pfbench.report.significance import NO_DIFFERENCE, Verdict, verdicts
+
+_HERE = Path(__file__).parent
+_MIME = {"svg": "svg+xml", "png": "png"}
+_SHARED = (
+    ("pfbench", "versions.pfbench"),
+    ("commit", "versions.commit"),
+    ("python", "versions.python"),
+    ("torch", "versions.torch"),
+    ("numpy", "versions.numpy"),
+    ("host", "host"),
+    ("device", "device"),
+    ("number type", "dtype"),
+    ("threads", "threads"),
+    ("seed", "seed"),
+    ("first run", "first_run"),
+    ("runs per filter", "runs"),
+    ("steps per run", "steps"),
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a report shows.
+
+    Attributes:
+        groups: groups of the state, None for all.
+        alpha: level of the tests after Holm's correction, and probability outside the bands.
+        from_time: leave out of all figures of merit what came before, seconds; curves over time show all.
+        formats: of the figures: svg, png; the page carries png where there is one, which stays small when curves are long.
+        mixed: accept results of several versions, seeds, runs or lengths side by side.
+        converged: bounds by group, in the unit shown, for the time to converge.
+
+    Raises:
+        ValueError: a value out of range.
+    """
+
+    groups: tuple[str, ...] | None = None
+    alpha: float = 0.05
+    from_time: float = 0.0
+    formats: tuple[str, ...] = ("svg", "png")
+    mixed: bool = False
+    converged: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.alpha < 1:
+            raise ValueError(f"alpha={self.alpha} is no probability; 0.05 is usual")
+        if not self.formats or set(self.formats) - set(_MIME):
+            raise ValueError(f"formats={list(self.formats)}: choose from {', '.join(_MIME)}")
+
+
+def write(
+    study: str, results: str | Path = "results", out: str | Path = "reports", options: Options | None = None
+) -> Path:
+    """Writes `<out>/<study>/`: index.html, report.md, verdicts.json, figures/, tables/.
+
+    The same results give the same bytes. Figures and tables of an earlier report in that folder are removed.
+
+    Args:
+        study: name of the folder in `results`.
+        results: folder of all studies.
+        out: folder of all reports.
+        options: what is shown.
+
+    Returns:
+        The page, index.html.
+
+    Raises:
+        FileNotFoundError: the study has no results.
+        ValueError: results that do not belong together, or a group that no result has.
+    """
+    options = options or Options()
+    found = cells(study, results, mixed=options.mixed)
+    groups = _groups(found, options.groups)
+    folder = Path(out) / study
+    _clear(folder)
+    style = looks(sorted((job.label for cell in found for job in cell.jobs), key=natural))
+    sections, decided = [], []
+    for cell in tqdm(found, desc=f"report {study}", disable=None, delay=2):
+        section, own = _section(cell, groups, style, folder, options)
+        sections.append(section)
+        decided += own
+    context = {
+        "study": study,
+        "options": options,
+        "groups": groups,
+        "cells": sections,
+        "verdicts": decided,
+        "shared": _shared(found),
+        "choices": _choices(found),
+        "failures": store.failures(Path(results) / study),
+        "css": (_HERE / "style.css").read_text(encoding="utf-8"),
+    }
+    text = json.dumps([_plain(verdict) for verdict in decided], indent=1, allow_nan=False)
+    (folder / "verdicts.json").write_text(text + "\n", encoding="utf-8")
+    for template, name in (("page.md.jinja", "report.md"), ("page.html.jinja", "index.html")):
+        page = _environment().get_template(template).render(context)
+        (folder / name).write_text(page, encoding="utf-8")
+    return folder / "index.html"
+
+
+def _section(
+    cell: Cell, groups: Sequence[str], style: Mapping[str, figures.Look], folder: Path, options: Options
+) -> tuple[dict[str, Any], list[Verdict]]:
+    """What the templates need of one cell; writes its figures and tables."""
+    whole = {job.label: job.load() for job in cell.jobs}
+    used = {label: later(result, options.from_time) for label, result in whole.items()}
+    runs = pd.concat([tidy(cell, job, whole[job.label], options.from_time, options.converged) for job in cell.jobs])
+    runs = runs[runs.group.isin(groups)]
+    decided = verdicts(runs, options.alpha)
+    prefix = slug(f"{cell.scenario}_{cell.noise}_{cell.model}")
+    parts = []
+    for group in groups:
+        own = [v for v in decided if v.group == group]
+        accuracy = tables.accuracy(used, group, own, options.alpha, options.converged.get(group))
+        if len(accuracy):
+            _table(folder, f"{prefix}_{slug(group)}", accuracy)
+            pairs = tables.decisions(own)
+            if own:
+                _table(folder, f"{prefix}_{slug(group)}_pairs", pairs)
+            shown = sum(v.winner != NO_DIFFERENCE for v in own)
+            said = {"unbeaten": _unbeaten(own), "shown": shown, "n": len(own)}
+            parts.append({"name": group, "accuracy": accuracy, "pairs": pairs, **said})
+    ran = tables.overview(used)
+    _table(folder, f"{prefix}_overview", ran)
+    drawn = [
+        _drawn(drawing, prefix, folder, options.formats)
+        for drawing in figures.drawings(whole, runs, style, groups, options.alpha)
+    ]
+    lost = [(label, int(result.arrays["lost"].sum()), result.meta["runs"]) for label, result in whole.items()]
+    section = {"name": cell.name, "anchor": prefix, "overview": ran, "parts": parts, "drawings": drawn}
+    return {**section, "lost": [row for row in lost if row[1]]}, decided
+
+
+def _drawn(drawing: figures.Drawing, prefix: str, folder: Path, formats: Sequence[str]) -> dict[str, Any]:
+    paths = figures.save(drawing._replace(name=f"{prefix}_{drawing.name}"), folder / "figures", formats)
+    first = min(paths, key=lambda path: path.suffix)
+    data = base64.b64encode(first.read_bytes()).decode("ascii")
+    return {
+        "file": f"figures/{first.name}",
+        "caption": drawing.caption,
+        "source": f"data:image/{_MIME[first.suffix[1:]]};base64,{data}",
+        "name": drawing.name,
+        "broad": drawing.name.startswith("spread_"),
+    }
+
+
+def _table(folder: Path, name: str, table: pd.DataFrame) -> None:
+    (folder / "tables").mkdir(parents=True, exist_ok=True)
+    (folder / "tables" / f"{name}.csv").write_text(tables.csv(table), encoding="utf-8")
+    (folder / "tables" / f"{name}.tex").write_text(tables.latex(table), encoding="utf-8")
+
+
+def _clear(folder: Path) -> None:
+    """Removes what an earlier report drew, so that no figure of a cell that is gone stays behind."""
+    for pattern in ("figures/*.svg", "figures/*.png", "tables/*.csv", "tables/*.tex"):
+        for path in folder.glob(pattern):
+            path.unlink()
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _groups(found: Sequence[Cell], wanted: tuple[str, ...] | None) -> list[str]:
+    states = [job.meta["state"] for cell in found for job in cell.jobs]
+    there = list(dict.fromkeys(block.group for state in states for block in blocks(state)))
+    unknown = sorted(set(wanted or ()) - set(there))
+    if unknown:
+        raise ValueError(f"groups: no result has {', '.join(unknown)}; choose from {', '.join(there)}")
+    return there if wanted is None else list(wanted)
+
+
+def _unbeaten(own: Sequence[Verdict]) -> list[str]:
+    labels = dict.fromkeys(label for v in own for label in (v.a, v.b))
+    beaten = {v.b if v.winner == v.a else v.a for v in own if v.winner != NO_DIFFERENCE}
+    return [label for label in labels if label not in beaten]
+
+
+def _shared(found: Sequence[Cell]) -> list[tuple[str, str]]:
+    """What all jobs ran with; several values are listed, as they are in a mixed report."""
+    rows = []
+    for name, path in _SHARED:
+        values = [_at(job.meta, path) for cell in found for job in cell.jobs]
+        rows.append((name, ", ".join(_distinct(str(value) for value in values if value is not None)) or "not stated"))
+    return rows
+
+
+def _choices(found: Sequence[Cell]) -> list[tuple[str, str]]:
+    """Each reading or choice that a job made, with the filters that made it."""
+    made: dict[str, list[str]] = {}
+    for cell in found:
+        for job in cell.jobs:
+            for text in job.meta.get("choices_made", ()):
+                made.setdefault(text, []).append(job.label)
+    everyone = {job.label for cell in found for job in cell.jobs}
+    return [(text, "all" if set(who) == everyone else ", ".join(_distinct(who))) for text, who in sorted(made.items())]
+
+
+def _distinct(values: Iterable[str]) -> list[str]:
+    return sorted(set(values), key=natural)
+
+
+def _at(meta: Any, path: str) -> Any:
+    for name in path.split("."):
+        meta = meta.get(name) if isinstance(meta, Mapping) else None
+    return meta
+
+
+def _plain(verdict: Verdict) -> dict[str, Any]:
+    """For JSON, which has no infinity."""
+    values = asdict(verdict).items()
+    return {name: str(v) if isinstance(v, float) and not math.isfinite(v) else v for name, v in values}
+
+
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_HERE),
+        autoescape=lambda name: bool(name and name.endswith("html.jinja")),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"table": tables.html, "pipe": tables.markdown, "number": tables.number}
+    return environment
