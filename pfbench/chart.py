@@ -18,8 +18,11 @@ from pfbench.nav import attitude
 class Block(Protocol):
     """One kind of component: `size` numbers in the state, `dimension` in a difference."""
 
-    size: int
-    dimension: int
+    @property
+    def size(self) -> int: ...
+
+    @property
+    def dimension(self) -> int: ...
 
     def add(self, x: Tensor, d: Tensor) -> Tensor: ...
 

@@ -33,8 +33,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(USAGE.format(version=pfbench.__version__))
         return
     if words[0] not in commands:
-        near = difflib.get_close_matches(words[0], commands, 1)
-        print(f"pfbench: no command '{words[0]}'" + (f"; did you mean '{near[0]}'?" if near else ""), file=sys.stderr)
+        print(f"pfbench: there is no command '{words[0]}'{_near(words[0], list(commands))}", file=sys.stderr)
         print(USAGE.format(version=pfbench.__version__), file=sys.stderr)
         raise SystemExit(2)
     try:
@@ -74,7 +73,8 @@ def _run(words: list[str]) -> None:
 
     _offer_experiments()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which explains them
-    sys.argv = ["pfbench run", *words]
+    flags = [word for word in words if word in ("-m", "--multirun")]  # first, or argparse takes no key=value after them
+    sys.argv = ["pfbench run", *flags, *(word for word in words if word not in flags)]
     hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job.run)()
 
 
@@ -82,7 +82,7 @@ def _report(words: list[str]) -> None:
     from pfbench.report.page import Options, write
 
     cfg = _compose(words)
-    chosen = {key: tuple(value) if isinstance(value, list) else value for key, value in cfg["report"].items()}
+    chosen: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in cfg["report"].items()}
     page = write(cfg["study"], cfg["results"], cfg["reports"], Options(**chosen))
     print(f"report: {page.resolve()}")
 
@@ -95,7 +95,7 @@ def _list(words: list[str]) -> None:
         print("\n`pfbench list GROUP` says what each one is")
         return
     if words[0] not in groups:
-        raise ValueError(f"no group '{words[0]}': there are {', '.join(groups)}")
+        raise ValueError(f"there is no group '{words[0]}'{_near(words[0], list(groups))}; there are {', '.join(groups)}")
     for path in sorted(groups[words[0]]):
         print(f"{path.stem:24} {_headline(path)}")
 
@@ -123,10 +123,16 @@ def _composed() -> Iterator[tuple[str, str]]:
         for path in files:
             choice = f"+experiment={path.stem}" if group == "experiment" else f"{group}={path.stem}"
             try:
-                _compose([choice, "data.root=somewhere"])
+                _compose([choice, *_home(group, path.stem), "data.root=somewhere"])
                 yield choice, ""
             except Exception as error:
                 yield choice, explain(error, [choice])
+
+
+def _home(group: str, name: str) -> list[str]:
+    """The scenario that asks for this model; a model may take its numbers from there."""
+    asks = f"/model@_global_.model: {name}\n"
+    return [f"scenario={path.stem}" for path in _groups()["scenario"] if group == "model" and asks in path.read_text()][:1]
 
 
 def _compose(overrides: list[str]) -> dict[str, Any]:
@@ -154,10 +160,8 @@ def _offer_experiments() -> None:
 
 def _groups() -> dict[str, list[Path]]:
     conf = conf_dir()
-    groups = {
-        folder.name: sorted(folder.glob("*.yaml")) for folder in sorted(conf.iterdir()) if folder.is_dir() and any(folder.glob("*.yaml"))
-    }
-    return groups | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
+    folders = [folder for folder in sorted(conf.iterdir()) if any(folder.glob("*.yaml"))]
+    return {folder.name: sorted(folder.glob("*.yaml")) for folder in folders} | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
 
 
 def _headline(path: Path) -> str:
@@ -166,20 +170,59 @@ def _headline(path: Path) -> str:
 
 
 def explain(error: BaseException, words: Sequence[str] = ()) -> str:
-    """An error as a person wants to read it: the cause that names key and value, and the nearest key that exists."""
-    cause = error
-    while cause.__cause__ is not None and type(cause).__name__ in ("InstantiationException", "ConfigCompositionException"):
-        cause = cause.__cause__
-    text = f"{cause}".strip() or type(cause).__name__
-    if cause is not error and "Could not override" in str(error):
-        text = f"{error}".strip()
-    missing = re.search(r"Could not override '([^']+)'", text)
-    if missing:
-        near = difflib.get_close_matches(missing[1], _keys(words, missing[1]), 3, 0.6)
-        value = next((word.partition("=")[2] for word in words if word.lstrip("+~").startswith(missing[1] + "=")), "")
-        text = f"there is no key '{missing[1]}' (given as {missing[1]}={value})"
-        text += f"; did you mean {' or '.join(near)}?" if near else "; `pfbench run --cfg job` prints all keys"
+    """An error as a person wants to read it: the key and the value that were given, and what to give instead."""
+    if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
+        return _refused(f"{error}", error.__cause__, words)
+    text = f"{error}".strip() or type(error).__name__
+    if found := re.search(r"Could not override '([^']+)'", text):
+        return _no_key(found[1], words)
+    if found := re.search(r"Could not find '(.+)/([^/']*)'", text):
+        options = re.findall(r"^\t(\w+)$", text, re.M)
+        return f"{found[1]}={found[2]}: there is no such {found[1]}{_near(found[2], options)}; there are {', '.join(options)}"
+    if found := re.search(r"Interpolation key '([^']+)' not found\s+full_key: (\S+)", text):
+        return f"{found[2]} comes from {found[1]}, which this choice does not have: give {found[2]}=..., or choose what fits together"
+    if found := re.search(r"Missing mandatory value: (\S+)", text):
+        return f"{found[1]} is not set: give {found[1]}=..."
+    if found := re.search(r"Error parsing override '([^']*)'", text):
+        return f"'{found[1]}' is not understood: give key=value, in quotes where the shell would read brackets or spaces itself"
     return text
+
+
+def _refused(text: str, cause: BaseException, words: Sequence[str]) -> str:
+    """What a class of ours or of a library said to the values of its yaml, under the name of the key that was given."""
+    place = re.search(r"full_key: (\S+)", text)
+    key = place[1] if place else "configuration"
+    said = " ".join(f"{cause}".split())
+    if unknown := re.search(r"got an unexpected keyword argument '(\w+)'", said):
+        return _no_key(f"{key}.{unknown[1]}", words)
+    if not isinstance(cause, ValueError) or type(cause) is not ValueError:
+        below = [word for word in words if word.lstrip("+").startswith(f"{key}.")]
+        return f"{key}: its values do not fit ({type(cause).__name__}: {said}); check {' '.join(below) or 'its yaml'}"
+    named = re.match(r"(?:\w+\.)*(\w+)(?=[=:])", said)
+    if named is None:
+        return f"{key}: {said}"
+    given = [name for name in (word.lstrip("+").partition("=")[0] for word in words) if name.endswith(f".{named[1]}")]
+    full = min(given, key=lambda name: not name.startswith(key), default=f"{key}.{named[1]}")
+    return full + said[named.end() :]
+
+
+def _no_key(wrong: str, words: Sequence[str]) -> str:
+    given = next((word for word in words if word.lstrip("+~").startswith(f"{wrong}=")), wrong)
+    keys = _keys(words, wrong)
+    if wrong in keys:
+        return f"{given}: not every cell of this sweep has the key '{wrong}'; sweep those that have it apart"
+    return f"{given}: there is no key '{wrong}'" + (_near(wrong, keys) or "; `pfbench run --cfg job` prints all keys")
+
+
+def _near(wrong: str, options: Sequence[str]) -> str:
+    """The options that are nearest to a misspelt one, as a question."""
+
+    def likeness(option: str) -> float:
+        return difflib.SequenceMatcher(None, option, wrong).ratio()
+
+    near = difflib.get_close_matches(wrong, options, 3, 0.6)
+    near = [option for option in near if likeness(option) > likeness(near[0]) - 0.1]
+    return f"; did you mean {' or '.join(near)}?" if near else ""
 
 
 def _keys(words: Sequence[str], wrong: str) -> list[str]:

@@ -32,8 +32,8 @@ def factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
 def gaussian_log_density(r: Tensor, covariance: Tensor, seen: Tensor) -> Tensor:
     """log N(r; 0, covariance) over the components seen: r [..., D], covariance [..., D, D], seen [..., D] -> [...].
 
-    A component that was not seen gets unit variance, no correlation and no residual, and its constant is taken back. A
-    covariance that is not positive gives NaN.
+    A component that was not seen gets unit variance, no correlation and no residual; its constant is taken back. A covariance
+    that is not positive gives NaN.
     """
     both = seen.unsqueeze(-1) & seen.unsqueeze(-2)
     eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)

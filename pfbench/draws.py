@@ -126,13 +126,13 @@ def _words(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle:
 def philox(counter: Words, key: tuple[Tensor, Tensor], rounds: int = 10) -> Words:
     """Philox4x32: counter and key as int64 tensors that hold 32-bit words, to four tensors of 32-bit random words.
 
-    Agrees with the generator's published known-answer vectors. A 32 x 32 -> 64 bit product wraps around in int64, and the
-    sign that the arithmetic shift drags along is masked away.
+    Agrees with the generator's published known-answer vectors. A 32 x 32 -> 64 bit product wraps around in int64; what the
+    arithmetic shift drags along and the high half of the other product are masked away together, after the exclusive or.
     """
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(rounds):
         p0, p1 = c0 * _MULTIPLY[0], c2 * _MULTIPLY[1]
-        c0, c1, c2, c3 = ((p1 >> 32) & _WORD) ^ c1 ^ k0, p1 & _WORD, ((p0 >> 32) & _WORD) ^ c3 ^ k1, p0 & _WORD
+        c0, c1, c2, c3 = ((p1 >> 32) ^ c1 ^ k0) & _WORD, p1, ((p0 >> 32) ^ c3 ^ k1) & _WORD, p0
         k0, k1 = (k0 + _WEYL[0]) & _WORD, (k1 + _WEYL[1]) & _WORD
-    return c0, c1, c2, c3
+    return c0, c1 & _WORD, c2, c3 & _WORD

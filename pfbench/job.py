@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import platform
+import re
 import subprocess
 import time
 from collections.abc import Callable
@@ -24,6 +25,7 @@ import pfbench
 from pfbench import store
 from pfbench.draws import Fill, MonteCarlo, blocked_normals, compiled_normals
 from pfbench.filter.belief import Info
+from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.model.base import StateSpaceModel
@@ -42,8 +44,7 @@ def run(cfg: DictConfig) -> float:
     Raises:
         Exception: whatever stopped the job, after a note of it has been left beside the results.
     """
-    config = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(config, dict)
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
     path = Path(cfg.results) / cfg.study / f"{store.key(config, PLACES)}.npz"
     choices = _choices()
     name = " ".join(choices[part] for part in ("scenario", "noise", "filter"))
@@ -53,7 +54,7 @@ def run(cfg: DictConfig) -> float:
     try:
         meta, arrays = compute(cfg, name)
     except Exception as error:
-        store.failed(path, choices, error)
+        log.error("%s: failed, see %s", name, store.failed(path, choices, error) or f"the error; {path} is kept")
         raise
     store.save(path, {"key": path.stem, "study": cfg.study, "choices": choices, "config": config, **meta}, arrays)
     headline = _headline(arrays, meta)
@@ -72,7 +73,8 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
         ValueError: bad values in the configuration.
     """
     settings(cfg)
-    scenario, noise, model, method = (build(cfg[part]) for part in ("scenario", "noise", "model", "filter"))
+    # the model first: a scenario may hold it, and what is wrong with a model is told under its own name
+    model, scenario, noise, method = (build(cfg[part]) for part in ("model", "scenario", "noise", "filter"))
     runs = torch.arange(cfg.first_run, cfg.first_run + cfg.runs)
     started = time.perf_counter()
     episode: Episode = scenario.draw(noise, runs, cfg.seed)
@@ -97,18 +99,17 @@ def settings(cfg: DictConfig) -> None:
     Raises:
         ValueError: names the key, the value and the remedy.
     """
-    if cfg.runs < 1:
-        raise ValueError(f"runs={cfg.runs}: give at least 1 Monte Carlo run")
-    if cfg.first_run < 0:
-        raise ValueError(f"first_run={cfg.first_run}: run numbers start at 0")
+    for key, least in (("runs", 1), ("first_run", 0), ("threads", 1), ("seed", 0)):
+        if type(cfg[key]) is not int or cfg[key] < least:
+            raise ValueError(f"{key}={cfg[key]}: give a whole number, {least} or more")
     if cfg.dtype not in ("float32", "float64"):
         raise ValueError(f"dtype={cfg.dtype}: give float64 (the default) or float32")
-    if cfg.threads < 1:
-        raise ValueError(f"threads={cfg.threads}: give at least 1 thread")
     if cfg.engine not in ("auto", "eager", "compiled"):
         raise ValueError(f"engine={cfg.engine}: give auto, eager or compiled")
-    if torch.device(cfg.device).type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device={cfg.device}: this machine has no CUDA device that torch can use; give device=cpu")
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", str(cfg.device)):
+        raise ValueError(f"device={cfg.device}: give cpu, cuda, or one of several as cuda:1")
+    if cfg.device != "cpu" and (torch.device(cfg.device).index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"device={cfg.device}: torch finds {torch.cuda.device_count()} CUDA devices here; give device=cpu")
     torch.set_num_threads(cfg.threads)
 
 
@@ -159,7 +160,7 @@ def describe(
         "dtype": cfg.dtype,
         "device": cfg.device if cfg.device == "cpu" else torch.cuda.get_device_name(cfg.device),
         "threads": cfg.threads,
-        "exact": method.exact,
+        "exact": method.exact or (model.linear and isinstance(method, GaussianFilter)),
         "told": False,
         "choices_made": [*model.choices, *notes],
         "versions": versions(),

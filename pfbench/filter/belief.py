@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -75,7 +75,7 @@ class Filter(Protocol):
     ) -> Cloud | Gaussian:
         """The belief before anything is seen, about `start` [R, D] or, without one, about the model's `origin`."""
 
-    def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud | Gaussian, Info]: ...
+    def step(self, model: StateSpaceModel, belief: Any, seen: Record, draws: Draws) -> tuple[Cloud | Gaussian, Info]: ...
 
 
 def gather(cloud: Cloud, ancestors: Tensor) -> Cloud:
@@ -103,6 +103,13 @@ def where(hit: Tensor, new: Cloud, old: Cloud) -> Cloud:
         window={k: choose(v, old.window[k]) for k, v in new.window.items()},
         memory={k: choose(v, old.memory[k]) for k, v in new.memory.items()},
     )
+
+
+def columns(a: Tensor, parts: tuple[int, ...]) -> Tensor:
+    """Components `parts` of the last axis; a view where they are neighbours, since an index list copies."""
+    if parts == tuple(range(parts[0], parts[0] + len(parts))):
+        return a[..., parts[0] : parts[0] + len(parts)]
+    return a[..., list(parts)]
 
 
 def weights(log_w: Tensor) -> Tensor:

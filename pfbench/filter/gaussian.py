@@ -59,7 +59,7 @@ class GaussianFilter:
 
     def init(self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None) -> Gaussian:
         """The moments of the initial law."""
-        law = model.initial(runs)
+        law: Any = model.initial(runs)
         dense = isinstance(law, torch.distributions.MultivariateNormal)
         covariance = law.covariance_matrix if dense else torch.diag_embed(law.variance)
         origin = model.origin.expand(runs, -1) if start is None else start
@@ -104,7 +104,7 @@ class GaussianFilter:
 
     def _look(self, model: StateSpaceModel, mean: Tensor, root: Tensor, seen: Record) -> Innovation:
         def through(xi: Tensor) -> tuple[Tensor, Tensor]:
-            law = model.observation(model.chart.add(mean.unsqueeze(1), xi @ root.mT), seen.u)
+            law: Any = model.observation(model.chart.add(mean.unsqueeze(1), xi @ root.mT), seen.u)
             dense = isinstance(law, torch.distributions.MultivariateNormal)
             return law.mean, law.covariance_matrix if dense else torch.diag_embed(law.variance)
 
@@ -121,16 +121,15 @@ def update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
     """Whitened posterior: mean [R, d], square root [R, d, d] and log evidence of the step [R] (NaN where there is no root)."""
     r, seen, m, omega = innovation
     root, ok = factor(omega)
-    white = torch.linalg.solve_triangular(root, torch.cat([m, r.unsqueeze(-1)], -1), upper=False)
-    a, z = white[..., :-1], white[..., -1:]  # Omega^-1/2 M and Omega^-1/2 r
-    eye = torch.eye(a.shape[-1], dtype=a.dtype, device=a.device).expand(a.shape[0], -1, -1)
-    # I + A' A is never formed: a prior 1e8 times as wide as the measurement's noise would drown the 1
-    information = torch.linalg.qr(torch.cat([a, eye], -2), mode="r")[1]  # upper triangular, of either sign
-    score = torch.linalg.solve_triangular(information.mT, a.mT @ z, upper=False)
+    white = torch.linalg.solve_triangular(root, torch.cat([m, r.unsqueeze(-1)], -1), upper=False)  # Omega^-1/2 [M r]
+    d = m.shape[-1]
+    eye = torch.eye(d, dtype=m.dtype, device=m.device).expand(m.shape[0], -1, -1)
+    # least squares by QR: forming I + A' A would drown the 1 of a prior 1e8 times as wide as the measurement's noise
+    stacked = torch.cat([white, torch.nn.functional.pad(eye, (0, 1))], -2)
+    triangle = torch.linalg.qr(stacked, mode="r")[1]  # [[information root, score], [0, root of the distance]], of any sign
+    information, score, distance = triangle[:, :d, :d], triangle[:, :d, d:], triangle[:, d, d].square()
     back = torch.linalg.solve_triangular(information, torch.cat([score, eye], -1), upper=True)
     log_det = root.diagonal(dim1=-2, dim2=-1).log().sum(-1) + information.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
-    shift = back[..., :1]
-    distance = (z - a @ shift).square().sum((-2, -1)) + shift.square().sum((-2, -1))  # z'z - score'score would cancel
     log_like = -0.5 * distance - log_det - 0.5 * _LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float would be float32
     return back[..., 0], back[..., 1:], torch.where(ok, log_like, torch.nan)
 

@@ -62,7 +62,7 @@ def run_filter(
         raise ValueError("record: no measurements; give at least one time step")
     if bool(torch.isinf(record.y).any()):
         raise ValueError("record.y holds infinite values: mark a missing component as NaN")
-    start = record.start
+    start = record.to(model.anchor).start
     record = model.prepare(record).to(model.anchor)
     belief = method.init(model, record.y.shape[0], draws.at(0), start)
     means, variances, traces = [], [], []

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pfbench.draws import Draws
-from pfbench.filter.belief import Cloud, Info, ess, weights
+from pfbench.filter.belief import Cloud, Info, columns, ess, weights
 from pfbench.filter.preferences import Preference, Weights
 from pfbench.filter.proposals import Bootstrap, Proposal
 from pfbench.filter.resamplers import Resample, Resampler, Systematic
@@ -18,6 +18,14 @@ from pfbench.filter.sizes import Fixed, Size
 from pfbench.filter.weights import Bayes, Weighing
 from pfbench.model.base import StateSpaceModel
 from pfbench.record import Record
+
+
+class Stage(Protocol):
+    """What every stage says of itself."""
+
+    @property
+    def exact(self) -> bool:
+        """Does the cloud that it leaves still target what it should, as N grows?"""
 
 
 class Move(Protocol):
@@ -59,7 +67,8 @@ class ParticleFilter:
     @property
     def exact(self) -> bool:
         """Does the weighted cloud target p(x_t | y_1:t) as N grows? True if every stage says so."""
-        return all(stage.exact for stage in (self.resampler, *self.moves, self.proposal, self.weigh))
+        stages: list[Stage] = [self.resampler, *self.moves, self.proposal, self.weigh]
+        return all(stage.exact for stage in stages)
 
     def init(self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None) -> Cloud:
         """N equally weighted particles of the initial law, drawn by its Cholesky factor or its scales."""
@@ -83,6 +92,7 @@ class ParticleFilter:
             cloud, trace[f"accepted_{i}"] = move(model, cloud, trace["resampled"], draws)
         x, log_ratio, memory = self.proposal(model, cloud, seen, draws)
         log_w = self.weigh(model, cloud.log_w, x, log_ratio, seen)
+        x, log_w = bury(x, log_w, cloud.x)
         total = log_w.logsumexp(1)
         lost = ~torch.isfinite(total)
         # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
@@ -93,14 +103,21 @@ class ParticleFilter:
         return cloud, summarise(model, cloud, trace)
 
 
+def bury(x: Tensor, log_w: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
+    """A particle that is not finite weighs nothing, and one that weighs nothing stays where its parent was.
+
+    Sums over particles would otherwise turn one NaN into the estimate of its run: 0 NaN is NaN.
+    """
+    log_w = torch.where(torch.isfinite(x.sum(-1)), log_w, -torch.inf)
+    dead = torch.isneginf(log_w).unsqueeze(1)
+    return torch.where(dead, parents.transpose(1, 2), x.transpose(1, 2)).transpose(1, 2), log_w
+
+
 def summarise(model: StateSpaceModel, cloud: Cloud, trace: dict[str, Tensor]) -> Info:
     """Estimate and spread of a cloud, for the report: sums over particles, no copy of the cloud is kept."""
     w = weights(cloud.log_w)
     mean = model.chart.mean(cloud.x, w)
     d = model.chart.subtract(cloud.x, mean.unsqueeze(1))
     weighted = w.unsqueeze(-1) * d
-    blocks = {}
-    for name, parts in model.groups.items():
-        index = list(parts)
-        blocks[name] = weighted[..., index].mT @ d[..., index]
+    blocks = {name: columns(weighted, parts).mT @ columns(d, parts) for name, parts in model.groups.items()}
     return Info(mean, (weighted * d).sum(1), blocks, trace)

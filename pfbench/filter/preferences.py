@@ -45,6 +45,6 @@ class LookAhead:
     def __call__(self, model: StateSpaceModel, cloud: Cloud, seen: Record) -> Tensor:
         quiet = model.noise.mean.expand(*cloud.x.shape[:2], model.noise_dim)
         ahead = model.log_likelihood(seen.y, model.propagate(cloud.x, seen.u, quiet), seen.u)
-        log_a = cloud.log_w + self.power * torch.nan_to_num(ahead, nan=-torch.inf)
+        log_a = cloud.log_w + self.power * torch.where(torch.isnan(ahead), -torch.inf, ahead)
         total = log_a.logsumexp(1, keepdim=True)
         return torch.where(torch.isfinite(total), log_a - total, cloud.log_w)

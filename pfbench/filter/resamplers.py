@@ -164,7 +164,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class Ssp:
-    """Srinivasan's sampling process: every count is floor(n a) or one more, negatively associated [Gerber, Chopin, Whiteley 2019].
+    """Srinivasan's sampling process: counts floor(n a) or one more, negatively associated [Gerber, Chopin, Whiteley 2019].
 
     Pairs of fractional parts are resolved in a tournament, so that N particles take log2 N batched rounds, not N steps; the
     order of pairing is free [Srinivasan 2001].

@@ -48,7 +48,7 @@ class Jacobian:
         y, covariance = f(like.new_zeros(like.shape[0], 1, d))
         centre = like.new_zeros(like.shape[0], d, d)  # the axis of points holds the directions
         directions = torch.eye(d, dtype=like.dtype, device=like.device).expand_as(centre)
-        _, slopes = torch.func.jvp(lambda xi: space.subtract(f(xi)[0], y), (centre,), (directions,))
+        slopes: Tensor = torch.func.jvp(lambda xi: space.subtract(f(xi)[0], y), (centre,), (directions,))[1]
         return Linearised(y[:, 0], slopes.mT, covariance[:, 0].expand(like.shape[0], -1, -1))
 
 

@@ -27,6 +27,7 @@ class StateSpaceModel(nn.Module, ABC):
         groups: components of a difference that a report shows together, by name.
         noise_dim: W, the dimension of the driving noise.
         observes_initial: the first measurement is of x_0, nothing is propagated before it.
+        linear: the map is linear and both laws are normal, so that every Gaussian filter is the Kalman filter and exact.
         choices: readings of ours that a report must mention.
     """
 
@@ -35,6 +36,7 @@ class StateSpaceModel(nn.Module, ABC):
     groups: dict[str, tuple[int, ...]]
     noise_dim: int
     observes_initial: bool = False
+    linear: bool = False
     choices: tuple[str, ...] = ()
 
     @property
@@ -122,7 +124,8 @@ class StateSpaceModel(nn.Module, ABC):
             return (law.base_dist.log_prob(y_hat + r) * seen).sum(-1)
         if isinstance(law, torch.distributions.MultivariateNormal):
             return gaussian_log_density(r, law.covariance_matrix, seen)
-        raise TypeError(f"{type(self).__name__}.observation returned {type(law).__name__}: return Independent or MultivariateNormal")
+        name = f"{type(self).__name__}.observation"
+        raise TypeError(f"{name} returned {type(law).__name__}: return Independent or MultivariateNormal")
 
 
 class AtRest(StateSpaceModel):
@@ -185,5 +188,5 @@ def positive(name: str, values: Any) -> Tensor:
     """
     tensor = torch.as_tensor(values, dtype=torch.float64)
     if not bool(((tensor > 0) & torch.isfinite(tensor)).all()):
-        raise ValueError(f"{name}={values}: give positive, finite numbers (a standard deviation or variance cannot be 0 or negative)")
+        raise ValueError(f"{name}={values}: give positive numbers (a standard deviation or variance cannot be 0 or negative)")
     return tensor

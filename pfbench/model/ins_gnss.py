@@ -57,6 +57,11 @@ class InsGnss(StateSpaceModel):
         ValueError: a sensor's bias of 0, which would make the initial law improper.
     """
 
+    linear = True
+    p0: Tensor
+    r: Tensor
+    seen: Tensor
+
     def __init__(
         self, imu: ImuErrors, receiver: Receiver, initial: Alignment, markov: bool = False, inflation: Inflation | None = None
     ) -> None:
@@ -108,7 +113,7 @@ class InsGnss(StateSpaceModel):
         extra = torch.cat([self.inflation.motion, *[self.inflation.gyro] * (d // 3 - 4), self.inflation.accelerometer])
         full, ok = factor(noise @ noise.mT + torch.diag(extra.to(noise).square()))
         if not bool(ok.all()):
-            raise ValueError(f"model.inflation={self.inflation}: the process noise has no square root; give every state some noise")
+            raise ValueError(f"model.inflation={self.inflation}: no square root of the noise exists; give every state some")
         return torch.cat([phi, full], -1)
 
     def _continuous(self, u: Intervals) -> tuple[Tensor, Tensor, Tensor]:
@@ -124,11 +129,12 @@ class InsGnss(StateSpaceModel):
         eye = torch.eye(3, dtype=f.dtype, device=f.device)
         g[..., d - 6 : d - 3, 6:9] = eye
         g[..., d - 3 :, 9:12] = eye
-        drivers = [_driver(imu.gyro_markov, imu.gyro_markov_time), _driver(imu.accelerometer_markov, imu.accelerometer_markov_time)]
+        gyro_driver = _driver(imu.gyro_markov, imu.gyro_markov_time)
+        accelerometer_driver = _driver(imu.accelerometer_markov, imu.accelerometer_markov_time)
         if self.markov:
             f[..., 12:15, 12:15] = -eye / imu.gyro_markov_time
             f[..., 15:18, 15:18] = -eye / imu.accelerometer_markov_time if imu.accelerometer_markov_time > 0 else 0 * eye
-        q = [imu.gyro_random_walk**2, imu.accelerometer_random_walk**2, *drivers]
+        q = [imu.gyro_random_walk**2, imu.accelerometer_random_walk**2, gyro_driver, accelerometer_driver]
         return f, g, f.new_tensor([value for value in q for _ in range(3)])
 
     def initial(self, runs: int) -> Distribution:

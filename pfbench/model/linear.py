@@ -29,6 +29,14 @@ class LinearGaussian(StateSpaceModel):
         ValueError: shapes that do not fit, standard deviations that are not positive.
     """
 
+    linear = True
+    f: Tensor
+    g: Tensor
+    h: Tensor
+    r: Tensor
+    m0: Tensor
+    l0: Tensor
+
     def __init__(
         self,
         transition_matrix: Any,
@@ -59,7 +67,8 @@ class LinearGaussian(StateSpaceModel):
         wanted = {"f": (d, d), "g": (d, tensors["g"].shape[-1]), "h": (dy, d), "r": (dy,), "m0": (d,), "l0": (d, d)}
         for name, shape in wanted.items():
             if tuple(tensors[name].shape) != shape:
-                raise ValueError(f"LinearGaussian {name}: shape {tuple(tensors[name].shape)}, but {shape} is needed for D={d}, Dy={dy}")
+                given = tuple(tensors[name].shape)
+                raise ValueError(f"LinearGaussian {name}: shape {given}, but {shape} is needed for D={d}, Dy={dy}")
             self.register_buffer(name, tensors[name])
         self.names = tuple(names) if names else tuple(f"x{i}" for i in range(d))
         self.units = tuple(units) if units else ("",) * d
@@ -87,7 +96,9 @@ class LinearGaussian(StateSpaceModel):
         return dense_normal(x @ self.f.mT, factor.expand(*x.shape[:-1], -1, -1))
 
 
-def local_level(level_sd: float, measurement_sd: float, initial_mean: float, initial_sd: float, observes_initial: bool = False) -> LinearGaussian:
+def local_level(
+    level_sd: float, measurement_sd: float, initial_mean: float, initial_sd: float, observes_initial: bool = False
+) -> LinearGaussian:
     """The local level model of the Nile data [Durbin and Koopman 2012, ch. 2]: x' = x + level_sd w, y = x + measurement_sd v."""
     positive("level_sd", level_sd)
     return LinearGaussian(

@@ -124,6 +124,9 @@ class StrapdownTotal(StateSpaceModel):
         ValueError: a density or standard deviation that is not positive.
     """
 
+    density: Tensor
+    r: Tensor
+    p0: Tensor
     noise_dim = 12
     choices = (
         "flat Earth about the start with constant normal gravity; the Earth's rate (0.004 deg/s) is left to the gyro bias",
@@ -173,7 +176,8 @@ class StrapdownTotal(StateSpaceModel):
             ValueError: inputs of another kind, or measurements that do not fit the believed standard deviations.
         """
         if not isinstance(record.u, Increments):
-            raise ValueError(f"record.u is {type(record.u).__name__}: StrapdownTotal needs Increments; choose a recorded scenario")
+            kind = type(record.u).__name__
+            raise ValueError(f"record.u is {kind}: StrapdownTotal needs Increments; choose a recorded scenario")
         if record.y.shape[-1] != len(self.r):
             raise ValueError(
                 f"the scenario measures {record.y.shape[-1]} components, believed.position_sd and velocity_sd give "

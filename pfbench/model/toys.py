@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -23,7 +24,13 @@ class Clock(NamedTuple):
 class Growth(StateSpaceModel):
     """x' = x/2 + 25 x/(1 + x^2) + 8 cos(1.2 t) + process_sd w, y = x^2/20 + measurement_sd v [Gordon, Salmond, Smith 1993]."""
 
-    def __init__(self, process_sd: float = math.sqrt(10.0), measurement_sd: float = 1.0, initial_sd: float = math.sqrt(2.0)) -> None:
+    q: Tensor
+    r: Tensor
+    p0: Tensor
+
+    def __init__(
+        self, process_sd: float = math.sqrt(10.0), measurement_sd: float = 1.0, initial_sd: float = math.sqrt(2.0)
+    ) -> None:
         super().__init__()
         self.register_buffer("q", positive("process_sd", [process_sd]))
         self.register_buffer("r", positive("measurement_sd", [measurement_sd]))
@@ -56,6 +63,8 @@ class StochasticVolatility(StateSpaceModel):
     The first propagation of a stationary x_0 leaves it stationary, so x_1 has the law that other libraries give to x_0.
     """
 
+    sigma: Tensor
+
     def __init__(self, mu: float = -1.0, rho: float = 0.95, sigma: float = 0.3) -> None:
         super().__init__()
         if not -1.0 < rho < 1.0:
@@ -87,6 +96,9 @@ class Benes(StateSpaceModel):
     step) with odds exp(2 x), so it can be driven by two normals: the increment, and one that decides the sign.
     """
 
+    d: Tensor
+    r: Tensor
+
     def __init__(self, step: float = 0.1, measurement_sd: float = 0.5) -> None:
         super().__init__()
         self.register_buffer("d", positive("step", step))
@@ -111,7 +123,13 @@ class Pendulum(StateSpaceModel):
     Euler step; white angular acceleration of root density `noise`.
     """
 
-    def __init__(self, step: float = 0.05, noise: float = 0.1, measurement_sd: float = 0.3, initial_sd: tuple[float, float] = (0.5, 0.5)) -> None:
+    l: Tensor
+    r: Tensor
+    p0: Tensor
+
+    def __init__(
+        self, step: float = 0.05, noise: float = 0.1, measurement_sd: float = 0.3, initial_sd: Sequence[float] = (0.5, 0.5)
+    ) -> None:
         super().__init__()
         d = float(positive("step", step))
         q = float(positive("noise", noise)) ** 2 * torch.tensor([[d**3 / 3, d**2 / 2], [d**2 / 2, d]], dtype=torch.float64)
@@ -142,6 +160,10 @@ class Pendulum(StateSpaceModel):
 
 class Lorenz63(StateSpaceModel):
     """The Lorenz attractor (10, 28, 8/3) by one Runge-Kutta step of order 4, all three states seen in noise [Lorenz 1963]."""
+
+    q: Tensor
+    r: Tensor
+    p0: Tensor
 
     def __init__(self, step: float = 0.02, process_sd: float = 0.1, measurement_sd: float = 1.0, initial_sd: float = 5.0) -> None:
         super().__init__()

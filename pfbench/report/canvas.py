@@ -44,12 +44,18 @@ class Look(NamedTuple):
     colour: str
     dash: _Dash
     marker: str
+    width: float
 
 
 def looks(labels: Sequence[str]) -> dict[str, Look]:
-    """Colour, dash and marker of each filter; all three differ for neighbours, so that one suffices in grey."""
-    each = zip(dict.fromkeys(labels), cycle(_COLOURS), cycle(_DASHES), cycle(_MARKERS), strict=False)
-    return {label: Look(colour, dash, marker) for label, colour, dash, marker in each}
+    """Colour, dash and marker of each filter; all three differ for neighbours, so that one suffices in grey.
+
+    Later lines are thinner: where filters agree exactly, the earlier ones still show on both sides.
+    """
+    names = list(dict.fromkeys(labels))
+    widths = np.linspace(1.0 + min(0.25 * len(names), 1.0), 1.0, len(names)) if len(names) > 1 else [1.3]
+    each = zip(names, cycle(_COLOURS), cycle(_DASHES), cycle(_MARKERS), widths, strict=False)
+    return {label: Look(colour, dash, marker, float(width)) for label, colour, dash, marker, width in each}
 
 
 def stack(n: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:

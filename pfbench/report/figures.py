@@ -60,6 +60,8 @@ def drawings(
         alpha: probability outside the NEES band.
     """
     shown = [block for block in _all_blocks(results) if block.group in groups]
+    if not shown:
+        return []
     wholes = list(dict.fromkeys(block.whole for block in shown))
     kept = "runs that were not lost"
     found = []
@@ -81,6 +83,8 @@ def drawings(
         text = f"Effective sample size of the particle filters, median and 5 to 95 % of the {kept}."
         found.append(Drawing("ess", text, partial(ess, results, style)))
     for label, result in results.items():
+        if result.arrays["lost"].all() or not any(b.group in groups for b in blocks(result.meta["state"])):
+            continue
         text = (
             f"{label}: error over time, median and 5 to 95 % of the {kept} (shaded), and three times the filter's own "
             f"standard deviation, median over runs (dashed). The first fifth is cut where it dwarfs the rest."
@@ -116,7 +120,7 @@ def track(results: Results, row: int, style: Mapping[str, Look]) -> Figure:
             continue
         off = result.arrays["error"][row][:, axes[0]].astype(np.float64) * axes[1]
         estimate = result.arrays["track"][row] + off
-        line = {"color": style[label].colour, "ls": style[label].dash, "lw": 1.1}
+        line: Any = {"color": style[label].colour, "ls": style[label].dash, "lw": style[label].width}
         plan.plot(estimate[:, 0], estimate[:, 1], label=label, **line)
         height.plot(result.arrays["time"], estimate[:, 2], **line)
     plan.set(xlabel="east in m", ylabel="north in m")
@@ -135,7 +139,8 @@ def error(results: Results, block: Block, style: Mapping[str, Look]) -> Figure:
             own = result.meta["state"]["names"]
             if name in own:
                 middle = quantiles(np.abs(values[..., own.index(name)]) * block.scale, [0.5])[0]
-                axis.plot(time, middle, color=style[label].colour, ls=style[label].dash, label=label)
+                look = style[label]
+                axis.plot(time, middle, color=look.colour, ls=look.dash, lw=look.width, label=label)
     for name, axis in zip(block.components, panels, strict=True):
         axis.set(title=name, ylabel=labelled("|error|", block.unit))
         log_if_wide(axis, axis.yaxis, [np.asarray(line.get_ydata()) for line in axis.lines])
@@ -197,6 +202,9 @@ def rmse(runs: pd.DataFrame, groups: Sequence[str], style: Mapping[str, Look]) -
             if lost:
                 place_of = axis.get_yaxis_transform()
                 axis.text(1.01, place, f"{lost} lost", transform=place_of, ha="left", va="center", fontsize=7)
+        # Said again because a filter that lost every run has no box, and its row must stay.
+        axis.set_yticks(range(len(labels)), labels)
+        axis.set_ylim(len(labels) - 0.5, -0.5)
         unit = str(own.unit.iloc[0]) if len(own) else ""
         axis.set(title=group, xlabel=labelled("RMSE per run", unit), ylabel="")
         log_if_wide(axis, axis.xaxis, [kept.value.to_numpy()])
@@ -216,11 +224,12 @@ def cost(results: Results, shown: Sequence[Block], style: Mapping[str, Look]) ->
                 look = style[label]
                 axis.scatter(time, errors[-1], s=38, color=look.colour, marker=look.marker, label=label, zorder=3)
         axis.set(title=block.group, ylabel=labelled("RMSE", block.unit))
-        axis.set_yscale("log")
-        axis.set_xscale("log")
         axis.margins(0.15)
-        plain_ticks(axis.yaxis, errors)
-    plain_ticks(panels[-1].xaxis, times)
+        # A logarithmic axis without a positive number on it is an error of matplotlib's.
+        if any(value > 0 for value in errors):
+            axis.set(xscale="log", yscale="log")
+            plain_ticks(axis.yaxis, errors)
+            plain_ticks(axis.xaxis, times)
     panels[-1].set_xlabel("time per step in ms")
     legend(figure, panels[0])
     return figure
@@ -239,7 +248,9 @@ def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alp
                 found = metrics.consistency(result.arrays["nees"][..., place], result.arrays["lost"], dof, alpha)
                 thin = thinned(result.arrays["time"].size)
                 time = result.arrays["time"][thin]
-                axis.plot(time, found.average[thin], color=style[label].colour, ls=style[label].dash, lw=1, label=label)
+                look = style[label]
+                line: Any = {"color": look.colour, "ls": look.dash, "lw": 0.8 * look.width}
+                axis.plot(time, found.average[thin], label=label, **line)
                 lines.append(found.average)
                 bands.append((found.runs, time, found.low[thin], found.high[thin], dof))
         _, time, low, high, dof = max(bands, key=lambda band: band[0])

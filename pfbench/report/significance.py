@@ -5,7 +5,8 @@ of their RMSE: Wilcoxon's signed-rank test with the ranks of zero differences sp
 correction over all pairs shown for one group of one cell [Holm 1979], the matched-pairs rank-biserial correlation
 [Kerby 2014] as the size of the effect and a BCa bootstrap interval [Efron 1987] of the median ratio.
 
-A lost run is worse than any that was not: it takes the largest rank. Two lost runs are a tie [ours].
+A lost run is worse than any that was not: it takes the largest rank. Two lost runs are a tie, and so are two runs whose
+RMSE agree to the precision of what is stored [ours].
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ from pfbench.metrics import Array
 
 NO_DIFFERENCE = "no difference shown"
 _RESAMPLES = 9999
+# Errors are stored in single precision: smaller differences of a logarithm are rounding. Filters that agree to the last
+# digit (EKF and UKF of a linear model) would otherwise be ranked by how they round, and be found different.
+_SAME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -115,12 +119,14 @@ def corrected(family: Sequence[Verdict], alpha: float) -> list[Verdict]:
 def log_ratio(a: Array, b: Array) -> Array:
     """log(a / b) per run, made finite: where one of the two was lost, beyond all others; where both were, 0.
 
+    Differences below the precision of what is stored are 0 too.
+
     Args:
         a, b: losses [n], non-negative, infinite where lost.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         d = np.log(a) - np.log(b)
-    d = np.where(a == b, 0.0, d)
+    d = np.where((a == b) | (np.abs(d) <= _SAME), 0.0, d)
     return np.where(np.isfinite(d), d, np.sign(d) * _beyond(d))
 
 
@@ -135,7 +141,7 @@ def wilcoxon(d: Array) -> tuple[float, float]:
 def rank_biserial(d: Array) -> float:
     """Share of the rank sum with d < 0 less the share with d > 0: positive when a, of d = log(a / b), is smaller."""
     rank = stats.rankdata(np.abs(d))
-    return float(-np.sum(np.sign(d) * rank) / rank.sum())
+    return float((rank[d < 0].sum() - rank[d > 0].sum()) / rank.sum())
 
 
 def median_interval(d: Array, level: float, seed: int) -> Interval:

@@ -56,9 +56,9 @@ def decisions(verdicts: Sequence[Verdict]) -> pd.DataFrame:
                 "pairs": v.pairs,
                 "lost a": v.lost_a,
                 "lost b": v.lost_b,
-                "RMSE a / b in %": 100 * v.ratio,
-                "low": 100 * v.low,
-                "high": 100 * v.high,
+                "RMSE a to b in %": 100 * (v.ratio - 1),
+                "low": 100 * (v.low - 1),
+                "high": 100 * (v.high - 1),
                 "interval": v.interval,
                 "effect": v.effect,
                 "T": v.statistic,
@@ -121,9 +121,11 @@ def number(value: Any) -> str:
     if np.isinf(value):
         return "∞" if value > 0 else "−∞"
     size = abs(float(value))
-    if size != 0 and not 1e-3 <= size < 1e5:
+    if size == 0:
+        return "0"  # and not -0
+    if not 1e-3 <= size < 1e5:
         return f"{value:.2e}"
-    digits = 2 - int(np.floor(np.log10(float(f"{size:.2e}")))) if size else 0
+    digits = 2 - int(np.floor(np.log10(float(f"{size:.2e}"))))
     return f"{value:.{max(digits, 0)}f}"
 
 

@@ -71,6 +71,11 @@ class SimulatedFlight:
         """Truth and nominal trajectory at the ends of the intervals."""
         flight = trajectory.fly(self.segments, self.start, self.imu_rate)
         per = round(self.imu_rate * self.interval)
+        if len(flight.dtheta) % per:
+            raise ValueError(
+                f"scenario.interval={self.interval}: the flight's {flight.time[-1]:g} s are no whole number of intervals; "
+                "give one that divides them, or make a segment longer"
+            )
         imu = sensors.corrupt(flight.dtheta, flight.dv, 1.0 / self.imu_rate, self.imu, draws)
         errors = self.initial.sd * draws.normal("world.initial", 1, 9)[:, 0]
         ins = strapdown.align(flight.dcm[0], flight.vel[0], flight.pos[0], errors[:, :3], errors[:, 3:6], errors[:, 6:])

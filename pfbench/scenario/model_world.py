@@ -10,7 +10,7 @@ from torch.distributions import Independent, Normal
 
 from pfbench.draws import MonteCarlo
 from pfbench.model.base import AtRest, StateSpaceModel
-from pfbench.noise.regimes import Nominal, Regime
+from pfbench.noise.regimes import Regime
 from pfbench.record import Episode, Record
 
 

@@ -1,8 +1,6 @@
 """Recorded drives and flights: real sensors and real motion, fixes degraded on purpose, errors scored against a reference.
 
-The motion is the same in every run; what differs between runs is the receiver's errors and the initial errors. Filter steps
-fall on the fixes and divide the time between them evenly, so no measurement is ever moved or interpolated; the reference is
-interpolated to the steps, never across a hole in it.
+A drive's motion is the same in every run; what differs between runs is the receiver's errors and the initial errors.
 """
 
 from __future__ import annotations
@@ -10,21 +8,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from pfbench.draws import MonteCarlo
 from pfbench.model.strapdown_total import Believed, Increments, StrapdownTotal, preintegrate
-from pfbench.nav import attitude
 from pfbench.noise.regimes import Regime
 from pfbench.record import Episode, Record
-from pfbench.scenario.logs import Array, Files, Imu, Log, Motion, read_log
-
-_SAME_TIME = 1e-3  # s
+from pfbench.scenario.legs import SAME_TIME, Leg, cut
+from pfbench.scenario.logs import Files, read_log
+from pfbench.scenario.tables import Array
 
 
 @dataclass(frozen=True)
@@ -88,7 +83,7 @@ class RecordedDrive:
     def draw(self, noise: Regime, runs: Tensor, seed: int) -> Episode:
         """The log with these runs' errors; times are those of the log."""
         log = read_log(locate(self.root, self.folder), self.files, origin=self.origin)
-        leg = cut(log, self.receiver, self.step, self.believed.bias.numpy(), self.start, self.end)
+        leg = cut(log, self.receiver.interval, self.step, self.receiver.velocity_sd is not None, self.start, self.end)
         return assemble([leg], leg.time, torch.zeros_like(runs), self.believed, self.receiver, noise, MonteCarlo(seed, runs))
 
 
@@ -121,50 +116,21 @@ class RecordedFlights:
 
     def draw(self, noise: Regime, runs: Tensor, seed: int) -> Episode:
         """The flights with these runs' errors; time is from the start of each flight."""
-        folder, bias = locate(self.root, self.folder), self.believed.bias.numpy()
+        folder, velocity = locate(self.root, self.folder), self.receiver.velocity_sd is not None
         used = torch.unique(runs % len(self.paths)).tolist()  # reads no flight that no run asks for
         logs = [read_log(folder, self.files, self.paths[i], self.imu, self.origin) for i in used]
-        legs = [cut(log, self.receiver, self.step, bias) for log in logs]
+        legs = [cut(log, self.receiver.interval, self.step, velocity) for log in logs]
         longest = max(legs, key=lambda leg: len(leg.time))
         for i, leg in zip(used, legs, strict=True):
-            shift = leg.since_start - longest.since_start[: len(leg.time)]
-            if np.abs(shift).max() > _SAME_TIME or not np.array_equal(leg.fixed, longest.fixed[: len(leg.time)]):
-                raise ValueError(f"{folder}: flight {self.paths[i]} has its fixes at other times than the longest one; run it as a RecordedDrive")
+            n = len(leg.time)
+            same = np.allclose(leg.since_start, longest.since_start[:n], rtol=0.0, atol=SAME_TIME)
+            if not same or not np.array_equal(leg.fixed, longest.fixed[:n]):
+                raise ValueError(
+                    f"{folder}: flight {self.paths[i]} has its fixes at other times than the longest one; "
+                    "leave it out of scenario.paths"
+                )
         which = torch.searchsorted(torch.tensor(used), runs % len(self.paths))
         return assemble(legs, longest.since_start, which, self.believed, self.receiver, noise, MonteCarlo(seed, runs))
-
-
-class Leg(NamedTuple):
-    """One log on filter steps; positions from the recorded start.
-
-    Attributes:
-        begin: time of the start, s.
-        time: end of each step [T] s.
-        fixed: steps that end on a fix [T].
-        fixes: recorded position and velocity at the end of each step [T, 6], NaN where there is none.
-        start: recorded attitude, velocity and position at the start [10].
-        truth: the same at the end of each step [T, 10], NaN in a hole of the reference.
-        force, rate: mean specific force and angular rate of the S pieces of each step [T, S, 3].
-        spans: their durations [T, S] s; 0 fills up.
-        gravity: m/s^2.
-        notes: for the report.
-    """
-
-    begin: float
-    time: Array
-    fixed: NDArray[np.bool_]
-    fixes: Array
-    start: Array
-    truth: Array
-    force: Array
-    rate: Array
-    spans: Array
-    gravity: float
-    notes: tuple[str, ...]
-
-    @property
-    def since_start(self) -> Array:
-        return self.time - self.begin
 
 
 def locate(root: str | None, folder: str) -> Path:
@@ -180,93 +146,6 @@ def locate(root: str | None, folder: str) -> Path:
     if not path.is_dir():
         raise ValueError(f"data.root={root}: no folder {path}; {remedy}")
     return path
-
-
-def cut(
-    log: Log, receiver: Receiver, step: float, bias: Array, start: float | None = None, end: float | None = None
-) -> Leg:
-    """A log on filter steps.
-
-    Raises:
-        ValueError: fewer than two fixes in the time that IMU and reference have in common, or velocities asked for that are
-            not recorded.
-    """
-    low = max(log.imu.time[0], log.reference.time[0], -np.inf if start is None else start)
-    high = min(log.imu.time[-1], log.reference.time[-1], np.inf if end is None else end)
-    chosen = thin(log.fixes.time, receiver.interval, low, high)
-    if len(chosen) < 2:
-        raise ValueError(
-            f"{len(chosen)} fixes between t = {low:.3f} and {high:.3f}, where IMU, reference, start and end overlap; "
-            "give a longer log, an earlier start or a later end"
-        )
-    if receiver.velocity_sd is not None and np.isnan(log.fixes.velocity).all():
-        raise ValueError("receiver.velocity_sd is set, but the fixes have no vn, ve, vd: add these columns, or set it to null")
-    at_fix = log.fixes.time[chosen]
-    pieces = np.maximum(1, np.ceil(np.diff(at_fix) / step - 1e-6).astype(int))
-    parts = [a + (b - a) * np.arange(1, n + 1) / n for a, b, n in zip(at_fix[:-1], at_fix[1:], pieces, strict=True)]
-    time = np.concatenate(parts)
-    ends = np.cumsum(pieces) - 1
-    time[ends] = at_fix[1:]
-    fixes = np.full((len(time), 6), np.nan)
-    fixes[ends] = np.hstack([log.fixes.position, log.fixes.velocity])[chosen[1:]]
-    truth = interpolate(log.reference, np.concatenate([at_fix[:1], time]))
-    if np.isnan(truth[0]).any():
-        raise ValueError(f"the reference has a hole at t = {at_fix[0]:.3f}, where the runs would start: choose another start")
-    first = truth[0].copy()
-    fixes[:, :3] -= first[7:]
-    truth[:, 7:] -= first[7:]
-    force, rate, spans = split(log.imu, np.concatenate([at_fix[:1], time]))
-    fixed = np.zeros(len(time), dtype=bool)
-    fixed[ends] = True
-    silent = int(np.isnan(fixes[ends, 0]).sum())
-    notes = log.notes + ((f"{silent} of {len(ends)} fixes not used (fix is not 1)",) if silent else ())
-    return Leg(float(at_fix[0]), time, fixed, fixes, truth[0], truth[1:], force, rate, spans, log.gravity, notes)
-
-
-def thin(time: Array, interval: float, low: float, high: float) -> NDArray[np.intp]:
-    """Indices of fixes in [low, high], each `interval` after the one before, to half the fixes' own spacing."""
-    slack = 0.5 * float(np.median(np.diff(time)))
-    chosen: list[int] = []
-    for i in np.flatnonzero((time >= low) & (time <= high)):
-        if not chosen or time[i] - time[chosen[-1]] >= max(interval - slack, 0.0):
-            chosen.append(int(i))
-    return np.array(chosen, dtype=np.intp)
-
-
-def interpolate(motion: Motion, time: Array) -> Array:
-    """Attitude, velocity, position of a reference at other times [T, 10]; NaN across a hole (two sample intervals and more).
-
-    Velocity and position on a straight line, attitude along the shortest turn.
-    """
-    longest = 1.9 * float(np.median(np.diff(motion.time)))
-    after = np.clip(np.searchsorted(motion.time, time - _SAME_TIME), 1, len(motion.time) - 1)
-    before = after - 1
-    gap = motion.time[after] - motion.time[before]
-    part = ((time - motion.time[before]) / gap)[:, None]
-    flat = np.hstack([motion.velocity, motion.position])
-    straight = (1.0 - part) * flat[before] + part * flat[after]
-    q = torch.from_numpy(motion.attitude)
-    inverse = q[before] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
-    turn = attitude.rotation_vector_from_quaternion(attitude.quaternion_multiply(inverse, q[after])) * torch.from_numpy(part)
-    turned = attitude.quaternion_multiply(q[before], attitude.quaternion_from_rotation_vector(turn)).numpy()
-    on_sample = np.minimum(part, 1.0 - part)[:, 0] * gap <= _SAME_TIME
-    known = (gap <= longest) | on_sample
-    known &= (time >= motion.time[0] - _SAME_TIME) & (time <= motion.time[-1] + _SAME_TIME)
-    return np.where(known[:, None], np.hstack([turned, straight]), np.nan)
-
-
-def split(imu: Imu, grid: Array) -> tuple[Array, Array, Array]:
-    """Mean force and rate [T, S, 3] and durations [T, S] between samples and grid points, samples joined by straight lines."""
-    inside = imu.time[(imu.time > grid[0]) & (imu.time < grid[-1])]
-    nodes = np.union1d(inside, grid)
-    values = np.stack([np.interp(nodes, imu.time, column) for column in (*imu.force.T, *imu.rate.T)], axis=-1)
-    mean = 0.5 * (values[1:] + values[:-1])
-    step = np.searchsorted(grid, nodes[:-1], side="right") - 1
-    place = np.arange(len(step)) - np.searchsorted(step, step)
-    shape = (len(grid) - 1, int(place.max()) + 1)
-    spans, pieces = np.zeros(shape), np.zeros((*shape, 6))
-    spans[step, place], pieces[step, place] = np.diff(nodes), mean
-    return pieces[..., :3], pieces[..., 3:], spans
 
 
 def assemble(
@@ -295,9 +174,7 @@ def _start(legs: Sequence[Leg], which: Tensor, believed: Believed, draws: MonteC
 
 
 def _increments(legs: Sequence[Leg], which: Tensor, believed: Believed) -> Increments:
-    pieces = max(leg.spans.shape[1] for leg in legs)
-    widened = [[np.pad(a, [(0, 0), (0, pieces - a.shape[1])] + [(0, 0)] * (a.ndim - 2)) for a in (leg.force, leg.rate, leg.spans)] for leg in legs]
-    force, rate, spans = (_padded(list(arrays), 0.0) for arrays in zip(*widened, strict=True))
+    force, rate, spans = (_padded(part, 0.0) for part in zip(*((leg.force, leg.rate, leg.spans) for leg in legs), strict=True))
     bias = believed.bias.expand(*spans.shape[:2], 6)
     gravity = torch.tensor([leg.gravity for leg in legs], dtype=torch.float64)[:, None].expand(spans.shape[:2])
     u = (*preintegrate(force, rate, spans, bias), bias, gravity, spans.sum(-1))
@@ -307,10 +184,11 @@ def _increments(legs: Sequence[Leg], which: Tensor, believed: Believed) -> Incre
 
 
 def _padded(arrays: Sequence[Array], fill: float) -> Tensor:
-    """Arrays [T_k, ...] one beside the other, filled up to the longest [K, T, ...]."""
-    length = max(len(a) for a in arrays)
-    pad = [np.pad(a, [(0, length - len(a))] + [(0, 0)] * (a.ndim - 1), constant_values=fill) for a in arrays]
-    return torch.from_numpy(np.stack(pad))
+    """Arrays one beside the other, each axis filled up to the longest [K, ...]."""
+    out = np.full((len(arrays), *np.max([a.shape for a in arrays], axis=0)), fill)
+    for part, a in zip(out, arrays, strict=True):
+        part[tuple(slice(n) for n in a.shape)] = a
+    return torch.from_numpy(out)
 
 
 def _positive(name: str, value: float) -> None:

@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
@@ -34,7 +35,8 @@ def cached(folder: str | Path | None, recipe: object, build: Callable[[], Arrays
     temporary = path.with_suffix(f".{uuid4().hex[:8]}.tmp")
     try:
         with temporary.open("xb") as file:
-            np.savez(file, **{name: tensor.numpy() for name, tensor in arrays.items()})
+            plain: dict[str, Any] = {name: tensor.numpy() for name, tensor in arrays.items()}
+            np.savez(file, **plain)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

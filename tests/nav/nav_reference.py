@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pfbench.nav import attitude, earth
 from pfbench.nav.strapdown import Ins, align
-from pfbench.nav.trajectory import Flight, Start, accelerate, climb, cruise, turn
+from pfbench.nav.trajectory import Flight, Segment, Start, accelerate, climb, cruise, turn
 
 ARCMIN = math.radians(1 / 60)
 
@@ -17,8 +17,9 @@ T003 = ([*_FIRST, climb(10, 10, 20), turn(90, 60), cruise(50)], Start(34, 108, 4
 _OUT = [cruise(20), accelerate(2, 40), climb(8, 10, 40), cruise(60), turn(90, 60), cruise(80), turn(-90, 60)]
 T004 = ([*_OUT, accelerate(1, 20), cruise(100)], Start(32, 118, 200, speed=20, heading_deg=45))
 
-# every kind of manoeuvre in a minute and a half, for the fast tests
-_DOGLEG = [accelerate(4, 10), climb(15, 5, 5), turn(-90, 20), cruise(5), turn(60, 20), accelerate(-2, 10)]
+# every kind of manoeuvre and a climbing turn in 80 s, for the fast tests
+_SPIRAL = [Segment(10, speed=-10, climb=0.2, heading=0.6), Segment(10, climb=-0.2, heading=0.4)]
+_DOGLEG = [accelerate(4, 10), climb(15, 5, 5), turn(-90, 20), cruise(5), *_SPIRAL, accelerate(-1, 10)]
 SHORT = (_DOGLEG, Start(-41, 30, 1500, speed=60))
 
 

@@ -1,0 +1,149 @@
+"""The tidy table: right numbers in right units, right labels, and no mixing of what does not belong together."""
+
+import numpy as np
+import pytest
+import synthetic_results as synthetic
+
+from pfbench import store
+from pfbench.report import frame
+
+SMALL = {"runs": 6, "steps": 20}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    root = tmp_path_factory.mktemp("results")
+    synthetic.study(root / "demo", runs=10, steps=30)
+    return root
+
+
+def test_one_row_per_run_and_figure(results):
+    table = frame.frame("demo", results)
+    assert list(table.columns) == [
+        "study", "key", "scenario", "noise", "model", "filter", "label", "particles", "seed", "run", "lost",
+        "group", "component", "unit", "metric", "value",
+    ]  # fmt: skip
+    assert not table.duplicated(["key", "run", "group", "component", "metric"]).any()
+    assert (table.groupby(["label", "group", "component", "metric"]).size() == 10).all()
+    assert set(table.label) == {method.name for method in synthetic.METHODS}
+    assert set(table[table.metric == "ess"].label) == {"sir", "cofm_amssrcpf"}
+    assert table[table.metric == "ess"].value.dropna().between(0, 1).all()
+
+
+def test_numbers_and_units_by_hand(results):
+    table = frame.frame("demo", results, from_time=10.0)
+    (raw,) = [r for r in store.results(results / "demo") if r.meta["label"] == "ekf"]
+    late = raw.arrays["time"] >= 10.0
+    error = raw.arrays["error"][3, late].astype(float)
+    rows = table[(table.label == "ekf") & (table.run == 3)].set_index(["metric", "group", "component"])
+    # One radian is 180 * 60 / pi minutes of arc.
+    expected = np.sqrt(np.mean(np.sum(error[:, :3] ** 2, axis=1))) * 180 * 60 / np.pi
+    assert rows.loc[("rmse", "attitude", "norm"), "value"] == pytest.approx(expected)
+    assert rows.loc[("rmse", "attitude", "norm"), "unit"] == "arcmin"
+    assert rows.loc[("rmse", "position", "position_U"), "value"] == pytest.approx(np.sqrt(np.mean(error[:, 8] ** 2)))
+    assert rows.loc[("rmse", "position", "position_U"), "unit"] == "m"
+    assert rows.loc[("max_error", "velocity", "norm"), "value"] == pytest.approx(
+        np.linalg.norm(error[:, 3:6], axis=1).max()
+    )
+    assert rows.loc[("nees", "position", "norm"), "value"] == pytest.approx(
+        raw.arrays["nees"][3, late, 2].mean(), rel=1e-5
+    )
+    assert rows.loc[("seconds_per_step", "", ""), "value"] == pytest.approx(0.4e-3)
+
+
+def test_a_lost_run_stays_with_an_infinite_error(results):
+    table = frame.frame("demo", results)
+    lost = table[table.lost]
+    assert set(zip(lost.label, lost.run, strict=True)) == {("sir", 7)}
+    assert np.isinf(lost.value[lost.metric.isin(["rmse", "max_error"])]).all()
+    assert lost.value[lost.metric.isin(["nees", "ess", "log_evidence"])].isna().all()
+    assert np.isfinite(table.value[~table.lost]).all()
+
+
+def test_units_shown():
+    state = {
+        "names": ["b_g", "b_a", "attitude_E", "clock", "clock_rate", "scale"],
+        "units": ["rad/s", "m/s^2", "rad", "m", "m/s", ""],
+        "groups": {"gyro": [0], "accelerometer": [1], "attitude": [2], "clock": [3, 4], "scale": [5]},
+    }
+    shown = {block.group: (block.unit, block.scale, block.whole) for block in frame.blocks(state)}
+    assert shown["gyro"] == ("deg/h", pytest.approx(206264.806), "gyro")
+    assert shown["accelerometer"] == ("mg", pytest.approx(101.9716), "accelerometer")
+    assert shown["attitude"] == ("arcmin", pytest.approx(3437.7468), "attitude")
+    # Metres and metres per second have no common norm.
+    assert shown["clock [m]"] == ("m", 1.0, "clock")
+    assert shown["clock [m/s]"] == ("m/s", 1.0, "clock")
+    assert shown["scale"] == ("", 1.0, "scale")
+
+
+def test_convergence_by_bound(results):
+    table = frame.frame("demo", results, converged={"attitude": 1e6})
+    found = table[table.metric == "converged"]
+    assert set(found.group) == {"attitude"}
+    assert (found.value[~found.lost] == 1.0).all()  # under so wide a bound from the first instant on
+    assert np.isinf(found.value[found.lost]).all()
+
+
+def test_labels_tell_configurations_of_one_filter_apart(tmp_path):
+    for particles in (400, 100, 1600):
+        synthetic.write(tmp_path / "demo", synthetic.Method("sir", 1.0, 1.0, particles), **SMALL)
+    synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), **SMALL)
+    (cell,) = frame.cells("demo", tmp_path)
+    assert [job.label for job in cell.jobs] == [
+        "ekf", "sir[particles=100]", "sir[particles=400]", "sir[particles=1600]",
+    ]  # fmt: skip
+
+
+def test_labels_name_only_what_differs(tmp_path):
+    method = synthetic.Method("sir", 1.0, 1.0, 100)
+    for threshold in (0.5, 1.0):
+        config = {"resampler": {"threshold": threshold, "kind": "systematic"}}
+        synthetic.write(tmp_path / "demo", method, config=config, **SMALL)
+    (cell,) = frame.cells("demo", tmp_path)
+    assert [job.label for job in cell.jobs] == ["sir[resampler.threshold=0.5]", "sir[resampler.threshold=1.0]"]
+
+
+def test_noise_regimes_are_cells(tmp_path):
+    for noise in ("surge", "nominal"):
+        synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), noise=noise, **SMALL)
+    found = frame.cells("demo", tmp_path)
+    assert [(cell.noise, [job.label for job in cell.jobs]) for cell in found] == [("nominal", ["ekf"]), ("surge", ["ekf"])]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"versions": {**synthetic.VERSIONS, "commit": "fff9999"}}, "versions.commit"),
+        ({"versions": {**synthetic.VERSIONS, "pfbench": "0.2.0"}}, "versions.pfbench"),
+        ({"seed": 6}, "seed"),
+        ({"runs": 7}, "runs"),
+        ({"steps": 21}, "steps"),
+    ],
+)
+def test_what_does_not_belong_together_is_refused_by_name(tmp_path, change, named):
+    synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), **SMALL)
+    odd = synthetic.write(tmp_path / "demo", synthetic.Method("ukf", 1.0), **{**SMALL, **change})
+    with pytest.raises(ValueError, match=rf"differ in {named} .*mixed=True") as refusal:
+        frame.frame("demo", tmp_path)
+    assert odd.name in str(refusal.value)
+    assert set(frame.frame("demo", tmp_path, mixed=True).label) == {"ekf", "ukf"}
+
+
+def test_an_empty_study_says_where_to_go(results):
+    with pytest.raises(FileNotFoundError) as refusal:
+        frame.frame("nothing", results)
+    message = str(refusal.value)
+    assert str(results / "nothing") in message
+    assert "demo" in message
+    assert "pfbench run -m +experiment=nothing" in message
+
+
+def test_a_study_that_only_failed_says_so(tmp_path):
+    store.failed(tmp_path / "bad" / "00.npz", {"filter": "sir"}, RuntimeError("no particles left"))
+    with pytest.raises(FileNotFoundError, match="1 jobs failed, the first with RuntimeError: no particles left"):
+        frame.frame("bad", tmp_path)
+
+
+def test_nothing_left_after_from_time_is_an_error(results):
+    with pytest.raises(ValueError, match="from_time=1000"):
+        frame.frame("demo", results, from_time=1000.0)

@@ -1,0 +1,223 @@
+"""The report: whole, the same for the same results, and honest about what is missing."""
+
+import base64
+import json
+import re
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import synthetic_results as synthetic
+from matplotlib.figure import Figure
+
+from pfbench import store
+from pfbench.report import figures, page, tables
+from pfbench.report.canvas import looks, zoom
+from pfbench.report.frame import cells
+
+QUICK = page.Options(formats=("svg",), groups=("position",))
+
+
+def everything(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    root = tmp_path_factory.mktemp("results")
+    synthetic.study(root / "demo", runs=12, steps=40)
+    return root
+
+
+@pytest.fixture(scope="module")
+def report(results, tmp_path_factory):
+    return page.write("demo", results, tmp_path_factory.mktemp("reports"), page.Options(formats=("svg", "png"))).parent
+
+
+def test_every_figure_and_table_is_there_and_on_the_page(report):
+    html, text = (report / "index.html").read_text(), (report / "report.md").read_text()
+    names = {path.stem for path in (report / "figures").iterdir()}
+    kinds = {name.removeprefix("flight_surge_ins_gnss_") for name in names}
+    assert kinds == {
+        "track", "error_attitude", "error_velocity", "error_position", "rmse", "cost", "nees", "ess",
+        "spread_ekf", "spread_ukf", "spread_sir", "spread_cofm_amssrcpf",
+    }  # fmt: skip
+    assert {path.suffix for path in (report / "figures").iterdir()} == {".svg", ".png"}
+    carried = [base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', html)]
+    assert sorted(carried) == sorted(path.read_bytes() for path in (report / "figures").glob("*.png"))
+    for path in (report / "figures").glob("*.png"):
+        assert f"](figures/{path.name})" in text
+    for path in (report / "tables").glob("*.csv"):
+        table = pd.read_csv(path, keep_default_na=False)
+        assert path.with_suffix(".tex").read_text().startswith(r"\begin{tabular}")
+        assert f"| {table.columns[1]}" in text
+    assert len(list((report / "tables").glob("*.csv"))) == 7  # overview, and two for each of three groups
+
+
+def test_the_page_needs_nothing_but_itself(report):
+    html = (report / "index.html").read_text()
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', html)
+    assert "http" not in re.sub(r'"data:[^"]+"', "", html)
+    assert "prefers-color-scheme: dark" in html
+
+
+@pytest.mark.parametrize("name", ["index.html", "report.md"])
+def test_the_text_says_what_ran_what_failed_and_what_was_lost(report, name):
+    text = (report / name).read_text()
+    for said in (
+        "0123abc",
+        "sir lost 1 of 12 runs",
+        "1 job failed",
+        "00000000deadbeef",
+        "covariance lost its positive eigenvalues",
+        "initial heading error drawn from the filter",
+        "p Holm (6)",
+        "18 comparisons",
+    ):
+        assert said in text, said
+
+
+def test_text_tables_and_json_render_the_same_verdicts(report):
+    decided = json.loads((report / "verdicts.json").read_text())
+    assert len(decided) == 18
+    printed = pd.read_csv(report / "tables" / "flight_surge_ins_gnss_position_pairs.csv")
+    own = [v for v in decided if v["group"] == "position"]
+    assert list(printed["better"]) == [v["winner"] for v in own]
+    np.testing.assert_allclose(printed["p Holm (6)"], [v["p_holm"] for v in own])
+    accuracy = pd.read_csv(report / "tables" / "flight_surge_ins_gnss_position.csv").set_index("filter")
+    for label in accuracy.index:
+        assert accuracy.loc[label, "beats"] == sum(v["winner"] == label for v in own)
+    unbeaten = [label for label in accuracy.index if accuracy.loc[label, "beaten by"] == 0]
+    line = next(row for row in (report / "report.md").read_text().splitlines() if "position: beaten by no other" in row)
+    assert all(label in line for label in unbeaten)
+
+
+def test_same_results_same_bytes_whatever_the_order_of_files(results, tmp_path, monkeypatch):
+    first = page.write("demo", results, tmp_path / "one", QUICK).parent
+    copy = tmp_path / "copy" / "demo"
+    copy.mkdir(parents=True)
+    for path in sorted((results / "demo").iterdir(), reverse=True):
+        shutil.copy(path, copy)
+    real = Path.glob
+    monkeypatch.setattr(Path, "glob", lambda self, pattern: reversed(sorted(real(self, pattern))))
+    second = page.write("demo", copy.parent, tmp_path / "two", QUICK).parent
+    assert everything(first) == everything(second)
+
+
+def test_a_new_report_leaves_no_figure_of_the_old_one(results, tmp_path):
+    page.write("demo", results, tmp_path, QUICK)
+    (tmp_path / "demo" / "figures" / "gone_cell.svg").write_text("old")
+    (tmp_path / "demo" / "notes.txt").write_text("mine")
+    page.write("demo", results, tmp_path, QUICK)
+    assert not (tmp_path / "demo" / "figures" / "gone_cell.svg").exists()
+    assert (tmp_path / "demo" / "notes.txt").read_text() == "mine"
+
+
+def test_mixed_versions_are_refused_and_named_when_allowed(tmp_path):
+    folder = tmp_path / "demo"
+    synthetic.write(folder, synthetic.METHODS[0], runs=6, steps=20)
+    synthetic.write(folder, synthetic.METHODS[1], runs=6, steps=20, versions={**synthetic.VERSIONS, "commit": "fff9999"})
+    with pytest.raises(ValueError, match=r"versions\.commit"):
+        page.write("demo", tmp_path, tmp_path / "reports", QUICK)
+    assert not (tmp_path / "reports").exists()
+    mixed = page.Options(formats=("svg",), groups=("position",), mixed=True)
+    path = page.write("demo", tmp_path, tmp_path / "reports", mixed)
+    assert "0123abc, fff9999" in path.read_text()
+
+
+def test_a_toy_without_map_particles_or_rival(tmp_path):
+    method = synthetic.Method("kalman", 1.0)
+    path = synthetic.write(tmp_path / "demo", method, runs=5, steps=20)
+    meta, arrays = store.load(path)
+    state = {"names": ["x"], "units": [""], "groups": {"state": [0]}}
+    toy = {name: arrays[name] for name in ("time", "log_evidence", "lost")}
+    toy |= {name: arrays[name][..., :1] for name in ("error", "sd", "nees")}
+    store.save(path, {**meta, "state": state}, toy)
+    made = page.write("demo", tmp_path, tmp_path / "reports", page.Options(formats=("svg",)))
+    kinds = {p.stem.removeprefix("flight_surge_ins_gnss_") for p in (made.parent / "figures").iterdir()}
+    assert kinds == {"error_state", "rmse", "cost", "nees", "spread_kalman"}
+    assert "one filter, nothing to compare" in made.read_text()
+    assert json.loads((made.parent / "verdicts.json").read_text()) == []
+
+
+def test_a_filter_that_lost_every_run_is_reported(tmp_path):
+    folder = tmp_path / "demo"
+    synthetic.write(folder, synthetic.METHODS[0], runs=8, steps=20)
+    synthetic.write(folder, synthetic.Method("doomed", 1.0, lost=tuple(range(8))), runs=8, steps=20)
+    made = page.write("demo", tmp_path, tmp_path / "reports", QUICK)
+    (verdict,) = json.loads((made.parent / "verdicts.json").read_text())
+    assert (verdict["winner"], verdict["lost_a"], verdict["ratio"]) == ("ekf", 8, "inf")
+    assert "doomed lost 8 of 8 runs" in made.read_text()
+    table = (made.parent / "report.md").read_text()
+    assert re.search(r"\| doomed +\| +0 \| +– \|", table)
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match="alpha=5"):
+        page.Options(alpha=5)
+    with pytest.raises(ValueError, match="choose from svg, png"):
+        page.Options(formats=("gif",))
+
+
+def test_unknown_group_is_refused(results, tmp_path):
+    with pytest.raises(ValueError, match="no result has height; choose from attitude, velocity, position"):
+        page.write("demo", results, tmp_path, page.Options(groups=("height",)))
+
+
+def test_text_of_a_stranger_is_not_markup(tmp_path):
+    synthetic.write(tmp_path / "demo", synthetic.Method("<b>sir</b>|x", 1.0), runs=5, steps=20)
+    made = page.write("demo", tmp_path, tmp_path / "reports", QUICK)
+    assert "<b>sir" not in made.read_text()
+    assert r"<b>sir</b>\|x" in (made.parent / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"), (-0.0, "0"), (1.0, "1.00"), (9.996, "10.0"), (123.456, "123"), (99_949.0, "99949"), (0.00123, "0.00123"),
+        (1.2e-7, "1.20e-07"), (3e8, "3.00e+08"), (-2.5, "-2.50"), (float("nan"), "–"), (float("inf"), "∞"),
+        (7, "7"), (True, "yes"), ("a", "a"), (None, "–"), (np.float64(0.5), "0.500"), (np.int64(40), "40"),
+    ],
+)  # fmt: skip
+def test_numbers_have_three_digits(value, text):
+    assert tables.number(value) == text
+
+
+def test_markdown_columns_line_up():
+    text = tables.markdown(pd.DataFrame({"a|b": ["x", "yy"], "n": [1.0, 20.0]}))
+    assert text.splitlines() == ["| a\\|b |    n |", "|------|-----:|", "| x    | 1.00 |", "| yy   | 20.0 |"]
+
+
+def test_estimated_track_is_truth_plus_error(results):
+    (cell,) = cells("demo", results)
+    loaded = {job.label: job.load() for job in cell.jobs}
+    style = looks(list(loaded))
+    plan, height = figures.track(loaded, 2, style).axes
+    line = next(line for line in plan.lines if line.get_label() == "ekf")
+    arrays = loaded["ekf"].arrays
+    np.testing.assert_allclose(line.get_xdata(), arrays["track"][2, :, 0] + arrays["error"][2, :, 6], rtol=1e-5)
+    np.testing.assert_allclose(line.get_ydata(), arrays["track"][2, :, 1] + arrays["error"][2, :, 7], rtol=1e-5)
+    up = arrays["track"][2, :, 2] + arrays["error"][2, :, 8]
+    assert any(np.allclose(line.get_ydata(), up, rtol=1e-5) for line in height.lines)
+
+
+def test_a_late_divergence_is_never_cut_off():
+    axis = Figure().subplots()
+    curve = np.ones(100)
+    curve[0], curve[-1] = 1000.0, 500.0
+    axis.plot(curve)
+    zoom(axis, [curve])
+    assert axis.get_ylim()[1] >= 500
+    curve[-1] = 1.0
+    zoom(axis, [curve])
+    assert axis.get_ylim()[1] < 10
+
+
+def test_templates_are_packaged():
+    here = Path(page.__file__).parent
+    patterns = tomllib.loads((here.parents[1] / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    shipped = {path.name for pattern in patterns["pfbench.report"] for path in here.glob(pattern)}
+    assert {"page.html.jinja", "page.md.jinja", "text.jinja", "style.css"} <= shipped

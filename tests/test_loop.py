@@ -1,0 +1,112 @@
+"""The time loop: what it refuses, what it hands to watchers, and that watching changes nothing."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from pfbench.draws import MonteCarlo
+from pfbench.filter.belief import Info
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.loop import run_filter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.rules import Cubature, Jacobian, Points
+from pfbench.model.linear import linear_walk, local_level
+from pfbench.model.toys import Growth
+from pfbench.record import Record
+
+MODEL = linear_walk(1.0, 0.5, 1.0)
+METHODS = [ParticleFilter(30), GaussianFilter(Jacobian()), GaussianFilter(Points(Cubature()))]
+every_method = pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+
+
+def draws(runs: int = 3) -> MonteCarlo:
+    return MonteCarlo(1, torch.arange(runs))
+
+
+def record(steps: int = 7, runs: int = 3) -> Record:
+    return Record(MonteCarlo(2, torch.arange(runs)).normal("y", steps, 1))
+
+
+def test_an_empty_record_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one time step"):
+        run_filter(METHODS[0], MODEL, Record(torch.zeros(3, 0, 1)), draws())
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf])
+def test_infinite_measurements_are_refused(value: float) -> None:
+    seen = record()
+    seen.y[1, 2] = value
+    with pytest.raises(ValueError, match="NaN"):
+        run_filter(METHODS[0], MODEL, seen, draws())
+
+
+@every_method
+def test_shapes(method: ParticleFilter | GaussianFilter) -> None:
+    estimate = run_filter(method, MODEL, record(), draws())
+    assert estimate.mean.shape == estimate.variance.shape == (3, 7, 2)
+    assert estimate.log_evidence.shape == estimate.lost.shape == (3,)
+    assert all(value.shape == (3, 7) for value in estimate.trace.values())
+    assert estimate.lost.dtype == torch.bool
+
+
+@every_method
+def test_watch_and_tick_are_called_at_every_step_and_change_nothing(method: ParticleFilter | GaussianFilter) -> None:
+    seen: list[int] = []
+    ticks: list[None] = []
+
+    def watch(t: int, info: Info) -> dict[str, torch.Tensor]:
+        seen.append(t)
+        return {"corner": info.blocks["state"][:, 0, 1], "block": info.blocks["state"]}
+
+    plain = run_filter(method, MODEL, record(), draws())
+    watched = run_filter(method, MODEL, record(), draws(), watch=watch, tick=lambda: ticks.append(None))
+    assert seen == list(range(7))
+    assert len(ticks) == 7
+    assert torch.equal(plain.mean, watched.mean)
+    assert torch.equal(plain.log_evidence, watched.log_evidence)
+    assert set(watched.trace) == set(plain.trace) | {"corner", "block"}
+    assert watched.trace["block"].shape == (3, 7, 2, 2)
+    assert torch.equal(watched.trace["corner"], watched.trace["block"][..., 0, 1])
+    assert torch.allclose(watched.trace["block"].diagonal(dim1=-2, dim2=-1), watched.variance)
+
+
+@every_method
+def test_the_evidence_is_additive(method: ParticleFilter | GaussianFilter) -> None:
+    """Unseen steps at the end add nothing to it."""
+    seen = record()
+    padded = Record(torch.cat([seen.y, torch.full((3, 4, 1), torch.nan, dtype=torch.float64)], 1))
+    short, long = (run_filter(method, MODEL, r, draws()) for r in (seen, padded))
+    assert torch.allclose(short.log_evidence, long.log_evidence, rtol=1e-12)
+    assert torch.equal(short.mean, long.mean[:, :7])
+    assert bool((long.variance[:, -1] > long.variance[:, 6]).all())
+
+
+@every_method
+def test_the_caller_s_record_is_left_alone(method: ParticleFilter | GaussianFilter) -> None:
+    seen = record()
+    before = seen.y.clone()
+    run_filter(method, Growth(), seen, draws())
+    assert torch.equal(seen.y, before)
+    assert seen.u == ()
+
+
+@every_method
+def test_a_model_that_sees_its_initial_state(method: ParticleFilter | GaussianFilter) -> None:
+    """With nothing seen, the first estimate is the initial law itself; the second has moved once."""
+    still, moved = (local_level(3.0, 1.0, 5.0, 2.0, observes_initial=flag) for flag in (True, False))
+    nothing = Record(torch.full((3, 2, 1), torch.nan, dtype=torch.float64))
+    method = ParticleFilter(20_000) if isinstance(method, ParticleFilter) else method
+    a, b = (run_filter(method, m, nothing, draws()) for m in (still, moved))
+    slack = 5 * math.sqrt(2 / 20_000) if isinstance(method, ParticleFilter) else 1e-12
+    for estimate, expected in ((a, (4.0, 13.0)), (b, (13.0, 22.0))):
+        assert torch.allclose(estimate.variance[..., 0], torch.tensor(expected, dtype=torch.float64).expand(3, -1), rtol=slack)
+
+
+@every_method
+def test_the_model_s_precision_decides(method: ParticleFilter | GaussianFilter) -> None:
+    model = linear_walk(1.0, 0.5, 1.0).float()
+    estimate = run_filter(method, model, record(), MonteCarlo(1, torch.arange(3), torch.float32))
+    assert estimate.mean.dtype == estimate.variance.dtype == torch.float32

@@ -1,0 +1,590 @@
+"""Particle filters: unbiased where they say they are exact, at the rate 1/sqrt N, and every run on its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import oracles
+import pytest
+import torch
+from pyro.distributions import Uniform
+from scipy import stats
+from torch import Tensor
+from torch.distributions import Distribution, Independent
+
+from pfbench.chart import Chart, Euclidean, wrap
+from pfbench.draws import Draws, MonteCarlo
+from pfbench.filter.belief import Cloud, ess, weights
+from pfbench.filter.loop import Estimate, run_filter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.preferences import LookAhead, Weights
+from pfbench.filter.resamplers import (
+    Killing,
+    Multinomial,
+    Regularise,
+    Resample,
+    Residual,
+    Scheme,
+    Ssp,
+    Stratified,
+    Systematic,
+)
+from pfbench.model.base import StateSpaceModel
+from pfbench.model.linear import LinearGaussian, linear_walk, local_level
+from pfbench.model.toys import Benes, Growth, Lorenz63, Pendulum, StochasticVolatility
+from pfbench.record import Record
+
+SCHEMES: list[Scheme] = [Systematic(), Stratified(), Multinomial(), Residual(), Ssp(), Killing()]
+
+
+class Exact(NamedTuple):
+    """What a filter should find after the last measurement: mean, E x^2 (per component [D]) and log evidence."""
+
+    mean: np.ndarray
+    square: np.ndarray
+    log_z: float
+
+
+def run(method: ParticleFilter, model: StateSpaceModel, y: Tensor, seed: int = 1, **options: Any) -> Estimate:
+    """One record y [T, Dy] filtered in as many runs as `options["runs"]` says, or y [R, T, Dy] as it is."""
+    if y.dim() == 2:
+        y = y.expand(options.pop("runs"), -1, -1)
+    draws = MonteCarlo(seed, torch.arange(y.shape[0]), model.anchor.dtype)
+    return run_filter(method, model, Record(y, options.pop("u", ()), options.pop("start", None)), draws, **options)
+
+
+def check_unbiased(method: ParticleFilter, model: StateSpaceModel, y: Tensor, exact: Exact, runs: int = 2000) -> None:
+    """E[Z_hat f_hat] = Z f for f = 1, x, x^2 and any number of particles [Del Moral 2004]: no bias to allow for."""
+    estimate = run(method, model, y, runs=runs)
+    ratio = torch.exp(estimate.log_evidence - exact.log_z).numpy()
+    mean, variance = estimate.mean[:, -1].numpy(), estimate.variance[:, -1].numpy()
+    scale = np.sqrt(exact.square)
+    values = [ratio - 1.0]
+    values += list((ratio[:, None] * (mean - exact.mean) / scale).T)
+    values += list((ratio[:, None] * ((variance + mean**2) / exact.square - 1.0)).T)
+    for value in values:
+        error = value.std() / math.sqrt(runs)
+        assert error < 0.2, "too few runs to tell anything"
+        assert abs(value.mean()) < 4.5 * error, f"{value.mean():.4f} +- {error:.4f}"
+
+
+# models with an answer
+
+WALK = linear_walk(1.0, 0.5, 1.0)
+WALK_Y = torch.tensor([[0.8], [2.9], [1.2], [math.nan], [3.0], [6.5]], dtype=torch.float64)
+
+
+def kalman(model: LinearGaussian, y: Tensor) -> Exact:
+    f, g, h, r, m0, root = (getattr(model, k).numpy() for k in ("f", "g", "h", "r", "m0", "l0"))
+    k = oracles.kalman(f, g @ g.T, h, np.diag(r**2), m0, root @ root.T, y.numpy(), model.observes_initial)
+    return Exact(k.mean[-1], np.diagonal(k.covariance[-1]) + k.mean[-1] ** 2, float(k.log_evidence.sum()))
+
+
+def by_grid(grid: np.ndarray, prior: np.ndarray, y: Tensor, transition: Any, log_likelihood: Any) -> Exact:
+    mean, variance, log_z = oracles.grid_filter(grid, prior, transition, log_likelihood, len(y))
+    return Exact(mean[-1:], variance[-1:] + mean[-1:] ** 2, log_z)
+
+
+def growth_case() -> tuple[StateSpaceModel, Tensor, Exact]:
+    """Measurements of a path that the model might take, in noise that leaves both signs of the state possible."""
+    rng, x, rows = np.random.default_rng(3), 0.5, []
+    for t in range(1, 7):
+        x = x / 2 + 25 * x / (1 + x**2) + 8 * np.cos(1.2 * t) + math.sqrt(10) * rng.normal()
+        rows.append([x**2 / 20 + 4.0 * rng.normal()])
+    y, grid = torch.tensor(rows), np.linspace(-45, 45, 1501)
+
+    def transition(t: int) -> np.ndarray:
+        centre = grid / 2 + 25 * grid / (1 + grid**2) + 8 * np.cos(1.2 * (t + 1))
+        return oracles.normal_density(grid[:, None], centre[None], math.sqrt(10.0))
+
+    def log_likelihood(t: int) -> np.ndarray:
+        return -0.5 * ((y[t].item() - grid**2 / 20) / 4.0) ** 2 - 0.5 * math.log(2 * math.pi * 16.0)
+
+    prior = oracles.normal_density(grid, 0.0, math.sqrt(2.0))
+    return Growth(measurement_sd=4.0), y, by_grid(grid, prior, y, transition, log_likelihood)
+
+
+def volatility_case() -> tuple[StateSpaceModel, Tensor, Exact]:
+    y = torch.tensor([[0.3], [-1.1], [2.0], [0.1], [-0.7], [0.2], [1.5], [-0.4]], dtype=torch.float64)
+    grid = np.linspace(-7, 5, 1201)
+    matrix = oracles.normal_density(grid[:, None], -1.0 + 0.95 * (grid[None] + 1.0), 0.3)
+    prior = oracles.normal_density(grid, -1.0, 0.3 / math.sqrt(1 - 0.95**2))
+
+    def log_likelihood(t: int) -> np.ndarray:
+        return -0.5 * y[t].item() ** 2 * np.exp(-grid) - 0.5 * grid - 0.5 * math.log(2 * math.pi)
+
+    return StochasticVolatility(-1.0, 0.95, 0.3), y, by_grid(grid, prior, y, lambda t: matrix, log_likelihood)
+
+
+def benes_case() -> tuple[StateSpaceModel, Tensor, Exact]:
+    """Steps so large that the law of the next state has two modes."""
+    y = torch.tensor([[0.4], [-0.3], [1.9], [2.2], [4.0]], dtype=torch.float64)
+    mean, variance, log_z = oracles.benes(y[:, 0].numpy(), 0.8, 1.0)
+    return Benes(0.8, 1.0), y, Exact(mean[-1:], variance[-1:] + mean[-1:] ** 2, log_z)
+
+
+def level_case() -> tuple[StateSpaceModel, Tensor, Exact]:
+    model = local_level(1.0, 1.5, 3.0, 2.0, observes_initial=True)
+    y = torch.tensor([[4.0], [1.0], [2.5], [math.nan], [5.0]], dtype=torch.float64)
+    return model, y, kalman(model, y)
+
+
+def singular_case() -> tuple[StateSpaceModel, Tensor, Exact]:
+    """Three states, one noise, a correlated initial law, measurements that are partly missing."""
+    model = LinearGaussian(
+        [[0.9, 0.5, 0.0], [0.0, 0.8, 0.3], [0.1, 0.0, 0.7]], [[0.0], [0.3], [1.0]],
+        [[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]], [1.0, 2.0],
+        [1.0, 0.0, -1.0], [[1.0, 0.0, 0.0], [0.8, 0.5, 0.0], [0.3, -0.4, 0.7]],
+    )  # fmt: skip
+    y = torch.tensor([[2.0, 1.0], [math.nan, -1.0], [0.5, math.nan], [1.5, 1.0]], dtype=torch.float64)
+    return model, y, kalman(model, y)
+
+
+CASES: dict[str, Callable[[], tuple[StateSpaceModel, Tensor, Exact]]] = {
+    "growth": growth_case,
+    "volatility": volatility_case,
+    "benes": benes_case,
+    "level seen at once": level_case,
+    "singular": singular_case,
+}
+PREFERENCES = {"weights": Weights(), "look ahead": LookAhead(), "look ahead, tempered": LookAhead(0.5)}
+
+
+def test_the_benes_closed_form_agrees_with_a_grid() -> None:
+    """The oracle against another one, made from the transition density alone."""
+    _, y, exact = benes_case()
+    grid = np.linspace(-14, 14, 2801)
+    matrix = oracles.normal_density(grid[:, None], grid[None], math.sqrt(0.8)) * np.cosh(grid[:, None]) / np.cosh(grid[None])
+    first = oracles.normal_density(grid, 0.0, math.sqrt(0.8)) * np.cosh(grid) * math.exp(-0.4)
+
+    def transition(t: int) -> np.ndarray:
+        return np.tile(first[:, None], (1, len(grid))) if t == 0 else matrix * math.exp(-0.4)
+
+    mean, variance, log_z = oracles.grid_filter(
+        grid, np.ones_like(grid), transition, lambda t: np.log(oracles.normal_density(y[t].item(), grid, 1.0)), len(y)
+    )
+    assert log_z == pytest.approx(exact.log_z, abs=1e-8)
+    assert mean[-1] == pytest.approx(exact.mean[0], abs=1e-8)
+    assert variance[-1] + mean[-1] ** 2 == pytest.approx(exact.square[0], rel=1e-8)
+
+
+# unbiasedness
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("scheme", SCHEMES, ids=lambda s: type(s).__name__)
+def test_every_scheme_is_unbiased(scheme: Scheme, threshold: float) -> None:
+    method = ParticleFilter(25, Resample(scheme, threshold))
+    assert method.exact
+    check_unbiased(method, WALK, WALK_Y, kalman(WALK, WALK_Y))
+
+
+@pytest.mark.parametrize("threshold", [0.5, 1.0])
+@pytest.mark.parametrize("preference", ["look ahead", "look ahead, tempered"])
+def test_the_auxiliary_filter_is_unbiased(preference: str, threshold: float) -> None:
+    method = ParticleFilter(25, Resample(Systematic(), threshold), preference=PREFERENCES[preference])
+    check_unbiased(method, WALK, WALK_Y, kalman(WALK, WALK_Y))
+
+
+@pytest.mark.parametrize("preference", PREFERENCES)
+@pytest.mark.parametrize("case", CASES)
+def test_unbiased_on_models_with_an_answer(case: str, preference: str) -> None:
+    model, y, exact = CASES[case]()
+    check_unbiased(ParticleFilter(60, Resample(Systematic(), 0.7), preference=PREFERENCES[preference]), model, y, exact)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_unbiased_with_narrow_error_bars(case: str) -> None:
+    model, y, exact = CASES[case]()
+    check_unbiased(ParticleFilter(400, Resample(Ssp(), 0.5)), model, y, exact, runs=8000)
+
+
+def test_nile_evidence() -> None:
+    y = torch.tensor(np.loadtxt(Path(__file__).parent / "nile.csv", delimiter=",", skiprows=1)[:, 1:])
+    model = local_level(math.sqrt(1470.0), math.sqrt(15100.0), 1000.0, math.sqrt(1000.0))
+    estimate = run(ParticleFilter(400), model, y, runs=200)
+    ratio = torch.exp(estimate.log_evidence + 638.8133628).numpy()
+    assert ratio.std() < 2.0
+    assert abs(ratio.mean() - 1.0) < 4 * ratio.std() / math.sqrt(200)
+    one = np.eye(1)
+    exact = oracles.kalman(one, 1470.0 * one, one, 15100.0 * one, np.array([1000.0]), 1000.0 * one, y.numpy())
+    sd = np.sqrt(exact.covariance[:, 0, 0])
+    z = (estimate.mean[..., 0].numpy().mean(0) - exact.mean[:, 0]) / sd
+    # each run's mean is within a few 1/sqrt N of the exact one; the average of 200 within a few 1/sqrt(200 N)
+    assert np.abs(z).max() < 10 / math.sqrt(200 * 400) + 10 / 400
+
+
+# the tests above can fail
+
+
+@dataclasses.dataclass(frozen=True)
+class Careless:
+    """A resampler with a planted mistake in the weights it hands on."""
+
+    mistake: str
+    exact = True
+
+    def __call__(self, model: StateSpaceModel, cloud: Cloud, log_a: Tensor, n: Tensor, draws: Draws) -> tuple[Cloud, Tensor]:
+        fresh, hit = Resample(Systematic(), 0.8)(model, cloud, log_a, n, draws)
+        flat = torch.full_like(fresh.log_w, -math.log(fresh.log_w.shape[1]))
+        if self.mistake == "preference not corrected":
+            return fresh._replace(log_w=torch.where(hit[:, None], flat, fresh.log_w)), hit
+        if self.mistake == "weights not reset":
+            return fresh._replace(log_w=torch.where(hit[:, None], cloud.log_w, fresh.log_w)), hit
+        if self.mistake == "weights reset in every run":
+            return fresh._replace(log_w=flat), hit
+        return fresh._replace(x=torch.where(hit[:, None, None], fresh.x.flip(1), fresh.x)), hit
+
+
+@pytest.mark.parametrize("mistake", ["preference not corrected", "weights not reset", "weights reset in every run"])
+def test_the_test_of_unbiasedness_sees_mistakes(mistake: str) -> None:
+    method = ParticleFilter(25, Careless(mistake), preference=LookAhead())
+    with pytest.raises(AssertionError):
+        check_unbiased(method, WALK, WALK_Y, kalman(WALK, WALK_Y))
+
+
+def test_an_exchange_of_equal_particles_is_no_mistake() -> None:
+    method = ParticleFilter(25, Careless("order"))
+    check_unbiased(method, WALK, WALK_Y, kalman(WALK, WALK_Y))
+
+
+@pytest.mark.parametrize("shrink", [False, True])
+def test_regularisation_says_that_it_is_not_exact_and_is_right(shrink: bool) -> None:
+    method = ParticleFilter(25, Regularise(Resample(Systematic(), 1.0), shrink=shrink))
+    assert not method.exact
+    with pytest.raises(AssertionError):
+        check_unbiased(method, WALK, WALK_Y, kalman(WALK, WALK_Y), runs=20_000)
+
+
+def test_regularisation_is_harmless_with_many_particles() -> None:
+    """The kernel's h^2 is 0.01 at N = 2000, of which no more than a few sums up; the mean moves by far less than a spread."""
+    exact = kalman(WALK, WALK_Y)
+    estimate = run(ParticleFilter(2000, Regularise(Resample(Systematic()))), WALK, WALK_Y, runs=50)
+    off = (estimate.mean[:, -1].numpy() - exact.mean) / np.sqrt(exact.square - exact.mean**2)
+    assert np.abs(off.mean(0)).max() < 0.05
+
+
+# the rate
+
+
+def squared_errors(particles: int, runs: int) -> np.ndarray:
+    """Squared distance to Kalman's means over the whole walk, in units of its spread [R]."""
+    rng = np.random.default_rng(2)
+    y = torch.tensor(np.cumsum(rng.normal(size=(20, 1)), 0) + rng.normal(size=(20, 1)))
+    f, g, h, r, m0, root = (getattr(WALK, k).numpy() for k in ("f", "g", "h", "r", "m0", "l0"))
+    k = oracles.kalman(f, g @ g.T, h, np.diag(r**2), m0, root @ root.T, y.numpy())
+    estimate = run(ParticleFilter(particles), WALK, y, runs=runs)
+    sd = np.sqrt(np.diagonal(k.covariance, axis1=1, axis2=2))
+    return (((estimate.mean.numpy() - k.mean) / sd) ** 2).mean((1, 2))
+
+
+@pytest.mark.slow
+def test_errors_fall_with_the_root_of_the_number_of_particles() -> None:
+    sizes, runs = np.array([128, 512, 2048, 8192]), 150
+    logs, errors = [], []
+    for n in sizes:
+        s = squared_errors(int(n), runs)
+        logs.append(0.5 * math.log(s.mean()))
+        errors.append(0.5 * s.std() / s.mean() / math.sqrt(runs))
+    x = np.log(sizes) - np.log(sizes).mean()
+    slope, error = x @ logs / (x @ x), math.sqrt((x**2) @ np.square(errors)) / (x @ x)
+    assert error < 0.02
+    assert abs(slope + 0.5) < 4 * error, f"{slope:.3f} +- {error:.3f}"
+
+
+@pytest.mark.slow
+def test_same_error_law_as_pyro_s_filter() -> None:
+    """Pyro resamples systematically below ESS = N/2 too, but at the end of a step: almost the same law of errors."""
+    import pyro
+    import pyro.distributions as dist
+    from pyro.infer import SMCFilter
+
+    n, runs = 300, 150
+    y = WALK_Y.nan_to_num(2.0)
+
+    class Walk:
+        def init(self, state: dict, *args: Any) -> None:
+            state["x"] = pyro.sample("x_init", dist.Normal(WALK.m0, WALK.l0.diagonal()).to_event(1))
+            self.t = 0
+
+        def step(self, state: dict, value: Tensor | None = None) -> None:
+            self.t += 1
+            law = dist.MultivariateNormal(state["x"] @ WALK.f.mT, scale_tril=WALK.g)
+            state["x"] = pyro.sample(f"x_{self.t}", law)
+            pyro.sample(f"y_{self.t}", dist.Normal(state["x"][..., 0], WALK.r[0]), obs=value)
+
+    class Guide(Walk):
+        def step(self, state: dict, value: Tensor | None = None) -> None:
+            self.t += 1
+            state["x"] = pyro.sample(f"x_{self.t}", dist.MultivariateNormal(state["x"] @ WALK.f.mT, scale_tril=WALK.g))
+
+    exact, theirs = kalman(WALK, y), []
+    with torch.random.fork_rng():
+        for seed in range(runs):
+            pyro.set_rng_seed(seed)
+            smc = SMCFilter(Walk(), Guide(), num_particles=n, max_plate_nesting=1, ess_threshold=0.5)
+            smc.init()
+            for value in y[:, 0]:
+                smc.step(value)
+            theirs.append(smc.get_empirical()["x"].mean.numpy() - exact.mean)
+    ours = run(ParticleFilter(n), WALK, y, runs=runs).mean[:, -1].numpy() - exact.mean
+    for component in range(2):
+        a, b = ours[:, component], np.array(theirs)[:, component]
+        assert stats.ks_2samp(a, b).pvalue > 1e-3
+        for errors in (a, b):
+            assert abs(errors.mean()) < 4 * errors.std() / math.sqrt(runs) + 2 / n
+
+
+# what a step does
+
+
+def belief(model: StateSpaceModel, n: int = 40, runs: int = 3) -> Cloud:
+    cloud = ParticleFilter(n).init(model, runs, MonteCarlo(5, torch.arange(runs)))
+    log_w = MonteCarlo(5, torch.arange(runs)).normal("w", n, 1)[..., 0].log_softmax(-1)
+    return cloud._replace(log_w=log_w)
+
+
+def test_the_first_cloud_has_the_moments_of_the_initial_law() -> None:
+    model, _, _ = singular_case()
+    x = ParticleFilter(50_000).init(model, 2, MonteCarlo(5, torch.arange(2))).x.numpy().reshape(-1, 3)
+    covariance = (model.l0 @ model.l0.mT).numpy()
+    sd = np.sqrt(np.diag(covariance))
+    assert np.all(np.abs(x.mean(0) - model.m0.numpy()) < 4 * sd / math.sqrt(len(x)))
+    error = np.sqrt((np.outer(sd, sd) ** 2 + covariance**2) / len(x))
+    assert np.all(np.abs(np.cov(x.T) - covariance) < 4.5 * error)
+
+
+def test_estimates_are_weighted_moments() -> None:
+    method = ParticleFilter(40, Resample(Systematic(), 0.0))
+    seen = Record(torch.full((3, 1), 0.3, dtype=torch.float64))
+    cloud, info = method.step(WALK, belief(WALK), seen, MonteCarlo(1, torch.arange(3)))
+    for r in range(3):
+        x, w = cloud.x[r].numpy(), np.exp(cloud.log_w[r].numpy())
+        assert w.sum() == pytest.approx(1.0)
+        mean, covariance = w @ x, np.cov(x.T, aweights=w, ddof=0)
+        assert np.allclose(info.mean[r], mean)
+        assert np.allclose(info.variance[r], np.diag(covariance))
+        for name, parts in WALK.groups.items():
+            assert np.allclose(info.blocks[name][r], covariance[np.ix_(parts, parts)])
+        assert float(info.trace["ess"][r]) == pytest.approx(1 / (w**2).sum())
+
+
+@pytest.mark.parametrize("preference", PREFERENCES)
+def test_a_step_that_sees_nothing_changes_no_weight(preference: str) -> None:
+    before = belief(WALK)
+    method = ParticleFilter(40, Resample(Systematic(), 0.0), preference=PREFERENCES[preference])
+    seen = Record(torch.full((3, 1), torch.nan, dtype=torch.float64))
+    after, info = method.step(WALK, before, seen, MonteCarlo(1, torch.arange(3)))
+    assert torch.allclose(after.log_w, before.log_w, atol=1e-14)
+    assert torch.allclose(after.log_z, before.log_z, atol=1e-14)
+    assert torch.allclose(info.trace["ess"], ess(before.log_w))
+    assert not torch.equal(after.x, before.x)  # but time goes on
+
+
+def test_resampling_is_told() -> None:
+    method = ParticleFilter(40, Resample(Systematic(), 0.6))
+    estimate = run(method, WALK, WALK_Y, runs=50)
+    assert estimate.trace["resampled"].dtype == torch.bool
+    before = torch.cat([torch.full((50, 1), 40.0, dtype=torch.float64), estimate.trace["ess"][:, :-1]], 1)
+    assert torch.equal(estimate.trace["resampled"], before < 0.6 * 40)
+    assert 0 < int(estimate.trace["resampled"].sum()) < estimate.trace["resampled"].numel()
+
+
+@dataclasses.dataclass(frozen=True)
+class Shift:
+    """A move that shifts refreshed runs, to see where it stands in the step."""
+
+    exact: bool = False
+
+    def __call__(self, model: StateSpaceModel, cloud: Cloud, hit: Tensor, draws: Draws) -> tuple[Cloud, Tensor]:
+        return cloud._replace(x=cloud.x + 100.0 * hit[:, None, None]), 0.25 * hit.double()
+
+
+def test_moves_come_after_the_refresh_and_before_the_proposal() -> None:
+    seen, draws = Record(torch.full((3, 1), torch.nan, dtype=torch.float64)), MonteCarlo(1, torch.arange(3))
+    before = belief(WALK)
+    before = before._replace(log_w=torch.cat([before.log_w[:2], torch.full((1, 40), -math.log(40)).double()]))
+    plain = ParticleFilter(40, Resample(Systematic(), 0.9))
+    still, _ = plain.step(WALK, before, seen, draws)
+    moved, info = dataclasses.replace(plain, moves=(Shift(),)).step(WALK, before, seen, draws)
+    assert info.trace["resampled"].tolist() == [True, True, False]
+    shift = (torch.tensor([100.0, 100.0], dtype=torch.float64) @ WALK.f.mT).expand(40, -1)
+    assert torch.allclose(moved.x[:2] - still.x[:2], shift)
+    assert torch.equal(moved.x[2], still.x[2])
+    assert info.trace["accepted_0"].tolist() == [0.25, 0.25, 0.0]
+    assert not dataclasses.replace(plain, moves=(Shift(),)).exact
+    assert dataclasses.replace(plain, moves=(Shift(exact=True),)).exact
+
+
+@pytest.mark.parametrize("particles", [1, 0, -5])
+def test_too_few_particles_are_refused(particles: int) -> None:
+    with pytest.raises(ValueError, match=f"particles={particles}"):
+        ParticleFilter(particles)
+
+
+@pytest.mark.parametrize("power", [0.0, 1.5, math.nan])
+def test_a_power_of_no_use_is_refused(power: float) -> None:
+    with pytest.raises(ValueError, match="power"):
+        LookAhead(power)
+
+
+# one run, its neighbours, its past and its future
+
+FILTERS: dict[str, ParticleFilter] = {
+    **{type(s).__name__: ParticleFilter(50, Resample(s, 0.7)) for s in SCHEMES},
+    "auxiliary": ParticleFilter(50, preference=LookAhead()),
+    "regularised": ParticleFilter(50, Regularise(Resample(Systematic()))),
+    "shrunk": ParticleFilter(50, Regularise(Resample(Systematic(), 1.0), shrink=True)),
+}
+every_filter = pytest.mark.parametrize("method", FILTERS.values(), ids=FILTERS.keys())
+every_toy = pytest.mark.parametrize(
+    "model", [WALK, Growth(), StochasticVolatility(), Benes(), Pendulum(), Lorenz63()], ids=lambda m: type(m).__name__
+)
+
+
+def measurements(model: StateSpaceModel, runs: int = 4, steps: int = 8) -> Tensor:
+    dy = model.observation(torch.ones(1, 1, model.chart.size, dtype=torch.float64), ()).event_shape[0]
+    mean = model.initial(1).mean[0, :dy] if dy == 3 else 0.0
+    return mean + MonteCarlo(8, torch.arange(runs)).normal("y", steps, dy)
+
+
+@every_filter
+@every_toy
+def test_the_future_is_not_used(method: ParticleFilter, model: StateSpaceModel) -> None:
+    y = measurements(model)
+    other = y.clone()
+    other[:, 5:] = other[:, 5:] + 0.7
+    other[:, 6] = torch.nan
+    one, two = run(method, model, y), run(method, model, other)
+    assert torch.equal(one.mean[:, :5], two.mean[:, :5])
+    assert torch.equal(one.variance[:, :5], two.variance[:, :5])
+    assert bool(torch.isfinite(one.mean).all())
+
+
+@every_filter
+@every_toy
+def test_a_run_cannot_feel_its_neighbours(method: ParticleFilter, model: StateSpaceModel) -> None:
+    y = measurements(model)
+    together = run(method, model, y)
+    alone = run_filter(method, model, Record(y[2:3]), MonteCarlo(1, torch.tensor([2])))
+    assert torch.allclose(alone.mean[0], together.mean[2], rtol=1e-12, atol=1e-12)
+    assert torch.allclose(alone.variance[0], together.variance[2], rtol=1e-12, atol=1e-12)
+    assert torch.allclose(alone.log_evidence[0], together.log_evidence[2], rtol=1e-12)
+
+
+@every_filter
+def test_an_impossible_measurement_loses_its_run_alone(method: ParticleFilter) -> None:
+    y = measurements(WALK)
+    healthy = run(method, WALK, y)
+    y[1, 3] = 1e200
+    estimate = run(method, WALK, y)
+    assert estimate.lost.tolist() == [False, True, False, False]
+    assert float(estimate.log_evidence[1]) == -math.inf
+    assert bool(torch.isnan(estimate.mean[1, 3:]).all())
+    assert torch.equal(estimate.mean[1, :3], healthy.mean[1, :3])
+    for r in (0, 2, 3):
+        assert torch.allclose(estimate.mean[r], healthy.mean[r], rtol=1e-12, atol=1e-14)
+
+
+class Fragile(LinearGaussian):
+    """A walk whose mechanisation fails far out: some particles become NaN, others infinite."""
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        moved = super().propagate(x, u, w)
+        moved = torch.where(x[..., :1] > 2.5, torch.nan, moved)
+        return torch.where(x[..., :1] < -2.5, torch.inf, moved)
+
+
+@every_filter
+def test_particles_that_have_become_nan_weigh_nothing(method: ParticleFilter) -> None:
+    """One sick particle must not make the estimate of its run NaN: 0 * NaN is NaN."""
+    model = Fragile(*(getattr(WALK, k) for k in ("f", "g", "h", "r", "m0", "l0")))
+    estimate = run(method, model, torch.zeros(6, 1, dtype=torch.float64), runs=40)
+    assert not bool(estimate.lost.any())
+    assert bool(torch.isfinite(estimate.mean).all())
+    assert bool(torch.isfinite(estimate.variance).all())
+    sick = run(method, model, torch.full((6, 1), torch.nan, dtype=torch.float64), runs=40)
+    assert bool(torch.isfinite(sick.mean[~sick.lost]).all())
+
+
+class Boxed(LinearGaussian):
+    """A walk that is seen within plus or minus a half: most of the particles are impossible."""
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        half = 0.5 * torch.ones_like(x[..., :1])
+        return Independent(Uniform(x[..., :1] - half, x[..., :1] + half, validate_args=False), 1)
+
+
+def test_a_look_ahead_that_finds_nothing_possible_falls_back_on_the_weights() -> None:
+    """The quiet state of each particle may be impossible while its noisy children are not."""
+    model = Boxed([[1.0]], [[2.0]], [[1.0]], [1.0], [0.0], [1e-3])
+    y = torch.tensor([[3.0]], dtype=torch.float64)
+    estimate = run(ParticleFilter(200, Resample(Systematic(), 1.0), preference=LookAhead()), model, y, runs=2000)
+    law = stats.norm(0.0, math.sqrt(4.0 + 1e-6))
+    truth = law.cdf(3.5) - law.cdf(2.5)
+    z = torch.exp(estimate.log_evidence).numpy()
+    assert abs(z.mean() - truth) < 4 * z.std() / math.sqrt(len(z))
+
+
+# angles, precision, start
+
+
+class Unrolled(Pendulum):
+    """The pendulum on the real line."""
+
+    @property
+    def chart(self) -> Chart:
+        return Chart((Euclidean(2),))
+
+
+def test_angles_that_cross_the_cut_change_nothing() -> None:
+    y = torch.sin(torch.linspace(3.0, 12.0, 25, dtype=torch.float64)).reshape(1, 25, 1).expand(2, -1, -1)
+    start = torch.tensor([[3.0, 8.0], [-3.1, -9.0]], dtype=torch.float64)
+    circle, line = (run(ParticleFilter(200), m, y, start=start) for m in (Pendulum(), Unrolled()))
+    assert float(line.mean[..., 0].abs().max()) > 5.0
+    assert torch.allclose(wrap(circle.mean[..., 0] - line.mean[..., 0]), torch.zeros(2, 25, dtype=torch.float64), atol=1e-7)
+    assert torch.allclose(circle.variance, line.variance, rtol=1e-6)
+    assert torch.allclose(circle.log_evidence, line.log_evidence, rtol=1e-9)
+
+
+@every_toy
+def test_single_precision_is_close_to_double(model: StateSpaceModel) -> None:
+    """Same draws; but a rounding may send a particle elsewhere at a resampling, so that runs agree in law only."""
+    y, n, runs = measurements(model, 1)[0], 200, 300
+    double = run(ParticleFilter(n), model, y, runs=runs)
+    single = run(ParticleFilter(n), model.float(), y, runs=runs)
+    model.double()
+    assert single.mean.dtype == torch.float32
+    assert single.log_evidence.dtype == torch.float64
+    for a, b in ((single.mean[:, -1], double.mean[:, -1]), (single.log_evidence[:, None], double.log_evidence[:, None])):
+        difference = model.chart.subtract(a.double(), b) if a.shape[-1] == model.chart.size else a.double() - b
+        error = difference.std(0) / math.sqrt(runs)
+        scale = b.std(0)
+        assert torch.all(difference.mean(0).abs() < 4.5 * error + 1e-3 * scale)
+        assert torch.all(difference.abs().median(0).values <= 2 * scale)
+
+
+def test_a_start_for_each_run() -> None:
+    start = torch.tensor([[0.0, 0.0], [50.0, -1.0], [-7.0, 2.0]], dtype=torch.float64)
+    y = torch.full((3, 5, 1), torch.nan, dtype=torch.float64)
+    estimate = run(ParticleFilter(4000), WALK, y, start=start)
+    expected = start
+    for t in range(5):
+        expected = expected @ WALK.f.mT
+        assert torch.all((estimate.mean[:, t] - expected).abs() < 5 * (estimate.variance[:, t] / 4000).sqrt())
+
+
+def test_weights_of_particles_sum_to_one_in_both_precisions() -> None:
+    log_w = 30 * MonteCarlo(1, torch.arange(4)).normal("w", 10_000, 1)[..., 0]
+    for dtype in (torch.float32, torch.float64):
+        assert torch.allclose(weights(log_w.to(dtype)).sum(-1).double(), torch.ones(4, dtype=torch.float64), atol=1e-5)
+    lonely = torch.full((1, 100), -torch.inf, dtype=torch.float64)
+    lonely[0, 7] = 0.0
+    assert float(ess(lonely)) == 1.0
+    assert float(ess(torch.zeros(1, 100))) == pytest.approx(100.0)
