@@ -95,7 +95,7 @@ def _list(words: list[str]) -> None:
         print("\n`pfbench list GROUP` says what each one is")
         return
     if words[0] not in groups:
-        raise ValueError(f"there is no group '{words[0]}'{_near(words[0], list(groups))}; there are {', '.join(groups)}")
+        raise ValueError(f"there is no group '{words[0]}'{_near(words[0], list(groups), '.')} There are {', '.join(groups)}")
     for path in sorted(groups[words[0]]):
         print(f"{path.stem:24} {_headline(path)}")
 
@@ -161,7 +161,8 @@ def _offer_experiments() -> None:
 def _groups() -> dict[str, list[Path]]:
     conf = conf_dir()
     folders = [folder for folder in sorted(conf.iterdir()) if any(folder.glob("*.yaml"))]
-    return {folder.name: sorted(folder.glob("*.yaml")) for folder in folders} | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
+    groups = {folder.name: sorted(folder.glob("*.yaml")) for folder in folders}
+    return groups | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
 
 
 def _headline(path: Path) -> str:
@@ -178,9 +179,10 @@ def explain(error: BaseException, words: Sequence[str] = ()) -> str:
         return _no_key(found[1], words)
     if found := re.search(r"Could not find '(.+)/([^/']*)'", text):
         options = re.findall(r"^\t(\w+)$", text, re.M)
-        return f"{found[1]}={found[2]}: there is no such {found[1]}{_near(found[2], options)}; there are {', '.join(options)}"
+        return f"{found[1]}={found[2]}: there is no such {found[1]}{_near(found[2], options, '.')} There are {', '.join(options)}"
     if found := re.search(r"Interpolation key '([^']+)' not found\s+full_key: (\S+)", text):
-        return f"{found[2]} comes from {found[1]}, which this choice does not have: give {found[2]}=..., or choose what fits together"
+        remedy = f"give {found[2]}=..., or choose a {found[1].partition('.')[0]} that has it"
+        return f"{found[2]} comes from {found[1]}, which is not there: {remedy}"
     if found := re.search(r"Missing mandatory value: (\S+)", text):
         return f"{found[1]} is not set: give {found[1]}=..."
     if found := re.search(r"Error parsing override '([^']*)'", text):
@@ -195,7 +197,7 @@ def _refused(text: str, cause: BaseException, words: Sequence[str]) -> str:
     said = " ".join(f"{cause}".split())
     if unknown := re.search(r"got an unexpected keyword argument '(\w+)'", said):
         return _no_key(f"{key}.{unknown[1]}", words)
-    if not isinstance(cause, ValueError) or type(cause) is not ValueError:
+    if type(cause) is not ValueError:
         below = [word for word in words if word.lstrip("+").startswith(f"{key}.")]
         return f"{key}: its values do not fit ({type(cause).__name__}: {said}); check {' '.join(below) or 'its yaml'}"
     named = re.match(r"(?:\w+\.)*(\w+)(?=[=:])", said)
@@ -209,20 +211,24 @@ def _refused(text: str, cause: BaseException, words: Sequence[str]) -> str:
 def _no_key(wrong: str, words: Sequence[str]) -> str:
     given = next((word for word in words if word.lstrip("+~").startswith(f"{wrong}=")), wrong)
     keys = _keys(words, wrong)
-    if wrong in keys:
+    if wrong in keys and {"-m", "--multirun"} & set(words):
         return f"{given}: not every cell of this sweep has the key '{wrong}'; sweep those that have it apart"
-    return f"{given}: there is no key '{wrong}'" + (_near(wrong, keys) or "; `pfbench run --cfg job` prints all keys")
+    others = [key for key in keys if key != wrong]
+    return f"{given}: there is no key '{wrong}'" + _near(wrong, others, "; `pfbench run --cfg job` prints all keys")
 
 
-def _near(wrong: str, options: Sequence[str]) -> str:
-    """The options that are nearest to a misspelt one, as a question."""
+def _near(wrong: str, options: Sequence[str], otherwise: str = "") -> str:
+    """The options, keys with dots or names without, that are nearest to a misspelt one, as a question."""
 
-    def likeness(option: str) -> float:
-        return difflib.SequenceMatcher(None, option, wrong).ratio()
+    def alike(a: str, b: str) -> float:
+        return difflib.SequenceMatcher(None, a, b).ratio()
 
-    near = difflib.get_close_matches(wrong, options, 3, 0.6)
-    near = [option for option in near if likeness(option) > likeness(near[0]) - 0.1]
-    return f"; did you mean {' or '.join(near)}?" if near else ""
+    def last(key: str) -> str:
+        return key.rpartition(".")[2]
+
+    near = {option: alike(option, wrong) for option in options if alike(last(option), last(wrong)) >= 0.6}
+    best = [option for option, likeness in near.items() if likeness > max(near.values()) - 0.1]
+    return f"; did you mean {' or '.join(best[:3])}?" if best else otherwise
 
 
 def _keys(words: Sequence[str], wrong: str) -> list[str]:

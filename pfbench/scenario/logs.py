@@ -193,10 +193,10 @@ def _check_turn(imu: Imu, reference: Motion, name: str, other: str) -> None:
     summed = np.cumsum(0.5 * np.diff(imu.time)[:, None] * (imu.rate[1:] + imu.rate[:-1]), axis=0)
     angle = np.vstack([np.zeros(3), summed])
     seen = np.diff(np.stack([np.interp(time, imu.time, column) for column in angle.T], axis=-1), axis=0)
-    span = np.diff(time)[:, None]
-    if np.sqrt(np.mean((true / span) ** 2)) < 0.02:
+    seen, true = (turn / np.diff(time)[:, None] for turn in (seen, true))
+    seen, true = seen - seen.mean(axis=0), true - true.mean(axis=0)  # the gyros' bias
+    if np.sqrt(np.mean(true**2)) < 0.02:
         return  # hardly turning: the comparison would be one of noise
-    seen = seen - span * np.median(seen / span, axis=0)  # the bias
     slope = float((seen * true).sum() / (true * true).sum())
     if slope > 20.0:
         raise ValueError(f"{name}: wx, wy, wz turn {slope:.0f} times as fast as {other}: in deg/s; multiply by {_DEGREE:.10f}")

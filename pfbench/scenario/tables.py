@@ -94,7 +94,7 @@ def numbers(table: Table, columns: Sequence[str]) -> Array:
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise ValueError(
-                f"{table.name}: column {column}, {table.row(int(bad[0]))} is {table.rows[column].iloc[bad[0]]!r} "
+                f"{table.name}: column {column}, {table.row(int(bad[0]))} is {table.rows[column].iloc[bad[0]]} "
                 f"({bad.size} such); give numbers, and leave out rows without data"
             )
         out[:, i] = values

@@ -94,8 +94,8 @@ def test_linear_blocks_are_derivatives_of_the_exact_equations():
     torch.testing.assert_close(linear[6:, first], exact[6:, first], rtol=1e-12, atol=1e-18)
     metres = earth.metre_scale(pos)[0]
     difference = (linear - exact)[:, 6:] / metres
-    # left out: change of the radii with latitude (3 e2 = 2 % of v / R^2 and v^2 / R^2); in the vertical channel also that
-    # of gravity with latitude (0.05 m/s^2 per rad, 0.8e-8 per metre), and half a per cent of its change with height
+    # left out: change of the radii with latitude (3 e2 = 2 % of v / R^2 and v^2 / R^2); in the vertical channel also
+    # that of gravity with latitude (0.05 m/s^2 per rad, 0.8e-8 per metre), and 0.5 % of its change with height
     assert difference[:3].abs().max() < 0.02 * 3200 / earth.A**2
     assert difference[3:5].abs().max() < 0.02 * 3200**2 / earth.A**2
     assert difference[5].abs().max() < 2.5e-8

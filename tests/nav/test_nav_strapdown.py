@@ -198,7 +198,8 @@ def test_intervals_say_what_happened():
     assert u.duration.shape == (1, seconds)
     assert (u.duration - 1).abs().max() < 1e-12
     scale = earth.metre_scale(flight.pos[::40])
-    assert ((u.pos_start[0] - flight.pos[:-1:40]) * scale[:-1]).abs().max() < 0.1
+    # an interval too early or too late would be 60 m off; the mechanisation is 0.1 m off at this rate
+    assert ((u.pos_start[0] - flight.pos[:-1:40]) * scale[:-1]).abs().max() < 1
     assert (u.vel_end[0] - flight.vel[40::40]).abs().max() < 1e-2
     assert attitude.attitude_error(flight.dcm[:-1:40], u.dcm[0]).abs().max() < 1e-6
     assert torch.equal(u.dcm[:, 1:], u.dcm_end[:, :-1])

@@ -1,0 +1,95 @@
+"""Workload W4: what users do all day. A 15-state INS error model, position and velocity measured, many Monte Carlo runs.
+
+One nominal trajectory, hence one dense [Phi | L] for each step, shared by all runs; states and measurements drawn from the
+model itself, so that the Kalman filter is exact and tells whether all contestants computed the same thing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from hydra import compose, initialize_config_dir
+
+from pfbench import job
+from pfbench.cli import conf_dir
+from pfbench.draws import MonteCarlo
+from pfbench.model.ins_gnss import InsGnss, Step
+
+Array = np.ndarray
+
+
+class Workload(NamedTuple):
+    """Arrays only, so that a contestant needs numpy to read it. All float64.
+
+    Attributes:
+        step: [Phi | L] of each step [T, 15, 30].
+        p0: initial standard deviations [15].
+        r: standard deviations of the measurements [6].
+        seen: the states that are measured [6].
+        y: measurements [R, T, 6].
+        truth: states [R, T, 15].
+        log_evidence: exact log p(y_1:T) [R].
+        mean: exact posterior means [R, T, 15].
+        sd: exact posterior standard deviations [T, 15], the same for all runs.
+        particles: N [].
+    """
+
+    step: Array
+    p0: Array
+    r: Array
+    seen: Array
+    y: Array
+    truth: Array
+    log_evidence: Array
+    mean: Array
+    sd: Array
+    particles: Array
+
+
+def ins_model() -> InsGnss:
+    """The 15-state model of the configuration, with noise added on purpose; no contestant draws from a singular law."""
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return job.build(compose("config", ["scenario=t003", "model=ins_gnss_inflated"]).model)
+
+
+def make(runs: int, steps: int, particles: int, seed: int = 1) -> Workload:
+    """The workload, drawn from the model over the first `steps` seconds of flight t003 (at most 300)."""
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        cfg = compose("config", ["scenario=t003", "worlds=null"])
+        flight, noise = job.build(cfg.scenario), job.build(cfg.noise)
+    model = ins_model()
+    step = model.discretise(flight.draw(noise, torch.arange(1), seed).record.u)[:, :steps]
+    draws = MonteCarlo(seed, torch.arange(runs))
+    x = model.p0 * draws.normal("world.state", 1, len(model.p0))
+    states = []
+    for t in range(steps):
+        x = model.propagate(x, Step(step[:, t]), draws.at(t + 1).normal("world.state", 1, model.noise_dim))
+        states.append(x[:, 0])
+    truth = torch.stack(states, 1)
+    error = torch.stack([draws.at(t + 1).normal("world.measurement", 1, len(model.r))[:, 0] for t in range(steps)], 1)
+    y = truth[..., model.seen] + model.r * error
+    parts = [a.numpy() for a in (step[0], model.p0, model.r, model.seen, y)]
+    return Workload(*parts, truth.numpy(), *kalman(*parts), np.array(particles))
+
+
+def kalman(step: Array, p0: Array, r: Array, seen: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Exact log evidence [R], means [R, T, D] and standard deviations [T, D]; gains are the same for all runs."""
+    d = len(p0)
+    m, p = np.zeros((len(y), d)), np.diag(p0**2)
+    log_evidence, means, sds = np.zeros(len(y)), [], []
+    for t in range(y.shape[1]):
+        phi, gain = step[t, :, :d], step[t, :, d:]
+        m, p = m @ phi.T, phi @ p @ phi.T + gain @ gain.T
+        h = np.eye(d)[seen]
+        s = h @ p @ h.T + np.diag(r**2)
+        k = np.linalg.solve(s, h @ p).T
+        e = y[:, t] - m @ h.T
+        log_evidence -= 0.5 * ((e * np.linalg.solve(s, e.T).T).sum(1) + np.linalg.slogdet(2.0 * math.pi * s)[1])
+        left = np.eye(d) - k @ h
+        m, p = m + e @ k.T, left @ p @ left.T + (k * r**2) @ k.T
+        means.append(m)
+        sds.append(np.sqrt(np.diag(p)))
+    return log_evidence, np.stack(means, 1), np.stack(sds)
