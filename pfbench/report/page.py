@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
@@ -126,11 +127,12 @@ def _section(
     whole = {job.label: job.load() for job in cell.jobs}
     used = {label: later(result, options.from_time) for label, result in whole.items()}
     runs = pd.concat([tidy(cell, job, whole[job.label], options.from_time, options.converged) for job in cell.jobs])
-    runs = runs[runs.group.isin(groups)]
+    known = [group for group in groups if _scored(used, group)]
+    runs = runs[runs.group.isin(known)]
     decided = verdicts(runs, options.alpha)
     prefix = slug(f"{cell.scenario}_{cell.noise}_{cell.model}")
     parts = []
-    for group in groups:
+    for group in known:
         own = [v for v in decided if v.group == group]
         accuracy = tables.accuracy(used, group, own, options.alpha, options.converged.get(group))
         if len(accuracy):
@@ -145,11 +147,23 @@ def _section(
     _table(folder, f"{prefix}_overview", ran)
     drawn = [
         _drawn(drawing, prefix, folder, options.formats)
-        for drawing in figures.drawings(whole, runs, style, groups, options.alpha)
+        for drawing in figures.drawings(whole, runs, style, known, options.alpha)
     ]
     lost = [(label, int(result.arrays["lost"].sum()), result.meta["runs"]) for label, result in whole.items()]
     section = {"name": cell.name, "anchor": prefix, "overview": ran, "parts": parts, "drawings": drawn}
+    there = {block.group for result in used.values() for block in blocks(result.meta["state"])}
+    section["unscored"] = [group for group in groups if group in there and group not in known]
     return {**section, "lost": [row for row in lost if row[1]]}, decided
+
+
+def _scored(results: Mapping[str, store.Result], group: str) -> bool:
+    """Is there a truth for the group in any run that was not lost, or no such run to tell?"""
+    for result in results.values():
+        error = result.arrays["error"][~result.arrays["lost"]]
+        places = [place for block in blocks(result.meta["state"]) if block.group == group for place in block.places]
+        if places and (not len(error) or not np.isnan(error[..., places]).all()):
+            return True
+    return False
 
 
 def _drawn(drawing: figures.Drawing, prefix: str, folder: Path, formats: Sequence[str]) -> dict[str, Any]:

@@ -161,7 +161,10 @@ def _accuracy(result: store.Result, block: Block, alpha: float, bound: float | N
         "runs used": norm.runs,
         f"RMSE norm{unit}": float(norm.value),
         f"RMSE run mean{unit}": float(metrics.rmse_run_mean(error, lost).value),
-        **{f"RMSE {name}{unit}": float(value) for name, value in zip(block.components, each, strict=True)},
+        **{
+            f"RMSE {name.removeprefix(f'{block.group}_')}{unit}": float(value)
+            for name, value in zip(block.components, each, strict=True)
+        },
         f"largest error{unit}": float(np.max(largest[~np.isnan(largest)])) if norm.runs else np.nan,
         f"NEES (dof {dof})": found.mean,
         "band at an instant": f"{number(float(low))} to {number(float(high))}",

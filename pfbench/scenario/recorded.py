@@ -27,7 +27,7 @@ class Receiver:
     """How recorded fixes become measurements.
 
     Args:
-        interval: seconds between the fixes that are handed out; the first one this much (or, on a coarser record, more) later.
+        interval: seconds between the fixes that are handed out; a record with fewer fixes hands out all of them.
         position_sd: standard deviations of the errors that a regime adds to them, East, North, Up in m; zeros leave the fixes
             as recorded (a regime can then only silence them).
         velocity_sd: the same for the recorded velocities in m/s; None where velocity is not measured.
