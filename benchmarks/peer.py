@@ -46,14 +46,14 @@ class Bootstrap(particles.FeynmanKac):
     def normals(self, n: int) -> np.ndarray:
         return self.chance.standard_normal((n, len(self.p0)), dtype=self.p0.dtype.type)
 
-    def M0(self, N: int) -> np.ndarray:  # noqa: N802, N803 (the library's names)
+    def M0(self, N: int) -> np.ndarray:
         return self.M(0, self.p0 * self.normals(N))
 
-    def M(self, t: int, xp: np.ndarray) -> np.ndarray:  # noqa: N802
+    def M(self, t: int, xp: np.ndarray) -> np.ndarray:
         phi, gain = self.steps[t]
         return xp @ phi + self.normals(len(xp)) @ gain
 
-    def logG(self, t: int, xp: np.ndarray, x: np.ndarray) -> np.ndarray:  # noqa: N802
+    def logG(self, t: int, xp: np.ndarray, x: np.ndarray) -> np.ndarray:
         z = (self.y[t] - x[:, self.seen]) * self.scale
         # weights in float64 whatever the states are: the library's resampling loop runs off the end if they sum to less than 1
         return self.constant - np.einsum("ij,ij->i", z, z).astype(float)

@@ -12,7 +12,7 @@ import numpy as np
 import oracles
 import pytest
 import torch
-from pyro.distributions import Uniform
+from pyro.distributions import Laplace, Normal, Uniform
 from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent
@@ -23,6 +23,7 @@ from pfbench.filter.belief import Cloud, ess, weights
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.preferences import LookAhead, Weights
+from pfbench.filter.proposals import Bootstrap, Proposed
 from pfbench.filter.resamplers import (
     Killing,
     Multinomial,
@@ -203,6 +204,52 @@ def test_unbiased_on_models_with_an_answer(case: str, preference: str) -> None:
 def test_unbiased_with_narrow_error_bars(case: str) -> None:
     model, y, exact = CASES[case]()
     check_unbiased(ParticleFilter(400, Resample(Ssp(), 0.5)), model, y, exact, runs=8000)
+
+
+@dataclasses.dataclass(frozen=True)
+class Tilted:
+    """A proposal that draws the noise from a wider and shifted normal law, and says so in its ratio, times `sign`."""
+
+    sign: float = 1.0
+    exact = True
+
+    def __call__(self, model: StateSpaceModel, cloud: Cloud, seen: Record, draws: Draws) -> Proposed:
+        z = draws.normal("noise", cloud.x.shape[1], model.noise_dim)
+        w = 0.3 + 1.3 * z
+        log_ratio = (0.5 * z * z - 0.5 * w * w + math.log(1.3)).sum(-1)
+        return Proposed(model.propagate(cloud.x, seen.u, w), self.sign * log_ratio, cloud.memory)
+
+
+def test_any_proposal_is_corrected_by_its_ratio() -> None:
+    exact = kalman(WALK, WALK_Y)
+    check_unbiased(ParticleFilter(40, proposal=Tilted()), WALK, WALK_Y, exact)
+    for sign in (-1.0, 0.0):
+        with pytest.raises(AssertionError, match=r"\+-"):
+            check_unbiased(ParticleFilter(40, proposal=Tilted(sign)), WALK, WALK_Y, exact, runs=8000)
+
+
+class Drifting(LinearGaussian):
+    """Its noise is normal, but neither centred nor of unit variance."""
+
+    @property
+    def noise(self) -> Distribution:
+        return Independent(Normal(self.m0.new_tensor([0.4]), self.m0.new_tensor([1.5])), 1)
+
+
+class Spiky(LinearGaussian):
+    """Its noise is Laplace's."""
+
+    @property
+    def noise(self) -> Distribution:
+        return Independent(Laplace(self.m0.new_tensor([0.4]), self.m0.new_tensor([1.5])), 1)
+
+
+@pytest.mark.parametrize(("kind", "law"), [(Drifting, stats.norm(0.4, 1.5)), (Spiky, stats.laplace(0.4, 1.5))])
+def test_noise_follows_the_model_s_law(kind: type[LinearGaussian], law: Any) -> None:
+    model = kind([[0.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0])
+    cloud = ParticleFilter(20_000).init(model, 2, MonteCarlo(1, torch.arange(2)))
+    x = Bootstrap()(model, cloud, Record(torch.zeros(2, 1)), MonteCarlo(1, torch.arange(2)).at(1)).x
+    assert stats.kstest(x.numpy().ravel(), law.cdf).pvalue > 1e-3
 
 
 def test_nile_evidence() -> None:

@@ -1,7 +1,7 @@
 """Trajectories from manoeuvres, and what ideal inertial sensors report along them.
 
 Three scalar profiles define the motion: speed, climb (flight-path) angle, heading. A segment changes each of them by a
-given amount: speed linearly, the angles by the quintic u^3 (10 - 15 u + 6 u^2), so that angular rate and angular
+given amount: speed linearly (or smoothly), the angles by the quintic u^3 (10 - 15 u + 6 u^2), so that angular rate and angular
 acceleration are continuous and vanish at the joints. Roll follows from coordinated turns. Everything is closed form or
 Gauss-Legendre quadrature, vectorised over time [ours].
 
@@ -35,6 +35,7 @@ class Segment:
         speed: change of speed, m/s.
         climb: change of flight-path angle, rad.
         heading: change of heading (clockwise from North), rad.
+        smooth: let the speed change by the quintic too, without a step in acceleration; linear in time otherwise.
 
     Raises:
         ValueError: duration not positive.
@@ -44,6 +45,7 @@ class Segment:
     speed: float = 0.0
     climb: float = 0.0
     heading: float = 0.0
+    smooth: bool = False
 
     def __post_init__(self) -> None:
         if not self.duration > 0:
@@ -88,9 +90,9 @@ class Flight(NamedTuple):
     dv: Tensor
 
 
-def accelerate(acceleration: float, duration: float) -> Manoeuvre:
-    """Constant acceleration along the track, m/s^2; negative to brake."""
-    return (Segment(duration, speed=acceleration * duration),)
+def accelerate(acceleration: float, duration: float, smooth: bool = False) -> Manoeuvre:
+    """Acceleration along the track, m/s^2, negative to brake: constant, or of this mean and without steps where `smooth`."""
+    return (Segment(duration, speed=acceleration * duration, smooth=smooth),)
 
 
 def cruise(duration: float) -> Manoeuvre:
@@ -193,7 +195,8 @@ def _profile(plan: list[Segment], counts: list[int], start: Start | _Reached, ra
         s = u**3 * (10 - 15 * u + 6 * u**2)
         s1 = 30 * u**2 * (1 - u) ** 2 / length
         s2 = 60 * u * (1 - u) * (1 - 2 * u) / length**2
-        speed = (begin.speed + segment.speed * u, torch.full_like(u, segment.speed / length))
+        v, v1 = (s, s1) if segment.smooth else (u, torch.full_like(u, 1 / length))
+        speed = (begin.speed + segment.speed * v, segment.speed * v1)
         angles = (begin.climb + segment.climb * s, segment.climb * s1)
         rows.append((*speed, *angles, begin.heading + segment.heading * s, segment.heading * s1, segment.heading * s2))
     return _Motion(*(torch.cat(column) for column in zip(*rows, strict=True)))

@@ -114,3 +114,14 @@ def test_flights_can_be_written_in_yaml(convert):
     made = hydra.utils.instantiate(call("fly", segments=plan, start=start, rate=10) | {"_convert_": convert})
     same = fly([cruise(5), climb(5, 2, 3)], Start(10, 20, 300, speed=25), rate=10)
     assert torch.equal(made.dv, same.dv)
+
+
+def test_a_smooth_start_gains_the_same_speed_without_a_step_in_acceleration():
+    start = Start(lat_deg=34.0, lon_deg=108.0, height=0.0)
+    smooth, hard = (fly([accelerate(2.0, 10.0, smooth), cruise(5.0)], start, rate=100.0) for smooth in (True, False))
+    assert smooth.vel[-1].norm() == pytest.approx(20.0, abs=1e-9)
+    assert hard.vel[-1].norm() == pytest.approx(20.0, abs=1e-9)
+    jump = [flight.dv[:, 1].diff().abs().max().item() * 100.0 for flight in (smooth, hard)]  # m/s^2 from sample to sample
+    # the quintic's jerk is at most 10 / sqrt(3) dV / T^2 = 1.155 m/s^3, so 0.0116 m/s^2 a sample; the hard start jumps by 2
+    assert jump[0] < 0.0125
+    assert jump[1] == pytest.approx(2.0, abs=0.05)

@@ -1,0 +1,238 @@
+"""Simulated flights: a run's world is its own, whoever else flies, whatever the cache holds, whatever filters come after."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from pfbench.draws import MonteCarlo
+from pfbench.nav import attitude, earth, trajectory
+from pfbench.nav.aiding import Alignment, Receiver
+from pfbench.nav.sensors import ImuErrors
+from pfbench.nav.trajectory import Start, accelerate, climb, cruise, turn
+from pfbench.noise.regimes import Nominal, Outage, Outliers, Regime, StudentT
+from pfbench.record import Episode
+from pfbench.scenario.flight import SimulatedFlight
+
+FLIGHT = SimulatedFlight(
+    segments=(accelerate(5.0, 4.0), climb(8.0, 2.0, 2.0), turn(20.0, 6.0), cruise(4.0)),
+    start=Start(lat_deg=32.0, lon_deg=118.0, height=200.0, speed=50.0, heading_deg=45.0),
+    imu=ImuErrors(0.5, 0.3, 300.0, 0.1, 500.0, 200.0, 200.0, 50.0),
+    receiver=Receiver((6.0, 7.0, 5.0), (0.3, 0.2, 0.1)),
+    initial=Alignment((10.0, 10.0, 60.0), (1.0, 1.0, 1.0), (10.0, 10.0, 10.0)),
+    imu_rate=50.0,
+    interval=0.2,
+)
+SEED = 6
+REGIMES: list[Regime] = [Nominal(), StudentT(4), Outliers(0.2, 10.0), Outage(((4.0, 8.0),))]
+
+
+def world(runs: list[int], noise: Regime | None = None, seed: int = SEED, flight: SimulatedFlight = FLIGHT) -> Episode:
+    return flight.draw(noise or Nominal(), torch.tensor(runs), seed)
+
+
+def parts(episode: Episode) -> dict[str, Tensor]:
+    assert episode.track is not None
+    inputs = {f"u.{name}": value for name, value in episode.record.u._asdict().items()}
+    return inputs | episode.truth | {"y": episode.record.y, "time": episode.time, "track": episode.track}
+
+
+def same(a: Episode, b: Episode, but: tuple[str, ...] = ()) -> list[str]:
+    """Names of what is not the same to the last bit."""
+    left, right = parts(a), parts(b)
+    assert left.keys() == right.keys()
+    return [name for name in left if name not in but and not torch.equal(left[name].nan_to_num(9e9), right[name].nan_to_num(9e9))]
+
+
+# whose world it is
+
+
+def test_the_same_seed_gives_the_same_world() -> None:
+    assert same(world([0, 1]), world([0, 1])) == []
+
+
+def test_another_seed_gives_another() -> None:
+    a, b = world([0, 1]), world([0, 1], seed=SEED + 1)
+    assert not (a.record.y == b.record.y).any()
+    assert not (a.truth["position"] == b.truth["position"]).any()
+
+
+def test_a_run_cannot_feel_the_batch() -> None:
+    """Run 3 alone is run 3 of ten and run 3 of any other company, in any order."""
+    ten, alone, company = world(list(range(10))), world([3]), world([7, 3, 100])
+    for name, value in parts(ten).items():
+        if name in ("time", "track", "u.duration"):
+            continue
+        # relative to the size of the quantity: products of matrices may be summed in another order in another batch
+        size = value.abs().amax(dim=tuple(range(1, value.dim())), keepdim=True)[3]
+        assert ((parts(alone)[name][0] - value[3]).abs() <= 1e-12 * size).all(), name
+        assert ((parts(company)[name][1] - value[3]).abs() <= 1e-12 * size).all(), name
+
+
+def test_runs_differ_in_everything_that_is_drawn() -> None:
+    episode = world([0, 1])
+    for name, value in {**episode.truth, "y": episode.record.y}.items():
+        assert not (value[0] == value[1]).any(), name
+
+
+@pytest.mark.parametrize("noise", REGIMES[1:], ids=lambda regime: type(regime).__name__)
+def test_a_regime_changes_what_is_measured_and_nothing_else(noise: Regime) -> None:
+    nominal, other = world([0, 1, 2]), world([0, 1, 2], noise)
+    assert same(nominal, other, but=("y",)) == []
+    assert not torch.equal(nominal.record.y, other.record.y)
+
+
+# the cache
+
+
+def test_a_cached_world_is_the_fresh_one(tmp_path: Path) -> None:
+    kept = replace(FLIGHT, cache=str(tmp_path))
+    fresh = world([0, 1])
+    first = world([0, 1], flight=kept)
+    files = sorted(tmp_path.iterdir())
+    stamp = files[0].stat().st_mtime_ns
+    second = world([0, 1], flight=kept)
+    assert same(fresh, first) == same(fresh, second) == []
+    assert [file.suffix for file in files] == [".npz"]  # one world, and no half-written file
+    assert sorted(tmp_path.iterdir()) == files
+    assert files[0].stat().st_mtime_ns == stamp
+
+
+def test_the_cache_holds_no_receiver_noise_and_tells_worlds_apart(tmp_path: Path) -> None:
+    kept = replace(FLIGHT, cache=str(tmp_path))
+    for noise in REGIMES:
+        assert same(world([0, 1], noise, flight=kept), world([0, 1], noise)) == []
+    assert len(list(tmp_path.iterdir())) == 1  # all regimes share one flown world
+    others = [
+        world([0, 2], flight=kept),
+        world([0, 1], seed=SEED + 1, flight=kept),
+        world([0, 1], flight=replace(kept, imu=replace(kept.imu, gyro_bias_deg_h=0.6))),
+        world([0, 1], flight=replace(kept, initial=Alignment((10.0, 10.0, 60.0), (1.0, 1.0, 1.0), (10.0, 10.0, 11.0)))),
+        world([0, 1], flight=replace(kept, segments=(*FLIGHT.segments, cruise(1.0)))),
+        world([0, 1], flight=replace(kept, interval=0.4)),
+    ]
+    assert len(list(tmp_path.iterdir())) == 1 + len(others)
+    world([0, 1], flight=replace(kept, receiver=Receiver((1.0, 1.0, 1.0))))
+    assert len(list(tmp_path.iterdir())) == 1 + len(others)  # a receiver only measures
+
+
+# the truth
+
+
+def test_truth_is_what_the_ins_is_wrong_by() -> None:
+    """INS minus errors is the flown path, seen again through the track."""
+    episode = world([0, 1, 2])
+    u, truth = episode.record.u, episode.truth
+    flown = trajectory.fly(FLIGHT.segments, FLIGHT.start, FLIGHT.imu_rate)
+    every = round(FLIGHT.imu_rate * FLIGHT.interval)
+    pos, vel, dcm = (a[every::every] for a in (flown.pos, flown.vel, flown.dcm))
+    assert torch.equal(episode.time, flown.time[every::every])
+    assert torch.allclose(u.pos_end - truth["position"] / earth.metre_scale(pos), pos.expand_as(u.pos_end), rtol=1e-14, atol=0)
+    assert torch.allclose(u.vel_end - truth["velocity"], vel.expand_as(u.vel_end), rtol=0, atol=1e-11)
+    turned = attitude.dcm_from_euler(truth["attitude"]) @ u.dcm_end
+    assert torch.allclose(turned, dcm.expand_as(turned), rtol=0, atol=1e-11)
+    assert episode.track is not None
+    assert torch.allclose(episode.track, earth.local_enu(pos, flown.pos[0]).expand(3, -1, -1))
+
+
+def test_sensor_truth_is_the_sum_of_its_parts_and_of_the_stated_size() -> None:
+    episode = world(list(range(400)))
+    truth, imu = episode.truth, FLIGHT.imu
+    assert torch.allclose(truth["gyro_bias"], truth["gyro_constant"] + truth["gyro_markov"], rtol=1e-14, atol=0)
+    assert (truth["gyro_constant"] == truth["gyro_constant"][:, :1]).all()
+    n = 1200  # runs times axes
+    accelerometer = math.hypot(imu.accelerometer_bias, imu.accelerometer_markov)
+    for name, sd in (("gyro_constant", imu.gyro_bias), ("gyro_markov", imu.gyro_markov), ("accelerometer_bias", accelerometer)):
+        for t in (0, -1):
+            z = truth[name][:, t].flatten() / sd
+            assert abs(z.mean()) < 4.5 / math.sqrt(n)
+            assert abs(z.std() - 1) < 4.5 / math.sqrt(2 * n)
+
+
+def test_errors_start_as_stated() -> None:
+    runs = list(range(400))
+    episode = world(runs)
+    z = torch.cat([episode.truth[name][:, 0] for name in ("attitude", "velocity", "position")], -1) / FLIGHT.initial.sd
+    # after the first 0.2 s: sensors add less than 0.05 of the initial deviations, tilts turn 0.03 m/s of gravity, speed 0.2 m
+    assert (z.mean(0).abs() < 4.5 / math.sqrt(len(runs)) + 0.02).all()
+    assert ((z.std(0) - 1).abs() < 4.5 / math.sqrt(2 * len(runs)) + 0.02).all()
+    correlation = torch.corrcoef(z.T) - torch.eye(9, dtype=torch.float64)
+    assert correlation.abs().max() < 4.5 / math.sqrt(len(runs)) + 0.03
+
+
+# what is measured
+
+
+def residuals(noise: Regime, runs: int = 200) -> Tensor:
+    """(y - truth) / nominal deviation [R, T, 6]."""
+    episode = world(list(range(runs)), noise)
+    seen = torch.cat([episode.truth["position"], episode.truth["velocity"]], -1)
+    return (episode.record.y - seen) / FLIGHT.receiver.sd
+
+
+def test_nominal_measurements_are_white_normal_and_of_the_stated_size() -> None:
+    z = residuals(Nominal())
+    n = z[..., 0].numel()
+    assert (z.mean((0, 1)).abs() < 4.5 / math.sqrt(n)).all()
+    assert ((z.flatten(0, 1).std(0) - 1).abs() < 4.5 / math.sqrt(2 * n)).all()
+    assert ((z[:, 1:] * z[:, :-1]).mean((0, 1)).abs() < 4.5 / math.sqrt(n)).all()  # from one epoch to the next
+    assert ((z[1:] * z[:-1]).mean((0, 1)).abs() < 4.5 / math.sqrt(n)).all()  # from one run to the next
+    between = torch.corrcoef(z.flatten(0, 1).T) - torch.eye(6, dtype=torch.float64)
+    assert between.abs().max() < 4.5 / math.sqrt(n)
+    assert ((z**4).mean((0, 1)) - 3).abs().max() < 4.5 * math.sqrt(96 / n)
+
+
+def test_outliers_come_as_often_and_as_large_as_stated() -> None:
+    z = residuals(Outliers(0.2, 10.0))
+    n = z[..., 0].numel()
+    # the kurtosis of the mixture, 3 (0.8 + 0.2 10^4) / (0.8 + 0.2 10^2)^2 = 13.9, gives the standard error of the variance
+    assert ((z**2).mean((0, 1)) / 20.8 - 1).abs().max() < 4.5 * math.sqrt((13.9 - 1) / n)
+    assert (z.abs().amax(-1) > 8).double().mean() > 0.1  # all components of an epoch at once
+
+
+def test_an_outage_is_silence_in_its_window_alone() -> None:
+    episode = world([0, 1], Outage(((4.0, 8.0),)))
+    silent = torch.isnan(episode.record.y).all(-1)
+    assert torch.equal(silent, torch.isnan(episode.record.y).any(-1))
+    assert torch.equal(silent, ((episode.time >= 4.0) & (episode.time < 8.0)).expand(2, -1))
+
+
+def test_a_receiver_without_velocity_measures_position_alone() -> None:
+    both, position = world([0, 1]), world([0, 1], flight=replace(FLIGHT, receiver=Receiver(FLIGHT.receiver.position_sd)))
+    assert position.record.y.shape[-1] == 3
+    # three components of the same stream
+    assert torch.equal(position.record.y, both.record.y[..., :3])
+
+
+# what cannot be flown
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"interval": 0.06}, r"scenario\.interval=0\.06.* 3 samples; give an even number"),
+        ({"interval": 0.01}, r"scenario\.interval=0\.01.*0\.5 samples; give an even number"),
+        ({"imu_rate": 33.3}, r"scenario\.interval=0\.2.*imu_rate=33\.3.*give an even number"),
+    ],
+)
+def test_intervals_that_are_no_even_number_of_samples_are_refused(change: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(FLIGHT, **change)  # type: ignore[arg-type]
+
+
+def test_a_flight_that_is_no_whole_number_of_intervals_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"scenario\.interval=0\.6: the flight's 20 s .*give one that divides"):
+        world([0], flight=replace(FLIGHT, interval=0.6))
+
+
+def test_time_and_intervals_agree() -> None:
+    episode = world([0])
+    assert np.allclose(np.diff(episode.time.numpy()), FLIGHT.interval)
+    assert torch.allclose(episode.record.u.duration, torch.tensor(FLIGHT.interval, dtype=torch.float64))
+    assert torch.equal(episode.record.u.pos_start[:, 1:], episode.record.u.pos_end[:, :-1])
