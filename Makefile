@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo test test-fast test-slow lint figures clean
+.PHONY: demo test test-fast test-slow lint bench figures clean
 
 # Installs everything once; runs again only when the requirements change.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -26,5 +26,14 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+# The peer needs numpy below 2, so it lives beside the project's own environment.
+.venv-bench/.installed: benchmarks/requirements.txt
+	$(PYTHON) -m venv .venv-bench
+	.venv-bench/bin/python -m pip install --quiet -r benchmarks/requirements.txt
+	touch $@
+
+bench: $(VENV)/.installed .venv-bench/.installed   ## speed against peers: benchmarks/w4.md, some minutes on a quiet machine
+	$(BIN)/python benchmarks/w4.py --peer .venv-bench/bin/python
+
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) .venv-bench build dist *.egg-info

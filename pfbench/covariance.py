@@ -40,5 +40,6 @@ def gaussian_log_density(r: Tensor, covariance: Tensor, seen: Tensor) -> Tensor:
     factor, info = torch.linalg.cholesky_ex(torch.where(both, covariance, eye))
     z = torch.linalg.solve_triangular(factor, r.unsqueeze(-1), upper=False).squeeze(-1)
     log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    value = -0.5 * (z * z).sum(-1) - log_det - 0.5 * _LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float would be float32
+    known = seen.sum(-1, dtype=r.dtype)  # an int64 count times a number would be float32
+    value = -0.5 * (z * z).sum(-1) - log_det - 0.5 * _LOG_2PI * known
     return torch.where(info == 0, value, torch.nan)

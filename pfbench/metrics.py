@@ -8,6 +8,7 @@ how many runs it is over.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -133,6 +134,22 @@ def consistency(nees: Array, lost: Flags, dof: int, alpha: float = 0.05) -> Cons
 def lost_share(lost: Flags) -> Average:
     """Share of the runs that were lost."""
     return Average(_mean(np.asarray(lost, dtype=np.float64), axis=0), int(np.size(lost)))
+
+
+def diverged(nees: Array, dofs: Sequence[int], lost: Flags, factor: float = 100.0) -> NDArray[np.bool_]:
+    """Runs that were not lost but whose filter no longer knows where it is [R].
+
+    A run has diverged when the mean over time of the normalised squared error of some group exceeds `factor` times its degrees
+    of freedom: an error of ten of the filter's own standard deviations, on the average of the whole run [ours].
+
+    Args:
+        nees: [R, T, G].
+        dofs: degrees of freedom of each group [G].
+        lost: [R].
+    """
+    with np.errstate(over="ignore"):
+        mean = _mean(np.asarray(nees, dtype=np.float64), axis=1)
+    return (mean > factor * np.asarray(dofs, dtype=np.float64)).any(axis=-1) & ~np.asarray(lost, dtype=bool)
 
 
 def convergence_time(time: Array, error: Array, lost: Flags, bound: float) -> Array:

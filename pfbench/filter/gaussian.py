@@ -130,7 +130,7 @@ def update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
     information, score, distance = triangle[:, :d, :d], triangle[:, :d, d:], triangle[:, d, d].square()
     back = torch.linalg.solve_triangular(information, torch.cat([score, eye], -1), upper=True)
     log_det = root.diagonal(dim1=-2, dim2=-1).log().sum(-1) + information.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
-    log_like = -0.5 * distance - log_det - 0.5 * _LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float would be float32
+    log_like = -0.5 * distance - log_det - 0.5 * _LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float is float32
     return back[..., 0], back[..., 1:], torch.where(ok, log_like, torch.nan)
 
 

@@ -21,7 +21,7 @@ class Estimate(NamedTuple):
 
     Attributes:
         mean: [R, T, D]; NaN from the instant at which a run is lost.
-        variance: diagonal of the covariance in the chart [R, T, d].
+        variance: diagonal of the covariance in the chart [R, T, d]; NaN likewise.
         log_evidence: log p(y_1:T) [R]; -inf where the run is lost.
         trace: per step and run, {name: [R, T]}: `ess`, `resampled`, and what was watched for.
     """
@@ -71,7 +71,7 @@ def run_filter(
         belief, info = method.step(stage, belief, record.at(t), draws.at(t + 1))
         alive = torch.isfinite(belief.log_z).unsqueeze(-1)
         means.append(torch.where(alive, info.mean, torch.nan))
-        variances.append(info.variance)
+        variances.append(torch.where(alive, info.variance, torch.nan))
         traces.append(info.trace | (watch(t, info) if watch else {}))
         if tick:
             tick()

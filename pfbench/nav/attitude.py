@@ -8,8 +8,16 @@ Hamilton's product, v_n = q v_b q*. Every function broadcasts over leading axes.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+
+# Hamilton's table: row 4 i + j says which component the product of units i and j is, and with what sign.
+_HAMILTON = torch.zeros(16, 4, dtype=torch.float64)
+for _i, _row in enumerate(((+1, +2, +3, +4), (+2, -1, +4, -3), (+3, -4, -1, +2), (+4, +3, -2, -1))):
+    for _j, _unit in enumerate(_row):
+        _HAMILTON[4 * _i + _j, abs(_unit) - 1] = math.copysign(1.0, _unit)
 
 
 def skew(a: Tensor) -> Tensor:
@@ -62,11 +70,9 @@ def rotation_vector_from_quaternion(q: Tensor) -> Tensor:
 
 def quaternion_multiply(p: Tensor, q: Tensor) -> Tensor:
     """Hamilton's product p q: [..., 4], [..., 4] -> [..., 4]."""
-    a, b, c, d = p.unbind(-1)
-    e, f, g, h = q.unbind(-1)
-    parts = [a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g]
-    parts += [a * g - b * h + c * e + d * f, a * h + b * g - c * f + d * e]
-    return torch.stack(parts, dim=-1)
+    # sixteen products at once: in forward-mode differentiation sixteen separate ones cost three times as much
+    products = (p.unsqueeze(-1) * q.unsqueeze(-2)).flatten(-2)
+    return products @ _HAMILTON.to(products)
 
 
 def dcm_from_quaternion(q: Tensor) -> Tensor:

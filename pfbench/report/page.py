@@ -150,10 +150,11 @@ def _section(
         for drawing in figures.drawings(whole, runs, style, known, options.alpha)
     ]
     lost = [(label, int(result.arrays["lost"].sum()), result.meta["runs"]) for label, result in whole.items()]
+    gone = [(label, int(tables.diverged(result).sum()), result.meta["runs"]) for label, result in used.items()]
     section = {"name": cell.name, "anchor": prefix, "overview": ran, "parts": parts, "drawings": drawn}
     there = {block.group for result in used.values() for block in blocks(result.meta["state"])}
     section["unscored"] = [group for group in groups if group in there and group not in known]
-    return {**section, "lost": [row for row in lost if row[1]]}, decided
+    return {**section, "lost": [row for row in lost if row[1]], "diverged": [row for row in gone if row[1]]}, decided
 
 
 def _scored(results: Mapping[str, store.Result], group: str) -> bool:

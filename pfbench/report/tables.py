@@ -129,6 +129,12 @@ def number(value: Any) -> str:
     return f"{value:.{max(digits, 0)}f}"
 
 
+def diverged(result: store.Result) -> np.ndarray:
+    """Runs that went on but far outside their own covariance [R]; see `metrics.diverged`."""
+    dofs = [len(parts) for parts in result.meta["state"]["groups"].values()]
+    return metrics.diverged(result.arrays["nees"], dofs, result.arrays["lost"])
+
+
 def _ran(label: str, result: store.Result) -> dict[str, Any]:
     meta, arrays = result.meta, result.arrays
     lost, particles = arrays["lost"], meta.get("particles")
@@ -142,6 +148,7 @@ def _ran(label: str, result: store.Result) -> dict[str, Any]:
         "runs": int(lost.size),
         "lost": int(lost.sum()),
         "lost in %": 100 * float(metrics.lost_share(lost).value),
+        "diverged": int(diverged(result).sum()),
         "time per step in ms": 1e3 * meta["seconds"]["per_step"],
         "ESS in %": 100 * _mean(ess),
         "log evidence": _mean(evidence),

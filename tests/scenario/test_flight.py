@@ -12,6 +12,11 @@ import torch
 from torch import Tensor
 
 from pfbench.draws import MonteCarlo
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.loop import run_filter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.rules import Cubature, Points
+from pfbench.model.ins_gnss import InsGnss
 from pfbench.nav import attitude, earth, trajectory
 from pfbench.nav.aiding import Alignment, Receiver
 from pfbench.nav.sensors import ImuErrors
@@ -86,6 +91,15 @@ def test_a_regime_changes_what_is_measured_and_nothing_else(noise: Regime) -> No
     nominal, other = world([0, 1, 2]), world([0, 1, 2], noise)
     assert same(nominal, other, but=("y",)) == []
     assert not torch.equal(nominal.record.y, other.record.y)
+
+
+def test_a_filter_leaves_the_world_as_it_was() -> None:
+    episode = world([0, 1])
+    model = InsGnss(FLIGHT.imu, FLIGHT.receiver, FLIGHT.initial)
+    for method in (GaussianFilter(Points(Cubature())), ParticleFilter(50)):
+        estimate = run_filter(method, model, episode.record, MonteCarlo(SEED, torch.arange(2)))
+        assert not torch.isnan(estimate.mean).any()
+        assert same(episode, world([0, 1])) == []
 
 
 # the cache

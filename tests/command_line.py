@@ -1,0 +1,55 @@
+"""`pfbench ...` without a new process, whose start costs seconds; and with one, where that is the point."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
+
+from pfbench import cli
+
+
+class Said(NamedTuple):
+    """Exit code and what was printed."""
+
+    code: int
+    out: str
+    err: str
+
+
+def pfbench(*words: object, home: Path) -> Said:
+    """The command line in this process; results and worlds below `home`, no recorded data."""
+    out, err, root = io.StringIO(), io.StringIO(), logging.getLogger()
+    handlers, level, code = list(root.handlers), root.level, 0
+    with (
+        mock.patch.dict(os.environ, environment(home)),
+        mock.patch.object(sys, "argv", ["pfbench"]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        os.environ.pop("PFBENCH_DATA", None)
+        try:
+            cli.main([str(word) for word in words])
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        finally:
+            root.handlers[:], root.level = handlers, level  # Hydra's point at streams that close now
+    return Said(code, out.getvalue(), err.getvalue())
+
+
+def process(*words: object, home: Path, cwd: Path, **more: str) -> Said:
+    """`python -m pfbench ...` in a folder of its own."""
+    env = {name: value for name, value in os.environ.items() if name != "PFBENCH_DATA"} | environment(home) | more
+    command = [sys.executable, "-m", "pfbench", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=env, check=False, timeout=600)
+    return Said(done.returncode, done.stdout, done.stderr)
+
+
+def environment(home: Path) -> dict[str, str]:
+    return {"PFBENCH_RESULTS": str(home / "results"), "PFBENCH_WORLDS": str(home / "worlds")}

@@ -1,0 +1,213 @@
+"""One job: a file that numpy alone reads, computed once, the same numbers however it is cut, and a note where it failed."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import Said, pfbench, process
+
+WALK = ("scenario=linear_walk", "scenario.steps=25", "particles=100")
+FIELDS = {"time", "error", "sd", "nees", "log_evidence", "lost", "meta"}
+
+
+def stored(file: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Meta and arrays, as somebody without pfbench reads them."""
+    with np.load(file, allow_pickle=False) as found:
+        return json.loads(str(found["meta"])), {name: found[name] for name in found.files if name != "meta"}
+
+
+def result(home: Path, *words: object, study: str = "adhoc") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Runs one cell in a fresh study and reads its only file."""
+    said = pfbench("run", *words, f"study={study}", home=home)
+    assert said.code == 0, said.err
+    (file,) = (home / "results" / study).glob("*.npz")
+    return stored(file)
+
+
+def identical(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name], equal_nan=a[name].dtype.kind == "f") for name in a)
+
+
+# a real process, twice: once to compute, once to find that it is done
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Said, Said, list[int]]:
+    home = tmp_path_factory.mktemp("twice")
+    words = ("run", *WALK, "filter=sir", "runs=3", "seed=5")
+    first = process(*words, home=home, cwd=home)
+    files = list((home / "results" / "adhoc").iterdir())
+    stamps = [file.stat().st_mtime_ns for file in files]
+    second = process(*words, home=home, cwd=home)
+    stamps += [file.stat().st_mtime_ns for file in (home / "results" / "adhoc").iterdir()]
+    return home, files[0], first, second, stamps
+
+
+def test_a_job_leaves_one_file_that_numpy_reads(twice: Any) -> None:
+    home, file, first, _, _ = twice
+    assert first.code == 0, first.err
+    assert [path.suffix for path in (home / "results" / "adhoc").iterdir()] == [".npz"]
+    meta, arrays = stored(file)
+    assert arrays.keys() | {"meta"} >= FIELDS | {"ess", "resampled"}
+    assert arrays["time"].shape == (25,)
+    assert arrays["error"].shape == arrays["sd"].shape == (3, 25, 2)
+    assert arrays["nees"].shape == (3, 25, 1)
+    assert arrays["log_evidence"].shape == arrays["lost"].shape == (3,)
+    assert np.isfinite(arrays["error"]).all()
+    assert not arrays["lost"].any()
+    assert meta["key"] == file.stem
+    assert (meta["runs"], meta["first_run"], meta["seed"], meta["steps"], meta["particles"]) == (3, 0, 5, 25, 100)
+    assert meta["choices"] == {"scenario": "linear_walk", "noise": "nominal", "filter": "sir", "model": "linear_walk"}
+    assert meta["config"]["filter"]["particles"] == 100
+    assert meta["state"] == {"names": ["position", "velocity"], "units": ["m", "m/s"], "groups": {"state": [0, 1]}}
+    assert meta["seconds"]["filter"] > 0
+    assert {"pfbench", "commit", "python", "torch", "numpy"} == meta["versions"].keys()
+    assert meta["exact"] is True
+
+
+def test_the_line_printed_is_the_error_stored(twice: Any) -> None:
+    _, file, first, _, _ = twice
+    error = stored(file)[1]["error"].astype(float)
+    assert f"linear_walk nominal sir: rms error {math.sqrt((error**2).sum(-1).mean()):.4g}, 0 of 3 runs lost" in first.out
+
+
+def test_a_finished_job_is_not_computed_again(twice: Any) -> None:
+    _, file, _, second, stamps = twice
+    assert second.code == 0
+    assert f"linear_walk nominal sir: done already ({file})" in second.out
+    assert stamps[0] == stamps[1]
+    assert len(stamps) == 2
+
+
+def test_another_process_and_another_day_give_the_same_bits(twice: Any, tmp_path: Path) -> None:
+    home, file, _, _, _ = twice
+    before = file.stat().st_mtime_ns
+    said = pfbench("run", *WALK, "filter=sir", "runs=3", "seed=5", "fresh=true", home=home)
+    assert said.code == 0
+    assert "done already" not in said.out
+    again, kept = stored(file)[1], stored(file)
+    assert file.stat().st_mtime_ns > before
+    elsewhere = result(tmp_path, *WALK, "filter=sir", "runs=3", "seed=5")
+    assert identical(again, elsewhere[1])
+    assert kept[0]["key"] == elsewhere[0]["key"]  # where results lie is no part of a job's name
+
+
+# what a job's name is made of
+
+
+def test_places_do_not_name_a_job_but_numbers_do(tmp_path: Path) -> None:
+    def key(*words: object) -> str:
+        study = f"s{len(list((tmp_path / 'results').glob('*')))}" if (tmp_path / "results").exists() else "s"
+        return str(result(tmp_path, *WALK, "filter=ekf", "runs=1", *words, study=study)[0]["key"])
+
+    one = key()
+    assert one == key("worlds=null") == key("threads=2", "engine=eager") == key("fresh=true") == key("report.alpha=0.01")
+    assert len({one, key("seed=2"), key("runs=2"), key("dtype=float32"), key("model.noise=0.4"), key("noise=student")}) == 6
+
+
+# the same numbers however the work is cut
+
+
+@pytest.mark.parametrize("method", ["ekf", "sir"])
+def test_runs_in_two_jobs_are_the_runs_of_one(tmp_path: Path, method: str) -> None:
+    words = (*WALK, f"filter={method}")
+    whole = result(tmp_path, *words, "runs=5", study="whole")[1]
+    head = result(tmp_path, *words, "runs=2", study="head")[1]
+    tail = result(tmp_path, *words, "first_run=2", "runs=3", study="tail")[1]
+    joined = {name: whole[name] if name == "time" else np.concatenate([head[name], tail[name]]) for name in whole}
+    assert identical(joined, whole)
+    assert not np.array_equal(head["error"], tail["error"][:2])
+
+
+@pytest.mark.parametrize("method", ["ekf", "sir"])
+def test_single_precision_is_close_to_double(tmp_path: Path, method: str) -> None:
+    words = (*WALK, f"filter={method}", "runs=20", "particles=500")
+    double, single = (result(tmp_path, *words, f"dtype={dtype}", study=dtype)[1] for dtype in ("float64", "float32"))
+    apart = np.abs(single["error"] - double["error"]) / double["sd"]
+    if method == "ekf":
+        assert apart.max() < 1e-4  # 25 steps, numbers of size 100 beside errors of size 1: 1e-7 grows to about 1e-5
+        assert np.allclose(single["log_evidence"], double["log_evidence"], atol=1e-3)
+    else:
+        # a rounding may send a slot to the neighbouring ancestor, and that alone: one particle of 500 at a time
+        assert np.sqrt((apart**2).mean()) < 0.1 / math.sqrt(500)
+        assert np.allclose(single["log_evidence"], double["log_evidence"], atol=0.1)
+    assert single["error"].dtype == np.float32
+    assert single["log_evidence"].dtype == np.float64
+
+
+def test_the_worlds_of_a_study_are_flown_once_for_all_filters(tmp_path: Path) -> None:
+    segments = "scenario.segments=[{_target_:pfbench.nav.trajectory.cruise,duration:10}]"
+    said = pfbench("run", "-m", "scenario=t004", segments, "filter=ekf,sir", "noise=nominal,student", "runs=2", home=tmp_path)
+    assert said.code == 0, said.err
+    assert len(list((tmp_path / "worlds").iterdir())) == 1
+    found = [stored(file) for file in (tmp_path / "results" / "adhoc").glob("*.npz")]
+    assert len(found) == 4
+    tracks = [arrays["track"] for _, arrays in found]
+    assert all(np.array_equal(track, tracks[0]) for track in tracks)
+    assert tracks[0].shape == (2, 10, 3)
+    # 20 m/s to the North-East, level
+    east = 20.0 * math.sqrt(0.5) * np.arange(1, 11)
+    assert np.allclose(tracks[0][0, :, 0], east, rtol=1e-3)
+    assert np.allclose(tracks[0][0, :, 1], east, rtol=1e-3)
+
+
+# failures
+
+
+def test_a_failed_job_leaves_a_note_and_its_success_takes_it_away(tmp_path: Path) -> None:
+    words = ("run", *WALK, "filter=ekf", "runs=2")
+    folder = tmp_path / "results" / "adhoc"
+    failed = pfbench(*words, "threads=0", home=tmp_path)
+    assert failed.code == 1
+    (note,) = folder.iterdir()
+    assert note.name.endswith(".failed.json")
+    said = json.loads(note.read_text())
+    assert said["message"] == "ValueError: threads=0: give a whole number, 1 or more"
+    assert said["choices"]["filter"] == "ekf"
+    assert "Traceback" in said["traceback"]
+    assert str(note) in failed.out
+    done = pfbench(*words, home=tmp_path)  # threads are no part of the name
+    assert done.code == 0
+    (file,) = folder.iterdir()
+    assert file.name == note.name.replace(".failed.json", ".npz")
+
+
+def test_a_failure_does_not_touch_a_good_result(tmp_path: Path) -> None:
+    words = ("run", *WALK, "filter=ekf", "runs=2")
+    assert pfbench(*words, home=tmp_path).code == 0
+    (file,) = (tmp_path / "results" / "adhoc").iterdir()
+    before = file.read_bytes()
+    assert pfbench(*words, "fresh=true", "threads=0", home=tmp_path).code == 1
+    assert list((tmp_path / "results" / "adhoc").iterdir()) == [file]
+    assert file.read_bytes() == before
+
+
+def test_a_sweep_goes_on_after_a_bad_cell_and_says_so(tmp_path: Path) -> None:
+    said = pfbench("run", "-m", *WALK, "filter=sir", "runs=2", "filter.particles=0,50,1,60", home=tmp_path)
+    assert said.code == 1
+    assert "filter.particles=0: give at least 2 particles" in said.err
+    folder = tmp_path / "results" / "adhoc"
+    assert sorted(stored(file)[0]["particles"] for file in folder.glob("*.npz")) == [50, 60]
+    notes = list(folder.glob("*.failed.json"))
+    messages = "".join(json.loads(note.read_text())["message"] for note in notes)
+    assert len(notes) == 2
+    assert all(f"filter.particles={n}: give at least 2 particles" in messages for n in (0, 1))
+    assert all(str(note) in said.out for note in notes)  # every one is named, not only the first
+
+
+def test_a_damaged_file_is_told_and_not_taken_for_a_result(tmp_path: Path) -> None:
+    words = ("run", *WALK, "filter=ekf", "runs=2")
+    assert pfbench(*words, home=tmp_path).code == 0
+    (file,) = (tmp_path / "results" / "adhoc").iterdir()
+    file.write_bytes(file.read_bytes()[:500])
+    said = pfbench(*words, home=tmp_path)
+    assert said.code == 1
+    assert f"{file} is damaged" in said.err
+    assert "delete it and run the job again" in said.err
+    assert pfbench(*words, "fresh=true", home=tmp_path).code == 0
+    assert stored(file)[0]["runs"] == 2
