@@ -14,7 +14,7 @@ from worker import Filter, serve
 
 
 def sir(work: Any, dtype: torch.dtype) -> Filter:
-    """Bootstrap filter, systematic resampling by search at every step, weighted mean and variance at every step."""
+    """Bootstrap filter, systematic resampling by search at every step, mean, variance and effective sample size at every step."""
     step, p0, r, y = (torch.from_numpy(a).to(dtype) for a in (work.step, work.p0, work.r, work.y))
     seen = torch.from_numpy(work.seen)
     (runs, steps, _), n, d = y.shape, int(work.particles), len(p0)
@@ -25,7 +25,7 @@ def sir(work: Any, dtype: torch.dtype) -> Filter:
         x = p0 * torch.randn(runs, n, d, dtype=dtype, generator=chance)
         w = torch.full((runs, n), 1.0 / n, dtype=dtype)
         log_z = torch.zeros(runs, dtype=torch.float64)
-        means, variances = [], []
+        means, variances, sizes = [], [], []
         for t in range(steps):
             u = (torch.arange(n) + torch.rand(runs, 1, dtype=dtype, generator=chance)) / n
             ancestors = torch.searchsorted(w.cumsum(1), u).clamp(max=n - 1)
@@ -37,6 +37,7 @@ def sir(work: Any, dtype: torch.dtype) -> Filter:
             w = log_w.softmax(1)
             mean = (w[..., None] * x).sum(1)
             means.append(mean)
+            sizes.append(1.0 / (w**2).sum(1))
             variances.append((w[..., None] * (x - mean[:, None]) ** 2).sum(1))
         return log_z, torch.stack(means, 1)
 

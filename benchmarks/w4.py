@@ -193,7 +193,8 @@ def draw(results: list[Result], work: workload.Workload, path: Path) -> None:
     axis.margins(x=0.12)
     axis.set_xlabel("CPU time in s, one thread (median, quartiles)", fontsize=8)
     runs, steps, _ = work.y.shape
-    axis.set_title(f"SIR, {runs} runs x {steps} steps x {work.particles} particles; times as fast as particles", fontsize=9, loc="left")
+    size = f"{runs} runs x {steps} steps x {work.particles} particles"
+    axis.set_title(f"SIR, {size}; figures: times as fast as the library particles", fontsize=9, loc="left")
     axis.tick_params(axis="x", labelsize=8)
     axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=150, metadata={"Software": None})

@@ -7,6 +7,7 @@ model itself, so that the Kalman filter is exact and tells whether all contestan
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from pfbench import job
 from pfbench.cli import conf_dir
 from pfbench.draws import MonteCarlo
 from pfbench.model.ins_gnss import InsGnss, Step
+from pfbench.nav.strapdown import Intervals
 
 Array = np.ndarray
 
@@ -64,10 +66,13 @@ def ins_model() -> InsGnss:
 
 
 def make(runs: int, steps: int, particles: int, seed: int = 1) -> Workload:
-    """The workload, drawn from the model over the first `steps` seconds of flight t003 (at most 300)."""
-    cfg, model = _configured(), ins_model()
-    nominal = job.build(cfg.scenario).draw(job.build(cfg.noise), torch.arange(1), seed).record.u
-    step = model.discretise(nominal)[:, :steps]
+    """The workload, drawn from the model over the first `steps` seconds of flight t003.
+
+    Raises:
+        ValueError: more steps than the flight has.
+    """
+    model = ins_model()
+    step = model.discretise(_nominal(steps, seed))[:, :steps]
     draws = MonteCarlo(seed, torch.arange(runs))
     x = model.p0 * draws.normal("world.state", 1, len(model.p0))
     states = []
@@ -77,8 +82,21 @@ def make(runs: int, steps: int, particles: int, seed: int = 1) -> Workload:
     truth = torch.stack(states, 1)
     error = torch.stack([draws.at(t + 1).normal("world.measurement", 1, len(model.r))[:, 0] for t in range(steps)], 1)
     y = truth[..., model.seen] + model.r * error
-    parts = [a.numpy() for a in (step[0], model.p0, model.r, model.seen, y)]
-    return Workload(*parts, truth.numpy(), *kalman(*parts), np.array(particles))
+    step0, p0, r, seen, seen_y = (a.numpy() for a in (step[0], model.p0, model.r, model.seen, y))
+    log_evidence, mean, sd = kalman(step0, p0, r, seen, seen_y)
+    return Workload(step0, p0, r, seen, seen_y, truth.numpy(), log_evidence, mean, sd, np.array(particles))
+
+
+def _nominal(steps: int, seed: int) -> Intervals:
+    """At least `steps` seconds of the flight, in whole segments: what nobody filters need not be flown."""
+    cfg = _configured()
+    flight = job.build(cfg.scenario)
+    segments = [segment for manoeuvre in flight.segments for segment in manoeuvre]
+    ends = np.cumsum([segment.duration for segment in segments])
+    if steps > ends[-1]:
+        raise ValueError(f"steps={steps}: the flight lasts {ends[-1]:g} s; give at most that")
+    flown = segments[: int(np.searchsorted(ends, steps)) + 1]
+    return replace(flight, segments=flown).draw(job.build(cfg.noise), torch.arange(1), seed).record.u
 
 
 def _configured() -> Any:

@@ -133,14 +133,19 @@ def fill(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> Fi
 
 
 def judge(model: StateSpaceModel, truth: Tensor) -> Callable[[int, Info], dict[str, Tensor]]:
-    """What is measured at each step against the truth [R, T, D]: error [R, d] and normalised error squared of each group."""
+    """What is measured at each step against the truth [R, T, D]: error [R, d] and normalised error squared of each group.
+
+    A filter without a spread left (a cloud collapsed to one particle) has an infinite normalised error, not an unknown one.
+    """
 
     def watch(t: int, info: Info) -> dict[str, Tensor]:
         error = model.error(info.mean, truth[:, t])
         nees = []
         for name, parts in model.groups.items():
             e = error[:, list(parts)].unsqueeze(-1)
-            nees.append((e.mT @ torch.linalg.solve_ex(info.blocks[name], e)[0]).flatten())
+            value = (e.mT @ torch.linalg.solve_ex(info.blocks[name], e)[0]).flatten()
+            known = ~torch.isnan(e).any(1).flatten()
+            nees.append(torch.where(known & ~(value >= 0.0), torch.inf, value))
         return {"error": error, "nees": torch.stack(nees, 1)}
 
     return watch

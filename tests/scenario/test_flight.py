@@ -17,7 +17,7 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.rules import Cubature, Points
 from pfbench.model.ins_gnss import InsGnss
-from pfbench.nav import attitude, earth, trajectory
+from pfbench.nav import attitude, earth, sensors, trajectory
 from pfbench.nav.aiding import Alignment, Receiver
 from pfbench.nav.sensors import ImuErrors
 from pfbench.nav.trajectory import Start, accelerate, climb, cruise, turn
@@ -169,6 +169,20 @@ def test_sensor_truth_is_the_sum_of_its_parts_and_of_the_stated_size() -> None:
             assert abs(z.std() - 1) < 4.5 / math.sqrt(2 * n)
 
 
+def test_sensor_truth_is_that_of_the_sample_that_ends_the_interval() -> None:
+    episode, imu, every = world([0, 1]), FLIGHT.imu, round(FLIGHT.imu_rate * FLIGHT.interval)
+    draws, n = MonteCarlo(SEED, torch.arange(2)), every * len(episode.time)
+
+    def at_the_ends(kind: str, sigma: float, time: float) -> Tensor:
+        return sensors.markov(f"world.imu.{kind}_markov", n, sigma, time, 1 / FLIGHT.imu_rate, draws)[:, every - 1 :: every]
+
+    assert torch.equal(episode.truth["gyro_markov"], at_the_ends("gyro", imu.gyro_markov, imu.gyro_markov_time))
+    constant = episode.truth["accelerometer_bias"] - at_the_ends(
+        "accelerometer", imu.accelerometer_markov, imu.accelerometer_markov_time
+    )
+    assert torch.allclose(constant, constant[:, :1].expand_as(constant), rtol=1e-12, atol=0)
+
+
 def test_errors_start_as_stated() -> None:
     runs = list(range(400))
     episode = world(runs)
@@ -200,6 +214,15 @@ def test_nominal_measurements_are_white_normal_and_of_the_stated_size() -> None:
     between = torch.corrcoef(z.flatten(0, 1).T) - torch.eye(6, dtype=torch.float64)
     assert between.abs().max() < 4.5 / math.sqrt(n)
     assert ((z**4).mean((0, 1)) - 3).abs().max() < 4.5 * math.sqrt(96 / n)
+
+
+def test_the_receiver_knows_nothing_of_how_the_ins_starts() -> None:
+    runs = 400
+    episode = world(list(range(runs)))
+    start = torch.cat([episode.truth[name][:, 0] for name in ("attitude", "velocity", "position", "gyro_bias")], -1)
+    first = residuals(Nominal(), runs)[:, 0]
+    between = torch.corrcoef(torch.cat([start, first], -1).T)[: start.shape[-1], start.shape[-1] :]
+    assert between.abs().max() < 4.5 / math.sqrt(runs)
 
 
 def test_outliers_come_as_often_and_as_large_as_stated() -> None:

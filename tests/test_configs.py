@@ -1,0 +1,216 @@
+"""Every yaml of conf/ and experiments/ says what it is, composes, lies where its class lies, and runs five steps."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from pfbench import cli, job
+from pfbench.draws import MonteCarlo
+from pfbench.filter.loop import run_filter
+from pfbench.noise.regimes import Nominal
+from pfbench.record import Episode, Record, map_inputs
+
+CONF = cli.conf_dir()
+DATA = os.environ.get("PFBENCH_DATA")
+FILES = [*sorted(CONF.rglob("*.yaml")), *sorted(cli.experiments_dir().glob("*.yaml"))]
+SEED, RUNS, STEPS = 1, torch.arange(2), 5
+GROUPS = {
+    group: [file.stem for file in sorted((CONF / group).glob("*.yaml"))] for group in ("filter", "model", "noise", "scenario")
+}
+EXPERIMENTS = [file.stem for file in sorted(cli.experiments_dir().glob("*.yaml"))]
+
+
+def composed(*words: str) -> DictConfig:
+    cli._offer_experiments()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", [*words, "worlds=null", "particles=30"])
+
+
+def targets(node: Any) -> Iterator[str]:
+    if isinstance(node, dict):
+        yield from ([node["_target_"]] if "_target_" in node else [])
+        node = list(node.values())
+    if isinstance(node, list):
+        for part in node:
+            yield from targets(part)
+
+
+def raw(file: Path) -> dict[str, Any]:
+    read = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
+    assert isinstance(read, dict)
+    return {str(key): value for key, value in read.items()}
+
+
+# what is written
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}/{file.stem}")
+def test_every_yaml_says_in_one_line_what_it_is(file: Path) -> None:
+    first, *rest = [line for line in file.read_text().splitlines() if not line.startswith("# @package")]
+    assert first.startswith("# ")
+    assert 10 < len(first) <= 130
+    assert first.rstrip()[-1] in ".]?)" or "pfbench run" in first
+    assert rest
+    if file.parent.parent == CONF and file.parent.name in GROUPS:
+        assert cli._headline(file) == first.removeprefix("# ").strip()  # what `pfbench list` shows
+
+
+@pytest.mark.parametrize(
+    "file", [file for file in FILES if file.parent.name in GROUPS], ids=lambda f: f"{f.parent.name}/{f.stem}"
+)
+def test_a_yaml_lies_in_the_folder_of_its_class(file: Path) -> None:
+    content = raw(file)
+    own = content.get("_target_")
+    if own is None:  # it builds on another yaml of its group
+        based = [part for part in content["defaults"] if isinstance(part, str) and part != "_self_"]
+        assert len(based) == 1
+        assert based[0] in GROUPS[file.parent.name]
+        return
+    assert own.startswith(f"pfbench.{file.parent.name}.")
+    if file.parent.name == "filter":  # and so does each of its stages
+        assert all(target.startswith("pfbench.filter.") for target in targets(content))
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}/{file.stem}")
+def test_no_yaml_points_at_somebodys_disk(file: Path) -> None:
+    assert not re.search(r"(^|[\s'\"\[=])(~/|/[a-z]+/|[A-Z]:)", re.sub(r"override /\S+", "", file.read_text()), re.M)
+
+
+# what runs
+
+
+def truncated(episode: Episode) -> Episode:
+    """Its first steps."""
+    record = episode.record
+    inputs = map_inputs(lambda a: a[:, :STEPS], record.u)
+    truth = {name: value[:, :STEPS] for name, value in episode.truth.items()}
+    return Episode(Record(record.y[:, :STEPS], inputs, record.start), episode.time[:STEPS], truth, None, episode.notes)
+
+
+WORLDS: dict[str, Episode] = {}
+
+
+def world(scenario: str) -> Episode:
+    """Five steps of a scenario; of a flight, its first seconds, since its whole costs seconds."""
+    if scenario not in WORLDS:
+        cfg = composed(f"scenario={scenario}")
+        flown = cfg.scenario._target_.endswith("SimulatedFlight")
+        if flown:  # the first manoeuvres that make up some seconds: 10 s of t003, 20 s of t004
+            cfg.scenario.segments = cfg.scenario.segments[:1]
+            cfg.scenario.imu_rate = 20.0
+        WORLDS[scenario] = truncated(job.build(cfg.scenario).draw(Nominal(), RUNS, SEED))
+    return WORLDS[scenario]
+
+
+def five_steps(scenario: str, *words: str) -> None:
+    cfg = composed(f"scenario={scenario}", *words)
+    model, method, episode = job.build(cfg.model), job.build(cfg["filter"]), world(scenario)
+    truth = model.assemble(episode.truth)
+    ticks: list[int] = []
+    estimate = run_filter(method, model, episode.record, MonteCarlo(SEED, RUNS), job.judge(model, truth), lambda: ticks.append(1))
+    assert len(ticks) == STEPS
+    assert estimate.mean.shape == (2, STEPS, model.chart.size)
+    assert estimate.variance.shape == (2, STEPS, len(model.names))
+    assert len(model.units) == len(model.names)
+    assert not estimate.lost.any()
+    assert torch.isfinite(estimate.mean).all()
+    assert (estimate.variance > 0).all()
+    assert estimate.trace["error"].shape == estimate.variance.shape
+    assert estimate.trace["nees"].shape == (2, STEPS, len(model.groups))
+    seen = truth.isfinite().all((0, 1))
+    assert seen.any()
+
+
+RECORDED = [name for name in GROUPS["scenario"] if "scenario.recorded." in (CONF / "scenario" / f"{name}.yaml").read_text()]
+
+
+def test_recorded_scenarios_are_told_from_the_others() -> None:
+    assert {"car_drive", "quad_flights", "own_log"} <= set(RECORDED)
+    assert {"t003", "t004", "linear_walk"} <= set(GROUPS["scenario"]) - set(RECORDED)
+
+
+@pytest.mark.parametrize("scenario", GROUPS["scenario"])
+def test_every_scenario_runs_with_the_default_filter(scenario: str) -> None:
+    if scenario in RECORDED and DATA is None:
+        pytest.skip("PFBENCH_DATA does not name the folder of the recorded data sets")
+    if scenario == "own_log":
+        pytest.skip("it is the user's log: scenario.folder says which")
+    five_steps(scenario)
+
+
+@pytest.mark.parametrize("method", GROUPS["filter"])
+@pytest.mark.parametrize("scenario", ["linear_walk", "t004"])
+def test_every_filter_runs(scenario: str, method: str) -> None:
+    five_steps(scenario, f"filter={method}", *(["model=ins_gnss_inflated"] if scenario == "t004" else []))
+
+
+@pytest.mark.parametrize("method", GROUPS["filter"])
+def test_every_filter_runs_where_the_transition_is_singular(method: str) -> None:
+    five_steps("t004", f"filter={method}")
+
+
+def homes(model: str) -> list[str]:
+    """Scenarios that have what a model needs."""
+    if model.startswith("ins_gnss"):
+        return ["t003", "t004"]
+    return ["car_drive"] if model == "strapdown_total" else [model]
+
+
+@pytest.mark.parametrize("model", GROUPS["model"])
+def test_every_model_runs(model: str) -> None:
+    for scenario in homes(model):
+        if scenario in RECORDED and DATA is None:
+            pytest.skip("PFBENCH_DATA does not name the folder of the recorded data sets")
+        if (scenario, model) == ("t003", "ins_gnss18"):
+            continue  # its sensors have no Markov part
+        five_steps(scenario, f"model={model}", "filter=ekf")
+
+
+@pytest.mark.parametrize("noise", GROUPS["noise"])
+@pytest.mark.parametrize("scenario", ["linear_walk", "t003"])
+def test_every_regime_gives_errors(scenario: str, noise: str) -> None:
+    cfg = composed(f"scenario={scenario}", f"noise={noise}")
+    regime, times = job.build(cfg.noise), torch.arange(1.0, 201.0, dtype=torch.float64)
+    errors = regime.errors(MonteCarlo(SEED, RUNS), torch.ones(3, dtype=torch.float64), times)
+    assert errors.shape == (2, 200, 3)
+    assert torch.isfinite(errors).any()
+
+
+# what composes
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_cell_of_every_experiment_composes(experiment: str) -> None:
+    cli._offer_experiments()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        study = compose("config", [f"+experiment={experiment}"], return_hydra_config=True)
+        params = OmegaConf.to_container(study.hydra.sweeper.params) or {}
+        assert isinstance(params, dict)
+        assert study.study == experiment  # `pfbench report study=NAME` finds what +experiment=NAME made
+        swept = [[f"{key}={value}" for value in str(values).split(",")] for key, values in params.items()]
+        cells = list(product(*swept))
+        assert len(cells) > 1
+        for cell in cells:
+            cfg = compose("config", [f"+experiment={experiment}", *cell, "data.root=somewhere"])
+            OmegaConf.to_container(cfg, resolve=True)
+            job.build(cfg["filter"])
+            job.build(cfg.model)
+
+
+def test_the_scenario_brings_its_model_and_another_can_be_asked_for() -> None:
+    assert composed("scenario=t004").model.markov is True
+    assert composed("scenario=t003").model.markov is False
+    assert composed("scenario=linear_walk").model._target_.endswith("linear_walk")
+    chosen = composed("model=ins_gnss_inflated", "scenario=t004")
+    assert chosen.model.inflation._target_.endswith("Inflation")
+    assert chosen.model.imu == chosen.scenario.imu  # numbers of the scenario, whatever the order of the words

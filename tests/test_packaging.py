@@ -1,0 +1,205 @@
+"""What is installed works without the checkout, and what others build on it works without being registered."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import Said, environment, process
+
+from pfbench import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+# a project of somebody else, in two files and a folder
+
+STAGES = '''
+"""A stage of mylab's own."""
+
+from dataclasses import dataclass
+
+from pfbench.model.base import StateSpaceModel
+from pfbench.record import Record
+
+
+@dataclass(frozen=True)
+class Tempered:
+    power: float = 0.5
+    exact = False
+
+    def __call__(self, model: StateSpaceModel, log_w, x, log_ratio, seen: Record):
+        return log_w + self.power * model.log_likelihood(seen.y, x, seen.u) + log_ratio
+'''
+CAREFUL = """\
+# SIR with a tempered likelihood.
+defaults:
+  - sir
+  - _self_
+weigh:
+  _target_: mylab.stages.Tempered
+  power: {power}
+"""
+
+
+@pytest.fixture
+def mylab(tmp_path: Path) -> Path:
+    (tmp_path / "mylab").mkdir()
+    (tmp_path / "mylab" / "__init__.py").touch()
+    (tmp_path / "mylab" / "stages.py").write_text(STAGES)
+    folder = tmp_path / "conf" / "filter"
+    folder.mkdir(parents=True)
+    (folder / "careful.yaml").write_text(CAREFUL.format(power=0.5))
+    (folder / "bold.yaml").write_text(CAREFUL.format(power=1.0))  # the SIR filter itself
+    return tmp_path
+
+
+def test_a_stage_of_another_project_runs_beside_the_shipped_ones(mylab: Path) -> None:
+    walk = ("scenario=linear_walk", "scenario.steps=30", "runs=3", "particles=100")
+    words = ("run", "-m", "hydra.searchpath=[file://conf]", *walk, "filter=sir,careful,bold", "study=mine")
+    said = process(*words, home=mylab, cwd=mylab)
+    assert said.code == 0, said.err
+    found = {}
+    for file in (mylab / "results" / "mine").glob("*.npz"):
+        with np.load(file, allow_pickle=False) as stored:
+            meta = json.loads(str(stored["meta"]))
+            found[meta["choices"]["filter"]] = meta["exact"], stored["error"], meta["config"]["filter"]
+    assert found.keys() == {"sir", "careful", "bold"}
+    assert found["careful"][2]["weigh"] == {"_target_": "mylab.stages.Tempered", "power": 0.5}
+    assert (found["sir"][0], found["careful"][0]) == (True, False)  # it says of itself that it is not exact
+    assert np.array_equal(found["bold"][1], found["sir"][1])  # the same draws, the same worlds, the same filter
+    assert not np.array_equal(found["careful"][1], found["sir"][1])
+
+
+# the wheel
+
+
+def setuptools_version() -> int:
+    try:
+        return int(version("setuptools").partition(".")[0])
+    except PackageNotFoundError:
+        return 0
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy of what is in the checkout: building leaves folders behind."""
+    home = tmp_path_factory.mktemp("wheel")
+    source = home / "source"
+    source.mkdir()
+    leave = shutil.ignore_patterns("__pycache__")
+    for name in ("pfbench", "conf", "experiments"):
+        shutil.copytree(ROOT / name, source / name, ignore=leave)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source / name)
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(home / "dist")]
+    # with a new enough setuptools at hand no network is needed
+    apart = [] if setuptools_version() < 77 else ["--no-build-isolation"]
+    build = subprocess.run([*command, *apart, str(source)], capture_output=True, text=True, check=False)
+    assert build.returncode == 0, build.stderr
+    (built,) = (home / "dist").glob("pfbench-*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path) -> Path:
+    target = wheel.parents[1] / "site"
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(target), str(wheel)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return target
+
+
+def elsewhere(installed: Path, cwd: Path, *words: str) -> Said:
+    """The installed command line; `cwd` is no checkout."""
+    return process(*words, home=cwd, cwd=cwd, PYTHONPATH=str(installed))
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as opened:
+        names = set(opened.namelist())
+    wanted = {f"pfbench/{file.relative_to(ROOT / 'pfbench')}" for file in (ROOT / "pfbench").rglob("*.py")}
+    wanted |= {f"pfbench/{file.relative_to(ROOT)}" for top in ("conf", "experiments") for file in (ROOT / top).rglob("*.yaml")}
+    wanted |= {
+        f"pfbench/report/{file.name}" for pattern in ("*.jinja", "*.css") for file in (ROOT / "pfbench/report").glob(pattern)
+    }
+    wanted |= {"pfbench/py.typed", "pfbench/conf/__init__.py", "pfbench/experiments/__init__.py"}
+    assert wanted <= names
+    rest = {name for name in names - wanted if ".dist-info/" not in name}
+    assert rest == set()  # no tests, no results, no caches
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+
+
+@pytest.mark.slow
+def test_the_installed_package_needs_no_checkout(installed: Path, tmp_path: Path) -> None:
+    ask = "import pfbench, pfbench.cli as c; print(pfbench.__file__, c.conf_dir(), c.experiments_dir(), sep='\\n')"
+    env = os.environ | {"PYTHONPATH": str(installed)}
+    where = subprocess.run([sys.executable, "-c", ask], env=env, cwd=tmp_path, capture_output=True, text=True, check=True)
+    module, conf, experiments = map(Path, where.stdout.splitlines())
+    assert module == installed / "pfbench" / "__init__.py"
+    assert conf == installed / "pfbench" / "conf"
+    assert experiments == installed / "pfbench" / "experiments"
+
+    listed = elsewhere(installed, tmp_path, "list")
+    assert listed.code == 0, listed.err
+    assert all(name in listed.out for name in ("sir", "t004", "quickstart"))
+    checked = elsewhere(installed, tmp_path, "check")
+    assert checked.code == 0, checked.err
+    files = [*cli.conf_dir().glob("*/*.yaml"), *cli.experiments_dir().glob("*.yaml")]
+    assert f"composed   {len(files)} of {len(files)} configurations" in checked.out
+    ran = elsewhere(installed, tmp_path, "run", "scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=50")
+    assert ran.code == 0, ran.err
+    assert len(list((tmp_path / "results" / "adhoc").glob("*.npz"))) == 1
+    told = elsewhere(installed, tmp_path, "report", "study=adhoc", "report.formats=[svg]")
+    assert told.code == 0, told.err
+    assert (tmp_path / "reports" / "adhoc" / "index.html").is_file()
+
+
+PROGRAM = """
+import hydra
+from pfbench import job
+
+
+@hydra.main(version_base="1.3", config_path="own", config_name="study")
+def main(cfg):
+    model, scenario, noise, method = (job.build(cfg[part]) for part in ("model", "scenario", "noise", "filter"))
+    print(type(model).__name__, type(scenario).__name__, type(noise).__name__, method.particles, cfg.mine)
+
+
+main()
+"""
+STUDY = """\
+defaults:
+  - /model: linear_walk
+  - /scenario: linear_walk
+  - /noise: outliers
+  - /filter: rpf
+  - _self_
+mine: 42
+particles: 70
+hydra:
+  searchpath: [pkg://pfbench.conf]
+  output_subdir: null
+  run: {dir: .}
+"""
+
+
+@pytest.mark.slow
+def test_another_program_composes_from_the_installed_yamls(installed: Path, tmp_path: Path) -> None:
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "study.yaml").write_text(STUDY)
+    (tmp_path / "program.py").write_text(PROGRAM)
+    env = os.environ | environment(tmp_path) | {"PYTHONPATH": str(installed)}
+    command = [sys.executable, "program.py", "filter=apf"]
+    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["LinearGaussian", "ModelWorld", "Outliers", "70", "42"]
