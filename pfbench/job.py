@@ -34,7 +34,10 @@ from pfbench.record import Episode
 log = logging.getLogger("pfbench")
 
 # what changes where and how fast a job runs, not what it computes
-PLACES = ("results", "worlds", "data", "study", "threads", "engine", "fresh", "report", "scenario.root", "scenario.cache")
+PLACES = (
+    "results", "reports", "worlds", "data", "study", "threads", "engine", "fresh", "report", "scenario.root", "scenario.cache",
+    "particles",  # counted where a filter uses it, as filter.particles
+)  # fmt: skip
 _COMPILE_FROM = 5e8  # normals; compiling their kernel costs some seconds and saves 15 ms for each million
 
 
@@ -42,9 +45,12 @@ def run(cfg: DictConfig) -> float:
     """Runs one job and saves it, or finds that it is done; returns the headline error (rms of the main group's norm).
 
     Raises:
+        ValueError: a study that names no folder.
         Exception: whatever stopped the job, after a note of it has been left beside the results.
     """
     config: Any = OmegaConf.to_container(cfg, resolve=True)
+    if not re.fullmatch(r"\w[\w.-]*", str(cfg.study)):
+        raise ValueError(f"study={cfg.study}: it names a folder of results; use letters, digits, points, dashes and underscores")
     path = Path(cfg.results) / cfg.study / f"{store.key(config, PLACES)}.npz"
     choices = _choices()
     name = " ".join(choices[part] for part in ("scenario", "noise", "filter"))

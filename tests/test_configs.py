@@ -197,7 +197,7 @@ def test_every_cell_of_every_experiment_composes(experiment: str) -> None:
         params = OmegaConf.to_container(study.hydra.sweeper.params) or {}
         assert isinstance(params, dict)
         assert study.study == experiment  # `pfbench report study=NAME` finds what +experiment=NAME made
-        swept = [[f"{key}={value}" for value in str(values).split(",")] for key, values in params.items()]
+        swept = [[f"{key!s}={value}" for value in str(values).split(",")] for key, values in params.items()]
         cells = list(product(*swept))
         assert len(cells) > 1
         for cell in cells:

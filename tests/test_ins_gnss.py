@@ -20,7 +20,7 @@ from pfbench.draws import MonteCarlo
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.rules import Cubature, Jacobian, Points, Unscented
-from pfbench.model.ins_gnss import InsGnss
+from pfbench.model.ins_gnss import InsGnss, Step
 from pfbench.nav import attitude, earth, error_dynamics
 from pfbench.nav.aiding import Alignment, Inflation, Receiver
 from pfbench.nav.sensors import ImuErrors
@@ -161,7 +161,9 @@ def test_the_transition_law_is_the_law_of_propagate(flight: Episode, name: str) 
     seen = model.prepare(flight.record).at(7)
     x = MonteCarlo(2, RUNS).normal("x", 5, len(model.names)) * model.p0
     w = MonteCarlo(2, RUNS).normal("w", 5, model.noise_dim)
-    log_p = model.transition(x, seen.u).log_prob(model.propagate(x, seen.u, w))
+    law = model.transition(x, seen.u)
+    assert law is not None
+    log_p = law.log_prob(model.propagate(x, seen.u, w))
     log_det = torch.linalg.slogdet(model.noise_gain(seen.u))[1].unsqueeze(-1)
     wanted = model.noise.log_prob(w) - log_det  # change of variables
     assert torch.allclose(log_p, wanted, rtol=1e-9, atol=1e-7)
@@ -180,7 +182,7 @@ def test_a_singular_transition_is_not_faked(flight: Episode, name: str) -> None:
 def test_measurement_order_is_position_then_velocity() -> None:
     model = MODELS["18 states"]()
     x = torch.arange(18.0, dtype=torch.float64).reshape(1, 1, 18)
-    law = model.observation(x, None)
+    law: Any = model.observation(x, Step(x))
     assert law.mean[0, 0].tolist() == [6.0, 7.0, 8.0, 3.0, 4.0, 5.0]
     assert torch.allclose(law.stddev[0, 0], torch.tensor([6.87, 7.20, 4.83, 0.21, 0.20, 0.14], dtype=torch.float64))
 

@@ -84,8 +84,10 @@ class InsGnss(StateSpaceModel):
         self.register_buffer("r", receiver.sd)
         self.register_buffer("seen", torch.tensor([6, 7, 8, 3, 4, 5][: len(receiver.sd)]))
         self.noise_dim = len(self.names) if inflation else 12
-        if inflation:
-            self.choices = (f"every filter's model is inflated: {inflation}",)
+        choices = [f"every filter's model is inflated: {inflation}"] if inflation else []
+        if markov and imu.accelerometer_bias > 0 and imu.accelerometer_markov > 0:
+            choices.append("the constant accelerometer bias counts as Markov and decays: its spread becomes too small")
+        self.choices = tuple(choices)
 
     @property
     def anchor(self) -> Tensor:

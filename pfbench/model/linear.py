@@ -113,6 +113,7 @@ def linear_walk(step: float, noise: float, measurement_sd: float, initial_sd: Se
     Q = noise^2 [[step^3/3, step^2/2], [step^2/2, step]], entered by its Cholesky factor.
     """
     positive("noise", noise)
+    positive("step", step)
     q = noise**2 * torch.tensor([[step**3 / 3, step**2 / 2], [step**2 / 2, step]], dtype=torch.float64)
     return LinearGaussian(
         [[1.0, step], [0.0, 1.0]], torch.linalg.cholesky(q), [[1.0, 0.0]], [measurement_sd], [0.0, 0.0], list(initial_sd),
