@@ -1,4 +1,4 @@
-"""pfbench itself: its SIR filter in its own time loop, with moments, group covariances and traces at every step.
+"""pfbench itself: its SIR filter in its own time loop, with mean, variance and traces at every step.
 
     python house.py float32|float64 eager|compiled WORKLOAD
 """
@@ -23,7 +23,9 @@ from pfbench.record import Record
 def sir(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
     """The project's SIR filter, resampling at every step; `compiled` fuses the kernel that makes normals."""
     model = ins_model().to(dtype)
-    record = Record(torch.from_numpy(work.y), Step(torch.from_numpy(work.step)[None])).to(model.anchor)
+    step, d = torch.from_numpy(work.step)[None], len(work.p0)
+    inputs = Step(step[..., :d].contiguous(), step[..., d:].contiguous())
+    record = Record(torch.from_numpy(work.y), inputs).to(model.anchor)
     method = ParticleFilter(int(work.particles), Resample(Systematic(), threshold=1.0))
     runs = torch.arange(len(work.y))
     fill = compiled_normals() if compiled else blocked_normals

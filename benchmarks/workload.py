@@ -72,17 +72,17 @@ def make(runs: int, steps: int, particles: int, seed: int = 1) -> Workload:
         ValueError: more steps than the flight has.
     """
     model = ins_model()
-    step = model.discretise(_nominal(steps, seed))[:, :steps]
+    phi, gain = (a[:, :steps] for a in model.discretise(_nominal(steps, seed)))
     draws = MonteCarlo(seed, torch.arange(runs))
     x = model.p0 * draws.normal("world.state", 1, len(model.p0))
     states = []
     for t in range(steps):
-        x = model.propagate(x, Step(step[:, t]), draws.at(t + 1).normal("world.state", 1, model.noise_dim))
+        x = model.propagate(x, Step(phi[:, t], gain[:, t]), draws.at(t + 1).normal("world.state", 1, model.noise_dim))
         states.append(x[:, 0])
     truth = torch.stack(states, 1)
     error = torch.stack([draws.at(t + 1).normal("world.measurement", 1, len(model.r))[:, 0] for t in range(steps)], 1)
     y = truth[..., model.seen] + model.r * error
-    step0, p0, r, seen, seen_y = (a.numpy() for a in (step[0], model.p0, model.r, model.seen, y))
+    step0, p0, r, seen, seen_y = (a.numpy() for a in (torch.cat([phi, gain], -1)[0], model.p0, model.r, model.seen, y))
     log_evidence, mean, sd = kalman(step0, p0, r, seen, seen_y)
     return Workload(step0, p0, r, seen, seen_y, truth.numpy(), log_evidence, mean, sd, np.array(particles))
 

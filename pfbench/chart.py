@@ -121,7 +121,7 @@ class Chart:
         Curved blocks average in the tangent at the heaviest particle, then again at the mean so found (Gauss-Newton).
         """
         if self.flat:
-            return (w.unsqueeze(-1) * x).sum(-2)
+            return (w.unsqueeze(-2) @ x).squeeze(-2)
         heaviest = w.argmax(-1, keepdim=True).unsqueeze(-1).expand(*x.shape[:-2], 1, x.shape[-1])
         m = x.gather(-2, heaviest)
         for _ in range(passes):

@@ -130,9 +130,9 @@ def philox(counter: Words, key: tuple[Tensor, Tensor], rounds: int = 10) -> Word
     arithmetic shift drags along and the high half of the other product are masked away together, after the exclusive or.
     """
     c0, c1, c2, c3 = counter
-    k0, k1 = key
-    for _ in range(rounds):
+    turn = torch.arange(rounds, device=key[0].device)
+    keys = zip(*(((k + weyl * turn) & _WORD).unbind(0) for k, weyl in zip(key, _WEYL, strict=True)), strict=True)
+    for k0, k1 in keys:
         p0, p1 = c0 * _MULTIPLY[0], c2 * _MULTIPLY[1]
         c0, c1, c2, c3 = ((p1 >> 32) ^ c1 ^ k0) & _WORD, p1, ((p0 >> 32) ^ c3 ^ k1) & _WORD, p0
-        k0, k1 = (k0 + _WEYL[0]) & _WORD, (k1 + _WEYL[1]) & _WORD
     return c0, c1 & _WORD, c2, c3 & _WORD

@@ -146,10 +146,10 @@ def judge(model: StateSpaceModel, truth: Tensor) -> Callable[[int, Info], dict[s
 
     def watch(t: int, info: Info) -> dict[str, Tensor]:
         error = model.error(info.mean, truth[:, t])
-        nees = []
-        for name, parts in model.groups.items():
-            e = error[:, list(parts)].unsqueeze(-1)
-            value = (e.mT @ torch.linalg.solve_ex(info.blocks[name], e)[0]).flatten()
+        nees, covariance = [], info.covariance()
+        for parts in map(list, model.groups.values()):
+            e = error[:, parts].unsqueeze(-1)
+            value = (e.mT @ torch.linalg.solve_ex(covariance[:, parts][:, :, parts], e)[0]).flatten()
             known = ~torch.isnan(e).any(1).flatten()
             nees.append(torch.where(known & ~(value >= 0.0), torch.inf, value))
         return {"error": error, "nees": torch.stack(nees, 1)}

@@ -39,10 +39,9 @@ NILE = torch.tensor(np.loadtxt(Path(__file__).parent / "nile.csv", delimiter=","
 
 def run(rule: Rule, model: StateSpaceModel, y: Tensor, u: Any = (), start: Tensor | None = None, **options: Any) -> Estimate:
     """Runs a Gaussian filter; its whole covariance is watched as trace["covariance"]."""
-    group = next(iter(model.groups))
     draws = MonteCarlo(0, torch.arange(y.shape[0]))
     method = GaussianFilter(rule, **options)
-    return run_filter(method, model, Record(y, u, start), draws, watch=lambda t, info: {"covariance": info.blocks[group]})
+    return run_filter(method, model, Record(y, u, start), draws, watch=lambda t, info: {"covariance": info.covariance()})
 
 
 # the oracles themselves, against one big normal law of all states and measurements

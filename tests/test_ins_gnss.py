@@ -88,7 +88,7 @@ def test_transition_is_the_matrix_exponential_to_order_four(flight: Episode) -> 
     ft = f * u.duration[..., None, None]
     before, after = scales(u)
     exact = after @ torch.matrix_exp(ft) @ torch.linalg.inv(before)
-    phi = MODELS["18 states"]().discretise(u)[..., :18]
+    phi = MODELS["18 states"]().discretise(u).phi
     # what a fourth-order series leaves out is its fifth term, and next to nothing more
     fifth = after @ torch.linalg.matrix_power(ft, 5) @ torch.linalg.inv(before) / 120
     assert (phi - exact).abs().max() <= 1.01 * fifth.abs().max() + 1e-12
@@ -96,7 +96,7 @@ def test_transition_is_the_matrix_exponential_to_order_four(flight: Episode) -> 
 
 
 def test_fifteen_states_are_eighteen_without_a_markov_part(flight: Episode) -> None:
-    phi18, phi15 = (MODELS[name]().discretise(flight.record.u) for name in ("18 states", "15 states"))
+    phi18, phi15 = (MODELS[name]().discretise(flight.record.u).phi for name in ("18 states", "15 states"))
     assert torch.allclose(phi15[..., :9, :12], phi18[..., :9, :12], rtol=1e-12, atol=0)
     eye = torch.eye(6, dtype=torch.float64).expand(*phi15.shape[:2], -1, -1)
     assert torch.equal(phi15[..., 9:, 9:15], eye)  # random walks
@@ -123,7 +123,7 @@ def test_noise_over_an_interval_against_van_loan(flight: Episode, source: str) -
     power = torch.matrix_exp(block * span)  # [Van Loan 1978]
     after = scales(u)[1]
     exact = after @ power[..., 18:, 18:].mT @ power[..., :18, 18:] @ after
-    factor = model.discretise(u)[..., 18 + first : 21 + first]
+    factor = model.discretise(u).gain[..., first : first + 3]
     ours = factor @ factor.mT
     for start, k in chain:
         axes = slice(start, start + 2)  # the vertical is driven by the horizontal specific force, which manoeuvres change
@@ -144,14 +144,14 @@ def test_the_noise_gain_is_what_propagate_does_with_noise(flight: Episode, name:
 
 def test_inflation_adds_its_variances_and_nothing_else(flight: Episode) -> None:
     plain, inflated = (MODELS[name]().discretise(flight.record.u) for name in ("18 states", "18 inflated"))
-    noise, full = plain[..., 18:], inflated[..., 18:]
+    noise, full = plain.gain, inflated.gain
     extra = full @ full.mT - noise @ noise.mT
     arcsec, size = math.radians(1 / 3600), Inflation()
     gyro, accelerometer = [size.gyro_deg_h * math.radians(1) / 3600] * 6, [size.accelerometer_ug * 9.80665e-6] * 3
     sd = [*(a * arcsec for a in size.attitude_arcsec), *size.velocity, *size.position, *gyro, *accelerometer]
     wanted = torch.diag(torch.tensor(sd, dtype=torch.float64).square())
     scale = torch.tensor(sd, dtype=torch.float64)
-    assert torch.allclose(plain[..., :18], inflated[..., :18], rtol=1e-14, atol=0)
+    assert torch.allclose(plain.phi, inflated.phi, rtol=1e-14, atol=0)
     assert torch.allclose(extra / scale / scale[:, None], (wanted / scale / scale[:, None]).expand_as(extra), atol=1e-9)
 
 
@@ -182,7 +182,7 @@ def test_a_singular_transition_is_not_faked(flight: Episode, name: str) -> None:
 def test_measurement_order_is_position_then_velocity() -> None:
     model = MODELS["18 states"]()
     x = torch.arange(18.0, dtype=torch.float64).reshape(1, 1, 18)
-    law: Any = model.observation(x, Step(x))
+    law: Any = model.observation(x, Step(x, x))
     assert law.mean[0, 0].tolist() == [6.0, 7.0, 8.0, 3.0, 4.0, 5.0]
     assert torch.allclose(law.stddev[0, 0], torch.tensor([6.87, 7.20, 4.83, 0.21, 0.20, 0.14], dtype=torch.float64))
 

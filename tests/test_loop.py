@@ -59,7 +59,7 @@ def test_watch_and_tick_are_called_at_every_step_and_change_nothing(method: Part
 
     def watch(t: int, info: Info) -> dict[str, torch.Tensor]:
         seen.append(t)
-        return {"corner": info.blocks["state"][:, 0, 1], "block": info.blocks["state"]}
+        return {"corner": info.covariance()[:, 0, 1], "block": info.covariance()}
 
     plain = run_filter(method, MODEL, record(), draws())
     watched = run_filter(method, MODEL, record(), draws(), watch=watch, tick=lambda: ticks.append(None))

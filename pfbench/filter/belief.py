@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -53,13 +54,13 @@ class Info(NamedTuple):
     Attributes:
         mean: estimate [R, D].
         variance: [R, d].
-        blocks: covariance of each of the model's groups, {group: [R, k, k]}.
+        covariance: gives the whole covariance in the chart [R, d, d] to whoever asks; a cloud's costs a tenth of a step.
         trace: anything per run, {name: [R]}, such as `ess` or `resampled`.
     """
 
     mean: Tensor
     variance: Tensor
-    blocks: dict[str, Tensor]
+    covariance: Callable[[], Tensor]
     trace: dict[str, Tensor]
 
 
@@ -103,13 +104,6 @@ def where(hit: Tensor, new: Cloud, old: Cloud) -> Cloud:
         window={k: choose(v, old.window[k]) for k, v in new.window.items()},
         memory={k: choose(v, old.memory[k]) for k, v in new.memory.items()},
     )
-
-
-def columns(a: Tensor, parts: tuple[int, ...]) -> Tensor:
-    """Components `parts` of the last axis; a view where they are neighbours, since an index list copies."""
-    if parts == tuple(range(parts[0], parts[0] + len(parts))):
-        return a[..., parts[0] : parts[0] + len(parts)]
-    return a[..., list(parts)]
 
 
 def weights(log_w: Tensor) -> Tensor:

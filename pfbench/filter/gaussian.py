@@ -82,8 +82,8 @@ class GaussianFilter:
         covariance = spread @ spread.mT
         mean = model.chart.add(predicted.y, (root @ shift.unsqueeze(-1)).squeeze(-1))
         log_z = belief.log_z + torch.where(rooted & positive & torch.isfinite(log_like), log_like, -torch.inf)
-        groups = {name: covariance[:, list(parts)][:, :, list(parts)] for name, parts in model.groups.items()}
-        return Gaussian(mean, covariance, log_z, memory), Info(mean, covariance.diagonal(dim1=-2, dim2=-1), groups, {})
+        info = Info(mean, covariance.diagonal(dim1=-2, dim2=-1), lambda: covariance, {})
+        return Gaussian(mean, covariance, log_z, memory), info
 
     def _predict(self, model: StateSpaceModel, belief: Gaussian, u: Any) -> tuple[Linearised, Tensor]:
         chart, d = model.chart, model.chart.dimension

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import Standard, StateSpaceModel
 from pfbench.record import Record
 
 
@@ -48,6 +48,8 @@ def draw_noise(model: StateSpaceModel, n: int, draws: Draws) -> Tensor:
     """
     law = model.noise
     base = law.base_dist if isinstance(law, torch.distributions.Independent) else law
+    if isinstance(base, Standard):
+        return draws.normal("noise", n, model.noise_dim)
     if isinstance(base, torch.distributions.Normal):
         return base.loc + base.scale * draws.normal("noise", n, model.noise_dim)
     return base.icdf(draws.uniform("noise", n, model.noise_dim).to(model.anchor.dtype))

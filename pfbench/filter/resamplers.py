@@ -68,9 +68,9 @@ class Resample:
             hit = 1.0 / a.square().sum(-1) < self.threshold * n.squeeze(1)
         ancestors = self.scheme(a, n, draws)
         slots = torch.arange(a.shape[1], device=a.device)
-        carried = (cloud.log_w - log_a).gather(1, ancestors) - torch.log(n.to(a.dtype))
-        fresh = belief.gather(cloud, ancestors)._replace(log_w=torch.where(slots < n, carried, -torch.inf))
-        return belief.where(hit, fresh, cloud), hit
+        fresh = belief.gather(cloud._replace(log_w=cloud.log_w - log_a), ancestors)
+        fresh = fresh._replace(log_w=torch.where(slots < n, fresh.log_w - torch.log(n.to(a.dtype)), -torch.inf))
+        return (belief.where(hit, fresh, cloud) if self.threshold < 1.0 else fresh), hit
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -13,6 +14,12 @@ from torch.distributions import Distribution
 from pfbench.chart import Chart, Euclidean
 from pfbench.covariance import gaussian_log_density
 from pfbench.record import Record
+
+_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class Standard(Normal):
+    """Independent standard normal numbers, known by this type, so that nobody need multiply them by one and add zero."""
 
 
 class StateSpaceModel(nn.Module, ABC):
@@ -58,7 +65,7 @@ class StateSpaceModel(nn.Module, ABC):
     def noise(self) -> Distribution:
         """Law of w, event [W], components independent; standard normal unless the model says otherwise."""
         zero = self.anchor.new_zeros(self.noise_dim)
-        return Normal(zero, torch.ones_like(zero), validate_args=False).to_event(1)
+        return Standard(zero, torch.ones_like(zero), validate_args=False).to_event(1)
 
     @abstractmethod
     def initial(self, runs: int) -> Distribution:
@@ -117,8 +124,10 @@ class StateSpaceModel(nn.Module, ABC):
             TypeError: the observation law is neither Independent nor MultivariateNormal.
         """
         law = self.observation(x, u)
+        seen = ~torch.isnan(y).unsqueeze(1)  # [R, 1, Dy]
+        if isinstance(law, torch.distributions.Independent) and isinstance(law.base_dist, torch.distributions.Normal):
+            return _log_normal(self.residual(y.nan_to_num().unsqueeze(1), law.base_dist.loc), law.base_dist.scale, seen)
         y_hat = law.mean
-        seen = ~torch.isnan(y).unsqueeze(1)
         r = torch.where(seen, self.residual(y.unsqueeze(1), y_hat), 0.0)
         if isinstance(law, torch.distributions.Independent):
             return (law.base_dist.log_prob(y_hat + r) * seen).sum(-1)
@@ -162,6 +171,18 @@ class AtRest(StateSpaceModel):
 
     def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
         return self.model.log_likelihood(y, x, u)
+
+
+def _log_normal(r: Tensor, sd: Tensor, seen: Tensor) -> Tensor:
+    """Log density of independent normal residuals [R, N, Dy] over the components seen [R, 1, Dy] -> [R, N].
+
+    Does what torch's log_prob does in one pass over the particles instead of eight: half of a step was spent there.
+    """
+    if sd.stride(0) == 0 and sd.stride(1) == 0:  # one scale for all particles, which torch has expanded
+        sd = sd[:1, :1]
+    z = r * (seen / sd)
+    constant = ((torch.log(sd) + _HALF_LOG_2PI) * seen).sum(-1)
+    return -0.5 * (z * z).sum(-1) - constant
 
 
 def independent_normal(mean: Tensor, sd: Tensor) -> Independent:

@@ -29,9 +29,10 @@ _TAYLOR = 4  # terms of the matrix exponential; at 1 s the fifth is below 1e-6 i
 
 
 class Step(NamedTuple):
-    """[Phi | L] of each interval [R or 1, T, D, D + W], so that a step is one product."""
+    """Transition [R or 1, T, D, D] and noise gain [R or 1, T, D, W] of each interval."""
 
-    step: Tensor
+    phi: Tensor
+    gain: Tensor
 
 
 class InsGnss(StateSpaceModel):
@@ -94,11 +95,11 @@ class InsGnss(StateSpaceModel):
         return self.p0
 
     def prepare(self, record: Record) -> Record:
-        """Intervals of the nominal trajectory to [Phi | L], once for all steps."""
-        return record if isinstance(record.u, Step) else record._replace(u=Step(self.discretise(record.u)))
+        """Intervals of the nominal trajectory to transitions and noise gains, once for all steps."""
+        return record if isinstance(record.u, Step) else record._replace(u=self.discretise(record.u))
 
-    def discretise(self, u: Intervals) -> Tensor:
-        """[Phi | L]: intervals with leading axes [...] -> [..., D, D + W], float64."""
+    def discretise(self, u: Intervals) -> Step:
+        """Transition [..., D, D] and noise gain [..., D, W] of intervals with leading axes [...], float64."""
         d = len(self.names)
         f, g, q = self._continuous(u)
         span = u.duration[..., None, None]
@@ -111,12 +112,12 @@ class InsGnss(StateSpaceModel):
         phi = error_dynamics.in_metres(phi, u.pos_start, u.pos_end)
         noise = error_dynamics.in_metres(gamma, u.pos_start, u.pos_end) @ g * torch.sqrt(q * span)
         if self.inflation is None:
-            return torch.cat([phi, noise], -1)
+            return Step(phi, noise)
         extra = torch.cat([self.inflation.motion, *[self.inflation.gyro] * (d // 3 - 4), self.inflation.accelerometer])
         full, ok = factor(noise @ noise.mT + torch.diag(extra.to(noise).square()))
         if not bool(ok.all()):
             raise ValueError(f"model.inflation={self.inflation}: no square root of the noise exists; give every state some")
-        return torch.cat([phi, full], -1)
+        return Step(phi, full)
 
     def _continuous(self, u: Intervals) -> tuple[Tensor, Tensor, Tensor]:
         """F [..., D, D], G [..., D, 12], and spectral densities q [12] of gyro, accelerometer, and their drivers."""
@@ -143,13 +144,15 @@ class InsGnss(StateSpaceModel):
         return normal_batch(runs, self.p0)
 
     def propagate(self, x: Tensor, u: Step, w: Tensor) -> Tensor:
-        return (u.step @ torch.cat([x.mT, w.mT], 1)).mT
+        runs = x.shape[0]
+        driven = u.gain.expand(runs, -1, -1) @ w.mT
+        return torch.baddbmm(driven, u.phi.expand(runs, -1, -1), x.mT).mT
 
     def noise_gain(self, u: Step) -> Tensor:
-        return u.step[..., len(self.names) :]
+        return u.gain
 
     def observation(self, x: Tensor, u: Step) -> Distribution:
-        return independent_normal(x[..., self.seen], self.r)
+        return independent_normal(x.mT.index_select(1, self.seen).mT, self.r)
 
     def transition(self, x: Tensor, u: Step) -> Distribution | None:
         if self.inflation is None:
