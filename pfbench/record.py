@@ -50,7 +50,7 @@ class Episode:
         time: seconds at each step [T].
         truth: true state by group of components, each [R, T, k]; a group that has no truth is left out, an instant without
             truth is NaN (after the end of a short flight, say).
-        track: true position East, North, Up in metres from the start [R, T, 3], or None where there is no map.
+        track: true position from the start: East, North, and height above the start's, m [R, T, 3]; None where there is no map.
         notes: readings and choices of this world that a report must mention.
     """
 

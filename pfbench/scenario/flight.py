@@ -57,7 +57,7 @@ class SimulatedFlight:
     def draw(self, noise: Regime, runs: Tensor, seed: int) -> Episode:
         """Worlds of these runs: position and velocity differences INS minus receiver, the intervals as inputs."""
         recipe = (
-            "flight 1", list(self.segments), self.start, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist()
+            "flight 2", list(self.segments), self.start, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist()
         )  # fmt: skip
         world = cached(self.cache, recipe, lambda: self._simulate(MonteCarlo(seed, runs)))
         truth = {name[6:]: value for name, value in world.items() if name.startswith("truth.")}
@@ -93,5 +93,7 @@ class SimulatedFlight:
             "accelerometer_bias": imu.accelerometer_bias.unsqueeze(1) + accelerometer,
         }
         named = {f"truth.{name}": value.contiguous() for name, value in truth.items()}
-        track = earth.local_enu(pos, flight.pos[0]).unsqueeze(0)
+        plan = earth.local_enu(pos, flight.pos[0])[:, :2]
+        height = pos[:, 2:] - flight.pos[0, 2]  # above the ellipsoid: the tangent plane is 100 m up after 36 km
+        track = torch.cat([plan, height], -1).unsqueeze(0)
         return {"time": flight.time[per::per], "track": track, **named, **{k: v.contiguous() for k, v in u._asdict().items()}}
