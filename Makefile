@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo test test-fast test-slow lint bench figures clean
+.PHONY: demo test test-fast test-slow lint bench clean
 
 # Installs everything once; runs again only when the requirements change.
 $(VENV)/.installed: pyproject.toml constraints.txt
