@@ -10,7 +10,7 @@ cost little more than one: eager torch spends its time on the number of operatio
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -83,7 +83,13 @@ def align(dcm: Tensor, vel: Tensor, pos: Tensor, alpha: Tensor, dvel: Tensor, dp
 
 @torch.no_grad()
 def navigate(
-    ins: Ins, dtheta: Tensor, dv: Tensor, dt: float | Tensor, samples_per_interval: int, samples_per_step: int = 2
+    ins: Ins,
+    dtheta: Tensor,
+    dv: Tensor,
+    dt: float | Tensor,
+    samples_per_interval: int,
+    samples_per_step: int = 2,
+    tick: Callable[[], object] | None = None,
 ) -> tuple[Ins, Intervals]:
     """Run the mechanisation over all samples.
 
@@ -95,6 +101,7 @@ def navigate(
             samples; one of no duration and no increment does nothing, so ragged intervals can be filled up with such.
         samples_per_interval: IMU samples in a filter interval; divides n.
         samples_per_step: 2, or 1, which uses the sample before (of this call) for coning and sculling.
+        tick: called after each interval (a progress bar).
 
     Returns:
         The state at the end, and the T = n / samples_per_interval intervals.
@@ -116,6 +123,8 @@ def navigate(
             nodes.append(state)
             forces.append(impulse)
             impulse = torch.zeros_like(impulse)
+            if tick:
+                tick()
     end = Ins(state.c.permute(2, 0, 1), state.v.T, state.p.T, state.a.T)
     return end, _intervals(nodes, forces, d.unflatten(-1, (-1, per_interval)).sum(-1))
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from pfbench.draws import MonteCarlo
 from pfbench.nav import attitude, earth, sensors, strapdown, trajectory
@@ -79,7 +80,9 @@ class SimulatedFlight:
         imu = sensors.corrupt(flight.dtheta, flight.dv, 1.0 / self.imu_rate, self.imu, draws)
         errors = self.initial.sd * draws.normal("world.initial", 1, 9)[:, 0]
         ins = strapdown.align(flight.dcm[0], flight.vel[0], flight.pos[0], errors[:, :3], errors[:, 3:6], errors[:, 6:])
-        _, u = strapdown.navigate(ins, imu.dtheta, imu.dv, 1.0 / self.imu_rate, per)
+        total = imu.dtheta.shape[1] // per
+        with tqdm(total=total, desc="simulating flights", unit="interval", delay=2, disable=None, leave=False) as bar:
+            _, u = strapdown.navigate(ins, imu.dtheta, imu.dv, 1.0 / self.imu_rate, per, tick=bar.update)
         dcm, vel, pos = flight.dcm[per::per], flight.vel[per::per], flight.pos[per::per]
         gyro, accelerometer = imu.gyro_markov[:, per - 1 :: per], imu.accelerometer_markov[:, per - 1 :: per]
         constant = imu.gyro_bias.unsqueeze(1).expand_as(gyro)
