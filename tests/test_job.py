@@ -9,7 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from command_line import Said, pfbench, process
+
+from pfbench.filter.belief import Info
+from pfbench.job import judge
+from pfbench.model.linear import linear_walk
 
 WALK = ("scenario=linear_walk", "scenario.steps=25", "particles=100")
 FIELDS = {"time", "error", "sd", "nees", "log_evidence", "lost", "meta"}
@@ -211,3 +216,14 @@ def test_a_damaged_file_is_told_and_not_taken_for_a_result(tmp_path: Path) -> No
     assert "delete it and run the job again" in said.err
     assert pfbench(*words, "fresh=true", home=tmp_path).code == 0
     assert stored(file)[0]["runs"] == 2
+
+
+def test_a_collapsed_cloud_is_infinitely_wrong_and_no_truth_is_unknown() -> None:
+    model = linear_walk(step=1.0, noise=1.0, measurement_sd=1.0)
+    nan, eye = torch.nan, torch.eye(2, dtype=torch.float64)
+    truth = torch.tensor([[0.0, 0.0], [0.0, 0.0], [nan, 0.0]], dtype=torch.float64).unsqueeze(1)
+    covariance = torch.stack([4.0 * eye, 0.0 * eye, eye])
+    info = Info(torch.ones(3, 2, dtype=torch.float64), covariance.diagonal(dim1=-2, dim2=-1), lambda: covariance, {})
+    nees = judge(model, truth)(0, info)["nees"][:, 0].tolist()
+    assert nees[:2] == [0.5, math.inf]
+    assert math.isnan(nees[2])
