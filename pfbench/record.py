@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -16,11 +16,14 @@ class Record(NamedTuple):
         u: inputs, a NamedTuple of tensors with leading axes [R, T] or [1, T] (shared by all runs), or () for none.
         start: the state [R, D] about which each run's initial law is laid out, where runs start from different states; None
             where the model's `origin` serves all of them.
+        spread: Cholesky factor [R, d, d] of each run's initial covariance about `start`, where runs differ in it (a filter that
+            starts from its first measurement, say); None where the model's `initial` law serves all of them.
     """
 
     y: Tensor
     u: Any = ()
     start: Tensor | None = None
+    spread: Tensor | None = None
 
     def at(self, t: int) -> Record:
         """Step t alone: y [R, Dy], inputs [R or 1, ...]."""
@@ -32,8 +35,8 @@ class Record(NamedTuple):
         def moved(a: Tensor) -> Tensor:
             return a.to(like) if a.is_floating_point() else a.to(like.device)
 
-        start = None if self.start is None else moved(self.start)
-        return Record(moved(self.y), map_inputs(moved, self.u), start)
+        start, spread = (None if a is None else moved(a) for a in (self.start, self.spread))
+        return Record(moved(self.y), map_inputs(moved, self.u), start, spread)
 
 
 def map_inputs(f: Any, u: Any) -> Any:
@@ -52,6 +55,8 @@ class Episode:
             truth is NaN (after the end of a short flight, say).
         track: true position from the start: East, North, and height above the start's, m [R, T, 3]; None where there is no map.
         notes: readings and choices of this world that a report must mention.
+        sheet: what a datasheet of the world draws besides, of run 0: `force` [T, 3] m/s^2 and `rate` [T, 3] rad/s in body axes,
+            `azimuth` and `elevation` of the satellites [T, S] rad (NaN where below the horizon).
     """
 
     record: Record
@@ -59,3 +64,4 @@ class Episode:
     truth: dict[str, Tensor]
     track: Tensor | None = None
     notes: tuple[str, ...] = ()
+    sheet: dict[str, Tensor] = field(default_factory=dict)

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from pfbench import cli, job
 from pfbench.draws import MonteCarlo
 from pfbench.filter.loop import run_filter
-from pfbench.noise.regimes import Nominal
+from pfbench.noise.regimes import Channels, Nominal
 from pfbench.record import Episode, Record, map_inputs
 
 CONF = cli.conf_dir()
@@ -181,7 +181,7 @@ def test_every_model_runs(model: str) -> None:
 def test_every_regime_gives_errors(scenario: str, noise: str) -> None:
     cfg = composed(f"scenario={scenario}", f"noise={noise}")
     regime, times = job.build(cfg.noise), torch.arange(1.0, 201.0, dtype=torch.float64)
-    errors = regime.errors(MonteCarlo(SEED, RUNS), torch.ones(3, dtype=torch.float64), times)
+    errors = regime.errors(MonteCarlo(SEED, RUNS), Channels.alike(torch.ones(3, dtype=torch.float64)), times)
     assert errors.shape == (2, 200, 3)
     assert torch.isfinite(errors).any()
 

@@ -11,7 +11,7 @@ import torch
 from scipy import stats
 
 from pfbench.draws import MonteCarlo
-from pfbench.noise.regimes import Nominal, Outage, Outliers, Regime, StudentT
+from pfbench.noise.regimes import Channels, Nominal, Outage, Outliers, Regime, StudentT
 
 SD = torch.tensor([2.0, 0.05, 30.0], dtype=torch.float64)
 TIME = torch.arange(0.0, 300.0, dtype=torch.float64)
@@ -21,7 +21,7 @@ every_regime = pytest.mark.parametrize("regime", REGIMES, ids=lambda r: type(r).
 
 
 def errors(regime: Regime, runs: torch.Tensor | None = None) -> torch.Tensor:
-    return regime.errors(MonteCarlo(2, torch.arange(RUNS) if runs is None else runs), SD, TIME)
+    return regime.errors(MonteCarlo(2, torch.arange(RUNS) if runs is None else runs), Channels.alike(SD), TIME)
 
 
 @every_regime
@@ -35,7 +35,7 @@ def test_shape_and_a_run_alone(regime: Regime) -> None:
 @every_regime
 def test_errors_scale_with_the_nominal_deviation(regime: Regime) -> None:
     z = errors(regime)
-    doubled = regime.errors(MonteCarlo(2, torch.arange(RUNS)), 2 * SD, TIME)
+    doubled = regime.errors(MonteCarlo(2, torch.arange(RUNS)), Channels.alike(2 * SD), TIME)
     assert torch.allclose(doubled, 2 * z, equal_nan=True)
 
 

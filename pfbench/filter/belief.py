@@ -72,9 +72,13 @@ class Filter(Protocol):
         """Does the belief target p(x_t | y_1:t): as N grows, or, for a Gaussian filter, on linear-Gaussian models?"""
 
     def init(
-        self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None
+        self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None, spread: Tensor | None = None
     ) -> Cloud | Gaussian:
-        """The belief before anything is seen, about `start` [R, D] or, without one, about the model's `origin`."""
+        """The belief before anything is seen.
+
+        About `start` [R, D] or, without one, about the model's `origin`; with the model's initial law or, where there is a
+        `spread` [R, d, d], as a normal with this Cholesky factor.
+        """
 
     def step(self, model: StateSpaceModel, belief: Any, seen: Record, draws: Draws) -> tuple[Cloud | Gaussian, Info]: ...
 

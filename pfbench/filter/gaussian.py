@@ -14,7 +14,7 @@ from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter.belief import Gaussian, Info
 from pfbench.filter.rules import Linearised, Rule, Space
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -57,9 +57,11 @@ class GaussianFilter:
     adaptations: tuple[Adaptation, ...] = ()
     exact = False  # on nonlinear or non-Gaussian models; on linear-Gaussian ones it is the Kalman filter
 
-    def init(self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None) -> Gaussian:
+    def init(
+        self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None, spread: Tensor | None = None
+    ) -> Gaussian:
         """The moments of the initial law."""
-        law: Any = model.initial(runs)
+        law: Any = initial_law(model, runs, spread)
         dense = isinstance(law, torch.distributions.MultivariateNormal)
         covariance = law.covariance_matrix if dense else torch.diag_embed(law.variance)
         origin = model.origin.expand(runs, -1) if start is None else start

@@ -62,9 +62,9 @@ def run_filter(
         raise ValueError("record: no measurements; give at least one time step")
     if bool(torch.isinf(record.y).any()):
         raise ValueError("record.y holds infinite values: mark a missing component as NaN")
-    start = record.to(model.anchor).start
+    started = record.to(model.anchor)
     record = model.prepare(record).to(model.anchor)
-    belief = method.init(model, record.y.shape[0], draws.at(0), start)
+    belief = method.init(model, record.y.shape[0], draws.at(0), started.start, started.spread)
     means, variances, traces = [], [], []
     for t in range(record.y.shape[1]):
         stage = AtRest(model) if t == 0 and model.observes_initial else model

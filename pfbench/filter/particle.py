@@ -16,7 +16,7 @@ from pfbench.filter.proposals import Bootstrap, Proposal
 from pfbench.filter.resamplers import Resample, Resampler, Systematic
 from pfbench.filter.sizes import Fixed, Size
 from pfbench.filter.weights import Bayes, Weighing
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
 
 
@@ -70,9 +70,11 @@ class ParticleFilter:
         stages: list[Stage] = [self.resampler, *self.moves, self.proposal, self.weigh]
         return all(stage.exact for stage in stages)
 
-    def init(self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None) -> Cloud:
+    def init(
+        self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None, spread: Tensor | None = None
+    ) -> Cloud:
         """N equally weighted particles of the initial law, drawn by its Cholesky factor or its scales."""
-        law = model.initial(runs)
+        law = initial_law(model, runs, spread)
         z = draws.normal("initial", self.particles, model.chart.dimension)
         if isinstance(law, torch.distributions.MultivariateNormal):
             spread = z @ law.scale_tril.mT

@@ -201,6 +201,13 @@ def dense_normal(mean: Tensor, factor: Tensor) -> MultivariateNormal:
     return MultivariateNormal(mean, scale_tril=factor, validate_args=False)
 
 
+def initial_law(model: StateSpaceModel, runs: int, spread: Tensor | None = None) -> Distribution:
+    """The law of x_0 in the chart, batch [R]: the model's, or the normal that a record brings by its factor [R, d, d]."""
+    if spread is None:
+        return model.initial(runs)
+    return dense_normal(spread.new_zeros(spread.shape[:-1]), spread)
+
+
 def positive(name: str, values: Any) -> Tensor:
     """A float64 tensor of strictly positive numbers.
 

@@ -1,4 +1,4 @@
-"""Noise regimes: what the world does to the measurements. The filter is not told."""
+"""Noise regimes: what the world does to the measurements and to the process. The filter is not told."""
 
 from __future__ import annotations
 
@@ -12,22 +12,59 @@ from torch import Tensor
 from pfbench.draws import Draws
 
 
-class Regime(Protocol):
-    """Errors of a receiver: nominal standard deviations [Dy] and times [T] in seconds -> errors [R, T, Dy], NaN where unseen."""
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """What a regime must know of a measurement.
 
-    def errors(self, draws: Draws, sd: Tensor, time: Tensor) -> Tensor: ...
+    Attributes:
+        sd: nominal standard deviations [Dy].
+        kind: of each component: position, velocity, range, rate, angle, or other.
+        source: number of the receiver or transmitter that a component comes from; those of one source vanish together.
+    """
+
+    sd: Tensor
+    kind: tuple[str, ...]
+    source: tuple[int, ...]
+
+    @staticmethod
+    def alike(sd: Tensor, kind: str = "other") -> Channels:
+        """Components of one kind from one source."""
+        return Channels(sd, (kind,) * len(sd), (0,) * len(sd))
+
+
+def fixes(sd: Tensor) -> Channels:
+    """Channels of a receiver that gives position [3] or position and velocity [6]."""
+    kind = ("position",) * 3 + ("velocity",) * 3
+    return Channels(sd, kind[: len(sd)], (0,) * len(sd))
+
+
+class Regime(Protocol):
+    """What a world does beyond the nominal."""
+
+    def errors(self, draws: Draws, channels: Channels, time: Tensor) -> Tensor:
+        """Errors of the measurements at times [T] in seconds: [R, T, Dy], NaN where unseen."""
+
+    def process(self, time: Tensor) -> Tensor:
+        """Factor on the variance of the process noise (of the inertial sensors' white noise) at times [T]: [T]."""
+
+
+class _Calm:
+    """A regime that leaves the process alone."""
+
+    def process(self, time: Tensor) -> Tensor:
+        return torch.ones_like(time)
 
 
 @dataclass(frozen=True)
-class Nominal:
+class Nominal(_Calm):
     """White and normal, as the filter believes."""
 
-    def errors(self, draws: Draws, sd: Tensor, time: Tensor) -> Tensor:
-        return sd * draws.normal("world.receiver", len(time), len(sd))
+    def errors(self, draws: Draws, channels: Channels, time: Tensor) -> Tensor:
+        return channels.sd * draws.normal("world.receiver", len(time), len(channels.sd))
 
 
 @dataclass(frozen=True)
-class StudentT:
+class StudentT(_Calm):
     """Heavy tails: Student's t with `dof` degrees of freedom, scaled so that the middle is that of the nominal law.
 
     Not scaled to the nominal variance, which would make the bulk of the errors smaller than the filter expects. [ours]
@@ -42,15 +79,15 @@ class StudentT:
         if self.dof < 3:
             raise ValueError(f"noise.dof={self.dof}: give at least 3 degrees of freedom (the variance is infinite below)")
 
-    def errors(self, draws: Draws, sd: Tensor, time: Tensor) -> Tensor:
-        t, k = len(time), len(sd)
+    def errors(self, draws: Draws, channels: Channels, time: Tensor) -> Tensor:
+        t, k = len(time), len(channels.sd)
         z = draws.normal("world.receiver", t, k)
         chi2 = draws.normal("world.tails", t, k * self.dof).square().reshape(-1, t, k, self.dof).sum(-1)
-        return sd * z / torch.sqrt(chi2 / self.dof)
+        return channels.sd * z / torch.sqrt(chi2 / self.dof)
 
 
 @dataclass(frozen=True)
-class Outliers:
+class Outliers(_Calm):
     """Impulsive errors: with `probability` an epoch's errors are `size` times as large, all components at once.
 
     Raises:
@@ -66,13 +103,13 @@ class Outliers:
         if not self.size >= 1.0:
             raise ValueError(f"noise.size={self.size}: give a factor of at least 1 on the nominal standard deviation")
 
-    def errors(self, draws: Draws, sd: Tensor, time: Tensor) -> Tensor:
+    def errors(self, draws: Draws, channels: Channels, time: Tensor) -> Tensor:
         hit = draws.uniform("world.outliers", len(time), 1) < self.probability
-        return torch.where(hit, self.size, 1.0).to(sd.dtype) * Nominal().errors(draws, sd, time)
+        return torch.where(hit, self.size, 1.0).to(channels.sd) * Nominal().errors(draws, channels, time)
 
 
 @dataclass(frozen=True)
-class Outage:
+class Outage(_Calm):
     """The receiver is silent in some windows; nominal outside them.
 
     Args:
@@ -89,8 +126,8 @@ class Outage:
             if len(window) != 2 or not window[0] < window[1]:
                 raise ValueError(f"noise.windows: {list(window)} is not a window; give [from, to] in seconds with from < to")
 
-    def errors(self, draws: Draws, sd: Tensor, time: Tensor) -> Tensor:
+    def errors(self, draws: Draws, channels: Channels, time: Tensor) -> Tensor:
         silent = torch.zeros_like(time, dtype=torch.bool)
         for start, end in self.windows:
             silent |= (time >= start) & (time < end)
-        return torch.where(silent[:, None], torch.nan, Nominal().errors(draws, sd, time))
+        return torch.where(silent[:, None], torch.nan, Nominal().errors(draws, channels, time))

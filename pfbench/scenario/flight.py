@@ -13,7 +13,7 @@ from tqdm import tqdm
 from pfbench.draws import MonteCarlo
 from pfbench.nav import attitude, earth, sensors, strapdown, trajectory
 from pfbench.nav.aiding import Alignment, Receiver
-from pfbench.noise.regimes import Regime
+from pfbench.noise.regimes import Regime, fixes
 from pfbench.record import Episode, Record
 from pfbench.scenario.worlds import Arrays, cached
 
@@ -65,7 +65,7 @@ class SimulatedFlight:
         time = world["time"]
         intervals = strapdown.Intervals(*(world[name] for name in strapdown.Intervals._fields))
         seen = torch.cat([truth["position"], truth["velocity"]], -1)[..., : len(self.receiver.sd)]
-        y = seen + noise.errors(MonteCarlo(seed, runs), self.receiver.sd, time)
+        y = seen + noise.errors(MonteCarlo(seed, runs), fixes(self.receiver.sd), time)
         return Episode(Record(y, intervals), time, truth, world["track"].expand(len(runs), -1, -1))
 
     def _simulate(self, draws: MonteCarlo) -> Arrays:

@@ -10,7 +10,7 @@ from torch.distributions import Independent, Normal
 
 from pfbench.draws import MonteCarlo
 from pfbench.model.base import AtRest, StateSpaceModel
-from pfbench.noise.regimes import Regime
+from pfbench.noise.regimes import Channels, Regime
 from pfbench.record import Episode, Record
 
 
@@ -57,7 +57,7 @@ class ModelWorld:
             sds.append(seen.stddev[:, 0])
         mean, sd = torch.stack(means, 1), torch.stack(sds, 1)
         unit = torch.ones(mean.shape[-1], dtype=torch.float64)
-        y = mean + sd * noise.errors(draws, unit, time)
+        y = mean + sd * noise.errors(draws, Channels.alike(unit), time)
         x_all = torch.stack(states, 1)
         truth = {name: x_all[..., list(parts)] for name, parts in model.groups.items()}
         return Episode(Record(y), time, truth)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pfbench.draws import MonteCarlo
 from pfbench.model.strapdown_total import Believed, Increments, StrapdownTotal, preintegrate
-from pfbench.noise.regimes import Regime
+from pfbench.noise.regimes import Channels, Regime, fixes
 from pfbench.record import Episode, Record
 from pfbench.scenario.legs import SAME_TIME, Leg, cut
 from pfbench.scenario.logs import Files, read_log
@@ -42,6 +42,11 @@ class Receiver:
         for name, sd in (("position_sd", self.position_sd), ("velocity_sd", self.velocity_sd)):
             if sd is not None and (len(sd) != 3 or min(sd) < 0.0):
                 raise ValueError(f"receiver.{name}={list(sd)}: give three standard deviations, East, North, Up (0 adds nothing)")
+
+    @property
+    def channels(self) -> Channels:
+        """Of position, and of velocity where it is measured; one receiver gives both."""
+        return fixes(self.sd)
 
     @property
     def sd(self) -> Tensor:
@@ -158,7 +163,7 @@ def assemble(
     sd = receiver.sd
     y = _padded([leg.fixes for leg in legs], np.nan)[which][..., : len(sd)]
     # errors are drawn for fixes, not for steps: the worlds stay the same when the step changes
-    y[:, fixed] += noise.errors(draws.at(0), sd, t[fixed])
+    y[:, fixed] += noise.errors(draws.at(0), receiver.channels, t[fixed])
     record = Record(y, _increments(legs, which, believed), _start(legs, which, believed, draws))
     groups = {"attitude": truth[..., :4], "velocity": truth[..., 4:7], "position": truth[..., 7:]}
     notes = tuple(dict.fromkeys(note for leg in legs for note in leg.notes))
