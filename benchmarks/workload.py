@@ -91,12 +91,12 @@ def _nominal(steps: int, seed: int) -> Intervals:
     """At least `steps` seconds of the flight, in whole segments: what nobody filters need not be flown."""
     cfg = _configured()
     flight = job.build(cfg.scenario)
-    segments = [segment for manoeuvre in flight.segments for segment in manoeuvre]
+    segments = [segment for manoeuvre in flight.path.segments for segment in manoeuvre]
     ends = np.cumsum([segment.duration for segment in segments])
     if steps > ends[-1]:
         raise ValueError(f"steps={steps}: the flight lasts {ends[-1]:g} s; give at most that")
     flown = segments[: int(np.searchsorted(ends, steps)) + 1]
-    return replace(flight, segments=flown).draw(job.build(cfg.noise), torch.arange(1), seed).record.u
+    return replace(flight, path=replace(flight.path, segments=flown)).draw(job.build(cfg.noise), torch.arange(1), seed).record.u
 
 
 def _configured() -> Any:

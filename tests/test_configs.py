@@ -106,7 +106,7 @@ def world(scenario: str) -> Episode:
         cfg = composed(f"scenario={scenario}")
         flown = cfg.scenario._target_.endswith("SimulatedFlight")
         if flown:  # the first manoeuvres that make up some seconds: 10 s of t003, 20 s of t004
-            cfg.scenario.segments = cfg.scenario.segments[:1]
+            cfg.scenario.path.segments = cfg.scenario.path.segments[:1]
             cfg.scenario.imu_rate = 20.0
         WORLDS[scenario] = truncated(job.build(cfg.scenario).draw(Nominal(), RUNS, SEED))
     return WORLDS[scenario]

@@ -146,7 +146,7 @@ def test_single_precision_is_close_to_double(tmp_path: Path, method: str) -> Non
 
 
 def test_the_worlds_of_a_study_are_flown_once_for_all_filters(tmp_path: Path) -> None:
-    segments = "scenario.segments=[{_target_:pfbench.nav.trajectory.cruise,duration:10}]"
+    segments = "scenario.path.segments=[{_target_:pfbench.nav.trajectory.cruise,duration:10}]"
     said = pfbench("run", "-m", "scenario=t004", segments, "filter=ekf,sir", "noise=nominal,student", "runs=2", home=tmp_path)
     assert said.code == 0, said.err
     assert len(list((tmp_path / "worlds").iterdir())) == 1

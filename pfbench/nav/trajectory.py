@@ -12,9 +12,9 @@ radians.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from torch import Tensor
 from pfbench.nav import attitude, earth
 
 G_TURN = 9.80665  # gravity of the coordinated turn [m/s^2]: fixed, so that the bank does not depend on the place
-_NODES = torch.tensor([0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6)], dtype=torch.float64)
+NODES = torch.tensor([0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6)], dtype=torch.float64)
 _WEIGHTS = torch.tensor([5.0, 8.0, 5.0], dtype=torch.float64) / 18
 
 
@@ -129,20 +129,12 @@ def fly(segments: Iterable[Segment | Iterable[Segment]], start: Start, rate: flo
     counts = _sample_counts(plan, rate)
     at_samples = _profile(plan, counts, start, rate, torch.zeros(1, dtype=torch.float64))
     last = _profile(plan[-1:], counts[-1:], _reached(plan[:-1], start), rate, torch.ones(1, dtype=torch.float64))
-    samples = _Motion(*(torch.cat([a[:, 0], b[-1:, 0]]) for a, b in zip(at_samples, last, strict=True)))
-    nodes = _profile(plan, counts, start, rate, _NODES)
-    if samples.speed.min() < 0:
-        raise ValueError(f"speed falls to {samples.speed.min():.3f} m/s: brake less, or start faster")
-    pos, node_pos = _positions(samples, nodes, start, 1 / rate)
-    w, f = _sensed(nodes, node_pos)
-    weights = _WEIGHTS[:, None] / rate
-    time = torch.arange(sum(counts) + 1, dtype=torch.float64) / rate
-    dcm = attitude.dcm_from_euler(_euler(samples))
-    return Flight(time, pos, _velocity(samples), dcm, (weights * w).sum(1), (weights * f).sum(1))
+    samples = Motion(*(torch.cat([a[:, 0], b[-1:, 0]]) for a, b in zip(at_samples, last, strict=True)))
+    return follow(samples, _profile(plan, counts, start, rate, NODES), start, rate)
 
 
-class _Motion(NamedTuple):
-    """The profiles and their time derivatives on some grid of instants."""
+class Motion(NamedTuple):
+    """Speed, climb angle, heading (m/s, rad) and their time derivatives on some grid of instants."""
 
     speed: Tensor
     speed1: Tensor
@@ -151,6 +143,147 @@ class _Motion(NamedTuple):
     heading: Tensor
     heading1: Tensor
     heading2: Tensor
+
+
+class Path(Protocol):
+    """A motion that can be sampled at any rate."""
+
+    def fly(self, rate: float) -> Flight:
+        """Truth and ideal sensors at `rate` samples per second."""
+
+
+@dataclass(frozen=True)
+class Manoeuvres:
+    """Segments flown one after the other; see `fly`."""
+
+    segments: Sequence[Any]
+    start: Start
+
+    def fly(self, rate: float) -> Flight:
+        return fly(self.segments, self.start, rate)
+
+
+@dataclass(frozen=True)
+class Cosine:
+    """A change between two times by half a cosine, 1/2 - 1/2 cos(pi u): its rate is continuous, its second derivative jumps.
+
+    Args: begin, end: s; change: in the unit of what changes.
+    """
+
+    begin: float
+    end: float
+    change: float
+
+    def __post_init__(self) -> None:
+        if not self.end > self.begin:
+            raise ValueError(f"begin={self.begin}, end={self.end}: a ramp must end after it begins")
+
+    def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Value and two time derivatives."""
+        k = math.pi / (self.end - self.begin)
+        a = k * (t.clamp(self.begin, self.end) - self.begin)
+        inside = ((t > self.begin) & (t < self.end)).to(t)
+        c = 0.5 * self.change
+        return c * (1 - torch.cos(a)), c * k * torch.sin(a) * inside, c * k * k * torch.cos(a) * inside
+
+
+@dataclass(frozen=True)
+class Cycloid:
+    """A change whose rate is one period of a raised cosine, u - sin(2 pi u) / 2 pi: two continuous derivatives.
+
+    Args: begin, end: s; change: in the unit of what changes.
+    """
+
+    begin: float
+    end: float
+    change: float
+
+    def __post_init__(self) -> None:
+        if not self.end > self.begin:
+            raise ValueError(f"begin={self.begin}, end={self.end}: a ramp must end after it begins")
+
+    def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Value and two time derivatives."""
+        length = self.end - self.begin
+        u = (t.clamp(self.begin, self.end) - self.begin) / length
+        turn = 2 * math.pi * u
+        value = self.change * (u - torch.sin(turn) / (2 * math.pi))
+        rate = self.change / length * (1 - torch.cos(turn))
+        return value, rate, self.change * 2 * math.pi / length**2 * torch.sin(turn)
+
+
+@dataclass(frozen=True)
+class Ramps:
+    """A motion whose speed, angles and climb rate are sums of ramps (Cosine or Cycloid).
+
+    Args:
+        start: initial position, speed, heading.
+        duration: s.
+        speed: changes of speed m/s; of the horizontal speed where `rise` is given.
+        climb_deg: changes of the flight-path angle; not together with `rise`.
+        heading_deg: changes of heading, clockwise.
+        rise: changes of the vertical speed m/s.
+
+    Raises:
+        ValueError: `climb_deg` and `rise` together; on flying, a duration of no whole number of samples, or a negative speed.
+    """
+
+    start: Start
+    duration: float
+    speed: Sequence[Cosine | Cycloid] = ()
+    climb_deg: Sequence[Cosine | Cycloid] = ()
+    heading_deg: Sequence[Cosine | Cycloid] = ()
+    rise: Sequence[Cosine | Cycloid] = ()
+
+    def __post_init__(self) -> None:
+        if self.climb_deg and self.rise:
+            raise ValueError("path.climb_deg and path.rise both say how steeply to climb: give one of them")
+
+    def fly(self, rate: float) -> Flight:
+        n = round(self.duration * rate)
+        if n < 1 or abs(n - self.duration * rate) > 1e-6:
+            raise ValueError(f"path.duration={self.duration}: at rate={rate} that is no whole number of samples")
+        at = torch.arange(n + 1, dtype=torch.float64)
+        return follow(self.motion(at / rate), self.motion((at[:-1, None] + NODES) / rate), self.start, rate)
+
+    def motion(self, t: Tensor) -> Motion:
+        """The motion at times t s."""
+        speed, speed1, _ = _total(self.speed, t, self.start.speed)
+        heading, heading1, heading2 = _total(self.heading_deg, t, self.start.heading_deg)
+        turned = (torch.deg2rad(a) for a in (heading, heading1, heading2))
+        if not self.rise:
+            climb, climb1, _ = _total(self.climb_deg, t, 0.0)
+            return Motion(speed, speed1, torch.deg2rad(climb), torch.deg2rad(climb1), *turned)
+        up, up1, _ = _total(self.rise, t, 0.0)
+        along = torch.hypot(speed, up)
+        safe = along.clamp(min=1e-9)
+        along1, steepen = (speed * speed1 + up * up1) / safe, (speed * up1 - up * speed1) / safe.square()
+        return Motion(along, torch.where(along > 0, along1, speed1), torch.atan2(up, speed), steepen, *turned)
+
+
+def _total(ramps: Sequence[Cosine | Cycloid], t: Tensor, start: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum of ramps from a start value, and its derivatives."""
+    value, rate, second = torch.full_like(t, start), torch.zeros_like(t), torch.zeros_like(t)
+    for ramp in ramps:
+        parts = ramp.at(t)
+        value, rate, second = value + parts[0], rate + parts[1], second + parts[2]
+    return value, rate, second
+
+
+def follow(samples: Motion, nodes: Motion, start: Start, rate: float) -> Flight:
+    """The flight with this motion at its n + 1 samples and, `NODES` of the way from each to the next, at n x 3 nodes.
+
+    Raises:
+        ValueError: speed becomes negative.
+    """
+    if samples.speed.min() < 0:
+        raise ValueError(f"speed falls to {samples.speed.min():.3f} m/s: brake less, or start faster")
+    pos, node_pos = _positions(samples, nodes, start, 1 / rate)
+    w, f = _sensed(nodes, node_pos)
+    weights = _WEIGHTS[:, None] / rate
+    time = torch.arange(len(samples.speed), dtype=torch.float64) / rate
+    dcm = attitude.dcm_from_euler(_euler(samples))
+    return Flight(time, pos, _velocity(samples), dcm, (weights * w).sum(1), (weights * f).sum(1))
 
 
 class _Reached(NamedTuple):
@@ -185,7 +318,7 @@ def _reached(plan: list[Segment], start: Start | _Reached) -> _Reached:
     )
 
 
-def _profile(plan: list[Segment], counts: list[int], start: Start | _Reached, rate: float, offsets: Tensor) -> _Motion:
+def _profile(plan: list[Segment], counts: list[int], start: Start | _Reached, rate: float, offsets: Tensor) -> Motion:
     """The motion at every sample plus `offsets` [m] of a sample: tensors [n, m]."""
     rows = []
     for k, (segment, count) in enumerate(zip(plan, counts, strict=True)):
@@ -199,16 +332,16 @@ def _profile(plan: list[Segment], counts: list[int], start: Start | _Reached, ra
         speed = (begin.speed + segment.speed * v, segment.speed * v1)
         angles = (begin.climb + segment.climb * s, segment.climb * s1)
         rows.append((*speed, *angles, begin.heading + segment.heading * s, segment.heading * s1, segment.heading * s2))
-    return _Motion(*(torch.cat(column) for column in zip(*rows, strict=True)))
+    return Motion(*(torch.cat(column) for column in zip(*rows, strict=True)))
 
 
-def _velocity(m: _Motion) -> Tensor:
+def _velocity(m: Motion) -> Tensor:
     """East, North, Up [..., 3]."""
     level, up = m.speed * torch.cos(m.climb), m.speed * torch.sin(m.climb)
     return torch.stack([level * torch.sin(m.heading), level * torch.cos(m.heading), up], dim=-1)
 
 
-def _acceleration(m: _Motion) -> Tensor:
+def _acceleration(m: Motion) -> Tensor:
     """Time derivative of the velocity's components [..., 3]."""
     sg, cg, sc, cc = torch.sin(m.climb), torch.cos(m.climb), torch.sin(m.heading), torch.cos(m.heading)
     along, across = m.speed1 * cg - m.speed * sg * m.climb1, m.speed * cg * m.heading1
@@ -216,15 +349,15 @@ def _acceleration(m: _Motion) -> Tensor:
     return torch.stack([along * sc + across * cc, along * cc - across * sc, up], dim=-1)
 
 
-def _bank(m: _Motion) -> Tensor:
+def _bank(m: Motion) -> Tensor:
     return m.speed * torch.cos(m.climb) * m.heading1 / G_TURN
 
 
-def _euler(m: _Motion) -> Tensor:
+def _euler(m: Motion) -> Tensor:
     return torch.stack([m.climb, torch.atan(_bank(m)), -m.heading], dim=-1)
 
 
-def _body_rate(m: _Motion) -> Tensor:
+def _body_rate(m: Motion) -> Tensor:
     """Rate of the body against the level frame, body axes [..., 3]."""
     bank = _bank(m)
     roll, sg, cg = torch.atan(bank), torch.sin(m.climb), torch.cos(m.climb)
@@ -235,7 +368,7 @@ def _body_rate(m: _Motion) -> Tensor:
     return torch.stack([x, roll1 + sg * yaw1, z], dim=-1)
 
 
-def _positions(samples: _Motion, nodes: _Motion, start: Start, d: float) -> tuple[Tensor, Tensor]:
+def _positions(samples: Motion, nodes: Motion, start: Start, d: float) -> tuple[Tensor, Tensor]:
     """Positions at the samples [n + 1, 3] and at the quadrature nodes [n, 3, 3]."""
     v, node_v = _velocity(samples), _velocity(nodes)
 
@@ -261,11 +394,11 @@ def _positions(samples: _Motion, nodes: _Motion, start: Start, d: float) -> tupl
 
 def _hermite(y: Tensor, y1: Tensor, d: float) -> Tensor:
     """Cubic through samples [n + 1] and their derivatives, at the quadrature nodes [n, 3]."""
-    u, (a, b) = _NODES, (y[:-1, None], y[1:, None])
+    u, (a, b) = NODES, (y[:-1, None], y[1:, None])
     return a + (b - a) * u**2 * (3 - 2 * u) + d * u * (1 - u) * ((1 - u) * y1[:-1, None] - u * y1[1:, None])
 
 
-def _sensed(m: _Motion, pos: Tensor) -> tuple[Tensor, Tensor]:
+def _sensed(m: Motion, pos: Tensor) -> tuple[Tensor, Tensor]:
     """Angular rate and specific force, body axes [n, 3 nodes, 3 axes]: strapdown equations solved for the sensors."""
     v, lat, h = _velocity(m), pos[..., 0], pos[..., 2]
     to_body = attitude.dcm_from_euler(_euler(m)).transpose(-1, -2)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,8 +24,7 @@ class SimulatedFlight:
     run draws its sensor errors, initial errors and receiver noise; the flown path is the same.
 
     Args:
-        segments: manoeuvres, in order.
-        start: where and how the flight begins.
+        path: the motion that is flown.
         imu: sizes of the sensors' errors.
         receiver: nominal standard deviations of the fixes.
         initial: standard deviations of the initial errors.
@@ -39,8 +36,7 @@ class SimulatedFlight:
         ValueError: an interval that is not an even number of samples, a flight that is not a whole number of intervals.
     """
 
-    segments: Sequence[Any]
-    start: trajectory.Start
+    path: trajectory.Path
     imu: sensors.ImuErrors
     receiver: Receiver
     initial: Alignment
@@ -58,7 +54,7 @@ class SimulatedFlight:
     def draw(self, noise: Regime, runs: Tensor, seed: int) -> Episode:
         """Worlds of these runs: position and velocity differences INS minus receiver, the intervals as inputs."""
         recipe = (
-            "flight 2", list(self.segments), self.start, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist()
+            "flight 3", self.path, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist()
         )  # fmt: skip
         world = cached(self.cache, recipe, lambda: self._simulate(MonteCarlo(seed, runs)))
         truth = {name[6:]: value for name, value in world.items() if name.startswith("truth.")}
@@ -70,7 +66,7 @@ class SimulatedFlight:
 
     def _simulate(self, draws: MonteCarlo) -> Arrays:
         """Truth and nominal trajectory at the ends of the intervals."""
-        flight = trajectory.fly(self.segments, self.start, self.imu_rate)
+        flight = self.path.fly(self.imu_rate)
         per = round(self.imu_rate * self.interval)
         if len(flight.dtheta) % per:
             raise ValueError(

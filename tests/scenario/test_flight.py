@@ -17,17 +17,20 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.rules import Cubature, Points
 from pfbench.model.ins_gnss import InsGnss
-from pfbench.nav import attitude, earth, sensors, trajectory
+from pfbench.nav import attitude, earth, sensors
 from pfbench.nav.aiding import Alignment, Receiver
 from pfbench.nav.sensors import ImuErrors
-from pfbench.nav.trajectory import Start, accelerate, climb, cruise, turn
+from pfbench.nav.trajectory import Manoeuvres, Start, accelerate, climb, cruise, turn
 from pfbench.noise.regimes import Nominal, Outage, Outliers, Regime, StudentT
 from pfbench.record import Episode
 from pfbench.scenario.flight import SimulatedFlight
 
-FLIGHT = SimulatedFlight(
+PATH = Manoeuvres(
     segments=(accelerate(5.0, 4.0), climb(8.0, 2.0, 2.0), turn(20.0, 6.0), cruise(4.0)),
     start=Start(lat_deg=32.0, lon_deg=118.0, height=200.0, speed=50.0, heading_deg=45.0),
+)
+FLIGHT = SimulatedFlight(
+    path=PATH,
     imu=ImuErrors(0.5, 0.3, 300.0, 0.1, 500.0, 200.0, 200.0, 50.0),
     receiver=Receiver((6.0, 7.0, 5.0), (0.3, 0.2, 0.1)),
     initial=Alignment((10.0, 10.0, 60.0), (1.0, 1.0, 1.0), (10.0, 10.0, 10.0)),
@@ -128,7 +131,7 @@ def test_the_cache_holds_no_receiver_noise_and_tells_worlds_apart(tmp_path: Path
         world([0, 1], seed=SEED + 1, flight=kept),
         world([0, 1], flight=replace(kept, imu=replace(kept.imu, gyro_bias_deg_h=0.6))),
         world([0, 1], flight=replace(kept, initial=Alignment((10.0, 10.0, 60.0), (1.0, 1.0, 1.0), (10.0, 10.0, 11.0)))),
-        world([0, 1], flight=replace(kept, segments=(*FLIGHT.segments, cruise(1.0)))),
+        world([0, 1], flight=replace(kept, path=replace(PATH, segments=(*PATH.segments, cruise(1.0))))),
         world([0, 1], flight=replace(kept, interval=0.4)),
     ]
     assert len(list(tmp_path.iterdir())) == 1 + len(others)
@@ -143,7 +146,7 @@ def test_truth_is_what_the_ins_is_wrong_by() -> None:
     """INS minus errors is the flown path, seen again through the track."""
     episode = world([0, 1, 2])
     u, truth = episode.record.u, episode.truth
-    flown = trajectory.fly(FLIGHT.segments, FLIGHT.start, FLIGHT.imu_rate)
+    flown = PATH.fly(FLIGHT.imu_rate)
     every = round(FLIGHT.imu_rate * FLIGHT.interval)
     pos, vel, dcm = (a[every::every] for a in (flown.pos, flown.vel, flown.dcm))
     assert torch.equal(episode.time, flown.time[every::every])
