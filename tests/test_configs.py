@@ -17,8 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 from pfbench import cli, job
 from pfbench.draws import MonteCarlo
 from pfbench.filter.loop import run_filter
-from pfbench.noise.regimes import Channels, Nominal
-from pfbench.record import Episode, Record, map_inputs
+from pfbench.noise.regimes import Nominal
+from pfbench.record import Channels, Episode, Record, map_inputs
 
 CONF = cli.conf_dir()
 DATA = os.environ.get("PFBENCH_DATA")

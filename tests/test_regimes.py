@@ -11,7 +11,8 @@ import torch
 from scipy import stats
 
 from pfbench.draws import MonteCarlo
-from pfbench.noise.regimes import Channels, Nominal, Outage, Outliers, Regime, StudentT
+from pfbench.noise.regimes import Nominal, Outage, Outliers, Regime, StudentT
+from pfbench.record import Channels
 
 SD = torch.tensor([2.0, 0.05, 30.0], dtype=torch.float64)
 TIME = torch.arange(0.0, 300.0, dtype=torch.float64)

@@ -1,17 +1,68 @@
-"""Sizes of what surrounds an INS: the receiver's errors, the errors that it starts with, and noise added on purpose."""
+"""What surrounds an INS: what aids it, the errors that it starts with, and noise added on purpose."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from pfbench.draws import Draws
+from pfbench.nav import earth
 from pfbench.nav.sensors import DEG_H, UG
+from pfbench.nav.strapdown import Intervals
+from pfbench.record import Channels, fixes
 
 ARCMIN = math.pi / 180.0 / 60.0
+
+
+class Flown(NamedTuple):
+    """A flight at the ends of T filter intervals: the truth, and what the INS of each run made of it.
+
+    Attributes:
+        time: s [T].
+        pos: latitude, longitude, height [T, 3] rad, rad, m.
+        vel: East, North, Up [T, 3] m/s.
+        dcm: body to level [T, 3, 3].
+        ins: the INS's own intervals [R, T, ...].
+    """
+
+    time: Tensor
+    pos: Tensor
+    vel: Tensor
+    dcm: Tensor
+    ins: Intervals
+
+
+@dataclass(frozen=True, eq=False)
+class Aided:
+    """What instruments make of a flight.
+
+    Attributes:
+        y: measurements without the instruments' noise [R, T, Dy]; NaN where nothing is seen.
+        u: inputs of the filter's model, a NamedTuple of tensors with leading axes [R or 1, T].
+        truth: true states of the instruments by group, each [R, T, k]: a receiver's clock, say.
+        sheet: what a datasheet draws; see Episode.
+    """
+
+    y: Tensor
+    u: Any
+    truth: dict[str, Tensor] = field(default_factory=dict)
+    sheet: dict[str, Tensor] = field(default_factory=dict)
+
+
+class Aiding(Protocol):
+    """Instruments that aid an INS."""
+
+    @property
+    def channels(self) -> Channels:
+        """Nominal noise of the measurement vector [Dy], and which component comes from where."""
+
+    def aid(self, flown: Flown, draws: Draws, process: Tensor) -> Aided:
+        """Measurements along a flight; `process` [T] multiplies the variance of whatever drives the instruments' own states."""
 
 
 def _sizes(key: str, values: Sequence[float], zero: bool = False) -> Tensor:
@@ -48,6 +99,16 @@ class Receiver:
             return position
         return torch.cat([position, _sizes("receiver.velocity_sd", self.velocity_sd)])
 
+    @property
+    def channels(self) -> Channels:
+        return fixes(self.sd)
+
+    def aid(self, flown: Flown, draws: Draws, process: Tensor) -> Aided:
+        """INS minus receiver."""
+        ins = flown.ins
+        difference = torch.cat([(ins.pos_end - flown.pos) * earth.metre_scale(flown.pos), ins.vel_end - flown.vel], -1)
+        return Aided(difference[..., : len(self.sd)], ins)
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -57,6 +118,7 @@ class Alignment:
         attitude_arcmin: East, North, Up [3].
         velocity: East, North, Up [3] m/s.
         position: North, East, Up [3] m.
+        drawn: each run draws its errors; else every run has exactly these, the filters believing in the law as before.
 
     Raises:
         ValueError: not three positive numbers each.
@@ -65,9 +127,15 @@ class Alignment:
     attitude_arcmin: Sequence[float]
     velocity: Sequence[float]
     position: Sequence[float]
+    drawn: bool = True
 
     def __post_init__(self) -> None:
         _ = self.sd
+
+    def errors(self, draws: Draws) -> Tensor:
+        """Attitude, velocity, position errors of these runs [R, 9]."""
+        z = draws.normal("world.initial", 1, 9)[:, 0]
+        return self.sd * (z if self.drawn else torch.ones_like(z))
 
     @property
     def sd(self) -> Tensor:

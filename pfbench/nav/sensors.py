@@ -118,7 +118,9 @@ class Corrupted(NamedTuple):
     accelerometer_markov: Tensor
 
 
-def corrupt(dtheta: Tensor, dv: Tensor, dt: float, errors: ImuErrors, draws: Draws) -> Corrupted:
+def corrupt(
+    dtheta: Tensor, dv: Tensor, dt: float, errors: ImuErrors, draws: Draws, process: Tensor | None = None
+) -> Corrupted:
     """Ideal increments to those of imperfect sensors.
 
     Args:
@@ -127,8 +129,10 @@ def corrupt(dtheta: Tensor, dv: Tensor, dt: float, errors: ImuErrors, draws: Dra
         dt: sampling interval, s.
         errors: their sizes.
         draws: decides the runs R; purposes "world.imu.*".
+        process: factor on the variance of the white noise of each sample [n]; None is 1.
     """
     n = dtheta.shape[-2]
+    swell = 1.0 if process is None else process.sqrt()[:, None]
     e = errors
     gyro_bias = _constant("world.imu.gyro_bias", e.gyro_bias, e.drawn_biases, draws)
     gyro_markov = markov("world.imu.gyro_markov", n, e.gyro_markov, e.gyro_markov_time, dt, draws)
@@ -139,9 +143,9 @@ def corrupt(dtheta: Tensor, dv: Tensor, dt: float, errors: ImuErrors, draws: Dra
     w = _misaligned(dtheta, e.gyro_misalignment) + (gyro_bias[:, None] + gyro_markov) * dt
     f = _misaligned(dv, e.accelerometer_misalignment) + (acc_bias[:, None] + acc_markov) * dt
     if e.gyro_random_walk > 0:
-        w = w + e.gyro_random_walk * math.sqrt(dt) * draws.normal("world.imu.gyro", n, 3)
+        w = w + swell * e.gyro_random_walk * math.sqrt(dt) * draws.normal("world.imu.gyro", n, 3)
     if e.accelerometer_random_walk > 0:
-        f = f + e.accelerometer_random_walk * math.sqrt(dt) * draws.normal("world.imu.accelerometer", n, 3)
+        f = f + swell * e.accelerometer_random_walk * math.sqrt(dt) * draws.normal("world.imu.accelerometer", n, 3)
     return Corrupted(w, f, gyro_bias, gyro_markov, acc_bias, acc_markov)
 
 

@@ -10,32 +10,7 @@ import torch
 from torch import Tensor
 
 from pfbench.draws import Draws
-
-
-@dataclass(frozen=True, eq=False)
-class Channels:
-    """What a regime must know of a measurement.
-
-    Attributes:
-        sd: nominal standard deviations [Dy].
-        kind: of each component: position, velocity, range, rate, angle, or other.
-        source: number of the receiver or transmitter that a component comes from; those of one source vanish together.
-    """
-
-    sd: Tensor
-    kind: tuple[str, ...]
-    source: tuple[int, ...]
-
-    @staticmethod
-    def alike(sd: Tensor, kind: str = "other") -> Channels:
-        """Components of one kind from one source."""
-        return Channels(sd, (kind,) * len(sd), (0,) * len(sd))
-
-
-def fixes(sd: Tensor) -> Channels:
-    """Channels of a receiver that gives position [3] or position and velocity [6]."""
-    kind = ("position",) * 3 + ("velocity",) * 3
-    return Channels(sd, kind[: len(sd)], (0,) * len(sd))
+from pfbench.record import Channels
 
 
 class Regime(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import torch
@@ -10,8 +11,8 @@ from tqdm import tqdm
 
 from pfbench.draws import MonteCarlo
 from pfbench.nav import attitude, earth, sensors, strapdown, trajectory
-from pfbench.nav.aiding import Alignment, Receiver
-from pfbench.noise.regimes import Regime, fixes
+from pfbench.nav.aiding import Aiding, Alignment, Flown
+from pfbench.noise.regimes import Regime
 from pfbench.record import Episode, Record
 from pfbench.scenario.worlds import Arrays, cached
 
@@ -26,7 +27,7 @@ class SimulatedFlight:
     Args:
         path: the motion that is flown.
         imu: sizes of the sensors' errors.
-        receiver: nominal standard deviations of the fixes.
+        receiver: the instruments that aid the INS; a GNSS receiver that gives fixes, say.
         initial: standard deviations of the initial errors.
         imu_rate: samples per second.
         interval: seconds between fixes; a whole, even number of samples.
@@ -38,7 +39,7 @@ class SimulatedFlight:
 
     path: trajectory.Path
     imu: sensors.ImuErrors
-    receiver: Receiver
+    receiver: Aiding
     initial: Alignment
     imu_rate: float = 100.0
     interval: float = 1.0
@@ -52,20 +53,17 @@ class SimulatedFlight:
             )
 
     def draw(self, noise: Regime, runs: Tensor, seed: int) -> Episode:
-        """Worlds of these runs: position and velocity differences INS minus receiver, the intervals as inputs."""
-        recipe = (
-            "flight 3", self.path, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist()
-        )  # fmt: skip
-        world = cached(self.cache, recipe, lambda: self._simulate(MonteCarlo(seed, runs)))
-        truth = {name[6:]: value for name, value in world.items() if name.startswith("truth.")}
-        time = world["time"]
-        intervals = strapdown.Intervals(*(world[name] for name in strapdown.Intervals._fields))
-        seen = torch.cat([truth["position"], truth["velocity"]], -1)[..., : len(self.receiver.sd)]
-        y = seen + noise.errors(MonteCarlo(seed, runs), fixes(self.receiver.sd), time)
-        return Episode(Record(y, intervals), time, truth, world["track"].expand(len(runs), -1, -1))
+        """Worlds of these runs: what the receiver says of the INS, and its inputs."""
+        draws = MonteCarlo(seed, runs)
+        flown, truth, track, sheet = self.fly(noise, runs, seed)
+        aided = self.receiver.aid(flown, draws, noise.process(flown.time))
+        y = aided.y + noise.errors(draws, self.receiver.channels, flown.time)
+        return Episode(
+            Record(y, aided.u), flown.time, truth | aided.truth, track.expand(len(runs), -1, -1), sheet=sheet | aided.sheet
+        )
 
-    def _simulate(self, draws: MonteCarlo) -> Arrays:
-        """Truth and nominal trajectory at the ends of the intervals."""
+    def fly(self, noise: Regime, runs: Tensor, seed: int) -> tuple[Flown, Arrays, Tensor, Arrays]:
+        """The flight of these runs, the INS's true errors by group, the track [1, T, 3], and what a datasheet draws of it."""
         flight = self.path.fly(self.imu_rate)
         per = round(self.imu_rate * self.interval)
         if len(flight.dtheta) % per:
@@ -73,8 +71,26 @@ class SimulatedFlight:
                 f"scenario.interval={self.interval}: the flight's {flight.time[-1]:g} s are no whole number of intervals; "
                 "give one that divides them, or make a segment longer"
             )
-        imu = sensors.corrupt(flight.dtheta, flight.dv, 1.0 / self.imu_rate, self.imu, draws)
-        errors = self.initial.sd * draws.normal("world.initial", 1, 9)[:, 0]
+        process = noise.process(flight.time[1:])
+        swell = None if bool((process == 1.0).all()) else hashlib.sha256(process.numpy().tobytes()).hexdigest()
+        recipe = ("flight 4", self.path, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist(), swell)
+        world = cached(self.cache, recipe, lambda: self._simulate(flight, per, process, MonteCarlo(seed, runs)))
+        truth = {name[6:]: value for name, value in world.items() if name.startswith("truth.")}
+        intervals = strapdown.Intervals(*(world[name] for name in strapdown.Intervals._fields))
+        ends = flight.time[per::per], flight.pos[per::per], flight.vel[per::per], flight.dcm[per::per]
+        flown = Flown(*ends, intervals)
+        plan = earth.local_enu(flown.pos, flight.pos[0])[:, :2]
+        height = flown.pos[:, 2:] - flight.pos[0, 2]  # above the ellipsoid: the tangent plane is 100 m up after 36 km
+        sheet = {
+            "force": flight.dv.unflatten(0, (-1, per)).mean(1) * self.imu_rate,
+            "rate": flight.dtheta.unflatten(0, (-1, per)).mean(1) * self.imu_rate,
+        }
+        return flown, truth, torch.cat([plan, height], -1).unsqueeze(0), sheet
+
+    def _simulate(self, flight: trajectory.Flight, per: int, process: Tensor, draws: MonteCarlo) -> Arrays:
+        """True errors and nominal trajectory at the ends of the intervals."""
+        imu = sensors.corrupt(flight.dtheta, flight.dv, 1.0 / self.imu_rate, self.imu, draws, process)
+        errors = self.initial.errors(draws)
         ins = strapdown.align(flight.dcm[0], flight.vel[0], flight.pos[0], errors[:, :3], errors[:, 3:6], errors[:, 6:])
         total = imu.dtheta.shape[1] // per
         with tqdm(total=total, desc="simulating flights", unit="interval", delay=2, disable=None, leave=False) as bar:
@@ -92,7 +108,4 @@ class SimulatedFlight:
             "accelerometer_bias": imu.accelerometer_bias.unsqueeze(1) + accelerometer,
         }
         named = {f"truth.{name}": value.contiguous() for name, value in truth.items()}
-        plan = earth.local_enu(pos, flight.pos[0])[:, :2]
-        height = pos[:, 2:] - flight.pos[0, 2]  # above the ellipsoid: the tangent plane is 100 m up after 36 km
-        track = torch.cat([plan, height], -1).unsqueeze(0)
-        return {"time": flight.time[per::per], "track": track, **named, **{k: v.contiguous() for k, v in u._asdict().items()}}
+        return {**named, **{k: v.contiguous() for k, v in u._asdict().items()}}

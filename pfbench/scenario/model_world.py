@@ -10,8 +10,8 @@ from torch.distributions import Independent, Normal
 
 from pfbench.draws import MonteCarlo
 from pfbench.model.base import AtRest, StateSpaceModel
-from pfbench.noise.regimes import Channels, Regime
-from pfbench.record import Episode, Record
+from pfbench.noise.regimes import Regime
+from pfbench.record import Channels, Episode, Record
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from pfbench.draws import MonteCarlo
 from pfbench.model.strapdown_total import Believed, Increments, StrapdownTotal, preintegrate
-from pfbench.noise.regimes import Channels, Regime, fixes
-from pfbench.record import Episode, Record
+from pfbench.noise.regimes import Regime
+from pfbench.record import Channels, Episode, Record, fixes
 from pfbench.scenario.legs import SAME_TIME, Leg, cut
 from pfbench.scenario.logs import Files, read_log
 from pfbench.scenario.tables import Array
