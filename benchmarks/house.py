@@ -12,7 +12,8 @@ import torch
 from worker import Filter, serve
 from workload import ins_model
 
-from pfbench.draws import MonteCarlo, blocked_normals, compiled_normals
+from pfbench import kernels
+from pfbench.draws import MonteCarlo
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.resamplers import Resample, Systematic
@@ -21,18 +22,17 @@ from pfbench.record import Record
 
 
 def sir(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
-    """The project's SIR filter, resampling at every step; `compiled` fuses the kernel that makes normals."""
+    """The project's SIR filter, resampling at every step; `compiled` fuses the kernels."""
     model = ins_model().to(dtype)
     step, d = torch.from_numpy(work.step)[None], len(work.p0)
     inputs = Step(step[..., :d].contiguous(), step[..., d:].contiguous())
     record = Record(torch.from_numpy(work.y), inputs).to(model.anchor)
     method = ParticleFilter(int(work.particles), Resample(Systematic(), threshold=1.0))
     runs = torch.arange(len(work.y))
-    fill = compiled_normals() if compiled else blocked_normals
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        with torch.no_grad():
-            estimate = run_filter(method, model, record, MonteCarlo(seed, runs, dtype, fill=fill))
+        with kernels.fused(compiled), torch.no_grad():
+            estimate = run_filter(method, model, record, MonteCarlo(seed, runs, dtype))
         return estimate.log_evidence, estimate.mean
 
     return run

@@ -9,13 +9,13 @@ to seed or to forget.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Protocol, TypeAlias
 
 import torch
 from torch import Tensor
+
+from pfbench.kernels import kernel
 
 _MULTIPLY = (0xD2511F53, 0xCD9E8D57)
 _WEYL = (0x9E3779B9, 0xBB67AE85)
@@ -23,7 +23,6 @@ _WORD = 0xFFFFFFFF
 _BLOCK = 16384  # words for which eager temporaries stay in the second-level cache: 19 -> 7 ms for 750 000 normals
 
 Words: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor]
-Fill: TypeAlias = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
 class Draws(Protocol):
@@ -42,8 +41,14 @@ class Draws(Protocol):
         """Uniform on the open interval (0, 1) [R, n, w], float64: single precision has too few levels for 1e6 particles."""
 
 
-def normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
-    """Standard normals by Box and Muller, float32 [R, w, 4 q]: four for each counter (quarter, component, step, run).
+def blocked_normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+    """`normals`, component by component where the whole would fall out of the cache; the same numbers."""
+    size = max(1, _BLOCK // max(1, runs.shape[0] * particle.shape[0]))
+    return torch.cat([_normals(key, step, runs, block, particle) for block in component.split(size)])
+
+
+def _normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+    """Standard normals by Box and Muller, float32 [w, R, 4 q]: four for each counter (quarter, component, step, run).
 
     Args: key [2], step [], runs [R], component [w], particle [q]; all int64.
     """
@@ -57,16 +62,13 @@ def normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle
     return torch.cat(parts, dim=-1)
 
 
-def blocked_normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
-    """`normals`, component by component where the whole would fall out of the cache; the same numbers."""
-    size = max(1, _BLOCK // max(1, runs.shape[0] * particle.shape[0]))
-    return torch.cat([normals(key, step, runs, block, particle) for block in component.split(size)], dim=1)
+normals = kernel(_normals, eager=blocked_normals)
 
 
-@cache
-def compiled_normals() -> Fill:
-    """`normals` as one fused kernel: a ninth of the eager time, after some seconds of compilation (cached on disk)."""
-    return torch.compile(normals, dynamic=True)
+@kernel
+def uniforms(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+    """Uniforms on the open interval (0, 1), float64 [w, R, 4 q]; arguments as for `normals`."""
+    return (torch.cat(_words(key, step, runs, component, particle), dim=-1).double() + 0.5) * 2.0**-32
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,6 @@ class MonteCarlo:
         dtype: of the normals. They are made in single precision (24 bits of resolution, largest value 6.7) and then
             converted: no statistic of ours can tell their law from a double-precision one, and they cost a sixth.
         step: time step; 0 is the time of the initial law.
-        fill: `blocked_normals` (eager) or `compiled_normals()`; they agree to rounding.
 
     Raises:
         ValueError: seed out of range.
@@ -89,7 +90,6 @@ class MonteCarlo:
     runs: Tensor
     dtype: torch.dtype = torch.float64
     step: int = 0
-    fill: Fill = blocked_normals
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed <= _WORD:
@@ -99,12 +99,10 @@ class MonteCarlo:
         return replace(self, step=step)
 
     def normal(self, purpose: str, n: int, w: int) -> Tensor:
-        z = self.fill(*self._counter(purpose, n, w))[..., :n]
-        return z.to(self.dtype).transpose(1, 2)
+        return normals(*self._counter(purpose, n, w))[..., :n].to(self.dtype).permute(1, 2, 0)
 
     def uniform(self, purpose: str, n: int, w: int) -> Tensor:
-        words = torch.cat(_words(*self._counter(purpose, n, w)), dim=-1)[..., :n]
-        return ((words.double() + 0.5) * 2.0**-32).transpose(1, 2)
+        return uniforms(*self._counter(purpose, n, w))[..., :n].permute(1, 2, 0)
 
     def _counter(self, purpose: str, n: int, w: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         def whole(value: object) -> Tensor:
@@ -116,9 +114,9 @@ class MonteCarlo:
 
 
 def _words(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Words:
-    """Four random words for each (component, run, quarter of the particles): [R, w, q] each."""
-    shape = (runs.shape[0], component.shape[0], particle.shape[0])
-    counter = (particle, component[:, None], step, runs[:, None, None])
+    """Four random words for each (component, run, quarter of the particles): [w, R, q] each."""
+    shape = (component.shape[0], runs.shape[0], particle.shape[0])
+    counter = (particle, component[:, None, None], step, runs[:, None])
     c0, c1, c2, c3 = (part.expand(shape) for part in counter)
     return philox((c0, c1, c2, c3), (key[0], key[1]))
 

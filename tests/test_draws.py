@@ -10,7 +10,8 @@ import torch
 from scipy import stats
 
 from pfbench import draws as module
-from pfbench.draws import MonteCarlo, blocked_normals, compiled_normals, normals, philox
+from pfbench import kernels
+from pfbench.draws import MonteCarlo, philox
 
 # Random123 known-answer vectors of philox4x32 with 10 rounds: counter, key -> words
 KNOWN = [
@@ -93,8 +94,9 @@ def test_a_run_alone_equals_itself_in_a_batch() -> None:
 
 
 def test_blocks_give_the_same_numbers() -> None:
-    whole = MonteCarlo(1, torch.arange(3), fill=normals).normal("x", 9000, 7)
-    assert torch.equal(whole, MonteCarlo(1, torch.arange(3), fill=blocked_normals).normal("x", 9000, 7))
+    draws = MonteCarlo(1, torch.arange(3))
+    whole = module._normals(*draws._counter("x", 9000, 7)).permute(1, 2, 0)
+    assert torch.equal(whole.double(), draws.normal("x", 9000, 7))
 
 
 def test_drawing_leaves_the_global_generator_alone() -> None:
@@ -129,5 +131,7 @@ def test_compiled_normals_agree_with_eager_ones() -> None:
     runs = torch.arange(3)
     for step, n, w in ((1, 1000, 3), (2, 77, 1)):  # the second call must not be read off the first shape
         eager = MonteCarlo(1, runs).at(step).normal("x", n, w)
-        fused = MonteCarlo(1, runs, fill=compiled_normals()).at(step).normal("x", n, w)
-        assert torch.allclose(eager, fused, rtol=0, atol=1e-5)
+        uniform = MonteCarlo(1, runs).at(step).uniform("x", n, w)
+        with kernels.fused():
+            assert torch.allclose(eager, MonteCarlo(1, runs).at(step).normal("x", n, w), rtol=0, atol=1e-5)
+            assert torch.equal(uniform, MonteCarlo(1, runs).at(step).uniform("x", n, w))

@@ -21,14 +21,16 @@ CHARTED = GROUND | {"nav", "chart"}
 MODELLED = CHARTED | {"model", "noise"}
 PLAIN = {"metrics", "store"}
 MAY_IMPORT: dict[str, set[str]] = {
-    **{part: set() for part in GROUND | PLAIN},
+    **{part: {"kernels"} for part in GROUND},
+    **{part: set() for part in PLAIN | {"kernels"}},
     "nav": GROUND,
     "chart": GROUND | {"nav"},
-    "model": CHARTED,
+    "model": CHARTED | {"kernels"},
     "noise": CHARTED,
-    "filter": CHARTED | {"model.base"},
+    "filter": CHARTED | {"kernels", "model.base"},
+    "bound": CHARTED | {"model.base", "filter"},
     "scenario": MODELLED,
-    **{part: MODELLED | PLAIN | {"filter", "scenario"} for part in ("job", "train", "ppl")},
+    **{part: MODELLED | PLAIN | {"kernels", "filter", "bound", "scenario"} for part in ("job", "train", "ppl")},
     "report": PLAIN,
     "cli": MODELLED | PLAIN | {"filter", "scenario", "job", "train", "ppl", "report"},
     "__main__": {"cli"},

@@ -25,7 +25,7 @@ from pfbench.nav import attitude, earth, error_dynamics
 from pfbench.nav.aiding import Alignment, Inflation, Receiver
 from pfbench.nav.sensors import ImuErrors
 from pfbench.nav.strapdown import Intervals
-from pfbench.nav.trajectory import Start, accelerate, climb, cruise, turn
+from pfbench.nav.trajectory import Manoeuvres, Start, accelerate, climb, cruise, turn
 from pfbench.noise.regimes import Nominal
 from pfbench.record import Episode
 from pfbench.scenario.flight import SimulatedFlight
@@ -48,7 +48,7 @@ MANOEUVRES = (accelerate(5.0, 10.0), climb(8.0, 5.0, 5.0), turn(60.0, 15.0), cru
 def flight() -> Episode:
     """A minute with every manoeuvre: 3 runs, 50 intervals of 1 s."""
     start = Start(lat_deg=32.0, lon_deg=118.0, height=200.0, speed=50.0, heading_deg=45.0)
-    return SimulatedFlight(MANOEUVRES, start, IMU, RECEIVER, INITIAL, imu_rate=20.0).draw(Nominal(), RUNS, 5)
+    return SimulatedFlight(Manoeuvres(MANOEUVRES, start), IMU, RECEIVER, INITIAL, imu_rate=20.0).draw(Nominal(), RUNS, 5)
 
 
 def composed(*words: str) -> Any:

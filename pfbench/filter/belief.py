@@ -18,7 +18,7 @@ class Cloud(NamedTuple):
     """Weighted particles.
 
     Attributes:
-        x: particles [R, N, D]; kept component-major in memory, that is as the transpose of a contiguous [R, D, N].
+        x: particles [R, N, D]; best kept component-major in memory, as a permuted contiguous [D, R, N].
         log_w: log weights [R, N], logsumexp 0; -inf is an empty slot (adaptive particle number).
         log_z: log evidence so far [R]; -inf where the run is lost.
         window: what moves need of the past, [R, N, L, ...], gathered with the particles.
@@ -85,10 +85,8 @@ class Filter(Protocol):
 
 def gather(cloud: Cloud, ancestors: Tensor) -> Cloud:
     """The cloud of the given ancestors [R, N]; everything that belongs to a particle goes with it."""
-    x = cloud.x.transpose(1, 2)
-    x = x.gather(2, ancestors.unsqueeze(1).expand(-1, x.shape[1], -1)).transpose(1, 2)
     return cloud._replace(
-        x=x,
+        x=_gather_states(cloud.x, ancestors),
         log_w=cloud.log_w.gather(1, ancestors),
         window={k: _gather_rows(v, ancestors) for k, v in cloud.window.items()},
         memory={k: _gather_rows(v, ancestors) for k, v in cloud.memory.items()},
@@ -102,7 +100,7 @@ def where(hit: Tensor, new: Cloud, old: Cloud) -> Cloud:
         return torch.where(hit.reshape(-1, *[1] * (a.dim() - 1)), a, b)
 
     return Cloud(
-        x=torch.where(hit[:, None, None], new.x.transpose(1, 2), old.x.transpose(1, 2)).transpose(1, 2),
+        x=torch.where(hit[:, None], new.x.permute(2, 0, 1), old.x.permute(2, 0, 1)).permute(1, 2, 0),
         log_w=choose(new.log_w, old.log_w),
         log_z=new.log_z,
         window={k: choose(v, old.window[k]) for k, v in new.window.items()},
@@ -126,6 +124,16 @@ def moments(chart: Chart, cloud: Cloud) -> tuple[Tensor, Tensor]:
     mean = chart.mean(cloud.x, w)
     d = chart.subtract(cloud.x, mean.unsqueeze(1))
     return mean, (w.unsqueeze(-1) * d).mT @ d
+
+
+def _gather_states(x: Tensor, ancestors: Tensor) -> Tensor:
+    """[R, N, D] by ancestors [R, M] -> [R, M, D], in the memory order of x: with one flat index where components come first."""
+    runs, n, d = x.shape
+    first = x.permute(2, 0, 1)
+    if first.is_contiguous():
+        flat = ancestors + n * torch.arange(runs, device=x.device)[:, None]
+        return first.reshape(d, -1).index_select(1, flat.flatten()).reshape(d, *ancestors.shape).permute(1, 2, 0)
+    return x.mT.gather(2, ancestors.unsqueeze(1).expand(-1, d, -1)).mT
 
 
 def _gather_rows(a: Tensor, ancestors: Tensor) -> Tensor:

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from pfbench.draws import Draws
-from pfbench.filter.belief import Cloud, Info, ess, weights
+from pfbench.filter.belief import Cloud, Info, weights
 from pfbench.filter.preferences import Preference, Weights
 from pfbench.filter.proposals import Bootstrap, Proposal
 from pfbench.filter.resamplers import Resample, Resampler, Systematic
 from pfbench.filter.sizes import Fixed, Size
 from pfbench.filter.weights import Bayes, Weighing
+from pfbench.kernels import kernel
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
 
@@ -95,14 +96,19 @@ class ParticleFilter:
         x, log_ratio, memory = self.proposal(model, cloud, seen, draws)
         log_w = self.weigh(model, cloud.log_w, x, log_ratio, seen)
         x, log_w = bury(x, log_w, cloud.x)
-        total = log_w.logsumexp(1)
-        lost = ~torch.isfinite(total)
         # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
-        log_w = torch.where(lost[:, None], -math.log(self.particles), log_w - total[:, None])
-        log_z = torch.where(lost, -torch.inf, belief.log_z + total)
-        cloud = Cloud(x, log_w, log_z, cloud.window, memory)
-        trace["ess"] = ess(log_w)
+        log_w, total, trace["ess"] = _normalise(log_w)
+        cloud = Cloud(x, log_w, belief.log_z + total, cloud.window, memory)
         return cloud, summarise(model, cloud, trace)
+
+
+@kernel
+def _normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Log weights -> normalised (flat where none is finite), their logsumexp (then -inf) [R], effective sample size [R]."""
+    total = log_w.logsumexp(1)
+    lost = ~torch.isfinite(total)
+    log_w = torch.where(lost[:, None], -math.log(log_w.shape[1]), log_w - total[:, None])
+    return log_w, torch.where(lost, -torch.inf, total), 1.0 / torch.exp(2.0 * log_w).sum(1)
 
 
 def bury(x: Tensor, log_w: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,16 +116,42 @@ def bury(x: Tensor, log_w: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
 
     Sums over particles would otherwise turn one NaN into the estimate of its run: 0 NaN is NaN.
     """
-    healthy = torch.isfinite(x.sum(-1))
-    if not x.is_cuda and bool(healthy.all()):  # looking costs nothing on the CPU, and saves a tenth of a step
+    if not x.is_cuda and bool(torch.isfinite(x.sum())):  # looking costs next to nothing on the CPU
         return x, log_w
+    healthy = torch.isfinite(x.sum(-1))
     log_w = torch.where(healthy, log_w, -torch.inf)
-    return torch.where(healthy.unsqueeze(1), x.transpose(1, 2), parents.transpose(1, 2)).transpose(1, 2), log_w
+    return torch.where(healthy, x.permute(2, 0, 1), parents.permute(2, 0, 1)).permute(1, 2, 0), log_w
 
 
 def summarise(model: StateSpaceModel, cloud: Cloud, trace: dict[str, Tensor]) -> Info:
     """Estimate and spread of a cloud, for the report: sums over particles, no copy of the cloud is kept."""
-    w = weights(cloud.log_w)
-    mean = model.chart.mean(cloud.x, w)
-    d = model.chart.subtract(cloud.x, mean.unsqueeze(1))
-    return Info(mean, (w.unsqueeze(-2) @ (d * d)).squeeze(-2), lambda: (w.unsqueeze(-1) * d).mT @ d, trace)
+    if model.chart.flat:
+        mean, variance = _flat_moments(cloud.x, cloud.log_w)
+    else:
+        w = weights(cloud.log_w)
+        mean = model.chart.mean(cloud.x, w)
+        variance = (w.unsqueeze(-2) @ model.chart.subtract(cloud.x, mean.unsqueeze(1)).square()).squeeze(-2)
+
+    def covariance() -> Tensor:
+        d = model.chart.subtract(cloud.x, mean.unsqueeze(1))
+        return (weights(cloud.log_w).unsqueeze(-1) * d).mT @ d
+
+    return Info(mean, variance, covariance, trace)
+
+
+def _separate_moments(x: Tensor, log_w: Tensor) -> tuple[Tensor, Tensor]:
+    w = weights(log_w).unsqueeze(-2)
+    mean = w @ x
+    d = x - mean
+    return mean.squeeze(-2), (w @ (d * d)).squeeze(-2)
+
+
+def _fused_moments(x: Tensor, log_w: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean and variance [R, D] of plain numbers [R, N, D]."""
+    w, parts = weights(log_w), x.permute(2, 0, 1)
+    mean = (w * parts).sum(-1)
+    d = parts - mean.unsqueeze(-1)
+    return mean.T, (w * d * d).sum(-1).T
+
+
+_flat_moments = kernel(_fused_moments, eager=_separate_moments)

@@ -17,6 +17,7 @@ from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter import belief
 from pfbench.filter.belief import Cloud, moments
+from pfbench.kernels import kernel
 from pfbench.model.base import StateSpaceModel
 
 _DOUBLE_FROM = 100_000  # particles; in float32 one ancestor in 500 is wrong there, and the evidence drifts
@@ -68,8 +69,11 @@ class Resample:
             hit = 1.0 / a.square().sum(-1) < self.threshold * n.squeeze(1)
         ancestors = self.scheme(a, n, draws)
         slots = torch.arange(a.shape[1], device=a.device)
-        fresh = belief.gather(cloud._replace(log_w=cloud.log_w - log_a), ancestors)
-        fresh = fresh._replace(log_w=torch.where(slots < n, fresh.log_w - torch.log(n.to(a.dtype)), -torch.inf))
+        fresh = belief.gather(cloud, ancestors)
+        log_w = -torch.log(n.to(a.dtype))
+        if log_a is not cloud.log_w:  # preferred by something else than the weights, which then carry the correction
+            log_w = log_w + (cloud.log_w - log_a).gather(1, ancestors)
+        fresh = fresh._replace(log_w=torch.where(slots < n, log_w, -torch.inf))
         return (belief.where(hit, fresh, cloud) if self.threshold < 1.0 else fresh), hit
 
 
@@ -118,11 +122,15 @@ class Systematic:
     """One uniform for all slots, positions (j + u) / n. Counts are within 1 of n a."""
 
     def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
-        reach = _cumulative(a) * n
-        u = draws.uniform("resample", 1, 1).squeeze(1).to(reach.dtype)
-        # where, since n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0
-        below = torch.where(reach < n, torch.ceil(reach - u), n)
-        return _ancestors(below.long(), n)
+        return _count(_evenly(a, n, draws.uniform("resample", 1, 1).squeeze(1)))
+
+
+@kernel
+def _evenly(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
+    """Slots of n filled up to and including each particle by the positions (j + u) / n; u [R, 1]."""
+    reach = _cumulative(a) * n
+    # where, since n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0
+    return _ends(torch.where(reach < n, torch.ceil(reach - u.to(reach.dtype)), n).long(), n)
 
 
 @dataclass(frozen=True)
@@ -204,7 +212,7 @@ class Killing:
         u = draws.uniform("resample", a.shape[1], 2)
         survives = u[..., 0] * a.max(1, keepdim=True).values < a
         slots = torch.arange(a.shape[1], device=a.device).expand_as(survives)
-        return torch.where(survives, slots, _pick(_cumulative(a), u[..., 1].contiguous()))
+        return torch.where(survives, slots, _pick(_cumulative(a), u[..., 1]))
 
 
 def _settle(first: Tensor, second: Tensor, toss: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -232,18 +240,25 @@ def _cumulative(a: Tensor) -> Tensor:
 
 def _pick(cumulative: Tensor, u: Tensor) -> Tensor:
     """Independent draws from the law with these cumulative sums, by inversion: [R, N], [R, M] -> [R, M]."""
-    return torch.searchsorted(cumulative, u.to(cumulative.dtype)).clamp(max=cumulative.shape[1] - 1)
+    return torch.searchsorted(cumulative, u.to(cumulative.dtype).contiguous()).clamp(max=cumulative.shape[1] - 1)
 
 
 def _ancestors(below: Tensor, n: Tensor) -> Tensor:
-    """Ancestors [R, N] from the number of slots filled up to and including each particle, int64 [R, N], non-decreasing.
+    """Ancestors [R, N] from the number of slots filled up to and including each particle, int64 [R, N], non-decreasing."""
+    return _count(_ends(below, n))
 
-    Slot j belongs to the first particle with more than j slots below it: count particles by where they end, and sum.
-    """
-    slots = below.shape[1]
+
+def _ends(below: Tensor, n: Tensor) -> Tensor:
+    """The same, made safe: between 0 and n, and n for the last particle."""
     wanted = n.long()
     ends = torch.minimum(below, wanted).clamp(min=0)  # in float32 the largest uniform is 1 and ends a weight of 0 at -1
-    ends[:, -1] = wanted.squeeze(1)
-    counts = torch.zeros(below.shape[0], slots + 1, dtype=torch.long, device=below.device)
+    last = torch.arange(below.shape[1], device=below.device) == below.shape[1] - 1
+    return torch.where(last, wanted, ends)
+
+
+def _count(ends: Tensor) -> Tensor:
+    """Slot j belongs to the first particle that ends after it: count particles by where they end, and sum [R, N]."""
+    slots = ends.shape[1]
+    counts = torch.zeros(ends.shape[0], slots + 1, dtype=torch.long, device=ends.device)
     counts.scatter_add_(1, ends, torch.ones_like(ends))
-    return counts.cumsum(1)[:, :slots].clamp(max=slots - 1)
+    return counts.cumsum(1)[:, :slots].clamp_(max=slots - 1)

@@ -145,14 +145,17 @@ class InsGnss(StateSpaceModel):
 
     def propagate(self, x: Tensor, u: Step, w: Tensor) -> Tensor:
         runs = x.shape[0]
+        if len(u.phi) == 1:  # one trajectory for all runs: one product, components first in memory
+            moved = (u.gain[0] @ w.permute(2, 0, 1).flatten(1)).addmm_(u.phi[0], x.permute(2, 0, 1).flatten(1))
+            return moved.unflatten(1, x.shape[:2]).permute(1, 2, 0)
         driven = u.gain.expand(runs, -1, -1) @ w.mT
-        return torch.baddbmm(driven, u.phi.expand(runs, -1, -1), x.mT).mT
+        return torch.baddbmm(driven, u.phi, x.mT).mT
 
     def noise_gain(self, u: Step) -> Tensor:
         return u.gain
 
     def observation(self, x: Tensor, u: Step) -> Distribution:
-        return independent_normal(x.mT.index_select(1, self.seen).mT, self.r)
+        return independent_normal(x.permute(2, 0, 1).index_select(0, self.seen).permute(1, 2, 0), self.r)
 
     def transition(self, x: Tensor, u: Step) -> Distribution | None:
         if self.inflation is None:
