@@ -12,7 +12,7 @@ import torch
 from worker import Filter, serve
 from workload import ins_model
 
-from pfbench import kernels
+from pfbench import fusion
 from pfbench.draws import MonteCarlo
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import ParticleFilter
@@ -31,7 +31,7 @@ def sir(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
     runs = torch.arange(len(work.y))
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        with kernels.fused(compiled), torch.no_grad():
+        with fusion.fused(compiled), torch.no_grad():
             estimate = run_filter(method, model, record, MonteCarlo(seed, runs, dtype))
         return estimate.log_evidence, estimate.mean
 

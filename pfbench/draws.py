@@ -15,7 +15,7 @@ from typing import Protocol, TypeAlias
 import torch
 from torch import Tensor
 
-from pfbench.kernels import kernel
+from pfbench.fusion import fusible
 
 _MULTIPLY = (0xD2511F53, 0xCD9E8D57)
 _WEYL = (0x9E3779B9, 0xBB67AE85)
@@ -62,10 +62,10 @@ def _normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particl
     return torch.cat(parts, dim=-1)
 
 
-normals = kernel(_normals, eager=blocked_normals)
+normals = fusible(_normals, eager=blocked_normals)
 
 
-@kernel
+@fusible
 def uniforms(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
     """Uniforms on the open interval (0, 1), float64 [w, R, 4 q]; arguments as for `normals`."""
     return (torch.cat(_words(key, step, runs, component, particle), dim=-1).double() + 0.5) * 2.0**-32

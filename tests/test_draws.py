@@ -10,7 +10,7 @@ import torch
 from scipy import stats
 
 from pfbench import draws as module
-from pfbench import kernels
+from pfbench import fusion
 from pfbench.draws import MonteCarlo, philox
 
 # Random123 known-answer vectors of philox4x32 with 10 rounds: counter, key -> words
@@ -132,6 +132,6 @@ def test_compiled_normals_agree_with_eager_ones() -> None:
     for step, n, w in ((1, 1000, 3), (2, 77, 1)):  # the second call must not be read off the first shape
         eager = MonteCarlo(1, runs).at(step).normal("x", n, w)
         uniform = MonteCarlo(1, runs).at(step).uniform("x", n, w)
-        with kernels.fused():
+        with fusion.fused():
             assert torch.allclose(eager, MonteCarlo(1, runs).at(step).normal("x", n, w), rtol=0, atol=1e-5)
             assert torch.equal(uniform, MonteCarlo(1, runs).at(step).uniform("x", n, w))

@@ -21,16 +21,16 @@ CHARTED = GROUND | {"nav", "chart"}
 MODELLED = CHARTED | {"model", "noise"}
 PLAIN = {"metrics", "store"}
 MAY_IMPORT: dict[str, set[str]] = {
-    **{part: {"kernels"} for part in GROUND},
-    **{part: set() for part in PLAIN | {"kernels"}},
+    **{part: {"fusion"} for part in GROUND},
+    **{part: set() for part in PLAIN | {"fusion"}},
     "nav": GROUND,
     "chart": GROUND | {"nav"},
-    "model": CHARTED | {"kernels"},
+    "model": CHARTED | {"fusion"},
     "noise": CHARTED,
-    "filter": CHARTED | {"kernels", "model.base"},
+    "filter": CHARTED | {"fusion", "model.base"},
     "bound": CHARTED | {"model.base", "filter"},
     "scenario": MODELLED,
-    **{part: MODELLED | PLAIN | {"kernels", "filter", "bound", "scenario"} for part in ("job", "train", "ppl")},
+    **{part: MODELLED | PLAIN | {"fusion", "filter", "bound", "scenario"} for part in ("job", "train", "ppl")},
     "report": PLAIN,
     "cli": MODELLED | PLAIN | {"filter", "scenario", "job", "train", "ppl", "report"},
     "__main__": {"cli"},

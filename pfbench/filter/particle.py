@@ -16,7 +16,7 @@ from pfbench.filter.proposals import Bootstrap, Proposal
 from pfbench.filter.resamplers import Resample, Resampler, Systematic
 from pfbench.filter.sizes import Fixed, Size
 from pfbench.filter.weights import Bayes, Weighing
-from pfbench.kernels import kernel
+from pfbench.fusion import fusible
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
 
@@ -102,7 +102,7 @@ class ParticleFilter:
         return cloud, summarise(model, cloud, trace)
 
 
-@kernel
+@fusible
 def _normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Log weights -> normalised (flat where none is finite), their logsumexp (then -inf) [R], effective sample size [R]."""
     total = log_w.logsumexp(1)
@@ -154,4 +154,4 @@ def _fused_moments(x: Tensor, log_w: Tensor) -> tuple[Tensor, Tensor]:
     return mean.T, (w * d * d).sum(-1).T
 
 
-_flat_moments = kernel(_fused_moments, eager=_separate_moments)
+_flat_moments = fusible(_fused_moments, eager=_separate_moments)

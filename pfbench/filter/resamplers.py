@@ -17,7 +17,7 @@ from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter import belief
 from pfbench.filter.belief import Cloud, moments
-from pfbench.kernels import kernel
+from pfbench.fusion import fusible
 from pfbench.model.base import StateSpaceModel
 
 _DOUBLE_FROM = 100_000  # particles; in float32 one ancestor in 500 is wrong there, and the evidence drifts
@@ -125,7 +125,7 @@ class Systematic:
         return _count(_evenly(a, n, draws.uniform("resample", 1, 1).squeeze(1)))
 
 
-@kernel
+@fusible
 def _evenly(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     """Slots of n filled up to and including each particle by the positions (j + u) / n; u [R, 1]."""
     reach = _cumulative(a) * n

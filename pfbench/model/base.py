@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 
 from pfbench.chart import Chart, Euclidean
 from pfbench.covariance import gaussian_log_density
-from pfbench.kernels import kernel
+from pfbench.fusion import fusible
 from pfbench.record import Record
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -177,7 +177,7 @@ class AtRest(StateSpaceModel):
         return self.model.log_likelihood(y, x, u)
 
 
-@kernel
+@fusible
 def _log_normal(r: Tensor, sd: Tensor, seen: Tensor) -> Tensor:
     """Log density of independent normal residuals [R, N, Dy] over the components seen [R, 1, Dy] -> [R, N].
 

@@ -1,9 +1,9 @@
 """Inner loops that a compiler may fuse.
 
-A kernel is a plain function of tensors. Eagerly each of its operations passes over all particles; fused, the whole function
-does so once. Compiling costs some seconds, so kernels run eagerly until a job that is large enough asks otherwise:
+A fusible function takes and gives tensors only. Eagerly each of its operations passes over all particles; fused, the whole of it
+does so once. Compiling costs some seconds, so they run eagerly until a job that is large enough asks otherwise:
 
-    with kernels.fused():
+    with fusion.fused():
         run_filter(...)
 
 Only pieces are compiled, not the step: over a whole step the compiler computes the noise again for each state component.
@@ -26,7 +26,7 @@ _fused: ContextVar[bool] = ContextVar("fused", default=False)
 
 @contextmanager
 def fused(wanted: bool = True) -> Iterator[None]:
-    """Within it kernels run compiled (or, `wanted` being False, eagerly); results agree to rounding."""
+    """Within it fusible functions run compiled (or, `wanted` being False, eagerly); results agree to rounding."""
     token = _fused.set(wanted)
     try:
         yield
@@ -34,8 +34,8 @@ def fused(wanted: bool = True) -> Iterator[None]:
         _fused.reset(token)
 
 
-def kernel(function: F, eager: F | None = None) -> F:
-    """A function of tensors as one to be fused.
+def fusible(function: F, eager: F | None = None) -> F:
+    """Makes a function of tensors one that can be fused.
 
     Args:
         function: what is compiled.

@@ -1,4 +1,4 @@
-"""Kernels: fused they compute what they compute eagerly."""
+"""Fusible functions: fused they compute what they compute eagerly."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from pfbench import kernels
+from pfbench import fusion
 from pfbench.draws import MonteCarlo
 from pfbench.filter import particle, resamplers
 from pfbench.filter.belief import Cloud, gather
@@ -26,17 +26,17 @@ compiler = pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"
 
 def test_what_is_not_fused_runs_the_eager_form() -> None:
     seen: list[str] = []
-    half = kernels.kernel(lambda: seen.append("fused"), eager=lambda: seen.append("eager"))
+    half = fusion.fusible(lambda: seen.append("fused"), eager=lambda: seen.append("eager"))
     half()
-    with kernels.fused(False):
+    with fusion.fused(False):
         half()
     assert seen == ["eager", "eager"]
 
 
 def test_the_switch_is_put_back_after_an_error() -> None:
-    with pytest.raises(RuntimeError), kernels.fused():
+    with pytest.raises(RuntimeError), fusion.fused():
         raise RuntimeError
-    assert not kernels._fused.get()
+    assert not fusion._fused.get()
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (0, 2, 1)])
@@ -70,9 +70,9 @@ def results(dtype: torch.dtype) -> list[Any]:
 @compiler
 @pytest.mark.filterwarnings("ignore")  # the compiler's own
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_fused_kernels_agree_with_eager_ones(dtype: torch.dtype) -> None:
+def test_fused_functions_agree_with_eager_ones(dtype: torch.dtype) -> None:
     eager = results(dtype)
-    with kernels.fused():
+    with fusion.fused():
         fused = results(dtype)
     torch.testing.assert_close(fused, eager)
 
@@ -88,7 +88,7 @@ def test_a_filter_runs_alike_fused_and_eagerly() -> None:
         return run_filter(ParticleFilter(300), model, record, MonteCarlo(1, torch.arange(4)))
 
     eager = run()
-    with kernels.fused(), torch.no_grad():
+    with fusion.fused(), torch.no_grad():
         fused = run()
     # normals agree to 1e-5 and a slot of a resampling may fall to a neighbour: far below the Monte Carlo error
     assert torch.allclose(fused.log_evidence, eager.log_evidence, rtol=0, atol=2e-2)
