@@ -23,6 +23,7 @@ class Cloud(NamedTuple):
         log_z: log evidence so far [R]; -inf where the run is lost.
         window: what moves need of the past, [R, N, L, ...], gathered with the particles.
         memory: the proposal's own, [R, N or 1, ...], gathered with the particles.
+        past: what was seen at the steps in the window, oldest first, each as Record.at gives it.
     """
 
     x: Tensor
@@ -30,6 +31,7 @@ class Cloud(NamedTuple):
     log_z: Tensor
     window: dict[str, Tensor] = {}  # noqa: RUF012 (a NamedTuple default, never written to)
     memory: dict[str, Tensor] = {}  # noqa: RUF012
+    past: tuple[Record, ...] = ()
 
 
 class Gaussian(NamedTuple):
@@ -105,6 +107,7 @@ def where(hit: Tensor, new: Cloud, old: Cloud) -> Cloud:
         log_z=new.log_z,
         window={k: choose(v, old.window[k]) for k, v in new.window.items()},
         memory={k: choose(v, old.memory[k]) for k, v in new.memory.items()},
+        past=new.past,
     )
 
 

@@ -83,7 +83,9 @@ class ParticleFilter:
             spread = z * law.stddev.unsqueeze(1)
         origin = model.origin.expand(1, -1) if start is None else start
         x = model.chart.add(origin.unsqueeze(1), law.mean.unsqueeze(1) + spread)
-        log_w = torch.full(x.shape[:2], -math.log(self.particles), dtype=x.dtype, device=x.device)
+        first = self.size.first(self.particles)
+        log_w = torch.full(x.shape[:2], -math.log(first), dtype=x.dtype, device=x.device)
+        log_w[:, first:] = -torch.inf
         return Cloud(x=x, log_w=log_w, log_z=torch.zeros_like(log_w[:, 0], dtype=torch.float64))
 
     def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud, Info]:
@@ -93,12 +95,12 @@ class ParticleFilter:
         cloud, trace["resampled"] = self.resampler(model, belief, log_a, self.size(belief), draws)
         for i, move in enumerate(self.moves):
             cloud, trace[f"accepted_{i}"] = move(model, cloud, trace["resampled"], draws)
-        x, log_ratio, memory = self.proposal(model, cloud, seen, draws)
+        x, log_ratio, memory, _ = self.proposal(model, cloud, seen, draws)
         log_w = self.weigh(model, cloud.log_w, x, log_ratio, seen)
         x, log_w = bury(x, log_w, cloud.x)
         # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
         log_w, total, trace["ess"] = _normalise(log_w)
-        cloud = Cloud(x, log_w, belief.log_z + total, cloud.window, memory)
+        cloud = cloud._replace(x=x, log_w=log_w, log_z=belief.log_z + total, memory=memory)
         return cloud, summarise(model, cloud, trace)
 
 

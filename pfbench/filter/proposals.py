@@ -15,11 +15,19 @@ from pfbench.record import Record
 
 
 class Proposed(NamedTuple):
-    """x [R, N, D]; log_ratio [R, N] = log p(w) - log q(w) of the noise that led there; memory as in Cloud."""
+    """Where particles were sent.
+
+    Attributes:
+        x: [R, N, D].
+        log_ratio: [R, N] log p(w) - log q(w) of the noise that led there.
+        memory: as in Cloud.
+        w: that noise [R, N, W], for moves that need it; None from a proposal that does not go through the noise.
+    """
 
     x: Tensor
     log_ratio: Tensor
     memory: dict[str, Tensor]
+    w: Tensor | None = None
 
 
 class Proposal(Protocol):
@@ -37,7 +45,7 @@ class Bootstrap:
 
     def __call__(self, model: StateSpaceModel, cloud: Cloud, seen: Record, draws: Draws) -> Proposed:
         w = draw_noise(model, cloud.x.shape[1], draws)
-        return Proposed(model.propagate(cloud.x, seen.u, w), torch.zeros_like(cloud.log_w), cloud.memory)
+        return Proposed(model.propagate(cloud.x, seen.u, w), torch.zeros_like(cloud.log_w), cloud.memory, w)
 
 
 def draw_noise(model: StateSpaceModel, n: int, draws: Draws) -> Tensor:

@@ -14,12 +14,18 @@ from pfbench.filter.belief import Cloud
 class Size(Protocol):
     """A cloud -> the number of particles wanted in each run, float [R, 1], at most the number of slots."""
 
+    def first(self, slots: int) -> int:
+        """The number to begin with, of so many slots."""
+
     def __call__(self, cloud: Cloud) -> Tensor: ...
 
 
 @dataclass(frozen=True)
 class Fixed:
     """All slots, always."""
+
+    def first(self, slots: int) -> int:
+        return slots
 
     def __call__(self, cloud: Cloud) -> Tensor:
         runs, slots = cloud.log_w.shape
