@@ -22,14 +22,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 import pfbench
-from pfbench import store
-from pfbench.draws import Fill, MonteCarlo, blocked_normals, compiled_normals
+from pfbench import fusion, store
+from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Info
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.model.base import StateSpaceModel
 from pfbench.record import Episode
+from pfbench.scenario.told import Witness
 
 log = logging.getLogger("pfbench")
 
@@ -83,14 +84,21 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
     model, scenario, noise, method = (build(cfg[part]) for part in ("model", "scenario", "noise", "filter"))
     runs = torch.arange(cfg.first_run, cfg.first_run + cfg.runs)
     started = time.perf_counter()
-    episode: Episode = scenario.draw(noise, runs, cfg.seed)
+    witness = Witness(noise)
+    episode: Episode = scenario.draw(witness, runs, cfg.seed)
     drawn = time.perf_counter()
     dtype = getattr(torch, cfg.dtype)
+    model = witness.tell(model, episode.time) if cfg.told else model
     model = model.to(cfg.device, dtype)
     truth = model.assemble(episode.truth).to(cfg.device, dtype)
     steps = episode.record.y.shape[1]
-    draws = MonteCarlo(cfg.seed, runs.to(cfg.device), dtype, fill=fill(cfg.engine, method, model, cfg.runs * steps))
-    with torch.no_grad(), tqdm(total=steps, desc=name, unit="step", delay=2, disable=None, leave=False) as bar:
+    draws = MonteCarlo(cfg.seed, runs.to(cfg.device), dtype)
+    fuse = fuses(cfg.engine, method, model, cfg.runs * steps)
+    with (
+        fusion.fused(fuse),
+        torch.no_grad(),
+        tqdm(total=steps, desc=name, unit="step", delay=2, disable=None, leave=False) as bar,
+    ):
         estimate = run_filter(method, model, episode.record, draws, judge(model, truth), bar.update)
     if cfg.device != "cpu":
         torch.cuda.synchronize()
@@ -108,6 +116,8 @@ def settings(cfg: DictConfig) -> None:
     for key, least in (("runs", 1), ("first_run", 0), ("threads", 1), ("seed", 0)):
         if type(cfg[key]) is not int or cfg[key] < least:
             raise ValueError(f"{key}={cfg[key]}: give a whole number, {least} or more")
+    if type(cfg.told) is not bool:
+        raise ValueError(f"told={cfg.told}: give true (the filter knows the noise regime) or false")
     if cfg.dtype not in ("float32", "float64"):
         raise ValueError(f"dtype={cfg.dtype}: give float64 (the default) or float32")
     if cfg.engine not in ("auto", "eager", "compiled"):
@@ -124,18 +134,18 @@ def build(node: Any) -> Any:
     return hydra.utils.instantiate(node, _convert_="all")
 
 
-def fill(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> Fill:
-    """The kernel that makes normals: compiled where asked for, or where a job is large enough to pay for the compilation."""
+def fuses(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> bool:
+    """Are inner loops compiled: where it was asked for, or where a job is large enough to pay for the compilation?"""
     numbers = run_steps * method.particles * model.noise_dim if isinstance(method, ParticleFilter) else 0
     if engine == "eager" or (engine == "auto" and numbers < _COMPILE_FROM):
-        return blocked_normals
-    one = torch.ones(2, dtype=torch.int64)
+        return False
     try:
-        compiled_normals()(one, one[0], one, one, one)
+        with fusion.fused():
+            MonteCarlo(0, torch.arange(2)).uniform("compiles", 2, 2)
     except Exception as error:  # torch raises many kinds where no C++ compiler is at hand
-        log.warning("engine=%s: the noise kernel does not compile here (%s); going on eagerly", engine, type(error).__name__)
-        return blocked_normals
-    return compiled_normals()
+        log.warning("engine=%s: nothing compiles here (%s); going on eagerly", engine, type(error).__name__)
+        return False
+    return True
 
 
 def judge(model: StateSpaceModel, truth: Tensor) -> Callable[[int, Info], dict[str, Tensor]]:
@@ -172,7 +182,7 @@ def describe(
         "device": cfg.device if cfg.device == "cpu" else torch.cuda.get_device_name(cfg.device),
         "threads": cfg.threads,
         "exact": method.exact or (model.linear and isinstance(method, GaussianFilter)),
-        "told": False,
+        "told": cfg.told,
         "choices_made": [*model.choices, *notes],
         "versions": versions(),
         "host": platform.node(),

@@ -179,6 +179,8 @@ def test_every_model_runs(model: str) -> None:
 @pytest.mark.parametrize("noise", GROUPS["noise"])
 @pytest.mark.parametrize("scenario", ["linear_walk", "t003"])
 def test_every_regime_gives_errors(scenario: str, noise: str) -> None:
+    if noise == "replay" and DATA is None:
+        pytest.skip("PFBENCH_DATA does not name the folder of the recorded data sets")
     cfg = composed(f"scenario={scenario}", f"noise={noise}")
     regime, times = job.build(cfg.noise), torch.arange(1.0, 201.0, dtype=torch.float64)
     errors = regime.errors(MonteCarlo(SEED, RUNS), Channels.alike(torch.ones(3, dtype=torch.float64)), times)

@@ -10,13 +10,16 @@ from torch.distributions import Independent, Normal
 
 from pfbench.draws import MonteCarlo
 from pfbench.model.base import AtRest, StateSpaceModel
-from pfbench.noise.regimes import Regime
+from pfbench.noise.regimes import Regime, step_process
 from pfbench.record import Channels, Episode, Record
 
 
 @dataclass(frozen=True)
 class ModelWorld:
     """`steps` steps of `model`.
+
+    A regime's factor on the process noise multiplies the variance of the noise that drives a step, averaged over the interval
+    that ends with it.
 
     Args:
         model: draws states and measurements.
@@ -42,10 +45,10 @@ class ModelWorld:
         law = model.initial(len(runs))
         x = model.chart.add(model.origin.expand(1, 1, -1), _sample(law, draws.normal("world.state", 1, model.chart.dimension)))
         blank = Record(torch.full((len(runs), self.steps, 1), torch.nan, dtype=torch.float64))
-        inputs = model.prepare(blank)
+        inputs, swell = model.prepare(blank), step_process(noise, time).sqrt()
         states, means, sds = [], [], []
         for t in range(self.steps):
-            w = model.noise.mean + model.noise.stddev * draws.at(t + 1).normal("world.state", 1, model.noise_dim)
+            w = model.noise.mean + swell[t] * model.noise.stddev * draws.at(t + 1).normal("world.state", 1, model.noise_dim)
             stage = AtRest(model) if t == 0 and model.observes_initial else model
             u = inputs.at(t).u
             x = stage.propagate(x, u, w)

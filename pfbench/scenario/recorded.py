@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pfbench.draws import MonteCarlo
 from pfbench.model.strapdown_total import Believed, Increments, StrapdownTotal, preintegrate
-from pfbench.noise.regimes import Regime
+from pfbench.noise.regimes import Regime, untouched_process
 from pfbench.record import Channels, Episode, Record, fixes
 from pfbench.scenario.legs import SAME_TIME, Leg, cut
 from pfbench.scenario.logs import Files, read_log
@@ -163,6 +163,7 @@ def assemble(
     sd = receiver.sd
     y = _padded([leg.fixes for leg in legs], np.nan)[which][..., : len(sd)]
     # errors are drawn for fixes, not for steps: the worlds stay the same when the step changes
+    untouched_process(noise, t)
     y[:, fixed] += noise.errors(draws.at(0), receiver.channels, t[fixed])
     record = Record(y, _increments(legs, which, believed), _start(legs, which, believed, draws))
     groups = {"attitude": truth[..., :4], "velocity": truth[..., 4:7], "position": truth[..., 7:]}

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import torch
 from pyro.distributions import Laplace
+from scipy import stats
 
 import pfbench
 from pfbench.model.linear import LinearGaussian, linear_walk, local_level
 from pfbench.model.toys import Pendulum, StochasticVolatility
 from pfbench.noise.regimes import Nominal, Outage, Outliers
+from pfbench.noise.surges import Surge
 from pfbench.scenario.model_world import ModelWorld
 
 RUNS, STEPS = 4000, 15
@@ -47,6 +49,22 @@ def test_measurements_are_the_state_and_white_noise_of_the_stated_size() -> None
     assert abs(z.mean()) < 4.5 / math.sqrt(z.numel())
     assert abs(z.std() - 1) < 4.5 / math.sqrt(2 * z.numel())
     assert abs((z[:, 1:] * z[:, :-1]).mean()) < 4.5 / math.sqrt(z.numel())
+
+
+def test_a_surge_multiplies_the_variance_of_what_drives_the_steps_in_its_window() -> None:
+    model = linear_walk(0.5, 0.3, 2.0)
+    surge = Surge(((3.0, 5.0),), (9.0,), (100.0,))
+    episode, calm = (ModelWorld(model, STEPS, interval=0.5).draw(noise, torch.arange(RUNS), 4) for noise in (surge, Nominal()))
+    x, g = episode.truth["state"], model.g.inverse()
+    w = (x[:, 1:] - x[:, :-1] @ model.f.mT) @ g.mT  # of the steps that end at 1.0, 1.5, ...
+    for t, seconds in enumerate(np.arange(1.0, 0.5 * STEPS + 0.1, 0.5)):
+        inside = 3.0 < seconds <= 5.0  # its interval lies in the window
+        low, high = stats.chi2(2 * RUNS).ppf([1e-5, 1 - 1e-5]) * (100.0 if inside else 1.0)
+        assert low < w[:, t].square().sum() < high
+    assert torch.equal(x[:, :6], calm.truth["state"][:, :6])  # common numbers before it
+    z = (episode.record.y[..., 0] - x[..., 0]) / 2.0
+    variance = torch.where((episode.time >= 3.0) & (episode.time < 5.0), 9.0, 1.0)
+    assert (((z.square().mean(0) / variance) - 1).abs() < 4.5 * math.sqrt(2 / RUNS)).all()
 
 
 def test_a_model_that_observes_its_initial_state_does_not_move_it_first() -> None:

@@ -1,0 +1,195 @@
+"""A model that is told the noise regime of its world: the filter with it knows the law of every step, as an oracle would."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
+
+from pfbench.chart import Chart
+from pfbench.draws import Draws
+from pfbench.model.base import StateSpaceModel, dense_normal, independent_normal
+from pfbench.noise import laws
+from pfbench.noise.laws import Law, Mixture
+from pfbench.noise.regimes import Regime, step_process
+from pfbench.record import Channels, Record
+
+
+@dataclass(eq=False)
+class Witness:
+    """A regime that passes everything on and keeps what the scenario said of its measurement, which Told needs."""
+
+    regime: Regime
+    channels: Channels | None = None
+
+    def errors(self, draws: Draws, channels: Channels, time: Tensor) -> Tensor:
+        self.channels = channels
+        return self.regime.errors(draws, channels, time)
+
+    def process(self, time: Tensor) -> Tensor:
+        return self.regime.process(time)
+
+    def law(self, channels: Channels, time: Tensor) -> Law:
+        return self.regime.law(channels, time)
+
+    def tell(self, model: StateSpaceModel, time: Tensor) -> Told:
+        """The model that knows the regime of the world just drawn, whose steps are at `time` [T].
+
+        Raises:
+            ValueError: a scenario that asked for no errors; see Told.
+        """
+        if self.channels is None:
+            raise ValueError("told=true: the scenario drew no errors from the noise regime; give told=false")
+        return Told(model, self.regime, self.channels, time)
+
+
+class Known(tuple[Tensor, ...]):
+    """Inputs of the model inside, then root of the process factor [1, T], shift and scale of the errors [1, T, Dy]."""
+
+    inner: ClassVar[type]
+
+    def __new__(cls, *leaves: Tensor) -> Known:
+        return super().__new__(cls, leaves)
+
+    @property
+    def inputs(self) -> Any:
+        """Of the model inside."""
+        return self.inner(*self[:-3]) if len(self) > 3 else ()
+
+
+@cache
+def _known(inner: type) -> type[Known]:
+    """The type is what a record keeps when it takes its inputs apart, so it knows the model's own."""
+
+    class Own(Known):
+        pass
+
+    Own.inner = inner
+    return Own
+
+
+class Told(StateSpaceModel):
+    """`model`, knowing the regime: at each step the factor on Q and the law of the errors.
+
+    The noise w is scaled about its mean by the root of the factor; the measurement's law is the regime's family, shifted and
+    scaled from the deviations of the model's own normal law. What the model inside is, this one is too, except that it is
+    linear only under normal errors.
+
+    Args:
+        model: what the filter believes otherwise; its measurement noise is normal.
+        regime: of the world.
+        channels: of the world's measurement.
+        time: s, of the record's steps [T].
+
+    Raises:
+        ValueError: a regime without a law step by step; on use, a record of another length, or measurement noise that is not
+            normal (not independent, under a regime that is not normal).
+    """
+
+    def __init__(self, model: StateSpaceModel, regime: Regime, channels: Channels, time: Tensor) -> None:
+        super().__init__()
+        self.model = model
+        self.names, self.units, self.groups = model.names, model.units, model.groups
+        self.noise_dim, self.observes_initial = model.noise_dim, model.observes_initial
+        self.family, shift, scale = regime.law(channels, time)
+        process = step_process(regime, time)
+        self.swollen, self.moved = bool((process != 1.0).any()), bool((shift != 0.0).any() or (scale != 1.0).any())
+        self.linear = model.linear and self.family is laws.normal
+        told = "the filter's model is told the noise regime: at each step the factor on Q and the law of the errors"
+        self.choices = (*model.choices, told)
+        for name, value in (("root", process.sqrt()), ("shift", shift), ("scale", scale)):
+            self.register_buffer(f"told_{name}", value.unsqueeze(0))
+
+    @property
+    def chart(self) -> Chart:
+        return self.model.chart
+
+    @property
+    def origin(self) -> Tensor:
+        return self.model.origin
+
+    @property
+    def anchor(self) -> Tensor:
+        return self.model.anchor
+
+    @property
+    def noise(self) -> Distribution:
+        return self.model.noise
+
+    def prepare(self, record: Record) -> Record:
+        if isinstance(record.u, Known):
+            return record
+        record = self.model.prepare(record)
+        own: Sequence[Tensor] = [self.get_buffer(f"told_{name}") for name in ("root", "shift", "scale")]
+        if record.y.shape[1] != own[0].shape[1]:
+            raise ValueError(f"the record has {record.y.shape[1]} steps, the filter was told of {own[0].shape[1]}")
+        inner: type = type(record.u)
+        return record._replace(u=_known(inner)(*record.u, *own))
+
+    def initial(self, runs: int) -> Distribution:
+        return self.model.initial(runs)
+
+    def propagate(self, x: Tensor, u: Known, w: Tensor) -> Tensor:
+        if self.swollen:
+            centre = self.model.noise.mean
+            w = centre + u[-3][:, None, None] * (w - centre)
+        return self.model.propagate(x, u.inputs, w)
+
+    def noise_gain(self, u: Known) -> Tensor | None:
+        gain = self.model.noise_gain(u.inputs)
+        return u[-3][:, None, None] * gain if self.swollen and gain is not None else gain
+
+    def transition(self, x: Tensor, u: Known) -> Distribution | None:
+        """The model's, its deviations scaled where the noise enters additively; None where it has none."""
+        law = self.model.transition(x, u.inputs)
+        if law is None or not self.swollen:
+            return law
+        if self.model.noise_gain(u.inputs) is None:
+            return None
+        root = u[-3][:, None, None]
+        if isinstance(law, Independent) and isinstance(law.base_dist, Normal):
+            return independent_normal(law.base_dist.loc, root * law.base_dist.scale)
+        if isinstance(law, MultivariateNormal):
+            return dense_normal(law.mean, root.unsqueeze(-1) * law.scale_tril)
+        return None
+
+    def observation(self, x: Tensor, u: Known) -> Distribution:
+        law = self.model.observation(x, u.inputs)
+        if self.family is laws.normal and not self.moved:
+            return law
+        shift, scale = (a.unsqueeze(1) for a in u[-2:])
+        if isinstance(law, Independent) and isinstance(law.base_dist, Normal):
+            centre, sd = law.base_dist.loc, law.base_dist.scale
+            return self.family(centre + shift * sd, scale * sd)
+        if isinstance(law, MultivariateNormal) and self.family is laws.normal:
+            return dense_normal(law.mean + shift * law.stddev, scale.unsqueeze(-1) * law.scale_tril)
+        raise ValueError(f"told=true: {type(self.model).__name__} has no independent normal measurement noise; give told=false")
+
+    def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
+        return self.model.residual(y, y_hat)
+
+    def assemble(self, truth: dict[str, Tensor]) -> Tensor:
+        return self.model.assemble(truth)
+
+    def error(self, mean: Tensor, truth: Tensor) -> Tensor:
+        return self.model.error(mean, truth)
+
+    def log_likelihood(self, y: Tensor, x: Tensor, u: Known) -> Tensor:
+        if self.family is laws.normal and not self.moved:
+            return self.model.log_likelihood(y, x, u.inputs)
+        law = self.observation(x, u)
+        if isinstance(law, Mixture):
+            return law.combine([self._density(part, y) for part in law.parts])
+        return self._density(law, y) if isinstance(law, Independent) else super().log_likelihood(y, x, u)
+
+    def _density(self, law: Any, y: Tensor) -> Tensor:
+        """Log density of independent components over those that were seen: y [R, Dy] -> [R, N]."""
+        seen, centre = ~torch.isnan(y).unsqueeze(1), law.mean
+        r = torch.where(seen, self.residual(y.unsqueeze(1), centre), 0.0)
+        density: Tensor = (law.base_dist.log_prob(centre + r) * seen).sum(-1)
+        return density
