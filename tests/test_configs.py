@@ -94,7 +94,7 @@ def truncated(episode: Episode) -> Episode:
     record = episode.record
     inputs = map_inputs(lambda a: a[:, :STEPS], record.u)
     truth = {name: value[:, :STEPS] for name, value in episode.truth.items()}
-    return Episode(Record(record.y[:, :STEPS], inputs, record.start), episode.time[:STEPS], truth, None, episode.notes)
+    return Episode(Record(record.y[:, :STEPS], inputs, record.start, record.spread), episode.time[:STEPS], truth, None, episode.notes)
 
 
 WORLDS: dict[str, Episode] = {}
@@ -163,7 +163,7 @@ def homes(model: str) -> list[str]:
     """Scenarios that have what a model needs."""
     if model.startswith("ins_gnss"):
         return ["t003", "t004"]
-    return ["car_drive"] if model == "strapdown_total" else [model]
+    return {"strapdown_total": ["car_drive"], "passive_location": ["passive_1"]}.get(model, [model])
 
 
 @pytest.mark.parametrize("model", GROUPS["model"])
