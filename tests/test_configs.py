@@ -131,7 +131,7 @@ def five_steps(scenario: str, *words: str) -> None:
     assert seen.any()
 
 
-RECORDED = [name for name in GROUPS["scenario"] if "scenario.recorded." in (CONF / "scenario" / f"{name}.yaml").read_text()]
+RECORDED = [name for name in GROUPS["scenario"] if "scenario.recorded" in (CONF / "scenario" / f"{name}.yaml").read_text()]
 
 
 def test_recorded_scenarios_are_told_from_the_others() -> None:
@@ -163,7 +163,7 @@ def homes(model: str) -> list[str]:
     """Scenarios that have what a model needs."""
     if model.startswith("ins_gnss"):
         return ["t003", "t004"]
-    return {"strapdown_total": ["car_drive"], "passive_location": ["passive_1"]}.get(model, [model])
+    return {"strapdown_total": ["car_drive"], "passive_location": ["passive_1"], "strapdown_tight": ["walk"]}.get(model, [model])
 
 
 @pytest.mark.parametrize("model", GROUPS["model"])
