@@ -106,7 +106,10 @@ def world(scenario: str) -> Episode:
         cfg = composed(f"scenario={scenario}")
         flown = cfg.scenario._target_.endswith("SimulatedFlight")
         if flown:  # the first manoeuvres that make up some seconds: 10 s of t003, 20 s of t004
-            cfg.scenario.path.segments = cfg.scenario.path.segments[:1]
+            if "segments" in cfg.scenario.path:
+                cfg.scenario.path.segments = cfg.scenario.path.segments[:1]
+            elif "duration" in cfg.scenario.path:
+                cfg.scenario.path.duration = 6.0
             cfg.scenario.imu_rate = 20.0
         WORLDS[scenario] = truncated(job.build(cfg.scenario).draw(Nominal(), RUNS, SEED))
     return WORLDS[scenario]
@@ -124,14 +127,14 @@ def five_steps(scenario: str, *words: str) -> None:
     assert len(model.units) == len(model.names)
     assert not estimate.lost.any()
     assert torch.isfinite(estimate.mean).all()
-    assert (estimate.variance > 0).all()
+    assert (estimate.variance >= 0).all()  # 0 where a constant is left with one ancestor
     assert estimate.trace["error"].shape == estimate.variance.shape
     assert estimate.trace["nees"].shape == (2, STEPS, len(model.groups))
     seen = truth.isfinite().all((0, 1))
     assert seen.any()
 
 
-RECORDED = [name for name in GROUPS["scenario"] if "scenario.recorded" in (CONF / "scenario" / f"{name}.yaml").read_text()]
+RECORDED = [name for name in GROUPS["scenario"] if re.search(r"\$\{data.root\}", (CONF / "scenario" / f"{name}.yaml").read_text())]
 
 
 def test_recorded_scenarios_are_told_from_the_others() -> None:
@@ -159,11 +162,14 @@ def test_every_filter_runs_where_the_transition_is_singular(method: str) -> None
     five_steps("t004", f"filter={method}")
 
 
+TIGHT = {"sins_gnss_tight": ["anshun_fit"], "sins_gnss_tight_nl": ["anshun_nl"]}
+
+
 def homes(model: str) -> list[str]:
     """Scenarios that have what a model needs."""
     if model.startswith("ins_gnss"):
         return ["t003", "t004"]
-    return {"strapdown_total": ["car_drive"], "passive_location": ["passive_1"], "strapdown_tight": ["walk"]}.get(model, [model])
+    return {"strapdown_total": ["car_drive"], "passive_location": ["passive_1"], "strapdown_tight": ["walk"], **TIGHT}.get(model, [model])
 
 
 @pytest.mark.parametrize("model", GROUPS["model"])
