@@ -2,10 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
+
+
+class Underway(Protocol):
+    """One filter's way through a world that answers to it; steps are asked for in order."""
+
+    def at(self, t: int) -> Record:
+        """Step t as the corrections so far have made it, with its axis of time: y [R, 1, Dy], inputs [R or 1, 1, ...]."""
+
+    def correct(self, mean: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """The world, corrected by the estimate [R, D] of the step just given.
+
+        Returns:
+            The estimate as it would read without any correction [R, D], and what takes states [R, N, D] to what they are after
+            this one.
+        """
+
+
+class Loop(Protocol):
+    """A world that a filter's estimates change: an INS that is corrected in flight."""
+
+    def begin(self, record: Record, groups: dict[str, tuple[int, ...]]) -> Underway:
+        """From the start, for a model with these groups of components.
+
+        Raises:
+            ValueError: a model whose states do not say how to correct this world.
+        """
 
 
 class Record(NamedTuple):
@@ -18,12 +45,15 @@ class Record(NamedTuple):
             where the model's `origin` serves all of them.
         spread: Cholesky factor [R, d, d] of each run's initial covariance about `start`, where runs differ in it (a filter that
             starts from its first measurement, say); None where the model's `initial` law serves all of them.
+        loop: where the filter's estimates change the world, how it then goes on; y and u are what they are without any change.
+            None where nothing that a filter does matters.
     """
 
     y: Tensor
     u: Any = ()
     start: Tensor | None = None
     spread: Tensor | None = None
+    loop: Loop | None = None
 
     def at(self, t: int) -> Record:
         """Step t alone: y [R, Dy], inputs [R or 1, ...]."""
@@ -36,7 +66,7 @@ class Record(NamedTuple):
             return a.to(like) if a.is_floating_point() else a.to(like.device)
 
         start, spread = (None if a is None else moved(a) for a in (self.start, self.spread))
-        return Record(moved(self.y), map_inputs(moved, self.u), start, spread)
+        return Record(moved(self.y), map_inputs(moved, self.u), start, spread, self.loop)
 
 
 def map_inputs(f: Any, u: Any) -> Any:

@@ -129,16 +129,16 @@ def corrupt(
         dt: sampling interval, s.
         errors: their sizes.
         draws: decides the runs R; purposes "world.imu.*".
-        process: factor on the variance of the white noise of each sample [n]; None is 1.
+        process: factor on the variance of what drives the errors in each sample [n], white noise and Markov parts; None is 1.
     """
     n = dtheta.shape[-2]
     swell = 1.0 if process is None else process.sqrt()[:, None]
     e = errors
     gyro_bias = _constant("world.imu.gyro_bias", e.gyro_bias, e.drawn_biases, draws)
-    gyro_markov = markov("world.imu.gyro_markov", n, e.gyro_markov, e.gyro_markov_time, dt, draws)
+    gyro_markov = markov("world.imu.gyro_markov", n, e.gyro_markov, e.gyro_markov_time, dt, draws, swell)
     acc_bias = _constant("world.imu.accelerometer_bias", e.accelerometer_bias, e.drawn_biases, draws)
     acc_markov = markov(
-        "world.imu.accelerometer_markov", n, e.accelerometer_markov, e.accelerometer_markov_time, dt, draws
+        "world.imu.accelerometer_markov", n, e.accelerometer_markov, e.accelerometer_markov_time, dt, draws, swell
     )
     w = _misaligned(dtheta, e.gyro_misalignment) + (gyro_bias[:, None] + gyro_markov) * dt
     f = _misaligned(dv, e.accelerometer_misalignment) + (acc_bias[:, None] + acc_markov) * dt
@@ -149,14 +149,16 @@ def corrupt(
     return Corrupted(w, f, gyro_bias, gyro_markov, acc_bias, acc_markov)
 
 
-def markov(purpose: str, n: int, sigma: float, time: float, dt: float, draws: Draws) -> Tensor:
+def markov(
+    purpose: str, n: int, sigma: float, time: float, dt: float, draws: Draws, swell: Tensor | float = 1.0
+) -> Tensor:
     """Three independent first-order Markov processes [R, n, 3]: x' = -x / time + white, of stationary sigma.
 
-    Exact at every dt: x_k = e^(-dt/time) x_(k-1) + sigma sqrt(1 - e^(-2 dt/time)) N(0, 1), x_0 in the stationary law.
+    Its driving noise is multiplied by `swell` [n, 1]. Exact at every dt: x_k = e^(-dt/time) x_(k-1) + sigma sqrt(1 - e^(-2 dt/time)) N(0, 1), x_0 in the stationary law.
     """
     if sigma == 0:
         return torch.zeros_like(draws.normal(purpose, 1, 3)).expand(-1, n, 3)
-    noise = draws.normal(purpose, n, 3).transpose(1, 2) * (sigma * math.sqrt(-math.expm1(-2 * dt / time)))
+    noise = (draws.normal(purpose, n, 3) * swell).transpose(1, 2) * (sigma * math.sqrt(-math.expm1(-2 * dt / time)))
     noise = torch.cat([draws.normal(f"{purpose}.start", 1, 3).transpose(1, 2) * sigma, noise[..., 1:]], dim=-1)
     return _autoregression(noise, dt / time).transpose(1, 2)
 

@@ -225,7 +225,8 @@ class Ramps:
         rise: changes of the vertical speed m/s.
 
     Raises:
-        ValueError: `climb_deg` and `rise` together; on flying, a duration of no whole number of samples, or a negative speed.
+        ValueError: `climb_deg` and `rise` together; on flying, a negative speed, a duration of no whole number of samples, or a
+            Cosine that begins or ends between two of them.
     """
 
     start: Start
@@ -243,6 +244,9 @@ class Ramps:
         n = round(self.duration * rate)
         if n < 1 or abs(n - self.duration * rate) > 1e-6:
             raise ValueError(f"path.duration={self.duration}: at rate={rate} that is no whole number of samples")
+        for ramp in (*self.speed, *self.climb_deg, *self.heading_deg, *self.rise):
+            if isinstance(ramp, Cosine):
+                _check_on_samples(ramp, self.duration, rate)
         at = torch.arange(n + 1, dtype=torch.float64)
         return follow(self.motion(at / rate), self.motion((at[:-1, None] + NODES) / rate), self.start, rate)
 
@@ -254,11 +258,24 @@ class Ramps:
         if not self.rise:
             climb, climb1, _ = _total(self.climb_deg, t, 0.0)
             return Motion(speed, speed1, torch.deg2rad(climb), torch.deg2rad(climb1), *turned)
+        if speed.min() < 0:  # not seen in the length of the velocity
+            raise ValueError(f"horizontal speed falls to {speed.min():.3f} m/s: brake less, or start faster")
         up, up1, _ = _total(self.rise, t, 0.0)
         along = torch.hypot(speed, up)
         safe = along.clamp(min=1e-9)
         along1, steepen = (speed * speed1 + up * up1) / safe, (speed * up1 - up * speed1) / safe.square()
         return Motion(along, torch.where(along > 0, along1, speed1), torch.atan2(up, speed), steepen, *turned)
+
+
+def _check_on_samples(ramp: Cosine, duration: float, rate: float) -> None:
+    for name, time in (("begin", ramp.begin), ("end", ramp.end)):
+        samples = time * rate
+        # the jump of its second derivative, a jump of the roll rate, would be integrated wrongly inside a sample
+        if 0 < time < duration and abs(samples - round(samples)) > 1e-6:
+            raise ValueError(
+                f"a Cosine's {name}={time} lies between two samples at rate={rate}: make it a multiple of {1 / rate:.6g} s, "
+                "or use a Cycloid"
+            )
 
 
 def _total(ramps: Sequence[Cosine | Cycloid], t: Tensor, start: float) -> tuple[Tensor, Tensor, Tensor]:

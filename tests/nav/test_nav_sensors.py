@@ -117,3 +117,19 @@ def test_scale_factor_and_misalignment():
     made = corrupt(STILL + 1, STILL + 2, DT, ImuErrors(gyro_misalignment=skewed), draws(1))
     assert made.dtheta[0, 0].tolist() == pytest.approx([1.003, 0.999, 1.0], rel=1e-15)
     assert (made.dv == 2).all()
+
+
+def test_a_surge_multiplies_the_variance_of_what_drives_the_errors_and_nothing_before_it():
+    surge = torch.where(torch.arange(N) < N // 2, 1.0, 9.0).double()
+    calm, wild = (corrupt(STILL, STILL, DT, TACTICAL, draws(400), process) for process in (None, surge))
+    assert torch.equal(wild.dtheta[:, : N // 2], calm.dtheta[:, : N // 2])
+    assert torch.equal(wild.gyro_bias, calm.gyro_bias)
+
+    def driven(c: sensors.Corrupted) -> list[torch.Tensor]:
+        decay = math.exp(-DT / TACTICAL.gyro_markov_time)
+        markov = c.gyro_markov[:, 1:] - decay * c.gyro_markov[:, :-1]
+        white = c.dtheta - (c.gyro_bias[:, None] + c.gyro_markov) * DT
+        return [markov[:, N // 2 :], white[:, N // 2 + 1 :]]
+
+    for swollen, nominal in zip(driven(wild), driven(calm), strict=True):
+        assert torch.allclose(swollen, 3.0 * nominal, rtol=1e-6, atol=1e-18)  # the same numbers, three times as large
