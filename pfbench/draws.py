@@ -15,6 +15,7 @@ from typing import Protocol, TypeAlias
 import torch
 from torch import Tensor
 
+from pfbench import native
 from pfbench.fusion import fusible
 
 _MULTIPLY = (0xD2511F53, 0xCD9E8D57)
@@ -30,6 +31,10 @@ class Draws(Protocol):
 
     Quasi-Monte-Carlo sources obey the same protocol: n points in w dimensions, fresh for each step and purpose.
     """
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the normals."""
 
     def at(self, step: int) -> Draws:
         """The same source at another time step."""
@@ -62,7 +67,7 @@ def _normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particl
     return torch.cat(parts, dim=-1)
 
 
-normals = fusible(_normals, eager=blocked_normals)
+normals = fusible(_normals, eager=blocked_normals, by_hand=native.normals)
 
 
 @fusible

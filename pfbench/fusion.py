@@ -11,6 +11,8 @@ Only pieces are compiled, not the step: over a whole step the compiler computes 
 
 from __future__ import annotations
 
+import logging
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -20,6 +22,9 @@ from typing import Any, TypeVar, cast
 import torch
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+log = logging.getLogger("pfbench")
+_failed: set[Callable[..., Any]] = set()  # what a compiler has refused once
 
 _fused: ContextVar[bool] = ContextVar("fused", default=False)
 
@@ -34,12 +39,13 @@ def fused(wanted: bool = True) -> Iterator[None]:
         _fused.reset(token)
 
 
-def fusible(function: F, eager: F | None = None) -> F:
+def fusible(function: F, eager: F | None = None, by_hand: F | None = None) -> F:
     """Makes a function of tensors one that can be fused.
 
     Args:
         function: what is compiled.
         eager: computes the same where nothing is fused, if separate operations have a faster way to do it.
+        by_hand: is taken for what would be compiled on the CPU and one thread, where it works.
     """
     separate = eager or function
 
@@ -47,8 +53,17 @@ def fusible(function: F, eager: F | None = None) -> F:
     def compiled() -> Callable[..., Any]:
         return torch.compile(function, dynamic=True)
 
+    def whole(*args: Any) -> Any:
+        if by_hand is not None and by_hand not in _failed and torch.get_num_threads() == 1 and not args[0].is_cuda:
+            try:
+                return by_hand(*args)
+            except (OSError, subprocess.CalledProcessError) as error:
+                log.warning("%s does not compile here (%s); torch compiles it instead", by_hand.__name__, type(error).__name__)
+                _failed.add(by_hand)
+        return compiled()(*args)
+
     @wraps(function)
     def call(*args: Any) -> Any:
-        return (compiled() if _fused.get() else separate)(*args)
+        return (whole if _fused.get() else separate)(*args)
 
     return cast(F, call)

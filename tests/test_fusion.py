@@ -61,7 +61,7 @@ def results(dtype: torch.dtype) -> list[Any]:
     return [
         particle._flat_moments(1e3 + x, z),
         particle._normalise(hidden),
-        base._log_normal(x, torch.full((1, 1, D), 0.7, dtype=dtype), seen),
+        base._log_normal(x, 0.1 * x, torch.full((1, 1, D), 0.7, dtype=dtype), seen),
         resamplers._evenly(a, n, u.double()),
     ]
 

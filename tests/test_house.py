@@ -21,8 +21,8 @@ CHARTED = GROUND | {"nav", "chart"}
 MODELLED = CHARTED | {"model", "noise"}
 PLAIN = {"metrics", "store"}
 MAY_IMPORT: dict[str, set[str]] = {
-    **{part: {"fusion"} for part in GROUND},
-    **{part: set() for part in PLAIN | {"fusion"}},
+    **{part: {"fusion", "native"} for part in GROUND},
+    **{part: set() for part in PLAIN | {"fusion", "native"}},
     "nav": GROUND,
     "chart": GROUND | {"nav"},
     "model": CHARTED | {"fusion"},
