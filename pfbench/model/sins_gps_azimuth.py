@@ -51,6 +51,10 @@ class Step(NamedTuple):
 class Form(Protocol):
     """Error equations, component-major: x [R, 9, N] with position in (rad, rad, m); inputs of one step [R or 1, ...]."""
 
+    @property
+    def linear_given(self) -> tuple[int, ...]:
+        """Components of the nine in which, with the biases, they are linear given the others; none if nothing is."""
+
     def rate(self, x: Tensor, gyro: Tensor, accelerometer: Tensor, u: Step) -> Tensor:
         """Time derivative of attitude and velocity errors [R, 6, N]; sensor biases in level axes [R, 3, N or 1]."""
 
@@ -72,6 +76,8 @@ class Paper(_Linear):
     The paper's equation 1; its G is lost in print, and this is the reading that its words fit [ours].
     """
 
+    linear_given = (0, 1, 3, 4, 5, 6, 7, 8)
+
     def rate(self, x: Tensor, gyro: Tensor, accelerometer: Tensor, u: Step) -> Tensor:
         linear = u.matrix[:, :6, 3:] @ x[:, 3:]
         return level_coupling(x[:, _ATTITUDE], u.w_in, u.f) + linear + torch.cat([-gyro, accelerometer], 1)
@@ -80,6 +86,8 @@ class Paper(_Linear):
 @dataclass(frozen=True)
 class Full(_Linear):
     """The exact equations of attitude and velocity, but with differences of rates, gravity and position rates linearised."""
+
+    linear_given = (3, 4, 5, 6, 7, 8)
 
     def rate(self, x: Tensor, gyro: Tensor, accelerometer: Tensor, u: Step) -> Tensor:
         alpha = x[:, _ATTITUDE].mT
@@ -93,6 +101,8 @@ class Full(_Linear):
 @dataclass(frozen=True)
 class Exact:
     """Differences of the mechanisation equations themselves [Yan Gongmin, postdoctoral report, eqs 4-17 to 4-21]."""
+
+    linear_given = ()
 
     def rate(self, x: Tensor, gyro: Tensor, accelerometer: Tensor, u: Step) -> Tensor:
         level = torch.eye(3, dtype=x.dtype, device=x.device)  # the biases are in level axes already
@@ -178,6 +188,7 @@ class SinsGpsAzimuth(StateSpaceModel):
         self.units = tuple(unit for _, unit in axes.values() for _ in range(3))
         self.groups = {group: (3 * i, 3 * i + 1, 3 * i + 2) for i, group in enumerate(axes)}
         self.noise_dim = 12 if biases else 6
+        self.linear_given = (*form.linear_given, *range(9, len(self.names))) if form.linear_given else ()
         self.imu, self.form, self.step, self.q_inflation, self.biases = imu, form, step, q_inflation, biases
         sizes = _bias_sizes(imu)
         if biases and not bool((sizes > 0).all()):

@@ -138,6 +138,7 @@ class Pendulum(StateSpaceModel):
         self.register_buffer("p0", positive("initial_sd", list(initial_sd)))
         self.step, self.noise_dim = d, 2
         self.names, self.units, self.groups = ("angle", "rate"), ("rad", "rad/s"), {"angle": (0,), "rate": (1,)}
+        self.linear_given = self.groups["rate"]
 
     @property
     def chart(self) -> Chart:

@@ -1,0 +1,652 @@
+"""The Rao-Blackwellised particle filter: Kalman where it may be, unbiased where it says so, better than sampling everything."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import oracles
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from pyro.distributions import Laplace, MultivariateNormal
+from torch import Tensor
+from torch.distributions import Distribution, Independent
+
+from pfbench import job
+from pfbench.chart import Chart, Euclidean, wrap
+from pfbench.cli import conf_dir
+from pfbench.draws import MonteCarlo
+from pfbench.filter import marginalised
+from pfbench.filter.belief import weights
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.loop import Estimate, run_filter
+from pfbench.filter.marginalised import Marginalised, RaoBlackwellised, Split, absorbed, split_of, swept
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.resamplers import Regularise, Resample, Systematic
+from pfbench.filter.rules import Jacobian
+from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.ins_gnss import InsGnss
+from pfbench.model.linear import LinearGaussian, linear_walk
+from pfbench.model.sins_gps_azimuth import Exact as ExactForm
+from pfbench.model.sins_gps_azimuth import Form, Full, Paper, SinsGpsAzimuth, Trapezoid
+from pfbench.model.toys import Growth, Lorenz63, Pendulum
+from pfbench.nav.aiding import Alignment, Receiver
+from pfbench.nav.sensors import ImuErrors
+from pfbench.nav.trajectory import Manoeuvres, Start, accelerate, turn
+from pfbench.noise.regimes import Nominal
+from pfbench.record import Episode, Record, map_inputs
+from pfbench.scenario.flight import SimulatedFlight
+
+PARTS = ("f", "g", "h", "r", "m0", "l0")
+WALK = linear_walk(1.0, 0.5, 1.0)
+WALK_Y = torch.tensor([[0.8], [2.9], [1.2], [math.nan], [3.0], [6.5]], dtype=torch.float64)
+NOISE = torch.tensor([[1.0, 0.8], [0.8, 4.0]], dtype=torch.float64)
+
+
+class Exact(NamedTuple):
+    """What a filter should find after the last measurement: mean, E x^2 (per component [D]) and log evidence."""
+
+    mean: np.ndarray
+    square: np.ndarray
+    log_z: float
+
+
+def run(method: Any, model: StateSpaceModel, y: Tensor, seed: int = 1, **options: Any) -> Estimate:
+    """One record y [T, Dy] filtered in as many runs as `options["runs"]` says, or y [R, T, Dy] as it is."""
+    if y.dim() == 2:
+        y = y.expand(options.pop("runs"), -1, -1)
+    draws = MonteCarlo(seed, torch.arange(y.shape[0]), model.anchor.dtype)
+    return run_filter(method, model, Record(y, options.pop("u", ()), options.pop("start", None)), draws, **options)
+
+
+def ratios(estimate: Estimate, exact: Exact) -> list[np.ndarray]:
+    """Z_hat f_hat / Z less f, for f = 1, x, x^2: each has the expectation 0."""
+    ratio = torch.exp(estimate.log_evidence - exact.log_z).numpy()
+    mean, variance = estimate.mean[:, -1].numpy(), estimate.variance[:, -1].numpy()
+    values = [ratio - 1.0]
+    values += list((ratio[:, None] * (mean - exact.mean) / np.sqrt(exact.square)).T)
+    values += list((ratio[:, None] * ((variance + mean**2) / exact.square - 1.0)).T)
+    return values
+
+
+def check_unbiased(method: RaoBlackwellised, model: StateSpaceModel, y: Tensor, exact: Exact, runs: int = 2000) -> None:
+    """E[Z_hat f_hat] = Z f for any number of particles [Del Moral 2004]: no bias to allow for."""
+    for value in ratios(run(method, model, y, runs=runs), exact):
+        error = value.std() / math.sqrt(runs)
+        assert abs(value.mean()) < 4.5 * error + 1e-9, f"{value.mean():.4f} +- {error:.4f}"
+        assert error < 0.2, "too few runs to tell anything"
+
+
+class Correlated(LinearGaussian):
+    """Its measurement noise is correlated, and it does not say that it is linear."""
+
+    linear = False
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return MultivariateNormal(x @ self.h.mT, NOISE.expand(*x.shape[:-1], 2, 2))
+
+
+class Hidden(LinearGaussian):
+    """It keeps to itself that it is linear, and its noise gain too."""
+
+    linear = False
+
+    def noise_gain(self, u: Any) -> None:
+        return None
+
+
+def singular(kind: type[LinearGaussian] = LinearGaussian) -> LinearGaussian:
+    """Three states, one noise, a correlated initial law; the third state is a constant unless noise reaches it."""
+    return kind(
+        [[0.9, 0.5, 0.0], [0.0, 0.8, 0.3], [0.0, 0.0, 1.0]], [[0.0], [0.8], [0.0]],
+        [[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]], [1.0, 2.0],
+        [1.0, 0.0, -1.0], [[1.0, 0.0, 0.0], [0.8, 0.5, 0.0], [0.3, -0.4, 0.7]],
+    )  # fmt: skip
+
+
+SINGULAR_Y = torch.tensor([[2.0, 1.0], [math.nan, -1.0], [0.5, math.nan], [1.5, 1.0]], dtype=torch.float64)
+
+
+def oracle(model: LinearGaussian, y: Tensor) -> oracles.Filtered:
+    f, g, h, r, m0, root = (getattr(model, k).numpy() for k in PARTS)
+    noise = NOISE.numpy() if isinstance(model, Correlated) else np.diag(r**2)
+    return oracles.kalman(f, g @ g.T, h, noise, m0, root @ root.T, y.numpy())
+
+
+def kalman(model: LinearGaussian, y: Tensor) -> Exact:
+    k = oracle(model, y)
+    return Exact(k.mean[-1], np.diagonal(k.covariance[-1]) + k.mean[-1] ** 2, float(k.log_evidence.sum()))
+
+
+# the two pieces of algebra
+
+
+@pytest.mark.parametrize("sampled", [[], [0], [2], [1, 3], [3, 0, 2]], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_sweeping_keeps_the_covariance_and_decides_what_is_sampled(sampled: list[int], dtype: torch.dtype) -> None:
+    a = MonteCarlo(1, torch.arange(6)).normal("a", 4, 7).reshape(2, 3, 4, 7)
+    a[..., 1, :] *= 1e-8  # radians beside metres
+    a[0, 0, 3] = 2.0 * a[0, 0, 0]  # no spread of its own
+    a[1, 1, 0] = 0.0  # a constant
+    a = a.to(dtype)
+    split = Split(sampled, [i for i in range(4) if i not in sampled], False)
+    columns, root = swept(a, split)
+    known = sum((c[..., :, None] * c[..., None, :] for c in columns), torch.zeros(4, 4, dtype=dtype))
+    rest = torch.zeros(2, 3, 4, 4, dtype=dtype)
+    rest[..., torch.tensor(split.linear)[:, None], torch.tensor(split.linear)] = root @ root.mT
+    size = a.norm(dim=-1) + 1e-15
+    scale = size[..., :, None] * size[..., None, :]
+    assert float(((known + rest - a @ a.mT) / scale).abs().max()) < 30 * torch.finfo(dtype).eps
+    for i in sampled:
+        assert float(((known - a @ a.mT) / scale)[..., i, :].abs().max()) < 30 * torch.finfo(dtype).eps
+    if sampled == [0]:  # a constant tells nothing of the others: all of their spread is left
+        assert torch.allclose(root[1, 1] @ root[1, 1].mT, (a @ a.mT)[1, 1, 1:, 1:], rtol=1e-4)
+
+
+@pytest.mark.parametrize("each", [1, 5])
+def test_absorbing_is_kalman_s_update(each: int) -> None:
+    draws = MonteCarlo(1, torch.arange(2))
+    root, h = draws.normal("l", each, 9).reshape(2, each, 3, 3), draws.normal("h", each, 12).reshape(2, each, 4, 3)
+    root[..., 0, :] *= 1e6
+    r = draws.normal("r", 5, 4)
+    mean, after, log_like = absorbed(root, h, r)
+    for run_ in range(2):
+        for i in range(5):
+            j = min(i, each - 1)
+            p = (root @ root.mT)[run_, j].numpy()
+            zero, eye = np.zeros((3, 3)), np.eye(3)
+            k = oracles.kalman(eye, zero, h[run_, j].numpy(), np.eye(4), np.zeros(3), p, r[run_, i].numpy()[None])
+            sd = np.sqrt(np.diag(k.covariance[0]))
+            assert np.allclose(mean[run_, i].numpy() / sd, k.mean[0] / sd, rtol=1e-3, atol=1e-3)  # the oracle cancels 1e12
+            found = (after @ after.mT)[run_, j].numpy()
+            assert np.allclose(found / np.outer(sd, sd), k.covariance[0] / np.outer(sd, sd), atol=1e-3)
+            assert float(log_like[run_, i]) - 2 * math.log(2 * math.pi) == pytest.approx(k.log_evidence[0], rel=1e-4)
+
+
+def test_absorbing_a_prior_of_1e12_is_right_to_many_digits() -> None:
+    """Closed form, one component: where a covariance would cancel, the root does not."""
+    root, h = 1e6 * torch.eye(2, dtype=torch.float64)[None, None], torch.tensor([[[[1e5, 0.0]]]], dtype=torch.float64)
+    mean, after, log_like = absorbed(root, h, torch.full((1, 1, 1), 3.0, dtype=torch.float64))
+    q2 = 1.0 + 1e22
+    assert float(mean[0, 0, 0]) == pytest.approx(3.0 * 1e17 / q2, rel=1e-12)
+    assert (after @ after.mT)[0, 0].diagonal().tolist() == pytest.approx([1e12 / q2, 1e12], rel=1e-4)
+    assert float(log_like) == pytest.approx(-4.5 / q2 - 0.5 * math.log(q2), rel=1e-12)
+
+
+# Kalman
+
+
+@pytest.mark.parametrize("model", [WALK, singular()], ids=["walk", "singular"])
+def test_with_nothing_to_sample_it_is_the_kalman_filter(model: LinearGaussian) -> None:
+    y = WALK_Y if model is WALK else SINGULAR_Y
+    method = RaoBlackwellised(2)
+    assert method.exact
+    estimate = run_filter(
+        method, model, Record(y.expand(3, -1, -1)), MonteCarlo(1, torch.arange(3)),
+        watch=lambda t, info: {"covariance": info.covariance()},
+    )  # fmt: skip
+    truth = oracle(model, y)
+    assert np.allclose(estimate.mean.numpy(), truth.mean, rtol=1e-9, atol=1e-9)
+    assert np.allclose(estimate.trace["covariance"].numpy(), truth.covariance, rtol=1e-9, atol=1e-9)
+    assert np.allclose(estimate.log_evidence.numpy(), truth.log_evidence.sum(), rtol=1e-10)
+
+
+SPLITS = [["x0"], ["x1"], ["x2"], ["x0", "x2"], ["x1", "x2"], ["x2", "x0", "x1"], ["state"]]
+
+
+@pytest.mark.parametrize("sampled", SPLITS, ids="+".join)
+@pytest.mark.parametrize("kind", [LinearGaussian, Correlated, Hidden])
+def test_any_split_of_a_linear_model_is_unbiased(kind: type[LinearGaussian], sampled: list[str]) -> None:
+    """A transition of rank one, a constant among the states, values that are missing, noise that is correlated."""
+    model = singular(kind)
+    check_unbiased(RaoBlackwellised(25, sampled), model, SINGULAR_Y, kalman(model, SINGULAR_Y), runs=1000)
+
+
+def check_scatters_less(ours: list[np.ndarray], theirs: list[np.ndarray]) -> None:
+    """Variances of the evidence, and of mean and evidence together, are smaller by four standard errors."""
+    for part in (slice(0, 1), slice(1, 1 + len(ours) // 2)):
+        squares = [np.square(values[part]).sum(0) for values in (ours, theirs)]
+        (a, ea), (b, eb) = ((q.mean(), q.std() / math.sqrt(len(q))) for q in squares)
+        assert b - a > 4.0 * math.hypot(ea, eb), f"{a:.4f} +- {ea:.4f}, sampling everything {b:.4f} +- {eb:.4f}"
+
+
+@pytest.mark.parametrize("sampled", SPLITS[:5], ids="+".join)
+def test_any_split_scatters_less_than_sampling_everything(sampled: list[str]) -> None:
+    """Rao and Blackwell, for weights that are never resampled; at equal N."""
+    model, runs, never = singular(), 6000, Resample(Systematic(), 0.0)
+    exact = kalman(model, SINGULAR_Y)
+    methods = RaoBlackwellised(25, sampled, never), ParticleFilter(25, never)
+    ours, sir = (ratios(run(m, model, SINGULAR_Y, runs=runs), exact) for m in methods)
+    check_scatters_less(ours, sir)
+
+
+def test_the_covariance_is_one_for_all_where_the_model_is_linear_and_each_its_own_elsewhere() -> None:
+    draws = MonteCarlo(1, torch.arange(2))
+    for model, each in ((singular(), 1), (singular(Hidden), 25)):
+        method = RaoBlackwellised(25, ["x0"])
+        cloud = method.init(model, 2, draws)
+        assert cloud.memory["root"].shape == (2, each, 2, 2)
+        for t in range(3):
+            cloud, _ = method.step(model, cloud, Record(SINGULAR_Y[t].expand(2, -1)), draws.at(t + 1))
+            assert cloud.memory["root"].shape == (2, each, 2, 2)
+
+
+def test_shared_and_separate_covariances_are_the_same_filter() -> None:
+    one, two = (run(RaoBlackwellised(25, ["x1"]), singular(kind), SINGULAR_Y, runs=4) for kind in (LinearGaussian, Hidden))
+    # a root is of any sign, and so is what comes of z: only a model without a gain may differ in it, and here does not
+    assert torch.allclose(one.mean, two.mean, rtol=1e-9, atol=1e-9)
+    assert torch.allclose(one.variance, two.variance, rtol=1e-9, atol=1e-9)
+    assert torch.allclose(one.log_evidence, two.log_evidence, rtol=1e-9)
+
+
+def test_derivatives_may_be_taken_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = run(RaoBlackwellised(25, ["x1"]), singular(Hidden), SINGULAR_Y, runs=4)
+    monkeypatch.setattr(marginalised, "_POINTS", 1)
+    assert torch.allclose(run(RaoBlackwellised(25, ["x1"]), singular(Hidden), SINGULAR_Y, runs=4).mean, whole.mean)
+
+
+def test_a_model_that_observes_its_initial_state() -> None:
+    model = LinearGaussian(*(getattr(singular(), k) for k in PARTS), observes_initial=True)
+    f, g, h, r, m0, root = (getattr(model, k).numpy() for k in PARTS)
+    k = oracles.kalman(f, g @ g.T, h, np.diag(r**2), m0, root @ root.T, SINGULAR_Y.numpy(), True)
+    exact = Exact(k.mean[-1], np.diagonal(k.covariance[-1]) + k.mean[-1] ** 2, float(k.log_evidence.sum()))
+    check_unbiased(RaoBlackwellised(25, ["x1"]), model, SINGULAR_Y, exact, runs=1000)
+
+
+# a model that is linear only given a part of it
+
+
+class Mixed(StateSpaceModel):
+    """s' = 0.6 s + sin s + 0.4 (1 + s^2/4)^-1 l + noise, l' = cos(s) l / 2 + 0.3 s + noise correlated with that of s;
+    y = (s^2/4, (1 + s/2) l + s) + noise whose size depends on s. State (l, s), so that the order of parts is not theirs."""
+
+    gain: Tensor
+    linear_given = (0,)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("gain", torch.tensor([[0.6, 0.0], [0.35, 0.5]], dtype=torch.float64))
+        self.names, self.units, self.groups, self.noise_dim = ("l", "s"), ("", ""), {"part": (0,), "rest": (1,)}, 2
+
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, self.gain.new_tensor([0.8, 0.7]), self.gain.new_tensor([0.5, -0.2]))
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        l, s = x.unbind(-1)
+        moved = torch.stack([0.5 * torch.cos(s) * l + 0.3 * s, 0.6 * s + torch.sin(s) + 0.4 * l / (1 + s * s / 4)], -1)
+        return moved + w @ self.gain.mT
+
+    def noise_gain(self, u: Any) -> Tensor | None:
+        return self.gain.unsqueeze(0)
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        l, s = x.unbind(-1)
+        sd = torch.stack([0.7 + 0 * s, 0.5 + 0.3 * torch.sigmoid(s)], -1)
+        return independent_normal(torch.stack([s * s / 4, (1 + s / 2) * l + s], -1), sd)
+
+
+class MixedTurned(Mixed):
+    """The same law, its noise turned by an angle that depends on s, and so not of one gain."""
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        c, n = torch.cos(x[..., 1]), torch.sin(x[..., 1])
+        a, b = w.unbind(-1)
+        return super().propagate(x, u, torch.stack([c * a - n * b, n * a + c * b], -1))
+
+    def noise_gain(self, u: Any) -> None:
+        return None
+
+
+MIXED_Y = torch.tensor([[0.9, -1.0], [0.2, math.nan], [1.5, 2.0], [math.nan, 1.2]], dtype=torch.float64)
+
+
+def mixed_by_grid(points: int = 45) -> Exact:
+    """Prediction and update on a grid of both states; sums over a smooth density converge faster than any power."""
+    ls, ss = np.linspace(-4.2, 5.4, points), np.linspace(-5.6, 5.6, points)
+    l, s = (a.ravel() for a in np.meshgrid(ls, ss, indexing="ij"))
+    cell = (ls[1] - ls[0]) * (ss[1] - ss[0])
+    mean_l = 0.5 * np.cos(s) * l + 0.3 * s
+    mean_s = 0.6 * s + np.sin(s) + 0.4 * l / (1 + s**2 / 4)
+    g = np.array([[0.6, 0.0], [0.35, 0.5]])
+    first = (l[:, None] - mean_l[None]) / g[0, 0]
+    transition = np.exp(-0.5 * first**2) / (np.sqrt(2 * np.pi) * g[0, 0])
+    transition *= oracles.normal_density(s[:, None], mean_s[None] + g[1, 0] * first, g[1, 1])
+    p = oracles.normal_density(l, 0.5, 0.8) * oracles.normal_density(s, -0.2, 0.7)
+    log_z = 0.0
+    for y in MIXED_Y.numpy():
+        p = transition @ p * cell
+        if not np.isnan(y[0]):
+            p = p * oracles.normal_density(y[0], s**2 / 4, 0.7)
+        if not np.isnan(y[1]):
+            p = p * oracles.normal_density(y[1], (1 + s / 2) * l + s, 0.5 + 0.3 / (1 + np.exp(-s)))
+        total = p.sum() * cell
+        p, log_z = p / total, log_z + math.log(total)
+    x = np.stack([l, s])
+    return Exact((x * p).sum(1) * cell, (x**2 * p).sum(1) * cell, log_z)
+
+
+@pytest.fixture(scope="module")
+def mixed() -> Exact:
+    return mixed_by_grid()
+
+
+def test_the_grid_has_converged_and_agrees_with_sampling_everything(mixed: Exact) -> None:
+    coarse = mixed_by_grid(39)
+    assert coarse.log_z == pytest.approx(mixed.log_z, abs=2e-4)
+    assert np.allclose(coarse.mean, mixed.mean, atol=2e-4)
+    estimate = run(ParticleFilter(20_000), Mixed(), MIXED_Y, runs=10)
+    for value in ratios(estimate, mixed):
+        assert abs(value.mean()) < 4.5 * value.std() / math.sqrt(10) + 1e-3
+
+
+@pytest.mark.parametrize("model", [Mixed(), MixedTurned()], ids=["one gain", "turned"])
+def test_unbiased_where_the_model_is_linear_only_given_a_part(model: StateSpaceModel, mixed: Exact) -> None:
+    method = RaoBlackwellised(25)
+    assert method.exact
+    check_unbiased(method, model, MIXED_Y, mixed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threshold", [0.0, 1.0])
+def test_unbiased_with_narrow_error_bars(threshold: float, mixed: Exact) -> None:
+    check_unbiased(RaoBlackwellised(100, None, Resample(Systematic(), threshold)), Mixed(), MIXED_Y, mixed, runs=6000)
+
+
+def test_the_wrong_part_cannot_be_left_to_a_kalman_filter(mixed: Exact) -> None:
+    """Linearised in s the filter does not claim to be exact, and is not."""
+    method = RaoBlackwellised(25, ["part"])
+    assert not method.exact
+    with pytest.raises(AssertionError, match=r"\+-"):
+        check_unbiased(method, Mixed(), MIXED_Y, mixed)
+
+
+def test_it_scatters_less_than_sampling_everything(mixed: Exact) -> None:
+    ours, sir = (ratios(run(m, Mixed(), MIXED_Y, runs=4000), mixed) for m in (RaoBlackwellised(25), ParticleFilter(25)))
+    check_scatters_less(ours, sir)
+
+
+def test_what_is_told_is_of_the_whole_mixture() -> None:
+    """Against draws of it: a particle by its weight, then l of its conditional law."""
+    draws, model, n = MonteCarlo(1, torch.arange(2)), Mixed(), 30
+    method = RaoBlackwellised(n)
+    cloud = method.init(model, 2, draws)
+    for t in range(2):
+        cloud, info = method.step(model, cloud, Record(MIXED_Y[t].expand(2, -1)), draws.at(t + 1))
+    rng, m = np.random.default_rng(1), 400_000
+    for r in range(2):
+        i = rng.choice(n, m, p=weights(cloud.log_w)[r].numpy())
+        x = cloud.x[r].numpy()[i]
+        x[:, 0] += cloud.memory["root"][r, :, 0, 0].numpy()[i] * rng.normal(size=m)
+        covariance = np.cov(x.T)
+        sd = np.sqrt(np.diag(covariance))
+        assert np.all(np.abs(info.mean[r].numpy() - x.mean(0)) < 5 * sd / math.sqrt(m))
+        assert np.all(np.abs(info.covariance()[r].numpy() - covariance) < 5 * np.outer(sd, sd) * math.sqrt(3.0 / m))
+        assert np.allclose(info.variance[r], info.covariance()[r].diagonal())
+
+
+# what models declare
+
+IMU = ImuErrors(0.05, 0.05, 3600.0, 0.01, 100.0, 50.0, 1800.0, 5.0)
+RECEIVER = Receiver((6.87, 7.20, 4.83), (0.21, 0.20, 0.14))
+INITIAL = Alignment((60.0, 60.0, 1200.0), (0.2, 0.2, 0.2), (10.0, 10.0, 10.0))
+SMALL = Alignment((1.0, 1.0, 5.0), (0.2, 0.2, 0.2), (10.0, 10.0, 10.0))
+
+
+@pytest.fixture(scope="module")
+def flight() -> Episode:
+    start = Start(lat_deg=32.0, lon_deg=118.0, height=200.0, speed=50.0, heading_deg=45.0)
+    path = Manoeuvres((accelerate(2.0, 8.0), turn(60.0, 10.0), accelerate(-2.0, 8.0)), start)
+    return SimulatedFlight(path, IMU, RECEIVER, SMALL, imu_rate=20.0).draw(Nominal(), torch.arange(3), 5)
+
+
+def azimuth(form: Form, biases: bool) -> SinsGpsAzimuth:
+    return SinsGpsAzimuth(IMU, RECEIVER, INITIAL, form, Trapezoid(), biases=biases)
+
+
+DECLARED: dict[str, StateSpaceModel] = {
+    "pendulum": Pendulum(),
+    "mixed": Mixed(),
+    "paper": azimuth(Paper(), False),
+    "paper, biases": azimuth(Paper(), True),
+    "full": azimuth(Full(), False),
+    "full, biases": azimuth(Full(), True),
+}
+
+
+def curvature(model: StateSpaceModel, u: Any, linear: tuple[int, ...]) -> tuple[float, float]:
+    """How far map and measurement are from f(x + a) + f(x + b) = f(x) + f(x + a + b), a and b in l and the noise, beside
+    f(x + a) - f(x); and how far the measurement's deviations move with l."""
+    draws, d = MonteCarlo(2, torch.arange(3)), len(model.names)
+    size: Tensor = model.initial(1).stddev[0]
+    mask = torch.zeros(d, dtype=torch.float64).index_fill(0, torch.tensor(linear), 1.0)
+    x = model.chart.add(model.origin, draws.normal("x", 40, d) * size)
+    steps = [(draws.normal(f"{p}x", 40, d) * size * mask, draws.normal(f"{p}w", 40, model.noise_dim)) for p in "ab"]
+    (a, wa), (b, wb) = steps
+
+    def both(shift: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        moved = model.propagate(model.chart.add(x, shift), u, w)
+        law: Any = model.observation(model.chart.add(x, shift), u)
+        return moved, law.mean, law.stddev
+
+    zero, none = torch.zeros_like(a), torch.zeros_like(wa)
+    f, fa, fb, fab = both(zero, none), both(a, wa), both(b, wb), both(a + b, wa + wb)
+    worst = 0.0
+    for j, subtract in ((0, model.chart.subtract), (1, model.residual)):
+        bent = subtract(fab[j], fa[j]) - subtract(fb[j], f[j])
+        whole = subtract(fa[j], f[j]).abs().amax((0, 1)) + size.min() * 1e-9
+        worst = max(worst, float((bent.abs().amax((0, 1)) / whole).max()))
+    return worst, float((fa[2] - f[2]).abs().max())
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_what_a_model_declares_linear_is(name: str, flight: Episode) -> None:
+    model = DECLARED[name]
+    u = model.prepare(flight.record).at(4).u if isinstance(model, SinsGpsAzimuth) else ()
+    assert model.linear_given
+    bent, noisy = curvature(model, u, model.linear_given)
+    assert bent < 1e-7
+    assert noisy == 0.0
+    for other in set(range(len(model.names))) - set(model.linear_given):  # and nothing could be added to it
+        assert max(curvature(model, u, (*model.linear_given, other))) > 1e-4
+
+
+def test_the_split_is_what_is_named_or_declared() -> None:
+    ins = InsGnss(IMU, RECEIVER, SMALL)
+    assert split_of(ins, ["attitude"]) == Split([0, 1, 2], list(range(3, 15)), True)
+    assert split_of(ins, ["attitude_U", "position"]) == Split([2, 6, 7, 8], [0, 1, 3, 4, 5, *range(9, 15)], True)
+    assert split_of(ins, None) == Split([], list(range(15)), True)
+    assert split_of(azimuth(Paper(), True), None) == Split([2], [0, 1, *range(3, 15)], False)
+    assert split_of(azimuth(Full(), True), None) == Split([0, 1, 2], list(range(3, 15)), False)
+
+
+# navigation
+
+
+def deviations(estimate: Estimate, kf: Estimate, chart: Chart) -> Tensor:
+    """Distance of means to the Kalman filter's, in its standard deviations [R, T, d]."""
+    return chart.subtract(estimate.mean, kf.mean) / kf.variance.sqrt()
+
+
+def test_thirty_particles_of_an_ins_are_close_to_its_kalman_filter(flight: Episode) -> None:
+    """Attitude sampled: the mean of 30 draws is off by 1/sqrt 30 = 0.18 spreads at best, a few times more after resampling."""
+    model, runs = InsGnss(IMU, RECEIVER, SMALL), torch.arange(3)
+    kf, ours, sir = (
+        run_filter(m, model, flight.record, MonteCarlo(1, runs))
+        for m in (GaussianFilter(Jacobian()), RaoBlackwellised(30, ["attitude"]), ParticleFilter(30))
+    )
+    assert not bool(ours.lost.any())
+    off, theirs = (deviations(e, kf, model.chart).square().mean().sqrt() for e in (ours, sir))
+    assert off < 0.7
+    assert off < 0.4 * theirs
+    spread = (ours.variance / kf.variance)[:, :, 3:].mean()  # what is not sampled keeps its spread
+    assert 0.7 < spread < 1.2
+    assert (ours.log_evidence - kf.log_evidence).abs().max() < 0.2 * (sir.log_evidence - kf.log_evidence).abs().min()
+
+
+@pytest.mark.parametrize("form", [Paper(), Full(), ExactForm()], ids=lambda f: type(f).__name__)
+def test_a_large_azimuth_error(form: Form, flight: Episode) -> None:
+    """Near the truth all forms are next to linear, and an extended Kalman filter is the answer."""
+    model = SinsGpsAzimuth(IMU, RECEIVER, SMALL, form, Trapezoid())
+    sampled = ["attitude_U"] if isinstance(form, ExactForm) else None
+    record = model.prepare(flight.record)
+    record = record._replace(y=record.y[:, :10], u=map_inputs(lambda a: a[:, :10], record.u))
+    kf, ours = (
+        run_filter(m, model, record, MonteCarlo(1, torch.arange(3)))
+        for m in (GaussianFilter(Jacobian()), RaoBlackwellised(40, sampled))
+    )
+    assert deviations(ours, kf, model.chart).square().mean().sqrt() < 0.4
+    assert (ours.log_evidence - kf.log_evidence).abs().max() < 2.0
+
+
+def test_a_quaternion_may_be_sampled_and_so_may_all_but_it() -> None:
+    """The chart's differences are sampled, three of them; close to the extended Kalman filter where errors are minutes of arc."""
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        cfg = compose("config", ["scenario=sar_flight", "worlds=null"])
+    cfg.scenario.imu_rate = 20.0
+    cfg.scenario.path.duration = 5.0
+    model, episode = job.build(cfg.model), job.build(cfg.scenario).draw(Nominal(), torch.arange(2), 3)
+    kf = run_filter(GaussianFilter(Jacobian()), model, episode.record, MonteCarlo(1, torch.arange(2)))
+    for sampled in (["attitude"], ["velocity"]):
+        ours = run_filter(RaoBlackwellised(40, sampled), model, episode.record, MonteCarlo(1, torch.arange(2)))
+        assert deviations(ours, kf, model.chart).square().mean().sqrt() < 0.5
+        assert torch.allclose(ours.mean[..., :4].norm(dim=-1), torch.ones(1, dtype=torch.float64))
+
+
+class Unrolled(Pendulum):
+    """The pendulum on the real line."""
+
+    @property
+    def chart(self) -> Chart:
+        return Chart((Euclidean(2),))
+
+
+@pytest.mark.parametrize("sampled", [None, ["rate"]], ids=str)
+def test_angles_that_cross_the_cut_change_nothing(sampled: list[str] | None) -> None:
+    y = torch.sin(torch.linspace(3.0, 12.0, 25, dtype=torch.float64)).reshape(1, 25, 1).expand(2, -1, -1)
+    start = torch.tensor([[3.0, 8.0], [-3.1, -9.0]], dtype=torch.float64)
+    circle, line = (run(RaoBlackwellised(40, sampled), m, y, start=start) for m in (Pendulum(), Unrolled()))
+    assert float(line.mean[..., 0].abs().max()) > 4.0
+    assert torch.allclose(wrap(circle.mean[..., 0] - line.mean[..., 0]), torch.zeros(2, 25, dtype=torch.float64), atol=1e-7)
+    assert torch.allclose(circle.variance, line.variance, rtol=1e-6)
+
+
+# one run, its neighbours, its past and its future
+
+CASES: dict[str, tuple[StateSpaceModel, list[str] | None]] = {
+    "walk": (WALK, ["position"]),
+    "walk, all Kalman": (WALK, None),
+    "pendulum": (Pendulum(), None),
+    "mixed": (Mixed(), None),
+    "lorenz": (Lorenz63(), ["x"]),
+    "growth, all sampled": (Growth(), ["state"]),
+}
+
+
+def measurements(model: StateSpaceModel, runs: int = 4, steps: int = 8) -> Tensor:
+    dy = model.observation(torch.ones(1, 1, model.chart.size, dtype=torch.float64), ()).event_shape[0]
+    mean = model.initial(1).mean[0, :dy] if dy == 3 else 0.0
+    return mean + MonteCarlo(8, torch.arange(runs)).normal("y", steps, dy)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_neither_future_nor_neighbours_are_felt(case: str) -> None:
+    model, sampled = CASES[case]
+    method, y = RaoBlackwellised(30, sampled), measurements(model)
+    other = y.clone()
+    other[:, 5:] = other[:, 5:] + 0.7
+    other[:, 6] = torch.nan
+    one, two = run(method, model, y), run(method, model, other)
+    assert torch.equal(one.mean[:, :5], two.mean[:, :5])
+    assert bool(torch.isfinite(two.mean).all())
+    alone = run_filter(method, model, Record(y[2:3]), MonteCarlo(1, torch.tensor([2])))
+    assert torch.allclose(alone.mean[0], one.mean[2], rtol=1e-9, atol=1e-9)
+    assert torch.allclose(alone.log_evidence[0], one.log_evidence[2], rtol=1e-9)
+    single = run(method, model.float(), y)
+    model.double()
+    assert single.mean.dtype == torch.float32
+    assert not bool(single.lost.any())
+
+
+@pytest.mark.parametrize("case", ["walk", "walk, all Kalman", "mixed"])
+def test_an_impossible_measurement_loses_its_run_alone(case: str) -> None:
+    model, sampled = CASES[case]
+    y, method = measurements(model), RaoBlackwellised(30, sampled)
+    healthy = run(method, model, y)
+    y[1, 3] = 1e200
+    estimate = run(method, model, y)
+    assert estimate.lost.tolist() == [False, True, False, False]
+    for r in (0, 2, 3):
+        assert torch.allclose(estimate.mean[r], healthy.mean[r], rtol=1e-12, atol=1e-14)
+
+
+class Fragile(Hidden):
+    """A walk whose mechanisation fails far out: some particles become NaN, others infinite."""
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        moved = super().propagate(x, u, w)
+        moved = torch.where(x[..., :1] > 2.5, torch.nan * moved, moved)
+        return torch.where(x[..., :1] < -2.5, torch.inf * moved, moved)
+
+
+def test_particles_that_are_not_finite_weigh_nothing() -> None:
+    model = Fragile(*(getattr(WALK, k) for k in PARTS))
+    for y in (torch.zeros(40, 6, 1, dtype=torch.float64), torch.full((40, 6, 1), torch.nan, dtype=torch.float64)):
+        estimate = run(RaoBlackwellised(30, ["x0"]), model, y)
+        healthy = ~estimate.lost
+        assert int(healthy.sum()) > 30
+        assert bool(torch.isfinite(estimate.mean[healthy]).all())
+        assert bool(torch.isfinite(estimate.variance[healthy]).all())
+
+
+# what is refused
+
+
+class Boxed(Mixed):
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return Independent(Laplace(x, torch.ones_like(x)), 1)
+
+
+class Spiky(LinearGaussian):
+    @property
+    def noise(self) -> Distribution:
+        return Independent(Laplace(torch.zeros_like(self.r), torch.ones_like(self.r)), 1)
+
+
+@dataclass(frozen=True)
+class Refused:
+    model: StateSpaceModel
+    sampled: list[str] | None
+    message: str
+
+
+REFUSED = [
+    Refused(WALK, ["attitude"], r"filter.sampled=\['attitude'\]: LinearGaussian has no \['attitude'\]; give groups of"),
+    Refused(Growth(), None, "Growth declares no component that is linear given the rest; name what to sample"),
+    Refused(Boxed(), None, "the measurement's noise of Boxed is Laplace"),
+    Refused(Spiky([[1.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0]), None, "the driving noise of Spiky is Laplace"),
+]
+
+
+@pytest.mark.parametrize("case", REFUSED, ids=lambda c: c.message[:30])
+def test_models_that_cannot_are_told_why(case: Refused) -> None:
+    with pytest.raises(ValueError, match=case.message):
+        run(RaoBlackwellised(10, case.sampled), case.model, measurements(case.model))
+
+
+def test_all_sampled_is_the_plain_filter_for_any_law() -> None:
+    model = Spiky([[1.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0])
+    ours, sir = (run(m, model, measurements(model)) for m in (RaoBlackwellised(30, ["state"]), ParticleFilter(30)))
+    assert torch.allclose(ours.mean, sir.mean)
+    assert torch.allclose(ours.log_evidence, sir.log_evidence)
+
+
+def test_it_says_when_it_is_exact() -> None:
+    assert RaoBlackwellised(10).exact
+    assert not RaoBlackwellised(10, ["attitude"]).exact
+    assert not RaoBlackwellised(10, None, Regularise(Resample(Systematic()))).exact  # type: ignore[arg-type]
+    assert Marginalised(Split([0], [1], False)).exact
+    with pytest.raises(ValueError, match=r"filter\.particles=1"):
+        RaoBlackwellised(1)
