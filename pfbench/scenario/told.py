@@ -100,6 +100,7 @@ class Told(StateSpaceModel):
         process = step_process(regime, time)
         self.swollen, self.moved = bool((process != 1.0).any()), bool((shift != 0.0).any() or (scale != 1.0).any())
         self.linear = model.linear and self.family is laws.normal
+        self.linear_given = model.linear_given if self.family is laws.normal else ()
         told = "the filter's model is told the noise regime: at each step the factor on Q and the law of the errors"
         self.choices = (*model.choices, told)
         for name, value in (("root", process.sqrt()), ("shift", shift), ("scale", scale)):
