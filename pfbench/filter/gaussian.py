@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -21,24 +21,84 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 
 class Innovation(NamedTuple):
-    """r [R, k] = y - y_hat, 0 where unseen; seen [R, k]; M [R, k, d]; Omega [R, k, k] without the state's own spread."""
+    """What is seen, against what was expected of it, for an unknown xi ~ N(0, I): r = M xi + e, Cov e = Omega.
+
+    Attributes:
+        r: y - y_hat, 0 where unseen [R, k].
+        seen: [R, k].
+        m: [R, k, d].
+        omega: without the state's own spread [R, k, k]: the measurement noise in use, and what M leaves of a curved map.
+        noise: the measurement noise in use; the model's until an adaptation changes it [R, k, k], 1 where unseen.
+        nominal: the model's, also of what is unseen [R, k, k].
+        root: of the predicted covariance, which xi is whitened by [R, d, d].
+    """
 
     r: Tensor
     seen: Tensor
     m: Tensor
     omega: Tensor
+    noise: Tensor = torch.zeros(())
+    nominal: Tensor = torch.zeros(())
+    root: Tensor = torch.zeros(())
+
+    @property
+    def spread(self) -> Tensor:
+        """Covariance of what is expected, for the state's spread alone [R, k, k]."""
+        return self.m @ self.m.mT + (self.omega - self.noise)
+
+    def with_noise(self, noise: Tensor) -> Innovation:
+        """The same with another measurement noise [R, k, k]; what is unseen keeps its 1."""
+        noise = torch.where(self.seen.unsqueeze(-1) & self.seen.unsqueeze(-2), noise, self.noise)
+        return self._replace(omega=self.omega + (noise - self.noise), noise=noise)
+
+    def widened(self, factor: Tensor) -> Innovation:
+        """The same with the predicted covariance `factor` [R] times as large."""
+        f = factor[:, None, None]
+        omega = self.omega + (f - 1.0) * (self.omega - self.noise)
+        return self._replace(m=self.m * f.sqrt(), omega=omega, root=self.root * f.sqrt())
 
 
 class Adaptation(Protocol):
-    """A change of the filter's noise or gain, in the order in which a filter lists them. All hooks may be the identity.
+    """A change of the filter's noise, in the order in which a filter lists them. Both hooks may be the identity.
 
-    predict_scale: the predicted state's linearisation, before its noise is added -> the same, scaled.
-    noise_adapt: the innovation -> the same with another noise covariance.
+    predict_scale: the predicted state's linearisation; its Omega holds the model's own noise `noise`, and so does M in the
+        columns beyond the state's where the noise went through the rule -> the same, scaled.
+    noise_adapt: the innovation -> the same with another noise covariance, and what the next step must know {name: [R, ...]}.
     """
 
     def predict_scale(self, predicted: Linearised, belief: Gaussian) -> Linearised: ...
 
     def noise_adapt(self, innovation: Innovation, belief: Gaussian) -> tuple[Innovation, dict[str, Tensor]]: ...
+
+
+class Gain(Protocol):
+    """A change of the gain alone: the factor [R] so far on the predicted covariance -> the factor, once all noise is known."""
+
+    def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor: ...
+
+
+class Advance(NamedTuple):
+    """One step in full, for what builds on a Gaussian filter.
+
+    Attributes:
+        prior: predicted mean [R, D].
+        prior_root: square root of the predicted covariance, as adapted [R, d, d].
+        mean: updated mean [R, D].
+        root: square root of the updated covariance [R, d, d], not triangular.
+        innovation: as adapted; its `noise` is the measurement noise in use.
+        log_like: log evidence of the step [R]; -inf where a covariance has no root.
+        memory: what adaptations carry to the next step.
+        trace: what the report may want {name: [R]}.
+    """
+
+    prior: Tensor
+    prior_root: Tensor
+    mean: Tensor
+    root: Tensor
+    innovation: Innovation
+    log_like: Tensor
+    memory: dict[str, Tensor]
+    trace: dict[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -49,13 +109,31 @@ class GaussianFilter:
     prior, however ill-conditioned. A covariance with no square root marks the run `lost`; nothing is repaired in silence.
 
     Args:
-        rule: Jacobian (EKF), Points(Unscented) or Points(Cubature).
+        rule: Jacobian (EKF), or Points (unscented and cubature filters).
         adaptations: fading, constrained noise; none by default.
+        gains: adaptive factor, ratio bound; none by default. They come last, in this order.
+        iterations: of the update. The measurement is linearised again about the updated law: with the Jacobian this is the
+            iterated EKF, Gauss-Newton [Bell and Cathey 1993], with points iterated posterior linearisation [Garcia-Fernandez
+            et al. 2015]. Their number is fixed, so that runs do not wait for each other [ours].
+        repair: a rule of negative weights may leave a covariance that is not one. Then what the rule found of a map's
+            curvature loses its negative eigenvalues [ours], and the trace counts such `repairs`; else the run is lost.
+
+    Raises:
+        ValueError: no iterations, or several with adaptations or gains, which judge a filter by its first innovation.
     """
 
     rule: Rule
-    adaptations: tuple[Adaptation, ...] = ()
+    adaptations: Sequence[Adaptation] = ()
+    gains: Sequence[Gain] = ()
+    iterations: int = 1
+    repair: bool = False
     exact = False  # on nonlinear or non-Gaussian models; on linear-Gaussian ones it is the Kalman filter
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"filter.iterations={self.iterations}: give 1 (no iteration) or more")
+        if self.iterations > 1 and (self.adaptations or self.gains):
+            raise ValueError(f"filter.iterations={self.iterations}: with adaptations or gains give 1")
 
     def init(
         self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None, spread: Tensor | None = None
@@ -70,22 +148,37 @@ class GaussianFilter:
 
     def step(self, model: StateSpaceModel, belief: Gaussian, seen: Record, draws: Draws) -> tuple[Gaussian, Info]:
         """The belief at t-1 and what is seen at t -> the belief at t."""
+        new = self.advance(model, belief, seen)
+        covariance = new.root @ new.root.mT
+        info = Info(new.mean, covariance.diagonal(dim1=-2, dim2=-1), lambda: covariance, new.trace)
+        return Gaussian(new.mean, covariance, belief.log_z + new.log_like, new.memory), info
+
+    def advance(self, model: StateSpaceModel, belief: Gaussian, seen: Record) -> Advance:
+        """The same, with all that it took."""
         memory: dict[str, Tensor] = {}
         predicted, rooted = self._predict(model, belief, seen.u)
         for adaptation in self.adaptations:
             predicted = adaptation.predict_scale(predicted, belief)
-        root, positive = factor(predicted.m @ predicted.m.mT + predicted.omega)
-        innovation = self._look(model, predicted.y, root, seen)
+        covariance = predicted.m @ predicted.m.mT
+        omega, mended = self._mended(predicted.omega, predicted.noise, covariance)
+        root, positive = factor(covariance + omega)
+        innovation = self._look(model, lambda xi: model.chart.add(predicted.y.unsqueeze(1), xi @ root.mT), predicted.y, seen)
+        innovation = innovation._replace(root=root)
         for adaptation in self.adaptations:
             innovation, carried = adaptation.noise_adapt(innovation, belief)
             memory |= carried
-        shift, updated, log_like = update(innovation)
-        spread = root @ updated
-        covariance = spread @ spread.mT
-        mean = model.chart.add(predicted.y, (root @ shift.unsqueeze(-1)).squeeze(-1))
-        log_z = belief.log_z + torch.where(rooted & positive & torch.isfinite(log_like), log_like, -torch.inf)
-        info = Info(mean, covariance.diagonal(dim1=-2, dim2=-1), lambda: covariance, {})
-        return Gaussian(mean, covariance, log_z, memory), info
+        trace = {name: value if value.dim() == 1 else value.amax(1) for name, value in memory.items() if value.dim() <= 2}
+        if self.gains:
+            widening = torch.ones_like(belief.mean[:, 0])
+            for gain in self.gains:
+                widening = gain(innovation, widening)
+            innovation, trace["widening"] = innovation.widened(widening), widening
+        shift, updated, log_like, mended_too, innovation = self._update(model, predicted.y, innovation, seen)
+        if self.repair:
+            trace["repairs"] = mended.to(root) + mended_too.to(root)
+        mean = model.chart.add(predicted.y, (innovation.root @ shift.unsqueeze(-1)).squeeze(-1))
+        log_like = torch.where(rooted & positive & torch.isfinite(log_like), log_like, -torch.inf)
+        return Advance(predicted.y, innovation.root, mean, innovation.root @ updated, innovation, log_like, memory, trace)
 
     def _predict(self, model: StateSpaceModel, belief: Gaussian, u: Any) -> tuple[Linearised, Tensor]:
         chart, d = model.chart, model.chart.dimension
@@ -104,24 +197,72 @@ class GaussianFilter:
 
         return self.rule(through, belief.mean, d + inner, Space(chart.subtract, chart.mean)), ok
 
-    def _look(self, model: StateSpaceModel, mean: Tensor, root: Tensor, seen: Record) -> Innovation:
+    def _look(self, model: StateSpaceModel, place: Callable[[Tensor], Tensor], like: Tensor, seen: Record) -> Innovation:
+        """The innovation for states place(xi), xi [R, P, d]."""
+
         def through(xi: Tensor) -> tuple[Tensor, Tensor]:
-            law: Any = model.observation(model.chart.add(mean.unsqueeze(1), xi @ root.mT), seen.u)
+            law: Any = model.observation(place(xi), seen.u)
             dense = isinstance(law, torch.distributions.MultivariateNormal)
             return law.mean, law.covariance_matrix if dense else torch.diag_embed(law.variance)
 
         space = Space(model.residual, around_first(model.residual))
-        y_hat, m, omega = self.rule(through, mean, root.shape[-1], space)
+        y_hat, m, omega, noise = self.rule(through, like, model.chart.dimension, space)
         there = ~torch.isnan(seen.y)
         r = torch.where(there, model.residual(seen.y, y_hat), 0.0)
         both = there.unsqueeze(-1) & there.unsqueeze(-2)
         eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
-        return Innovation(r, there, torch.where(there.unsqueeze(-1), m, 0.0), torch.where(both, omega, eye))
+        m, omega, used = torch.where(there.unsqueeze(-1), m, 0.0), torch.where(both, omega, eye), torch.where(both, noise, eye)
+        return Innovation(r, there, m, omega, used, noise)
+
+    def _update(
+        self, model: StateSpaceModel, mean: Tensor, innovation: Innovation, seen: Record
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Innovation]:
+        """As `update`, then which runs were mended [R], and the innovation used last."""
+        innovation, mended = self._positive(innovation)
+        shift, updated, log_like = update(innovation)
+        for _ in range(self.iterations - 1):
+            innovation, also = self._positive(self._look_again(model, mean, innovation.root, shift, updated, seen))
+            shift, updated, log_like = update(innovation)
+            mended = mended | also
+        return shift, updated, log_like, mended, innovation
+
+    def _look_again(
+        self, model: StateSpaceModel, mean: Tensor, root: Tensor, shift: Tensor, updated: Tensor, seen: Record
+    ) -> Innovation:
+        """The innovation linearised about the updated law N(shift, updated updated') of xi, in the same coordinates."""
+
+        def place(xi: Tensor) -> Tensor:
+            return model.chart.add(mean.unsqueeze(1), (shift.unsqueeze(1) + xi @ updated.mT) @ root.mT)
+
+        again = self._look(model, place, mean, seen)
+        m = torch.linalg.solve_triangular(updated, again.m, upper=True, left=False)
+        return again._replace(m=m, r=again.r + (m @ shift.unsqueeze(-1)).squeeze(-1), root=root)
+
+    def _positive(self, innovation: Innovation) -> tuple[Innovation, Tensor]:
+        m = innovation.m
+        # what M sees needs no root, but with it goes the whole law of state and measurement: Omega alone must be positive
+        omega, mended = self._mended(innovation.omega, innovation.noise, torch.zeros_like(m @ m.mT))
+        return innovation._replace(omega=omega), mended
+
+    def _mended(self, omega: Tensor, noise: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+        """Omega such that Omega + rest has a square root, and which runs it had to be changed in [R]."""
+        if not self.repair:
+            return omega, omega.new_zeros(len(omega), dtype=torch.bool)
+        bad = ~factor(rest + omega)[1]
+        if not bad.is_cuda and not bool(bad.any()):  # looking costs next to nothing on the CPU
+            return omega, bad
+        size = torch.sqrt((omega.diagonal(dim1=-2, dim2=-1).abs() + rest.diagonal(dim1=-2, dim2=-1)).clamp(min=1e-300))
+        scale = size.unsqueeze(-1) * size.unsqueeze(-2)
+        left = (omega - noise) / scale
+        whole = torch.isfinite(left).all(-1).all(-1)[:, None, None]  # eigh raises for all runs where one has no numbers
+        values, vectors = torch.linalg.eigh(torch.where(whole, left, 0.0))
+        left = (vectors * values.clamp(min=0.0).unsqueeze(-2)) @ vectors.mT
+        return torch.where(bad[:, None, None] & whole, noise + left * scale, omega), bad
 
 
 def update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
     """Whitened posterior: mean [R, d], square root [R, d, d] and log evidence of the step [R] (NaN where there is no root)."""
-    r, seen, m, omega = innovation
+    r, seen, m, omega, *_ = innovation
     root, ok = factor(omega)
     white = torch.linalg.solve_triangular(root, torch.cat([m, r.unsqueeze(-1)], -1), upper=False)  # Omega^-1/2 [M r]
     d = m.shape[-1]

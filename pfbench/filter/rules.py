@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple, Protocol, TypeAlias
 
 import torch
@@ -28,11 +29,12 @@ class Space(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """y [R, k]; M [R, k, d] in whitened coordinates; Omega [R, k, k]: what M leaves, plus the law's own covariance."""
+    """y [R, k]; M [R, k, d] in whitened coordinates; Omega [R, k, k]: what M leaves, plus the law's own covariance `noise`."""
 
     y: Tensor
     m: Tensor
     omega: Tensor
+    noise: Tensor
 
 
 class Rule(Protocol):
@@ -54,7 +56,8 @@ class Jacobian:
             value, slopes = forward_ad.unpack_dual(moved)
         if slopes is None:  # the map does not depend on the state
             slopes = torch.zeros_like(value)
-        return Linearised(y[:, 0], slopes.mT, covariance[:, 0].expand(like.shape[0], -1, -1))
+        own = covariance[:, 0].expand(like.shape[0], -1, -1)
+        return Linearised(y[:, 0], slopes.mT, own, own)
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Points:
         m = (w_cov[:, None] * r).mT @ xi
         left = r - xi @ m.mT
         own = (w_mean[:, None, None] * covariance).sum(1) if covariance.shape[1] > 1 else covariance[:, 0]
-        return Linearised(y, m, (w_cov[:, None] * left).mT @ left + own)
+        return Linearised(y, m, (w_cov[:, None] * left).mT @ left + own, own)
 
 
 @dataclass(frozen=True)
@@ -117,3 +120,125 @@ class Cubature:
         ball = math.sqrt(d) * torch.eye(d, dtype=torch.float64)
         w = torch.full((2 * d,), 0.5 / d, dtype=torch.float64)
         return torch.cat([ball, -ball]), w, w
+
+
+class SphereRule(Protocol):
+    """Mean over the unit sphere: d -> unit vectors [P, d] and weights [P] that sum to 1. Frozen, so that points are kept."""
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]: ...
+
+
+class RadialRule(Protocol):
+    """Mean over |x|, x ~ N(0, I_d): d -> radii and their weights, which sum to 1. Odd powers come with the sphere."""
+
+    def __call__(self, d: int) -> list[tuple[float, float]]: ...
+
+
+@dataclass(frozen=True)
+class Product:
+    """Points r u and weights c a of a rule on the sphere and a rule along the radius; a radius of 0 gives one centre point.
+
+    Of the degree that the poorer of its parts has [Arasaratnam and Haykin 2009, proposition 3.2]; what the richer one adds is
+    right in one direction only: of a third-degree sphere and a fifth-degree radius, E|x|^4.
+
+    | sphere, radius | filter | points |
+    |---|---|---|
+    | Axis3, Radial3 | CKF | 2 d |
+    | Axis5, Radial5 | HCKF; a negative weight from d = 5 on | 2 d^2 + 1 |
+    | Simplex3, Radial3 | SSRCKF | 2 d + 2 |
+    | Simplex5, Radial5 | SSRHCKF; negative weights from d = 8 on | d^2 + 3 d + 3 |
+    | Simplex3, Radial5 | MSSRCKF | 2 d + 3 |
+    | Simplex5, Radial3 | the other mix; negative weights from d = 8 on | d^2 + 3 d + 2 |
+    | Axis3, Radial5 | the UKF of kappa = 2 | 2 d + 1 |
+
+    Where weights are negative a covariance may lose its square root: see GaussianFilter.repair.
+    """
+
+    sphere: SphereRule
+    radial: RadialRule
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
+        return _product(self, d)
+
+
+@lru_cache(maxsize=64)
+def _product(rule: Product, d: int) -> tuple[Tensor, Tensor, Tensor]:
+    u, a = rule.sphere(d)
+    shells = rule.radial(d)
+    xi = torch.cat([r * u if r > 0.0 else torch.zeros(1, d, dtype=torch.float64) for r, _ in shells])
+    w = torch.cat([c * a if r > 0.0 else torch.full((1,), c, dtype=torch.float64) for r, c in shells])
+    return xi, w, w
+
+
+@dataclass(frozen=True)
+class Radial3:
+    """One shell: E|x|^2 = d [Arasaratnam and Haykin 2009]."""
+
+    def __call__(self, d: int) -> list[tuple[float, float]]:
+        return [(math.sqrt(d), 1.0)]
+
+
+@dataclass(frozen=True)
+class Radial5:
+    """A shell and the centre: E|x|^4 = d (d + 2) as well [Jia, Xin and Cheng 2013]."""
+
+    def __call__(self, d: int) -> list[tuple[float, float]]:
+        return [(0.0, 2.0 / (d + 2)), (math.sqrt(d + 2), d / (d + 2))]
+
+
+@dataclass(frozen=True)
+class Axis3:
+    """Both ends of each axis, 2 d points [Arasaratnam and Haykin 2009]."""
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        return _both_ways(torch.eye(d, dtype=torch.float64), 0.5 / d)
+
+
+@dataclass(frozen=True)
+class Axis5:
+    """The axes, and the diagonals of each pair of them, 2 d^2 points [Jia, Xin and Cheng 2013]."""
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        axes = torch.eye(d, dtype=torch.float64)
+        k, l = torch.triu_indices(d, d, 1)
+        diagonals = torch.cat([axes[k] + axes[l], axes[k] - axes[l]]) / math.sqrt(2.0)
+        return _joined(_both_ways(axes, (4 - d) / (2 * d * (d + 2))), _both_ways(diagonals, 1.0 / (d * (d + 2))))
+
+
+@dataclass(frozen=True)
+class Simplex3:
+    """The d + 1 corners of a regular simplex and what lies opposite [Wang, Feng and Tseng 2014], 2 d + 2 points."""
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        return _both_ways(_simplex(d), 0.5 / (d + 1))
+
+
+@dataclass(frozen=True)
+class Simplex5:
+    """The corners of a simplex and the middles of its edges, carried out to the sphere [Lu and Darmofal 2004]."""
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        corners = _simplex(d)
+        ends = _both_ways(corners, d * (7 - d) / (2 * (d + 1) ** 2 * (d + 2)))
+        if d == 1:  # two corners, no middle
+            return ends
+        k, l = torch.triu_indices(d + 1, d + 1, 1)
+        middles = math.sqrt(d / (2 * (d - 1))) * (corners[k] + corners[l])
+        return _joined(ends, _both_ways(middles, 2 * (d - 1) ** 2 / (d * (d + 1) ** 2 * (d + 2))))
+
+
+def _both_ways(u: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    return torch.cat([u, -u]), torch.full((2 * len(u),), weight, dtype=torch.float64)
+
+
+def _joined(*parts: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    return torch.cat([u for u, _ in parts]), torch.cat([a for _, a in parts])
+
+
+def _simplex(d: int) -> Tensor:
+    """Corners a_j of a regular simplex on the unit sphere [d + 1, d]: a_j . a_k = -1/d [Lu and Darmofal 2004]."""
+    i = torch.arange(1, d + 1, dtype=torch.float64)
+    j = torch.arange(1, d + 2, dtype=torch.float64)[:, None]
+    below = -torch.sqrt((d + 1) / (d * (d - i + 2) * (d - i + 1)))
+    at = torch.sqrt((d + 1) * (d - i + 1) / (d * (d - i + 2)))
+    return torch.where(i < j, below, 0.0) + torch.where(i == j, at, 0.0)

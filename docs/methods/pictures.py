@@ -1,0 +1,398 @@
+"""The pictures of the method pages: `python docs/methods/pictures.py`, or with names of functions for some of them."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from pfbench.draws import MonteCarlo
+from pfbench.filter.adaptations import AdaptiveFactor, ConstrainedNoise, Fading, RatioBound
+from pfbench.filter.belief import Cloud, moments, weights
+from pfbench.filter.cells import Raw, Whitened, divide
+from pfbench.filter.ensemble import EnsembleKalmanFilter, SquareRoot
+from pfbench.filter.gaussian import Adaptation, Gain, GaussianFilter
+from pfbench.filter.gaussian_particles import GaussianRefresh
+from pfbench.filter.guided import Guided, GuidedNoise
+from pfbench.filter.kernels import Flow
+from pfbench.filter.loop import run_filter
+from pfbench.filter.marginalised import RaoBlackwellised
+from pfbench.filter.moves import Metropolis
+from pfbench.filter.moves import Path as Past
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.points import Halton
+from pfbench.filter.polymerisation import Kept, Polymerised, Stretched
+from pfbench.filter.proposals import Bootstrap, Proposal
+from pfbench.filter.reconstruction import Control, Reconstructed, Uncorrected
+from pfbench.filter.resamplers import Regularise, Resample, Resampler, Systematic
+from pfbench.filter.rules import Axis3, Axis5, Jacobian, Points, Product, Radial3, Radial5, Simplex3
+from pfbench.filter.swarm import Everything, Likelihood, Limits, Printed, Swarm
+from pfbench.model.linear import LinearGaussian, linear_walk
+from pfbench.record import Record
+
+HERE = Path(__file__).parent
+
+
+def dmc_reconstructed() -> None:
+    """Position and velocity, position seen: what the shift does to a predicted cloud, as printed and with marginal weights."""
+    model = LinearGaussian(
+        [[1.0, 0.0], [0.0, 1.0]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0]], [2.0], [0.0, 0.0], [[2.0, 0.0], [0.8, 0.4]],
+        names=("position", "velocity"),
+    )  # fmt: skip
+    y, draws = torch.tensor([[4.0]], dtype=torch.float64), MonteCarlo(3, torch.arange(1))
+    cloud = ParticleFilter(250).init(model, 1, draws)
+    seen, control = Record(y), Control(control_weight=1.0)  # a gain of a half, so that the shift can be seen
+    plain = Bootstrap()(model, cloud, seen, draws.at(1))
+    exact, _ = GaussianFilter(Jacobian()).step(model, GaussianFilter(Jacobian()).init(model, 1, draws), seen, draws)
+    panels: dict[str, Proposal] = {
+        "predicted (SIR)": Bootstrap(),
+        "as printed: all are shifted": Reconstructed(control=control, correction=Uncorrected()),
+        "marginal: half shifted, weights corrected": Reconstructed(control=control),
+    }
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained")
+    for axis, (title, proposal) in zip(axes, panels.items(), strict=True):
+        sent = proposal(model, cloud, seen, draws.at(1))
+        log_w = model.log_likelihood(y, sent.x, ()) + sent.log_ratio
+        after = Cloud(sent.x, log_w.log_softmax(1), cloud.log_z)
+        moved = (sent.x != plain.x).any(-1)[0]
+        size = 250 * 12 * weights(after.log_w)[0]
+        for group, colour in ((~moved, "#0072B2"), (moved, "#E69F00")):
+            axis.scatter(*sent.x[0, group].T, s=size[group], color=colour, alpha=0.6, linewidths=0)
+        for mean, covariance, colour, label in (
+            (exact.mean[0], exact.covariance[0], "#009E73", "exact posterior"),
+            (*(part[0] for part in moments(model.chart, after)), "#D55E00", "weighted cloud"),
+        ):
+            axis.plot(*_ellipse(mean, covariance), color=colour, label=f"{label}, 2 sd")
+        axis.axvline(4.0, color="0.6", linewidth=1, linestyle=":")
+        axis.set_title(title, fontsize=11)
+        axis.set(xlabel="position (seen, dotted)")
+    axes[0].set_ylabel("velocity (not seen)")
+    axes[0].legend(loc="upper left", frameon=False)
+    figure.savefig(HERE / "dmc_reconstructed.png", dpi=80)
+
+
+def mssrckf() -> None:
+    """Points of four rules in two dimensions, and what they make of a turn by an uncertain angle."""
+    rules = {
+        "CKF": (Product(Axis3(), Radial3()), "#0072B2"),
+        "SSRCKF": (Product(Simplex3(), Radial3()), "#009E73"),
+        "MSSRCKF": (Product(Simplex3(), Radial5()), "#D55E00"),
+        "HCKF": (Product(Axis5(), Radial5()), "#CC79A7"),
+    }
+    spread = torch.diag(torch.tensor([0.12, 0.7], dtype=torch.float64))  # distance, direction
+    middle = torch.tensor([2.0, math.pi / 2], dtype=torch.float64)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.4, 4.0), layout="constrained")
+    polar = middle + torch.randn(4000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) @ spread
+    cloud = torch.stack([polar[:, 0] * torch.cos(polar[:, 1]), polar[:, 0] * torch.sin(polar[:, 1])], -1)
+    right.scatter(*cloud.T, s=1.5, color="0.75", rasterized=True)
+    right.plot(*_ellipse(cloud.mean(0), torch.cov(cloud.T)), color="0.35", linestyle="--", label="moments of the cloud")
+    for (name, (rule, colour)), mark in zip(rules.items(), "s^oD", strict=True):
+        xi, w, _ = rule(2)
+        left.scatter(*xi.T, s=300 * w.abs(), marker=mark, facecolors="none", edgecolors=colour, label=name)
+        at = middle + xi @ spread
+        moved = torch.stack([at[:, 0] * torch.cos(at[:, 1]), at[:, 0] * torch.sin(at[:, 1])], -1)
+        mean = w @ moved
+        right.plot(*_ellipse(mean, (w[:, None] * (moved - mean)).T @ (moved - mean)), color=colour, label=name)
+    left.set(aspect="equal", title="points for N(0, I), area: weight", xlim=(-2.9, 2.9), ylim=(-2.9, 2.9))
+    right.set(aspect="equal", title="after a turn: ellipses of 2 sd")
+    left.legend(fontsize=8, loc="upper right")
+    right.legend(fontsize=8, loc="lower center")
+    figure.savefig(HERE / "mssrckf.png", dpi=80)
+
+
+def fm_mssrckf() -> None:
+    """Errors of 300 runs in the last step of a burst of process noise, and what the filters believe of them."""
+    figure = _errors(
+        {"MSSRCKF": ((), ()), "S = 1.05": ((Fading(1.05),), ()), "S and alpha": ((Fading(1.05),), (AdaptiveFactor(),))}, q=400.0
+    )
+    figure.savefig(HERE / "fm_mssrckf.png", dpi=80)
+
+
+def cofm_mssrckf() -> None:
+    """Errors of 300 runs in the last step of a burst of measurement noise, and what the filters believe of them."""
+    both = (Fading(1.002), ConstrainedNoise())
+    figure = _errors(
+        {
+            "MSSRCKF": ((), ()),
+            "FM-MSSRCKF": (both[:1], (AdaptiveFactor(),)),
+            "COFM-MSSRCKF": (both, (AdaptiveFactor(), RatioBound())),
+        },
+        r=9.5,
+    )
+    figure.savefig(HERE / "cofm_mssrckf.png", dpi=80)
+
+
+def _errors(methods: dict[str, tuple[tuple[Adaptation, ...], tuple[Gain, ...]]], r: float = 1.0, q: float = 1.0) -> Figure:
+    """A walk in the plane seen by five equal sensors; the last 15 of 40 steps are a burst."""
+    h = torch.tensor([[1.0, 0.0], [0.8, 0.6], [0.5, -0.9], [0.2, 1.0], [-0.7, 0.4]], dtype=torch.float64)
+    eye = torch.eye(2, dtype=torch.float64)
+    model = LinearGaussian(eye, 0.3 * eye, h, [1.0] * 5, [0.0, 0.0], [1.0, 1.0])
+    draws, runs, steps = torch.Generator().manual_seed(3), 300, 40
+    burst = torch.arange(steps)[None, :, None] >= steps - 15
+    moved = 0.3 * torch.randn(runs, steps, 2, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(q), 1.0)
+    x = torch.randn(runs, 1, 2, dtype=torch.float64, generator=draws) + moved.cumsum(1)
+    noise = torch.randn(runs, steps, 5, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(r), 1.0)
+    figure, axes = plt.subplots(1, len(methods), figsize=(9.0, 3.3), sharex=True, sharey=True, layout="constrained")
+    for at, (name, (adaptations, gains)), colour in zip(axes, methods.items(), ("#0072B2", "#E69F00", "#009E73"), strict=True):
+        method = GaussianFilter(Points(Product(Simplex3(), Radial5())), adaptations, gains)
+        found = run_filter(
+            method, model, Record(x @ h.mT + noise), MonteCarlo(0, torch.arange(runs)), lambda t, i: {"p": i.covariance()}
+        )
+        error = (found.mean - x)[:, -1]
+        at.scatter(*error.T, s=5, color="0.6", label="errors")
+        centre, believed = torch.zeros(2, dtype=torch.float64), found.trace["p"][:, -1].median(0).values
+        at.plot(*_ellipse(centre, torch.cov(error.T)), color="0.35", linestyle="--", label="their 2 sd")
+        at.plot(*_ellipse(centre, believed), color=colour, label="2 sd believed")
+        at.set(aspect="equal", title=f"{name}: rms {float(error.square().sum(-1).mean().sqrt()):.2f}")
+        at.legend(fontsize=7, loc="upper right")
+    return figure
+
+
+def _ellipse(mean: Tensor, covariance: Tensor) -> Tensor:
+    """Points at two standard deviations of a normal law in the plane [2, 100]."""
+    angle = torch.linspace(0.0, 2.0 * torch.pi, 100, dtype=mean.dtype)
+    circle = torch.stack([torch.cos(angle), torch.sin(angle)])
+    return mean[:, None] + 2.0 * torch.linalg.cholesky(covariance) @ circle
+
+
+def cpso_escape() -> None:
+    """Position and velocity, position seen: where a chaotic swarm with escape leaves a predicted cloud, printed and corrected."""
+    model = LinearGaussian(
+        [[1.0, 0.0], [0.0, 1.0]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0]], [2.0], [0.0, 0.0], [[2.0, 0.0], [0.8, 0.4]],
+        names=("position", "velocity"),
+    )  # fmt: skip
+    y, draws = torch.tensor([[4.0]], dtype=torch.float64), MonteCarlo(3, torch.arange(1))
+    cloud = ParticleFilter(250).init(model, 1, draws)
+    seen, plain = Record(y), Bootstrap()(model, cloud, Record(y), draws.at(1))
+    exact, _ = GaussianFilter(Jacobian()).step(model, GaussianFilter(Jacobian()).init(model, 1, draws), seen, draws)
+    printed = Swarm(
+        fitness=Likelihood(), coordinates=Everything(), limits=Limits(prior=True, box=None), iterations=30, weights=Printed()
+    )
+    panels: dict[str, Proposal] = {
+        "predicted (SIR)": Bootstrap(),
+        "as printed, 30 iterations": printed,
+        "corrected: half drawn about the swarm": Swarm(),
+    }
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained")
+    for axis, (title, proposal) in zip(axes, panels.items(), strict=True):
+        sent = proposal(model, cloud, seen, draws.at(1))
+        after = Cloud(sent.x, (model.log_likelihood(y, sent.x, ()) + sent.log_ratio).log_softmax(1), cloud.log_z)
+        moved = ((sent.x - plain.x).abs() > 1e-9).any(-1)[0]
+        size = 250 * 12 * weights(after.log_w)[0]
+        for group, colour in ((~moved, "#0072B2"), (moved, "#E69F00")):
+            axis.scatter(*sent.x[0, group].T, s=size[group], color=colour, alpha=0.6, linewidths=0)
+        for mean, covariance, colour, label in (
+            (exact.mean[0], exact.covariance[0], "#009E73", "exact posterior"),
+            (*(part[0] for part in moments(model.chart, after)), "#D55E00", "weighted cloud"),
+        ):
+            axis.plot(*_ellipse(mean, covariance), color=colour, label=f"{label}, 2 sd")
+        axis.axvline(4.0, color="0.6", linewidth=1, linestyle=":")
+        axis.set_title(title, fontsize=11)
+        axis.set(xlabel="position (seen, dotted)", ylim=(-4, 8))
+    axes[0].set_ylabel("velocity (not seen)")
+    axes[0].legend(loc="upper left", frameon=False)
+    figure.savefig(HERE / "cpso_escape.png", dpi=80)
+
+
+def enkf() -> None:
+    """Position and velocity, position seen: where the members of a small ensemble go, with perturbed measurements and without."""
+    model = LinearGaussian(
+        [[1.0, 0.0], [0.0, 1.0]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0]], [1.0], [0.0, 0.0], [[2.0, 0.0], [0.8, 0.4]],
+        names=("position", "velocity"),
+    )  # fmt: skip
+    seen, draws = Record(torch.tensor([[2.5]], dtype=torch.float64)), MonteCarlo(5, torch.arange(1))
+    kalman = GaussianFilter(Jacobian())
+    panels = {"perturbed measurements": EnsembleKalmanFilter(60), "square root": EnsembleKalmanFilter(60, SquareRoot())}
+    exact, _ = kalman.step(model, kalman.init(model, 1, draws), seen, draws)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained")
+    for axis, (title, method) in zip(axes, panels.items(), strict=True):
+        before = method.init(model, 1, draws)
+        after, info = method.step(model, before, seen, draws.at(1))
+        start = Bootstrap()(model, before, seen, draws.at(1)).x[0]
+        axis.plot(*torch.stack([start, after.x[0]]).permute(2, 0, 1), color="0.8", linewidth=0.7)
+        axis.scatter(*start.T, s=10, color="#0072B2", label="predicted")
+        axis.scatter(*after.x[0].T, s=10, color="#E69F00", label="moved")
+        for mean, covariance, colour, label in (
+            (exact.mean[0], exact.covariance[0], "#009E73", "Kalman, 2 sd"),
+            (info.mean[0], info.covariance()[0], "#D55E00", "ensemble, 2 sd"),
+        ):
+            axis.plot(*_ellipse(mean, covariance), color=colour, label=label)
+        axis.axvline(2.5, color="0.6", linewidth=1, linestyle=":")
+        axis.set(title=title, xlabel="position (seen, dotted)")
+    axes[0].set_ylabel("velocity (not seen)")
+    axes[0].legend(loc="upper left", frameon=False)
+    figure.savefig(HERE / "enkf.png", dpi=80)
+
+
+def rbpf() -> None:
+    """Position and velocity, position seen: 40 particles, and 40 sampled positions with a normal law of the velocity each."""
+    model = LinearGaussian(
+        [[1.0, 0.5], [0.0, 0.95]], [[0.8, 0.0], [0.0, 0.4]], [[1.0, 0.0]], [0.7], [0.0, 0.0], [1.0, 1.5],
+        names=("position", "velocity"),
+    )  # fmt: skip
+    y, draws = torch.tensor([[[0.4], [1.6], [2.0]]], dtype=torch.float64), MonteCarlo(4, torch.arange(1))
+    exact = GaussianFilter(Jacobian()).init(model, 1, draws)
+    for t in range(y.shape[1]):
+        exact, _ = GaussianFilter(Jacobian()).step(model, exact, Record(y[:, t]), draws)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained")
+    panels = {
+        "SIR, 40 particles": ParticleFilter(40),
+        "RBPF, 40: position sampled, velocity normal": RaoBlackwellised(40, ["position"]),
+    }
+    for axis, (title, method) in zip(axes, panels.items(), strict=True):
+        cloud = method.init(model, 1, draws)
+        for t in range(y.shape[1]):
+            cloud, info = method.step(model, cloud, Record(y[:, t]), draws.at(t + 1))
+        if cloud.memory:
+            sd = 2.0 * cloud.memory["root"][0, 0, 0, 0].abs()
+            axis.errorbar(*cloud.x[0].T, yerr=sd, fmt="none", ecolor="#E69F00", elinewidth=1, label="conditional law, 2 sd")
+        axis.scatter(*cloud.x[0].T, s=40 * 16 * weights(cloud.log_w)[0], color="#0072B2", linewidths=0, zorder=3)
+        for mean, covariance, colour, label in (
+            (exact.mean[0], exact.covariance[0], "#009E73", "Kalman, 2 sd"),
+            (info.mean[0], info.covariance()[0], "#D55E00", "told, 2 sd"),
+        ):
+            axis.plot(*_ellipse(mean, covariance), color=colour, label=label)
+        axis.set(title=title, xlabel="position (seen)")
+    axes[0].set_ylabel("velocity (not seen)")
+    axes[1].legend(loc="upper left", frameon=False)
+    figure.savefig(HERE / "rbpf.png", dpi=80)
+
+
+def qmc_polymerised() -> None:
+    """A weighted cloud on a ridge across the axes, and what aggregation makes of it: repaired, and in two readings of eq. 18."""
+    model, draws = _plain(2), MonteCarlo(5, torch.arange(1))
+    z = draws.normal("x", 250, 2)
+    x = torch.stack([z[..., 0] + 0.25 * z[..., 1], z[..., 0] - 0.25 * z[..., 1]], -1)
+    cloud = Cloud(x, (-(x[..., 0] - 1.0).square()).log_softmax(1), torch.zeros(1, dtype=torch.float64))
+    panels: dict[str, Polymerised | None] = {
+        "weighted, whitened cells": None,
+        "repaired: shares, pooled spread": Polymerised(),
+        "eq. 18, counts by weight": Polymerised(displacement=Stretched()),
+        "as printed: boxes, counts kept": Polymerised(Raw(), Kept(), Stretched()),
+    }
+    figure, axes = plt.subplots(1, 4, figsize=(13, 3.6), sharex=True, sharey=True, layout="constrained")
+    for axis, (title, resampler) in zip(axes, panels.items(), strict=True):
+        _scatter_refreshed(axis, model, cloud, resampler, title)
+    w, (mean, covariance) = weights(cloud.log_w), moments(model.chart, cloud)
+    number = divide(Whitened(), x - mean.unsqueeze(1), w > 0, covariance)[0]
+    shades = ["#0072B2", "#E69F00", "#009E73", "#CC79A7"]
+    axes[0].collections[0].set_color([shades[int(k) % 4] for k in number])
+    axes[1].legend(loc="lower right", frameon=False, fontsize=9)
+    figure.savefig(HERE / "qmc_polymerised.png", dpi=75)
+
+
+def gpf() -> None:
+    """A bent cloud, and the normal law that a Gaussian particle filter makes of it: by chance, and on Halton points."""
+    model, draws = _plain(2), MonteCarlo(5, torch.arange(1))
+    z = draws.normal("x", 250, 2)
+    x = torch.stack([z[..., 0], z[..., 0].square() - 1.0 + 0.3 * z[..., 1]], -1)
+    cloud = Cloud(x, (-0.5 * (x[..., 0] - 0.5).square()).log_softmax(1), torch.zeros(1, dtype=torch.float64))
+    panels: dict[str, GaussianRefresh | None] = {
+        "weighted": None,
+        "refreshed by chance": GaussianRefresh(),
+        "refreshed on Halton points": GaussianRefresh(Halton()),
+    }
+    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.6), sharex=True, sharey=True, layout="constrained")
+    for axis, (title, resampler) in zip(axes, panels.items(), strict=True):
+        _scatter_refreshed(axis, model, cloud, resampler, title)
+    axes[1].legend(loc="lower right", frameon=False, fontsize=9)
+    figure.savefig(HERE / "gpf.png", dpi=75)
+
+
+def _plain(d: int) -> LinearGaussian:
+    """Some model of d plain numbers, for stages that ask for nothing else."""
+    eye = torch.eye(d, dtype=torch.float64)
+    return LinearGaussian(eye, eye, eye, [1.0] * d, [0.0] * d, [1.0] * d)
+
+
+def _scatter_refreshed(axis: Axes, model: LinearGaussian, cloud: Cloud, resampler: Resampler | None, title: str) -> None:
+    """A cloud [1, N, 2] before or after a resampler, areas by weight, with two-deviation ellipses of then and before."""
+    n = torch.full((1, 1), float(cloud.x.shape[1]), dtype=torch.float64)
+    after = cloud if resampler is None else resampler(model, cloud, cloud.log_w, n, MonteCarlo(6, torch.arange(1)))[0]
+    size = cloud.x.shape[1] * 9 * weights(after.log_w)[0]
+    axis.scatter(*after.x[0].T, s=size, color="#0072B2" if resampler is None else "#E69F00", alpha=0.7, linewidths=0)
+    for shown, colour, label in ((cloud, "#009E73", "before, 2 sd"), (after, "#D55E00", "after, 2 sd")):
+        mean, covariance = (part[0] for part in moments(model.chart, shown))
+        axis.plot(*_ellipse(mean, covariance), color=colour, label=label)
+    axis.set_title(title, fontsize=11)
+
+
+def mcmc_rpf() -> None:
+    """Constant velocity in little noise, position seen: a cloud of few ancestors, smoothed, and moved; Kalman's law beside it."""
+    model, n, steps = linear_walk(1.0, 0.01, 1.0), 200, 12
+    draws, runs = MonteCarlo(4, torch.arange(1)), torch.ones(1, dtype=torch.bool)
+    record = Record(0.3 * torch.arange(1.0, steps + 1).reshape(1, steps, 1).double() + draws.normal("y", steps, 1))
+    kept = Past(steps, driven=True)
+    method, kalman = ParticleFilter(n, Resample(Systematic(), 0.5)), GaussianFilter(Jacobian())
+    cloud, law = method.init(model, 1, draws), kalman.init(model, 1, draws)
+    cloud = kept.begin(model, cloud, model.m0.expand(1, -1), (model.l0 @ model.l0.mT).expand(1, -1, -1))
+    size = method.size(cloud)
+    for t in range(steps):
+        now, seen = draws.at(t + 1), record.at(t)
+        cloud, _ = method.resampler(model, cloud, cloud.log_w, size, now)
+        sent = method.proposal(model, cloud, seen, now)
+        log_w = (cloud.log_w + model.log_likelihood(seen.y, sent.x, seen.u)).log_softmax(1)
+        cloud = kept.follow(model, cloud, cloud._replace(x=sent.x, log_w=log_w), sent.w, seen)
+        law, _ = kalman.step(model, law, seen, now)
+    copies, _ = Resample(Systematic(), 1.0)(model, cloud, cloud.log_w, size, draws)
+    smoothed, _ = Regularise(Resample(Systematic(), 1.0))(model, cloud, cloud.log_w, size, draws)
+    moved, _ = Metropolis(Flow(steps), 20)(model, copies, runs, draws)
+    count = len(torch.unique(copies.x[0, :, 0]))
+    panels = {
+        f"resampled: {count} places": copies,
+        "RPF as printed: blurred where it lies": smoothed,
+        "20 flow moves: spread, not widened": moved,
+    }
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained")
+    for axis, (title, shown), colour in zip(axes, panels.items(), ("#0072B2", "#E69F00", "#CC79A7"), strict=True):
+        axis.scatter(*shown.x[0].T, s=12, color=colour, alpha=0.7, linewidths=0)
+        axis.plot(*_ellipse(law.mean[0], law.covariance[0]), color="#009E73", label="Kalman, 2 sd")
+        mean, covariance = (part[0] for part in moments(model.chart, shown))
+        axis.plot(*_ellipse(mean, covariance), color="#D55E00", label="cloud, 2 sd")
+        axis.set_title(title, fontsize=11)
+        axis.set_xlabel("position")
+    axes[0].set_ylabel("velocity")
+    axes[0].legend(frameon=False, fontsize=9)
+    figure.savefig(HERE / "mcmc_rpf.png", dpi=90)
+    plt.close(figure)
+
+
+def cofm_amssrcpf() -> None:
+    """Position and velocity, position seen far from where it was expected: children by three proposals, areas by weight."""
+    model = linear_walk(1.0, 0.8, 0.3, (1.0, 1.0))
+    guide, draws = GaussianFilter(Jacobian()), MonteCarlo(3, torch.arange(1))
+    seen = Record(torch.tensor([[2.5]], dtype=torch.float64))
+    exact, _ = guide.step(model, guide.init(model, 1, draws), seen, draws)
+    panels: dict[str, Proposal] = {
+        "model's noise (SIR)": Bootstrap(),
+        "noise given parent and y": GuidedNoise(guide),
+        "one guide for the cloud": Guided(guide),
+    }
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained")
+    for axis, (title, proposal), colour in zip(axes, panels.items(), ("#0072B2", "#E69F00", "#CC79A7"), strict=True):
+        method = ParticleFilter(150, proposal=proposal)
+        after, info = method.step(model, method.init(model, 1, draws), seen, draws.at(1))
+        w = weights(after.log_w)[0]
+        axis.scatter(*after.x[0].T, s=8.0 + 1500.0 * w, color=colour, alpha=0.5, linewidths=0)
+        axis.plot(*_ellipse(exact.mean[0], exact.covariance[0]), color="#009E73", label="Kalman, 2 sd")
+        axis.set_title(f"{title}: ESS {float(info.trace['ess'][0]):.0f} of 150", fontsize=11)
+        axis.set_xlabel("position")
+    axes[0].set_ylabel("velocity")
+    axes[0].legend(frameon=False, fontsize=9)
+    figure.savefig(HERE / "cofm_amssrcpf.png", dpi=90)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    pictures = [name for name, value in globals().items() if callable(value) and getattr(value, "__module__", "") == "__main__"]
+    for name in sys.argv[1:] or [name for name in pictures if not name.startswith("_")]:
+        globals()[name]()
