@@ -20,6 +20,7 @@ pfbench {version}: benchmarks of particle filters in integrated navigation
       pfbench run -m scenario=t003 filter=ekf,sir noise=nominal,outliers study=mine
       pfbench run -m +experiment=quickstart
   pfbench report study=NAME          figures, tables and tests of a study, as a page
+  pfbench report scenario=NAME       the datasheet of a scene, as a page; also: noise=NAME, runs=20
   pfbench list [group]               what can be composed
   pfbench check                      composes everything; versions, threads, device, data root
 """
@@ -83,10 +84,28 @@ def _run(words: list[str]) -> None:
 def _report(words: list[str]) -> None:
     from pfbench.report.page import Options, write
 
+    named = {word.lstrip("+").partition("=")[0] for word in words}
+    if "scenario" in named and not named & {"study", "experiment"}:
+        return _datasheet(words)
     cfg = _compose(words)
+    if cfg["study"] == "datasheets":
+        raise ValueError("study=datasheets: there lie the datasheets of scenes; give scenario=NAME to see one, or another study")
     chosen: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in cfg["report"].items()}
     page = write(cfg["study"], cfg["results"], cfg["reports"], Options(**chosen))
     print(f"report: {page.resolve()}")
+
+
+def _datasheet(words: list[str]) -> None:
+    """The page of one scene, of `survey.RUNS` runs unless the words say how many."""
+    from pfbench import survey
+    from pfbench.report.datasheet import write
+
+    few = [] if any(word.startswith("runs=") for word in words) else [f"runs={survey.RUNS}"]
+    cfg, choices = _composition([*words, *few])
+    own = conf_dir() / "scenario" / f"{choices['scenario']}.yaml"
+    file = survey.survey(cfg, choices, _headline(own) if own.exists() else "")
+    page = write(file, cfg["reports"], tuple(cfg["report"]["formats"]))
+    print(f"datasheet: {page.resolve()}")
 
 
 def _list(words: list[str]) -> None:
@@ -139,14 +158,23 @@ def _home(group: str, name: str) -> list[str]:
 
 def _compose(overrides: list[str]) -> dict[str, Any]:
     """The resolved configuration as plain dicts and lists."""
+    return _composition(overrides)[0]
+
+
+def _composition(overrides: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
+    """The same, and the names of what was chosen in each group."""
     from hydra import compose, initialize_config_dir
-    from omegaconf import OmegaConf
+    from omegaconf import OmegaConf, open_dict
 
     _offer_experiments()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = OmegaConf.to_container(compose("config", overrides), resolve=True)
+        composed = compose("config", overrides, return_hydra_config=True)
+    choices = {str(group): str(name) for group, name in composed.hydra.runtime.choices.items()}
+    with open_dict(composed):
+        del composed["hydra"]
+    cfg = OmegaConf.to_container(composed, resolve=True)
     assert isinstance(cfg, dict)
-    return {str(key): value for key, value in cfg.items()}
+    return {str(key): value for key, value in cfg.items()}, choices
 
 
 def _offer_experiments() -> None:

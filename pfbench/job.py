@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
 import logging
 import math
 import platform
 import re
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,21 +25,27 @@ from tqdm import tqdm
 
 import pfbench
 from pfbench import fusion, store
+from pfbench.bound import posterior_bound
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Info
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.model.base import StateSpaceModel
+from pfbench.noise.regimes import Nominal
 from pfbench.record import Episode
 from pfbench.scenario.told import Witness
+from pfbench.scenario.worlds import cached
 
 log = logging.getLogger("pfbench")
+
+DATASHEETS = "datasheets"  # the folder of results in which the scenes' own datasheets lie
 
 # what changes where and how fast a job runs, not what it computes
 PLACES = (
     "results", "reports", "worlds", "data", "study", "threads", "engine", "fresh", "report", "scenario.root", "scenario.cache",
     "particles",  # counted where a filter uses it, as filter.particles
+    "bound",  # stands beside what a filter does; fresh=true adds it to a finished job
 )  # fmt: skip
 _COMPILE_FROM = 5e8  # normals; compiling their kernel costs some seconds and saves 15 ms for each million
 
@@ -52,6 +60,8 @@ def run(cfg: DictConfig) -> float:
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     if not re.fullmatch(r"\w[\w.-]*", str(cfg.study)):
         raise ValueError(f"study={cfg.study}: it names a folder of results; use letters, digits, points, dashes and underscores")
+    if cfg.study == DATASHEETS:
+        raise ValueError(f"study={cfg.study}: there lie the datasheets of scenes; give the study another name")
     path = Path(cfg.results) / cfg.study / f"{store.key(config, PLACES)}.npz"
     choices = _choices()
     name = " ".join(choices[part] for part in ("scenario", "noise", "filter"))
@@ -87,6 +97,9 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
     witness = Witness(noise)
     episode: Episode = scenario.draw(witness, runs, cfg.seed)
     drawn = time.perf_counter()
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    least, said = lower_bound(config, model, witness, episode)
+    bounded = time.perf_counter()
     dtype = getattr(torch, cfg.dtype)
     model = witness.tell(model, episode.time) if cfg.told else model
     model = model.to(cfg.device, dtype)
@@ -103,11 +116,14 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
     if cfg.device != "cpu":
         torch.cuda.synchronize()
     ended = time.perf_counter()
-    seconds = {"world": drawn - started, "filter": ended - drawn, "per_step": (ended - drawn) / steps}
-    return describe(cfg, model, method, steps, seconds, episode.notes), _arrays(episode, estimate)
+    seconds = {
+        "world": drawn - started, "bound": bounded - drawn, "filter": ended - bounded, "per_step": (ended - bounded) / steps
+    }  # fmt: skip
+    meta = describe(cfg, model, method, steps, seconds, episode.notes)
+    return {**meta, "bound": said}, {**_arrays(episode, estimate), **_shared(episode, least)}
 
 
-def settings(cfg: DictConfig) -> None:
+def settings(cfg: DictConfig | Mapping[str, Any]) -> None:
     """The one door for global things: threads, and the checks of what concerns the whole job.
 
     Raises:
@@ -116,17 +132,19 @@ def settings(cfg: DictConfig) -> None:
     for key, least in (("runs", 1), ("first_run", 0), ("threads", 1), ("seed", 0)):
         if type(cfg[key]) is not int or cfg[key] < least:
             raise ValueError(f"{key}={cfg[key]}: give a whole number, {least} or more")
-    if type(cfg.told) is not bool:
-        raise ValueError(f"told={cfg.told}: give true (the filter knows the noise regime) or false")
-    if cfg.dtype not in ("float32", "float64"):
-        raise ValueError(f"dtype={cfg.dtype}: give float64 (the default) or float32")
-    if cfg.engine not in ("auto", "eager", "compiled"):
-        raise ValueError(f"engine={cfg.engine}: give auto, eager or compiled")
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", str(cfg.device)):
-        raise ValueError(f"device={cfg.device}: give cpu, cuda, or one of several as cuda:1")
-    if cfg.device != "cpu" and (torch.device(cfg.device).index or 0) >= torch.cuda.device_count():
-        raise ValueError(f"device={cfg.device}: torch finds {torch.cuda.device_count()} CUDA devices here; give device=cpu")
-    torch.set_num_threads(cfg.threads)
+    if type(cfg["told"]) is not bool:
+        raise ValueError(f"told={cfg['told']}: give true (the filter knows the noise regime) or false")
+    if cfg["bound"] not in (True, False, "auto"):
+        raise ValueError(f"bound={cfg['bound']}: give auto (where the model's laws are the world's), true or false")
+    if cfg["dtype"] not in ("float32", "float64"):
+        raise ValueError(f"dtype={cfg['dtype']}: give float64 (the default) or float32")
+    if cfg["engine"] not in ("auto", "eager", "compiled"):
+        raise ValueError(f"engine={cfg['engine']}: give auto, eager or compiled")
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", str(cfg["device"])):
+        raise ValueError(f"device={cfg['device']}: give cpu, cuda, or one of several as cuda:1")
+    if cfg["device"] != "cpu" and (torch.device(cfg["device"]).index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"device={cfg['device']}: torch finds {torch.cuda.device_count()} CUDA devices here; give device=cpu")
+    torch.set_num_threads(cfg["threads"])
 
 
 def build(node: Any) -> Any:
@@ -165,6 +183,74 @@ def judge(model: StateSpaceModel, truth: Tensor) -> Callable[[int, Info], dict[s
         return {"error": error, "nees": torch.stack(nees, 1)}
 
     return watch
+
+
+def lower_bound(
+    config: Mapping[str, Any], model: StateSpaceModel, witness: Witness, episode: Episode
+) -> tuple[Tensor | None, str]:
+    """No filter's rms error can be smaller: standard deviations of the posterior Cramer-Rao bound, and what they are.
+
+    The bound is that of the world, and so of the model that is told the noise regime, whatever the filters are told. Runs have
+    a recursion in common where there is one, else each its own. It is kept beside the worlds, for all filters of a study; the
+    model's source file decides it too. Where filters start from a measurement that the record does not hold, it starts from the
+    model's own initial law.
+
+    Args:
+        config: of the job, resolved: model, scenario, noise, seed, bound, worlds.
+        model: that filters believe in, on the processor in double precision, not told.
+        witness: of the noise regime, after the worlds were drawn.
+        episode: the worlds.
+
+    Returns:
+        Standard deviations [T, d] and their description; or None and why there is no bound.
+    """
+    why = _boundless(config, episode)
+    if why:
+        return None, why
+    try:
+        told = model if isinstance(witness.regime, Nominal) else witness.tell(model, episode.time)
+    except ValueError:
+        return None, "no bound: the errors of this noise regime have no law step by step"
+    initial = None if episode.record.spread is None else torch.diag_embed(model.initial(1).variance[0])
+    where = {**config["scenario"], "root": None, "cache": None}
+    code = hashlib.sha256(Path(inspect.getfile(type(model))).read_bytes()).hexdigest()
+    drawn = config["noise"], config["seed"], config["first_run"], config["runs"]
+    recipe = ("bound 1", code, config["model"], where, *drawn)
+
+    def build() -> dict[str, Tensor]:
+        truth = told.assemble(episode.truth)
+        try:
+            found, apart = posterior_bound(told, truth, episode.record, initial), model.linear
+        except ValueError:  # no recursion in common; where runs have none of their own either, that says why
+            found, apart = posterior_bound(told, truth, episode.record, initial, run_by_run=True), True
+        sd = found.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+        return {"bound": sd.contiguous(), "apart": torch.tensor(apart)}
+
+    try:
+        kept = cached(config["worlds"], recipe, build)
+    except ValueError as error:
+        return None, "no bound: " + f"{error}".removeprefix("Told: ")
+    how = "the mean of the runs' own" if bool(kept["apart"]) else "one recursion for all runs"
+    law = "; it starts from the model's own initial law, without the measurement from which filters start"
+    first = "" if initial is None else law
+    knows = "" if told is model else " that is told the noise regime"
+    return kept["bound"], f"posterior Cramer-Rao bound of the model{knows}, {how}{first}"
+
+
+def _boundless(config: Mapping[str, Any], episode: Episode) -> str:
+    """Why nobody need look for a bound, or nothing."""
+    if config["bound"] is False:
+        return "no bound: it was not asked for (bound=false)"
+    if config["bound"] is True:
+        return ""
+    if "root" in config["scenario"]:
+        return "no bound: the scene was recorded, and the laws of its errors are not known"
+    if episode.record.loop is not None:
+        return "no bound: what a filter estimates changes this world"
+    for name, value in config["model"].items():
+        if "inflation" in name and value not in (None, 1.0):
+            return f"no bound: the model has more process noise than the world, on purpose (model.{name})"
+    return ""
 
 
 def describe(
@@ -233,6 +319,12 @@ def _arrays(episode: Episode, estimate: Estimate) -> dict[str, np.ndarray]:
     if episode.track is not None:
         arrays["track"] = episode.track.float()
     return {name: value.cpu().numpy() for name, value in arrays.items()}
+
+
+def _shared(episode: Episode, least: Tensor | None) -> dict[str, np.ndarray]:
+    """What all runs have in common: the bound [T, d], the range [T] by which errors of a location become relative."""
+    parts = {"bound": least, "range": episode.sheet.get("range")}
+    return {name: value.float().numpy() for name, value in parts.items() if value is not None}
 
 
 def _headline(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> float:

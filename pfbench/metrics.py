@@ -53,6 +53,27 @@ class Consistency(NamedTuple):
     runs: int
 
 
+class Whiteness(NamedTuple):
+    """Normalised residuals against the white standard normal law, and 95 % bands of what is estimated under it.
+
+    Attributes:
+        mean, mean_band: 0 within the band.
+        variance, variance_band: mean square, about 0; 1 within the band.
+        lag, lag_band: autocorrelation of neighbours in time; 0 within the band.
+        beyond: share of the numbers beyond three standard deviations; 0.0027 of a normal law.
+        numbers: how many there are.
+    """
+
+    mean: float
+    mean_band: float
+    variance: float
+    variance_band: float
+    lag: float
+    lag_band: float
+    beyond: float
+    numbers: int
+
+
 def rmse_per_run(error: Array, lost: Flags) -> Array:
     """Root of the mean over time of the squared norm, for each run [R].
 
@@ -129,6 +150,59 @@ def consistency(nees: Array, lost: Flags, dof: int, alpha: float = 0.05) -> Cons
     inside = ((average >= low) & (average <= high))[known]
     share = float(inside.mean()) if inside.size else np.nan
     return Consistency(average, low, high, count, float(_mean(kept.ravel(), axis=0)), share, _seen(kept))
+
+
+def whiteness(z: Array) -> Whiteness:
+    """Whether normalised residuals are white and of variance 1 [Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2].
+
+    Args:
+        z: [R, T, K], NaN where nothing was measured. Instants at which nothing was measured in any run are left out, so that
+            neighbours are the next ones that were; a pair counts where both of its numbers are known.
+    """
+    z = np.asarray(z, dtype=np.float64)
+    known = z[~np.isnan(z)]
+    kept = z[:, ~np.isnan(z).all(axis=(0, 2))]
+    products = kept[:, 1:] * kept[:, :-1]
+    pairs = int((~np.isnan(products)).sum())
+    square = float(_mean(known**2, axis=0))
+    lag = float(_mean(products.ravel(), axis=0)) / square if pairs and square > 0 else np.nan
+    root = 1.96 / np.sqrt(max(known.size, 1))
+    beyond = float(_mean((np.abs(known) > 3).astype(np.float64), axis=0))
+    band = 1.96 / np.sqrt(pairs) if pairs else np.nan
+    return Whiteness(
+        float(_mean(known, axis=0)), float(root), square, float(np.sqrt(2) * root), lag, float(band), beyond, known.size
+    )
+
+
+def over_bound(error: Array, lost: Flags, bound: Array) -> float:
+    """Root of the ratio of the mean squared norm of the error to that of the bound, over the same runs and instants.
+
+    Args:
+        error: [R, T, K].
+        lost: [R].
+        bound: standard deviations [T, K] of the Cramer-Rao bound, which all runs share.
+
+    Returns:
+        1 for a filter that reaches the bound; NaN when no run entered.
+    """
+    square = _square(error)[~lost]
+    floor = np.where(np.isnan(square), np.nan, _square(bound))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.sqrt(_mean(square.ravel(), axis=0) / _mean(floor.ravel(), axis=0)))
+
+
+def relative_error(error: Array, lost: Flags, distance: Array, last: int | None = None) -> Average:
+    """Mean over runs and time of the norm of the error as a share of a distance.
+
+    Args:
+        error: [R, T, K]; horizontal, for a location on the ground.
+        lost: [R].
+        distance: [T], from the observer to the target.
+        last: steps at the end that count; None is all.
+    """
+    norm = np.sqrt(_square(error)[~lost]) / np.asarray(distance, dtype=np.float64)
+    kept = norm if last is None else norm[:, -last:]
+    return Average(_mean(kept.ravel(), axis=0), _seen(kept))
 
 
 def lost_share(lost: Flags) -> Average:

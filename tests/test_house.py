@@ -31,8 +31,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "bound": CHARTED | {"model.base", "filter"},
     "scenario": MODELLED,
     **{part: MODELLED | PLAIN | {"fusion", "filter", "bound", "scenario"} for part in ("job", "train", "ppl")},
+    "survey": MODELLED | PLAIN | {"fusion", "filter", "bound", "scenario", "job"},
     "report": PLAIN,
-    "cli": MODELLED | PLAIN | {"filter", "scenario", "job", "train", "ppl", "report"},
+    "cli": MODELLED | PLAIN | {"filter", "scenario", "job", "survey", "train", "ppl", "report"},
     "__main__": {"cli"},
 }
 UPSTAIRS = {"job", "train", "cli"}  # may ask the package itself, for its version

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,8 +13,9 @@ import torch
 from command_line import Said, pfbench, process
 
 from pfbench.filter.belief import Info
-from pfbench.job import judge
+from pfbench.job import _boundless, judge
 from pfbench.model.linear import linear_walk
+from pfbench.record import Episode, Record
 
 WALK = ("scenario=linear_walk", "scenario.steps=25", "particles=100")
 FIELDS = {"time", "error", "sd", "nees", "log_evidence", "lost", "meta"}
@@ -124,7 +125,8 @@ def test_runs_in_two_jobs_are_the_runs_of_one(tmp_path: Path, method: str) -> No
     whole = result(tmp_path, *words, "runs=5", study="whole")[1]
     head = result(tmp_path, *words, "runs=2", study="head")[1]
     tail = result(tmp_path, *words, "first_run=2", "runs=3", study="tail")[1]
-    joined = {name: whole[name] if name == "time" else np.concatenate([head[name], tail[name]]) for name in whole}
+    common = ("time", "bound")
+    joined = {name: whole[name] if name in common else np.concatenate([head[name], tail[name]]) for name in whole}
     assert identical(joined, whole)
     assert not np.array_equal(head["error"], tail["error"][:2])
 
@@ -149,7 +151,7 @@ def test_the_worlds_of_a_study_are_flown_once_for_all_filters(tmp_path: Path) ->
     segments = "scenario.path.segments=[{_target_:pfbench.nav.trajectory.cruise,duration:10}]"
     said = pfbench("run", "-m", "scenario=t004", segments, "filter=ekf,sir", "noise=nominal,student", "runs=2", home=tmp_path)
     assert said.code == 0, said.err
-    assert len(list((tmp_path / "worlds").iterdir())) == 1
+    assert len(list((tmp_path / "worlds").iterdir())) == 2  # the flights, and the bound in the nominal one
     found = [stored(file) for file in (tmp_path / "results" / "adhoc").glob("*.npz")]
     assert len(found) == 4
     tracks = [arrays["track"] for _, arrays in found]
@@ -159,6 +161,74 @@ def test_the_worlds_of_a_study_are_flown_once_for_all_filters(tmp_path: Path) ->
     east = 20.0 * math.sqrt(0.5) * np.arange(1, 11)
     assert np.allclose(tracks[0][0, :, 0], east, rtol=1e-3)
     assert np.allclose(tracks[0][0, :, 1], east, rtol=1e-3)
+
+
+# the bound beside the errors
+
+
+@pytest.mark.parametrize("words", [(), ("noise=outage", "noise.windows=[[5,9]]"), ("noise=r_only",)])
+def test_the_bound_of_a_linear_world_is_kalmans_deviation(tmp_path: Path, words: tuple[str, ...]) -> None:
+    """Of the filter that is told the regime, whether or not the one that ran was."""
+    told = result(tmp_path, *WALK, *words, "filter=ekf", "runs=3", "told=true", study="told")
+    plain = result(tmp_path, *WALK, *words, "filter=ekf", "runs=3", study="plain")
+    assert told[1]["bound"].shape == (25, 2)
+    assert np.allclose(told[1]["bound"], told[1]["sd"], rtol=1e-5)
+    assert np.array_equal(told[1]["bound"], plain[1]["bound"])
+    assert "posterior Cramer-Rao bound of the model" in plain[0]["bound"]
+
+
+WHY = {
+    "heavy tails": (("noise=student",), "not normal"),
+    "not asked for": (("bound=false",), "it was not asked for"),
+    "no additive noise": (("scenario=benes",), "its process noise is not additive and normal"),
+}
+
+
+@pytest.mark.parametrize("case", WHY)
+def test_where_there_is_no_bound_the_job_says_why(tmp_path: Path, case: str) -> None:
+    words, reason = WHY[case]
+    meta, arrays = result(tmp_path, *WALK[:1], "scenario.steps=4", *words, "filter=ekf", "runs=2")
+    assert "bound" not in arrays
+    assert meta["bound"].startswith("no bound: ")
+    assert reason in meta["bound"]
+
+
+def test_worlds_that_are_not_the_models_have_no_bound_unless_asked() -> None:
+    episode = Episode(Record(torch.zeros(1, 2, 1)), torch.arange(2.0), {})
+    config = {"bound": "auto", "scenario": {}, "model": {"inflation": None, "q_inflation": 1.0}}
+    assert _boundless(config, episode) == ""
+    assert "recorded" in _boundless({**config, "scenario": {"root": "somewhere"}}, episode)
+    assert "(model.inflation)" in _boundless({**config, "model": {"inflation": {"velocity": [1.0]}}}, episode)
+    assert "(model.q_inflation)" in _boundless({**config, "model": {"q_inflation": 30.0}}, episode)
+    looped = Episode(episode.record._replace(loop=cast(Any, object())), episode.time, {})
+    assert "changes this world" in _boundless(config, looped)
+    assert _boundless({**config, "bound": True, "scenario": {"root": "somewhere"}}, episode) == ""
+
+
+def test_a_location_brings_its_range_and_a_bound_from_the_models_own_prior(tmp_path: Path) -> None:
+    meta, arrays = result(tmp_path, "scenario=passive_1", "scenario.steps=3", "filter=ekf", "runs=4")
+    # 226.3 km at first, closing by 200 m/s on the east axis while the emitter goes north-west
+    t = np.arange(1, 4)
+    assert np.allclose(arrays["range"], np.hypot(160e3 - 215.0 * t, 160e3 + 15.0 * t), rtol=1e-6)
+    assert arrays["bound"].shape == (3, 4)
+    assert "the model's own initial law" in meta["bound"]
+    # the prior, 60 km per axis and 30 m/s, is more than the first look leaves of it
+    assert (arrays["bound"][0, :2] < 60e3).all()
+    assert np.allclose(arrays["bound"][0, 2:], 30.0, rtol=0.3)
+
+
+def test_the_bound_is_kept_with_the_worlds_and_known_by_what_decides_it(tmp_path: Path) -> None:
+    def kept() -> int:
+        return len(list((tmp_path / "worlds").glob("*")))
+
+    words = (*WALK, "runs=2", "fresh=true")
+    result(tmp_path, *words, "filter=ekf", study="a")
+    assert kept() == 1
+    result(tmp_path, *words, "filter=sir", "told=true", study="b")
+    assert kept() == 1
+    for n, more in enumerate(("seed=2", "runs=3", "model.noise=0.4", "scenario.steps=24", "noise=r_only")):
+        result(tmp_path, *words, "filter=ekf", more, study=f"c{n}")
+        assert kept() == n + 2
 
 
 # failures

@@ -451,6 +451,7 @@ class Shift:
     """A move that shifts refreshed runs, to see where it stands in the step."""
 
     exact: bool = False
+    keeps = None
 
     def __call__(self, model: StateSpaceModel, cloud: Cloud, hit: Tensor, draws: Draws) -> tuple[Cloud, Tensor]:
         return cloud._replace(x=cloud.x + 100.0 * hit[:, None, None]), 0.25 * hit.double()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
@@ -142,4 +143,10 @@ def _gather_states(x: Tensor, ancestors: Tensor) -> Tensor:
 def _gather_rows(a: Tensor, ancestors: Tensor) -> Tensor:
     if a.shape[1] == 1:  # shared by all particles of a run
         return a
-    return a.gather(1, ancestors.reshape(*ancestors.shape, *[1] * (a.dim() - 2)).expand(-1, -1, *a.shape[2:]))
+    (runs, n, *rest), dims = a.shape, a.dim()
+    first = a.permute(*range(2, dims), 0, 1)
+    if rest and first.is_contiguous():  # a window whose particles come last in memory, and shall stay there
+        flat = ancestors + n * torch.arange(runs, device=a.device)[:, None]
+        picked = first.reshape(math.prod(rest), runs * n).index_select(1, flat.flatten())
+        return picked.reshape(*rest, *ancestors.shape).permute(dims - 2, dims - 1, *range(dims - 2))
+    return a.gather(1, ancestors.reshape(*ancestors.shape, *[1] * len(rest)).expand(-1, -1, *rest))

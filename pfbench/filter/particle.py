@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, Info, weights
+from pfbench.filter.guided import Guided, GuidedParticles
+from pfbench.filter.moves import Keeper, Move, Named, together
+from pfbench.filter.points import Independent, Points
 from pfbench.filter.preferences import Preference, Weights
 from pfbench.filter.proposals import Bootstrap, Proposal
 from pfbench.filter.resamplers import Resample, Resampler, Systematic
@@ -29,15 +32,6 @@ class Stage(Protocol):
         """Does the cloud that it leaves still target what it should, as N grows?"""
 
 
-class Move(Protocol):
-    """A rejuvenation of the runs that were refreshed, from what the cloud carries in its window; acceptance rate [R]."""
-
-    @property
-    def exact(self) -> bool: ...
-
-    def __call__(self, model: StateSpaceModel, cloud: Cloud, hit: Tensor, draws: Draws) -> tuple[Cloud, Tensor]: ...
-
-
 @dataclass(frozen=True)
 class ParticleFilter:
     """A recipe; it holds no particles.
@@ -48,9 +42,11 @@ class ParticleFilter:
     Args:
         particles: N, the number of slots.
         resampler, size, preference, moves, proposal, weigh: the stages; the defaults make the SIR filter.
+        points: where the particles of the initial law come from; stages have points of their own.
 
     Raises:
-        ValueError: fewer than two particles.
+        ValueError: fewer than two particles; moves of a past after a resampler that does not copy particles with theirs, or
+            that cannot share one.
     """
 
     particles: int
@@ -60,10 +56,14 @@ class ParticleFilter:
     moves: tuple[Move, ...] = ()
     proposal: Proposal = field(default_factory=Bootstrap)
     weigh: Weighing = field(default_factory=Bayes)
+    points: Points = field(default_factory=Independent)
 
     def __post_init__(self) -> None:
         if self.particles < 2:
             raise ValueError(f"filter.particles={self.particles}: give at least 2 particles")
+        if self.keeper is not None and not isinstance(self.resampler, Resample):
+            name = type(self.resampler).__name__
+            raise ValueError(f"filter.resampler={name}: moves need particles that are copied with their past; choose Resample")
 
     @property
     def exact(self) -> bool:
@@ -71,12 +71,20 @@ class ParticleFilter:
         stages: list[Stage] = [self.resampler, *self.moves, self.proposal, self.weigh]
         return all(stage.exact for stage in stages)
 
+    @property
+    def keeper(self) -> Keeper | None:
+        """What particles carry of their past: exactly what the moves ask for."""
+        return together(self.moves)
+
     def init(
         self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None, spread: Tensor | None = None
     ) -> Cloud:
         """N equally weighted particles of the initial law, drawn by its Cholesky factor or its scales."""
-        law = initial_law(model, runs, spread)
-        z = draws.normal("initial", self.particles, model.chart.dimension)
+        law: Any = initial_law(model, runs, spread)
+        memory: dict[str, Tensor] = {}
+        if isinstance(self.proposal, Guided | GuidedParticles):  # its guide starts from the law, not from particles of it
+            memory = self.proposal.begin(model, runs, draws, start, spread)
+        z = self.points(draws).normal("initial", self.particles, model.chart.dimension)
         if isinstance(law, torch.distributions.MultivariateNormal):
             spread = z @ law.scale_tril.mT
         else:
@@ -86,7 +94,13 @@ class ParticleFilter:
         first = self.size.first(self.particles)
         log_w = torch.full(x.shape[:2], -math.log(first), dtype=x.dtype, device=x.device)
         log_w[:, first:] = -torch.inf
-        return Cloud(x=x, log_w=log_w, log_z=torch.zeros_like(log_w[:, 0], dtype=torch.float64))
+        cloud = Cloud(x=x, log_w=log_w, log_z=torch.zeros_like(log_w[:, 0], dtype=torch.float64), memory=memory)
+        if self.keeper is None:
+            return cloud
+        dense = isinstance(law, torch.distributions.MultivariateNormal)
+        covariance = law.covariance_matrix if dense else torch.diag_embed(law.variance)
+        mean = model.chart.add(origin, law.mean)
+        return self.keeper.begin(model, cloud, mean.expand(runs, -1), covariance.expand(runs, -1, -1))
 
     def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud, Info]:
         """The cloud at t-1 and what is seen at t -> the weighted cloud at t."""
@@ -94,13 +108,16 @@ class ParticleFilter:
         log_a = self.preference(model, belief, seen)
         cloud, trace["resampled"] = self.resampler(model, belief, log_a, self.size(belief), draws)
         for i, move in enumerate(self.moves):
-            cloud, trace[f"accepted_{i}"] = move(model, cloud, trace["resampled"], draws)
-        x, log_ratio, memory, _ = self.proposal(model, cloud, seen, draws)
+            cloud, trace[f"accepted_{i}"] = move(model, cloud, trace["resampled"], Named(draws, f"move_{i}."))
+        x, log_ratio, memory, w = self.proposal(model, cloud, seen, draws)
         log_w = self.weigh(model, cloud.log_w, x, log_ratio, seen)
         x, log_w = bury(x, log_w, cloud.x)
         # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
         log_w, total, trace["ess"] = _normalise(log_w)
+        parents, keeper = cloud, self.keeper
         cloud = cloud._replace(x=x, log_w=log_w, log_z=belief.log_z + total, memory=memory)
+        if keeper is not None:
+            cloud = keeper.follow(model, parents, cloud, w, seen)
         return cloud, summarise(model, cloud, trace)
 
 

@@ -7,7 +7,8 @@ of range: cumulative sums are float64 from N = 1e5 on and their last value is se
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -77,23 +78,74 @@ class Resample:
         return (belief.where(hit, fresh, cloud) if self.threshold < 1.0 else fresh), hit
 
 
+class Smoothing(Protocol):
+    """A density K(e) of d whitened coordinates, the same for e and -e, that smooths a cloud: x + h A e."""
+
+    def bandwidth(self, d: int, n: Tensor) -> Tensor:
+        """The h that is best for n normal particles in d dimensions [R, 1]."""
+
+    def variance(self, d: int) -> float:
+        """Of each coordinate of e."""
+
+    def draw(self, draws: Draws, purpose: str, n: int, d: int) -> Tensor:
+        """e [R, n, d]."""
+
+
+@dataclass(frozen=True)
+class NormalKernel:
+    """K = N(0, I), h = (4/(d+2))^(1/(d+4)) N^(-1/(d+4)) [Silverman 1986; Musso, Oudjane, Le Gland 2001]."""
+
+    def bandwidth(self, d: int, n: Tensor) -> Tensor:
+        return (4.0 / (d + 2)) ** (1.0 / (d + 4)) * n ** (-1.0 / (d + 4))
+
+    def variance(self, d: int) -> float:
+        return 1.0
+
+    def draw(self, draws: Draws, purpose: str, n: int, d: int) -> Tensor:
+        return draws.normal(purpose, n, d)
+
+
+@dataclass(frozen=True)
+class Epanechnikov:
+    """K = (d+2)/(2 c) (1 - |e|^2) on the unit ball, whose volume is c: the kernel of least mean integrated squared error.
+
+    h = (8 (d+4) (2 sqrt(pi))^d / (c N))^(1/(d+4)) [Musso, Oudjane, Le Gland 2001].
+    """
+
+    def bandwidth(self, d: int, n: Tensor) -> Tensor:
+        log_volume = 0.5 * d * math.log(math.pi) - math.lgamma(0.5 * d + 1.0)
+        log_top = math.log(8.0 * (d + 4)) + d * math.log(2.0 * math.sqrt(math.pi)) - log_volume
+        return math.exp(log_top / (d + 4)) * n ** (-1.0 / (d + 4))
+
+    def variance(self, d: int) -> float:
+        return 1.0 / (d + 4)
+
+    def draw(self, draws: Draws, purpose: str, n: int, d: int) -> Tensor:
+        """In a uniform direction; the squared length is Beta(d/2, 2), a product of powers of two uniforms."""
+        e = draws.normal(purpose, n, d)
+        u = draws.uniform(f"{purpose}.length", n, 2).to(e.dtype)
+        return e / e.norm(dim=-1, keepdim=True) * (u[..., :1] ** (1.0 / d) * u[..., 1:] ** (1.0 / (d + 2)))
+
+
 @dataclass(frozen=True)
 class Regularise:
     """Draws from a kernel estimate of the cloud: copies by `inner`, then adds h A e in the chart to the runs it touched.
 
-    Covariance A A' is that of the weighted cloud before resampling; h is the Gaussian kernel's optimal bandwidth
-    (4/(d+2))^(1/(d+4)) N^(-1/(d+4)) [Silverman 1986; Musso, Oudjane, Le Gland 2001] times `scale`.
+    Covariance A A' is that of the weighted cloud before resampling; h is the kernel's optimal bandwidth times `scale`
+    [Musso, Oudjane, Le Gland 2001; Yan et al. 2016, eqs. 7-9, whose eq. 9 prints n - 2 for n + 2 and loses a sign].
 
     Args:
         inner: the resampler that copies.
         scale: factor on the optimal bandwidth; 1/2 for clouds of several modes.
         shrink: pull particles to the mean first, so that the covariance is kept [West 1993; Liu and West 2001]; without it
-            each refresh multiplies the covariance by 1 + h^2.
+            each refresh multiplies the covariance by 1 + h^2 times the kernel's variance.
+        kernel: the law of e.
     """
 
     inner: Resample
     scale: float = 1.0
     shrink: bool = False
+    kernel: Smoothing = field(default_factory=NormalKernel)
     exact = False
 
     def __post_init__(self) -> None:
@@ -106,12 +158,13 @@ class Regularise:
         mean, covariance = moments(model.chart, cloud)
         fresh, hit = self.inner(model, cloud, log_a, n, draws)
         d = covariance.shape[-1]
-        h = self.scale * (4.0 / (d + 2)) ** (1.0 / (d + 4)) * n.to(covariance.dtype) ** (-1.0 / (d + 4))  # [R, 1]
-        step = h.unsqueeze(-1) * (draws.normal("regularise", fresh.x.shape[1], d) @ factor(covariance)[0].mT)
+        h = self.scale * self.kernel.bandwidth(d, n.to(covariance.dtype))  # [R, 1]
+        e = self.kernel.draw(draws, "regularise", fresh.x.shape[1], d)
+        step = h.unsqueeze(-1) * (e @ factor(covariance)[0].mT)
         centre = mean.unsqueeze(1)
         if self.shrink:
-            pulled = torch.sqrt(1.0 - (h * h).clamp(max=1.0)).unsqueeze(-1) * model.chart.subtract(fresh.x, centre)
-            x = model.chart.add(centre, pulled + step)
+            kept = torch.sqrt(1.0 - (self.kernel.variance(d) * h * h).clamp(max=1.0))
+            x = model.chart.add(centre, kept.unsqueeze(-1) * model.chart.subtract(fresh.x, centre) + step)
         else:
             x = model.chart.add(fresh.x, step)
         return fresh._replace(x=torch.where(hit[:, None, None], x, fresh.x)), hit

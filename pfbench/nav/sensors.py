@@ -154,7 +154,8 @@ def markov(
 ) -> Tensor:
     """Three independent first-order Markov processes [R, n, 3]: x' = -x / time + white, of stationary sigma.
 
-    Its driving noise is multiplied by `swell` [n, 1]. Exact at every dt: x_k = e^(-dt/time) x_(k-1) + sigma sqrt(1 - e^(-2 dt/time)) N(0, 1), x_0 in the stationary law.
+    Its driving noise is multiplied by `swell` [n, 1]. Exact at every dt:
+    x_k = e^(-dt/time) x_(k-1) + sigma sqrt(1 - e^(-2 dt/time)) N(0, 1), x_0 in the stationary law.
     """
     if sigma == 0:
         return torch.zeros_like(draws.normal(purpose, 1, 3)).expand(-1, n, 3)

@@ -33,6 +33,10 @@ from pfbench.report.frame import Block, blocks
 
 Results = Mapping[str, store.Result]
 
+_BOUND: Any = {"color": "black", "ls": (0, (3, 1.2)), "lw": 0.8, "zorder": 4}
+_MEDIAN = 0.6745  # of the absolute value of a standard normal number
+
+
 class Drawing(NamedTuple):
     """One figure, drawn when asked for.
 
@@ -72,6 +76,8 @@ def drawings(
         found.append(Drawing("track", text, partial(track, results, row, style)))
     for block in shown:
         text = f"Absolute error of {block.group} over time, median of the {kept}."
+        if any(bound_of(result) is not None for result in results.values()):
+            text += " Dashed black: what the median is of a normal error that reaches the Cramer-Rao bound."
         found.append(Drawing(f"error_{slug(block.group)}", text, partial(error, results, block, style)))
     text = f"RMSE of each run: quartiles, whiskers to 1.5 quartile ranges, one point for each of the {kept}."
     found.append(Drawing("rmse", text, partial(rmse, runs, [block.group for block in shown], style)))
@@ -89,6 +95,8 @@ def drawings(
             f"{label}: error over time, median and 5 to 95 % of the {kept} (shaded), and three times the filter's own "
             f"standard deviation, median over runs (dashed). The first fifth is cut where it dwarfs the rest."
         )
+        if bound_of(result) is not None:
+            text += " Thin black: three times the Cramer-Rao bound."
         found.append(Drawing(f"spread_{slug(label)}", text, partial(spread, result, groups, style[label])))
     return found
 
@@ -120,9 +128,10 @@ def track(results: Results, row: int, style: Mapping[str, Look]) -> Figure:
             continue
         off = result.arrays["error"][row][:, axes[0]].astype(np.float64) * axes[1]
         estimate = result.arrays["track"][row] + off
+        known = ~np.isnan(estimate).any(-1)  # rare steps would leave gaps in which no line shows
         line: Any = {"color": style[label].colour, "ls": style[label].dash, "lw": style[label].width}
-        plan.plot(estimate[:, 0], estimate[:, 1], label=label, **line)
-        height.plot(result.arrays["time"], estimate[:, 2], **line)
+        plan.plot(estimate[known, 0], estimate[known, 1], label=label, **line)
+        height.plot(result.arrays["time"][known], estimate[known, 2], **line)
     plan.set(xlabel="east in m", ylabel="north in m")
     plan.set_aspect("equal", adjustable="datalim")
     height.set(xlabel="time in s", ylabel="height in m")
@@ -134,13 +143,17 @@ def error(results: Results, block: Block, style: Mapping[str, Look]) -> Figure:
     """Median absolute error over time, one panel per component, all filters."""
     figure, panels = stack(len(block.components), 1.3)
     for label, result in results.items():
-        time, values = _kept(result, "error")
+        own = result.meta["state"]["names"]
         for name, axis in zip(block.components, panels, strict=True):
-            own = result.meta["state"]["names"]
             if name in own:
-                middle = quantiles(np.abs(values[..., own.index(name)]) * block.scale, [0.5])[0]
+                time, (values,) = _kept(result, own.index(name), "error")
+                middle = quantiles(np.abs(values) * block.scale, [0.5])[0]
                 look = style[label]
-                axis.plot(time, middle, color=look.colour, ls=look.dash, lw=look.width, label=label)
+                line: Any = {"color": look.colour, "ls": look.dash, "lw": look.width, "marker": _mark(time)}
+                axis.plot(time, middle, label=label, **line)
+    for name, axis in zip(block.components, panels, strict=True):
+        for time, sd in _bounds(results, name):
+            axis.plot(time, _MEDIAN * sd * block.scale, label="Cramer-Rao bound", marker=_mark(time), **_BOUND)
     for name, axis in zip(block.components, panels, strict=True):
         axis.set(title=name, ylabel=labelled("|error|", block.unit))
         log_if_wide(axis, axis.yaxis, [np.asarray(line.get_ydata()) for line in axis.lines])
@@ -160,19 +173,21 @@ def spread(result: store.Result, groups: Sequence[str], look: Look) -> Figure:
     columns = max(len(own) for _, own in rows)
     figure = Figure(figsize=(max(COLUMN, 2.4 * columns), 0.2 + 1.45 * len(rows)), layout="constrained")
     panels = figure.subplots(len(rows), columns, squeeze=False, sharex=True)
-    time, errors = _kept(result, "error")
-    _, sd = _kept(result, "sd")
     for line, (block, own) in zip(panels, rows, strict=True):
         for axis, k in zip(line, own, strict=False):
             place = block.places[k]
-            low, middle, high = quantiles(errors[..., place] * block.scale, [0.05, 0.5, 0.95])
-            bound = 3 * quantiles(sd[..., place] * block.scale, [0.5])[0]
+            time, (errors, sds) = _kept(result, place, "error", "sd")
+            low, middle, high = quantiles(errors * block.scale, [0.05, 0.5, 0.95])
+            own_sd = 3 * quantiles(sds * block.scale, [0.5])[0]
             axis.fill_between(time, low, high, color=look.colour, alpha=0.3, lw=0, label="5 to 95 % of runs")
-            axis.plot(time, middle, color=look.colour, lw=1, label="median error")
-            axis.plot(time, bound, color="0.15", ls="--", lw=0.9, label="3 sigma of the filter")
-            axis.plot(time, -bound, color="0.15", ls="--", lw=0.9)
+            axis.plot(time, middle, color=look.colour, lw=1, label="median error", marker=_mark(time))
+            axis.plot(time, own_sd, color=look.colour, ls="--", lw=1, label="3 sigma of the filter", marker=_mark(time))
+            axis.plot(time, -own_sd, color=look.colour, ls="--", lw=1, marker=_mark(time))
+            for instants, sd in _bounds({"": result}, block.components[k]):
+                for sign in (1, -1):
+                    axis.plot(instants, sign * 3 * sd * block.scale, label="3 sigma of the bound" if sign > 0 else "", **_BOUND)
             axis.set_title(block.components[k])
-            zoom(axis, [low, high, bound, -bound])
+            zoom(axis, [low, high, own_sd, -own_sd])
         line[0].set_ylabel(labelled("error", block.unit))
         for axis in line[len(own) :]:
             axis.set_visible(False)
@@ -246,10 +261,10 @@ def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alp
                 dof = len(own[group])
                 place = list(own).index(group)
                 found = metrics.consistency(result.arrays["nees"][..., place], result.arrays["lost"], dof, alpha)
-                thin = thinned(result.arrays["time"].size)
+                thin = _thin(found.runs_at > 0)
                 time = result.arrays["time"][thin]
                 look = style[label]
-                line: Any = {"color": look.colour, "ls": look.dash, "lw": 0.8 * look.width}
+                line: Any = {"color": look.colour, "ls": look.dash, "lw": 0.8 * look.width, "marker": _mark(time)}
                 axis.plot(time, found.average[thin], label=label, **line)
                 lines.append(found.average)
                 bands.append((found.runs, time, found.low[thin], found.high[thin], dof))
@@ -269,7 +284,7 @@ def ess(results: Results, style: Mapping[str, Look]) -> Figure:
     figure, (axis,) = stack(1, 2.2)
     for label, result in results.items():
         if "ess" in result.arrays and result.meta.get("particles"):
-            time, values = _kept(result, "ess")
+            time, (values,) = _kept(result, None, "ess")
             low, middle, high = quantiles(100 * values / result.meta["particles"], [0.05, 0.5, 0.95])
             axis.fill_between(time, low, high, color=style[label].colour, alpha=0.18, lw=0)
             axis.plot(time, middle, color=style[label].colour, ls=style[label].dash, label=label)
@@ -279,10 +294,42 @@ def ess(results: Results, style: Mapping[str, Look]) -> Figure:
     return figure
 
 
-def _kept(result: store.Result, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Instants and values of the runs that were not lost, thinned."""
-    thin = thinned(result.arrays["time"].size)
-    return result.arrays["time"][thin], result.arrays[name][~result.arrays["lost"]][:, thin].astype(np.float64)
+def bound_of(result: store.Result) -> np.ndarray | None:
+    """Standard deviations [T, d] of the Cramer-Rao bound, where the job has one."""
+    return result.arrays.get("bound")
+
+
+def _bounds(results: Results, component: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Instants at which the component is scored and the bound there: at most one, for all filters see the same worlds."""
+    for result in results.values():
+        sd, own = bound_of(result), result.meta["state"]["names"]
+        if sd is not None and component in own:
+            place = own.index(component)
+            thin = _thin(~np.isnan(result.arrays["error"][..., place]).all(0))
+            return [(result.arrays["time"][thin], sd[thin, place].astype(np.float64))]
+    return []
+
+
+def _kept(result: store.Result, place: int | None, *names: str) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Instants and values [R, T] of the runs that were not lost, thinned; of one place in the state, or of a whole trace.
+
+    Instants at which no run knows the first of them are left out before: where truth is rare, thinning would miss it.
+    """
+    kept = ~result.arrays["lost"]
+    values = [result.arrays[name][kept] if place is None else result.arrays[name][kept][..., place] for name in names]
+    thin = _thin(~np.isnan(values[0]).all(0))
+    return result.arrays["time"][thin], [value[:, thin].astype(np.float64) for value in values]
+
+
+def _thin(known: np.ndarray) -> np.ndarray:
+    """Indices of the instants drawn, of those that are known [T]."""
+    there = np.flatnonzero(known)
+    return there[thinned(there.size)]
+
+
+def _mark(time: np.ndarray) -> str:
+    """One instant makes no line."""
+    return "." if time.size == 1 else ""
 
 
 def _all_blocks(results: Results) -> list[Block]:

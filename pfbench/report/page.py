@@ -94,7 +94,7 @@ def write(
     found = cells(study, results, mixed=options.mixed)
     groups = _groups(found, options.groups)
     folder = Path(out) / study
-    _clear(folder)
+    clear(folder)
     style = looks(sorted((job.label for cell in found for job in cell.jobs), key=natural))
     sections, decided = [], []
     for cell in tqdm(found, desc=f"report {study}", disable=None, delay=2):
@@ -110,12 +110,17 @@ def write(
         "shared": _shared(found),
         "choices": _choices(found),
         "failures": store.failures(Path(results) / study),
-        "css": (_HERE / "style.css").read_text(encoding="utf-8"),
     }
     text = json.dumps([_plain(verdict) for verdict in decided], indent=1, allow_nan=False)
     (folder / "verdicts.json").write_text(text + "\n", encoding="utf-8")
-    for template, name in (("page.md.jinja", "report.md"), ("page.html.jinja", "index.html")):
-        page = _environment().get_template(template).render(context)
+    return render("page", folder, context)
+
+
+def render(template: str, folder: Path, context: Mapping[str, Any]) -> Path:
+    """Writes index.html and report.md by the templates of that name; returns the first."""
+    css = (_HERE / "style.css").read_text(encoding="utf-8")
+    for kind, name in (("md", "report.md"), ("html", "index.html")):
+        page = _environment().get_template(f"{template}.{kind}.jinja").render({**context, "css": css})
         (folder / name).write_text(page, encoding="utf-8")
     return folder / "index.html"
 
@@ -125,8 +130,9 @@ def _section(
 ) -> tuple[dict[str, Any], list[Verdict]]:
     """What the templates need of one cell; writes its figures and tables."""
     whole = {job.label: job.load() for job in cell.jobs}
-    used = {label: later(result, options.from_time) for label, result in whole.items()}
-    runs = pd.concat([tidy(cell, job, whole[job.label], options.from_time, options.converged) for job in cell.jobs])
+    used = {label: _later(result, options.from_time) for label, result in whole.items()}
+    bare = {label: _apart(result)[0] for label, result in whole.items()}
+    runs = pd.concat([tidy(cell, job, bare[job.label], options.from_time, options.converged) for job in cell.jobs])
     known = [group for group in groups if _scored(used, group)]
     runs = runs[runs.group.isin(known)]
     decided = verdicts(runs, options.alpha)
@@ -136,25 +142,40 @@ def _section(
         own = [v for v in decided if v.group == group]
         accuracy = tables.accuracy(used, group, own, options.alpha, options.converged.get(group))
         if len(accuracy):
-            _table(folder, f"{prefix}_{slug(group)}", accuracy)
+            save_table(folder, f"{prefix}_{slug(group)}", accuracy)
             pairs = tables.decisions(own)
             if own:
-                _table(folder, f"{prefix}_{slug(group)}_pairs", pairs)
+                save_table(folder, f"{prefix}_{slug(group)}_pairs", pairs)
             shown = sum(v.winner != NO_DIFFERENCE for v in own)
             said = {"unbeaten": _unbeaten(own), "shown": shown, "n": len(own)}
             parts.append({"name": group, "accuracy": accuracy, "pairs": pairs, **said})
     ran = tables.overview(used)
-    _table(folder, f"{prefix}_overview", ran)
-    drawn = [
-        _drawn(drawing, prefix, folder, options.formats)
+    save_table(folder, f"{prefix}_overview", ran)
+    pictures = [
+        drawn(drawing, prefix, folder, options.formats)
         for drawing in figures.drawings(whole, runs, style, known, options.alpha)
     ]
     lost = [(label, int(result.arrays["lost"].sum()), result.meta["runs"]) for label, result in whole.items()]
     gone = [(label, int(tables.diverged(result).sum()), result.meta["runs"]) for label, result in used.items()]
-    section = {"name": cell.name, "anchor": prefix, "overview": ran, "parts": parts, "drawings": drawn}
+    section = {"name": cell.name, "anchor": prefix, "overview": ran, "parts": parts, "drawings": pictures}
     there = {block.group for result in used.values() for block in blocks(result.meta["state"])}
     section["unscored"] = [group for group in groups if group in there and group not in known]
+    section["bounds"] = _distinct(result.meta["bound"] for result in whole.values() if "bound" in result.meta)
     return {**section, "lost": [row for row in lost if row[1]], "diverged": [row for row in gone if row[1]]}, decided
+
+
+def _apart(result: store.Result) -> tuple[store.Result, dict[str, Any]]:
+    """The result without, and alone, what all runs have in common: [T, ...], where the others are [R, T, ...]."""
+    common: dict[str, Any] = {name: result.arrays[name] for name in ("bound", "range") if name in result.arrays}
+    return store.Result(result.meta, {k: v for k, v in result.arrays.items() if k not in common}), common
+
+
+def _later(result: store.Result, from_time: float) -> store.Result:
+    """The same without the instants before, see `frame.later`."""
+    bare, common = _apart(result)
+    cut = later(bare, from_time)
+    left = result.arrays["time"].size - cut.arrays["time"].size
+    return store.Result(cut.meta, {**cut.arrays, **{name: value[left:] for name, value in common.items()}})
 
 
 def _scored(results: Mapping[str, store.Result], group: str) -> bool:
@@ -167,7 +188,8 @@ def _scored(results: Mapping[str, store.Result], group: str) -> bool:
     return False
 
 
-def _drawn(drawing: figures.Drawing, prefix: str, folder: Path, formats: Sequence[str]) -> dict[str, Any]:
+def drawn(drawing: figures.Drawing, prefix: str, folder: Path, formats: Sequence[str]) -> dict[str, Any]:
+    """What the templates need of one figure; writes its files."""
     paths = figures.save(drawing._replace(name=f"{prefix}_{drawing.name}"), folder / "figures", formats)
     first = min(paths, key=lambda path: path.suffix)
     data = base64.b64encode(first.read_bytes()).decode("ascii")
@@ -180,13 +202,14 @@ def _drawn(drawing: figures.Drawing, prefix: str, folder: Path, formats: Sequenc
     }
 
 
-def _table(folder: Path, name: str, table: pd.DataFrame) -> None:
+def save_table(folder: Path, name: str, table: pd.DataFrame) -> None:
+    """As CSV and LaTeX."""
     (folder / "tables").mkdir(parents=True, exist_ok=True)
     (folder / "tables" / f"{name}.csv").write_text(tables.csv(table), encoding="utf-8")
     (folder / "tables" / f"{name}.tex").write_text(tables.latex(table), encoding="utf-8")
 
 
-def _clear(folder: Path) -> None:
+def clear(folder: Path) -> None:
     """Removes what an earlier report drew, so that no figure of a cell that is gone stays behind."""
     for pattern in ("figures/*.svg", "figures/*.png", "tables/*.csv", "tables/*.tex"):
         for path in folder.glob(pattern):

@@ -14,6 +14,7 @@ from pfbench.report.frame import Block, blocks
 from pfbench.report.significance import NO_DIFFERENCE, Verdict
 
 Results = Mapping[str, store.Result]
+_LAST = 20  # steps over which a location is said to have settled [Pu and Qin, section 4]
 
 
 def overview(results: Results) -> pd.DataFrame:
@@ -177,6 +178,13 @@ def _accuracy(result: store.Result, block: Block, alpha: float, bound: float | N
         "band at an instant": f"{number(float(low))} to {number(float(high))}",
         "instants in band in %": 100 * found.inside,
     }
+    if "bound" in arrays:
+        floor = arrays["bound"][:, block.places].astype(np.float64) * block.scale
+        row["RMSE norm to Cramer-Rao bound"] = metrics.over_bound(error, lost, floor)
+    if "range" in arrays and block.whole == "position":
+        for name, last in (("mean", None), (f"last {_LAST} steps", _LAST)):
+            share = metrics.relative_error(error[..., :2] / block.scale, lost, arrays["range"], last)
+            row[f"error in % of range, {name}"] = 100 * float(share.value)
     if bound is not None:
         when = metrics.convergence_time(arrays["time"], error, lost, bound)
         row[f"median time to {bound:g} {block.unit} in s"] = float(np.median(when[~np.isnan(when)]))

@@ -1,0 +1,470 @@
+"""Guided proposals: exact ratios, the Kalman filter where it applies, off switches, and the pitfalls that are known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from test_particle_filters import CASES, WALK, WALK_Y, Drifting, Spiky, check_unbiased, kalman, run
+from torch import Tensor
+from torch.distributions import Independent, MultivariateNormal, Normal, StudentT
+
+from pfbench.draws import MonteCarlo
+from pfbench.filter.adaptations import AdaptiveFactor, ConstrainedNoise, Fading, RatioBound
+from pfbench.filter.belief import Cloud, ess, moments
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.guided import Guided, GuidedNoise, GuidedParticles
+from pfbench.filter.loop import Estimate, run_filter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.points import Sobol
+from pfbench.filter.preferences import Additive, Entropy, Flattened, Form, Mix, Temper
+from pfbench.filter.proposals import Bootstrap, Proposal
+from pfbench.filter.resamplers import Resample, Systematic
+from pfbench.filter.rules import Axis3, Cubature, Jacobian, Points, Product, Radial3, Radial5, Simplex3, Unscented
+from pfbench.filter.sizes import EssStep
+from pfbench.model.base import StateSpaceModel
+from pfbench.model.linear import LinearGaussian
+from pfbench.model.toys import Clock, Growth, Lorenz63, Pendulum
+from pfbench.record import Record
+
+EKF, UKF, CKF = GaussianFilter(Jacobian()), GaussianFilter(Points(Unscented())), GaussianFilter(Points(Cubature()))
+MSSR = Points(Product(Simplex3(), Radial5()))
+COFM = GaussianFilter(MSSR, (Fading(), ConstrainedNoise()), (AdaptiveFactor(), RatioBound()))
+ALWAYS = Resample(Systematic(), 1.0)
+
+
+def lg5() -> tuple[LinearGaussian, Tensor]:
+    """Five states, two measurements, 20 steps: A of spectral radius 0.95, Q = 0.3 I, R = 0.5 I; and one record of it [20, 2]."""
+    rng = np.random.default_rng(5)
+    a = rng.normal(size=(5, 5))
+    a *= 0.95 / np.abs(np.linalg.eigvals(a)).max()
+    h = rng.normal(size=(2, 5))
+    model = LinearGaussian(a, math.sqrt(0.3) * np.eye(5), h, [math.sqrt(0.5)] * 2, np.zeros(5), np.ones(5))
+    x, rows = rng.normal(size=5), []
+    for _ in range(20):
+        x = a @ x + math.sqrt(0.3) * rng.normal(size=5)
+        rows.append(h @ x + math.sqrt(0.5) * rng.normal(size=2))
+    return model, torch.tensor(np.array(rows))
+
+
+def tracker(sensors: int = 4) -> tuple[LinearGaussian, Tensor]:
+    """Two states seen by more sensors than there are states, so that R can be told: some steps, the last ones in large noise."""
+    rng = np.random.default_rng(1)
+    h = rng.normal(size=(sensors, 2))
+    model = LinearGaussian([[1.0, 1.0], [0.0, 1.0]], [[0.5, 0.0], [0.2, 0.3]], h, [1.0] * sensors, [0.0, 0.0], [2.0, 1.0])
+    x, rows = np.array([1.0, 0.5]), []
+    for t in range(12):
+        x = np.array([x[0] + x[1], x[1]]) + 0.3 * rng.normal(size=2)
+        rows.append(h @ x + (4.0 if t > 5 else 1.0) * rng.normal(size=sensors))
+    return model, torch.tensor(np.array(rows))
+
+
+def cloud_of(method: ParticleFilter, model: StateSpaceModel, runs: int, seed: int = 1) -> tuple[Cloud, MonteCarlo]:
+    draws = MonteCarlo(seed, torch.arange(runs))
+    return method.init(model, runs, draws.at(0)), draws.at(1)
+
+
+def same(a: Estimate, b: Estimate) -> bool:
+    return torch.equal(a.mean, b.mean) and torch.equal(a.variance, b.variance) and torch.equal(a.log_evidence, b.log_evidence)
+
+
+# noise given parent and measurement
+
+
+@pytest.mark.parametrize("guide", [EKF, UKF], ids=["ekf", "ukf"])
+@pytest.mark.parametrize("case", CASES)
+def test_guided_noise_is_unbiased(case: str, guide: GaussianFilter) -> None:
+    model, y, exact = CASES[case]()
+    method = ParticleFilter(40, Resample(Systematic(), 0.7), proposal=GuidedNoise(guide))
+    assert method.exact
+    check_unbiased(method, model, y, exact, runs=1000)
+
+
+@pytest.mark.parametrize("options", [{"shared": True}, {"widen": 1.6}, {"shared": True, "widen": 2.0}, {"points": Sobol()}])
+def test_guided_noise_is_unbiased_whatever_its_options(options: dict[str, Any]) -> None:
+    model, y, exact = CASES["growth"]()
+    method = ParticleFilter(60, Resample(Systematic(), 0.7), proposal=GuidedNoise(CKF, **options))
+    check_unbiased(method, model, y, exact, runs=1000)
+
+
+@pytest.mark.parametrize("kind", [Drifting, Spiky])
+def test_the_ratio_of_any_law_of_noise_is_one_on_average(kind: type[LinearGaussian]) -> None:
+    """E_q[p / q] = 1, and E_q[w p / q] is the mean of p. The wide proposal keeps the variance of p / q finite."""
+    model = kind([[0.5]], [[1.0]], [[1.0]], [2.0], [0.0], [1.0])
+    stage = GuidedNoise(EKF, widen=4.0)
+    cloud, draws = cloud_of(ParticleFilter(100_000, proposal=stage), model, 2)
+    _, log_ratio, _, w = stage(model, cloud, Record(torch.full((2, 1), 1.5, dtype=torch.float64)), draws)
+    assert w is not None
+    for value, expected in ((log_ratio.exp(), 1.0), (log_ratio.exp() * w[..., 0], 0.4)):
+        assert abs(value.mean() - expected) < 4.5 * value.std() / math.sqrt(value.numel())
+
+
+@pytest.mark.parametrize("guide", [EKF, UKF, CKF], ids=["ekf", "ukf", "ckf"])
+@pytest.mark.parametrize("shared", [False, True])
+def test_guided_noise_is_optimal_on_linear_models(shared: bool, guide: GaussianFilter) -> None:
+    """The weight is p(y | parent), whichever child was drawn."""
+    model, _, _ = CASES["singular"]()
+    assert isinstance(model, LinearGaussian)
+    model.linear = shared
+    stage = GuidedNoise(guide)
+    cloud, draws = cloud_of(ParticleFilter(50, proposal=stage), model, 3)
+    y = torch.tensor([[2.0, 1.0], [0.5, math.nan], [math.nan, math.nan]], dtype=torch.float64)
+    x, log_ratio, _, w = stage(model, cloud, Record(y), draws)
+    total = log_ratio + model.log_likelihood(y, x, ())
+    s = model.h @ model.g @ (model.h @ model.g).mT + torch.diag(model.r**2)
+    y_hat = cloud.x @ (model.h @ model.f).mT
+    both = MultivariateNormal(y_hat[0], s).log_prob(y[0])
+    first = Normal(y_hat[1, :, 0], s[0, 0].sqrt()).log_prob(y[1, 0])
+    torch.testing.assert_close(total, torch.stack([both, first, torch.zeros_like(first)]), rtol=0, atol=1e-10)
+    assert w is not None
+    torch.testing.assert_close(x, model.propagate(cloud.x, (), w))
+    torch.testing.assert_close(w[2], draws.normal("guide", 50, 1)[2])  # nothing seen: the model's own noise
+
+
+def test_nothing_is_guided_where_nothing_moves() -> None:
+    model, y, _ = CASES["level seen at once"]()
+    guided = run(ParticleFilter(30, proposal=GuidedNoise(EKF)), model, y[:1], runs=4)
+    plain = run(ParticleFilter(30), model, y[:1], runs=4)
+    torch.testing.assert_close(guided.log_evidence, plain.log_evidence)
+
+
+def test_a_guide_without_a_root_proposes_from_the_prior() -> None:
+    """A measurement law so wrong that it has no covariance must not make a particle's ratio anything but p / q."""
+
+    class Broken(Growth):
+        def observation(self, x: Tensor, u: Any) -> Any:
+            law: Any = super().observation(x, u)
+            return Independent(Normal(law.mean, torch.where(law.mean > 1.0, torch.nan, 4.0), validate_args=False), 1)
+
+    stage = GuidedNoise(EKF)
+    cloud, draws = cloud_of(ParticleFilter(50, proposal=stage), Broken(), 2)
+    sent = stage(Broken(), cloud, Record(torch.ones(2, 1, dtype=torch.float64), Clock(torch.ones(1))), draws)
+    assert sent.w is not None
+    own = sent.w == draws.normal("guide", 50, 1)
+    assert own.any()
+    assert torch.isfinite(sent.log_ratio).all()
+    assert (sent.log_ratio[own[..., 0]] == 0.0).all()
+
+
+@pytest.mark.parametrize("guide", [COFM, replace(EKF, iterations=2), GaussianFilter(MSSR, gains=(AdaptiveFactor(),))])
+def test_guided_noise_refuses_what_it_would_ignore(guide: GaussianFilter) -> None:
+    with pytest.raises(ValueError, match="leave out adaptations, gains and iterations"):
+        GuidedNoise(guide)
+
+
+# one guide for the cloud
+
+
+def gaussian(method: GaussianFilter, model: StateSpaceModel, y: Tensor, runs: int = 3, **options: Any) -> Estimate:
+    draws = MonteCarlo(1, torch.arange(runs))
+    return run_filter(method, model, Record(y.expand(runs, -1, -1), *options.values()), draws)
+
+
+@pytest.mark.parametrize("case", ["singular", "level seen at once"])
+def test_guided_is_the_kalman_filter_on_linear_models(case: str) -> None:
+    """All weights are equal, every step's evidence is exact, and matched draws have Kalman's mean and covariance."""
+    model, y, exact = CASES[case]()
+    estimate = run(ParticleFilter(20, ALWAYS, proposal=Guided(CKF, matched=True)), model, y, runs=3)
+    variance = torch.tensor(exact.square - exact.mean**2)
+    torch.testing.assert_close(estimate.mean[:, -1], torch.tensor(exact.mean).expand(3, -1), rtol=0, atol=1e-9)
+    torch.testing.assert_close(estimate.variance[:, -1], variance.expand(3, -1), rtol=0, atol=1e-9)
+    torch.testing.assert_close(estimate.log_evidence, torch.full((3,), exact.log_z, dtype=torch.float64), rtol=0, atol=1e-9)
+    assert (estimate.trace["ess"] - 20.0).abs().max() < 1e-8
+
+
+def test_the_guide_may_doubt_its_noise_and_the_weights_stay_equal() -> None:
+    model, y = tracker()
+    own = gaussian(COFM, model, y)
+    guided = run(ParticleFilter(40, ALWAYS, proposal=Guided(COFM, matched=True)), model, y, runs=3)
+    assert own.trace["r"].max() > 2.0  # or the test would be of nothing
+    torch.testing.assert_close(guided.mean, own.mean, rtol=0, atol=1e-9)
+    torch.testing.assert_close(guided.log_evidence, own.log_evidence, rtol=0, atol=1e-8)
+    assert (guided.trace["ess"] - 40.0).abs().max() < 1e-7
+    doubted = run(ParticleFilter(40, ALWAYS, proposal=Guided(COFM, "nominal", matched=True)), model, y, runs=3)
+    assert doubted.trace["ess"].min() < 20.0
+
+
+def test_the_nominal_target_has_the_model_s_evidence_at_the_first_step() -> None:
+    """With a guide that doubts its noise, E[Z_hat] is p(y) of the model as it is, and not of the model as adapted."""
+    model, y = tracker()
+    y = 6.0 * y[:1]
+    exact = kalman(model, y)
+    estimate = run(ParticleFilter(200, proposal=Guided(COFM, "nominal")), model, y, runs=1000)
+    ratio = torch.exp(estimate.log_evidence - exact.log_z)
+    assert abs(ratio.mean() - 1.0) < 4.5 * ratio.std() / math.sqrt(1000)
+    adapted = run(ParticleFilter(200, proposal=Guided(COFM)), model, y, runs=2)
+    assert abs(adapted.log_evidence[0] - exact.log_z) > 0.5
+
+
+@pytest.mark.parametrize("target", ["adapted", "nominal"])
+@pytest.mark.parametrize("model", [Lorenz63(), Pendulum()], ids=["lorenz", "pendulum"])
+def test_the_ratio_is_that_of_the_densities(model: StateSpaceModel, target: Any) -> None:
+    """Against torch's densities, on a nonlinear model, after a step that has given the guide something to doubt."""
+    dy = 3 if isinstance(model, Lorenz63) else 1
+    doubts = Fading(1.3), ConstrainedNoise(0.9, free_below=10.0)
+    guide = replace(COFM, adaptations=doubts, gains=(AdaptiveFactor(0.5),))
+    stage = Guided(guide, target, widen=1.7)
+    method = ParticleFilter(30, ALWAYS, proposal=stage)
+    cloud, draws = cloud_of(method, model, 2)
+    seen = Record(torch.full((2, dy), 9.0 if dy == 3 else 1.4, dtype=torch.float64))
+    cloud, _ = method.step(model, cloud, seen, draws)
+    x, log_ratio, _, _ = stage(model, cloud, seen, draws.at(2))
+    before = stage._before(model, cloud)
+    new, plain = guide.advance(model, before, seen), GaussianFilter(guide.rule).advance(model, before, seen)
+
+    def density(centre: Tensor, root: Tensor, scale: float = 1.0) -> Tensor:
+        difference = model.chart.subtract(x, centre.unsqueeze(1))
+        law = MultivariateNormal(torch.zeros_like(centre).unsqueeze(1), scale * (root @ root.mT).unsqueeze(1))
+        return law.log_prob(difference)
+
+    prior = density(new.prior, (new if target == "adapted" else plain).prior_root)
+    likelihood = model.log_likelihood(seen.y, x, ())
+    if target == "adapted":
+        law: Any = model.observation(x, ())
+        likelihood = MultivariateNormal(law.mean, new.innovation.noise.unsqueeze(1)).log_prob(seen.y.unsqueeze(1))
+        assert (new.innovation.noise > 1.2 * new.innovation.nominal).any()
+    expected = prior + likelihood - density(new.mean, new.root, 1.7) - math.log(30)
+    got = log_ratio + cloud.log_w + model.log_likelihood(seen.y, x, ())
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-7)
+
+
+def test_the_guide_starts_where_the_record_starts() -> None:
+    model, y = WALK, WALK_Y
+    start = torch.tensor([[5.0, 1.0], [-3.0, 2.0]], dtype=torch.float64)
+    spread = torch.tensor([[[0.5, 0.0], [0.1, 0.2]], [[3.0, 0.0], [0.0, 1.0]]], dtype=torch.float64)
+    record = Record(y.expand(2, -1, -1), (), start, spread)
+    draws = MonteCarlo(1, torch.arange(2))
+    own = run_filter(CKF, model, record, draws)
+    guided = run_filter(ParticleFilter(10, ALWAYS, proposal=Guided(CKF, matched=True)), model, record, draws)
+    torch.testing.assert_close(guided.mean, own.mean, rtol=0, atol=1e-9)
+    torch.testing.assert_close(guided.log_evidence, own.log_evidence, rtol=0, atol=1e-9)
+    assert abs(own.mean[0] - own.mean[1]).max() > 0.1
+
+
+def test_a_run_s_guide_does_not_know_of_the_others() -> None:
+    model, y = tracker()
+    many = torch.stack([y, 2.0 * y, y + 1.0])
+    method = ParticleFilter(30, ALWAYS, EssStep(5, 0.5, 10, 30, 20), Entropy(), proposal=Guided(COFM, "nominal"))
+    all_three = run(method, model, many)
+    alone = run_filter(method, model, Record(many[1:2]), MonteCarlo(1, torch.tensor([1])))
+    torch.testing.assert_close(all_three.mean[1:2], alone.mean)
+    torch.testing.assert_close(all_three.log_evidence[1:2], alone.log_evidence)
+
+
+def test_a_run_whose_guide_fails_is_lost_and_counted() -> None:
+    spread = torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
+    spread[1] = torch.nan
+    method = ParticleFilter(20, ALWAYS, proposal=Guided(COFM))
+    record = Record(WALK_Y.expand(3, -1, -1), (), torch.zeros(3, 2, dtype=torch.float64), spread)
+    estimate = run_filter(method, WALK, record, MonteCarlo(1, torch.arange(3)))
+    assert estimate.lost.tolist() == [False, True, False]
+    assert torch.isnan(estimate.mean[1]).all()
+    assert torch.isfinite(estimate.mean[[0, 2]]).all()
+
+
+def test_an_adapted_noise_needs_a_normal_law() -> None:
+    class Heavy(LinearGaussian):
+        def observation(self, x: Tensor, u: Any) -> Any:
+            return Independent(StudentT(4.0, x @ self.h.mT, self.r.expand(*x.shape[:2], -1)), 1)
+
+    linear, y = tracker()
+    model = Heavy(linear.f, linear.g, linear.h, linear.r, linear.m0, [2.0, 1.0])
+    with pytest.raises(ValueError, match="choose target=nominal"):
+        run(ParticleFilter(20, proposal=Guided(COFM)), model, y, runs=2)
+    for stage in (Guided(COFM, "nominal"), Guided(replace(COFM, adaptations=(Fading(1.1),)))):
+        assert not run(ParticleFilter(20, proposal=stage), model, y, runs=2).lost.any()
+
+
+# off switches: the same random stream, the same numbers
+
+
+def test_off_switches_are_exact() -> None:
+    model, y = Growth(), CASES["growth"]()[1]
+    clock = Clock(torch.arange(1.0, 7.0, dtype=torch.float64)[None])
+
+    def estimate(guide: GaussianFilter, **stages: Any) -> Estimate:
+        return run(ParticleFilter(60, ALWAYS, proposal=Guided(guide), **stages), model, y, runs=5, u=clock)
+
+    plain = estimate(GaussianFilter(MSSR))
+    assert same(plain, estimate(GaussianFilter(MSSR), size=EssStep(0, 0.5, 10, 60, 60), preference=Entropy(Temper(0.0))))
+    for form in (Temper(0.0), Additive(0.0), Mix(0.0)):
+        assert same(plain, estimate(GaussianFilter(MSSR), weigh=Flattened(form)))
+    off = (Fading(1.0), ConstrainedNoise(r_max=1.0, q_max=1.0)), (AdaptiveFactor(math.inf), RatioBound(math.inf))
+    assert same(plain, estimate(GaussianFilter(MSSR, *off)))
+    assert same(estimate(CKF), estimate(GaussianFilter(Points(Product(Axis3(), Radial3())))))
+    assert not same(plain, estimate(CKF))
+    assert not same(plain, estimate(COFM))
+
+
+def test_entropy_does_nothing_where_draws_have_no_parents() -> None:
+    """Honest weights, one guide for the cloud: what is resampled is forgotten. Flattened weights do change the estimate."""
+    model, y = tracker()
+
+    def estimate(**stages: Any) -> Estimate:
+        return run(ParticleFilter(60, ALWAYS, proposal=Guided(COFM, "nominal"), **stages), model, y, runs=4)
+
+    plain, spared = estimate(), estimate(preference=Entropy(Temper(1.0)))
+    torch.testing.assert_close(spared.mean, plain.mean, rtol=0, atol=1e-10)
+    torch.testing.assert_close(spared.log_evidence, plain.log_evidence, rtol=0, atol=1e-10)
+    assert abs(estimate(weigh=Flattened(Temper(1.0))).mean - plain.mean).max() > 0.05
+
+
+# evidence, honest and printed
+
+
+LG5, LG5_Y = lg5()
+FORMS = {"temper": Temper(), "additive": Additive(), "mix": Mix()}
+
+
+def evidence(method: ParticleFilter, runs: int, steps: int = 20, seed: int = 1) -> tuple[float, float]:
+    """Mean of Z / Z_exact and its standard error."""
+    y = LG5_Y[:steps]
+    ratio = torch.exp(run(method, LG5, y, seed, runs=runs).log_evidence - kalman(LG5, y).log_z)
+    return float(ratio.mean()), float(ratio.std()) / math.sqrt(runs)
+
+
+SCOPES: dict[str, Proposal] = {"bootstrap": Bootstrap(), "conditional": GuidedNoise(CKF)}
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("scope", SCOPES)
+def test_evidence_with_entropy_and_a_changing_number_is_unbiased(scope: str, form: str) -> None:
+    method = ParticleFilter(80, ALWAYS, EssStep(10, 0.5, 40, 80, 60), Entropy(FORMS[form]), proposal=SCOPES[scope])
+    assert method.exact
+    mean, error = evidence(method, 1500, steps=6)
+    assert abs(mean - 1.0) < 4.0 * error
+    assert error < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adaptive", [False, True])
+@pytest.mark.parametrize("strength", [0.0, 0.5])
+@pytest.mark.parametrize("scope", SCOPES)
+def test_evidence_of_the_whole_record(scope: str, strength: float, adaptive: bool) -> None:
+    method = ParticleFilter(150, ALWAYS, preference=Entropy(Temper(strength)), proposal=SCOPES[scope])
+    if adaptive:
+        method = replace(method, particles=200, size=EssStep())
+    mean, error = evidence(method, 500)
+    assert abs(mean - 1.0) < 4.0 * error
+
+
+@pytest.mark.parametrize("form", [Temper(0.5), Mix(0.5), Additive(2.0)], ids=lambda f: type(f).__name__)
+def test_flattened_weights_are_biased(form: Form) -> None:
+    """A guard against mixing the two in silence: the same data, weights flattened for good. The sign depends on the record."""
+    method = ParticleFilter(150, ALWAYS, weigh=Flattened(form), proposal=GuidedNoise(CKF))
+    assert not method.exact
+    mean, error = evidence(method, 500)
+    assert abs(mean - 1.0) > 5.0 * error
+
+
+# a guide for each particle
+
+
+@pytest.mark.filterwarnings("ignore:GuidedParticles")
+@pytest.mark.parametrize("guide", [EKF, CKF], ids=["ekf", "ckf"])
+def test_guided_particles_are_unbiased(guide: GaussianFilter) -> None:
+    method = ParticleFilter(30, Resample(Systematic(), 0.7), proposal=GuidedParticles(guide))
+    assert method.exact
+    check_unbiased(method, WALK, WALK_Y[:4], kalman(WALK, WALK_Y[:4]), runs=500)
+    model, y, exact = CASES["growth"]()
+    method = replace(method, proposal=GuidedParticles(guide, widen=1.5))
+    check_unbiased(method, model, y[:3], exact_growth(y[:3]), runs=500)
+    del exact
+
+
+def exact_growth(y: Tensor) -> Any:
+    """The first steps of the growth case, by a bootstrap filter of so many particles that its error is nothing here."""
+    estimate = run(ParticleFilter(200_000), Growth(measurement_sd=4.0), y, runs=4)
+    mean, variance = estimate.mean[:, -1].mean(0).numpy(), estimate.variance[:, -1].mean(0).numpy()
+    return type(CASES["growth"]()[2])(mean, variance + mean**2, float(estimate.log_evidence.mean()))
+
+
+def test_a_guide_for_each_particle_is_told_to_be_dear() -> None:
+    with pytest.warns(UserWarning, match="N times the cost of Guided"):
+        ParticleFilter(10, proposal=GuidedParticles(EKF)).init(WALK, 2, MonteCarlo(1, torch.arange(2)))
+
+
+@pytest.mark.filterwarnings("ignore:GuidedParticles")
+def test_a_singular_transition_is_refused_and_noise_takes_it() -> None:
+    model, y, exact = CASES["singular"]()
+    with pytest.raises(ValueError, match="choose GuidedNoise"):
+        run(ParticleFilter(20, proposal=GuidedParticles(EKF)), model, y, runs=2)
+    estimate = run(ParticleFilter(3000, proposal=GuidedNoise(EKF)), model, y, runs=20)
+    sd = np.sqrt(exact.square - exact.mean**2)
+    assert np.abs(estimate.mean[:, -1].mean(0).numpy() - exact.mean).max() < 0.05 * sd.max()
+
+
+# pitfalls
+
+
+def test_static_states_keep_one_ancestor_unless_they_are_redrawn() -> None:
+    """A constant that is never moved: even optimal proposals leave a few values of it; a guide for the cloud draws new ones."""
+    model = LinearGaussian([[1.0, 1.0], [0.0, 1.0]], [[0.3], [0.0]], [[1.0, 0.0]], [1.0], [0.0, 0.5], [1.0, 1.0])
+    y = 0.5 * torch.arange(1.0, 61.0, dtype=torch.float64)[:, None]
+
+    def values(proposal: Proposal) -> int:
+        method = ParticleFilter(100, ALWAYS, proposal=proposal)
+        cloud, draws = cloud_of(method, model, 1)
+        for t in range(60):
+            cloud, _ = method.step(model, cloud, Record(y[t : t + 1]), draws.at(t + 1))
+        return len(cloud.x[0, :, 1].unique())
+
+    assert values(GuidedNoise(EKF)) < 10
+    assert values(Guided(EKF)) == 100
+
+
+def test_going_on_from_moments_needs_matched_draws() -> None:
+    """Without them the spread of the particles shrinks at each step; with them nothing is lost on a linear model."""
+    model = LinearGaussian(np.eye(8), 1e-3 * np.eye(8), np.eye(8), [30.0] * 8, np.zeros(8), np.ones(8))
+    y = torch.zeros(30, 8, dtype=torch.float64)
+
+    def spread(**options: Any) -> Tensor:
+        return run(ParticleFilter(20, proposal=Guided(EKF, **options)), model, y, runs=4).variance[:, -1].log().mean()
+
+    own = gaussian(EKF, model, y).variance[:, -1].log().mean()
+    torch.testing.assert_close(spread(track="moments", matched=True), own, rtol=0, atol=1e-8)
+    assert spread(track="moments") < own - 2.0
+    assert abs(spread() - own) < 0.3
+
+
+def test_on_a_linear_model_the_number_comes_to_rest_at_its_least() -> None:
+    model, y = tracker()
+    method = ParticleFilter(200, ALWAYS, EssStep(), Entropy(), proposal=Guided(COFM))
+    estimate = run(method, model, y, runs=5)
+    # the number is decided at the start of each step, the first one included
+    assert estimate.trace["ess"][0, :6].tolist() == pytest.approx([140.0, 130.0, 120.0, 110.0, 100.0, 100.0])
+    own = gaussian(COFM, model, y, runs=5)
+    off = (estimate.mean - own.mean).square().mean((0, 1)) / own.variance.mean((0, 1))
+    assert (off < 3.0 / 100).all()  # sigma^2 / N, and a factor for its scatter over 60 values
+
+
+def test_matching_needs_more_particles_than_states() -> None:
+    with pytest.raises(ValueError, match="give more than 2 particles"):
+        run(ParticleFilter(2, proposal=Guided(EKF, matched=True)), WALK, WALK_Y, runs=1)
+
+
+@pytest.mark.parametrize("options", [{"target": "both"}, {"track": "none"}, {"widen": 0.0}])
+def test_bad_arguments_are_named(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"proposal.{next(iter(options))}="):
+        Guided(EKF, **options)
+
+
+def test_moments_of_empty_slots_are_nothing() -> None:
+    """Slots without a particle have no part in the matched draws, nor in the estimate."""
+    stage = Guided(EKF, matched=True)
+    method = ParticleFilter(50, ALWAYS, EssStep(0, 0.5, 10, 50, 20), proposal=stage)
+    cloud, draws = cloud_of(method, WALK, 2)
+    seen = Record(WALK_Y[:1].expand(2, -1))
+    cloud, info = method.step(WALK, cloud, seen, draws)
+    assert (cloud.log_w > -torch.inf).sum(1).tolist() == [20, 20]
+    assert not torch.isnan(cloud.log_w).any()
+    assert ess(cloud.log_w).tolist() == pytest.approx([20.0, 20.0])
+    own, _ = EKF.step(WALK, EKF.init(WALK, 2, draws), seen, draws)
+    mean, covariance = moments(WALK.chart, cloud)
+    torch.testing.assert_close(mean, own.mean, rtol=0, atol=1e-10)
+    torch.testing.assert_close(info.covariance(), own.covariance, rtol=0, atol=1e-10)
+    torch.testing.assert_close(covariance, own.covariance, rtol=0, atol=1e-10)
