@@ -129,6 +129,11 @@ class GaussianFilter:
     repair: bool = False
     exact = False  # on nonlinear or non-Gaussian models; on linear-Gaussian ones it is the Kalman filter
 
+    @property
+    def plain(self) -> bool:
+        """Nothing changes its noise or its gain: on a linear-Gaussian model it is the Kalman filter."""
+        return not self.adaptations and not self.gains
+
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise ValueError(f"filter.iterations={self.iterations}: give 1 (no iteration) or more")

@@ -150,8 +150,9 @@ def later(result: store.Result, from_time: float) -> store.Result:
     if kept.all():
         return result
     shared = {name: result.arrays[name] for name in ("log_evidence", "lost")}
-    traces = {name: a[:, kept] for name, a in result.arrays.items() if name not in ("time", *shared)}
-    return store.Result(result.meta, {"time": time[kept], **traces, **shared})
+    common: dict[str, np.ndarray] = {name: result.arrays[name][kept] for name in ("bound", "range") if name in result.arrays}
+    traces = {name: a[:, kept] for name, a in result.arrays.items() if name not in ("time", *shared, *common)}
+    return store.Result(result.meta, {"time": time[kept], **traces, **common, **shared})
 
 
 def tidy(cell: Cell, job: Job, result: store.Result, from_time: float, converged: Mapping[str, float]) -> pd.DataFrame:

@@ -130,9 +130,8 @@ def _section(
 ) -> tuple[dict[str, Any], list[Verdict]]:
     """What the templates need of one cell; writes its figures and tables."""
     whole = {job.label: job.load() for job in cell.jobs}
-    used = {label: _later(result, options.from_time) for label, result in whole.items()}
-    bare = {label: _apart(result)[0] for label, result in whole.items()}
-    runs = pd.concat([tidy(cell, job, bare[job.label], options.from_time, options.converged) for job in cell.jobs])
+    used = {label: later(result, options.from_time) for label, result in whole.items()}
+    runs = pd.concat([tidy(cell, job, whole[job.label], options.from_time, options.converged) for job in cell.jobs])
     known = [group for group in groups if _scored(used, group)]
     runs = runs[runs.group.isin(known)]
     decided = verdicts(runs, options.alpha)
@@ -162,20 +161,6 @@ def _section(
     section["unscored"] = [group for group in groups if group in there and group not in known]
     section["bounds"] = _distinct(result.meta["bound"] for result in whole.values() if "bound" in result.meta)
     return {**section, "lost": [row for row in lost if row[1]], "diverged": [row for row in gone if row[1]]}, decided
-
-
-def _apart(result: store.Result) -> tuple[store.Result, dict[str, Any]]:
-    """The result without, and alone, what all runs have in common: [T, ...], where the others are [R, T, ...]."""
-    common: dict[str, Any] = {name: result.arrays[name] for name in ("bound", "range") if name in result.arrays}
-    return store.Result(result.meta, {k: v for k, v in result.arrays.items() if k not in common}), common
-
-
-def _later(result: store.Result, from_time: float) -> store.Result:
-    """The same without the instants before, see `frame.later`."""
-    bare, common = _apart(result)
-    cut = later(bare, from_time)
-    left = result.arrays["time"].size - cut.arrays["time"].size
-    return store.Result(cut.meta, {**cut.arrays, **{name: value[left:] for name, value in common.items()}})
 
 
 def _scored(results: Mapping[str, store.Result], group: str) -> bool:
