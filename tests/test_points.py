@@ -122,7 +122,8 @@ def test_averages_are_unbiased(points: Points) -> None:
 def test_stages_that_share_a_set_draw_its_points_together(points: Points) -> None:
     """Base points of two stages are those of one set; on the same axes they would be the same but for the shift."""
     draws = source(300)
-    ahead, behind, again = (points(draws, first).normal(name, 400, w) for name, first, w in (("a", 0, 3), ("b", 3, 2), ("b", 0, 3)))
+    wanted = (("a", 0, 3), ("b", 3, 2), ("b", 0, 3))
+    ahead, behind, again = (points(draws, first).normal(name, 400, w) for name, first, w in wanted)
     both = torch.cat([ahead, behind], -1)
 
     def off(z: Tensor) -> Tensor:
