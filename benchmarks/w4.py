@@ -39,9 +39,9 @@ class Contestant(NamedTuple):
 
 CONTESTANTS = (
     Contestant("pfbench float32, eager", "pfbench", ("house.py", "float32", "eager")),
-    Contestant("pfbench float32, compiled noise", "pfbench", ("house.py", "float32", "compiled")),
+    Contestant("pfbench float32, compiled", "pfbench", ("house.py", "float32", "compiled")),
     Contestant("pfbench float64, eager", "pfbench", ("house.py", "float64", "eager")),
-    Contestant("pfbench float64, compiled noise", "pfbench", ("house.py", "float64", "compiled")),
+    Contestant("pfbench float64, compiled", "pfbench", ("house.py", "float64", "compiled")),
     Contestant("naive torch float32", "naive torch", ("naive.py", "float32")),
     Contestant("naive torch float64", "naive torch", ("naive.py", "float64")),
     Contestant("particles float32", "particles", ("peer.py", "float32")),
