@@ -505,7 +505,7 @@ def distances(swarm: Swarm, sizes: tuple[int, ...], runs: int = 50) -> list[floa
     return [float(((x - mean)[:, 4:] / variance[4:].sqrt()).square().mean().sqrt()) for x in found]
 
 
-@pytest.mark.parametrize("velocity", [ESCAPE, Inertia(), Gaussian()], ids=["escape", "inertia", "gaussian"])
+@pytest.mark.parametrize("velocity", [ESCAPE, Gaussian()], ids=["escape", "gaussian"])
 def test_the_corrected_swarm_converges_at_the_monte_carlo_rate(velocity: Any) -> None:
     """Four times the particles halve the distance to the Kalman filter."""
     few, many = distances(dataclasses.replace(CORRECTED, velocity=velocity), (60, 240))
@@ -633,10 +633,10 @@ TOYS = [Growth(), StochasticVolatility(), Benes(), Pendulum(), Lorenz63()]
 
 
 @pytest.mark.parametrize("model", TOYS, ids=lambda v: type(v).__name__)
-@pytest.mark.parametrize("name", SWARMS)
+@pytest.mark.parametrize("name", ["printed", "corrected"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_swarms_run_on_models_of_all_kinds(model: StateSpaceModel, name: str, dtype: torch.dtype) -> None:
-    y = torch.full((3, 6, 3 if isinstance(model, Lorenz63) else 1), 0.6, dtype=dtype)
+    y = torch.full((3, 3, 3 if isinstance(model, Lorenz63) else 1), 0.6, dtype=dtype)
     source = MonteCarlo(1, torch.arange(3), dtype)
     estimate = run_filter(ParticleFilter(40, ALWAYS, proposal=SWARMS[name]), model.to(dtype), Record(y), source)
     model.to(torch.float64)
@@ -687,12 +687,12 @@ def flown(runs: int, steps: int, model: str) -> tuple[Any, Episode]:
 @pytest.mark.slow
 def test_in_flight_the_corrected_swarm_converges_and_the_printed_one_returns_the_fix() -> None:
     """Distances in position from 20 s on: to the Kalman filter of the same inflated model, and to the raw fix."""
-    cfg, episode = flown(12, 60, "ins_gnss_inflated")
+    cfg, episode = flown(8, 50, "ins_gnss_inflated")
     model = job.build(cfg.model)
 
     def estimated(name: str, n: int = 100) -> Tensor:
         words = composed("t004", f"filter={name}", f"particles={n}")["filter"]
-        return run_filter(job.build(words), model, episode.record, draws(12, 9)).mean[:, 20:, 6:9]
+        return run_filter(job.build(words), model, episode.record, draws(8, 9)).mean[:, 20:, 6:9]
 
     def rms(d: Tensor) -> float:
         return float(d.square().mean().sqrt())
