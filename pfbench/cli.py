@@ -151,9 +151,16 @@ def _composed() -> Iterator[tuple[str, str]]:
 
 
 def _home(group: str, name: str) -> list[str]:
-    """The scenario that asks for this model; a model may take its numbers from there."""
-    asks = f"/model@_global_.model: {name}\n"
-    return [f"scenario={path.stem}" for path in _groups()["scenario"] if group == "model" and asks in path.read_text()][:1]
+    """The scenario that asks for this model, or for one whose name it extends; a model may take its numbers from there."""
+    if group != "model":
+        return []
+    parts = name.split("_")
+    for known in ("_".join(parts[:n]) for n in range(len(parts), 0, -1)):
+        asks = f"/model@_global_.model: {known}\n"
+        found = [f"scenario={path.stem}" for path in _groups()["scenario"] if asks in path.read_text()]
+        if found:
+            return found[:1]
+    return []
 
 
 def _compose(overrides: list[str]) -> dict[str, Any]:

@@ -340,7 +340,7 @@ def test_evidence_with_entropy_and_a_changing_number_is_unbiased(scope: str, for
     assert error < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("adaptive", [False, True])
 @pytest.mark.parametrize("strength", [0.0, 0.5])
 @pytest.mark.parametrize("scope", SCOPES)
@@ -353,7 +353,7 @@ def test_evidence_of_the_whole_record(scope: str, strength: float, adaptive: boo
 
 
 @pytest.mark.parametrize(
-    ("form", "runs"), [(Temper(0.5), 500), (Mix(0.5), 500), pytest.param(Additive(0.5), 4000, marks=pytest.mark.slow)]
+    ("form", "runs"), [(Temper(0.5), 500), (Mix(0.5), 500), pytest.param(Additive(0.5), 4000, marks=pytest.mark.study)]
 )
 def test_flattened_weights_are_biased(form: Form, runs: int) -> None:
     """A guard against mixing the two in silence: the same data, weights flattened for good. The sign depends on the record."""

@@ -172,7 +172,7 @@ def test_the_exact_paths_pass_their_own_test() -> None:
     assert np.allclose(case.mean.reshape(-1, 2)[1:], smooth)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("i", range(3))
 @pytest.mark.parametrize("name", KERNELS)
 def test_moves_leave_the_law_of_the_whole_path(name: str, i: int) -> None:
@@ -373,7 +373,7 @@ BROKEN: dict[str, tuple[float, Callable[[Walk], Any]]] = {
 QUICK = ("tail", "likelihood alone", "flow without the likelihood", "noises renewed")
 
 
-@pytest.mark.parametrize("mistake", [m if m.startswith(QUICK) else pytest.param(m, marks=pytest.mark.slow) for m in BROKEN])
+@pytest.mark.parametrize("mistake", [m if m.startswith(QUICK) else pytest.param(m, marks=pytest.mark.study) for m in BROKEN])
 def test_the_test_of_invariance_sees_mistakes(mistake: str) -> None:
     q, make = BROKEN[mistake]
     m = 20_000 if "prior" in mistake else 4000  # of ten measurements the prior is one more
@@ -460,7 +460,7 @@ def test_flow_keeps_the_prior_of_a_pendulum(refresh: float) -> None:
     assert geweke(model, Unprincipled(5, PriorSized(0.7), refresh), lambda j: (), 600, 15) < 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("larger", [1.0, 50.0])
 def test_flow_keeps_the_prior_of_an_inertial_navigation(larger: float) -> None:
     """With quaternions, misalignments as printed and of a degree: the chart's curvature counts there."""
@@ -555,7 +555,7 @@ def spread_ratio(method: ParticleFilter, q: float, runs: int, steps: int = 30) -
     return float(ratio.mean()), float(ratio.std() / math.sqrt(runs))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("q", [1.0, 0.1])
 def test_moves_do_not_widen_the_cloud_and_regularisation_does(q: float) -> None:
     """Kalman's spread within 4 percent; regularisation multiplies it by 1 + h^2 each time, h^2 = 0.17, and so does a Riccati."""

@@ -535,7 +535,7 @@ def test_over_a_sample_the_generator_loses_what_its_neighbourhoods_lack() -> Non
 # on the paper's world
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("scenario", ["passive_1", "passive_2", "passive_3"])
 def test_no_filter_beats_the_bound_and_the_repair_beats_the_print(scenario: str) -> None:
     """Root mean square relative error over the last 20 looks of 100 runs; below 0.9 of the bound a filter reads off the truth."""

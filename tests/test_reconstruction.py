@@ -330,7 +330,7 @@ CONVERGING: dict[str, Proposal] = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", CONVERGING)
 def test_corrected_versions_approach_kalman_with_the_root_of_the_number(name: str) -> None:
     sizes, runs = np.array([200, 800, 3200]), 60

@@ -684,7 +684,7 @@ def flown(runs: int, steps: int, model: str) -> tuple[Any, Episode]:
     return cfg, dataclasses.replace(episode, record=Record(record.y[:, :steps], map_inputs(lambda a: a[:, :steps], record.u)))
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_in_flight_the_corrected_swarm_converges_and_the_printed_one_returns_the_fix() -> None:
     """Distances in position from 20 s on: to the Kalman filter of the same inflated model, and to the raw fix."""
     cfg, episode = flown(8, 50, "ins_gnss_inflated")
@@ -705,7 +705,7 @@ def test_in_flight_the_corrected_swarm_converges_and_the_printed_one_returns_the
     assert rms(estimated("cpso_escape_stopped") - kf) > 2.0 * few
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("scenario", ["sar_flight", "anshun_fit", "passive_1", "t003"])
 def test_swarms_fly_with_quaternions_missing_satellites_and_bearings(scenario: str) -> None:
     cfg = composed(scenario)
