@@ -14,7 +14,7 @@ demo: $(VENV)/.installed        ## quickstart study: run, compare, report
 	$(BIN)/pfbench run -m +experiment=quickstart
 	$(BIN)/pfbench report study=quickstart
 
-test: test-fast test-slow       ## all tests
+test: test-fast test-slow       ## fast and slow tests
 
 test-fast: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2
@@ -22,7 +22,7 @@ test-fast: $(VENV)/.installed
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 -m slow
 
-test-study: $(VENV)/.installed  ## reproductions of the methods' tables, some of an hour
+test-study: $(VENV)/.installed ## reproductions of the methods' tables, minutes each
 	$(BIN)/python -m pytest -n 2 -m study
 
 lint: $(VENV)/.installed
