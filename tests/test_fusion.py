@@ -51,8 +51,8 @@ def test_a_gather_keeps_memory_order_and_takes_the_right_particles(order: tuple[
     assert cloud.x.stride() == x.stride() or order == (0, 1, 2)
 
 
-def results(dtype: torch.dtype) -> list[Any]:
-    x, z = DRAWS.normal("x", N, D).to(dtype), DRAWS.normal("w", N, 1)[..., 0].to(dtype)
+def results(x: Tensor, z: Tensor) -> list[Any]:
+    dtype = x.dtype
     hidden = z.clone()
     hidden[0] = -torch.inf  # a run of which nothing is left
     seen = torch.ones(RUNS, 1, D, dtype=torch.bool)
@@ -71,9 +71,11 @@ def results(dtype: torch.dtype) -> list[Any]:
 @pytest.mark.filterwarnings("ignore")  # the compiler's own
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_fused_functions_agree_with_eager_ones(dtype: torch.dtype) -> None:
-    eager = results(dtype)
+    # the draws are made once: fused and eager normals differ by roundings of float32 (test below)
+    x, z = DRAWS.normal("x", N, D).to(dtype), DRAWS.normal("w", N, 1)[..., 0].to(dtype)
+    eager = results(x, z)
     with fusion.fused():
-        fused = results(dtype)
+        fused = results(x, z)
     torch.testing.assert_close(fused, eager)
 
 

@@ -103,7 +103,8 @@ def mssrckf() -> None:
         mean = w @ moved
         right.plot(*_ellipse(mean, (w[:, None] * (moved - mean)).T @ (moved - mean)), color=colour, label=name)
     left.set(aspect="equal", title="points for N(0, I), area: weight", xlim=(-2.9, 2.9), ylim=(-2.9, 2.9))
-    right.set(aspect="equal", title="after a turn: ellipses of 2 sd")
+    left.set(xlabel="state 1 in sd", ylabel="state 2 in sd")
+    right.set(aspect="equal", title="after a turn: ellipses of 2 sd", xlabel="east", ylabel="north")
     left.legend(fontsize=8, loc="upper right")
     right.legend(fontsize=8, loc="lower center")
     figure.savefig(HERE / "mssrckf.png", dpi=80)
@@ -141,7 +142,7 @@ def _errors(methods: dict[str, tuple[tuple[Adaptation, ...], tuple[Gain, ...]]],
     moved = 0.3 * torch.randn(runs, steps, 2, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(q), 1.0)
     x = torch.randn(runs, 1, 2, dtype=torch.float64, generator=draws) + moved.cumsum(1)
     noise = torch.randn(runs, steps, 5, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(r), 1.0)
-    figure, axes = plt.subplots(1, len(methods), figsize=(9.0, 3.3), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, len(methods), figsize=(9.0, 3.7), sharex=True, sharey=True, layout="constrained")
     for at, (name, (adaptations, gains)), colour in zip(axes, methods.items(), ("#0072B2", "#E69F00", "#009E73"), strict=True):
         method = GaussianFilter(Points(Product(Simplex3(), Radial5())), adaptations, gains)
         found = run_filter(
@@ -152,8 +153,9 @@ def _errors(methods: dict[str, tuple[tuple[Adaptation, ...], tuple[Gain, ...]]],
         centre, believed = torch.zeros(2, dtype=torch.float64), found.trace["p"][:, -1].median(0).values
         at.plot(*_ellipse(centre, torch.cov(error.T)), color="0.35", linestyle="--", label="their 2 sd")
         at.plot(*_ellipse(centre, believed), color=colour, label="2 sd believed")
-        at.set(aspect="equal", title=f"{name}: rms {float(error.square().sum(-1).mean().sqrt()):.2f}")
-        at.legend(fontsize=7, loc="upper right")
+        at.set(aspect="equal", title=f"{name}: rms {float(error.square().sum(-1).mean().sqrt()):.2f}", xlabel="error of state 1")
+        at.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=3, frameon=False, columnspacing=0.8)
+    axes[0].set_ylabel("error of state 2")
     return figure
 
 
@@ -324,6 +326,9 @@ def _scatter_refreshed(axis: Axes, model: LinearGaussian, cloud: Cloud, resample
         mean, covariance = (part[0] for part in moments(model.chart, shown))
         axis.plot(*_ellipse(mean, covariance), color=colour, label=label)
     axis.set_title(title, fontsize=11)
+    axis.set_xlabel("state 1")
+    if axis.get_subplotspec().is_first_col():
+        axis.set_ylabel("state 2")
 
 
 def mcmc_rpf() -> None:
