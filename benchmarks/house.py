@@ -12,9 +12,9 @@ import torch
 from worker import Filter, serve
 from workload import ins_model
 
-from pfbench import fusion
+from pfbench import fusion, native
 from pfbench.draws import MonteCarlo
-from pfbench.filter.loop import run_filter
+from pfbench.filter.loop import run_filter, runs_at_once
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.resamplers import Resample, Systematic
 from pfbench.model.ins_gnss import Step
@@ -29,10 +29,11 @@ def sir(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
     record = Record(torch.from_numpy(work.y), inputs).to(model.anchor)
     method = ParticleFilter(int(work.particles), Resample(Systematic(), threshold=1.0))
     runs = torch.arange(len(work.y))
+    block = runs_at_once(len(runs), method.particles, d)
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         with fusion.fused(compiled), torch.no_grad():
-            estimate = run_filter(method, model, record, MonteCarlo(seed, runs, dtype))
+            estimate = run_filter(method, model, record, MonteCarlo(seed, runs, dtype), at_once=block)
         return estimate.log_evidence, estimate.mean
 
     return run
@@ -40,6 +41,7 @@ def sir(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
 
 def contestant(work: Any) -> tuple[Filter, dict[str, str]]:
     torch.set_num_threads(1)
+    native.keep_memory()  # as a job does
     run = sir(work, getattr(torch, sys.argv[1]), compiled=sys.argv[2] == "compiled")
     return run, {"torch": torch.__version__, "numpy": sys.modules["numpy"].__version__}
 

@@ -46,6 +46,13 @@ class Draws(Protocol):
         """Uniform on the open interval (0, 1) [R, n, w], float64: single precision has too few levels for 1e6 particles."""
 
 
+class Source(Draws, Protocol):
+    """Draws of a whole batch, which can be told apart by its runs."""
+
+    def of(self, runs: slice) -> Draws:
+        """The same source for some of the runs."""
+
+
 def blocked_normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
     """`normals`, component by component where the whole would fall out of the cache; the same numbers."""
     size = max(1, _BLOCK // max(1, runs.shape[0] * particle.shape[0]))
@@ -70,10 +77,12 @@ def _normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particl
 normals = fusible(_normals, eager=blocked_normals, by_hand=native.normals)
 
 
-@fusible
-def uniforms(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+def _uniforms(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
     """Uniforms on the open interval (0, 1), float64 [w, R, 4 q]; arguments as for `normals`."""
     return (torch.cat(_words(key, step, runs, component, particle), dim=-1).double() + 0.5) * 2.0**-32
+
+
+uniforms = fusible(_uniforms, by_hand=native.uniforms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +111,9 @@ class MonteCarlo:
 
     def at(self, step: int) -> MonteCarlo:
         return replace(self, step=step)
+
+    def of(self, runs: slice) -> MonteCarlo:
+        return replace(self, runs=self.runs[runs])
 
     def normal(self, purpose: str, n: int, w: int) -> Tensor:
         return normals(*self._counter(purpose, n, w))[..., :n].to(self.dtype).permute(1, 2, 0)

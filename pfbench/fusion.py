@@ -20,6 +20,7 @@ from functools import cache, wraps
 from typing import Any, TypeVar, cast
 
 import torch
+from torch.autograd import forward_ad
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -39,13 +40,19 @@ def fused(wanted: bool = True) -> Iterator[None]:
         _fused.reset(token)
 
 
+def _plain(args: tuple[Any, ...]) -> bool:
+    """Numbers on the CPU, to be worked on by one thread, and no gradient of them is wanted."""
+    wanted = any((a.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(a).tangent is not None for a in args)
+    return torch.get_num_threads() == 1 and not args[0].is_cuda and not wanted
+
+
 def fusible(function: F, eager: F | None = None, by_hand: F | None = None) -> F:
     """Makes a function of tensors one that can be fused.
 
     Args:
         function: what is compiled.
         eager: computes the same where nothing is fused, if separate operations have a faster way to do it.
-        by_hand: is taken for what would be compiled on the CPU and one thread, where it works.
+        by_hand: is taken for what would be compiled on the CPU and one thread, where it works and no gradient is wanted.
     """
     separate = eager or function
 
@@ -54,7 +61,7 @@ def fusible(function: F, eager: F | None = None, by_hand: F | None = None) -> F:
         return torch.compile(function, dynamic=True)
 
     def whole(*args: Any) -> Any:
-        if by_hand is not None and by_hand not in _failed and torch.get_num_threads() == 1 and not args[0].is_cuda:
+        if by_hand is not None and by_hand not in _failed and _plain(args):
             try:
                 return by_hand(*args)
             except (OSError, subprocess.CalledProcessError) as error:

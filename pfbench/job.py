@@ -24,12 +24,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 import pfbench
-from pfbench import fusion, store
+from pfbench import fusion, native, store
 from pfbench.bound import posterior_bound
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Info
 from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.loop import Estimate, run_filter
+from pfbench.filter.loop import Estimate, run_filter, runs_at_once
 from pfbench.filter.particle import ParticleFilter
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.regimes import Nominal
@@ -112,7 +112,7 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
         torch.no_grad(),
         tqdm(total=steps, desc=name, unit="step", delay=2, disable=None, leave=False) as bar,
     ):
-        estimate = run_filter(method, model, episode.record, draws, judge(model, truth), bar.update)
+        estimate = run_filter(method, model, episode.record, draws, judge(model, truth), bar.update, at_once(cfg, method, model))
     if cfg.device != "cpu":
         torch.cuda.synchronize()
     ended = time.perf_counter()
@@ -145,11 +145,19 @@ def settings(cfg: DictConfig | Mapping[str, Any]) -> None:
     if cfg["device"] != "cpu" and (torch.device(cfg["device"]).index or 0) >= torch.cuda.device_count():
         raise ValueError(f"device={cfg['device']}: torch finds {torch.cuda.device_count()} CUDA devices here; give device=cpu")
     torch.set_num_threads(cfg["threads"])
+    native.keep_memory()
 
 
 def build(node: Any) -> Any:
     """The object that a configuration node names by `_target_`; lists and dicts below it become plain ones."""
     return hydra.utils.instantiate(node, _convert_="all")
+
+
+def at_once(cfg: DictConfig, method: Any, model: StateSpaceModel) -> int | None:
+    """Runs that a step takes together; None, all of them, on another device than the CPU."""
+    if cfg.device != "cpu" or not isinstance(method, ParticleFilter):
+        return None
+    return runs_at_once(cfg.runs, method.particles, model.chart.size)
 
 
 def fuses(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> bool:

@@ -1,4 +1,8 @@
-"""The one loop that is written in C++, compiled on the spot where there is a compiler: see normals.cpp."""
+"""The loops that are written in C++, compiled on the spot where there is a compiler: see normals.cpp and loops.cpp.
+
+Each computes what the torch function of its place does, on the CPU and one thread, and raises OSError or CalledProcessError
+where there is no C++ compiler, or one that does not understand the source. Gradients do not pass through them.
+"""
 
 from __future__ import annotations
 
@@ -15,39 +19,105 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_SOURCE = Path(__file__).with_name("normals.cpp")
-_FLAGS = ("-O3", "-march=native", "-ffast-math", "-mno-recip", "-fopenmp-simd", "-shared", "-fPIC")
-_NUMBER, _ADDRESS = ctypes.c_int64, ctypes.c_void_p
+_HERE = Path(__file__).parent
+_COMMON = ("-O3", "-march=native", "-fopenmp-simd", "-fPIC", "-c")
+_FLAGS = {
+    "normals": (*_COMMON, "-ffast-math", "-mno-recip"),
+    "loops": (*_COMMON, "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"),
+}
 
 
 def normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
-    """Standard normals, float32 [w, R, 4 q], as draws.normals makes them, to 5e-6; arguments as there, on the CPU.
+    """Standard normals, float32 [w, R, 4 q], as draws.normals makes them, to 5e-6."""
+    return _drawn("normals", torch.float32, key, step, runs, component, particle)
 
-    Raises:
-        OSError, subprocess.CalledProcessError: no C++ compiler, or one that does not understand the source.
-    """
-    out = torch.empty(len(component), len(runs), 4 * len(particle))
-    axes = [part for axis in (runs, component, particle) for part in (axis.contiguous().data_ptr(), len(axis))]
-    _library().normals(out.data_ptr(), *axes, int(step), *key.tolist())
+
+def uniforms(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+    """Uniforms, float64 [w, R, 4 q], as draws.uniforms makes them, to the last digit."""
+    return _drawn("uniforms", torch.float64, key, step, runs, component, particle)
+
+
+def systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
+    """Ancestors [R, N] by the positions (j + u) / n; probabilities a [R, N], n [R or 1, 1], u [R, 1]."""
+    runs, slots = a.shape
+    ancestors = torch.empty(runs, slots, dtype=torch.int64)
+    n, u = (part.double().expand(runs, 1).contiguous() for part in (n, u))
+    _call("systematic", a.dtype, ancestors, a.contiguous(), n, u, runs, slots)
+    return ancestors
+
+
+def gather(x: Tensor, ancestors: Tensor) -> Tensor:
+    """x [D, R, N] by ancestors [R, M] -> [D, R, M]."""
+    d, runs, slots = x.shape
+    out = x.new_empty(d, *ancestors.shape)
+    _call("gather", x.dtype, out, x.contiguous(), ancestors.contiguous(), d, runs, slots, ancestors.shape[1])
     return out
 
 
+def log_normal(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tensor:
+    """-1/2 sum ((y - mean) scale)^2 - constant [R, N]; y, scale [R, K], mean [R, N, K], constant [R]."""
+    runs, particles, components = mean.shape
+    out = mean.new_empty(runs, particles)
+    strides = torch.tensor(mean.stride())
+    y, scale = (part.to(mean.dtype).expand(runs, components).contiguous() for part in (y, scale))
+    constant = constant.to(mean.dtype).expand(runs).contiguous()
+    _call("log_normal", mean.dtype, out, y, mean, scale, constant, strides, runs, particles, components)
+    return out
+
+
+def moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance [R, D] of x [R, N, D] by weights [R, N] whose sum is 1."""
+    parts, (runs, particles, components) = x.permute(2, 0, 1).contiguous(), x.shape
+    mean, variance = x.new_empty(2, runs, components)
+    _call("moments", x.dtype, mean, variance, parts, w.contiguous(), components, runs, particles)
+    return mean, variance
+
+
 @cache
-def _library() -> Any:
+def keep_memory() -> None:
+    """Has the C library keep what is freed, for the next step, where it can be told so.
+
+    It gives blocks of some megabytes back to the system otherwise and fetches them again, page by page, at each step: up to a
+    third of a bootstrap filter's time. Of glibc; elsewhere nothing happens.
+    """
+    for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
+        tell = getattr(ctypes.CDLL(None), "mallopt", None)
+        if tell is not None:
+            tell(option, 1 << 30)
+
+
+def _drawn(
+    name: str, dtype: torch.dtype, key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor
+) -> Tensor:
+    out = torch.empty(len(component), len(runs), 4 * len(particle), dtype=dtype)
+    axes = [part for axis in (runs, component, particle) for part in (axis.contiguous(), len(axis))]
+    getattr(_library("normals"), name)(*_plain(out, *axes, int(step), *key.tolist()))
+    return out
+
+
+def _call(name: str, dtype: torch.dtype, *arguments: Tensor | int) -> None:
+    getattr(_library("loops"), f"{name}_{str(dtype).removeprefix('torch.')}")(*_plain(*arguments))
+
+
+def _plain(*arguments: Tensor | int) -> list[Any]:
+    return [ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_int64(a) for a in arguments]
+
+
+@cache
+def _library(source: str) -> Any:
     compiler = next((found for name in ("c++", "g++", "clang++") if (found := shutil.which(name))), None)
     if compiler is None:
         raise OSError("no C++ compiler")
-    source = _SOURCE.read_bytes()
-    name = hashlib.sha256(source + repr((compiler, _FLAGS, os.cpu_count())).encode()).hexdigest()[:16]
+    path = _HERE / f"{source}.cpp"
+    name = hashlib.sha256(path.read_bytes() + repr((compiler, _FLAGS[source], os.cpu_count())).encode()).hexdigest()[:16]
     folder = Path(tempfile.gettempdir()) / f"pfbench_{os.getuid()}"
-    path = folder / f"{name}.so"
-    if not path.exists():
+    built = folder / f"{name}.so"
+    if not built.exists():
         folder.mkdir(mode=0o700, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            built = Path(scratch) / path.name
-            subprocess.run([compiler, *_FLAGS, "-o", built, _SOURCE, "-lm"], check=True, capture_output=True)
-            os.replace(built, path)
-    library = ctypes.CDLL(str(path))
-    library.normals.argtypes = [_ADDRESS, *(_ADDRESS, _NUMBER) * 3, *(_NUMBER,) * 3]
-    library.normals.restype = None
-    return library
+            part, new = Path(scratch) / f"{source}.o", Path(scratch) / built.name
+            subprocess.run([compiler, *_FLAGS[source], "-o", part, path], check=True, capture_output=True)
+            # linked without -ffast-math, with which a library switches small numbers off in the whole process
+            subprocess.run([compiler, "-shared", "-o", new, part, "-lm"], check=True, capture_output=True)
+            os.replace(new, built)
+    return ctypes.CDLL(str(built))

@@ -93,3 +93,18 @@ extern "C" void normals(float* out, const int64_t* run, int64_t runs, const int6
                 pairs(c, d, n, out + 2 * quarters + q, out + 3 * quarters + q);
             }
 }
+
+// Uniforms on (0, 1): out [W, R, 4 Q], as normals.
+extern "C" void uniforms(double* out, const int64_t* run, int64_t runs, const int64_t* component, int64_t components,
+                         const int64_t* quarter, int64_t quarters, int64_t step, int64_t key0, int64_t key1) {
+    alignas(64) uint32_t word[4][BLOCK];
+    for (int64_t w = 0; w < components; ++w)
+        for (int64_t r = 0; r < runs; ++r, out += 4 * quarters)
+            for (int64_t q = 0; q < quarters; q += BLOCK) {
+                const int n = static_cast<int>(quarters - q < BLOCK ? quarters - q : BLOCK);
+                words(quarter + q, static_cast<uint32_t>(component[w]), static_cast<uint32_t>(step), static_cast<uint32_t>(run[r]),
+                      static_cast<uint32_t>(key0), static_cast<uint32_t>(key1), n, word[0], word[1], word[2], word[3]);
+                for (int k = 0; k < 4; ++k)
+                    for (int i = 0; i < n; ++i) out[k * quarters + q + i] = (word[k][i] + 0.5) * 0x1p-32;
+            }
+}

@@ -59,6 +59,15 @@ class Record(NamedTuple):
         """Step t alone: y [R, Dy], inputs [R or 1, ...]."""
         return Record(self.y[:, t], map_inputs(lambda a: a[:, t], self.u))
 
+    def of(self, runs: slice) -> Record:
+        """Some of the runs."""
+
+        def some(a: Tensor) -> Tensor:
+            return a[runs] if len(a) > 1 else a
+
+        start, spread = (None if a is None else a[runs] for a in (self.start, self.spread))
+        return Record(self.y[runs], map_inputs(some, self.u), start, spread, self.loop)
+
     def to(self, like: Tensor) -> Record:
         """On the device of `like`, floating-point numbers in its dtype."""
 
@@ -70,8 +79,8 @@ class Record(NamedTuple):
 
 
 def map_inputs(f: Any, u: Any) -> Any:
-    """The NamedTuple of inputs with `f` applied to each of its tensors."""
-    return type(u)(*map(f, u)) if u else u
+    """The NamedTuple of inputs with `f` applied to each of its tensors, those of NamedTuples in it too."""
+    return type(u)(*(map_inputs(f, part) if isinstance(part, tuple) else f(part) for part in u)) if u else u
 
 
 @dataclass(frozen=True)

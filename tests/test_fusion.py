@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
-from pfbench import fusion
+from pfbench import fusion, native
 from pfbench.draws import MonteCarlo
 from pfbench.filter import particle, resamplers
 from pfbench.filter.belief import Cloud, gather
@@ -59,9 +60,9 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
     seen[1, 0, 2] = False
     a, n, u = torch.softmax(3.0 * z, -1), torch.full((RUNS, 1), N), torch.tensor([[0.1], [0.5], [0.9]])
     return [
-        particle._flat_moments(1e3 + x, z),
+        particle._flat_moments(1e3 + x, torch.softmax(z, 1)),
         particle._normalise(hidden),
-        base._log_normal(x, 0.1 * x, torch.full((1, 1, D), 0.7, dtype=dtype), seen),
+        base._log_normal(0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen),
         resamplers._evenly(a, n, u.double()),
     ]
 
@@ -95,3 +96,54 @@ def test_a_filter_runs_alike_fused_and_eagerly() -> None:
     # normals agree to 1e-5 and a slot of a resampling may fall to a neighbour: far below the Monte Carlo error
     assert torch.allclose(fused.log_evidence, eager.log_evidence, rtol=0, atol=2e-2)
     assert torch.allclose(fused.mean, eager.mean, rtol=0, atol=2e-2)
+
+
+@compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
+    """Empty slots, fewer particles wanted than slots, all weight on one, and weights that nobody can use."""
+    a = torch.softmax(2.0 * DRAWS.normal("w", N, 1)[..., 0].to(dtype), -1)
+    a = torch.cat([a, torch.zeros(3, N, dtype=dtype)])
+    a[0, N // 2 :] = 0.0
+    a[3, 7] = a[4, -1] = 1.0
+    a[5] = torch.nan
+    n = torch.tensor([[N], [N // 3], [2], [N], [N], [N]], dtype=dtype)
+    u = torch.linspace(1e-9, 1.0 - 1e-9, 6, dtype=torch.float64)[:, None]
+    assert torch.equal(native.systematic(a, n, u), resamplers._counted_evenly(a, n, u))
+    assert torch.equal(native.systematic(a[:1], n[:1], u[:1]), native.systematic(a, n[:1], u)[:1])
+
+
+@compiler
+def test_a_loop_by_hand_gathers() -> None:
+    x, ancestors = DRAWS.normal("x", N, D).permute(2, 0, 1), (DRAWS.uniform("a", 3 * N, 1)[..., 0] * N).long()
+    expected = x.gather(2, ancestors.expand(D, -1, -1))
+    assert torch.equal(native.gather(x, ancestors), expected)
+    assert torch.equal(native.gather(x.contiguous().float(), ancestors), expected.float())
+
+
+@compiler
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (0, 2, 1)])
+def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(order: tuple[int, int, int]) -> None:
+    back = [order.index(k) for k in range(3)]
+    x, w = DRAWS.normal("x", N, D).permute(order).contiguous().permute(back), torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1)
+    x[1, 5, 2], x[2, 4, 0] = torch.nan, torch.inf
+    y, scale, constant = x[:, 0], torch.rand(RUNS, D, dtype=torch.float64), torch.rand(RUNS, dtype=torch.float64)
+    scale[1, 1] = 0.0  # not seen
+    torch.testing.assert_close(
+        native.log_normal(y, x, scale, constant), base._run_quadratic(y, x, scale, constant), equal_nan=True
+    )
+    torch.testing.assert_close(native.moments(x, w), particle._separate_moments(x, w), equal_nan=True)
+
+
+@compiler
+def test_a_gradient_goes_round_the_loops_by_hand() -> None:
+    x, w = DRAWS.normal("x", N, D).requires_grad_(), torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1)
+    with fusion.fused():
+        particle._flat_moments(x, w)[0].sum().backward()
+    torch.testing.assert_close(x.grad, w.unsqueeze(-1).expand_as(x))
+
+
+@compiler
+def test_small_numbers_are_still_numbers_after_the_loops_are_loaded() -> None:
+    native.normals(torch.tensor([1, 2]), torch.tensor(0), *(torch.arange(2) for _ in range(3)))
+    assert float(torch.tensor(1e-310, dtype=torch.float64) / 2) > 0.0  # -ffast-math, when linked, would make it 0

@@ -16,22 +16,23 @@ PACKAGE = ROOT / "pfbench"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 # what each part of the house may import; a part may always import itself
+FAST = {"fusion", "native"}
 GROUND = {"record", "draws", "covariance"}
 CHARTED = GROUND | {"nav", "chart"}
 MODELLED = CHARTED | {"model", "noise"}
 PLAIN = {"metrics", "store"}
 MAY_IMPORT: dict[str, set[str]] = {
-    **{part: {"fusion", "native"} for part in GROUND},
-    **{part: set() for part in PLAIN | {"fusion", "native"}},
+    **{part: FAST for part in GROUND},
+    **{part: set() for part in PLAIN | FAST},
     "nav": GROUND,
     "chart": GROUND | {"nav"},
-    "model": CHARTED | {"fusion"},
+    "model": CHARTED | FAST,
     "noise": CHARTED,
-    "filter": CHARTED | {"fusion", "model.base"},
+    "filter": CHARTED | FAST | {"model.base"},
     "bound": CHARTED | {"model.base", "filter"},
     "scenario": MODELLED,
-    **{part: MODELLED | PLAIN | {"fusion", "filter", "bound", "scenario"} for part in ("job", "train", "ppl")},
-    "survey": MODELLED | PLAIN | {"fusion", "filter", "bound", "scenario", "job"},
+    **{part: MODELLED | PLAIN | FAST | {"filter", "bound", "scenario"} for part in ("job", "train", "ppl")},
+    "survey": MODELLED | PLAIN | FAST | {"filter", "bound", "scenario", "job"},
     "report": PLAIN,
     "cli": MODELLED | PLAIN | {"filter", "scenario", "job", "survey", "train", "ppl", "report"},
     "__main__": {"cli"},

@@ -10,7 +10,7 @@ import torch
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Info
 from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.loop import run_filter
+from pfbench.filter.loop import run_filter, runs_at_once
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.rules import Cubature, Jacobian, Points
 from pfbench.model.linear import linear_walk, local_level
@@ -71,6 +71,32 @@ def test_watch_and_tick_are_called_at_every_step_and_change_nothing(method: Part
     assert watched.trace["block"].shape == (3, 7, 2, 2)
     assert torch.equal(watched.trace["corner"], watched.trace["block"][..., 0, 1])
     assert torch.allclose(watched.trace["block"].diagonal(dim1=-2, dim2=-1), watched.variance)
+
+
+@every_method
+@pytest.mark.parametrize("at_once", [1, 2, 5, 9])
+def test_runs_may_be_stepped_in_blocks(method: ParticleFilter | GaussianFilter, at_once: int) -> None:
+    """Starts, spreads and inputs are of each run, one run has no measurement and the worlds are watched: nothing may change."""
+    runs = 5
+    seen = record(7, runs)._replace(
+        start=MonteCarlo(4, torch.arange(runs)).normal("start", 2, 1)[..., 0],
+        spread=torch.eye(2, dtype=torch.float64) * torch.arange(1.0, 1.0 + runs, dtype=torch.float64)[:, None, None],
+    )
+    seen.y[3] = torch.nan
+
+    def watch(t: int, info: Info) -> dict[str, torch.Tensor]:
+        return {"mean": info.mean, "covariance": info.covariance()}
+
+    whole = run_filter(method, MODEL, seen, draws(runs), watch)
+    blocked = run_filter(method, MODEL, seen, draws(runs), watch, at_once=at_once)
+    torch.testing.assert_close(blocked._asdict(), whole._asdict(), rtol=1e-12, atol=1e-12, equal_nan=True)
+
+
+@pytest.mark.parametrize(("runs", "blocks"), [(1, 1), (100, 1), (300, 2), (1000, 8)])
+def test_blocks_of_runs_are_of_about_equal_size(runs: int, blocks: int) -> None:
+    size = runs_at_once(runs, 500, 15)
+    assert -(-runs // size) == blocks
+    assert size * blocks - runs < blocks
 
 
 @every_method

@@ -132,7 +132,7 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     wanted |= {
         f"pfbench/report/{file.name}" for pattern in ("*.jinja", "*.css") for file in (ROOT / "pfbench/report").glob(pattern)
     }
-    wanted |= {"pfbench/py.typed", "pfbench/normals.cpp", "pfbench/conf/__init__.py", "pfbench/experiments/__init__.py"}
+    wanted |= {"pfbench/py.typed", "pfbench/normals.cpp", "pfbench/loops.cpp", "pfbench/conf/__init__.py", "pfbench/experiments/__init__.py"}
     assert wanted <= names
     rest = {name for name in names - wanted if ".dist-info/" not in name}
     assert rest == set()  # no tests, no results, no caches

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from pfbench.draws import Draws
+from pfbench.draws import Source
 from pfbench.filter.belief import Cloud, Filter, Gaussian, Info
 from pfbench.filter.rules import Jacobian, Space
 from pfbench.model.base import AtRest, StateSpaceModel
 from pfbench.record import Record, Underway
+
+_NUMBERS = 1_000_000  # of a block's particles
 
 Watch = Callable[[int, Info], dict[str, Tensor]]
 
@@ -43,9 +45,10 @@ def run_filter(
     method: Filter,
     model: StateSpaceModel,
     record: Record,
-    draws: Draws,
+    draws: Source,
     watch: Watch | None = None,
     tick: Callable[[], object] | None = None,
+    at_once: int | None = None,
 ) -> Estimate:
     """Runs a filter over a record, all runs as one batch.
 
@@ -56,6 +59,8 @@ def run_filter(
         draws: the filter's randomness; step 0 is the initial law, step t the t-th measurement.
         watch: (t, info) -> {name: [R] or [R, ...]}, for what needs more than mean and variance; it cannot influence the filter.
         tick: called after each step (a progress bar).
+        at_once: runs that a step takes together, one such block after the other; None takes all. The estimate is the same, but
+            for rounding; see `runs_at_once`. A world that is corrected is stepped as a whole.
 
     Raises:
         ValueError: an empty record, or one with infinities; a world to be corrected by a model or filter that cannot.
@@ -66,35 +71,64 @@ def run_filter(
         raise ValueError("record.y holds infinite values: mark a missing component as NaN")
     started = record.to(model.anchor)
     closed = None if record.loop is None else record.loop.begin(record, _correctable(model))
-    record = model.prepare(record).to(model.anchor)
-    belief = method.init(model, record.y.shape[0], draws.at(0), started.start, started.spread)
+    record = model.prepare(record).to(model.anchor)._replace(start=started.start, spread=started.spread)
+    runs = record.y.shape[0]
+    size = runs if at_once is None or closed is not None else at_once
+    blocks = [slice(first, first + size) for first in range(0, runs, size)]
+    parts = [(record.of(block), draws.of(block)) for block in blocks] if len(blocks) > 1 else [(record, draws)]
+    beliefs: list[Any] = [method.init(model, len(part.y), own.at(0), part.start, part.spread) for part, own in parts]
     means, variances, traces = [], [], []
     for t in range(record.y.shape[1]):
         stage = AtRest(model) if t == 0 and model.observes_initial else model
-        seen = record.at(t) if closed is None else model.prepare(closed.at(t)).to(model.anchor).at(0)
-        belief, info = method.step(stage, belief, seen, draws.at(t + 1))
-        alive = torch.isfinite(belief.log_z).unsqueeze(-1)
-        if closed is not None:
-            belief, info = fed_back(model, closed, belief, info, alive)
+        infos = []
+        for k, (part, own) in enumerate(parts):
+            seen = part.at(t) if closed is None else model.prepare(closed.at(t)).to(model.anchor).at(0)
+            beliefs[k], info = method.step(stage, beliefs[k], seen, own.at(t + 1))
+            if closed is not None:
+                beliefs[k], info = fed_back(model, closed, beliefs[k], info)
+            infos.append(info)
+        info, log_z = _joined(infos), torch.cat([belief.log_z for belief in beliefs])
+        alive = torch.isfinite(log_z).unsqueeze(-1)
         means.append(torch.where(alive, info.mean, torch.nan))
         variances.append(torch.where(alive, info.variance, torch.nan))
         traces.append(info.trace | (watch(t, info) if watch else {}))
         if tick:
             tick()
     trace = {name: torch.stack([step[name] for step in traces], 1) for name in traces[0]}
-    return Estimate(torch.stack(means, 1), torch.stack(variances, 1), belief.log_z, trace)
+    return Estimate(torch.stack(means, 1), torch.stack(variances, 1), log_z, trace)
+
+
+def runs_at_once(runs: int, particles: int, dimension: int) -> int:
+    """How many runs a step should take together on the CPU: blocks of about equal size and of a million numbers each.
+
+    A step's memory then depends on the size of a block and no longer on the number of runs. Smaller blocks would stay in the
+    cache of a core, but below some hundred thousand numbers single operations cost more than what they work on [measured on a
+    15-state INS with 500 particles: alone on the machine 100 runs together were a tenth faster than 50, beside others who use
+    the shared cache a third slower].
+    """
+    return -(-runs // max(1, round(runs * particles * dimension / _NUMBERS)))
+
+
+def _joined(infos: list[Info]) -> Info:
+    """What the blocks of runs tell, as one."""
+    if len(infos) == 1:
+        return infos[0]
+    mean, variance = (torch.cat([getattr(info, name) for info in infos]) for name in ("mean", "variance"))
+    trace = {name: torch.cat([info.trace[name] for info in infos]) for name in infos[0].trace}
+    return Info(mean, variance, lambda: torch.cat([info.covariance() for info in infos]), trace)
 
 
 def fed_back(
-    model: StateSpaceModel, closed: Underway, belief: Cloud | Gaussian, info: Info, alive: Tensor
+    model: StateSpaceModel, closed: Underway, belief: Cloud | Gaussian, info: Info
 ) -> tuple[Cloud | Gaussian, Info]:
-    """The world corrected by the estimate, of the runs that are alive [R, 1], and the belief about what is then left.
+    """The world corrected by the estimate, of the runs that are alive, and the belief about what is then left.
 
     A Gaussian moves by its mean and, since a rotation of the axes turns its spread, by the derivative there [ours].
 
     Raises:
         ValueError: a cloud that carries its past, which a corrected world has left behind.
     """
+    alive = torch.isfinite(belief.log_z).unsqueeze(-1)
     told, left = closed.correct(torch.where(alive, info.mean, 0.0))
     info = info._replace(mean=torch.where(alive, told.to(info.mean), info.mean))
     if isinstance(belief, Cloud):

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from pfbench import native
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, Info, weights
 from pfbench.filter.guided import Guided, GuidedParticles
@@ -121,7 +122,6 @@ class ParticleFilter:
         return cloud, summarise(model, cloud, trace)
 
 
-@fusible
 def _normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Log weights -> normalised (flat where none is finite), their logsumexp (then -inf) [R], effective sample size [R]."""
     total = log_w.logsumexp(1)
@@ -145,7 +145,7 @@ def bury(x: Tensor, log_w: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
 def summarise(model: StateSpaceModel, cloud: Cloud, trace: dict[str, Tensor]) -> Info:
     """Estimate and spread of a cloud, for the report: sums over particles, no copy of the cloud is kept."""
     if model.chart.flat:
-        mean, variance = _flat_moments(cloud.x, cloud.log_w)
+        mean, variance = _flat_moments(cloud.x, weights(cloud.log_w))
     else:
         w = weights(cloud.log_w)
         mean = model.chart.mean(cloud.x, w)
@@ -158,19 +158,18 @@ def summarise(model: StateSpaceModel, cloud: Cloud, trace: dict[str, Tensor]) ->
     return Info(mean, variance, covariance, trace)
 
 
-def _separate_moments(x: Tensor, log_w: Tensor) -> tuple[Tensor, Tensor]:
-    w = weights(log_w).unsqueeze(-2)
-    mean = w @ x
+def _separate_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    mean = w.unsqueeze(-2) @ x
     d = x - mean
-    return mean.squeeze(-2), (w @ (d * d)).squeeze(-2)
+    return mean.squeeze(-2), (w.unsqueeze(-2) @ (d * d)).squeeze(-2)
 
 
-def _fused_moments(x: Tensor, log_w: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean and variance [R, D] of plain numbers [R, N, D]."""
-    w, parts = weights(log_w), x.permute(2, 0, 1)
+def _fused_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean and variance [R, D] of plain numbers [R, N, D] by weights [R, N]."""
+    parts = x.permute(2, 0, 1)
     mean = (w * parts).sum(-1)
     d = parts - mean.unsqueeze(-1)
     return mean.T, (w * d * d).sum(-1).T
 
 
-_flat_moments = fusible(_fused_moments, eager=_separate_moments)
+_flat_moments = fusible(_fused_moments, eager=_separate_moments, by_hand=native.moments)

@@ -14,6 +14,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from pfbench import native
 from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter import belief
@@ -175,15 +176,17 @@ class Systematic:
     """One uniform for all slots, positions (j + u) / n. Counts are within 1 of n a."""
 
     def __call__(self, a: Tensor, n: Tensor, draws: Draws) -> Tensor:
-        return _count(_evenly(a, n, draws.uniform("resample", 1, 1).squeeze(1)))
+        return _evenly(_precise(a), n, draws.uniform("resample", 1, 1).squeeze(1))
 
 
-@fusible
-def _evenly(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
-    """Slots of n filled up to and including each particle by the positions (j + u) / n; u [R, 1]."""
+def _counted_evenly(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
+    """Ancestors [R, N] by the positions (j + u) / n of slots j; u [R, 1]."""
     reach = _cumulative(a) * n
     # where, since n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0
-    return _ends(torch.where(reach < n, torch.ceil(reach - u.to(reach.dtype)), n).long(), n)
+    return _ancestors(torch.where(reach < n, torch.ceil(reach - u.to(reach.dtype)), n).long(), n)
+
+
+_evenly = fusible(_counted_evenly, by_hand=native.systematic)
 
 
 @dataclass(frozen=True)
@@ -287,8 +290,12 @@ def _wanted(a: Tensor, n: Tensor) -> Tensor:
 
 def _cumulative(a: Tensor) -> Tensor:
     """Cumulative sums [R, N] whose last value is 1, whatever rounding did."""
-    sums = (a.double() if a.shape[1] >= _DOUBLE_FROM else a).cumsum(1)
+    sums = _precise(a).cumsum(1)
     return sums / sums[:, -1:]
+
+
+def _precise(a: Tensor) -> Tensor:
+    return a.double() if a.shape[1] >= _DOUBLE_FROM else a
 
 
 def _pick(cumulative: Tensor, u: Tensor) -> Tensor:
@@ -297,21 +304,13 @@ def _pick(cumulative: Tensor, u: Tensor) -> Tensor:
 
 
 def _ancestors(below: Tensor, n: Tensor) -> Tensor:
-    """Ancestors [R, N] from the number of slots filled up to and including each particle, int64 [R, N], non-decreasing."""
-    return _count(_ends(below, n))
+    """Ancestors [R, N] from the number of slots filled up to and including each particle, int64 [R, N], non-decreasing.
 
-
-def _ends(below: Tensor, n: Tensor) -> Tensor:
-    """The same, made safe: between 0 and n, and n for the last particle."""
-    wanted = n.long()
+    Slot j belongs to the first particle that ends after it: count particles by where they end, and sum.
+    """
+    (runs, slots), wanted = below.shape, n.long()
     ends = torch.minimum(below, wanted).clamp(min=0)  # in float32 the largest uniform is 1 and ends a weight of 0 at -1
-    last = torch.arange(below.shape[1], device=below.device) == below.shape[1] - 1
-    return torch.where(last, wanted, ends)
-
-
-def _count(ends: Tensor) -> Tensor:
-    """Slot j belongs to the first particle that ends after it: count particles by where they end, and sum [R, N]."""
-    slots = ends.shape[1]
-    counts = torch.zeros(ends.shape[0], slots + 1, dtype=torch.long, device=ends.device)
-    counts.scatter_add_(1, ends, torch.ones_like(ends))
-    return counts.cumsum(1)[:, :slots].clamp_(max=slots - 1)
+    last = torch.arange(slots, device=below.device) == slots - 1
+    ends = torch.where(last, wanted, ends)  # whatever rounding did
+    counts = torch.zeros(runs, slots + 1, dtype=torch.long, device=ends.device).scatter_add(1, ends, torch.ones_like(ends))
+    return counts.cumsum(1)[:, :slots].clamp(max=slots - 1)

@@ -11,6 +11,7 @@ from pyro.distributions import Independent, MultivariateNormal, Normal
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from pfbench import native
 from pfbench.chart import Chart, Euclidean
 from pfbench.covariance import gaussian_log_density
 from pfbench.fusion import fusible
@@ -135,7 +136,7 @@ class StateSpaceModel(nn.Module, ABC):
                 sd = sd[:1, :1]
             y, y_hat = y.nan_to_num().unsqueeze(1), law.base_dist.loc
             if type(self).residual is not StateSpaceModel.residual:  # a plain difference is taken within the fused loop
-                y, y_hat = self.residual(y, y_hat), torch.zeros_like(y)
+                y, y_hat = torch.zeros_like(y), -self.residual(y, y_hat)
             return _log_normal(y, y_hat, sd, seen)
         y_hat = law.mean
         r = torch.where(seen, self.residual(y.unsqueeze(1), y_hat), 0.0)
@@ -184,15 +185,31 @@ class AtRest(StateSpaceModel):
         return self.model.log_likelihood(y, x, u)
 
 
-@fusible
 def _log_normal(y: Tensor, mean: Tensor, sd: Tensor, seen: Tensor) -> Tensor:
-    """Log density of independent normals about `mean` [R, N, Dy] over the components seen [R, 1, Dy] -> [R, N].
+    """Log density at y [R, 1, Dy] of independent normals about `mean` [R, N, Dy] over the components seen [R, 1, Dy] -> [R, N].
 
-    Does what torch's log_prob does in one pass over the particles instead of eight: half of a step was spent there.
+    Scales are of a run or, [R, N, Dy], of each particle. Does what torch's log_prob does in one pass over the particles
+    instead of eight: half of a step was spent there.
     """
-    z = (y - mean) * (seen / sd)
-    constant = ((torch.log(sd) + _HALF_LOG_2PI) * seen).sum(-1)
-    return -0.5 * (z * z).sum(-1) - constant
+    scale, constant = seen / sd, ((torch.log(sd) + _HALF_LOG_2PI) * seen).sum(-1)
+    if scale.shape[1] == 1:
+        return _quadratic(y[:, 0], mean, scale[:, 0], constant[:, 0])
+    return _quadratic_of_each(y, mean, scale) - constant
+
+
+def _run_quadratic(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tensor:
+    """-1/2 sum ((y - mean) scale)^2 - constant [R, N]; y, scale [R, K], mean [R, N, K], constant [R]."""
+    z = (y[:, None] - mean) * scale[:, None]
+    return -0.5 * (z * z).sum(-1) - constant[:, None]
+
+
+@fusible
+def _quadratic_of_each(y: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
+    z = (y - mean) * scale
+    return -0.5 * (z * z).sum(-1)
+
+
+_quadratic = fusible(_run_quadratic, by_hand=native.log_normal)
 
 
 def independent_normal(mean: Tensor, sd: Tensor) -> Independent:

@@ -27,8 +27,10 @@ from pfbench.nav.aiding import Aided, Alignment, Flown, Receiver
 from pfbench.nav.sensors import ImuErrors
 from pfbench.nav.trajectory import Manoeuvres, Start, accelerate, cruise, turn
 from pfbench.noise.regimes import Nominal, Outage, Regime
+from pfbench.noise.surges import Surge
 from pfbench.record import Channels, Episode, Record, Underway
 from pfbench.scenario.flight import SimulatedFlight
+from pfbench.scenario.told import Witness
 
 IMU = ImuErrors(
     gyro_bias_deg_h=1.0,
@@ -181,7 +183,7 @@ def test_the_spread_of_a_gaussian_turns_as_its_particles_would() -> None:
     covariance = (root @ root.T).expand(3, -1, -1)
     belief = Gaussian(mean, covariance, torch.zeros(3, dtype=torch.float64))
     info = Info(mean, covariance.diagonal(dim1=-2, dim2=-1), lambda: covariance, {})
-    moved, _ = fed_back(model, way, belief, info, torch.ones(3, 1, dtype=torch.bool))
+    moved, _ = fed_back(model, way, belief, info)
     assert isinstance(moved, Gaussian)
     x = mean.unsqueeze(1) + MonteCarlo(3, RUNS).normal("cloud", 10_000, 9) @ root.T
     second = underway(pair(LARGE)[1])
@@ -204,7 +206,7 @@ def test_a_lost_run_is_no_longer_corrected() -> None:
     eye = torch.eye(9, dtype=torch.float64).expand(3, -1, -1)
     belief = Gaussian(mean, eye, torch.tensor([0.0, -torch.inf, -torch.inf], dtype=torch.float64))
     info = Info(mean, torch.ones_like(mean), lambda: eye, {})
-    moved, told = fed_back(model, way, belief, info, torch.isfinite(belief.log_z).unsqueeze(-1))
+    moved, told = fed_back(model, way, belief, info)
     assert torch.isnan(told.mean[1:]).all()
     assert torch.isfinite(told.mean[0]).all()
     assert moved.x.isnan().any() if isinstance(moved, Cloud) else moved.mean[0].abs().max() < 1e-9
@@ -273,6 +275,33 @@ def test_a_filter_in_single_precision_corrects_an_ins_in_double() -> None:
     assert away.max() < 0.05
 
 
+# told
+
+
+def test_a_told_filter_of_a_corrected_world_knows_each_step() -> None:
+    """Of both loops it makes the same; and at each step it is the filter whose model has this step's noise."""
+    swollen = Surge(((5.0, 9.0),), (4.0,), (9.0,))
+    model, method = fifteen(), GaussianFilter(Jacobian())
+    apart, closed = [], []
+    for found, switch in ((apart, False), (closed, True)):
+        witness = Witness(swollen)
+        world = flight(SMALL, switch).draw(witness, RUNS, 4)
+        told = witness.tell(model, world.time)
+        found += [filtered(method, told, world), filtered(method, model, world), told, world]
+    away = (apart[0].trace["error"] - closed[0].trace["error"]).abs() / apart[0].variance.sqrt()
+    assert away.max() < 2e-3
+    assert torch.allclose(apart[0].log_evidence, closed[0].log_evidence, rtol=1e-3)
+    before, within = slice(0, 4), slice(5, 8)
+    assert torch.allclose(closed[0].variance[:, before], closed[1].variance[:, before])
+    assert (closed[0].variance[:, within, 3:9] > 1.2 * closed[1].variance[:, within, 3:9]).all()
+    told, world = closed[2:]
+    way = underway(world)
+    for t in range(9):
+        seen = told.prepare(way.at(t)).u
+        assert float(seen.root) == (3.0 if 5 <= t + 0.5 < 9 else 1.0)
+        assert seen.scale.unique().tolist() == [2.0 if 5 <= t + 1 < 9 else 1.0]
+
+
 # what cannot be
 
 
@@ -286,7 +315,7 @@ def test_models_and_filters_that_cannot_close_the_loop_are_refused() -> None:
     past = Cloud(zero, zero[..., 0], zero[:, 0, 0], window={"parents": zero.unsqueeze(2)})
     info = Info(zero[:, 0], zero[:, 0] + 1, lambda: zero, {})
     with pytest.raises(ValueError, match=r"carry their past.*scenario\.closed=false"):
-        fed_back(model, way, past, info, torch.ones(3, 1, dtype=torch.bool))
+        fed_back(model, way, past, info)
 
 
 class Odometer:

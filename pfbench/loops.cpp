@@ -1,0 +1,96 @@
+// The loops over particles of a bootstrap filter's step, one run at a time, so that a run's particles stay in the first-level cache.
+//
+// Particles lie component by component: x [D, R, N]. Compiled without -ffinite-math-only: NaN and infinity keep their meaning.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+namespace {
+// One uniform u for all slots, positions (j + u) / n: slot j goes to the first particle whose sum of weights lies beyond its position.
+template <class T>
+void systematic(int64_t* ancestor, const T* weight, const double* wanted, const double* uniform, int64_t runs, int64_t slots) {
+    std::vector<T> sums(slots);
+    std::vector<int32_t> ends(slots), ending(slots + 1);
+    for (int64_t r = 0; r < runs; ++r, weight += slots, ancestor += slots) {
+        double sum = 0.0;
+        for (int64_t i = 0; i < slots; ++i) sums[i] = static_cast<T>(sum += weight[i]);
+        const T whole = sums[slots - 1], n = static_cast<T>(wanted[r]), u = static_cast<T>(uniform[r]);
+        for (int64_t i = 0; i < slots; ++i) {
+            const T reach = sums[i] / whole * n;
+            // not simply ceil: n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0
+            const T end = reach < n ? std::ceil(reach - u) : n;
+            ends[i] = static_cast<int32_t>(end < 0 ? 0 : end);
+        }
+        ends[slots - 1] = static_cast<int32_t>(n);  // whatever rounding did
+        std::fill(ending.begin(), ending.end(), 0);
+        for (int64_t i = 0; i < slots; ++i) ++ending[ends[i]];
+        int64_t passed = 0;  // a slot belongs to the first particle that ends after it
+        for (int64_t j = 0; j < slots; ++j) ancestor[j] = std::min(passed += ending[j], slots - 1);
+    }
+}
+
+template <class T>
+void gather(T* out, const T* x, const int64_t* ancestor, int64_t components, int64_t runs, int64_t slots, int64_t wanted) {
+    std::vector<int32_t> from(wanted);
+    for (int64_t r = 0; r < runs; ++r) {
+        for (int64_t j = 0; j < wanted; ++j) from[j] = static_cast<int32_t>(ancestor[r * wanted + j]);
+        for (int64_t d = 0; d < components; ++d) {
+            const T* row = x + (d * runs + r) * slots;
+            T* to = out + (d * runs + r) * wanted;
+            for (int64_t j = 0; j < wanted; ++j) to[j] = row[from[j]];
+        }
+    }
+}
+
+// -1/2 sum ((y - mean) scale)^2 - constant; y, scale and constant are of a run, mean [R, N, K] lies as its strides say.
+template <class T>
+void log_normal(T* out, const T* y, const T* mean, const T* scale, const T* constant, const int64_t* stride, int64_t runs,
+                int64_t particles, int64_t components) {
+    for (int64_t r = 0; r < runs; ++r, out += particles) {
+        for (int64_t i = 0; i < particles; ++i) out[i] = -constant[r];
+        for (int64_t k = 0; k < components; ++k) {
+            const T* at = mean + r * stride[0] + k * stride[2];
+            const T centre = y[r * components + k], by = scale[r * components + k];
+            if (stride[1] == 1)  // known to the compiler
+                for (int64_t i = 0; i < particles; ++i) {
+                    const T z = (centre - at[i]) * by;
+                    out[i] -= T(0.5) * z * z;
+                }
+            else
+                for (int64_t i = 0; i < particles; ++i) {
+                    const T z = (centre - at[i * stride[1]]) * by;
+                    out[i] -= T(0.5) * z * z;
+                }
+        }
+    }
+}
+
+template <class T>
+void moments(T* mean, T* variance, const T* x, const T* weight, int64_t components, int64_t runs, int64_t particles) {
+    for (int64_t r = 0; r < runs; ++r)
+        for (int64_t d = 0; d < components; ++d) {
+            const T* row = x + (d * runs + r) * particles;
+            const T* w = weight + r * particles;
+            T first = 0, second = 0;
+            for (int64_t i = 0; i < particles; ++i) first += w[i] * row[i];
+            for (int64_t i = 0; i < particles; ++i) second += w[i] * (row[i] - first) * (row[i] - first);
+            mean[r * components + d] = first;
+            variance[r * components + d] = second;
+        }
+}
+}  // namespace
+
+#define BOTH(name, parameters_of, arguments)                             \
+    extern "C" void name##_float32 parameters_of(float) { name arguments; } \
+    extern "C" void name##_float64 parameters_of(double) { name arguments; }
+#define SYSTEMATIC(T) (int64_t* a, const T* w, const double* n, const double* u, int64_t runs, int64_t slots)
+#define GATHER(T) (T* out, const T* x, const int64_t* a, int64_t d, int64_t runs, int64_t slots, int64_t wanted)
+#define LOG_NORMAL(T)                                                                                                       \
+    (T* out, const T* y, const T* mean, const T* scale, const T* constant, const int64_t* stride, int64_t runs, int64_t n, int64_t k)
+#define MOMENTS(T) (T* mean, T* variance, const T* x, const T* w, int64_t d, int64_t runs, int64_t n)
+
+BOTH(systematic, SYSTEMATIC, (a, w, n, u, runs, slots))
+BOTH(gather, GATHER, (out, x, a, d, runs, slots, wanted))
+BOTH(log_normal, LOG_NORMAL, (out, y, mean, scale, constant, stride, runs, n, k))
+BOTH(moments, MOMENTS, (mean, variance, x, w, d, runs, n))
