@@ -10,7 +10,7 @@ import platform
 import re
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,10 +27,10 @@ import pfbench
 from pfbench import fusion, native, store
 from pfbench.bound import posterior_bound
 from pfbench.draws import MonteCarlo
-from pfbench.filter.belief import Info
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter, runs_at_once
 from pfbench.filter.particle import ParticleFilter
+from pfbench.judge import Judge
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.regimes import Nominal
 from pfbench.record import Episode
@@ -106,21 +106,23 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
     truth = model.assemble(episode.truth).to(cfg.device, dtype)
     steps = episode.record.y.shape[1]
     draws = MonteCarlo(cfg.seed, runs.to(cfg.device), dtype)
+    judge = Judge(model, truth, cfg.scored)
     fuse = fuses(cfg.engine, method, model, cfg.runs * steps)
     with (
         fusion.fused(fuse),
         torch.no_grad(),
         tqdm(total=steps, desc=name, unit="step", delay=2, disable=None, leave=False) as bar,
     ):
-        estimate = run_filter(method, model, episode.record, draws, judge(model, truth), bar.update, at_once(cfg, method, model))
+        estimate = run_filter(method, model, episode.record, draws, judge, bar.update, at_once(cfg, method, model))
     if cfg.device != "cpu":
         torch.cuda.synchronize()
     ended = time.perf_counter()
+    spent = ended - bounded - judge.seconds
     seconds = {
-        "world": drawn - started, "bound": bounded - drawn, "filter": ended - bounded, "per_step": (ended - bounded) / steps
+        "world": drawn - started, "bound": bounded - drawn, "scores": judge.seconds, "filter": spent, "per_step": spent / steps
     }  # fmt: skip
     meta = describe(cfg, model, method, steps, seconds, episode.notes)
-    return {**meta, "bound": said}, {**_arrays(episode, estimate), **_shared(episode, least)}
+    return {**meta, "bound": said}, {**_arrays(episode, estimate, judge), **_shared(episode, least)}
 
 
 def settings(cfg: DictConfig | Mapping[str, Any]) -> None:
@@ -129,7 +131,7 @@ def settings(cfg: DictConfig | Mapping[str, Any]) -> None:
     Raises:
         ValueError: names the key, the value and the remedy.
     """
-    for key, least in (("runs", 1), ("first_run", 0), ("threads", 1), ("seed", 0)):
+    for key, least in (("runs", 1), ("first_run", 0), ("threads", 1), ("seed", 0), ("scored", 0)):
         if type(cfg[key]) is not int or cfg[key] < least:
             raise ValueError(f"{key}={cfg[key]}: give a whole number, {least} or more")
     if type(cfg["told"]) is not bool:
@@ -172,25 +174,6 @@ def fuses(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> b
         log.warning("engine=%s: nothing compiles here (%s); going on eagerly", engine, type(error).__name__)
         return False
     return True
-
-
-def judge(model: StateSpaceModel, truth: Tensor) -> Callable[[int, Info], dict[str, Tensor]]:
-    """What is measured at each step against the truth [R, T, D]: error [R, d] and normalised error squared of each group.
-
-    A filter without a spread left (a cloud collapsed to one particle) has an infinite normalised error, not an unknown one.
-    """
-
-    def watch(t: int, info: Info) -> dict[str, Tensor]:
-        error = model.error(info.mean, truth[:, t])
-        nees, covariance = [], info.covariance()
-        for parts in map(list, model.groups.values()):
-            e = error[:, parts].unsqueeze(-1)
-            value = (e.mT @ torch.linalg.solve_ex(covariance[:, parts][:, :, parts], e)[0]).flatten()
-            known = ~torch.isnan(e).any(1).flatten()
-            nees.append(torch.where(known & ~(value >= 0.0), torch.inf, value))
-        return {"error": error, "nees": torch.stack(nees, 1)}
-
-    return watch
 
 
 def lower_bound(
@@ -312,7 +295,7 @@ def _choices() -> dict[str, str]:
     return {part: str(chosen[part]) for part in ("scenario", "noise", "filter", "model")}
 
 
-def _arrays(episode: Episode, estimate: Estimate) -> dict[str, np.ndarray]:
+def _arrays(episode: Episode, estimate: Estimate, judge: Judge) -> dict[str, np.ndarray]:
     trace = dict(estimate.trace)
     gone = torch.isnan(estimate.mean).any(-1, keepdim=True)
     arrays = {
@@ -326,6 +309,7 @@ def _arrays(episode: Episode, estimate: Estimate) -> dict[str, np.ndarray]:
     }
     if episode.track is not None:
         arrays["track"] = episode.track.float()
+    arrays |= {name: value.float() if value.is_floating_point() else value for name, value in judge.arrays().items()}
     return {name: value.cpu().numpy() for name, value in arrays.items()}
 
 

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from pfbench import cli, job
 from pfbench.draws import MonteCarlo
 from pfbench.filter.loop import run_filter
+from pfbench.judge import Judge
 from pfbench.noise.regimes import Nominal
 from pfbench.record import Channels, Episode, Record, map_inputs
 
@@ -121,7 +122,7 @@ def five_steps(scenario: str, *words: str) -> None:
     model, method, episode = job.build(cfg.model), job.build(cfg["filter"]), world(scenario)
     truth = model.assemble(episode.truth)
     ticks: list[int] = []
-    estimate = run_filter(method, model, episode.record, MonteCarlo(SEED, RUNS), job.judge(model, truth), lambda: ticks.append(1))
+    estimate = run_filter(method, model, episode.record, MonteCarlo(SEED, RUNS), Judge(model, truth), lambda: ticks.append(1))
     assert len(ticks) == STEPS
     assert estimate.mean.shape == (2, STEPS, model.chart.size)
     assert estimate.variance.shape == (2, STEPS, len(model.names))

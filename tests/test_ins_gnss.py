@@ -20,6 +20,7 @@ from pfbench.draws import MonteCarlo
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.rules import Cubature, Jacobian, Points, Unscented
+from pfbench.judge import Judge
 from pfbench.model.ins_gnss import InsGnss, Step
 from pfbench.nav import attitude, earth, error_dynamics
 from pfbench.nav.aiding import Alignment, Inflation, Receiver
@@ -216,7 +217,7 @@ def test_error_is_corrected_minus_true(flight: Episode) -> None:
 
 def filtered(rule: Any, model: InsGnss, episode: Episode) -> Estimate:
     runs = torch.arange(episode.record.y.shape[0])
-    watch = job.judge(model, model.assemble(episode.truth))
+    watch = Judge(model, model.assemble(episode.truth))
     with torch.no_grad():
         return run_filter(GaussianFilter(rule), model, episode.record, MonteCarlo(1, runs), watch)
 

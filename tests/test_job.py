@@ -13,7 +13,8 @@ import torch
 from command_line import Said, pfbench, process
 
 from pfbench.filter.belief import Info
-from pfbench.job import _boundless, judge
+from pfbench.job import _boundless
+from pfbench.judge import Judge
 from pfbench.model.linear import linear_walk
 from pfbench.record import Episode, Record
 
@@ -125,7 +126,7 @@ def test_runs_in_two_jobs_are_the_runs_of_one(tmp_path: Path, method: str) -> No
     whole = result(tmp_path, *words, "runs=5", study="whole")[1]
     head = result(tmp_path, *words, "runs=2", study="head")[1]
     tail = result(tmp_path, *words, "first_run=2", "runs=3", study="tail")[1]
-    common = ("time", "bound")
+    common = ("time", "bound", "scored")
     joined = {name: whole[name] if name in common else np.concatenate([head[name], tail[name]]) for name in whole}
     assert identical(joined, whole)
     assert not np.array_equal(head["error"], tail["error"][:2])
@@ -294,6 +295,6 @@ def test_a_collapsed_cloud_is_infinitely_wrong_and_no_truth_is_unknown() -> None
     truth = torch.tensor([[0.0, 0.0], [0.0, 0.0], [nan, 0.0]], dtype=torch.float64).unsqueeze(1)
     covariance = torch.stack([4.0 * eye, 0.0 * eye, eye])
     info = Info(torch.ones(3, 2, dtype=torch.float64), covariance.diagonal(dim1=-2, dim2=-1), lambda: covariance, {})
-    nees = judge(model, truth)(0, info)["nees"][:, 0].tolist()
+    nees = Judge(model, truth)(0, info)["nees"][:, 0].tolist()
     assert nees[:2] == [0.5, math.inf]
     assert math.isnan(nees[2])

@@ -20,6 +20,7 @@ from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.rules import Cubature, Jacobian, Points, Unscented
+from pfbench.judge import Judge
 from pfbench.model.sins_gps_azimuth import (
     Euler,
     Exact,
@@ -377,7 +378,7 @@ def test_what_cannot_be(build: Any, message: str) -> None:
 
 def filtered(method: Any, model: SinsGpsAzimuth, episode: Episode, seed: int = 1) -> Estimate:
     runs = torch.arange(episode.record.y.shape[0])
-    watch = job.judge(model, model.assemble(episode.truth))
+    watch = Judge(model, model.assemble(episode.truth))
     with torch.no_grad():
         return run_filter(method, model, episode.record, MonteCarlo(seed, runs), watch)
 

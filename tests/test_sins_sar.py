@@ -20,6 +20,7 @@ from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.rules import Cubature, Jacobian, Points, Rule
+from pfbench.judge import Judge
 from pfbench.model.sins_sar import SinsSar, Step, from_metres, surroundings, to_metres
 from pfbench.nav import attitude, earth, error_dynamics
 from pfbench.nav.aiding import ARCMIN, Alignment, Inflation
@@ -406,7 +407,7 @@ def beginning(episode: Episode, steps: int) -> Episode:
 
 def filtered(rule: Rule, model: SinsSar, episode: Episode) -> Estimate:
     runs = torch.arange(episode.record.y.shape[0])
-    watch = job.judge(model, model.assemble(episode.truth))
+    watch = Judge(model, model.assemble(episode.truth))
     with torch.no_grad():
         return run_filter(GaussianFilter(rule), model, episode.record, MonteCarlo(1, runs), watch)
 

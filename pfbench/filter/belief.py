@@ -61,12 +61,15 @@ class Info(NamedTuple):
         variance: [R, d].
         covariance: gives the whole covariance in the chart [R, d, d] to whoever asks; a cloud's costs a tenth of a step.
         trace: anything per run, {name: [R]}, such as `ess` or `resampled`.
+        cloud: gives the particles' deviations from the mean [R, N, d] and their log weights [R, N] to whoever asks; None from a
+            filter whose law is the normal one.
     """
 
     mean: Tensor
     variance: Tensor
     covariance: Callable[[], Tensor]
     trace: dict[str, Tensor]
+    cloud: Callable[[], tuple[Tensor, Tensor]] | None = None
 
 
 class Filter(Protocol):

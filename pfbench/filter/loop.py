@@ -115,7 +115,13 @@ def _joined(infos: list[Info]) -> Info:
         return infos[0]
     mean, variance = (torch.cat([getattr(info, name) for info in infos]) for name in ("mean", "variance"))
     trace = {name: torch.cat([info.trace[name] for info in infos]) for name in infos[0].trace}
-    return Info(mean, variance, lambda: torch.cat([info.covariance() for info in infos]), trace)
+    clouds = [info.cloud for info in infos if info.cloud is not None]
+
+    def cloud() -> tuple[Tensor, Tensor]:
+        deviations, log_w = zip(*(part() for part in clouds), strict=True)
+        return torch.cat(deviations), torch.cat(log_w)
+
+    return Info(mean, variance, lambda: torch.cat([info.covariance() for info in infos]), trace, cloud if clouds else None)
 
 
 def fed_back(

@@ -151,11 +151,14 @@ def summarise(model: StateSpaceModel, cloud: Cloud, trace: dict[str, Tensor]) ->
         mean = model.chart.mean(cloud.x, w)
         variance = (w.unsqueeze(-2) @ model.chart.subtract(cloud.x, mean.unsqueeze(1)).square()).squeeze(-2)
 
-    def covariance() -> Tensor:
-        d = model.chart.subtract(cloud.x, mean.unsqueeze(1))
-        return (weights(cloud.log_w).unsqueeze(-1) * d).mT @ d
+    def deviations() -> tuple[Tensor, Tensor]:
+        return model.chart.subtract(cloud.x, mean.unsqueeze(1)), cloud.log_w
 
-    return Info(mean, variance, covariance, trace)
+    def covariance() -> Tensor:
+        d, log_w = deviations()
+        return (weights(log_w).unsqueeze(-1) * d).mT @ d
+
+    return Info(mean, variance, covariance, trace, deviations)
 
 
 def _separate_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:

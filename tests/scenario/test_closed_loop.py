@@ -18,6 +18,7 @@ from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, fed_back, run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.rules import Jacobian, Points, Unscented
+from pfbench.judge import Judge
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.ins_gnss import InsGnss
 from pfbench.model.linear import linear_walk
@@ -64,7 +65,7 @@ def underway(episode: Episode) -> Underway:
 
 
 def filtered(method: Any, model: StateSpaceModel, episode: Episode, runs: Tensor = RUNS, **words: Any) -> Estimate:
-    watch = job.judge(model, model.assemble(episode.truth).to(model.anchor))
+    watch = Judge(model, model.assemble(episode.truth).to(model.anchor))
     with torch.no_grad():
         return run_filter(method, model, episode.record, MonteCarlo(1, runs, **words), watch)
 

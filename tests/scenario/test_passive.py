@@ -21,6 +21,7 @@ from pfbench.draws import MonteCarlo
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import run_filter
 from pfbench.filter.rules import Cubature, Jacobian, Points
+from pfbench.judge import Judge
 from pfbench.model.passive_location import SPEED_OF_LIGHT, PassiveLocation, Platform, level_attitude, look, relative
 from pfbench.noise.regimes import Nominal, Outage, Outliers, Regime, StudentT
 from pfbench.record import Episode
@@ -359,7 +360,7 @@ def test_gaussian_filters_are_consistent_where_what_they_are_told_is_true(rule: 
     wrong = sd * MonteCarlo(4, torch.arange(runs)).normal("world.wrong", 1, 4)[:, 0]
     start = doubles([*scene.target_position, *scene.target_velocity]) + wrong
     record = episode.record._replace(start=start, spread=torch.diag(sd).expand(runs, -1, -1))
-    watch = job.judge(MODEL, MODEL.assemble(episode.truth))
+    watch = Judge(MODEL, MODEL.assemble(episode.truth))
     with torch.no_grad():
         nees = run_filter(GaussianFilter(rule), MODEL, record, MonteCarlo(1, torch.arange(runs)), watch).trace["nees"]
     low, high = stats.chi2.ppf([level, 1 - level], 2 * runs)

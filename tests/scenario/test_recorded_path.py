@@ -14,11 +14,11 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from synthetic_log import GRAVITY, ORIGIN, drive, write
 
-from pfbench import job
 from pfbench.draws import MonteCarlo
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import run_filter
 from pfbench.filter.rules import Jacobian
+from pfbench.judge import Judge
 from pfbench.nav import attitude, earth
 from pfbench.noise.regimes import Nominal
 from pfbench.scenario.flight import SimulatedFlight
@@ -145,7 +145,7 @@ def test_the_filter_is_consistent_on_the_recorded_drive() -> None:
     scenario, model = composed("scenario.path.end=400", "scenario.imu_rate=50")
     runs = torch.arange(40)
     episode = scenario.draw(Nominal(), runs, 1)
-    watch = job.judge(model, model.assemble(episode.truth))
+    watch = Judge(model, model.assemble(episode.truth))
     nees = run_filter(GaussianFilter(Jacobian()), model, episode.record, MonteCarlo(1, runs), watch).trace["nees"]
     assert nees.shape == (40, 399, 5)
     # time averages of 40 runs, each a chi-square of 3 or, since errors last, of less: four standard errors of single instants

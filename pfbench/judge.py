@@ -1,0 +1,132 @@
+"""What a filter's beliefs are worth, measured against the truth, which only the judge sees.
+
+Errors and normalised errors at every step; scores of the whole law at some instants, since they cost more than a filter's step:
+continuous ranked probability and energy scores [Gneiting, Raftery 2007] and the probability integral transform, from which rank
+histograms and the coverage of intervals come.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+from typing import NamedTuple, TypeAlias
+
+import scoringrules
+import torch
+from torch import Tensor
+
+from pfbench.covariance import factor
+from pfbench.draws import MonteCarlo
+from pfbench.filter.belief import Info, weights
+from pfbench.model.base import StateSpaceModel
+
+Groups: TypeAlias = Collection[tuple[int, ...]]
+
+_POINTS = 64  # of a law whose energy score is taken: its bias, E|x - x'| / 128, is the same for all filters [ours]
+
+
+class Scores(NamedTuple):
+    """Of a law, against the truth; NaN where there is no truth.
+
+    Attributes:
+        crps: continuous ranked probability score of each component [R, d], in its unit.
+        pit: probability that the law gives to values below the truth [R, d]; uniform for a filter that knows what it knows.
+        energy: energy score of each group [R, G], the CRPS of vectors.
+    """
+
+    crps: Tensor
+    pit: Tensor
+    energy: Tensor
+
+
+class Judge:
+    """Watches a filter on its way, as run_filter's `watch`.
+
+    Args:
+        model: what the filter believes.
+        truth: the true state [R, T, D], NaN where there is none.
+        instants: how many instants are scored, spread evenly, the last one among them; 0 scores nothing.
+
+    Attributes:
+        at: the steps scored [S].
+        scores: of those that have been passed.
+        seconds: what scoring took.
+    """
+
+    def __init__(self, model: StateSpaceModel, truth: Tensor, instants: int = 0) -> None:
+        steps = truth.shape[1]
+        self.model, self.truth = model, truth
+        self.at = sorted({(k + 1) * steps // instants - 1 for k in range(instants)} - {-1})
+        self.scores: list[Scores] = []
+        self.seconds = 0.0
+
+    def __call__(self, t: int, info: Info) -> dict[str, Tensor]:
+        """Error [R, d] and normalised error squared of each group [R, G].
+
+        A filter without a spread left (a cloud collapsed to one particle) has an infinite normalised error, not an unknown one.
+        """
+        error = self.model.error(info.mean, self.truth[:, t])
+        nees, covariance = [], info.covariance()
+        for parts in map(list, self.model.groups.values()):
+            e = error[:, parts].unsqueeze(-1)
+            value = (e.mT @ torch.linalg.solve_ex(covariance[:, parts][:, :, parts], e)[0]).flatten()
+            known = ~torch.isnan(e).any(1).flatten()
+            nees.append(torch.where(known & ~(value >= 0.0), torch.inf, value))
+        if t in self.at:
+            begun = time.perf_counter()
+            self.scores.append(self._scored(t, error, covariance, info))
+            self.seconds += time.perf_counter() - begun
+        return {"error": error, "nees": torch.stack(nees, 1)}
+
+    def arrays(self) -> dict[str, Tensor]:
+        """What was scored: steps [S], crps and pit [R, S, d], energy [R, S, G]; nothing where nothing was."""
+        if not self.scores:
+            return {}
+        parts = zip(Scores._fields, zip(*self.scores, strict=True), strict=True)
+        return {"scored": torch.tensor(self.at)} | {name: torch.stack(values, 1) for name, values in parts}
+
+    def _scored(self, t: int, error: Tensor, covariance: Tensor, info: Info) -> Scores:
+        groups = self.model.groups.values()
+        if info.cloud is not None:
+            return of_cloud(error, *info.cloud(), groups)
+        draws = MonteCarlo(0, torch.zeros(1, dtype=torch.int64, device=error.device), error.dtype, t)  # the same for all runs
+        return of_normal(error, covariance, draws.normal("energy score", _POINTS, error.shape[1]), groups)
+
+
+def of_cloud(error: Tensor, deviation: Tensor, log_w: Tensor, groups: Groups) -> Scores:
+    """Scores of weighted particles.
+
+    Args:
+        error: of the estimate [R, d].
+        deviation: of the particles from the estimate [R, N, d].
+        log_w: their log weights [R, N].
+        groups: components whose energy score is wanted.
+    """
+    w, off = weights(log_w), (error.unsqueeze(1) + deviation).permute(0, 2, 1)  # particles minus truth [R, d, N]
+    shared = w.unsqueeze(1).expand_as(off)
+    crps = scoringrules.crps_ensemble(torch.zeros_like(error), off, ens_w=shared, estimator="qd", backend="torch")
+    below = (shared * (off < 0)).sum(-1) + 0.5 * (shared * (off == 0)).sum(-1)
+    places = (torch.arange(_POINTS, device=w.device, dtype=w.dtype) + 0.5) / _POINTS
+    picked = torch.searchsorted(w.cumsum(-1), places.expand(len(w), -1).contiguous()).clamp(max=w.shape[1] - 1)
+    thinned = off.gather(2, picked.unsqueeze(1).expand(-1, off.shape[1], -1))
+    return _whole(error, crps, below, thinned, groups)
+
+
+def of_normal(error: Tensor, covariance: Tensor, z: Tensor, groups: Groups) -> Scores:
+    """Scores of normal laws: error [R, d], covariance [R, d, d]; normals [R or 1, n, d] stand for the law in energy scores."""
+    sd = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
+    spread = torch.where(sd > 0, sd, 1.0)
+    crps = scoringrules.crps_normal(torch.zeros_like(error), error, spread, backend="torch")
+    crps = torch.where(sd > 0, crps, error.abs())
+    points = error.unsqueeze(-1) + factor(covariance)[0] @ z.mT
+    return _whole(error, crps, torch.special.ndtr(-error / sd), points, groups)
+
+
+def _whole(error: Tensor, crps: Tensor, pit: Tensor, points: Tensor, groups: Groups) -> Scores:
+    """NaN where there is no truth; `points` minus truth are [R, d, n]."""
+    known = ~torch.isnan(error)
+    energy = [
+        scoringrules.es_ensemble(torch.zeros_like(error[:, parts]), points[:, parts].mT, backend="torch")
+        for parts in map(list, groups)
+    ]
+    return Scores(torch.where(known, crps, torch.nan), torch.where(known, pit, torch.nan), torch.stack(energy, 1))

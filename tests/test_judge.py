@@ -1,0 +1,111 @@
+"""Scores of laws against the truth: closed forms, and calibration of an exact filter."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy import stats
+from torch import Tensor
+
+from pfbench.draws import MonteCarlo
+from pfbench.filter.belief import Info
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.loop import run_filter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.rules import Jacobian
+from pfbench.judge import Judge, of_cloud, of_normal
+from pfbench.model.linear import linear_walk
+from pfbench.noise.regimes import Nominal
+from pfbench.scenario.model_world import ModelWorld
+
+MODEL = linear_walk(1.0, 0.3, 1.0)
+GROUPS = ((0,), (1,), (0, 1))
+
+
+def law(runs: int = 3) -> tuple[Tensor, Tensor]:
+    """Errors [R, 2] and covariance [R, 2, 2], correlated."""
+    covariance = torch.tensor([[4.0, 1.5], [1.5, 1.0]], dtype=torch.float64).expand(runs, -1, -1)
+    return torch.tensor([[0.0, 0.0], [1.0, -2.0], [6.0, 0.5]], dtype=torch.float64)[:runs], covariance
+
+
+def test_a_large_cloud_of_a_normal_law_scores_as_the_law() -> None:
+    error, covariance = law()
+    n, root = 40_000, torch.linalg.cholesky(covariance)
+    z = MonteCarlo(1, torch.arange(3)).normal("z", n, 2)
+    cloud = of_cloud(error, z @ root.mT, torch.zeros(3, n, dtype=torch.float64), GROUPS)
+    exact = of_normal(error, covariance, z[:, :2000], GROUPS)
+    sd = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert ((cloud.crps - exact.crps).abs() < 6 * sd / math.sqrt(n)).all()
+    assert ((cloud.pit - exact.pit).abs() < 6 * 0.5 / math.sqrt(n)).all()
+    # 64 points stand for the cloud: the mean distance from the truth is off by a few standard errors of 64, and by the bias
+    assert ((cloud.energy - exact.energy).abs() < 6 * sd.sum(-1, keepdim=True) / 8).all()
+    z = torch.tensor([0.5, -1.5], dtype=torch.float64)  # Gneiting and Raftery 2007, eq. 21
+    expected = z * (2 * torch.special.ndtr(z) - 1) + 2 * torch.exp(-z * z / 2) / math.sqrt(2 * math.pi) - 1 / math.sqrt(math.pi)
+    one = of_normal(z[:, None], torch.ones(2, 1, 1, dtype=torch.float64), torch.zeros(2, 4, 1, dtype=torch.float64), ((0,),))
+    torch.testing.assert_close(one.crps[:, 0], expected)
+
+
+def test_the_energy_score_of_one_component_is_its_crps() -> None:
+    error, _ = law()
+    deviation = MonteCarlo(2, torch.arange(3)).normal("z", 64, 2)
+    scores = of_cloud(error, deviation, torch.zeros(3, 64, dtype=torch.float64), GROUPS)
+    torch.testing.assert_close(scores.energy[:, :2], scores.crps)
+
+
+def test_a_weighted_particle_is_as_many_particles() -> None:
+    error, _ = law()
+    deviation = MonteCarlo(2, torch.arange(3)).normal("z", 16, 2)
+    repeated = deviation.repeat_interleave(torch.tensor([1, 3] * 8), dim=1)
+    w = torch.tensor([1.0, 3.0] * 8, dtype=torch.float64).log().expand(3, -1)
+    empty = torch.cat([w, torch.full((3, 1), -torch.inf, dtype=torch.float64)], 1)
+    padded = torch.cat([deviation, torch.full((3, 1, 2), 1e6, dtype=torch.float64)], 1)
+    one = of_cloud(error, padded, empty, GROUPS)
+    torch.testing.assert_close(one._asdict(), of_cloud(error, repeated, torch.zeros(3, 32, dtype=w.dtype), GROUPS)._asdict())
+
+
+def test_a_point_scores_its_distance() -> None:
+    error, covariance = law()
+    point = of_cloud(error, torch.zeros(3, 5, 2, dtype=torch.float64), torch.zeros(3, 5, dtype=torch.float64), GROUPS)
+    flat = of_normal(error, 0 * covariance, torch.zeros(3, 8, 2, dtype=torch.float64), GROUPS)
+    for scores in (point, flat):
+        torch.testing.assert_close(scores.crps, error.abs())
+        torch.testing.assert_close(scores.energy[:, 2], error.norm(dim=1))
+
+
+def test_without_a_truth_there_is_no_score() -> None:
+    error = torch.tensor([[0.5, torch.nan]], dtype=torch.float64)
+    scores = of_cloud(error, torch.zeros(1, 4, 2, dtype=torch.float64), torch.zeros(1, 4, dtype=torch.float64), GROUPS)
+    assert torch.isnan(scores.crps).tolist() == torch.isnan(scores.pit).tolist() == [[False, True]]
+    assert torch.isnan(scores.energy).tolist() == [[False, True, True]]
+
+
+@pytest.mark.parametrize(("instants", "at"), [(0, []), (1, [9]), (3, [2, 5, 9]), (10, list(range(10))), (99, list(range(10)))])
+def test_instants_are_spread_evenly_and_the_last_is_among_them(instants: int, at: list[int]) -> None:
+    assert Judge(MODEL, torch.zeros(1, 10, 2), instants).at == at
+
+
+@pytest.mark.parametrize("method", [GaussianFilter(Jacobian()), ParticleFilter(400)], ids=["kalman", "sir"])
+def test_an_honest_filter_is_calibrated_and_a_confident_one_is_not(method: GaussianFilter | ParticleFilter) -> None:
+    runs = torch.arange(300)
+    episode = ModelWorld(MODEL, 20).draw(Nominal(), runs, 3)
+    truth = MODEL.assemble(episode.truth)
+
+    def confident(t: int, info: Info) -> dict[str, Tensor]:
+        d, log_w = info.cloud() if info.cloud else (None, None)
+        cloud = None if d is None else (lambda: (0.6 * d, log_w))
+        return proud(t, info._replace(covariance=lambda: 0.36 * info.covariance(), cloud=cloud))
+
+    honest, proud = Judge(MODEL, truth, 2), Judge(MODEL, truth, 2)
+    for judge, watch in ((honest, honest), (proud, confident)):
+        run_filter(method, MODEL, episode.record, MonteCarlo(4, runs), watch)
+        found = judge.arrays()
+        assert found["scored"].tolist() == [9, 19]
+        assert found["crps"].shape == found["pit"].shape == (300, 2, 2)
+        assert found["energy"].shape == (300, 2, len(MODEL.groups))
+    p = [stats.kstest(judge.arrays()["pit"][:, -1, 0], "uniform").pvalue for judge in (honest, proud)]
+    assert p[0] > 1e-3
+    assert p[1] < 1e-4
+    assert (honest.arrays()["crps"] - proud.arrays()["crps"]).mean() < 0
+    assert honest.seconds > 0
