@@ -20,6 +20,7 @@ pfbench {version}: benchmarks of particle filters in integrated navigation
       pfbench run -m scenario=t003 filter=ekf,sir noise=nominal,outliers study=mine
       pfbench run -m +experiment=quickstart
   pfbench report study=NAME          figures, tables and tests of a study, as a page
+  pfbench report study=claims        every claim of the five papers, and what the studies say of it
   pfbench report scenario=NAME       the datasheet of a scene, as a page; also: noise=NAME, runs=20
   pfbench list [group]               what can be composed
   pfbench check                      composes everything; versions, threads, device, data root
@@ -90,6 +91,13 @@ def _report(words: list[str]) -> None:
     cfg = _compose(words)
     if cfg["study"] == "datasheets":
         raise ValueError("study=datasheets: there lie the datasheets of scenes; give scenario=NAME to see one, or another study")
+    if cfg["study"] == "claims":
+        from pfbench.report import ledger
+
+        said = cfg["report"]
+        page = ledger.write(cfg["results"], cfg["reports"], said["alpha"], conf_dir(), experiments_dir(), mixed=said["mixed"])
+        print(f"claims: {page.resolve()}")
+        return
     chosen: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in cfg["report"].items()}
     page = write(cfg["study"], cfg["results"], cfg["reports"], Options(**chosen))
     print(f"report: {page.resolve()}")

@@ -60,8 +60,8 @@ def run(cfg: DictConfig) -> float:
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     if not re.fullmatch(r"\w[\w.-]*", str(cfg.study)):
         raise ValueError(f"study={cfg.study}: it names a folder of results; use letters, digits, points, dashes and underscores")
-    if cfg.study == DATASHEETS:
-        raise ValueError(f"study={cfg.study}: there lie the datasheets of scenes; give the study another name")
+    if cfg.study in (DATASHEETS, "claims"):
+        raise ValueError(f"study={cfg.study}: `pfbench report` puts pages of its own there; give the study another name")
     path = Path(cfg.results) / cfg.study / f"{store.key(config, PLACES)}.npz"
     choices = _choices()
     name = " ".join(choices[part] for part in ("scenario", "noise", "filter"))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterator
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -216,7 +216,7 @@ def test_every_regime_gives_errors(scenario: str, noise: str) -> None:
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_cell_of_every_experiment_composes(experiment: str) -> None:
+def test_every_choice_of_every_experiment_composes(experiment: str) -> None:
     cli._offer_experiments()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         study = compose("config", [f"+experiment={experiment}"], return_hydra_config=True)
@@ -224,8 +224,9 @@ def test_every_cell_of_every_experiment_composes(experiment: str) -> None:
         assert isinstance(params, dict)
         assert study.study == experiment  # `pfbench report study=NAME` finds what +experiment=NAME made
         swept = [[f"{key!s}={value}" for value in str(values).split(",")] for key, values in params.items()]
-        cells = list(product(*swept))
-        assert len(cells) > 1
+        number = max(map(len, swept))
+        cells = [[values[k % len(values)] for values in swept] for k in range(number)]  # every value once: not every pair
+        assert math.prod(map(len, swept)) > 1
         for cell in cells:
             cfg = compose("config", [f"+experiment={experiment}", *cell, "data.root=somewhere"])
             OmegaConf.to_container(cfg, resolve=True)

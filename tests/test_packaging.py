@@ -130,9 +130,10 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     wanted = {f"pfbench/{file.relative_to(ROOT / 'pfbench')}" for file in (ROOT / "pfbench").rglob("*.py")}
     wanted |= {f"pfbench/{file.relative_to(ROOT)}" for top in ("conf", "experiments") for file in (ROOT / top).rglob("*.yaml")}
     wanted |= {
-        f"pfbench/report/{file.name}" for pattern in ("*.jinja", "*.css") for file in (ROOT / "pfbench/report").glob(pattern)
+        f"pfbench/report/{file.name}" for pattern in ("*.jinja", "*.css", "*.yaml") for file in (ROOT / "pfbench/report").glob(pattern)
     }
-    wanted |= {"pfbench/py.typed", "pfbench/normals.cpp", "pfbench/loops.cpp", "pfbench/conf/__init__.py", "pfbench/experiments/__init__.py"}
+    wanted |= {f"pfbench/{file}" for file in ("py.typed", "normals.cpp", "loops.cpp")}
+    wanted |= {f"pfbench/{folder}/__init__.py" for folder in ("conf", "experiments")}
     assert wanted <= names
     rest = {name for name in names - wanted if ".dist-info/" not in name}
     assert rest == set()  # no tests, no results, no caches

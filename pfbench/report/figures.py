@@ -22,7 +22,6 @@ from pfbench.report.canvas import (
     labelled,
     legend,
     log_if_wide,
-    plain_ticks,
     quantiles,
     slug,
     stack,
@@ -81,8 +80,6 @@ def drawings(
         found.append(Drawing(f"error_{slug(block.group)}", text, partial(error, results, block, style)))
     text = f"RMSE of each run: quartiles, whiskers to 1.5 quartile ranges, one point for each of the {kept}."
     found.append(Drawing("rmse", text, partial(rmse, runs, [block.group for block in shown], style)))
-    text = "Time per step against the root of the mean over runs and time of the squared error."
-    found.append(Drawing("cost", text, partial(cost, results, shown, style)))
     text = f"NEES averaged over the {kept}, with its two-sided {100 * (1 - alpha):g} % chi-square band."
     found.append(Drawing("nees", text, partial(nees, results, wholes, style, alpha)))
     if any("ess" in result.arrays for result in results.values()):
@@ -223,30 +220,6 @@ def rmse(runs: pd.DataFrame, groups: Sequence[str], style: Mapping[str, Look]) -
         unit = str(own.unit.iloc[0]) if len(own) else ""
         axis.set(title=group, xlabel=labelled("RMSE per run", unit), ylabel="")
         log_if_wide(axis, axis.xaxis, [kept.value.to_numpy()])
-    return figure
-
-
-def cost(results: Results, shown: Sequence[Block], style: Mapping[str, Look]) -> Figure:
-    """Time per step against RMSE, one panel per group."""
-    figure, panels = stack(len(shown), 1.6)
-    times = [1e3 * result.meta["seconds"]["per_step"] for result in results.values()]
-    for block, axis in zip(shown, panels, strict=True):
-        errors = []
-        for (label, result), time in zip(results.items(), times, strict=True):
-            if any(own.group == block.group for own in blocks(result.meta["state"])):
-                value = metrics.rmse_norm(result.arrays["error"][..., block.places], result.arrays["lost"]).value
-                errors.append(float(value) * block.scale)
-                look = style[label]
-                axis.scatter(time, errors[-1], s=38, color=look.colour, marker=look.marker, label=label, zorder=3)
-        axis.set(title=block.group, ylabel=labelled("RMSE", block.unit))
-        axis.margins(0.15)
-        # A logarithmic axis without a positive number on it is an error of matplotlib's.
-        if any(value > 0 for value in errors):
-            axis.set(xscale="log", yscale="log")
-            plain_ticks(axis.yaxis, errors)
-            plain_ticks(axis.xaxis, times)
-    panels[-1].set_xlabel("time per step in ms")
-    legend(figure, panels[0])
     return figure
 
 

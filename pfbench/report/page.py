@@ -16,10 +16,11 @@ import pandas as pd
 from tqdm import tqdm
 
 from pfbench import store
-from pfbench.report import figures, tables
+from pfbench.report import across, budget, figures, ranking_figures, tables
+from pfbench.report.across import Across
 from pfbench.report.canvas import looks, slug
 from pfbench.report.frame import Cell, blocks, cells, later, natural, tidy
-from pfbench.report.significance import NO_DIFFERENCE, Verdict, verdicts
+from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Verdict, over_page, sensitivity, verdicts
 
 _HERE = Path(__file__).parent
 _MIME = {"svg": "svg+xml", "png": "png"}
@@ -51,6 +52,8 @@ class Options:
         formats: of the figures: svg, png; the page carries png where there is one, which stays small when curves are long.
         mixed: accept results of several versions, seeds, runs or lengths side by side.
         converged: bounds by group, in the unit shown, for the time to converge.
+        margin: share by which RMSE may differ between filters that count as equal.
+        wanted: share by which RMSE differs in the effect for which the needed number of runs is computed.
 
     Raises:
         ValueError: a value out of range.
@@ -62,10 +65,15 @@ class Options:
     formats: tuple[str, ...] = ("svg", "png")
     mixed: bool = False
     converged: Mapping[str, float] = field(default_factory=dict)
+    margin: float = 0.05
+    wanted: float = 0.1
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 1:
             raise ValueError(f"alpha={self.alpha} is no probability; 0.05 is usual")
+        for name in ("margin", "wanted"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}={getattr(self, name)} is no share by which errors differ; 0.05 is five per cent")
         if not self.formats or set(self.formats) - set(_MIME):
             raise ValueError(f"formats={list(self.formats)}: choose from {', '.join(_MIME)}")
 
@@ -73,7 +81,7 @@ class Options:
 def write(
     study: str, results: str | Path = "results", out: str | Path = "reports", options: Options | None = None
 ) -> Path:
-    """Writes `<out>/<study>/`: index.html, report.md, verdicts.json, figures/, tables/.
+    """Writes `<out>/<study>/`: index.html, report.md, verdicts.json, across.json, pfbench.bib, figures/, tables/.
 
     The same results give the same bytes. Figures and tables of an earlier report in that folder are removed.
 
@@ -96,23 +104,39 @@ def write(
     folder = Path(out) / study
     clear(folder)
     style = looks(sorted((job.label for cell in found for job in cell.jobs), key=natural))
-    sections, decided = [], []
+    sections, decided, runs = [], [], []
     for cell in tqdm(found, desc=f"report {study}", disable=None, delay=2):
-        section, own = _section(cell, groups, style, folder, options)
+        section, own, rows = _section(cell, groups, style, folder, options)
         sections.append(section)
         decided += own
+        runs.append(rows)
+    decided = over_page(decided)
+    table = pd.concat(runs, ignore_index=True)
+    scored = [group for group in groups if (table.group == group).any()]
+    over_cells = [across.across(table, group, options.alpha, options.margin) for group in scored]
+    note = budget.stated([job.meta for cell in found for job in cell.jobs])
     context = {
         "study": study,
         "options": options,
         "groups": groups,
         "cells": sections,
         "verdicts": decided,
+        "everything": tables.everything(decided),
+        "page_shown": sum(v.p_page <= options.alpha for v in decided),
+        "shown": sum(v.winner != NO_DIFFERENCE for v in decided),
+        "family_sizes": sorted({v.family for v in decided}),
+        "budget": note,
+        "across": _across(table, over_cells, decided, style, folder, options, note),
+        "lost_rules": [rule.name for rule in LOST_RULES],
+        "bibtex": (bibtex := _bibtex(found)),
         "shared": _shared(found),
         "choices": _choices(found),
         "failures": store.failures(Path(results) / study),
     }
-    text = json.dumps([_plain(verdict) for verdict in decided], indent=1, allow_nan=False)
-    (folder / "verdicts.json").write_text(text + "\n", encoding="utf-8")
+    (folder / "pfbench.bib").write_text(bibtex, encoding="utf-8")
+    for name, typed in (("verdicts", decided), ("across", over_cells)):
+        text = json.dumps([_plain(asdict(one)) for one in typed], indent=1, allow_nan=False)
+        (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
     return render("page", folder, context)
 
 
@@ -120,47 +144,122 @@ def render(template: str, folder: Path, context: Mapping[str, Any]) -> Path:
     """Writes index.html and report.md by the templates of that name; returns the first."""
     css = (_HERE / "style.css").read_text(encoding="utf-8")
     for kind, name in (("md", "report.md"), ("html", "index.html")):
-        page = _environment().get_template(f"{template}.{kind}.jinja").render({**context, "css": css})
+        page = _environment(kind == "html").get_template(f"{template}.{kind}.jinja").render({**context, "css": css})
         (folder / name).write_text(page, encoding="utf-8")
     return folder / "index.html"
 
 
 def _section(
     cell: Cell, groups: Sequence[str], style: Mapping[str, figures.Look], folder: Path, options: Options
-) -> tuple[dict[str, Any], list[Verdict]]:
-    """What the templates need of one cell; writes its figures and tables."""
+) -> tuple[dict[str, Any], list[Verdict], pd.DataFrame]:
+    """What the templates need of one cell, what is decided in it, and its runs; writes its figures and tables."""
     whole = {job.label: job.load() for job in cell.jobs}
     used = {label: later(result, options.from_time) for label, result in whole.items()}
     runs = pd.concat([tidy(cell, job, whole[job.label], options.from_time, options.converged) for job in cell.jobs])
     known = [group for group in groups if _scored(used, group)]
+    fronts = [budget.front(cell.name, runs, group) for group in known]
     runs = runs[runs.group.isin(known)]
-    decided = verdicts(runs, options.alpha)
+    decided = verdicts(runs, options.alpha, options.margin, options.wanted)
+    note = budget.stated([job.meta for job in cell.jobs])
     prefix = slug(f"{cell.scenario}_{cell.noise}_{cell.model}")
     parts = []
     for group in known:
         own = [v for v in decided if v.group == group]
         accuracy = tables.accuracy(used, group, own, options.alpha, options.converged.get(group))
         if len(accuracy):
-            save_table(folder, f"{prefix}_{slug(group)}", accuracy)
-            pairs = tables.decisions(own)
+            save_table(folder, f"{prefix}_{slug(group)}", accuracy, note)
+            pairs, effects = tables.decisions(own), tables.effects(own)
             if own:
-                save_table(folder, f"{prefix}_{slug(group)}_pairs", pairs)
-            shown = sum(v.winner != NO_DIFFERENCE for v in own)
-            said = {"unbeaten": _unbeaten(own), "shown": shown, "n": len(own)}
-            parts.append({"name": group, "accuracy": accuracy, "pairs": pairs, **said})
+                save_table(folder, f"{prefix}_{slug(group)}_pairs", pairs, note)
+                save_table(folder, f"{prefix}_{slug(group)}_effects", effects, note)
+            front = next(front for front in fronts if front.group == group)
+            parts.append({"name": group, "accuracy": accuracy, "pairs": pairs, "effects": effects, **_said(own, front)})
     ran = tables.overview(used)
-    save_table(folder, f"{prefix}_overview", ran)
-    pictures = [
-        drawn(drawing, prefix, folder, options.formats)
-        for drawing in figures.drawings(whole, runs, style, known, options.alpha)
-    ]
+    save_table(folder, f"{prefix}_overview", ran, note)
+    shown = [
+        *figures.drawings(whole, runs, style, known, options.alpha), *ranking_figures.of_cell(decided, fronts, style)
+    ]  # fmt: skip
+    pictures = [drawn(drawing, prefix, folder, options.formats) for drawing in shown]
     lost = [(label, int(result.arrays["lost"].sum()), result.meta["runs"]) for label, result in whole.items()]
     gone = [(label, int(tables.diverged(result).sum()), result.meta["runs"]) for label, result in used.items()]
-    section = {"name": cell.name, "anchor": prefix, "overview": ran, "parts": parts, "drawings": pictures}
+    section: dict[str, Any] = {"budget": note, "name": cell.name, "anchor": prefix}
+    section |= {"overview": ran, "parts": parts, "drawings": pictures}
     there = {block.group for result in used.values() for block in blocks(result.meta["state"])}
     section["unscored"] = [group for group in groups if group in there and group not in known]
     section["bounds"] = _distinct(result.meta["bound"] for result in whole.values() if "bound" in result.meta)
-    return {**section, "lost": [row for row in lost if row[1]], "diverged": [row for row in gone if row[1]]}, decided
+    return {**section, "lost": [row for row in lost if row[1]], "diverged": [row for row in gone if row[1]]}, decided, runs
+
+
+def _said(own: Sequence[Verdict], front: budget.Front) -> dict[str, Any]:
+    """What the text says of one group of one cell."""
+    runs = [v.needed for v in own if math.isfinite(v.needed)]
+    least = [v.detectable for v in own if math.isfinite(v.detectable)]
+    return {
+        "unbeaten": _unbeaten(own),
+        "shown": sum(v.winner != NO_DIFFERENCE for v in own),
+        "equal": sum(v.equivalent for v in own),
+        "n": len(own),
+        "needed": (int(min(runs)), int(max(runs))) if runs else None,
+        "detectable": (100 * min(least), 100 * max(least)) if least else None,
+        "had": (min(v.pairs for v in own), max(v.pairs for v in own)) if own else None,
+        "front": [label for label, kept in zip(front.filters, front.kept, strict=True) if kept],
+    }
+
+
+def _across(
+    table: pd.DataFrame, found: Sequence[Across], decided: Sequence[Verdict], style: Mapping[str, figures.Look], folder: Path,
+    options: Options, note: str,
+) -> dict[str, Any]:  # fmt: skip
+    """What the templates need of all cells together; writes its figures and tables."""
+    sources = [across.blocks(table, one.group) for one in found]
+    ranked, changed = tables.ranked(found), tables.sensitive(sensitivity(table, options.alpha))
+    for name, one_table in (("ranks", ranked), ("lost_rules", changed)):
+        if len(one_table):
+            save_table(folder, f"across_{name}", one_table, note)
+    parts = []
+    for one in found:
+        pairs = tables.across_pairs(one)
+        if len(pairs):
+            save_table(folder, f"across_{slug(one.group)}", pairs, note)
+        others = [across.across(table, one.group, options.alpha, options.margin, rule) for rule in LOST_RULES[1:]]
+        parts.append({"one": one, "pairs": pairs, "changed": _changed(one, others)})
+    drawings = ranking_figures.of_study(list(zip(found, sources, strict=True)), decided, style)
+    return {
+        "parts": parts,
+        "ranked": ranked,
+        "sensitive": changed,
+        "lost": bool(table.lost.any()),
+        "drawings": [drawn(drawing, "across", folder, options.formats) for drawing in drawings],
+    }
+
+
+def _changed(one: Across, others: Sequence[Across]) -> list[str]:
+    """How many decisions across cells change under each other rule for lost runs."""
+    if one.refused:
+        return []
+    said = []
+    for other in others:
+        winners = {(p.a, p.b): p.winner for p in other.pairs}
+        n = sum(winners.get((p.a, p.b)) != p.winner for p in one.pairs)
+        said.append(f"{other.rule}: {other.refused or f'{n} of {len(one.pairs)}'}")
+    return said
+
+
+def _bibtex(found: Sequence[Cell]) -> str:
+    """An entry that a user can paste: the versions that made the results, and the year they were made in."""
+    metas = [job.meta for cell in found for job in cell.jobs]
+    version = ", ".join(_distinct(str(_at(meta, "versions.pfbench")) for meta in metas))
+    commit = ", ".join(_distinct(str(_at(meta, "versions.commit")) for meta in metas if _at(meta, "versions.commit")))
+    years = [str(meta["created"])[:4] for meta in metas if meta.get("created")]
+    note = f"  note    = {{Commit {commit}}},\n" if commit else ""
+    return (
+        "@software{pfbench,\n"
+        "  author  = {{The pfbench authors}},\n"
+        "  title   = {{pfbench}: probabilistic programming and benchmarking of particle filters in integrated navigation},\n"
+        f"  version = {{{version}}},\n{note}"
+        + (f"  year    = {{{max(years)}}},\n" if years else "")
+        + "}\n"
+    )
 
 
 def _scored(results: Mapping[str, store.Result], group: str) -> bool:
@@ -187,11 +286,11 @@ def drawn(drawing: figures.Drawing, prefix: str, folder: Path, formats: Sequence
     }
 
 
-def save_table(folder: Path, name: str, table: pd.DataFrame) -> None:
-    """As CSV and LaTeX."""
+def save_table(folder: Path, name: str, table: pd.DataFrame, note: str = "") -> None:
+    """As CSV and LaTeX; a note, such as the budget, stands below the LaTeX table and in a last column of the CSV."""
     (folder / "tables").mkdir(parents=True, exist_ok=True)
-    (folder / "tables" / f"{name}.csv").write_text(tables.csv(table), encoding="utf-8")
-    (folder / "tables" / f"{name}.tex").write_text(tables.latex(table), encoding="utf-8")
+    (folder / "tables" / f"{name}.csv").write_text(tables.csv(table.assign(note=note) if note else table), encoding="utf-8")
+    (folder / "tables" / f"{name}.tex").write_text(tables.latex(table, note), encoding="utf-8")
 
 
 def clear(folder: Path) -> None:
@@ -247,16 +346,20 @@ def _at(meta: Any, path: str) -> Any:
     return meta
 
 
-def _plain(verdict: Verdict) -> dict[str, Any]:
+def _plain(value: Any) -> Any:
     """For JSON, which has no infinity."""
-    values = asdict(verdict).items()
-    return {name: str(v) if isinstance(v, float) and not math.isfinite(v) else v for name, v in values}
+    if isinstance(value, Mapping):
+        return {name: _plain(below) for name, below in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(below) for below in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _environment() -> jinja2.Environment:
+def _environment(escaping: bool) -> jinja2.Environment:
+    """Of one kind of page: what templates share is escaped, or not, as the page that imports it needs."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_HERE),
-        autoescape=lambda name: bool(name and name.endswith("html.jinja")),
+        autoescape=escaping,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 
 from pfbench import metrics, store
+from pfbench.report.across import Across
 from pfbench.report.frame import Block, blocks
-from pfbench.report.significance import NO_DIFFERENCE, Verdict
+from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Sensitivity, Verdict
 
 Results = Mapping[str, store.Result]
 _LAST = 20  # steps over which a location is said to have settled [Pu and Qin, section 4]
@@ -72,6 +73,96 @@ def decisions(verdicts: Sequence[Verdict]) -> pd.DataFrame:
     )
 
 
+def effects(verdicts: Sequence[Verdict]) -> pd.DataFrame:
+    """How large the differences are, whether two filters count as equal, and what it takes to tell: one row per verdict."""
+    return pd.DataFrame(
+        [
+            {
+                "a": v.a,
+                "b": v.b,
+                "effect": v.effect,
+                "effect low": v.effect_low,
+                "effect high": v.effect_high,
+                "P(a better)": v.better,
+                "P low": v.better_low,
+                "P high": v.better_high,
+                f"p equal within {100 * v.margin:g} % ({v.family})": v.p_equivalent,
+                "equal": v.equivalent,
+                "scatter in %": 100 * v.scatter,
+                f"runs needed for {100 * v.wanted:g} %": _whole(v.needed),
+                "least found in %": 100 * v.detectable,
+            }
+            for v in verdicts
+        ]
+    )
+
+
+def everything(verdicts: Sequence[Verdict]) -> pd.DataFrame:
+    """All comparisons of a page, short, for the table that can be filtered."""
+    return pd.DataFrame(
+        [
+            {
+                "cell": f"{v.scenario} / {v.noise} / {v.model}",
+                "group": v.group,
+                "a": v.a,
+                "b": v.b,
+                "RMSE a to b in %": 100 * (v.ratio - 1),
+                "P(a better)": v.better,
+                "p Holm": v.p_holm,
+                f"p Holm ({v.page})": v.p_page,
+                "better": v.winner,
+                "equal": v.equivalent,
+            }
+            for v in verdicts
+        ]
+    )
+
+
+def ranked(found: Sequence[Across]) -> pd.DataFrame:
+    """Mean rank over cells of each filter, one column per group."""
+    made = [one for one in found if not one.refused]
+    labels = list(dict.fromkeys(label for one in made for label in one.filters))
+    by_group = {f"rank, {one.group}": dict(zip(one.filters, one.ranks, strict=True)) for one in made}
+    return pd.DataFrame([{"filter": label, **{k: own.get(label, np.nan) for k, own in by_group.items()}} for label in labels])
+
+
+def across_pairs(one: Across) -> pd.DataFrame:
+    """All pairs of one group across cells."""
+    return pd.DataFrame(
+        [
+            {
+                "a": p.a,
+                "b": p.b,
+                "cells a, b": f"{p.wins}, {p.losses}",
+                "RMSE a to b in %": 100 * (p.ratio - 1),
+                "effect": p.effect,
+                f"p Nemenyi ({p.family})": p.p_nemenyi,
+                f"p Conover-Holm ({p.family})": p.p_conover,
+                f"p Wilcoxon-Holm ({p.family})": p.p_wilcoxon,
+                "Bayes: a": p.bayes_a,
+                f"equal within {100 * one.margin:g} %": p.bayes_equal,
+                "Bayes: b": p.bayes_b,
+                "P(a better)": p.better,
+                "P low": p.better_low,
+                "P high": p.better_high,
+                "better": p.winner,
+            }
+            for p in one.pairs
+        ]
+    )
+
+
+def sensitive(found: Sequence[Sensitivity]) -> pd.DataFrame:
+    """The decisions that another rule for lost runs would change."""
+    rules = [rule.name for rule in LOST_RULES]
+    return pd.DataFrame(
+        [
+            {"cell": s.cell, "group": s.group, "a": s.a, "b": s.b, **dict(zip(rules, s.winners, strict=True))}
+            for s in found
+        ]
+    )
+
+
 def html(table: pd.DataFrame) -> str:
     """An HTML table; numbers are marked so that the style sheet can set them right."""
     kinds = [' class="number"' if _is_number(table[name]) else "" for name in table]
@@ -99,11 +190,17 @@ def markdown(table: pd.DataFrame) -> str:
     return "\n".join([rows[0], rule, *rows[1:]])
 
 
-def latex(table: pd.DataFrame) -> str:
-    """A booktabs tabular."""
+def latex(table: pd.DataFrame, note: str = "") -> str:
+    """A booktabs tabular; a note stands below its last rule."""
     layout = "".join("r" if _is_number(table[name]) else "l" for name in table)
     style = table.style.format(number, escape="latex").format_index(escape="latex", axis=1).hide(axis="index")
-    return style.to_latex(hrules=True, column_format=layout)
+    text = style.to_latex(hrules=True, column_format=layout)
+    if not note:
+        return text
+    safe = pd.DataFrame([[note]]).style.format(escape="latex").hide(axis="index").hide(axis="columns").to_latex()
+    said = safe.splitlines()[1].removesuffix(r" \\")
+    below = rf"\multicolumn{{{len(table.columns)}}}{{l}}{{\footnotesize {said}}} \\"
+    return text.replace("\\end{tabular}", f"{below}\n\\end{{tabular}}")
 
 
 def csv(table: pd.DataFrame) -> str:
@@ -195,6 +292,11 @@ def _standing(label: str, verdicts: Sequence[Verdict]) -> dict[str, Any]:
     met = [v for v in verdicts if label in (v.a, v.b)]
     beaten = sum(v.winner not in (label, NO_DIFFERENCE) for v in met)
     return {"beats": sum(v.winner == label for v in met), "beaten by": beaten}
+
+
+def _whole(value: float) -> str:
+    """A count that may be infinite or unknown."""
+    return f"{value:.0f}" if np.isfinite(value) else number(float(value))
 
 
 def _mean(values: np.ndarray) -> float:

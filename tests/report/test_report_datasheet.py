@@ -12,7 +12,7 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench import metrics, store
-from pfbench.report import datasheet, figures
+from pfbench.report import datasheet, figures, scene, scene_figures
 from pfbench.report.canvas import RC
 
 STEPS, RUNS, SLOTS = 30, 6, 4
@@ -105,7 +105,7 @@ def test_old_or_other_files_are_refused(tmp_path: Path) -> None:
 
 def test_the_spread_is_the_deviation_over_runs_beside_the_bound(whole: store.Result) -> None:
     whole.arrays["error"][:, 7] = np.nan  # an instant without truth is no gap
-    panels = datasheet.spread(whole).axes
+    panels = scene_figures.spread(whole).axes
     error = np.delete(whole.arrays["error"].astype(float), 7, axis=1)
     assert [axis.get_title() for axis in panels] == ["attitude", "velocity", "position"]
     for axis, first, scale in zip(panels, (0, 3, 6), (60 * np.degrees(1), 1.0, 1.0), strict=True):
@@ -117,7 +117,7 @@ def test_the_spread_is_the_deviation_over_runs_beside_the_bound(whole: store.Res
 
 def test_the_sky_has_north_up_and_east_to_the_right_and_names(whole: store.Result) -> None:
     with matplotlib.rc_context(RC):
-        figure = datasheet.sky(whole)
+        figure = scene_figures.sky(whole)
         figure.canvas.draw()
     (axis,) = figure.axes
     centre, north, east = (axis.transData.transform(point) for point in ((0.0, 0.0), (0.0, 45.0), (np.pi / 2, 45.0)))
@@ -127,8 +127,23 @@ def test_the_sky_has_north_up_and_east_to_the_right_and_names(whole: store.Resul
     lines = [line for line in axis.lines if len(np.asarray(line.get_xdata())) > 2]
     np.testing.assert_allclose(lines[0].get_ydata(), 90 - np.degrees(whole.arrays["elevation"][:, 0]))
     assert [len(np.asarray(line.get_xdata())) for line in lines] == [STEPS, STEPS, STEPS - 10, STEPS]
-    visible = datasheet.seen(whole).axes[0].lines[0].get_ydata()
+    visible = scene_figures.seen(whole).axes[0].lines[0].get_ydata()
     np.testing.assert_array_equal(visible, [3] * 10 + [4] * (STEPS - 10))
+
+
+def test_a_scene_may_spell_its_satellites_and_show_them_at_some_steps_alone(whole: store.Result) -> None:
+    assert scene.satellites(whole) == ["G01", "G02", "G07", "G30"]
+    codes = [[ord(letter) for letter in name] for name in ("E1 ", "R24", "G05", "C06")]
+    spelled = whole.arrays | {"satellites": np.array(codes, np.float32)}
+    for name in ("azimuth", "elevation"):
+        spelled[name] = np.where(np.arange(STEPS)[:, None] % 3 == 0, spelled[name], np.nan)
+    sheet = store.Result(whole.meta, spelled)
+    assert scene.satellites(sheet) == ["E1", "R24", "G05", "C06"]
+    assert any(fact == "Satellites above the horizon: 3 to 4 of 4." for fact in datasheet.facts(sheet))
+    line = scene_figures.seen(sheet).axes[0].lines[0]
+    assert line.get_linestyle() == "None"
+    np.testing.assert_array_equal(line.get_xdata(), np.arange(1.0, STEPS + 1, 3))
+    assert {text.get_text() for text in scene_figures.sky(sheet).axes[0].texts} >= {"E1", "R24", "G05", "C06"}
 
 
 def test_runs_with_the_same_residuals_count_once(whole: store.Result) -> None:

@@ -42,7 +42,8 @@ def test_every_figure_and_table_is_there_and_on_the_page(report):
     names = {path.stem for path in (report / "figures").iterdir()}
     kinds = {name.removeprefix("flight_surge_ins_gnss_") for name in names}
     assert kinds == {
-        "track", "error_attitude", "error_velocity", "error_position", "rmse", "cost", "nees", "ess",
+        "track", "error_attitude", "error_velocity", "error_position", "rmse", "front", "nees", "ess",
+        "forest_attitude", "forest_velocity", "forest_position",
         "spread_ekf", "spread_ukf", "spread_sir", "spread_cofm_amssrcpf",
     }  # fmt: skip
     assert {path.suffix for path in (report / "figures").iterdir()} == {".svg", ".png"}
@@ -54,7 +55,8 @@ def test_every_figure_and_table_is_there_and_on_the_page(report):
         table = pd.read_csv(path, keep_default_na=False)
         assert path.with_suffix(".tex").read_text().startswith(r"\begin{tabular}")
         assert f"| {table.columns[1]}" in text
-    assert len(list((report / "tables").glob("*.csv"))) == 7  # overview, and two for each of three groups
+    own = [path for path in (report / "tables").glob("*.csv") if not path.name.startswith("across_")]
+    assert len(own) == 10  # overview, and three for each of three groups
 
 
 def test_the_page_needs_nothing_but_itself(report):
@@ -138,7 +140,7 @@ def test_a_toy_without_map_particles_or_rival(tmp_path):
     store.save(path, {**meta, "state": state}, toy)
     made = page.write("demo", tmp_path, tmp_path / "reports", page.Options(formats=("svg",)))
     kinds = {p.stem.removeprefix("flight_surge_ins_gnss_") for p in (made.parent / "figures").iterdir()}
-    assert kinds == {"error_state", "rmse", "cost", "nees", "spread_kalman"}
+    assert kinds == {"error_state", "rmse", "front", "nees", "spread_kalman"}
     assert "one filter, nothing to compare" in made.read_text()
     assert json.loads((made.parent / "verdicts.json").read_text()) == []
 
@@ -168,7 +170,8 @@ def test_unknown_group_is_refused(results, tmp_path):
 
 
 def test_text_of_a_stranger_is_not_markup(tmp_path):
-    synthetic.write(tmp_path / "demo", synthetic.Method("<b>sir</b>|x", 1.0), runs=5, steps=20)
+    for size, name in enumerate(("<b>sir</b>|x", "<b>sir</b>|y", "<b>sir</b>|z"), 1):
+        synthetic.write(tmp_path / "demo", synthetic.Method(name, float(size)), runs=20, steps=20)
     made = page.write("demo", tmp_path, tmp_path / "reports", QUICK)
     assert "<b>sir" not in made.read_text()
     assert r"<b>sir</b>\|x" in (made.parent / "report.md").read_text()

@@ -1,0 +1,112 @@
+"""What filters of a cell were given alike, and who is best at what he costs.
+
+A comparison is of equal budgets: the same number of particles, the same time per step, or the same number of evaluations of the
+likelihood. Which one was meant is said by the experiment (key `budget` of the job); what the jobs measured is said beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pfbench.metrics import Array
+
+SAME_N = "same N"
+KINDS = (SAME_N, "same time per step", "same likelihood evaluations")
+_CLOSE = 1.25  # times per step that differ by less are called the same: they scatter from job to job [ours]
+
+
+@dataclass(frozen=True)
+class Front:
+    """Accuracy against time, one group of one cell.
+
+    Attributes:
+        cell, group, unit: what is shown.
+        filters: labels, by time.
+        seconds: per step.
+        rmse: median over runs of the RMSE, a lost run being worse than any other; infinite where half were lost.
+        kept: is there no filter that is as fast and as accurate, and better in one of the two?
+    """
+
+    cell: str
+    group: str
+    unit: str
+    filters: tuple[str, ...]
+    seconds: tuple[float, ...]
+    rmse: tuple[float, ...]
+    kept: tuple[bool, ...]
+
+
+def stated(metas: Sequence[Mapping[str, Any]]) -> str:
+    """The budget of jobs that are compared, and what they measured of it, in words for a table.
+
+    Args:
+        metas: descriptions of the jobs.
+
+    Raises:
+        ValueError: a job names a budget that is not one of `KINDS`.
+    """
+    kinds = list(dict.fromkeys(_kind(meta) for meta in metas))
+    if len(kinds) > 1:
+        return f"Budget: not the same for all ({', '.join(kinds)})."
+    (kind,) = kinds
+    return f"Budget: {kind}{_measured(kind, metas)}."
+
+
+def front(cell: str, rows: pd.DataFrame, group: str) -> Front:
+    """Who is best at what he costs.
+
+    Args:
+        cell: name.
+        rows: of one cell, from `frame`.
+        group: of the state.
+    """
+    own = rows[(rows.metric == "rmse") & (rows.component == "norm") & (rows.group == group)]
+    error = own.groupby("label").value.median()
+    time = rows[rows.metric == "seconds_per_step"].groupby("label").value.median().reindex(error.index)
+    order = sorted(error.index, key=lambda label: (time[label], error[label], label))
+    seconds, rmse = time[order].to_numpy(dtype=np.float64), error[order].to_numpy(dtype=np.float64)
+    unit = str(own.unit.iloc[0]) if len(own) else ""
+    kept = tuple(map(bool, undominated(seconds, rmse)))
+    return Front(cell, group, unit, tuple(map(str, order)), tuple(map(float, seconds)), tuple(map(float, rmse)), kept)
+
+
+def undominated(cost: Array, loss: Array) -> np.ndarray:
+    """Which of n points no other one dominates: no larger in both and smaller in one; an infinite or unknown loss is none."""
+    cost, loss = np.asarray(cost, dtype=np.float64), np.asarray(loss, dtype=np.float64)
+    no_worse = (cost[:, None] <= cost) & (loss[:, None] <= loss)
+    less = (cost[:, None] < cost) | (loss[:, None] < loss)
+    return ~(no_worse & less).any(axis=0) & np.isfinite(loss)
+
+
+def _kind(meta: Mapping[str, Any]) -> str:
+    config = meta.get("config")
+    kind = str(meta.get("budget") or (config.get("budget") if isinstance(config, Mapping) else None) or SAME_N)
+    if kind not in KINDS:
+        raise ValueError(f"budget={kind} of job {meta.get('key')} is none that a report knows; give one of {', '.join(KINDS)}")
+    return kind
+
+
+def _measured(kind: str, metas: Sequence[Mapping[str, Any]]) -> str:
+    if kind == SAME_N:
+        numbers = sorted({int(meta["particles"]) for meta in metas if meta.get("particles")})
+        if not numbers:
+            return " (no particle filter here)"
+        if len(numbers) == 1:
+            return f" (N = {numbers[0]} of each particle filter)"
+        return f" was not kept (N = {', '.join(map(str, numbers))})"
+    if kind == KINDS[1]:
+        times = [1e3 * float(meta["seconds"]["per_step"]) for meta in metas]
+        low, high = min(times), max(times)
+        said = f"{low:.3g} to {high:.3g} ms per step"
+        return f" ({said})" if high <= _CLOSE * low else f" was not kept ({said})"
+    counts = [float(meta["likelihoods_per_step"]) for meta in metas if meta.get("likelihoods_per_step") is not None]
+    if len(counts) < len(metas):
+        return " (as the experiment states; the jobs do not count them)"
+    least, most = min(counts), max(counts)
+    said = f"{least:g} to {most:g} per step"
+    return f" ({said})" if most <= _CLOSE * least else f" was not kept ({said})"

@@ -1,0 +1,161 @@
+"""The page of all claims: what each paper says, what was measured, and whether it holds."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pfbench.report import page, tables
+from pfbench.report.canvas import slug
+from pfbench.report.claims import PAPERS, load
+from pfbench.report.evidence import gather
+from pfbench.report.rulings import VERDICTS, Finding, Ruling, decide
+
+STUDY = "claims"  # the folder of reports in which the page lies
+
+
+def write(
+    results: str | Path = "results",
+    out: str | Path = "reports",
+    alpha: float = 0.05,
+    conf: Path | None = None,
+    experiments: Path | None = None,
+    *,
+    mixed: bool = False,
+) -> Path:
+    """Writes `<out>/claims/`: index.html, report.md, verdicts.json, tables/. The same results give the same bytes.
+
+    Args:
+        results: folder of all studies; claims whose studies have no results are shown as not run.
+        out: folder of all reports, which the page links to.
+        alpha: level after correction.
+        conf, experiments: as `claims.load`.
+        mixed: as in `frame`.
+
+    Returns:
+        The page, index.html.
+
+    Raises:
+        ValueError: bad records, or results that do not belong together.
+    """
+    claims = load(conf, experiments)
+    rulings = decide(claims, gather(claims, results, mixed=mixed), alpha)
+    folder = Path(out) / STUDY
+    page.clear(folder)
+    page.save_table(folder, STUDY, table(rulings))
+    plain = [_plain(ruling) for ruling in rulings]
+    (folder / "verdicts.json").write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    shown = {study for ruling in rulings for study in ruling.claim.studies if (Path(out) / study / "index.html").is_file()}
+    context = {"papers": papers(rulings, shown), "verdicts": VERDICTS, "count": count(rulings), "alpha": alpha, "n": len(rulings)}
+    return page.render(STUDY, folder, context)
+
+
+def papers(rulings: Sequence[Ruling], reports: set[str] | None = None) -> list[dict[str, Any]]:
+    """What the templates show: for each paper its title and the rows of its claims.
+
+    Args:
+        rulings: from `decide`.
+        reports: studies whose pages can be linked to; None links to none.
+    """
+    return [
+        {"key": key, "title": title, "rows": [_row(r, reports or set()) for r in rulings if r.claim.paper == key]}
+        for key, title in PAPERS.items()
+    ]
+
+
+def of_study(rulings: Sequence[Ruling], study: str) -> list[Ruling]:
+    """Those that a study has a part in."""
+    return [ruling for ruling in rulings if study in ruling.claim.studies]
+
+
+def count(rulings: Sequence[Ruling]) -> pd.DataFrame:
+    """How many claims of each paper have each verdict."""
+    rows = []
+    for key, title in [*PAPERS.items(), ("", "all")]:
+        found = Counter(r.verdict for r in rulings if key in ("", r.claim.paper))
+        rows.append({"paper": title, **{verdict: found[verdict] for verdict in VERDICTS}, "claims": found.total()})
+    return pd.DataFrame(rows)
+
+
+def table(rulings: Sequence[Ruling]) -> pd.DataFrame:
+    """One row for each comparison, and one for each claim without any; numbers as they are."""
+    rows = []
+    for ruling in rulings:
+        claim = ruling.claim
+        head = {"id": claim.id, "printed": claim.printed, "verdict": ruling.verdict, "reason": ruling.reason}
+        found = [(form, f) for form, findings in ruling.findings.items() for f in findings]
+        rows += [{**head, **_numbers(form, f)} for form, f in found] or [head]
+    texts = ["form", "asked", "a", "b", "measure", "cell", "unit", "outcome"]
+    full = pd.DataFrame(rows)
+    return full.fillna(dict.fromkeys((name for name in texts if name in full), "")) if rows else full
+
+
+def said(found: Finding) -> str:
+    """What was measured, with its interval, in words."""
+    one = found.comparison
+    if np.isnan(found.effect):
+        return found.why
+    unit = f" {found.unit}" if found.unit else ""
+    known = not (np.isinf(found.low) and np.isinf(found.high))
+    between = f" [{tables.number(found.low)}, {tables.number(found.high)}]" if known else ""
+    printed = f", printed {tables.number(one.printed)}" if np.isfinite(one.printed) else ""
+    return f"{tables.number(found.effect)}{between}{unit}{printed}"
+
+
+def _row(ruling: Ruling, reports: set[str]) -> dict[str, Any]:
+    claim = ruling.claim
+    everywhere = [f.comparison for findings in ruling.findings.values() for f in findings]
+    lines: dict[Any, dict[str, Any]] = {}
+    for form, f in ((form, f) for form, findings in ruling.findings.items() for f in findings):
+        shared = everywhere.count(f.comparison) > 1  # asked of both forms: shown once, of neither
+        lines.setdefault(f.comparison, _line("" if shared else form, f, reports))
+    reason = f": {ruling.reason}" if ruling.reason else ""
+    return {"claim": claim, "verdict": ruling.verdict, "reason": reason, "note": ruling.note, "lines": list(lines.values())}
+
+
+def _line(form: str, found: Finding, reports: set[str]) -> dict[str, Any]:
+    one = found.comparison
+    sides = one.a
+    if one.b:
+        elsewhere = "" if not one.b_cell else f" in {one.b_cell.rsplit('/', 1)[0]}"
+        sides += f" {'minus' if one.statistic == 'close' else 'to'} {one.b}{elsewhere}"
+    link = f"../{one.study}/index.html#{slug(one.cell.replace('/', '_'))}" if one.study in reports else ""
+    lost = f"{found.lost_a + found.lost_b} lost" if found.lost_a + found.lost_b else ""
+    p = f"p Holm {tables.number(found.p_holm)}" if np.isfinite(found.p_holm) else ""
+    more = ", ".join(text for text in (f"{found.pairs} runs" if found.pairs else "", p, lost) if text)
+    asked = one.statistic.replace("_", " ")
+    shown = "measured" if one.statistic == "report" else found.outcome
+    where = one.cell.replace("/", " / ")
+    words = {"form": form, "sides": sides, "measure": one.measure, "asked": asked, "said": said(found), "more": more}
+    return {**words, "outcome": shown, "where": where, "study": one.study, "link": link}
+
+
+def _numbers(form: str, found: Finding) -> dict[str, Any]:
+    one = found.comparison
+    words = {"form": form, "asked": one.statistic, "a": one.a, "b": one.b, "measure": one.measure, "cell": one.cell}
+    numbers = {"printed effect": one.printed, "effect": found.effect, "low": found.low, "high": found.high}
+    tested = {"p": found.p, "p Holm": found.p_holm, "runs": found.pairs}
+    return {**words, "unit": found.unit, "outcome": found.outcome, **numbers, **tested}
+
+
+def _plain(ruling: Ruling) -> dict[str, Any]:
+    """For JSON, which has no infinity."""
+
+    def number(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: number(below) for key, below in value.items()}
+        if isinstance(value, list | tuple):
+            return [number(below) for below in value]
+        return str(value) if isinstance(value, float) and not np.isfinite(value) else value
+
+    claim = {key: getattr(ruling.claim, key) for key in ("id", "paper", "claim", "source", "printed", "note")}
+    findings = {form: [asdict(f) for f in found] for form, found in ruling.findings.items()}
+    read = {"reading": claim.pop("note"), "verdict": ruling.verdict, "reason": ruling.reason, "note": ruling.note}
+    return {**claim, **read, "findings": number(findings)}

@@ -1,0 +1,239 @@
+"""Figures of who is better: effects within a cell, ranks, decisions and profiles across cells, fronts of accuracy and time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import scikit_posthocs as posthocs
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from pfbench.report import across
+from pfbench.report.across import Across, Blocks
+from pfbench.report.budget import Front
+from pfbench.report.canvas import COLUMN, Look, labelled, legend, plain_ticks, slug, stack
+from pfbench.report.figures import Drawing
+from pfbench.report.significance import NO_DIFFERENCE, Verdict
+
+_PAIRS = 28  # of a forest that a column's height still holds
+_BETTER, _WORSE = "#0072B2", "#E69F00"  # apart in grey too: dark and light
+
+
+def of_cell(own: Sequence[Verdict], fronts: Sequence[Front], style: Mapping[str, Look]) -> list[Drawing]:
+    """Figures of one cell: the front of accuracy and time, and a forest of effects per group."""
+    found = []
+    shown = [front for front in fronts if np.isfinite(front.rmse).any()]
+    if shown:
+        text = (
+            "Time per step against the median over runs of the RMSE, a lost run being worse than any other. Ringed and joined: "
+            "filters that no other one beats in both."
+        )
+        found.append(Drawing("front", text, partial(fronts_of, shown, style)))
+    for group in dict.fromkeys(v.group for v in own):
+        pairs = [v for v in own if v.group == group]
+        if 0 < len(pairs) <= _PAIRS:
+            level = f"{100 * pairs[0].level:g}"
+            text = (
+                f"RMSE of {group} of the first filter over that of the second (below 1 the first is better), median over runs "
+                f"and {level} % interval. "
+                f"Filled: a difference is shown; square: equivalence within the shaded margin of {100 * pairs[0].margin:g} % is."
+            )
+            found.append(Drawing(f"forest_{slug(group)}", text, partial(forest, pairs)))
+    return found
+
+
+def of_study(
+    found: Sequence[tuple[Across, Blocks]], decided: Sequence[Verdict], style: Mapping[str, Look]
+) -> list[Drawing]:
+    """Figures across the cells of a study."""
+    drawings = []
+    for one, sources in found:
+        name = slug(one.group)
+        if not one.refused:
+            text = (
+                f"Mean ranks of {one.group} over {len(one.cells)} cells, 1 is best. A bar joins filters between which Nemenyi's "
+                f"test at {100 * one.alpha:g} % shows no difference; CD is its critical difference."
+            )
+            drawings.append(Drawing(f"critical_difference_{name}", text, partial(critical_difference, one, style)))
+        own = [v for v in decided if v.group == one.group]
+        if own and len({(v.scenario, v.noise, v.model) for v in own}) > 1:
+            text = (
+                f"{one.group}: cells in which the filter of the row is shown to be better than that of the column, and in "
+                "which it is shown to be worse, after Holm's correction within each cell."
+            )
+            drawings.append(Drawing(f"matrix_{name}", text + _starred(one), partial(matrix, own, one)))
+        if len(sources.runs) > 1 and len(sources.filters) > 1:
+            text = (
+                f"{one.group}: share of the runs in which the RMSE of a filter is at most so many times that of the best "
+                f"filter of the same run; {len(sources.cells)} cells of equal weight. A lost run never gets there."
+            )
+            drawings.append(Drawing(f"profile_{name}", text, partial(profiles, sources, style)))
+    return drawings
+
+
+def critical_difference(one: Across, style: Mapping[str, Look]) -> Figure:
+    """Mean ranks on a line, bars over those that are not told apart [Demsar 2006, figure 1]."""
+    k = len(one.filters)
+    half = -(-k // 2)
+    figure = Figure(figsize=(COLUMN, 0.85 + 0.17 * (half + _bars(one))), layout="constrained")
+    axis = figure.subplots()
+    # Above the omnibus level nothing is told apart, whatever a single pair says.
+    p = np.ones((k, k))
+    for pair in one.pairs:
+        i, j = one.filters.index(pair.a), one.filters.index(pair.b)
+        p[i, j] = p[j, i] = pair.p_nemenyi if one.p_f <= one.alpha else 1.0
+    axis.set_xlim(1, k)
+    posthocs.critical_difference_diagram(
+        dict(zip(one.filters, one.ranks, strict=True)),
+        pd.DataFrame(p, index=one.filters, columns=one.filters),
+        ax=axis, alpha=one.alpha, label_props={"fontsize": 7}, text_h_margin=0.1,
+        color_palette={label: style[label].colour for label in one.filters},
+        marker_props={"s": 14, "zorder": 4}, elbow_props={"linewidth": 0.9},
+        crossbar_props={"linewidth": 2.2, "color": "0.25", "marker": "|"},
+        label_fmt_left="{label} {rank:.2f} ", label_fmt_right=" {rank:.2f} {label}",
+    )  # fmt: skip
+    for text in axis.texts:  # a light colour is a line, but no letter
+        text.set_color("black")
+    axis.spines["top"].set(visible=True, bounds=(1, k))
+    axis.set_xlim(1, max(k, 1 + one.critical))
+    axis.set_xticks(range(1, k + 1))
+    axis.plot([1, 1 + one.critical], [1.9, 1.9], color="0.25", lw=1.2, marker="|", ms=4, clip_on=False)
+    axis.text(1 + one.critical / 2, 2.1, f"CD {one.critical:.2f}", ha="center", va="bottom", fontsize=7)
+    axis.grid(False)
+    return figure
+
+
+def matrix(own: Sequence[Verdict], one: Across) -> Figure:
+    """Cells won and lost of each pair, rows against columns."""
+    labels = sorted(dict.fromkeys(label for v in own for label in (v.a, v.b)), key=lambda label: _rank(one, label))
+    won, met = np.zeros((len(labels),) * 2, dtype=int), np.zeros((len(labels),) * 2, dtype=int)
+    for v in own:
+        i, j = labels.index(v.a), labels.index(v.b)
+        met[i, j] += 1
+        met[j, i] += 1
+        won[i, j] += v.winner == v.a
+        won[j, i] += v.winner == v.b
+    share = np.divide(won - won.T, met, out=np.full(met.shape, np.nan), where=met > 0)
+    side = max(COLUMN, 1.15 + 0.36 * len(labels))
+    figure = Figure(figsize=(side, side - 0.35), layout="constrained")
+    axis = figure.subplots()
+    axis.imshow(share, cmap=_blue_and_orange(), vmin=-1, vmax=1)
+    stars = {frozenset((p.a, p.b)) for p in one.pairs if p.winner != NO_DIFFERENCE}
+    for i, row in enumerate(labels):
+        for j, column in enumerate(labels):
+            if met[i, j]:
+                star = "*" if frozenset((row, column)) in stars else ""
+                ink = "white" if share[i, j] > 0.55 else "black"
+                axis.text(j, i, f"{won[i, j]}–{won[j, i]}{star}", ha="center", va="center", fontsize=6.5, color=ink)
+    axis.set_xticks(range(len(labels)), labels, rotation=40, ha="right", rotation_mode="anchor")
+    axis.set_yticks(range(len(labels)), labels)
+    axis.set_xlabel(f"shown better – shown worse, of {met.max()} cells")
+    axis.grid(False)
+    axis.tick_params(length=0)
+    return figure
+
+
+def profiles(sources: Blocks, style: Mapping[str, Look]) -> Figure:
+    """Share of runs within a factor of the best filter, over the factor."""
+    reach = float(np.clip(max(_worst(own) for own in sources.runs), 1.1, 100.0))
+    at = np.geomspace(1.0, reach, 200)
+    figure, (axis,) = stack(1, 2.1)
+    for label, share in zip(sources.filters, across.profile(sources, at), strict=True):
+        look = style[label]
+        line: Any = {"color": look.colour, "ls": look.dash, "lw": look.width}
+        axis.plot(at, 100 * share, label=label, **line)
+    axis.set(xscale="log", xlabel="RMSE over that of the best filter of the run", ylabel="runs in %", ylim=(0, 102))
+    plain_ticks(axis.xaxis, at)
+    legend(figure, axis)
+    return figure
+
+
+def forest(pairs: Sequence[Verdict]) -> Figure:
+    """Ratio of RMSE and its interval, one row per pair."""
+    figure = Figure(figsize=(COLUMN, 0.75 + 0.17 * len(pairs)), layout="constrained")
+    axis = figure.subplots()
+    ends = [x for v in pairs for x in (v.low, v.ratio, v.high) if np.isfinite(x) and x > 0]
+    low, high = min([*ends, 1 / (1 + pairs[0].margin)]), max([*ends, 1 + pairs[0].margin])
+    edges = low / (high / low) ** 0.06, high * (high / low) ** 0.06
+    axis.axvspan(1 / (1 + pairs[0].margin), 1 + pairs[0].margin, color="0.88", lw=0, zorder=0)
+    axis.axvline(1, color="0.4", lw=0.8, zorder=1)
+    for row, v in enumerate(pairs):
+        shown = v.winner != NO_DIFFERENCE
+        colour = "0.35" if not shown else _BETTER if v.winner == v.a else "#B35900"
+        # What lost runs decide has no finite end: the line goes on to the edge.
+        left, right = (float(np.clip(x, *edges)) for x in (v.low, v.high))
+        axis.plot([left, right], [row, row], color=colour, lw=1.1, zorder=2)
+        axis.plot(
+            float(np.clip(v.ratio, *edges)), row, ls="none", marker="s" if v.equivalent else "o", ms=4, mec=colour,
+            mfc=colour if shown else "white", mew=0.9, zorder=3,
+        )  # fmt: skip
+    axis.set_yticks(range(len(pairs)), [f"{v.a} / {v.b}" for v in pairs], fontsize=5.8)
+    axis.set_ylim(len(pairs) - 0.4, -0.6)
+    axis.set(xscale="log", xlim=edges, xlabel="ratio of RMSE")
+    plain_ticks(axis.xaxis, [low, high])
+    if high < 3 * low:
+        axis.xaxis.set_major_locator(MaxNLocator(5))
+    axis.grid(False, axis="y")
+    return figure
+
+
+def fronts_of(fronts: Sequence[Front], style: Mapping[str, Look]) -> Figure:
+    """Median RMSE against time per step, one panel per group, the front ringed and joined."""
+    figure, panels = stack(len(fronts), 1.6)
+    for front, axis in zip(fronts, panels, strict=True):
+        best = [i for i, kept in enumerate(front.kept) if kept]
+        milliseconds = [1e3 * s for s in front.seconds]
+        corner: Any = {"drawstyle": "steps-post", "color": "0.55", "lw": 0.9, "zorder": 1}
+        axis.plot([milliseconds[i] for i in best], [front.rmse[i] for i in best], **corner)
+        for label, time, error, kept in zip(front.filters, milliseconds, front.rmse, front.kept, strict=True):
+            look = style[label]
+            y = error if np.isfinite(error) else np.nan
+            axis.scatter(time, y, s=30, color=look.colour, marker=look.marker, label=label, zorder=3, lw=0)
+            if kept:
+                axis.scatter(time, y, s=95, facecolors="none", edgecolors="0.2", lw=0.9, zorder=2)
+        finite = [e for e in front.rmse if np.isfinite(e)]
+        axis.margins(0.15)
+        if any(e > 0 for e in finite):
+            axis.set(xscale="log", yscale="log")
+            plain_ticks(axis.yaxis, finite)
+            plain_ticks(axis.xaxis, milliseconds)
+        lost = [label for label, e in zip(front.filters, front.rmse, strict=True) if np.isinf(e)]
+        note = f" (off the chart, half of the runs lost: {', '.join(lost)})" if lost else ""
+        axis.set(title=front.group + note, ylabel=labelled("RMSE", front.unit))
+    panels[-1].set_xlabel("time per step in ms")
+    legend(figure, panels[0])
+    return figure
+
+
+def _starred(one: Across) -> str:
+    return f" A star: Nemenyi's test across {len(one.cells)} cells shows a difference." if one.shown else ""
+
+
+def _rank(one: Across, label: str) -> float:
+    known = dict(zip(one.filters, one.ranks, strict=False))
+    return known.get(label, float(len(known)))
+
+
+def _bars(one: Across) -> int:
+    """Bars of the diagram at most: one for each filter that begins a group of its own."""
+    order = sorted(range(len(one.ranks)), key=lambda i: one.ranks[i])
+    rank = [one.ranks[i] for i in order]
+    alike = one.p_f > one.alpha
+    ends = [max(j for j in range(i, len(rank)) if alike or rank[j] - rank[i] < one.critical) for i in range(len(rank))]
+    return len({end for i, end in enumerate(ends) if end > i})
+
+
+def _worst(own: np.ndarray) -> float:
+    """Largest finite ratio to the best filter of a run."""
+    best = own.min(axis=1, keepdims=True)
+    known = np.isfinite(own) & (best > 0)
+    return float(np.divide(own, best, out=np.ones(own.shape), where=known).max())
+
+
+def _blue_and_orange() -> Any:
+    return LinearSegmentedColormap.from_list("better", [_WORSE, "#ffffff", _BETTER])

@@ -1,0 +1,212 @@
+"""Cells as blocks: against published numbers and other implementations, and by how often the tests are wrong."""
+
+import baycomp
+import numpy as np
+import pandas as pd
+import pytest
+import scikit_posthocs as posthocs
+from scipy import stats
+from statsmodels.stats.multitest import multipletests
+
+from pfbench.report import across, significance
+
+# Demsar 2006, table 6: AUC of C4.5, C4.5+m, C4.5+cf, C4.5+m+cf; the rounded tie of "voting" in its published order.
+DEMSAR = np.array([
+    [0.763, 0.768, 0.771, 0.798], [0.599, 0.591, 0.590, 0.569], [0.954, 0.971, 0.968, 0.967], [0.628, 0.661, 0.654, 0.657],
+    [0.882, 0.888, 0.886, 0.898], [0.936, 0.931, 0.916, 0.931], [0.661, 0.668, 0.609, 0.685], [0.583, 0.583, 0.563, 0.625],
+    [0.775, 0.838, 0.866, 0.875], [1.000, 1.000, 1.000, 1.000], [0.940, 0.962, 0.965, 0.962], [0.619, 0.666, 0.614, 0.669],
+    [0.972, 0.981, 0.9751, 0.975], [0.957, 0.978, 0.946, 0.970],
+])  # fmt: skip
+
+
+def table(cells, group="position", model="m", first=0):
+    """Rows as `frame` makes them, from losses {label: [runs]} of each cell."""
+    parts = []
+    for c, losses in enumerate(cells):
+        for label, values in losses.items():
+            values = np.asarray(values, dtype=float)
+            rows = {"scenario": f"s{c // 2}", "noise": f"n{c % 2}", "model": model, "seed": 1, "group": group}
+            more = {"label": label, "run": np.arange(first, first + len(values)), "value": values, "lost": np.isinf(values)}
+            parts.append(pd.DataFrame({**rows, **more, "component": "norm", "metric": "rmse", "unit": "m"}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def world(rng, cells=8, runs=12, sizes=(1.0, 1.0, 1.0, 1.0), scatter=0.2):
+    """Cells of filters whose errors are so large, each with a scatter of its own in each cell and run."""
+    found = []
+    for _ in range(cells):
+        common = np.exp(rng.standard_normal() + 0.5 * rng.standard_normal(runs))
+        sides = np.exp(scatter * rng.standard_normal(len(sizes)))
+        found.append({
+            "abcdefg"[k]: size * side * common * np.exp(0.1 * rng.standard_normal(runs))
+            for k, (size, side) in enumerate(zip(sizes, sides, strict=True))
+        })  # fmt: skip
+    return found
+
+
+def test_demsar_table_6():
+    rank = across.ranks(-DEMSAR)
+    found = across.friedman(rank)
+    assert np.round(found.ranks, 3).tolist() == [3.143, 2.0, 2.893, 1.964]
+    assert round(found.plain, 3) == 9.279  # printed: 9.28
+    f = 13 * found.plain / (14 * 3 - found.plain)
+    assert round(f, 3) == 3.686  # printed: 3.69
+    assert round(stats.f.sf(f, 3, 39), 4) == 0.0198
+    assert round(stats.f.isf(0.05, 3, 39), 2) == 2.85
+    # With the correction for ties, which scipy makes and the paper does not:
+    assert (round(found.chi2, 3), round(found.p, 4)) == (10.228, 0.0167)
+    assert round(found.critical, 3) == 1.254  # printed: 1.25
+    assert round(across.friedman(rank, 0.10).critical, 3) == 1.118  # printed: 1.12
+    error = across.standard_error(14, 4)
+    assert round(found.critical / error, 3) == 2.569
+    dunn = stats.norm.isf(0.05 / 6)
+    assert (round(dunn, 3), round(dunn * error, 3)) == (2.394, 1.168)
+    z = (found.ranks[0] - found.ranks[[3, 1, 2]]) / error
+    assert np.round(z, 3).tolist() == [2.415, 2.342, 0.512]
+    p = 2 * stats.norm.sf(z)
+    assert np.round(p, 3).tolist() == [0.016, 0.019, 0.608]
+    for method in ("holm", "simes-hochberg", "hommel"):
+        assert multipletests(p, method=method)[0].tolist() == [True, True, False]
+    nemenyi = across.nemenyi(rank)
+    assert np.round([nemenyi[0, 3], nemenyi[0, 1]], 4).tolist() == [0.0742, 0.0887]
+    assert min(nemenyi[0, 2], nemenyi[1, 2], nemenyi[1, 3], nemenyi[2, 3]) > 0.22
+
+
+def test_the_pairs_are_those_of_scikit_posthocs_and_scipy():
+    cells = world(np.random.default_rng(1), 9, 11, (1.0, 1.1, 1.3, 1.6))
+    found = across.across(table(cells), "position")
+    values = np.array([[np.median(np.log(own[label])) for label in "abcd"] for own in cells])
+    nemenyi = posthocs.posthoc_nemenyi_friedman(values).to_numpy()
+    conover = posthocs.posthoc_conover_friedman(values, p_adjust="holm").to_numpy()
+    apart = pd.DataFrame(values).melt(var_name="filter", value_name="value")
+    wilcoxon = posthocs.posthoc_wilcoxon(apart, "value", "filter", zero_method="zsplit", p_adjust="holm").to_numpy()
+    for pair in found.pairs:
+        i, j = "abcd".index(pair.a), "abcd".index(pair.b)
+        assert (pair.p_nemenyi, pair.p_conover, pair.p_wilcoxon) == pytest.approx((nemenyi[i, j], conover[i, j], wilcoxon[i, j]))
+        assert pair.ratio == pytest.approx(np.exp(np.median(values[:, i] - values[:, j])))
+        assert (pair.wins, pair.losses) == ((values[:, i] < values[:, j]).sum(), (values[:, i] > values[:, j]).sum())
+        assert pair.family == 6
+    assert found.chi2 == pytest.approx(stats.friedmanchisquare(*values.T)[0])
+    np.testing.assert_allclose(found.ranks, stats.rankdata(values, axis=1).mean(0))
+
+
+@pytest.mark.parametrize("rope", [0.05, 0.4])
+def test_the_bayesian_signed_rank_is_baycomps(rope):
+    rng = np.random.default_rng(2)
+    a, b = rng.standard_normal((2, 9))
+    theirs = baycomp.SignedRankTest.probs(a, b + 0.3, rope, nsamples=4000, random_state=1)
+    ours = across.signed_rank(b + 0.3 - a, rope, seed=3)
+    # both are shares of draws: of 4000 and of 20 000
+    assert ours == pytest.approx(theirs, abs=4 * np.sqrt(0.25 / 4000 + 0.25 / 20_000))
+    assert sum(ours) == pytest.approx(1)
+    assert across.signed_rank(np.full(8, -1.0), 0.05, 1)[0] > 0.99
+    assert across.signed_rank(np.zeros(8), 0.05, 1)[1] > 0.99
+
+
+def test_the_better_filter_is_on_the_right_side_of_every_number():
+    found = across.across(table(world(np.random.default_rng(3), 12, 15, (1.0, 1.5, 2.2), 0.02)), "position")
+    assert found.unbeaten == ["a"]
+    assert found.p_f < 1e-6
+    pair = next(p for p in found.pairs if (p.a, p.b) == ("a", "c"))
+    assert (pair.winner, pair.wins, pair.losses, pair.effect) == ("a", 12, 0, 1.0)
+    assert pair.ratio == pytest.approx(1 / 2.2, rel=0.05)
+    assert pair.bayes_a > 0.99 > 0.01 > pair.bayes_b
+    assert 0.5 < pair.better_low < pair.better < pair.better_high < 1
+    assert max(pair.p_nemenyi, pair.p_conover) < 1e-4
+
+
+def test_verdicts_do_not_feel_the_order_of_runs_rows_or_filters():
+    rows = table(world(np.random.default_rng(4), 6, 9, (1.0, 1.2, 1.4)))
+    first = across.across(rows, "position")
+    assert across.across(rows.sample(frac=1, random_state=2), "position") == first
+    turned = rows.assign(run=8 - rows.run)  # the same runs under other numbers
+    assert across.across(turned, "position") == first
+
+
+def test_seeds_of_a_cell_are_no_blocks():
+    own = world(np.random.default_rng(5), 1, 500, (1.0, 1.5, 2.0))
+    found = across.across(table(own), "position")
+    assert found.pairs == ()
+    assert "takes 5 cells at least, and the 3 filters have 1 cell in common" in found.refused
+    two = across.across(table(world(np.random.default_rng(5), 8, 5, (1.0, 2.0))), "position")
+    assert "compares 3 filters at least, and 2 filters ran" in two.refused
+    # More runs in the same cells are no more blocks.
+    few = world(np.random.default_rng(6), 5, 9, (1.0, 1.1, 1.2))
+    many = [{label: np.tile(values, 20) for label, values in cell.items()} for cell in few]
+    assert across.across(table(many), "position").p == across.across(table(few), "position").p
+
+
+def test_incomplete_blocks_are_left_out_by_name():
+    cells = world(np.random.default_rng(7), 8, 6, (1.0, 1.1, 1.2))
+    del cells[2]["b"]
+    cells[5]["c"][:] = np.nan  # no truth
+    cells[0]["visitor"] = cells[0]["a"]
+    found = across.across(table(cells), "position")
+    assert found.filters == ("a", "b", "c")
+    assert len(found.cells) == 6
+    assert found.left_out == ("visitor (ran in 1 of 8 cells)", "s1 / n0 / m (without b)", "s2 / n1 / m (without c)")
+    whole = [cell for i, cell in enumerate(cells) if i not in (2, 5)]
+    assert across.across(table(whole), "position").pairs == found.pairs or found.refused == ""
+    apart = pd.concat([table(cells[:7]), table(cells[7:], first=100).assign(scenario="s9")])
+    stranger = table([{"b": cells[7]["b"]}], first=500).assign(scenario="s9", noise="n0")
+    apart = pd.concat([apart[(apart.scenario != "s9") | (apart.label != "b")], stranger])
+    assert any("no run in common" in text for text in across.across(apart, "position").left_out)
+
+
+def test_worlds_that_two_cells_share_are_counted():
+    cells = world(np.random.default_rng(8), 4, 6, (1.0, 1.1, 1.2))
+    both = pd.concat([table(cells), table(cells, model="other")])
+    assert across.across(both, "position").shared == 4
+    assert across.across(table(world(np.random.default_rng(8), 6, 5, (1.0, 1.1, 1.2))), "position").shared == 0
+
+
+def test_a_filter_lost_in_most_runs_is_last_and_nothing_breaks():
+    cells = world(np.random.default_rng(9), 7, 9, (1.0, 1.1, 0.5))
+    for cell in cells:
+        cell["c"][:5] = np.inf
+    found = across.across(table(cells), "position")
+    assert found.ranks[2] == 3.0
+    assert next(p for p in found.pairs if (p.a, p.b) == ("a", "c")).ratio == 0.0
+    for rule, rank in ((significance.LEFT_OUT, 1.0), (significance.LARGEST, 3.0)):
+        other = across.across(table(cells), "position", rule=rule)
+        assert (other.ranks[2], other.rule) == (rank, rule.name)
+
+
+def test_ties_and_rounding_share_a_rank():
+    values = np.array([[0.0, 1e-9, 1.0, np.inf, np.inf], [3.0, 2.0, 1.0, 0.0, -1.0]])
+    assert across.ranks(values).tolist() == [[1.5, 1.5, 3.0, 4.5, 4.5], [5.0, 4.0, 3.0, 2.0, 1.0]]
+    same = {"a": np.ones(4), "b": np.ones(4), "c": np.ones(4)}
+    found = across.across(table([same] * 6), "position")
+    assert (found.p_f, found.shown, found.unbeaten) == (1.0, 0, ["a", "b", "c"])
+    assert all(p.p_conover == 1 and p.better == 0.5 and p.bayes_equal > 0.9 for p in found.pairs)
+
+
+def test_the_profile_counts_runs_within_a_factor_of_the_best():
+    cells = [{"a": [1.0, 2.0], "b": [2.0, 1.0], "c": [np.inf, 4.0]}, {"a": [1.0] * 4, "b": [3.0] * 4, "c": [1.5] * 4}]
+    found = across.profile(across.blocks(table(cells), "position"), np.array([1.0, 1.5, 2.0, 3.0, 4.0, 1e9]))
+    # cells weigh the same although one has twice the runs
+    assert found[0].tolist() == [0.75, 0.75, 1.0, 1.0, 1.0, 1.0]
+    assert found[1].tolist() == [0.25, 0.25, 0.5, 1.0, 1.0, 1.0]
+    assert found[2].tolist() == [0.0, 0.5, 0.5, 0.5, 0.75, 0.75]
+
+
+@pytest.mark.slow
+def test_false_winners_across_cells_are_as_rare_as_alpha(monkeypatch):
+    """The same filter under four names, in many studies."""
+    monkeypatch.setattr("gc.collect", lambda *_: 0)
+    rng, n, alpha = np.random.default_rng(10), 600, 0.05
+    omnibus = nemenyi = conover = signed = 0
+    for _ in range(n):
+        values = rng.standard_normal((12, 4))
+        rank = across.ranks(values)
+        hit = across.friedman(rank).p_f <= alpha
+        omnibus += hit
+        nemenyi += hit and across.nemenyi(rank).min() <= alpha
+        conover += hit and across.conover(rank).min() <= alpha
+        signed += min(across.wilcoxons(values).values()) <= alpha
+    error = 4 * np.sqrt(alpha * (1 - alpha) / n)
+    # F is the law of a continuous statistic; with 12 blocks of 4 the discrete one is within half a per cent of it.
+    assert omnibus / n == pytest.approx(alpha, abs=error + 0.005)
+    assert alpha / 4 < nemenyi / n <= alpha + error
+    assert alpha / 4 < conover / n <= alpha + error + 0.005
+    assert signed / n <= alpha + error

@@ -1,0 +1,468 @@
+"""The claims of the papers: their records are whole and name what there is, and verdicts follow planted effects."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from scipy import stats
+from statsmodels.stats.multitest import multipletests
+from synthetic_results import METHODS, STATE, write
+
+from pfbench import cli, store
+from pfbench.report import claims, evidence, ledger, rulings
+from pfbench.report.claims import Claim, Comparison
+
+IDS = [
+    *(f"C000-{k}" for k in range(1, 10)),
+    *(f"C001-{k}" for k in range(1, 11)),
+    *(f"002-{k:02}" for k in range(1, 32)),
+    *(f"003-C{k}" for k in range(1, 11)),
+    *(f"004-C{k}" for k in range(1, 12)),
+]
+CONF, STUDIES = cli.conf_dir(), cli.experiments_dir()
+ALL = claims.load(CONF, STUDIES)
+CELL = "flight/surge/ins_gnss"
+LESS = Comparison("less", "s", CELL, "rmse", "a", "b", group="position")
+
+
+# the records
+
+
+def test_each_of_the_71_claims_has_one_record() -> None:
+    assert len(IDS) == 71
+    assert sorted(claim.id for claim in ALL) == sorted(IDS)
+    assert all(claim.paper in claim.id for claim in ALL)
+
+
+def test_each_claim_can_be_decided_or_says_why_not() -> None:
+    for claim in ALL:
+        assert any(claim.tests.values()) or claim.why, claim.id
+        assert claim.claim[0].isupper() or claim.claim[0].isdigit(), claim.id
+        assert not claim.claim.endswith("."), claim.id
+
+
+def swept(study: str) -> dict[str, set[str]]:
+    """What each cell of a study runs: filters, with the settings that are swept in brackets; read without Hydra."""
+    content = yaml.safe_load((STUDIES / f"{study}.yaml").read_text())
+    chosen = {key.split("/")[-1]: value for part in content["defaults"] for key, value in part.items()}
+    params = {key: str(values).split(",") for key, values in content["hydra"]["sweeper"]["params"].items()}
+    ran: dict[str, set[str]] = {}
+    for values in product(*params.values()):
+        one = {**chosen, **dict(zip(params, values, strict=True))}
+        model = chosen.get("model") or home(one["scenario"])
+        told = sorted(f"{key.removeprefix('filter.')}={value}" for key, value in one.items() if "." in key)
+        name = f"{one['filter']}[{','.join(told)}]" if told else one["filter"]
+        ran.setdefault(f"{one['scenario']}/{one['noise']}/{model}", set()).add(name)
+    return ran
+
+
+def home(scenario: str) -> str:
+    """The model that a scenario asks for, itself or by what it extends."""
+    defaults = yaml.safe_load((CONF / "scenario" / f"{scenario}.yaml").read_text())["defaults"]
+    asks = [value for part in defaults if isinstance(part, dict) for key, value in part.items() if "model" in key]
+    return asks[0] if asks else home(next(part for part in defaults if isinstance(part, str) and part != "_self_"))
+
+
+def test_the_studies_hold_every_cell_that_the_claims_need() -> None:
+    sides = {side for claim in ALL for tests in claim.tests.values() for test in tests for side in test.sides}
+    ran = {study: swept(study) for study in {study for study, _, _ in sides}}
+    missing = sorted(side for side in sides if side[2] not in ran[side[0]].get(side[1], ()))
+    assert missing == []
+    assert all(study.startswith("paper_") for study in ran)
+    unused = {path.stem for path in STUDIES.glob("paper_*.yaml")} - set(ran)
+    assert unused == set()
+
+
+RECORD = """
+- id: X-1
+  paper: "000"
+  claim: Better
+  source: figure
+  tests:
+    - {is: less, study: quickstart, cell: t004/nominal/ins_gnss, metric: rmse, group: position, a: sir, b: ekf}
+"""
+WRONG = {
+    "unknown filter": ("a: sir", "a: sri", r"X-1: filter='sri' is not known; there are apf, ckf"),
+    "unknown scenario": ("t004/", "t999/", r"X-1: scenario='t999' is not known; there are .*t004"),
+    "unknown noise": ("/nominal/", "/normal/", r"X-1: noise='normal'"),
+    "unknown model": ("/ins_gnss,", "/ins_gps,", r"X-1: model='ins_gps'"),
+    "unknown study": ("quickstart", "slowstart", r"X-1: study='slowstart'.*quickstart"),
+    "unknown group": ("group: position", "group: place", r"X-1: group='place' is not known; there are attitude"),
+    "unknown metric": ("metric: rmse", "metric: rsme", r"X-1: metric='rsme' is not known; there are rmse"),
+    "unknown statistic": ("is: less", "is: better", r"X-1: is='better' is not known; there are less"),
+    "unknown key": ("b: ekf}", "b: ekf, margn: 1}", r"X-1: a test does not know \['margn'\]"),
+    "no other side": (", b: ekf}", "}", r"X-1: a test that is less needs b"),
+    "half a cell": ("t004/nominal/ins_gnss", "t004/nominal", r"X-1: cell=t004/nominal, .*give scenario/noise/model"),
+    "no tests": (RECORD[RECORD.index("  tests:") :], "  note: none", r"X-1: it has neither tests nor a reason"),
+    "unknown paper": ('"000"', '"999"', r"X-1: paper='999'"),
+    "bad reason": ("  tests:", "  why: because\n  tests:", r"X-1: why='because'; begin with one of not stated"),
+    "uneven lists": ("b: ekf", "b: [ekf, ukf], from: [1, 2, 3]", r"X-1: lists of \[2, 3\] values"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_record_is_told_by_name(case: str, tmp_path: Path) -> None:
+    old, new, message = WRONG[case]
+    assert old in RECORD
+    (tmp_path / "good.yaml").write_text(RECORD)
+    claims.load(CONF, STUDIES, tmp_path / "good.yaml")
+    (tmp_path / "bad.yaml").write_text(RECORD.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        claims.load(CONF, STUDIES, tmp_path / "bad.yaml")
+
+
+def test_an_id_stands_once(tmp_path: Path) -> None:
+    (tmp_path / "twice.yaml").write_text(RECORD + RECORD)
+    with pytest.raises(ValueError, match="X-1 stands there more than once"):
+        claims.load(path=tmp_path / "twice.yaml")
+
+
+def test_lists_stand_side_by_side_and_method_for_each_form(tmp_path: Path) -> None:
+    text = RECORD.replace("  tests:", "  forms: {printed: rpf, repaired: apf}\n  tests:")
+    text = text.replace("a: sir, b: ekf", "a: 'method[particles=9]', b: [ekf, ukf], from: [0, 5]")
+    (tmp_path / "lists.yaml").write_text(text)
+    (claim,) = claims.load(CONF, STUDIES, tmp_path / "lists.yaml")
+    seen = {form: [(t.a, t.b, t.start) for t in tests] for form, tests in claim.tests.items()}
+    assert seen == {
+        "printed": [("rpf[particles=9]", "ekf", 0.0), ("rpf[particles=9]", "ukf", 5.0)],
+        "repaired": [("apf[particles=9]", "ekf", 0.0), ("apf[particles=9]", "ukf", 5.0)],
+    }
+
+
+# the statistics, on frames with a planted effect
+
+
+def frame(tests: Comparison | list[Comparison], **values: Any) -> pd.DataFrame:
+    """Rows as `gather` makes them, the same values under every measure."""
+    several = tests if isinstance(tests, list) else [tests]
+    parts = []
+    for test in {t.measure: t for t in several}.values():
+        for label, one in values.items():
+            where = next((side for t in several for side in t.sides if side[2] == label), (test.study, test.cell, label))
+            head = {"study": where[0], "cell": where[1], "label": label, "measure": test.measure, "seed": 1, "unit": "m"}
+            numbers = np.asarray(one, dtype=float)
+            parts.append(pd.DataFrame({**head, "run": np.arange(numbers.size), "lost": np.isinf(numbers), "value": numbers}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def claim(*tests: Comparison, id: str = "X-1", **forms: Comparison) -> Claim:
+    return Claim(id, "000", "", "", "", {form: (test,) for form, test in forms.items()} or {"": tests}, {})
+
+
+def ruled(test: Comparison, **values: Any) -> rulings.Ruling:
+    (ruling,) = rulings.decide([claim(test)], frame(test, **values))
+    return ruling
+
+
+def losses(seed: int, ratio: float, runs: int = 60, scatter: float = 0.2) -> dict[str, np.ndarray]:
+    """Two filters on shared worlds, a `ratio` times b but for its own scatter."""
+    rng = np.random.default_rng(seed)
+    b = np.exp(0.5 * rng.standard_normal(runs))
+    return {"a": ratio * b * np.exp(scatter * rng.standard_normal(runs)), "b": b}
+
+
+def only(seed: int, level: float, scatter: float = 0.1, runs: int = 60) -> dict[str, np.ndarray]:
+    return {"a": level * np.exp(scatter * np.random.default_rng(seed).standard_normal(runs))}
+
+
+def alone(statistic: str, **settings: Any) -> Comparison:
+    return replace(LESS, statistic=statistic, b="", **settings)
+
+
+YES, NO, OPEN = "reproduced", "not reproduced", "cannot be decided"
+PLANTED = {
+    "less": (LESS, losses(1, 0.7), losses(1, 1.3)),
+    "less, no effect": (LESS, losses(2, 0.7), losses(2, 1.0, scatter=0.05)),
+    "greater": (replace(LESS, statistic="greater"), losses(3, 1.4), losses(3, 0.8)),
+    "equal": (replace(LESS, statistic="equal"), losses(4, 1.02, scatter=0.1), losses(4, 1.3, scatter=0.1)),
+    "equal, below": (replace(LESS, statistic="equal"), losses(4, 0.98, scatter=0.1), losses(4, 0.7, scatter=0.1)),
+    "no worse": (replace(LESS, statistic="no_worse"), losses(5, 0.5), losses(5, 1.4)),
+    "close": (replace(LESS, statistic="close", margin=0.5), losses(6, 1.0), losses(6, 3.0)),
+    "below": (alone("below", high=2.0), only(7, 1.5), only(7, 2.5)),
+    "above": (alone("above", low=2.0), only(8, 2.5), only(8, 1.5)),
+    "within, low": (alone("within", low=110, high=180), only(9, 150), only(9, 90)),
+    "within, high": (alone("within", low=110, high=180), only(9, 150), only(9, 220)),
+    "near": (alone("near", printed=22.0, margin=0.2), only(10, 21), only(10, 30)),
+    "near, below": (alone("near", printed=22.0, margin=0.2), only(10, 23), only(10, 15)),
+    "flat": (alone("flat", metric="growth", margin=0.1), {"a": 0.02 * np.sin(np.arange(60))}, {"a": 0.3 + np.arange(60) / 60}),
+    "falls": (alone("falls", metric="growth"), {"a": -0.3 - np.arange(60) / 60}, {"a": 0.3 + np.arange(60) / 60}),
+    "share": (alone("share", metric="diverged", low=0.05), {"a": np.arange(60) < 20}, {"a": np.zeros(100)}),
+    "cost": (replace(LESS, statistic="cost", high=1.0), {"a": [0.8], "b": [1.0]}, {"a": [1.3], "b": [1.0]}),
+    "cost, printed": (replace(LESS, statistic="cost", printed=12.45), {"a": [9.0], "b": [1.0]}, {"a": [2.0], "b": [1.0]}),
+    "cost, alike": (replace(LESS, statistic="cost", low=0.77, high=1.3), {"a": [1.0], "b": [1.0]}, {"a": [0.5], "b": [1.0]}),
+    "printed ratio": (replace(LESS, printed=0.6), losses(11, 0.65), losses(11, 0.95, scatter=0.02)),
+    "printed ratio, too much": (replace(LESS, printed=0.6), losses(11, 0.5), losses(11, 0.2)),
+}
+
+
+@pytest.mark.parametrize("case", PLANTED)
+def test_a_planted_effect_turns_the_verdict(case: str) -> None:
+    test, there, gone = PLANTED[case]
+    assert (ruled(test, **there).verdict, ruled(test, **gone).verdict) == (YES, NO)
+
+
+def test_every_statistic_is_planted() -> None:
+    assert {test.statistic for test, _, _ in PLANTED.values()} | {"report"} == set(claims.STATISTICS)
+
+
+@pytest.mark.parametrize("case", [case for case in PLANTED if "cost" not in case and case != "share"])
+def test_too_few_runs_decide_nothing(case: str) -> None:
+    test, there, _ = PLANTED[case]
+    few = ruled(test, **{label: np.asarray(values)[:3] for label, values in there.items()})
+    assert (few.verdict, few.reason) == (OPEN, "no power")
+
+
+@pytest.mark.parametrize("ratio", [1 / 1.1, 1.1])
+def test_equivalence_needs_both_sides(ratio: float) -> None:
+    assert ruled(replace(LESS, statistic="equal"), **losses(21, ratio, scatter=0.1)).verdict == OPEN
+    assert ruled(alone("near", printed=1.0), **only(22, ratio)).verdict == OPEN
+
+
+def test_one_timing_within_a_tenth_decides_nothing() -> None:
+    test = replace(LESS, statistic="cost", high=1.0)
+    assert ruled(test, a=[1.05], b=[1.0]).reason == ruled(test, a=[0.95], b=[1.0]).reason == "no power"
+
+
+def test_the_order_of_rows_and_of_claims_changes_nothing() -> None:
+    tests = [test for test, _, _ in PLANTED.values() if test.b and test.statistic != "cost"]
+    several = [claim(test, id=f"X-{k}") for k, test in enumerate(tests)]
+    rows = frame(tests, **losses(12, 0.8))
+    first = rulings.decide(several, rows)
+    for seed in range(3):
+        shuffled = rows.sample(frac=1, random_state=seed)
+        assert rulings.decide(several, shuffled) == first
+    backwards = rulings.decide(several[::-1], rows)
+    assert [r.verdict for r in backwards[::-1]] == [r.verdict for r in first]
+
+
+def test_runs_are_paired_by_their_number() -> None:
+    world = np.exp(2 * np.random.default_rng(13).standard_normal(40))
+    paired = frame(LESS, a=0.8 * world, b=world)
+    assert rulings.decide([claim(LESS)], paired)[0].verdict == YES
+    apart = paired.copy()
+    ours = apart.label == "a"
+    apart.loc[ours, "run"] = (apart.loc[ours, "run"] * 7 + 3) % 40
+    assert rulings.decide([claim(LESS)], apart)[0].verdict == OPEN
+
+
+def test_lost_runs_count_against_who_lost_them() -> None:
+    values = losses(14, 0.7)
+    hurt = values["a"].copy()
+    hurt[:40] = np.inf
+    found = ruled(LESS, a=hurt, b=values["b"])
+    assert found.verdict == NO
+    assert found.findings[""][0].effect == np.inf
+    assert found.findings[""][0].lost_a == 40
+    other = ruled(LESS, a=values["a"], b=hurt)
+    assert (other.verdict, other.findings[""][0].effect) == (YES, 0.0)
+
+
+def test_where_both_are_lost_nothing_is_decided() -> None:
+    gone = np.full(60, np.inf)
+    for statistic in ("less", "equal", "close"):
+        found = ruled(replace(LESS, statistic=statistic), a=gone, b=gone)
+        assert (found.verdict, found.reason) == (OPEN, "lost")
+    assert ruled(alone("near", printed=1.0), a=gone).reason == "lost"
+    assert ruled(alone("below", high=1.0), a=gone).verdict == NO  # it did not stay below
+
+
+def test_what_did_not_run_is_said() -> None:
+    found = ruled(LESS, a=[1.0, 2.0])
+    assert (found.verdict, found.reason) == (OPEN, "not run")
+    assert rulings.decide(ALL[:5], frame(LESS, a=[1.0]))[0].reason == "not run"
+
+
+def test_holm_goes_over_all_comparisons_of_a_paper() -> None:
+    values = losses(15, 0.93, runs=40)
+    nothing = {f"n{k}": values["b"] * np.exp(np.random.default_rng(k).standard_normal(40)) for k in range(20)}
+    others = [replace(LESS, a=label) for label in nothing]
+    rows = frame([LESS, *others], **values, **nothing)
+    (one,) = rulings.decide([claim(LESS)], rows)
+    assert one.verdict == YES
+    many = rulings.decide([claim(LESS), *(claim(test, id=f"N-{k}") for k, test in enumerate(others))], rows)
+    assert many[0].findings[""][0].family == 21
+    assert many[0].findings[""][0].p == one.findings[""][0].p
+    assert many[0].verdict == OPEN
+    elsewhere = [replace(claim(test, id=f"N-{k}"), paper="001") for k, test in enumerate(others)]
+    assert rulings.decide([claim(LESS), *elsewhere], rows)[0].verdict == YES
+
+
+def test_holm_is_that_of_statsmodels() -> None:
+    p = np.random.default_rng(20).random(30) ** 3
+    p[3] = p[17]
+    assert rulings.holm_adjusted(p) == pytest.approx(multipletests(p, method="holm")[1])
+    assert rulings.holm_adjusted(np.array([])) == []
+
+
+def test_forms_are_told_apart() -> None:
+    printed, repaired = LESS, replace(LESS, a="c")
+    both = claim(printed=printed, repaired=repaired)
+
+    def verdict(a: float, c: float, runs: int = 60) -> tuple[str, str]:
+        values = losses(16, a)
+        other = losses(16, c)["a"][:runs]
+        (found,) = rulings.decide([both], frame([printed, repaired], **values, c=other))
+        return found.verdict, found.reason
+
+    assert verdict(0.6, 0.6) == (YES, "")
+    assert verdict(0.6, 1.5) == ("reproduced only as printed", "")
+    assert verdict(1.5, 0.6) == ("reproduced only as repaired", "")
+    assert verdict(1.5, 1.5) == (NO, "")
+    assert verdict(1.5, 0.6, runs=3) == verdict(0.6, 0.6, runs=3) == (OPEN, "no power")
+    stated = replace(both, tests={"repaired": (repaired,)}, why={"printed": ("not run", "it has no density")})
+    rows = frame([printed, repaired], **losses(16, 1.0), c=losses(16, 0.6)["a"])
+    (found,) = rulings.decide([stated], rows)
+    assert (found.verdict, found.note) == ("reproduced only as repaired", "as printed: it has no density")
+
+
+def test_one_comparison_that_fails_decides_against_the_claim() -> None:
+    good, bad, short = LESS, replace(LESS, a="c"), replace(LESS, a="d")
+    values = {**losses(17, 0.6), "c": losses(17, 1.5)["a"], "d": losses(17, 0.6)["a"][:3]}
+    rows = frame([good, bad, short], **values)
+    assert rulings.decide([claim(good, bad, short)], rows)[0].verdict == NO
+    assert rulings.decide([claim(good, short)], rows)[0].reason == "no power"
+
+
+def test_what_is_not_stated_is_measured_all_the_same() -> None:
+    test = alone("report")
+    record = replace(claim(test), why={"": ("not stated", "lost table")})
+    (found,) = rulings.decide([record], frame(test, **only(18, 3.0)))
+    assert (found.verdict, found.reason, found.note) == (OPEN, "not stated", "lost table")
+    assert found.findings[""][0].effect == pytest.approx(3.0, rel=0.1)
+    assert ledger.said(found.findings[""][0]).endswith("m")
+
+
+def test_the_interval_of_the_median_covers_as_often_as_it_says() -> None:
+    for n in (1, 5, 6, 9, 20, 60):
+        low, high = rulings.median_interval(np.arange(n, dtype=float), 0.95)
+        if n < 6:  # 1 - 2 / 2^5 < 0.95: no interval of five numbers is wide enough
+            assert (low, high) == (-np.inf, np.inf)
+            continue
+        k = int(low)  # order statistics k + 1 and n - k: the median is outside when k or fewer signs are one way
+        assert high == n - 1 - k
+        assert 2 * stats.binom.cdf(k, n, 0.5) <= 0.05 < 2 * stats.binom.cdf(k + 1, n, 0.5)
+
+
+def test_false_claims_are_as_rare_as_the_level() -> None:
+    rng, n, alpha = np.random.default_rng(19), 500, 0.05
+    drawn = (np.exp(rng.standard_normal((2, 25))) for _ in range(n))
+    wrong = sum(rulings.p_value(rulings.sample(LESS, a, b)) <= alpha for a, b in drawn)
+    assert wrong / n == pytest.approx(alpha, abs=4 * np.sqrt(alpha * (1 - alpha) / n))
+
+
+# what is read from results
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    for method in METHODS:
+        write(tmp_path / "s", method, runs=20, steps=60)
+    return tmp_path
+
+
+def result(folder: Path, label: str) -> store.Result:
+    return next(r for r in store.results(folder / "s") if r.meta["label"] == label)
+
+
+def test_measures_are_of_the_seconds_asked_for(study: Path) -> None:
+    test = Comparison("report", "s", CELL, "rmse", "ukf", group="position", component="position_N", start=20, end=30)
+    found = result(study, "ukf")
+    error, time = found.arrays["error"][..., 7].astype(float), found.arrays["time"]
+    inside = (time >= 20) & (time <= 30)
+    assert inside.sum() == 11
+    assert evidence.measured(found, test) == pytest.approx(np.sqrt((error[:, inside] ** 2).mean(1)))
+    assert evidence.measured(found, replace(test, metric="max_error")) == pytest.approx(np.abs(error[:, inside]).max(1))
+    assert evidence.measured(found, replace(test, metric="mean_abs")) == pytest.approx(np.abs(error[:, inside]).mean(1))
+    rows = evidence.gather([claim(test)], study)
+    assert rows.value.to_numpy() == pytest.approx(np.sqrt((error[:, inside] ** 2).mean(1)))
+    assert set(rows.unit) == {"m"}
+
+
+def test_measures_are_in_the_unit_shown_and_lost_runs_stay(study: Path) -> None:
+    test = Comparison("report", "s", CELL, "rmse", "sir", group="attitude")
+    found = result(study, "sir")
+    error = found.arrays["error"][..., :3].astype(float)
+    value = evidence.measured(found, test)
+    assert value[7] == np.inf
+    kept = np.arange(20) != 7
+    assert value[kept] == pytest.approx(np.degrees(np.sqrt((error[kept] ** 2).sum(-1).mean(1))) * 60)
+    rows = evidence.gather([claim(test)], study)
+    assert (rows.unit.unique().tolist(), rows.lost.sum()) == (["arcmin"], 1)
+    share = evidence.measured(found, replace(test, metric="ess"))
+    assert share * 200 == pytest.approx(evidence.measured(found, replace(test, metric="effective")), nan_ok=True)
+    assert np.isnan(share[7])
+    assert evidence.measured(found, replace(test, metric="diverged"))[7] == 1
+    assert np.isnan(evidence.measured(found, replace(test, metric="accepted"))).all()  # nothing was moved
+    assert evidence.measured(found, replace(test, metric="seconds_per_step")) == pytest.approx(np.full(20, 4e-3))
+
+
+def test_growth_is_that_of_an_exponential(study: Path) -> None:
+    found = result(study, "ekf")
+    time = found.arrays["time"]
+    error = np.zeros_like(found.arrays["error"])
+    error[..., 6:] = np.exp(-0.01 * time)[None, :, None]
+    made = store.Result(found.meta, {**found.arrays, "error": error})
+    test = Comparison("falls", "s", CELL, "growth", "ekf", group="position", start=20)
+    assert evidence.measured(made, test) == pytest.approx(np.full(20, -0.01 * 40), rel=1e-5)
+
+
+def test_accepted_is_a_mean_over_the_steps_with_moves(study: Path) -> None:
+    found = result(study, "sir")
+    hit = found.arrays["resampled"].astype(bool)
+    made = store.Result(found.meta, {**found.arrays, "accepted_0": np.where(hit, 0.25, 0.0)})
+    test = Comparison("report", "s", CELL, "accepted", "sir")
+    value = evidence.measured(made, test)
+    assert value[~np.isnan(value)] == pytest.approx(0.25)
+
+
+def test_a_label_with_settings_finds_its_job_whatever_else_ran(tmp_path: Path) -> None:
+    plain = METHODS[2]
+    for scale in (0.5, 1.0):
+        write(tmp_path / "s", plain, runs=8, steps=10, config={"moves": [{"scale": scale}]})
+    test = Comparison("report", "s", CELL, "rmse", "sir[moves.0.scale=0.5]", group="position")
+    assert len(evidence.gather([claim(test)], tmp_path)) == 8
+    assert len(evidence.gather([claim(replace(test, a="sir[moves.0.scale=2.0]"))], tmp_path)) == 0
+    with pytest.raises(ValueError, match="several jobs are sir"):
+        evidence.gather([claim(replace(test, a="sir"))], tmp_path)
+
+
+def test_a_group_that_a_result_lacks_is_told(study: Path) -> None:
+    test = Comparison("report", "s", CELL, "rmse", "ekf", group="clock [m]")
+    with pytest.raises(ValueError, match=re.escape("no group 'clock [m]' in attitude, velocity, position")):
+        evidence.gather([claim(test)], study)
+    assert "velocity" in STATE["groups"]
+
+
+# the page
+
+
+def test_the_page_shows_every_claim(tmp_path: Path) -> None:
+    page = ledger.write(tmp_path / "none", tmp_path / "reports", 0.05, CONF, STUDIES)
+    text = page.read_text()
+    for claim_id in IDS:
+        assert text.count(f'<tr id="{claim_id}"') == 1
+    assert "http" not in text  # it works offline
+    markdown = (page.parent / "report.md").read_text()
+    assert len(re.findall(r"^### .+: cannot be decided: ", markdown, re.M)) == 71
+    assert {"verdicts.json", "tables"} <= {path.name for path in page.parent.iterdir()}
+
+
+def test_the_page_has_the_numbers_and_a_link_to_the_cell(study: Path) -> None:
+    test = Comparison("less", "s", CELL, "rmse", "cofm_amssrcpf", "ekf", group="position", printed=0.6)
+    found = rulings.decide([claim(test)], evidence.gather([claim(test)], study))
+    assert found[0].verdict == YES
+    (line,) = ledger.papers(found, {"s"})[0]["rows"][0]["lines"]
+    assert line["link"] == "../s/index.html#flight_surge_ins_gnss"
+    assert re.fullmatch(r"0\.6\d+ \[0\.\d+, 0\.\d+\], printed 0\.600", line["said"])
+    assert ledger.papers(found)[0]["rows"][0]["lines"][0]["link"] == ""  # no page, no link
+    assert ledger.count(found).set_index("paper").loc["all", "claims"] == 1
+    assert ledger.of_study(found, "s") == found
+    assert ledger.of_study(found, "t") == []

@@ -1,0 +1,150 @@
+"""The page of a study of several cells: what it says across cells is what was decided, and every table names its budget."""
+
+import json
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+import synthetic_results as synthetic
+from matplotlib.figure import Figure
+
+from pfbench.report import across, budget, frame, page, ranking_figures, significance, tables
+from pfbench.report.canvas import looks
+
+METHODS = (
+    synthetic.Method("ekf", 2.0, 0.7, None, 0.4),
+    synthetic.Method("sir", 1.5, 0.8, 200, 4.0, (1, 2, 3, 4)),
+    synthetic.Method("apf", 1.0, 0.9, 200, 6.0),
+)
+NOISES = ("nominal", "surge", "heavy", "outage", "jam", "bursts")
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    root = tmp_path_factory.mktemp("results")
+    for noise in NOISES:
+        for method in METHODS:
+            synthetic.write(root / "many", method, noise=noise, runs=15, steps=6)
+    return root
+
+
+@pytest.fixture(scope="module")
+def report(results, tmp_path_factory):
+    drawn = []
+
+    def stub(drawing, prefix, folder, formats):
+        drawn.append(f"{prefix}_{drawing.name}")
+        return {"file": drawing.name, "caption": drawing.caption, "source": "data:,", "name": drawing.name, "broad": False}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "drawn", stub)
+        folder = page.write("many", results, tmp_path_factory.mktemp("reports"), page.Options(groups=("position",))).parent
+    (folder / "drawn.json").write_text(json.dumps(drawn))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["index.html", "report.md"])
+def test_the_text_is_that_of_the_verdicts(report, name):
+    text = (report / name).read_text()
+    (one,) = json.loads((report / "across.json").read_text())
+    assert len(one["cells"]) == 6
+    assert one["filters"] == ["apf", "ekf", "sir"]
+    assert f"Iman-Davenport F {tables.number(float(one['f']))} (p {tables.number(one['p_f'])})" in text
+    shown = [p for p in one["pairs"] if p["winner"] != significance.NO_DIFFERENCE]
+    assert f"A difference is shown in {len(shown)} of 3 pairs" in text
+    beaten = {p["a"] if p["winner"] == p["b"] else p["b"] for p in shown}
+    assert f"beaten by no other: {', '.join(f for f in one['filters'] if f not in beaten)}." in text
+    decided = json.loads((report / "verdicts.json").read_text())
+    assert {v["page"] for v in decided} == {18}
+    many = sum(v["p_page"] <= 0.05 for v in decided)
+    assert f"Corrected over all 18 of this page together, {many} do." in text
+    assert "With another rule (pairs with a lost run left out; largest finite error of the cell)" in text
+    assert "@software{pfbench," in text
+    assert "year    = {2026}" in text
+    runs = sorted(int(v["needed"]) for v in decided if v["noise"] == "surge")
+    assert f"with a power of 0.8, {runs[0]} to {runs[-1]} runs are needed" in text
+
+
+def test_every_table_names_its_budget(report):
+    said = "Budget: same N (N = 200 of each particle filter)."
+    for path in (report / "tables").glob("*.csv"):
+        assert set(pd.read_csv(path).note) == {said}
+        latex = path.with_suffix(".tex").read_text()
+        assert said in latex
+        assert latex.rstrip().endswith("\\end{tabular}")
+    html = (report / "index.html").read_text()
+    assert html.count("<table>") == len(re.findall(r"</table></div>(?:\n</div>)?\n<p class=\"note\">Budget: same N", html))
+
+
+def test_the_page_carries_its_figures_and_its_filter(report):
+    drawn = json.loads((report / "drawn.json").read_text())
+    assert {"across_critical_difference_position", "across_matrix_position", "across_profile_position"} <= set(drawn)
+    assert sum(name.endswith("_front") for name in drawn) == 6
+    html = (report / "index.html").read_text()
+    sift = html[html.index('<div class="sift">') :]
+    assert sift[: sift.index("</table>")].count("<tr>") == 1 + 18
+    assert html.count("<script>") == 1
+    assert "<script src" not in html
+
+
+def test_pictures_across_cells_show_what_was_decided(results):
+    table = frame.frame("many", results)
+    decided = significance.verdicts(table[table.group == "position"])
+    one, sources = across.across(table, "position"), across.blocks(table, "position")
+    style = looks(sorted(set(table.label)))
+    found = {d.name: d.make() for d in ranking_figures.of_study([(one, sources)], decided, style)}
+    assert all(isinstance(figure, Figure) and figure.get_figwidth() <= 3.6 for figure in found.values())
+    ranks = {text.get_text() for text in found["critical_difference_position"].axes[0].texts}
+    assert all(any(f"{rank:.2f}" in text for text in ranks) for rank in one.ranks)
+    axis = found["matrix_position"].axes[0]
+    order = [tick.get_text() for tick in axis.get_yticklabels()]
+    for text in axis.texts:
+        x, y = text.get_position()
+        row, column = order[round(y)], order[round(x)]
+        won = sum(v.winner == row for v in decided if {v.a, v.b} == {row, column})
+        assert text.get_text().startswith(f"{won}–")
+    lines = {line.get_label(): line.get_ydata()[-1] for line in found["profile_position"].axes[0].lines}
+    assert lines["sir"] == pytest.approx(100 * 11 / 15)  # four of fifteen runs are lost in each cell
+
+
+def test_the_front_is_who_is_not_dominated():
+    cost = np.array([1.0, 2.0, 3.0, 3.0, 4.0, 0.5])
+    loss = np.array([5.0, 3.0, 3.5, 2.0, np.inf, np.inf])
+    assert budget.undominated(cost, loss).tolist() == [True, True, False, True, False, False]
+    assert budget.undominated(np.ones(3), np.ones(3)).all()
+    rng = np.random.default_rng(1)
+    cost, loss = rng.random((2, 40))
+    best = [not any(c <= x and l <= y and (c < x or l < y) for c, l in zip(cost, loss, strict=True))
+            for x, y in zip(cost, loss, strict=True)]  # fmt: skip
+    assert budget.undominated(cost, loss).tolist() == best
+
+
+def test_a_budget_that_was_not_kept_is_not_claimed():
+    def job(particles, per_step=1e-3, **config):
+        return {"key": "k", "particles": particles, "seconds": {"per_step": per_step}, "config": config}
+
+    assert budget.stated([job(100), job(None)]) == "Budget: same N (N = 100 of each particle filter)."
+    assert "was not kept (N = 100, 400)" in budget.stated([job(100), job(400)])
+    kind = "same time per step"
+    assert budget.stated([job(100, budget=kind), job(9, 1.1e-3, budget=kind)]) == f"Budget: {kind} (1 to 1.1 ms per step)."
+    assert "was not kept" in budget.stated([job(100, budget=kind), job(9, 5e-3, budget=kind)])
+    assert "not the same for all" in budget.stated([job(100), job(100, budget=kind)])
+    with pytest.raises(ValueError, match="budget=fair"):
+        budget.stated([job(1, budget="fair")])
+
+
+def test_rules_for_lost_runs_that_decide_otherwise_are_listed():
+    runs = np.arange(20)
+    a, b = np.linspace(1, 1.2, 20), np.linspace(1.3, 1.6, 20)
+    a[:14] = np.inf  # better where it survives, which is not often
+    rows = pd.concat([
+        pd.DataFrame({"label": label, "run": runs, "value": value, "lost": np.isinf(value)})
+        for label, value in (("a", a), ("b", b))
+    ])  # fmt: skip
+    rows = rows.assign(scenario="s", noise="n", model="m", seed=1, group="position", component="norm", metric="rmse", unit="m")
+    (found,) = significance.sensitivity(rows)
+    assert found.winners == ("b", "a", significance.NO_DIFFERENCE)
+    assert significance.sensitivity(rows[~rows.lost]) == []
+    (verdict,) = significance.verdicts(rows)
+    assert verdict.winner == "b"
