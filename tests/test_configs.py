@@ -170,6 +170,7 @@ def test_every_filter_runs_where_the_transition_is_singular_or_says_why_not(meth
 
 HOMES = {
     "strapdown_total": ["car_drive"],
+    "strapdown_aided": ["fixed_wing_aided"],
     "strapdown_tight": ["walk"],
     "passive_location": ["passive_1"],
     "sins_gnss_tight": ["anshun_fit"],

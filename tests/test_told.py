@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import oracles
@@ -31,7 +31,7 @@ from pfbench.noise.correlated import GaussMarkov, NonLineOfSight
 from pfbench.noise.regimes import Glint, Laplace, Nominal, Outage, Outliers, Regime, StudentT
 from pfbench.noise.replay import Replay
 from pfbench.noise.surges import BiasStep, Surge
-from pfbench.record import Channels, Record
+from pfbench.record import Channels, Record, map_inputs
 from pfbench.scenario.model_world import ModelWorld
 from pfbench.scenario.told import Told, Witness
 
@@ -288,6 +288,24 @@ def test_told_is_the_model_inside_in_all_else() -> None:
     assert len(knows.choices) == len(model.choices) + 1
     record = knows.prepare(Record(torch.zeros(1, 60, 1).double()))
     assert knows.prepare(record) is record
+
+
+def test_inputs_within_inputs_are_taken_apart_and_put_together() -> None:
+    class Inner(NamedTuple):
+        a: torch.Tensor
+        b: torch.Tensor
+
+    class Outer(NamedTuple):
+        inner: Inner | tuple[()]
+        c: torch.Tensor
+
+    u = Outer(Inner(torch.ones(2, 3), torch.arange(3.0).expand(2, 3)), torch.zeros(2, 3))
+    found = Record(torch.zeros(2, 3, 1), u).at(2).u
+    assert type(found) is Outer
+    assert type(found.inner) is Inner
+    assert found.inner.b.tolist() == [2.0, 2.0]
+    assert map_inputs(lambda a: a + 1.0, Outer((), torch.zeros(1))) == Outer((), torch.ones(1))
+    assert map_inputs(lambda a: a, ()) == ()
 
 
 class Wrapping(LinearGaussian):

@@ -187,7 +187,8 @@ def _corrected(
 
     With rates linear in time over two samples of d1 and d2 seconds, both the coning and the sculling integral are cross
     products of the samples times (d1 + d2)^2 / (6 d1 d2), 2/3 for equal ones; over the second sample alone, times
-    d2^2 / (6 d1 (d1 + d2)), 1/12.
+    d2^2 / (6 d1 (d1 + d2)), 1/12. A force that is constant in a body that turns at a constant rate gives
+    f + w x f / 2 + w x (w x f) / 6 + ..., from the series of the rotation; of what varies, second order is kept.
     """
     if per_step == 2:
         w1, w2, f1, f2, d1, d2 = *_pair(dtheta, -2), *_pair(dv, -2), *_pair(d, -1)
@@ -201,7 +202,8 @@ def _corrected(
     factor = torch.where((d1 > 0) & (d2 > 0), factor, torch.zeros_like(factor)).unsqueeze(-1)
     coning = factor * torch.linalg.cross(w1, w2)
     sculling = factor * (torch.linalg.cross(w1, f2) + torch.linalg.cross(f1, w2))
-    return w + coning, f + 0.5 * torch.linalg.cross(w, f) + sculling, t
+    swept = torch.linalg.cross(w, f)
+    return w + coning, f + 0.5 * swept + torch.linalg.cross(w, swept) / 6 + sculling, t
 
 
 def _pair(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:

@@ -175,8 +175,7 @@ class Cosine:
     change: float
 
     def __post_init__(self) -> None:
-        if not self.end > self.begin:
-            raise ValueError(f"begin={self.begin}, end={self.end}: a ramp must end after it begins")
+        _check_order(self)
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Value and two time derivatives."""
@@ -199,8 +198,7 @@ class Cycloid:
     change: float
 
     def __post_init__(self) -> None:
-        if not self.end > self.begin:
-            raise ValueError(f"begin={self.begin}, end={self.end}: a ramp must end after it begins")
+        _check_order(self)
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Value and two time derivatives."""
@@ -265,6 +263,11 @@ class Ramps:
         safe = along.clamp(min=1e-9)
         along1, steepen = (speed * speed1 + up * up1) / safe, (speed * up1 - up * speed1) / safe.square()
         return Motion(along, torch.where(along > 0, along1, speed1), torch.atan2(up, speed), steepen, *turned)
+
+
+def _check_order(ramp: Cosine | Cycloid) -> None:
+    if not ramp.end > ramp.begin:
+        raise ValueError(f"begin={ramp.begin}, end={ramp.end}: a ramp must end after it begins")
 
 
 def _check_on_samples(ramp: Cosine, duration: float, rate: float) -> None:

@@ -44,14 +44,24 @@ class CorrectedIns:
                 f"velocity and position, this one has {groups or 'states that are no differences'}; choose ins_gnss or "
                 "sins_gps_azimuth, or give closed=false"
             )
-        return _Flight(self, record)
+        return CorrectedFlight(self, record)
 
 
-class _Flight:
-    """One filter's flight. Navigation stays in double precision, whatever the filter computes in."""
+class CorrectedFlight:
+    """One filter's flight. Navigation stays in double precision, whatever the filter computes in.
+
+    The records of its steps have it as their loop, being how they go on.
+
+    Attributes:
+        t: the step that was last asked for; -1 before the first.
+    """
 
     def __init__(self, course: CorrectedIns, record: Record) -> None:
         self.course, self.record, self.ins, self.t = course, record, course.ins, -1
+
+    def begin(self, record: Record, groups: dict[str, tuple[int, ...]]) -> Underway:
+        """Goes on from where it is."""
+        return self
 
     def at(self, t: int) -> Record:
         """The interval that the corrected INS flies, and what the same fixes say of it: y is INS minus fix."""
@@ -61,7 +71,7 @@ class _Flight:
         position = (u.pos_end - self.record.u.pos_end[:, t : t + 1]) * earth.metre_scale(u.pos_end)
         velocity = u.vel_end - self.record.u.vel_end[:, t : t + 1]
         moved = torch.cat([position, velocity], -1)[..., : self.record.y.shape[-1]]
-        return Record(self.record.y[:, t : t + 1] + moved, u)
+        return Record(self.record.y[:, t : t + 1] + moved, u, loop=self)
 
     def correct(self, mean: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Attitude C <- C(alpha) C, velocity and position subtract; biases stay states: nothing is taken off the sensors."""

@@ -97,7 +97,7 @@ class SimulatedFlight:
             )
         process = step_process(noise, flight.time[1:])
         swell = None if bool((process == 1.0).all()) else hashlib.sha256(process.numpy().tobytes()).hexdigest()
-        recipe = ("flight 5", self.path, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist(), swell)
+        recipe = ("flight 6", self.path, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist(), swell)
         world = cached(self.cache, recipe, lambda: self._simulate(flight, per, process, MonteCarlo(seed, runs)))
         truth = {name[6:]: value for name, value in world.items() if name.startswith("truth.")}
         intervals = strapdown.Intervals(*(world[name] for name in strapdown.Intervals._fields))

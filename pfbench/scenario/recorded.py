@@ -20,6 +20,7 @@ from pfbench.record import Channels, Episode, Record, fixes
 from pfbench.scenario.legs import SAME_TIME, Leg, cut
 from pfbench.scenario.logs import Files, read_log
 from pfbench.scenario.tables import Array
+from pfbench.scenario.withholding import Withholding
 
 
 @dataclass(frozen=True)
@@ -67,9 +68,12 @@ class RecordedDrive:
         start, end: seconds of the log; None for all that IMU, fixes and reference have in common.
         files: names of the tables.
         origin: lat_deg, lon_deg, h_m of the local frame, where the files do not say it.
+        withholding: which fixes are kept from the filters and serve as the truth, where the reference is no better than they
+            are; None hands out all of them, and the reference is the truth.
 
     Raises:
-        ValueError: a step or interval that is not positive; on drawing, a missing root or folder, or a faulty log.
+        ValueError: a step or interval that is not positive; on drawing, a missing root or folder, a faulty log, or no fix
+            withheld where some should be.
     """
 
     root: str | None
@@ -81,15 +85,25 @@ class RecordedDrive:
     end: float | None = None
     files: Files = field(default_factory=Files)
     origin: Sequence[float] | None = None
+    withholding: Withholding | None = None
 
     def __post_init__(self) -> None:
         _positive("scenario.step", self.step)
 
     def draw(self, noise: Regime, runs: Tensor, seed: int) -> Episode:
         """The log with these runs' errors; times are those of the log."""
+        return self.over(self.read(), noise, runs, seed)
+
+    def read(self) -> Leg:
+        """The log on its steps."""
         log = read_log(locate(self.root, self.folder), self.files, origin=self.origin)
-        leg = cut(log, self.receiver.interval, self.step, self.receiver.velocity_sd is not None, self.start, self.end)
-        return assemble([leg], leg.time, torch.zeros_like(runs), self.believed, self.receiver, noise, MonteCarlo(seed, runs))
+        return cut(log, self.receiver.interval, self.step, self.receiver.velocity_sd is not None, self.start, self.end)
+
+    def over(self, leg: Leg, noise: Regime, runs: Tensor, seed: int) -> Episode:
+        """The worlds of these runs over the log as read."""
+        one, draws = torch.zeros_like(runs), MonteCarlo(seed, runs)
+        world = assemble([leg], leg.time, one, self.believed, self.receiver, noise, draws)
+        return world if self.withholding is None else self.withholding.score(world, leg, runs, self.files.reference)
 
 
 @dataclass(frozen=True)
@@ -151,6 +165,12 @@ def locate(root: str | None, folder: str) -> Path:
     if not path.is_dir():
         raise ValueError(f"data.root={root}: no folder {path}; {remedy}")
     return path
+
+
+def spelled(names: Sequence[str]) -> Tensor:
+    """Names, such as G12, for the sheet of an Episode: codes of their letters, filled up with spaces [S, longest]."""
+    longest = max(map(len, names), default=0)
+    return torch.tensor([[ord(letter) for letter in name.ljust(longest)] for name in names], dtype=torch.float64)
 
 
 def assemble(

@@ -1,6 +1,4 @@
-"""A recorded drive through a city with raw pseudoranges and odometry, and what its range errors say of their own law.
-
-`PFBENCH_DATA=... python -m pfbench.scenario.recorded_urban` prints the laws that the model yamls hold.
+"""A recorded drive through a city with raw pseudoranges and odometry; `urban_law` estimates the law of its range errors.
 
 Satellites come in the Earth-fixed axes of transmission and are turned into those of reception, about the start; a range is then
 a plain distance (to a millimetre within a kilometre of the start).
@@ -8,8 +6,6 @@ a plain distance (to a millimetre within a kilometre of the start).
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -17,15 +13,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from torch import Tensor
 
 from pfbench.draws import MonteCarlo
-from pfbench.model.urban_gnss import CN0_REFERENCE, Believed, Normal, SightOrTail, Sky, TailedNormal, UrbanGnss
+from pfbench.model.urban_gnss import Believed, Normal, Sky, UrbanGnss
 from pfbench.nav import earth
-from pfbench.noise.regimes import Regime
+from pfbench.nav.orbits import azimuth_elevation
+from pfbench.noise.regimes import Regime, untouched_process
 from pfbench.record import Channels, Episode, Record
-from pfbench.scenario.recorded import locate
+from pfbench.scenario.recorded import locate, spelled
 from pfbench.scenario.tables import Array, numbers, read_table, times
 
 LIGHT = 299792458.0  # m/s
@@ -134,8 +130,8 @@ class UrbanDrive:
         start, end: seconds of the drive that are scored; null for all of it.
 
     Raises:
-        ValueError: on drawing, a missing root or folder, a faulty table, fewer than two epochs, or a start at which the car
-            stands, so that it has no heading.
+        ValueError: on drawing, a missing root or folder, a faulty table, fewer than two epochs, a start at which the car stands,
+            so that it has no heading, or a regime that swells the noise of recorded sensors.
     """
 
     root: str | None
@@ -157,10 +153,12 @@ class UrbanDrive:
         slots = len(drive.satellites)
         sd = torch.full((slots,), self.receiver.range_sd, dtype=torch.float64)
         channels = Channels(sd, ("range",) * slots, tuple(range(slots)))
+        untouched_process(noise, time)
         y[:, epochs] += noise.errors(draws.at(0), channels, time[epochs])
         record = Record(y, sky, self._start(drive, draws))
         track = torch.cat([truth["position"], truth["height"]], -1)
-        return Episode(record, time, truth, track, (f"clock: nominal drift {self.receiver.clock_drift} m/s taken off",))
+        notes = (f"clock: nominal drift {self.receiver.clock_drift} m/s taken off",)
+        return Episode(record, time, truth, track, notes, directions(drive))
 
     def _start(self, drive: Drive, draws: MonteCarlo) -> Tensor:
         """Starts [R, 9] about which the reference has the believed initial law."""
@@ -204,6 +202,14 @@ def reference(drive: Drive) -> dict[str, Tensor]:
     return {"position": enu[:, :2], "height": enu[:, 2:], "heading": heading[:, None]}
 
 
+def directions(drive: Drive) -> dict[str, Tensor]:
+    """For the sheet, from the start: azimuth and elevation [T, S] at all epochs but the first, NaN where not seen; names."""
+    origin = torch.from_numpy(drive.position[0])
+    place = torch.from_numpy(turned(drive.place[1:], earth.ecef(origin).numpy()))
+    azimuth, elevation = azimuth_elevation(origin, place)
+    return {"azimuth": azimuth, "elevation": elevation, "satellites": spelled(drive.satellites)}
+
+
 def reduce(drive: Drive, clock_drift: float) -> tuple[Tensor, Sky]:
     """Pseudoranges less the range from the start and the nominal drift [T, S], and the inputs of the steps after the first."""
     origin = torch.from_numpy(drive.position[0])
@@ -219,103 +225,3 @@ def reduce(drive: Drive, clock_drift: float) -> tuple[Tensor, Sky]:
     filled = [np.where(np.isnan(a), fill, a) for a, fill in ((reach, 2e7), (glonass, 0.0), (drive.cn0, 40.0), (drive.sd, 1.0))]
     leaves = [np.diff(drive.time), *middle, *(a[1:] for a in (line, *filled))]
     return torch.from_numpy(reduced), Sky(*(torch.from_numpy(np.ascontiguousarray(leaf))[None] for leaf in leaves))
-
-
-class Residuals(NamedTuple):
-    """Pseudoranges less the range from the reference and a nominal clock, one for each satellite seen, n in all.
-
-    Attributes:
-        time: [n] s.
-        value: [n] m; clock and inter-system bias are still in it.
-        glonass: [n] 1 or 0.
-        cn0: [n] dB-Hz.
-        sd: as the receiver states it [n] m.
-        elevation: [n] rad.
-    """
-
-    time: Tensor
-    value: Tensor
-    glonass: Tensor
-    cn0: Tensor
-    sd: Tensor
-    elevation: Tensor
-
-
-def residuals(drive: Drive, clock_drift: float = -49.7) -> Residuals:
-    """Residuals of a stretch at its reference, measured from the level of the first epoch."""
-    position = torch.from_numpy(drive.position)
-    at = earth.ecef(position).numpy()[:, None]
-    sight = turned(drive.place, at) - at
-    reach = np.linalg.norm(sight, axis=-1)
-    up = np.einsum("tsi,ti->ts", sight / reach[..., None], earth.local_axes(position)[:, 2].numpy())
-    value = drive.range - reach - (clock_drift * (drive.time - drive.time[0]))[:, None]
-    value -= np.nanquantile(value[0], 0.2)
-    glonass = [float(name.startswith("R")) for name in drive.satellites]
-    every = (drive.time[:, None], value, np.array(glonass), drive.cn0, drive.sd, np.arcsin(up))
-    seen = ~np.isnan(value)
-    return Residuals(*(torch.from_numpy(np.broadcast_to(a, seen.shape)[seen]) for a in every))
-
-
-class Clock(NamedTuple):
-    """Receiver clock as straight lines between knots, and the inter-system bias."""
-
-    knots: Array
-    level: Array
-    inter_system: float
-
-
-def fit(data: Residuals, log_density: Callable[[Tensor, Tensor], Tensor], begin: Array, knot: float) -> tuple[Array, Clock]:
-    """Maximum likelihood of a law's parameters, with the clock and the inter-system bias as nuisance parameters.
-
-    Args:
-        data: residuals of one contiguous stretch.
-        log_density: errors [n], parameters [k] on the whole real line -> log density [n].
-        begin: where the search starts [k].
-        knot: seconds between the knots of the clock.
-
-    Raises:
-        ValueError: the search does not end in an optimum.
-    """
-    t, n = data.time.numpy(), max(2, 1 + round(float(np.ptp(data.time.numpy())) / knot))
-    knots = np.linspace(t.min(), t.max(), n)
-    design = torch.from_numpy(np.stack([np.interp(t, knots, row) for row in np.eye(n)], -1))
-    start = np.array([np.quantile(data.value.numpy()[np.abs(t - at) <= knot], 0.2) for at in knots])
-
-    def objective(p: Array) -> tuple[float, Array]:
-        parameters = torch.from_numpy(p).requires_grad_()
-        error = data.value - design @ parameters[:n] - data.glonass * parameters[n]
-        loss = -log_density(error, parameters[n + 1 :]).mean()
-        (slope,) = torch.autograd.grad(loss, parameters)
-        return float(loss.detach()), slope.numpy()
-
-    found = minimize(objective, np.concatenate([start, [0.0], begin]), jac=True, method="BFGS", options={"gtol": 1e-5})
-    if np.abs(found.jac).max() > 1e-4:
-        raise ValueError(f"no maximum of the likelihood found ({found.message}); give a longer stretch or wider knots")
-    return found.x[n + 1 :], Clock(knots, found.x[:n], float(found.x[n]))
-
-
-def estimate_normal(data: Residuals, knot: float = 20.0) -> tuple[Normal, Clock]:
-    """The factor of `Normal` that fits best. Raises as `fit`."""
-
-    def log_density(e: Tensor, p: Tensor) -> Tensor:
-        return torch.distributions.Normal(0.0, torch.exp(p[0]) * data.sd, validate_args=False).log_prob(e)
-
-    p, clock = fit(data, log_density, np.zeros(1), knot)
-    return Normal(float(np.exp(p[0]))), clock
-
-
-def estimate_mixture(data: Residuals, knot: float = 20.0) -> tuple[SightOrTail, Clock]:
-    """Share, sd, tail and slope of `SightOrTail` that fit best. Raises as `fit`."""
-
-    def log_density(e: Tensor, p: Tensor) -> Tensor:
-        odds, sd, tail = p[0] + p[3] * (data.cn0 - CN0_REFERENCE), torch.exp(p[1]), torch.exp(p[2])
-        return TailedNormal(torch.zeros_like(e), odds, sd, tail).log_prob(e)
-
-    p, clock = fit(data, log_density, np.array([0.0, np.log(5.0), np.log(40.0), 0.0]), knot)
-    share, sd, tail = 1.0 / (1.0 + np.exp(-p[0])), np.exp(p[1]), np.exp(p[2])
-    return SightOrTail(float(share), float(sd), float(tail), float(p[3])), clock
-
-
-if __name__ == "__main__":
-    training = residuals(stretch(read_drive(locate(os.environ.get("PFBENCH_DATA"), "berlin_urban_tc")), 0.0, 100.0))
-    print(estimate_normal(training)[0], estimate_mixture(training)[0], sep="\n")

@@ -20,11 +20,11 @@ from pfbench.draws import MonteCarlo
 from pfbench.model.strapdown_tight import BelievedTight, Sighted
 from pfbench.model.strapdown_total import Increments
 from pfbench.nav import earth
-from pfbench.noise.regimes import Nominal, Regime
+from pfbench.noise.regimes import Nominal, Regime, untouched_process
 from pfbench.record import Channels, Episode, Record
 from pfbench.scenario.legs import Leg, cut, interpolate
 from pfbench.scenario.logs import Files, read_log
-from pfbench.scenario.recorded import Receiver, assemble, locate
+from pfbench.scenario.recorded import Receiver, assemble, locate, spelled
 from pfbench.scenario.tables import Array, Table, numbers, read_table
 
 _SAME_EPOCH = 0.02  # s: a receiver stamps by its own clock, which it keeps within some milliseconds
@@ -110,8 +110,8 @@ class RecordedWalk:
         origin: lat_deg, lon_deg, h_m of the local frame, where the files do not say it.
 
     Raises:
-        ValueError: a step that is not positive; on drawing, a missing root or folder, a faulty log, or no satellite of GPS at
-            the start.
+        ValueError: a step that is not positive; on drawing, a missing root or folder, a faulty log, no satellite of GPS at the
+            start, or a regime that swells the noise of recorded sensors.
     """
 
     root: str | None
@@ -136,10 +136,12 @@ class RecordedWalk:
         time = np.concatenate([[leg.begin], leg.time])
         measured, notes = reduced(sky, time, leg.start[4:7])
         y = torch.where(fixed[:, None], torch.from_numpy(measured[1:]), torch.nan).repeat(len(runs), 1, 1)
+        untouched_process(noise, loose.time)
         # errors are drawn for epochs, not for steps: the worlds stay the same when the step changes
         y[:, fixed] += noise.errors(draws.at(0), self.receiver.channels(len(sky.names)), loose.time[fixed])
         record = Record(y, sighted(loose.record.u, sky), self._start(loose.record.start, draws))
-        seen = {name: torch.from_numpy(getattr(sky, name)[1:]) for name in ("azimuth", "elevation")}
+        azimuth, elevation = (torch.from_numpy(a[1:]) for a in (sky.azimuth, sky.elevation))
+        seen = {"azimuth": azimuth, "elevation": elevation, "satellites": spelled(sky.names)}
         return Episode(record, loose.time, loose.truth, loose.track, (*loose.notes, *notes), seen)
 
     def _start(self, motion: Tensor | None, draws: MonteCarlo) -> Tensor:

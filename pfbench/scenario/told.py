@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,6 +16,7 @@ from pfbench.noise import laws
 from pfbench.noise.laws import Law, Mixture
 from pfbench.noise.regimes import Regime, step_process
 from pfbench.record import Channels, Record
+from pfbench.scenario.closed_loop import CorrectedFlight
 
 
 @dataclass(eq=False)
@@ -48,29 +47,19 @@ class Witness:
         return Told(model, self.regime, self.channels, time)
 
 
-class Known(tuple[Tensor, ...]):
-    """Inputs of the model inside, then root of the process factor [1, T], shift and scale of the errors [1, T, Dy]."""
+class Known(NamedTuple):
+    """Inputs of a model that is told the regime.
 
-    inner: ClassVar[type]
+    Attributes:
+        inner: of the model inside.
+        root: of the factor on its process noise [1, T].
+        shift, scale: of its measurement's errors, in their standard deviations [1, T, Dy].
+    """
 
-    def __new__(cls, *leaves: Tensor) -> Known:
-        return super().__new__(cls, leaves)
-
-    @property
-    def inputs(self) -> Any:
-        """Of the model inside."""
-        return self.inner(*self[:-3]) if len(self) > 3 else ()
-
-
-@cache
-def _known(inner: type) -> type[Known]:
-    """The type is what a record keeps when it takes its inputs apart, so it knows the model's own."""
-
-    class Own(Known):
-        pass
-
-    Own.inner = inner
-    return Own
+    inner: Any
+    root: Tensor
+    shift: Tensor
+    scale: Tensor
 
 
 class Told(StateSpaceModel):
@@ -126,11 +115,12 @@ class Told(StateSpaceModel):
         if isinstance(record.u, Known):
             return record
         record = self.model.prepare(record)
-        own: Sequence[Tensor] = [self.get_buffer(f"told_{name}") for name in ("root", "shift", "scale")]
+        own = [self.get_buffer(f"told_{name}") for name in ("root", "shift", "scale")]
+        if isinstance(record.loop, CorrectedFlight):  # a step of a world that answers says which one it is
+            own = [a[:, record.loop.t].unsqueeze(1) for a in own]
         if record.y.shape[1] != own[0].shape[1]:
             raise ValueError(f"the record has {record.y.shape[1]} steps, the filter was told of {own[0].shape[1]}")
-        inner: type = type(record.u)
-        return record._replace(u=_known(inner)(*record.u, *own))
+        return record._replace(u=Known(record.u, *own))
 
     def initial(self, runs: int) -> Distribution:
         return self.model.initial(runs)
@@ -138,21 +128,21 @@ class Told(StateSpaceModel):
     def propagate(self, x: Tensor, u: Known, w: Tensor) -> Tensor:
         if self.swollen:
             centre = self.model.noise.mean
-            w = centre + u[-3][:, None, None] * (w - centre)
-        return self.model.propagate(x, u.inputs, w)
+            w = centre + u.root[:, None, None] * (w - centre)
+        return self.model.propagate(x, u.inner, w)
 
     def noise_gain(self, u: Known) -> Tensor | None:
-        gain = self.model.noise_gain(u.inputs)
-        return u[-3][:, None, None] * gain if self.swollen and gain is not None else gain
+        gain = self.model.noise_gain(u.inner)
+        return u.root[:, None, None] * gain if self.swollen and gain is not None else gain
 
     def transition(self, x: Tensor, u: Known) -> Distribution | None:
         """The model's, its deviations scaled where the noise enters additively; None where it has none."""
-        law = self.model.transition(x, u.inputs)
+        law = self.model.transition(x, u.inner)
         if law is None or not self.swollen:
             return law
-        if self.model.noise_gain(u.inputs) is None:
+        if self.model.noise_gain(u.inner) is None:
             return None
-        root = u[-3][:, None, None]
+        root = u.root[:, None, None]
         if isinstance(law, Independent) and isinstance(law.base_dist, Normal):
             return independent_normal(law.base_dist.loc, root * law.base_dist.scale)
         if isinstance(law, MultivariateNormal):
@@ -160,10 +150,10 @@ class Told(StateSpaceModel):
         return None
 
     def observation(self, x: Tensor, u: Known) -> Distribution:
-        law = self.model.observation(x, u.inputs)
+        law = self.model.observation(x, u.inner)
         if self.family is laws.normal and not self.moved:
             return law
-        shift, scale = (a.unsqueeze(1) for a in u[-2:])
+        shift, scale = (a.unsqueeze(1) for a in (u.shift, u.scale))
         if isinstance(law, Independent) and isinstance(law.base_dist, Normal):
             centre, sd = law.base_dist.loc, law.base_dist.scale
             return self.family(centre + shift * sd, scale * sd)
@@ -182,7 +172,7 @@ class Told(StateSpaceModel):
 
     def log_likelihood(self, y: Tensor, x: Tensor, u: Known) -> Tensor:
         if self.family is laws.normal and not self.moved:
-            return self.model.log_likelihood(y, x, u.inputs)
+            return self.model.log_likelihood(y, x, u.inner)
         law = self.observation(x, u)
         if isinstance(law, Mixture):
             return law.combine([self._density(part, y) for part in law.parts])

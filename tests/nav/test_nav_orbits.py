@@ -15,17 +15,15 @@ import torch
 from torch import Tensor
 
 from pfbench.nav import earth
+from pfbench.nav.broadcast import Broadcast
+from pfbench.nav.ephemeris import GM_GPS, WEEK, read_rinex
 from pfbench.nav.orbits import (
-    GM_GPS,
     GPS_OMEGA,
     LIGHT,
-    WEEK,
-    Broadcast,
     Constellation,
     Walker,
     azimuth_elevation,
     eccentric_anomaly,
-    read_rinex,
     sagnac,
     transmit,
 )

@@ -69,15 +69,13 @@ def test_sensors_lead_along_the_smoothed_motion(noise: tuple[float, float, float
     """However bad the record is: what is replayed is one motion, and the mechanisation finds it again."""
     flight = Replay(record(20.0, *noise)).fly(50.0)
     turned, velocity, position = closure(flight)
-    # the mechanisation turns an increment by half of the step's rotation, second order: it lacks w x (w x f) / 6
-    w, f = (a.unflatten(0, (-1, 2)).sum(1) for a in (flight.dtheta, flight.dv))
-    missed = torch.linalg.cross(w, torch.linalg.cross(w, f)).norm(dim=-1).sum() / 6
     assert turned < 1e-8
-    assert velocity < missed + 1e-5
-    assert position < (missed + 1e-5) * flight.time[-1]
+    assert velocity < 1e-5
+    # velocity is joined by straight lines: T^2 / 12 of the change of acceleration, up to 10 m/s^2
+    assert position < 1e-5 * flight.time[-1] + 0.04**2 / 12 * 10.0
     finer = closure(Replay(record(20.0, *noise)).fly(100.0))
-    # and nothing else: what is left falls with the square of the step, unless knots fall inside of samples
-    assert all(3.5 < float(a / b) < 4.5 for a, b in zip((turned, velocity, position), finer, strict=True))
+    # what is left falls with the square of the step at least, unless knots fall inside of samples
+    assert all(float(a / b) > 3.5 for a, b in zip((turned, velocity, position), finer, strict=True))
 
 
 def test_a_fast_flight_far_north_feels_the_level_frame_turn() -> None:

@@ -29,17 +29,33 @@ def test_closes_on_the_generator(plan, rate, per_step):
 
 
 @pytest.mark.parametrize("per_step", [1, 2])
-def test_twice_the_rate_leaves_a_quarter_of_the_error(per_step):
+def test_twice_the_rate_leaves_an_eighth_of_the_error_of_velocity(per_step):
+    # of position a quarter, since velocity is joined by straight lines, once the eighths have become small
     coarse, fine = (closure(fly(*SHORT, rate), rate, per_step) for rate in (20, 40))
-    assert 3.5 < coarse[3:6].norm() / fine[3:6].norm() < 4.5
-    assert 3.5 < coarse[6:].norm() / fine[6:].norm() < 4.5
+    assert coarse[3:6].norm() / fine[3:6].norm() > 7
+    assert 3.5 < coarse[6:].norm() / fine[6:].norm() < 8
+
+
+@pytest.mark.parametrize("per_step", [1, 2])
+def test_a_steady_force_in_a_body_that_turns_steadily(per_step):
+    """Against the integral of the rotation in closed form, over a turn of 0.3 rad: to the fourth order of the series."""
+    w, f, span = torch.tensor([0.5, -0.7, 0.4]).double(), torch.tensor([3.0, 8.0, 9.0]).double(), 0.316
+    samples = torch.ones(1, 2, 3, dtype=torch.float64)
+    spans = torch.full((1, 2), span, dtype=torch.float64)
+    turn, push, _ = strapdown._corrected(samples * w * span, samples * f * span, spans, per_step, False)
+    k, angle = attitude.skew(w), w.norm()
+    whole = span * (2 if per_step == 2 else 1)
+    s, c = torch.sin(angle * whole), torch.cos(angle * whole)
+    swept = whole * torch.eye(3).double() + (1 - c) / angle**2 * k + (angle * whole - s) / angle**3 * k @ k
+    assert torch.allclose(turn[0, -1], w * whole, rtol=0, atol=1e-12)
+    assert (push[0, -1] - swept @ f).norm() < f.norm() * whole * (angle * whole) ** 3 / 24 * 1.01
 
 
 @pytest.mark.slow
 def test_twice_the_rate_leaves_a_quarter_of_the_error_over_the_reference_flight():
     coarse, fine = (closure(fly(*T003, rate), rate) for rate in (50, 100))
-    ratio = coarse[3:].abs() / fine[3:].abs()
-    assert ((ratio > 3.5) & (ratio < 4.5)).all()
+    assert coarse[3:6].norm() / fine[3:6].norm() > 3.5
+    assert coarse[6:].norm() / fine[6:].norm() > 3.5
 
 
 @pytest.mark.slow
@@ -149,8 +165,9 @@ def test_samples_at_uneven_times():
     error = errors(end, flight)[0].abs()
     even = closure(fly(*SHORT, rate=40), 40).abs()
     # two samples together last as long as two of 40 Hz, and the error is that of the step
-    assert error[3:6].norm() < 1.5 * even[3:6].norm()
-    assert error[6:].norm() < 1.5 * even[6:].norm()
+    # what is quadratic in time is not symmetric about the middle of unequal samples: third order of 0.05 s, not fourth
+    assert error[3:6].norm() < 4e-5
+    assert error[6:].norm() < 1e-3 + 1.5 * even[6:].norm()
 
 
 @pytest.mark.parametrize("per_step", [1, 2])

@@ -22,19 +22,10 @@ from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.rules import Jacobian
 from pfbench.model.urban_gnss import Believed, Normal, SightOrTail, TailedNormal, UrbanGnss
 from pfbench.noise.regimes import Nominal, Outage
+from pfbench.noise.surges import Surge
 from pfbench.record import Episode
-from pfbench.scenario.recorded_urban import (
-    Receiver,
-    Residuals,
-    UrbanDrive,
-    estimate_mixture,
-    estimate_normal,
-    handed_out,
-    read_drive,
-    reference,
-    residuals,
-    stretch,
-)
+from pfbench.scenario.recorded_urban import Receiver, UrbanDrive, handed_out, read_drive, reference, stretch
+from pfbench.scenario.urban_law import Residuals, estimate_mixture, estimate_normal, residuals
 
 CONF = Path(__file__).parents[2] / "conf"
 DATA = os.environ.get("PFBENCH_DATA")
@@ -150,6 +141,26 @@ def test_residuals_at_the_reference_are_the_clock(root: Path) -> None:
     assert away.max() - away.min() < 0.5 * 6e-6**2 * 2.6e7 + 2e-5
     assert len(data.value) == (read_drive(root / "city").time < 10.0).sum() + 4 * 101
     assert torch.rad2deg(data.elevation[:5]).tolist() == pytest.approx([15, 30, 45, 60, 75], abs=0.01)
+
+
+def test_the_sheet_tells_where_satellites_stand(root: Path) -> None:
+    episode = scenario(root).draw(Nominal(), numbers(0, 1), 1)
+    sheet, time = episode.sheet, episode.time
+    names = ["".join(map(chr, row)) for row in sheet["satellites"].long().tolist()]
+    assert names == sorted(NAMES)
+    for k, name in enumerate(NAMES):
+        azimuth, elevation = (torch.rad2deg(sheet[part][:, names.index(name)]) for part in ("azimuth", "elevation"))
+        seen = ~torch.isnan(elevation)
+        assert torch.equal(seen, (time < 10.0) | (k > 0))
+        assert torch.equal(seen, ~torch.isnan(azimuth))
+        away = azimuth[seen] - 70.0 * k - 0.01 * time[seen]
+        assert torch.remainder(away + 180.0, 360.0).sub(180.0).abs().max() < 1e-3  # turned with the Earth: 4e-4 degrees
+        assert (elevation[seen] - 15.0 * (k + 1)).abs().max() < 1e-3
+
+
+def test_a_regime_cannot_swell_what_was_recorded(root: Path) -> None:
+    with pytest.raises(ValueError, match="the sensors of this scenario were recorded"):
+        scenario(root).draw(Surge(((1.0, 2.0),), (1.0,), (4.0,)), numbers(0), 1)
 
 
 def test_ranges_are_handed_out_at_the_interval(root: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -135,6 +136,9 @@ def test_low_and_missing_satellites_are_not_seen_and_harm_nothing(root: Path, tm
     satellites = episode.record.y.shape[-1] // 2
     assert satellites == high < whole["svid"].nunique()
     assert episode.sheet["elevation"].shape == (80, satellites)
+    spelled = ["".join(map(chr, row)) for row in episode.sheet["satellites"].long().tolist()]
+    assert len(set(spelled)) == satellites
+    assert all(re.fullmatch(r"[GEW]\d\d", name) for name in spelled)
     assert float(torch.rad2deg(episode.sheet["elevation"]).nan_to_num(90.0).min()) >= 20.0
     assert all(torch.isfinite(leaf).all() for leaf in episode.record.u)
     each = torch.isnan(episode.record.y[0, 3::4])

@@ -21,13 +21,15 @@ from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.rules import Jacobian
 from pfbench.model.strapdown_total import Believed, StrapdownTotal
 from pfbench.noise.regimes import Nominal, Outage
-from pfbench.scenario.recorded import Receiver
-from pfbench.scenario.recorded_wing import RecordedWing, Withholding
+from pfbench.scenario.recorded import Receiver, RecordedDrive
+from pfbench.scenario.withholding import Withholding
 
 CONF = Path(__file__).parents[2] / "conf"
 DATA = os.environ.get("PFBENCH_DATA")
 recorded = pytest.mark.skipif(DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets")
 MISSED = np.array([0.3, -0.2, 0.1])  # m North, East, down: the errors of the synthetic fixes
+
+AS_RECORDED = Receiver(position_sd=(0.0, 0.0, 0.0), velocity_sd=(0.0, 0.0, 0.0))
 
 BELIEVED = Believed(
     gyro_density=1e-4,
@@ -53,9 +55,10 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def wing(root: Path, given: int = 1, withheld: int = 1, **changes: object) -> RecordedWing:
+def wing(root: Path, given: int = 1, withheld: int = 1, **changes: object) -> RecordedDrive:
     begin, shifted = changes.pop("begin", None), bool(changes.pop("shifted", True))
-    return replace(RecordedWing(str(root), "wing", BELIEVED, withholding=Withholding(given, withheld, begin, shifted)), **changes)
+    plain = RecordedDrive(str(root), "wing", BELIEVED, AS_RECORDED, withholding=Withholding(given, withheld, begin, shifted))
+    return replace(plain, **changes)
 
 
 def times(time: torch.Tensor, known: torch.Tensor) -> list[float]:

@@ -1,0 +1,116 @@
+"""Readings of a barometer and a magnetometer beside recorded fixes: exact on a synthetic log, seen where fixes are withheld."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from synthetic_log import tables, write
+
+from pfbench.model.strapdown_aided import BelievedAided, StrapdownAided
+from pfbench.model.strapdown_total import Believed
+from pfbench.noise.regimes import Nominal, Outage
+from pfbench.noise.surges import Surge
+from pfbench.scenario.recorded import Receiver, RecordedDrive
+from pfbench.scenario.recorded_aided import Instruments, RecordedAided, pressure_height
+from pfbench.scenario.told import Told, Witness
+from pfbench.scenario.withholding import Withholding
+
+FIELD, IRON = [0.17, 0.01, 0.52], [0.4, -0.2, 0.3]  # North, East, Down; forward, right, down
+MOTION = Believed(
+    gyro_density=1e-4,
+    accelerometer_density=1e-3,
+    gyro_bias_walk=1e-6,
+    accelerometer_bias_walk=1e-5,
+    position_sd=[1.0, 1.0, 2.0],
+    velocity_sd=[0.1, 0.1, 0.1],
+    attitude_sd_deg=[0.5, 0.5, 2.0],
+    initial_velocity_sd=[0.2, 0.2, 0.1],
+    initial_position_sd=[1.0, 1.0, 2.0],
+    gyro_bias_sd_deg_s=0.01,
+    accelerometer_bias_sd=0.01,
+)
+BELIEVED = BelievedAided(MOTION, 1.0, [0.01] * 3, FIELD, 3.0, 0.1, 0.02, 1e-4)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root with one flight of 20 s whose pressure rises by a pascal a second, in a uniform field."""
+    folder, log = tmp_path_factory.mktemp("data"), tables()
+    imu, yaw = log["imu"], np.interp(log["imu"]["t"], log["reference"]["t"], log["reference"]["yaw"])
+    imu["p_static_kpa"] = 98.0 + 0.001 * imu["t"]
+    imu[["mx", "my", "mz"]] = Rotation.from_euler("Z", yaw[:, None]).inv().apply(FIELD) + IRON
+    write(folder / "wing", log)
+    return folder
+
+
+def wing(root: Path, **changes: object) -> RecordedAided:
+    flight = RecordedDrive(None, "wing", MOTION, Receiver(velocity_sd=[0.0] * 3), withholding=Withholding())
+    flight = replace(flight, receiver=replace(flight.receiver, position_sd=[0.0] * 3))
+    return replace(RecordedAided(str(root), flight, BELIEVED, Instruments(IRON)), **changes)
+
+
+def test_readings_are_those_of_the_log_at_every_fix_withheld_or_not(root: Path) -> None:
+    episode = wing(root).draw(Nominal(), torch.arange(2), 1)
+    y, time = episode.record.y, episode.time.numpy()
+    assert y.shape == (2, 80, 10)
+    at_fix = torch.arange(1, 81) % 4 == 0
+    assert torch.equal(~torch.isnan(y[..., 6:]), at_fix[:, None].expand_as(y[..., 6:]))
+    withheld = torch.isnan(y[..., 0]) & at_fix
+    assert withheld.sum(1).tolist() == [10, 10]
+    fall = pressure_height(98.0 + 0.001 * time) - pressure_height(np.array(98.0))
+    assert np.allclose(y[0, at_fix, 6], fall[at_fix], atol=1e-9)
+    model = StrapdownAided(BELIEVED)
+    state = model.assemble(episode.truth).nan_to_num(0.0)
+    seen = torch.stack([model.observation(state[:, t : t + 1], episode.record.at(t).u).mean[:, 0] for t in range(80)], 1)
+    assert (y - seen)[:, at_fix][..., 7:].abs().max() < 2e-4  # the reference's heading between its samples
+
+
+def test_pressure_height_is_the_standard_atmosphere() -> None:
+    table = {101.325: 0.0, 95.4608: 500.0, 89.8746: 1000.0, 54.0199: 5000.0}  # ICAO Doc 7488
+    assert pressure_height(np.array(list(table))) == pytest.approx(list(table.values()), abs=0.1)
+
+
+def test_starts_have_the_believed_law_about_the_log(root: Path) -> None:
+    episode = wing(root).draw(Nominal(), torch.arange(400), 1)
+    start = episode.record.start
+    assert start is not None
+    z = start[:, 16:] / BELIEVED.bias_sd
+    assert (z.mean(0).abs() < 4.5 / 20).all()
+    assert ((z.std(0) - 1).abs() < 4.5 / 28).all()
+    plain = replace(wing(root).flight, root=str(root)).draw(Nominal(), torch.arange(400), 1)
+    assert torch.equal(start[:, :16], plain.record.start)  # the same flight as without instruments
+    alone = wing(root).draw(Nominal(), torch.tensor([7]), 1)
+    assert torch.equal(alone.record.start, start[7:8])
+    assert torch.equal(alone.record.y.nan_to_num(-1.0), episode.record.y[7:8].nan_to_num(-1.0))
+
+
+def test_a_regime_reaches_fixes_and_readings_at_once_and_can_be_told(root: Path) -> None:
+    flight = wing(root).flight
+    noisy = replace(flight, receiver=Receiver(position_sd=[3.0] * 3, velocity_sd=[0.5] * 3))
+    scene = wing(root, flight=noisy, instruments=Instruments(IRON, height_sd=2.0, magnetic_sd=0.01))
+    witness = Witness(Nominal())
+    episode = scene.draw(witness, torch.arange(300), 1)
+    away = episode.record.y - wing(root).draw(Nominal(), torch.arange(300), 1).record.y
+    sd = torch.stack([column[~torch.isnan(column)].std() for column in away.unbind(-1)])
+    assert torch.allclose(sd, torch.tensor([3.0] * 3 + [0.5] * 3 + [2.0] + [0.01] * 3).double(), rtol=0.06)
+    told = witness.tell(StrapdownAided(BELIEVED), episode.time)
+    assert isinstance(told, Told)
+    assert told.prepare(episode.record).u.shift.shape == (1, 80, 10)
+    silent = scene.draw(Outage(windows=[[5.0, 10.0]]), torch.arange(2), 1).record.y
+    assert torch.isnan(silent[:, 19:39]).all()
+    with pytest.raises(ValueError, match="a regime cannot swell their noise"):
+        scene.draw(Surge(((5.0, 9.0),), (1.0,), (4.0,)), torch.arange(2), 1)
+
+
+def test_what_cannot_be_read_is_refused(root: Path) -> None:
+    with pytest.raises(ValueError, match=r"instruments\.hard_iron=\[1\.0\]: give three"):
+        Instruments([1.0])
+    with pytest.raises(ValueError, match=r"instruments\.height_sd=-1\.0"):
+        Instruments(height_sd=-1.0)
+    with pytest.raises(ValueError, match=r"data\.root is not set"):
+        replace(wing(root), root=None).draw(Nominal(), torch.arange(1), 1)
