@@ -47,6 +47,9 @@ PLACES = (
     "particles",  # counted where a filter uses it, as filter.particles
     "bound",  # stands beside what a filter does; fresh=true adds it to a finished job
 )  # fmt: skip
+# what says how jobs are compared and changes nothing in one: no part of its name while it is usual
+BUDGETS = ("same N", "same time per step", "same likelihood evaluations")  # what filters that are compared have alike
+USUAL: Mapping[str, Any] = {"budget": "same N"}
 _COMPILE_FROM = 5e8  # normals; compiling their kernel costs some seconds and saves 15 ms for each million
 
 
@@ -62,7 +65,7 @@ def run(cfg: DictConfig) -> float:
         raise ValueError(f"study={cfg.study}: it names a folder of results; use letters, digits, points, dashes and underscores")
     if cfg.study in (DATASHEETS, "claims"):
         raise ValueError(f"study={cfg.study}: `pfbench report` puts pages of its own there; give the study another name")
-    path = Path(cfg.results) / cfg.study / f"{store.key(config, PLACES)}.npz"
+    path = Path(cfg.results) / cfg.study / f"{name_of(config)}.npz"
     choices = _choices()
     name = " ".join(choices[part] for part in ("scenario", "noise", "filter"))
     if path.exists() and not cfg.fresh:
@@ -81,6 +84,11 @@ def run(cfg: DictConfig) -> float:
         name, headline, lost, meta["runs"], 1e3 * seconds["per_step"], seconds["world"] + seconds["filter"],
     )  # fmt: skip
     return headline
+
+
+def name_of(config: Mapping[str, Any]) -> str:
+    """The key of a job: of what it computes, and of what it states of itself that is not usual."""
+    return store.key(config, (*PLACES, *(name for name, usual in USUAL.items() if config.get(name) == usual)))
 
 
 def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -140,6 +148,8 @@ def settings(cfg: DictConfig | Mapping[str, Any]) -> None:
         raise ValueError(f"bound={cfg['bound']}: give auto (where the model's laws are the world's), true or false")
     if cfg["dtype"] not in ("float32", "float64"):
         raise ValueError(f"dtype={cfg['dtype']}: give float64 (the default) or float32")
+    if cfg["budget"] not in BUDGETS:
+        raise ValueError(f"budget={cfg['budget']}: give one of {', '.join(BUDGETS)}")
     if cfg["engine"] not in ("auto", "eager", "compiled"):
         raise ValueError(f"engine={cfg['engine']}: give auto, eager or compiled")
     if not re.fullmatch(r"cpu|cuda(:\d+)?", str(cfg["device"])):

@@ -120,6 +120,15 @@ def mean_per_run(trace: Array, lost: Flags) -> Array:
     return np.where(lost, np.nan, each)
 
 
+def score_per_run(score: Array, lost: Flags) -> Array:
+    """Mean over instants of a score [R, S] or [R, S, K] that is small when good, over components too, for each run [R].
+
+    Infinite for a lost run, NaN for a run without truth.
+    """
+    each = np.asarray(score, dtype=np.float64)
+    return _with_lost(_mean(each.reshape(len(each), -1), axis=1), lost)
+
+
 def nees_band(dof: int, runs: int | NDArray[np.intp], alpha: float = 0.05) -> tuple[Array, Array]:
     """Two-sided band of the NEES averaged over independent runs [Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2].
 
@@ -203,6 +212,39 @@ def relative_error(error: Array, lost: Flags, distance: Array, last: int | None 
     norm = np.sqrt(_square(error)[~lost]) / np.asarray(distance, dtype=np.float64)
     kept = norm if last is None else norm[:, -last:]
     return Average(_mean(kept.ravel(), axis=0), _seen(kept))
+
+
+def coverage_per_run(pit: Array, lost: Flags, level: float) -> Array:
+    """Share of the truths in the central region of probability `level`, for each run [R]; NaN for a lost run.
+
+    Args:
+        pit: probability that the filter gives to values below the truth [R, S, K], NaN where there is no truth.
+        lost: [R].
+        level: 0 to 1.
+    """
+    pit = np.asarray(pit, dtype=np.float64)
+    # Of single precision, as it is stored: a truth on the edge is inside.
+    inside = np.where(np.isnan(pit), np.nan, np.abs(pit - 0.5) <= level / 2 + 1e-6)
+    return np.where(lost, np.nan, _mean(inside.reshape(len(inside), -1), axis=1))
+
+
+def rank_histogram(pit: Array, lost: Flags, bins: int = 10) -> Average:
+    """Share of the truths in each of `bins` equal parts of probability, value [bins], each run of the same weight; flat for a
+    filter that knows what it knows [Gneiting, Balabdaoui, Raftery 2007]. Other arguments as `coverage_per_run`."""
+    kept = np.asarray(pit, dtype=np.float64)[~lost]
+    kept = kept.reshape(len(kept), -1)
+    known = ~np.isnan(kept)
+    place = np.clip(np.where(known, kept, 0.0) * bins, 0, bins - 1).astype(int)
+    each = np.stack([_mean(np.where(known, place == k, np.nan), axis=1) for k in range(bins)], axis=1)
+    return Average(_mean(each, axis=0), int(known.any(axis=1).sum()))
+
+
+def share_band(share: float, runs: int, alpha: float = 0.05) -> tuple[float, float]:
+    """Two-sided binomial band of the share of `runs` independent cases that have probability `share`; NaN of none."""
+    if runs < 1:
+        return np.nan, np.nan
+    low, high = (float(stats.binom.ppf(q, runs, share)) / runs for q in (alpha / 2, 1 - alpha / 2))
+    return low, high
 
 
 def lost_share(lost: Flags) -> Average:

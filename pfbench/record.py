@@ -56,8 +56,8 @@ class Record(NamedTuple):
     loop: Loop | None = None
 
     def at(self, t: int) -> Record:
-        """Step t alone: y [R, Dy], inputs [R or 1, ...]."""
-        return Record(self.y[:, t], map_inputs(lambda a: a[:, t], self.u))
+        """Step t alone: y [R, Dy], inputs [R or 1, ...]; start and spread stay, for stages that begin at the first step."""
+        return Record(self.y[:, t], map_inputs(lambda a: a[:, t], self.u), self.start, self.spread)
 
     def of(self, runs: slice) -> Record:
         """Some of the runs."""

@@ -23,7 +23,7 @@ import numpy as np
 
 FORMAT = 1
 
-# Axes that must agree across arrays: R runs, T steps, D components, G groups of components.
+# Axes that must agree across arrays: R runs, T steps, D components, G groups of components, S steps scored.
 _AXES = {
     "time": "T",
     "error": "RTD",
@@ -32,6 +32,7 @@ _AXES = {
     "log_evidence": "R",
     "lost": "R",
 }
+_OPTIONAL = {"scored": "S", "crps": "RSD", "pit": "RSD", "energy": "RSG", "bound": "TD", "range": "T"}
 _META = ("key", "study", "choices", "config", "label", "seed", "runs", "state")
 
 
@@ -41,7 +42,7 @@ class Result(NamedTuple):
     Attributes:
         meta: what ran: key, study, choices, config, label, seed, versions, seconds, state (names, units, groups) ...
         arrays: time [T] s; error, sd [R, T, D]; nees [R, T, G]; log_evidence, lost [R]; optional traces [R, T], track
-            [R, T, 3] m East, North, Up.
+            [R, T, 3] m East, North, Up; the steps scored [S] with crps, pit [R, S, D] and energy [R, S, G], see `judge`.
     """
 
     meta: dict[str, Any]
@@ -235,7 +236,7 @@ def _check_meta(path: Path, meta: Any) -> None:
 
 
 def _check_arrays(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises ValueError where arrays are missing, are pickled, or disagree about R, T, D or G."""
+    """Raises ValueError where arrays are missing, are pickled, or disagree about R, T, D, G or S."""
     missing = [name for name in _AXES if name not in arrays]
     if missing:
         raise ValueError(f"{path}: a result needs the arrays {', '.join(missing)}")
@@ -250,8 +251,9 @@ def _check_arrays(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.n
         "D": len(meta["state"]["names"]),
         "G": len(meta["state"]["groups"]),
         "T": arrays["time"].size,
+        "S": arrays["scored"].size if "scored" in arrays else 0,
     }
-    for name, axes in _AXES.items():
+    for name, axes in (_AXES | {name: axes for name, axes in _OPTIONAL.items() if name in arrays}).items():
         expected = tuple(size[axis] for axis in axes)
         if arrays[name].shape != expected:
             raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {list(axes)} = {expected}")

@@ -17,8 +17,9 @@ from torch.distributions import Distribution, Independent
 
 from pfbench.chart import wrap
 from pfbench.draws import MonteCarlo
-from pfbench.filter.adaptations import AdaptiveFactor, ConstrainedNoise, Fading, MatrixNoise, RatioBound, TraceNoise
+from pfbench.filter.adaptations import ConstrainedNoise, Fading, MatrixNoise, TraceNoise
 from pfbench.filter.belief import Gaussian
+from pfbench.filter.gains import AdaptiveFactor, RatioBound
 from pfbench.filter.gaussian import GaussianFilter, Innovation
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.rules import Axis3, Axis5, Jacobian, Points, Product, Radial3, Radial5, Rule, Simplex3, Simplex5
@@ -117,7 +118,7 @@ def test_every_rule_is_kalman_on_a_linear_model(rule: Rule, kind: type[Tight]) -
 @every_rule
 def test_iterations_change_nothing_on_a_linear_model(rule: Rule) -> None:
     model = Tight()
-    y = simulate(model, 2, 10, missing=0.2)
+    y = simulate(model, 1, 6, missing=0.2)
     for each in (rule, Jacobian()):
         one, five = run(GaussianFilter(each), model, y), run(GaussianFilter(each, iterations=5), model, y)
         assert torch.allclose(one.mean, five.mean, rtol=1e-9, atol=1e-10)
@@ -425,6 +426,7 @@ def test_the_widened_ratio_stays_bounded() -> None:
 # what innovations tell of R and Q
 
 
+@pytest.mark.slow
 def test_a_burst_of_measurement_noise_is_told_from_a_burst_of_process_noise() -> None:
     """E r = 9.5 - 8.5 0.8^k after k steps of the burst, whatever the state does; q stays where it is, since its dead band is of
     three standard deviations. With the other burst r stays 1 and q grows."""
@@ -455,6 +457,7 @@ def carried(method: GaussianFilter, model: StateSpaceModel, y: Tensor) -> list[d
     return found
 
 
+@pytest.mark.slow
 def test_constrained_noise_costs_little_in_calm_and_helps_in_bursts() -> None:
     """The published comparison in miniature, all filters on the same worlds: rms errors, those of the plain filter being 1."""
     model, runs, burst = Tight(noisy=0.1), 60, range(40, 60)

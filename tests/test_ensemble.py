@@ -210,14 +210,14 @@ def test_a_large_ensemble_is_kalman(analysis: Analysis) -> None:
 @pytest.mark.slow
 @every_analysis
 def test_errors_fall_with_the_root_of_the_number_of_members(analysis: Analysis) -> None:
-    sizes, runs = np.array([64, 256, 1024, 4096]), 400
+    sizes, runs = np.array([64, 256, 1024]), 400
     squares = [off(EnsembleKalmanFilter(int(n), analysis), runs) for n in sizes]
     x = np.log(sizes) - np.log(sizes).mean()
     for j, what in enumerate(["mean", "covariance", "evidence"]):
         logs = np.array([0.5 * math.log(s[:, j].mean()) for s in squares])
         errors = np.array([0.5 * s[:, j].std() / s[:, j].mean() / math.sqrt(runs) for s in squares])
         slope, error = x @ logs / (x @ x), math.sqrt((x**2) @ errors**2) / (x @ x)
-        assert error < 0.03
+        assert error < 0.05
         # corrections of order 1/N bend the line at 64 members by a per cent or two
         assert abs(slope + 0.5) < 4 * error + 0.02, f"{what}: {slope:.3f} +- {error:.3f}"
 

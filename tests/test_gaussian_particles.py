@@ -71,6 +71,7 @@ def distance(method: ParticleFilter, runs: int = 60) -> float:
     return float(np.einsum("ri,ij,rj->r", e, np.linalg.inv(k.covariance[-1]), e).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("second_draw", [True, False])
 def test_the_limit_is_kalman_s_filter_and_even_points_come_nearer(second_draw: bool) -> None:
     """The mean square distance falls like 1/N or faster; a mean of 60 chi-squares of some 4 degrees is known to a tenth."""

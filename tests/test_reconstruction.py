@@ -16,21 +16,12 @@ from torch import Tensor
 
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Cloud, weights
+from pfbench.filter.control import Control, Static, Step
+from pfbench.filter.corrections import Correction, Density, Marginal, Uncorrected
+from pfbench.filter.linearisation import innovation, sight
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.proposals import Bootstrap, Proposal, Proposed
-from pfbench.filter.reconstruction import (
-    Control,
-    Correction,
-    Density,
-    Marginal,
-    Reconstructed,
-    ReconstructedNoise,
-    Static,
-    Step,
-    Uncorrected,
-    innovation,
-    slope,
-)
+from pfbench.filter.reconstruction import Reconstructed, ReconstructedNoise
 from pfbench.filter.resamplers import Resample, Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear import LinearGaussian
@@ -74,7 +65,7 @@ def test_the_paper_s_gain_is_an_eleventh_on_velocity_and_position_and_nothing_on
     cloud = ParticleFilter(7).init(model, 2, MonteCarlo(1, torch.arange(2)))
     y = torch.arange(6.0, dtype=torch.float64)
     for seen, scale in ((seen_of(y, 2), torch.ones(6)), (seen_of(y.index_fill(0, torch.tensor([4]), math.nan), 2), y != 4)):
-        h = slope(model, cloud.x, seen)
+        h = sight(model, cloud.x, seen)
         gain = Control().gain(model, cloud, seen, h)
         assert h.shape == (2, 7, 6, 9)
         assert gain.shape == (2, 7, 9, 6)
@@ -114,7 +105,7 @@ def test_the_control_minimises_its_index() -> None:
 def test_the_step_response_is_that_after_one_interval() -> None:
     """On a linear model A = H F B; the state that is held is not shifted, units scale the inputs."""
     model, cloud, seen = WALK, belief(WALK), seen_of(WALK_Y[0], 3)
-    h = slope(model, cloud.x[:, :1], seen)
+    h = sight(model, cloud.x[:, :1], seen)
     for held, b in (((), [2.0, 0.5]), (("velocity",), [2.0, 0.0])):
         a, inputs = Step(held, (2.0, 0.5))(model, cloud, seen, h)
         assert torch.allclose(a[0, 0], model.h @ model.f @ torch.diag(torch.tensor(b).double()))
@@ -149,7 +140,7 @@ def test_the_slope_of_the_measurement_agrees_with_differences(name: str) -> None
     cloud, step = belief(model, 6), 1e-6
     y = torch.zeros(model.observation(cloud.x, inputs(name)).mean.shape[-1], dtype=torch.float64)
     seen = seen_of(y, 3, inputs(name))
-    h = slope(model, cloud.x, seen)
+    h = sight(model, cloud.x, seen)
     for i, e in enumerate(step * torch.eye(model.chart.dimension).double()):
         up, down = (innovation(model, model.chart.add(cloud.x, sign * e), seen) for sign in (1, -1))
         assert torch.allclose((down - up) / (2 * step), h[..., i], atol=1e-6)
@@ -209,7 +200,7 @@ def test_the_shift_is_no_idle_one() -> None:
     plain = Bootstrap()(WALK, cloud, seen, MonteCarlo(2, torch.arange(1)).at(1))
     for name, proposal in EXACT.items():
         sent = proposal(WALK, cloud, seen, MonteCarlo(2, torch.arange(1)).at(1))
-        moved = (sent.x != plain.x).any(-1)
+        moved = (sent.x != plain.x).any(-1)[torch.isfinite(cloud.log_w)]
         share = 0.5 if "half" in name else 2 / 3 if "third" in name else 1.0
         assert moved.double().mean() == pytest.approx(share, abs=1e-3)
         assert (innovation(WALK, sent.x, seen).mean() / innovation(WALK, plain.x, seen).mean()) < 1.0 - 0.02 * share
@@ -275,7 +266,7 @@ def test_corrected_versions_are_unbiased(name: str, case: str) -> None:
     if (name, case) == ("density", "singular"):  # one noise for three states: of the shift only its projection is left
         method = dataclasses.replace(method, proposal=EXACT["density, half kept"])
     assert method.exact
-    check_unbiased(method, model, y, exact, runs=800)
+    check_unbiased(method, model, y, exact, runs=500)
 
 
 def test_as_printed_it_is_biased_and_says_so() -> None:
@@ -285,6 +276,7 @@ def test_as_printed_it_is_biased_and_says_so() -> None:
         check_unbiased(method, WALK, WALK_Y, kalman(WALK, WALK_Y))
 
 
+@pytest.mark.slow
 def test_marginal_weights_are_an_approximation_where_the_cloud_is_not_normal_and_say_so() -> None:
     model, y, exact = CASES["growth"]()
     method = ParticleFilter(200, ALWAYS, proposal=Reconstructed(control=Control(control_weight=0.5)))
@@ -330,32 +322,32 @@ CONVERGING: dict[str, Proposal] = {
 }
 
 
-@pytest.mark.study
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONVERGING)
 def test_corrected_versions_approach_kalman_with_the_root_of_the_number(name: str) -> None:
-    sizes, runs = np.array([200, 800, 3200]), 60
+    sizes, runs = np.array([200, 800, 3200]), np.array([80, 40, 20])  # most of the work is that of the most particles
     # a static shift is a tenth of the innovation: where the noise is no wider, a large innovation leaves few weights, and the
     # rate is reached only with far more particles
     model = toy(0.6, 6.0) if name == "density" else toy(0.3, 1.0)
     logs, errors = [], []
-    for n in sizes:
-        square, ratio = against_kalman(CONVERGING[name], model, int(n), runs, 50)
+    for n, some in zip(sizes, runs, strict=True):
+        square, ratio = against_kalman(CONVERGING[name], model, int(n), int(some), 30)
         total = square.mean(1)
         logs.append(0.5 * math.log(total.mean()))
-        errors.append(0.5 * total.std() / total.mean() / math.sqrt(runs))
+        errors.append(0.5 * total.std() / total.mean() / math.sqrt(some))
     x = np.log(sizes) - np.log(sizes).mean()
     slope_, error = x @ logs / (x @ x), math.sqrt((x**2) @ np.square(errors)) / (x @ x)
-    assert error < 0.05
+    assert error < 0.06
     assert abs(slope_ + 0.5) < 4 * error, f"{slope_:.3f} +- {error:.3f}"
-    assert np.all(np.abs(ratio.mean(0) - 1) < 4 * ratio.std(0) / math.sqrt(runs) + 0.01)
+    assert np.all(np.abs(ratio.mean(0) - 1) < 4 * ratio.std(0) / math.sqrt(runs[-1]) + 0.01)
 
 
 @pytest.mark.parametrize("name", CONVERGING)
 def test_corrected_versions_find_kalman(name: str) -> None:
     """A distance of a few 1/sqrt N; a ratio of variances of 1 but for the bias of order 1/N and its spread over runs."""
-    square, ratio = against_kalman(CONVERGING[name], toy(0.3, 1.0), 1000, 20, 40)
-    assert math.sqrt(square.mean()) < 8 / math.sqrt(1000)
-    assert np.all(np.abs(ratio.mean(0) - 1) < 4 * ratio.std(0) / math.sqrt(20) + 0.02)
+    square, ratio = against_kalman(CONVERGING[name], toy(0.3, 1.0), 600, 12, 30)
+    assert math.sqrt(square.mean()) < 8 / math.sqrt(600)
+    assert np.all(np.abs(ratio.mean(0) - 1) < 4 * ratio.std(0) / math.sqrt(12) + 0.02)
 
 
 def test_as_printed_it_finds_the_filter_of_another_model() -> None:

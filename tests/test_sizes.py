@@ -17,7 +17,7 @@ from pfbench.filter.belief import Cloud, ess
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.preferences import Additive, Entropy, Flattened, Form, Mix, Temper
 from pfbench.filter.resamplers import Multinomial, Resample, Scheme, Stratified, Systematic
-from pfbench.filter.sizes import EssStep, EssTarget, Size
+from pfbench.filter.sizes import Bounds, EssStep, EssTarget, Size
 from pfbench.record import Record
 
 STRENGTHS = [0.1, 0.5, 1.0]
@@ -128,7 +128,7 @@ def test_a_strength_out_of_range_is_named(form: type, strength: float) -> None:
 
 def test_a_step_up_or_down() -> None:
     """Run by run, by the ESS of the weights; 45 of 100 is below half, 55 above; bounds hold."""
-    size = EssStep(step=10, threshold=0.5, least=95, most=105, start=100)
+    size = EssStep(step=10, threshold=0.5, bounds=Bounds(95, 105, 100))
 
     def of(effective: int, n: int = 100) -> Tensor:
         """n particles, all but `effective` of them with weights that are next to nothing."""
@@ -136,20 +136,23 @@ def test_a_step_up_or_down() -> None:
 
     wanted = size(cloud(torch.stack([of(45), of(55)])))
     assert wanted.tolist() == [[105.0], [95.0]]
-    free = EssStep(step=10, threshold=0.5, least=10, most=120, start=100)
+    free = EssStep(10, 0.5, Bounds(10, 120, 100))
     assert free(cloud(torch.stack([of(45), of(55), of(45, 115), of(14, 15)]))).tolist() == [[110.0], [90.0], [120.0], [10.0]]
-    assert EssStep(0, 0.5, 10, 120, 100)(cloud(torch.stack([of(45), of(20, 60)]))).tolist() == [[100.0], [100.0]]
-    assert EssStep(10, 0.3, 10, 120, 100)(cloud(of(45)[None])).tolist() == [[90.0]]
+    assert EssStep(0, 0.5, Bounds(10, 120, 100))(cloud(torch.stack([of(45), of(20, 60)]))).tolist() == [[100.0], [100.0]]
+    assert EssStep(10, 0.3, Bounds(10, 120, 100))(cloud(of(45)[None])).tolist() == [[90.0]]
 
 
 def test_an_effective_size_is_aimed_at() -> None:
-    size = EssTarget(target=40.0, least=20, most=100, start=50)
+    size = EssTarget(40.0, Bounds(20, 100, 50))
     log_w = torch.stack([log_weights([1.0] * n + [1e-12] * (50 - n), 100) for n in (25, 50, 10)])
     torch.testing.assert_close(ess(log_w), torch.tensor([25.0, 50.0, 10.0], dtype=torch.float64))
     assert size(cloud(log_w)).tolist() == [[80.0], [40.0], [100.0]]
 
 
-@pytest.mark.parametrize("size", [EssStep(7, 0.6, 10, 40, 25), EssTarget(15.0, 10, 40, 25)], ids=lambda s: type(s).__name__)
+FEW = Bounds(10, 40, 25)
+
+
+@pytest.mark.parametrize("size", [EssStep(7, 0.6, FEW), EssTarget(15.0, FEW)], ids=lambda s: type(s).__name__)
 @pytest.mark.parametrize("threshold", [0.5, 1.0])
 def test_a_changing_number_leaves_everything_unbiased(size: Size, threshold: float) -> None:
     method = ParticleFilter(40, Resample(Systematic(), threshold), size, Entropy())
@@ -159,7 +162,7 @@ def test_a_changing_number_leaves_everything_unbiased(size: Size, threshold: flo
 
 def test_the_number_changes_from_step_to_step_without_a_nan() -> None:
     """What is decided at t - 1 holds at t; slots beyond it are empty; a run does not follow its neighbours."""
-    size = EssStep(7, 0.6, 10, 40, 25)
+    size = EssStep(7, 0.6, FEW)
     method = ParticleFilter(40, Resample(Systematic(), 1.0), size)
     draws = MonteCarlo(1, torch.arange(30))
     belief, seen = method.init(WALK, 30, draws.at(0)), set()
@@ -177,12 +180,12 @@ def test_the_number_changes_from_step_to_step_without_a_nan() -> None:
 @pytest.mark.parametrize(
     ("make", "key"),
     [
-        (lambda: EssStep(10, 0.5, 200, 300, 100), "size.least=200"),
+        (lambda: Bounds(200, 300, 100), "least=200"),
         (lambda: EssStep(-1), "size.step=-1"),
         (lambda: EssStep(threshold=1.5), "threshold=1.5"),
         (lambda: EssTarget(0.0), "size.target=0.0"),
-        (lambda: ParticleFilter(50, size=EssStep()).init(WALK, 2, MonteCarlo(1, torch.arange(2))), "size.most=200"),
-        (lambda: ParticleFilter(50, size=EssTarget()).init(WALK, 2, MonteCarlo(1, torch.arange(2))), "size.most=1000"),
+        (lambda: ParticleFilter(50, size=EssStep()).init(WALK, 2, MonteCarlo(1, torch.arange(2))), "size.bounds.most=200"),
+        (lambda: ParticleFilter(50, size=EssTarget()).init(WALK, 2, MonteCarlo(1, torch.arange(2))), "size.bounds.most=1000"),
     ],
 )
 def test_bad_arguments_are_named(make: Any, key: str) -> None:

@@ -16,26 +16,32 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from pfbench.draws import MonteCarlo
-from pfbench.filter.adaptations import AdaptiveFactor, ConstrainedNoise, Fading, RatioBound
+from pfbench.filter.adaptations import ConstrainedNoise, Fading
 from pfbench.filter.belief import Cloud, moments, weights
 from pfbench.filter.cells import Raw, Whitened, divide
+from pfbench.filter.control import Control
+from pfbench.filter.coordinates import Everything, Likelihood
+from pfbench.filter.corrections import Uncorrected
 from pfbench.filter.ensemble import EnsembleKalmanFilter, SquareRoot
+from pfbench.filter.gains import AdaptiveFactor, RatioBound
 from pfbench.filter.gaussian import Adaptation, Gain, GaussianFilter
 from pfbench.filter.gaussian_particles import GaussianRefresh
-from pfbench.filter.guided import Guided, GuidedNoise
+from pfbench.filter.guided import Guided
+from pfbench.filter.guided_noise import GuidedNoise
 from pfbench.filter.kernels import Flow
 from pfbench.filter.loop import run_filter
 from pfbench.filter.marginalised import RaoBlackwellised
 from pfbench.filter.moves import Metropolis
-from pfbench.filter.moves import Path as Past
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.points import Halton
 from pfbench.filter.polymerisation import Kept, Polymerised, Stretched
 from pfbench.filter.proposals import Bootstrap, Proposal
-from pfbench.filter.reconstruction import Control, Reconstructed, Uncorrected
+from pfbench.filter.reconstruction import Reconstructed
 from pfbench.filter.resamplers import Regularise, Resample, Resampler, Systematic
 from pfbench.filter.rules import Axis3, Axis5, Jacobian, Points, Product, Radial3, Radial5, Simplex3
-from pfbench.filter.swarm import Everything, Likelihood, Limits, Printed, Swarm
+from pfbench.filter.swarm import Limits, Swarm
+from pfbench.filter.swarm_weights import Printed
+from pfbench.filter.window import Path as Past
 from pfbench.model.linear import LinearGaussian, linear_walk
 from pfbench.record import Record
 

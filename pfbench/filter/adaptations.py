@@ -1,4 +1,4 @@
-"""Gaussian filters that doubt their noise: fading memory, noise constrained by what is seen, adaptive and bounded gains.
+"""Gaussian filters that doubt their noise: fading memory, noise constrained by what is seen.
 
 The equations of the paper behind these [COFM-AMSSRCPF 2024, Measurement and Control] are known from its prose alone; what it
 leaves open is marked.
@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from pfbench.covariance import factor
 from pfbench.filter.belief import Gaussian
 from pfbench.filter.gaussian import Innovation, update
+from pfbench.filter.principal_axes import Axes, check_share, diagonal, precision, principal
 from pfbench.filter.rules import Linearised
 
 
@@ -40,8 +39,7 @@ class Fading:
             raise ValueError(f"Fading.factor={self.factor}: give 1 (no fading) or more")
 
     def predict_scale(self, predicted: Linearised, belief: Gaussian) -> Linearised:
-        d = predicted.m.shape[-2]
-        m = torch.cat([predicted.m[..., :d] * math.sqrt(self.factor), predicted.m[..., d:]], -1)
+        m = _scaled(predicted.m, math.sqrt(self.factor), 1.0)
         return predicted._replace(m=m, omega=predicted.omega + (self.factor - 1.0) * (predicted.omega - predicted.noise))
 
     def noise_adapt(self, innovation: Innovation, belief: Gaussian) -> tuple[Innovation, dict[str, Tensor]]:
@@ -80,8 +78,8 @@ class ConstrainedNoise:
     groups: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
-        _check_share("ConstrainedNoise.forget", self.forget)
-        _check_share("ConstrainedNoise.decay", self.decay)
+        check_share("ConstrainedNoise.forget", self.forget)
+        check_share("ConstrainedNoise.decay", self.decay)
         for name in ("r_max", "q_max"):
             if not getattr(self, name) >= 1.0:
                 raise ValueError(f"ConstrainedNoise.{name}={getattr(self, name)}: give 1 (never changed) or more")
@@ -92,10 +90,9 @@ class ConstrainedNoise:
         """P- = C_f + q Q."""
         if "q" not in belief.memory:  # nothing has been seen yet
             return predicted
-        q, d = belief.memory["q"][:, None, None], predicted.m.shape[-2]
-        m = torch.cat([predicted.m[..., :d], predicted.m[..., d:] * q.sqrt()], -1)
-        omega = predicted.omega + (q - 1.0) * predicted.noise
-        return predicted._replace(m=m, omega=omega, noise=predicted.noise * q)
+        q = belief.memory["q"][:, None, None]
+        m, noise = _scaled(predicted.m, 1.0, q.sqrt()), predicted.noise * q
+        return predicted._replace(m=m, omega=predicted.omega + (noise - predicted.noise), noise=noise)
 
     def noise_adapt(self, innovation: Innovation, belief: Gaussian) -> tuple[Innovation, dict[str, Tensor]]:
         nothing = torch.ones_like(innovation.r), torch.zeros_like(belief.mean[:, 0]), torch.ones_like(belief.mean[:, 0])
@@ -142,7 +139,7 @@ class TraceNoise:
     r_max: float = 100.0
 
     def __post_init__(self) -> None:
-        _check_share("TraceNoise.forget", self.forget)
+        check_share("TraceNoise.forget", self.forget)
         if not self.r_max >= 1.0:
             raise ValueError(f"TraceNoise.r_max={self.r_max}: give 1 (never changed) or more")
 
@@ -150,11 +147,11 @@ class TraceNoise:
         return predicted
 
     def noise_adapt(self, innovation: Innovation, belief: Gaussian) -> tuple[Innovation, dict[str, Tensor]]:
-        w, k = _weights(innovation), innovation.seen.sum(-1, dtype=innovation.r.dtype)
+        w, k = precision(innovation), innovation.seen.sum(-1, dtype=innovation.r.dtype)
         surprise = belief.memory.get("surprise", torch.ones_like(k))
         newest = (w * innovation.r.square()).sum(-1) / k.clamp(min=1.0)
         surprise = torch.where(k > 0, (1.0 - self.forget) * surprise + self.forget * newest, surprise)
-        expected = (w * _diagonal(innovation.spread)).sum(-1) / k.clamp(min=1.0)
+        expected = (w * diagonal(innovation.spread)).sum(-1) / k.clamp(min=1.0)
         r = (surprise - expected).clamp(1.0, self.r_max)
         return innovation.with_noise(innovation.noise * r[:, None, None]), {"surprise": surprise, "trace_r": r}
 
@@ -177,15 +174,14 @@ class MatrixNoise:
     keep: float = 0.99
 
     def __post_init__(self) -> None:
-        _check_share("MatrixNoise.keep", self.keep)
+        check_share("MatrixNoise.keep", self.keep)
 
     def predict_scale(self, predicted: Linearised, belief: Gaussian) -> Linearised:
         """P- = C_f + Q, Q = a^k of the model's and what has been learned."""
         if "process" not in belief.memory:  # nothing has been seen yet
             return predicted
-        kept, d = belief.memory["kept"][:, None, None], predicted.m.shape[-2]
-        noise = predicted.noise * kept + belief.memory["process"]
-        m = torch.cat([predicted.m[..., :d], predicted.m[..., d:] * kept.sqrt()], -1)
+        kept = belief.memory["kept"][:, None, None]
+        m, noise = _scaled(predicted.m, 1.0, kept.sqrt()), predicted.noise * kept + belief.memory["process"]
         return predicted._replace(m=m, omega=predicted.omega + (noise - predicted.noise), noise=noise)
 
     def noise_adapt(self, innovation: Innovation, belief: Gaussian) -> tuple[Innovation, dict[str, Tensor]]:
@@ -208,158 +204,11 @@ class MatrixNoise:
         }
 
 
-@dataclass(frozen=True)
-class AdaptiveFactor:
-    """Widens the prediction by 1 / alpha where the innovation is large: P- / alpha [Yang, He and Xu 2001].
-
-    dV = sqrt(v' W v / tr(W (C_zz + R))); alpha = 1 while dV <= c0, then c0 / dV, and not below `least`. It cannot tell a wrong
-    state from a noisy measurement: in a burst of the latter it widens all states, step after step. Bound it by RatioBound.
-
-    Args:
-        threshold: c0; infinity switches it off.
-        least: smallest alpha.
-        weighted: W = diag(R)^-1 of the model's noise [ours]; false is W = I, as the literature prints it, which adds squares of
-            metres to squares of metres per second.
-
-    Raises:
-        ValueError: an argument outside its range.
-    """
-
-    threshold: float = 1.5
-    least: float = 0.1
-    weighted: bool = True
-
-    def __post_init__(self) -> None:
-        _check_share("AdaptiveFactor.least", self.least)
-        if not self.threshold > 0.0:
-            raise ValueError(f"AdaptiveFactor.threshold={self.threshold}: give a positive number, or .inf for no factor")
-
-    def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:
-        w = _weights(innovation) if self.weighted else innovation.seen.to(innovation.r.dtype)
-        expected = (w * _diagonal(innovation.spread + innovation.noise)).sum(-1)
-        surprise = torch.sqrt((w * innovation.r.square()).sum(-1) / torch.where(expected > 0.0, expected, 1.0))
-        return factor / torch.where(surprise > self.threshold, self.threshold / surprise, 1.0).clamp(min=self.least)
-
-
-@dataclass(frozen=True)
-class RatioBound:
-    """Bounds the ratio rho of predicted error to measurement noise, and so the gain, rho / (1 + rho) [ours, after the paper].
-
-    rho is the largest eigenvalue of C_zz in units of the R in use of a group of sensors. A widening f is cut so that f rho
-    stays at `highest`, but never below 1: it does not narrow what the model predicts. Where f rho is below `lowest` it is raised.
-
-    Args:
-        highest: infinity switches the bound off.
-        lowest: 0 switches it off.
-        groups: as ConstrainedNoise.groups.
-
-    Raises:
-        ValueError: bounds that are negative or crossed.
-    """
-
-    highest: float = 1.0
-    lowest: float = 0.0
-    groups: Sequence[int] | None = None
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.lowest <= self.highest:
-            raise ValueError(f"RatioBound.lowest={self.lowest}, highest={self.highest}: give 0 <= lowest <= highest")
-
-    def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:
-        _, same = _grouped(innovation, self.groups)
-        white = _whitened(_root(innovation.noise, same), innovation.spread, same)
-        rho = torch.linalg.eigvalsh(white).amax(-1).clamp(min=0.0)
-        some = torch.where(rho > 0.0, rho, 1.0)
-        factor = torch.where(factor * rho > self.highest, (self.highest / some).clamp(min=1.0), factor)
-        return torch.where((factor * rho < self.lowest) & (rho > 0.0), self.lowest / some, factor)
-
-
-class Axes(NamedTuple):
-    """Principal axes of what is expected, in units of the nominal noise, group by group of sensors.
-
-    Attributes:
-        ratio: eigenvalues lam of the expected spread [R, k].
-        w: innovation along the axes [R, k].
-        seen: axes of components that were seen [R, k].
-        share: squares of the axes' components [R, k components, k axes]; an axis stays within its group.
-        member: 1 where an axis is of a component's group, be the component seen or not [R, k components, k axes].
-    """
-
-    ratio: Tensor
-    w: Tensor
-    seen: Tensor
-    share: Tensor
-    member: Tensor
-
-    def along(self, value: Tensor) -> Tensor:
-        """What is one number for each group, of components [R, k] -> of axes [R, k]."""
-        return (self.share.mT @ value.unsqueeze(-1)).squeeze(-1)
-
-
-def principal(innovation: Innovation, groups: Sequence[int] | None = None) -> Axes:
-    """Generalised eigenvalues of the expected spread against the nominal noise, of each group of sensors by itself.
-
-    All groups are solved at once, as one block matrix whose blocks are set apart by multiples of more than its trace: no axis
-    mixes two groups, even where both have the eigenvalue 0, and runs may differ in what they see.
-    """
-    alike, same = _grouped(innovation, groups)
-    root = _root(innovation.nominal, same)
-    white = _whitened(root, innovation.spread, same)
-    first = torch.where(innovation.seen, same.to(torch.int8).argmax(-1), same.shape[-1])  # component of its group
-    apart = first * (1.0 + _diagonal(white).abs().sum(-1, keepdim=True))
-    _, axes = torch.linalg.eigh(white + torch.diag_embed(apart))
-    share = axes.square()
-    ratio = (axes * (white @ axes)).sum(-2).clamp(min=0.0)  # not the eigenvalues less what sets them apart, which would cancel
-    w = (axes.mT @ torch.linalg.solve_triangular(root, innovation.r.unsqueeze(-1), upper=False)).squeeze(-1)
-    seen = (innovation.seen.to(share).unsqueeze(-2) @ share).squeeze(-2) > 0.5
-    return Axes(ratio, w, seen, share, alike.to(share) @ share)
-
-
-def _grouped(innovation: Innovation, groups: Sequence[int] | None) -> tuple[Tensor, Tensor]:
-    """Components of one group, and those of them of which both are seen, both [R, k, k]."""
-    seen = innovation.seen
-    k = seen.shape[-1]
-    if groups is None:
-        size = _diagonal(innovation.nominal)
-        alike = (size.unsqueeze(-1) - size.unsqueeze(-2)).abs() <= 1e-6 * size.unsqueeze(-1)
-    else:
-        if len(groups) != k:
-            raise ValueError(f"groups={list(groups)}: give the number of a group for each of the {k} components measured")
-        number = torch.tensor(list(groups), device=seen.device)
-        alike = (number[:, None] == number).expand(*seen.shape, k)
-    return alike, alike & seen.unsqueeze(-1) & seen.unsqueeze(-2)
-
-
-def _root(noise: Tensor, same: Tensor) -> Tensor:
-    """Lower triangular root of the noise, correlations between groups left out, 1 for what is unseen [R, k, k]."""
-    return factor(torch.where(same, noise, torch.eye(same.shape[-1], dtype=noise.dtype, device=noise.device)))[0]
-
-
-def _whitened(root: Tensor, spread: Tensor, same: Tensor) -> Tensor:
-    """R^-1/2 spread R^-1/2 within groups [R, k, k], 0 for what is unseen."""
-    half = torch.linalg.solve_triangular(root, torch.where(same, spread, 0.0), upper=False)
-    white = torch.linalg.solve_triangular(root, half.mT, upper=False)
-    return _finite(0.5 * (white + white.mT))
-
-
-def _finite(a: Tensor) -> Tensor:
-    """0 for a run with anything that is no number: eigh raises for the whole batch, and such a run is lost anyway."""
-    return torch.where(torch.isfinite(a).all(-1).all(-1)[:, None, None], a, 0.0)
-
-
-def _weights(innovation: Innovation) -> Tensor:
-    """diag(R)^-1 of the model's noise [R, k], 0 where unseen."""
-    return torch.where(innovation.seen, 1.0 / _diagonal(innovation.nominal), 0.0)
-
-
-def _diagonal(a: Tensor) -> Tensor:
-    return a.diagonal(dim1=-2, dim2=-1)
+def _scaled(m: Tensor, carried: float, driven: Tensor | float) -> Tensor:
+    """M [R, d, d + W] with the columns of the state and those of the noise scaled."""
+    d = m.shape[-2]
+    return torch.cat([m[..., :d] * carried, m[..., d:] * driven], -1)
 
 
 def _outer(a: Tensor) -> Tensor:
     return a.unsqueeze(-1) * a.unsqueeze(-2)
-
-
-def _check_share(name: str, value: float) -> None:
-    if not 0.0 < value <= 1.0:
-        raise ValueError(f"{name}={value}: give a number in (0, 1]")

@@ -147,7 +147,7 @@ def _flat_select(first: Tensor, ancestors: Tensor) -> Tensor:
     """[D, R, N] by ancestors [R, M] -> [D, R, M]; one flat index costs a fifth of an expanded one."""
     d, runs, n = first.shape
     flat = ancestors + n * torch.arange(runs, device=first.device)[:, None]
-    return first.reshape(d, -1).index_select(1, flat.flatten()).reshape(d, *ancestors.shape)
+    return first.reshape(d, runs * n).index_select(1, flat.flatten()).reshape(d, *ancestors.shape)
 
 
 _picked = fusible(_flat_select, by_hand=native.gather)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pfbench.covariance import factor
+from pfbench.filter.whitening import whiten
 
 
 class Grid(Protocol):
@@ -87,10 +88,3 @@ def divide(grid: Grid, p: Tensor, alive: Tensor, covariance: Tensor) -> Tensor:
     ordered, order = key.sort(1)
     number = torch.nn.functional.pad((ordered[:, 1:] != ordered[:, :-1]).cumsum(1), (1, 0))
     return torch.zeros_like(key).scatter(1, order, number)
-
-
-def whiten(p: Tensor, root: Tensor) -> Tensor:
-    """root^-1 p for p [R, N, k] and a lower triangular root [R, k, k]; 0 in a component without spread."""
-    diagonal = root.diagonal(dim1=-2, dim2=-1)
-    solvable = root + torch.diag_embed((diagonal == 0.0).to(root.dtype))
-    return torch.linalg.solve_triangular(solvable, p.mT, upper=False).mT

@@ -7,7 +7,7 @@ single precision 1 sequence in 100 is stuck at 0 after 100 iterations and 1 in 5
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, moments
+from pfbench.filter.derived_draws import Derived
 from pfbench.model.base import StateSpaceModel
 
 _QUARTERS = 4  # 0, 1/4, 1/2, 3/4 and 1 end at a fixed point
@@ -115,24 +116,4 @@ class Chaotic:
     """Points for the initial law: its quantiles at chaotic values that have been made uniform. The same law, exactly [ours]."""
 
     def __call__(self, draws: Draws, first: int = 0) -> Draws:
-        return _Sequences(draws)
-
-
-@dataclass(frozen=True, eq=False)
-class _Sequences:
-    """The values of so many sequences, made uniform: as independent as their seeds."""
-
-    draws: Draws
-
-    @property
-    def dtype(self) -> torch.dtype:
-        return self.draws.dtype
-
-    def at(self, step: int) -> Draws:
-        return replace(self, draws=self.draws.at(step))
-
-    def uniform(self, purpose: str, n: int, w: int) -> Tensor:
-        return uniform(settled(self.draws.uniform(purpose, n, w)))
-
-    def normal(self, purpose: str, n: int, w: int) -> Tensor:
-        return torch.special.ndtri(self.uniform(purpose, n, w)).to(self.dtype)
+        return Derived(draws, lambda d, p, n, w: uniform(settled(d.uniform(p, n, w))))

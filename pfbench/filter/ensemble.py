@@ -18,12 +18,12 @@ from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, Info
 from pfbench.filter.gaussian import around_first
+from pfbench.filter.linearisation import spread, where_seen
 from pfbench.filter.particle import ParticleFilter, bury, summarise
 from pfbench.filter.proposals import Bootstrap
+from pfbench.filter.whitening import LOG_2PI, log_det
 from pfbench.model.base import StateSpaceModel
 from pfbench.record import Record
-
-_LOG_2PI = math.log(2.0 * math.pi)
 
 
 class Forecast(NamedTuple):
@@ -148,10 +148,7 @@ def _look(model: StateSpaceModel, x: Tensor, d: Tensor, seen: Record) -> tuple[F
     there = ~torch.isnan(seen.y)
     r = torch.where(there, model.residual(seen.y.nan_to_num(), y_hat), 0.0)
     s = torch.where(there.unsqueeze(1), model.residual(law.mean, y_hat.unsqueeze(1)), 0.0)
-    dense = isinstance(law, torch.distributions.MultivariateNormal)
-    noise = law.covariance_matrix.mean(1) if dense else torch.diag_embed(law.variance.mean(1))
-    eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
-    root, ok = factor(torch.where(there.unsqueeze(-1) & there.unsqueeze(-2), noise, eye))
+    root, ok = factor(where_seen(spread(law).mean(1), there))
     white = torch.linalg.solve_triangular(root, torch.cat([s.mT / math.sqrt(n - 1), r.unsqueeze(-1)], -1), upper=False)
     s, r = white[..., :-1].mT, white[..., -1]
     product = torch.where(torch.isfinite(s).all(1).all(-1)[:, None, None], s.mT @ s, torch.nan)
@@ -159,8 +156,8 @@ def _look(model: StateSpaceModel, x: Tensor, d: Tensor, seen: Record) -> tuple[F
     values, vectors = torch.linalg.eigh(torch.nan_to_num(product, 0.0, 0.0, 0.0))
     values = values.clamp(min=0.0)
     along = (r.unsqueeze(-2) @ vectors).squeeze(-2)
-    log_det = root.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * values.log1p().sum(-1)
+    scale = log_det(root) + 0.5 * values.log1p().sum(-1)
     known = there.sum(-1, dtype=r.dtype)
-    log_like = -0.5 * (along.square() / (1.0 + values)).sum(-1) - log_det - 0.5 * _LOG_2PI * known
+    log_like = -0.5 * (along.square() / (1.0 + values)).sum(-1) - scale - 0.5 * LOG_2PI * known
     ok = ok & torch.isfinite(product).all(-1).all(-1)
     return Forecast(d, s, r, values, vectors), torch.where(ok, log_like, torch.nan)

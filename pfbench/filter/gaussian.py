@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -14,10 +13,9 @@ from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter.belief import Gaussian, Info
 from pfbench.filter.rules import Linearised, Rule, Space
+from pfbench.filter.whitening import LOG_2PI, log_det
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
-
-_LOG_2PI = math.log(2.0 * math.pi)
 
 
 class Innovation(NamedTuple):
@@ -277,8 +275,8 @@ def update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
     triangle = torch.linalg.qr(stacked, mode="r")[1]  # [[information root, score], [0, root of the distance]], of any sign
     information, score, distance = triangle[:, :d, :d], triangle[:, :d, d:], triangle[:, d, d].square()
     back = torch.linalg.solve_triangular(information, torch.cat([score, eye], -1), upper=True)
-    log_det = root.diagonal(dim1=-2, dim2=-1).log().sum(-1) + information.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
-    log_like = -0.5 * distance - log_det - 0.5 * _LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float is float32
+    scale = log_det(root) + log_det(information)
+    log_like = -0.5 * distance - scale - 0.5 * LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float is float32
     return back[..., 0], back[..., 1:], torch.where(ok, log_like, torch.nan)
 
 

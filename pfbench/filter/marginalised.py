@@ -9,27 +9,25 @@ learns from s', and then l' learns from the measurement, whose density given s' 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
-from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
+from torch.distributions import Distribution, MultivariateNormal
 
 from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, Info, weights
+from pfbench.filter.linearisation import base, derivative, innovation, is_normal, mean, quiet, where_seen
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.proposals import Bootstrap, Proposed
 from pfbench.filter.resamplers import Resample, Resampler, Systematic
+from pfbench.filter.square_root import absorbed, swept
+from pfbench.filter.whitening import LOG_2PI, log_det
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
-
-_LOG_2PI = math.log(2.0 * math.pi)
-_POINTS = 200_000  # states differentiated at a time
 
 
 class Split(NamedTuple):
@@ -74,14 +72,14 @@ class Marginalised:
             return sent._replace(log_ratio=model.log_likelihood(seen.y, sent.x, seen.u))
         before = cloud.memory["root"]
         predicted, noise = _spread(model, cloud.x, before, seen.u, self.split)
-        columns, root = swept(noise, self.split)
+        columns, root = swept(noise, self.split.sampled, self.split.linear)
         z = draws.normal("noise", cloud.x.shape[1], len(columns)).to(cloud.x)
         x = model.chart.add(predicted, _along(columns, z, noise))
         h, r, log_sd = _expected(model, x, seen, self.split)
         shift, root, log_like = absorbed(root, h, r)
         x = model.chart.add(x, _placed(shift, self.split.linear, model.chart.dimension))
         known = (~torch.isnan(seen.y)).sum(-1, dtype=x.dtype).unsqueeze(-1)
-        log_like = log_like - log_sd - 0.5 * _LOG_2PI * known
+        log_like = log_like - log_sd - 0.5 * LOG_2PI * known
         sound = torch.isfinite(root).all(-1).all(-1)  # where not, the particle weighs nothing and stays as it was
         memory = {"root": torch.where(sound[..., None, None], root, before)}
         return Proposed(x, torch.where(sound, log_like, -torch.inf), memory)
@@ -131,7 +129,7 @@ class RaoBlackwellised:
         _check_normal(model, "the driving noise", model.noise)
         law: Any = initial_law(model, runs, spread)
         root = law.scale_tril if isinstance(law, MultivariateNormal) else torch.diag_embed(law.stddev)
-        columns, root = swept(root.unsqueeze(1), split)
+        columns, root = swept(root.unsqueeze(1), split.sampled, split.linear)
         z = draws.normal("initial", self.particles, len(columns)).to(cloud.x)
         origin = model.origin.expand(runs, -1) if start is None else start
         shift = law.mean.unsqueeze(1) + _along(columns, z, law.mean.unsqueeze(1).unsqueeze(-1))
@@ -176,74 +174,21 @@ def split_of(model: StateSpaceModel, sampled: Sequence[str] | None) -> Split:
     return Split(sorted(chosen), [i for i in range(d) if i not in chosen], model.linear)
 
 
-def swept(a: Tensor, split: Split) -> tuple[list[Tensor], Tensor]:
-    """The normal law of e = A xi, xi ~ N(0, I): e_s is decided by as many independent numbers z, e_l then known up to a root.
-
-    Gram-Schmidt, component by component, so that a component of s that has no spread of its own takes none of l's; a
-    covariance is never formed.
-
-    Args:
-        a: [..., d, m], m at least the size of l.
-
-    Returns:
-        Columns L_j [..., d] with e = sum_j L_j z_j + what is left, and a lower triangular root of the covariance of what is left
-        of l [..., l, l], of any sign.
-    """
-    size = a.norm(dim=-1)
-    tolerance = 1e3 * torch.finfo(a.dtype).eps
-    columns = []
-    for i in split.sampled:
-        row = a[..., i, :]
-        length = row.norm(dim=-1, keepdim=True)
-        real = length > tolerance * size[..., i : i + 1]
-        axis = torch.where(real, row / torch.where(real, length, 1.0), 0.0)
-        column = (a @ axis.unsqueeze(-1)).squeeze(-1)
-        a = a - column.unsqueeze(-1) * axis.unsqueeze(-2)
-        columns.append(column)
-    return columns, torch.linalg.qr(a[..., split.linear, :].mT, mode="r")[1].mT
-
-
-def absorbed(root: Tensor, h: Tensor, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The Kalman update of N(0, root root') by r = H l + v, v ~ N(0, I), one component after the other, on the root
-    [Potter 1963; Bierman 1977].
-
-    Args:
-        root: [R, N or 1, l, l].
-        h: [R, N or 1, k, l].
-        r: [R, N, k].
-
-    Returns:
-        Mean [R, N, l], root [R, N or 1, l, l], and the log density of r but for k/2 log 2 pi [R, N].
-    """
-    shift, log_like = r.new_zeros(*r.shape[:-1], root.shape[-1]), torch.zeros_like(r[..., 0])
-    for j in range(r.shape[-1]):
-        row = h[..., j, :]
-        f = (root * row.unsqueeze(-1)).sum(-2)  # root' h
-        q2 = 1.0 + f.square().sum(-1)
-        reach = (root * f.unsqueeze(-2)).sum(-1)
-        e = r[..., j] - (row * shift).sum(-1)
-        shift = shift + reach * (e / q2).unsqueeze(-1)
-        root = root - (reach / (q2 + q2.sqrt()).unsqueeze(-1)).unsqueeze(-1) * f.unsqueeze(-2)
-        log_like = log_like - 0.5 * (e * e / q2 + torch.log(q2))
-    return shift, root, log_like
-
-
 def _spread(model: StateSpaceModel, x: Tensor, root: Tensor, u: Any, split: Split) -> tuple[Tensor, Tensor]:
     """Where particles go without noise [R, N, D], and A of the normal law A xi about it, in the chart [R, N or 1, d, m]."""
     chart, noise, gain = model.chart, model.noise, model.noise_gain(u)
     l, w = len(split.linear), 0 if gain is not None else model.noise_dim
-    quiet = noise.mean.expand(*x.shape[:2], -1)
-    predicted = model.propagate(x, u, quiet)
+    predicted = model.propagate(x, u, quiet(model, x))
 
     def moved(at: Tensor, xi: Tensor) -> Tensor:
-        driven = noise.mean.expand(*xi.shape[:2], -1)
+        driven = quiet(model, xi)
         if w:
             driven = driven + noise.stddev * xi[..., l:]
         start = chart.add(at, _placed(xi[..., :l], split.linear, chart.dimension))
         return model.propagate(start, u, driven)
 
     centre = model.origin.expand(len(x), 1, -1) if split.common else x
-    slopes = _derivative(moved, chart.subtract, centre, l + w)
+    slopes = derivative(moved, centre, l + w, chart.subtract)
     if gain is not None:
         sized = (gain * noise.stddev).unsqueeze(1)
         slopes = torch.cat([slopes, sized.expand(*slopes.shape[:2], -1, -1)], -1)
@@ -257,43 +202,21 @@ def _expected(model: StateSpaceModel, x: Tensor, seen: Record, split: Split) -> 
     _check_normal(model, "the measurement's noise", law)
 
     def looked(at: Tensor, xi: Tensor) -> Tensor:
-        place = model.chart.add(at, _placed(xi, split.linear, model.chart.dimension))
-        mean: Tensor = model.observation(place, seen.u).mean
-        return mean
+        return mean(model.observation(model.chart.add(at, _placed(xi, split.linear, model.chart.dimension)), seen.u))
 
     centre = model.origin.expand(len(x), 1, -1) if split.common else x
-    h = _derivative(looked, model.residual, centre, len(split.linear))
+    h = derivative(looked, centre, len(split.linear), model.residual)
     there = ~torch.isnan(seen.y).unsqueeze(1)
     h = torch.where(there.unsqueeze(-1), h, 0.0)
-    r = torch.where(there, model.residual(seen.y.nan_to_num().unsqueeze(1), law.mean), 0.0)
+    r = innovation(model, x, seen)
     if not isinstance(law, MultivariateNormal):
         sd = torch.where(there, law.stddev, 1.0)
         return h / (sd[:, :1] if split.common else sd).unsqueeze(-1), r / sd, sd.log().sum(-1)
-    eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
     covariance = law.covariance_matrix[:, :1] if split.common else law.covariance_matrix
-    root, ok = factor(torch.where(there.unsqueeze(-1) & there.unsqueeze(-2), covariance, eye))
-    log_sd = torch.where(ok, root.diagonal(dim1=-2, dim2=-1).log().sum(-1), torch.nan)
+    root, ok = factor(where_seen(covariance, there))
+    log_sd = torch.where(ok, log_det(root), torch.nan)
     white = torch.linalg.solve_triangular(root, h, upper=False)
     return white, torch.linalg.solve_triangular(root, r.unsqueeze(-1), upper=False).squeeze(-1), log_sd
-
-
-def _derivative(
-    f: Callable[[Tensor, Tensor], Tensor], subtract: Callable[[Tensor, Tensor], Tensor], at: Tensor, d: int
-) -> Tensor:
-    """Derivative in xi, at 0, of f: states [R, P, D], xi [R, P, d] -> [R, P, k]: [R, N, k, d] for states `at` [R, N, D]."""
-    runs, n = at.shape[:2]
-    block = max(1, _POINTS // (runs * n))
-    parts = []
-    for directions in torch.eye(d, dtype=at.dtype, device=at.device).split(block):
-        points = at.repeat_interleave(len(directions), 1)
-        xi = directions.repeat(runs, n, 1)
-        with forward_ad.dual_level():
-            value = f(points, forward_ad.make_dual(torch.zeros_like(xi), xi))
-            still = forward_ad.unpack_dual(value)[0].detach()
-            slopes = forward_ad.unpack_dual(subtract(value, still))[1]
-        slopes = torch.zeros_like(subtract(still, still)) if slopes is None else slopes  # it does not depend on xi
-        parts.append(slopes.unflatten(1, (n, len(directions))))
-    return torch.cat(parts, 2).mT
 
 
 def _along(columns: list[Tensor], z: Tensor, like: Tensor) -> Tensor:
@@ -326,9 +249,8 @@ def _with_conditional(info: Info, cloud: Cloud, split: Split) -> Info:
 
 
 def _check_normal(model: StateSpaceModel, what: str, law: Distribution) -> None:
-    base = law.base_dist if isinstance(law, Independent) else law
-    if not isinstance(base, Normal | MultivariateNormal):
+    if not is_normal(law):
         raise ValueError(
-            f"RaoBlackwellised: {what} of {type(model).__name__} is {type(base).__name__}, and a Kalman filter for part of the "
-            "state needs it normal; sample all states (filter=sir), or choose a normal law"
+            f"RaoBlackwellised: {what} of {type(model).__name__} is {type(base(law)).__name__}, and a Kalman filter for part of "
+            "the state needs it normal; sample all states (filter=sir), or choose a normal law"
         )

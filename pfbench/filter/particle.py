@@ -12,14 +12,15 @@ from torch import Tensor
 from pfbench import native
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, Info, weights
-from pfbench.filter.guided import Guided, GuidedParticles
-from pfbench.filter.moves import Keeper, Move, Named, together
+from pfbench.filter.derived_draws import named
+from pfbench.filter.moves import Move, together
 from pfbench.filter.points import Independent, Points
 from pfbench.filter.preferences import Preference, Weights
 from pfbench.filter.proposals import Bootstrap, Proposal
 from pfbench.filter.resamplers import Resample, Resampler, Systematic
 from pfbench.filter.sizes import Fixed, Size
 from pfbench.filter.weights import Bayes, Weighing
+from pfbench.filter.window import Keeper
 from pfbench.fusion import fusible
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
@@ -82,9 +83,6 @@ class ParticleFilter:
     ) -> Cloud:
         """N equally weighted particles of the initial law, drawn by its Cholesky factor or its scales."""
         law: Any = initial_law(model, runs, spread)
-        memory: dict[str, Tensor] = {}
-        if isinstance(self.proposal, Guided | GuidedParticles):  # its guide starts from the law, not from particles of it
-            memory = self.proposal.begin(model, runs, draws, start, spread)
         z = self.points(draws).normal("initial", self.particles, model.chart.dimension)
         if isinstance(law, torch.distributions.MultivariateNormal):
             spread = z @ law.scale_tril.mT
@@ -95,7 +93,7 @@ class ParticleFilter:
         first = self.size.first(self.particles)
         log_w = torch.full(x.shape[:2], -math.log(first), dtype=x.dtype, device=x.device)
         log_w[:, first:] = -torch.inf
-        cloud = Cloud(x=x, log_w=log_w, log_z=torch.zeros_like(log_w[:, 0], dtype=torch.float64), memory=memory)
+        cloud = Cloud(x=x, log_w=log_w, log_z=torch.zeros_like(log_w[:, 0], dtype=torch.float64))
         if self.keeper is None:
             return cloud
         dense = isinstance(law, torch.distributions.MultivariateNormal)
@@ -109,7 +107,7 @@ class ParticleFilter:
         log_a = self.preference(model, belief, seen)
         cloud, trace["resampled"] = self.resampler(model, belief, log_a, self.size(belief), draws)
         for i, move in enumerate(self.moves):
-            cloud, trace[f"accepted_{i}"] = move(model, cloud, trace["resampled"], Named(draws, f"move_{i}."))
+            cloud, trace[f"accepted_{i}"] = move(model, cloud, trace["resampled"], named(draws, f"move_{i}."))
         x, log_ratio, memory, w = self.proposal(model, cloud, seen, draws)
         log_w = self.weigh(model, cloud.log_w, x, log_ratio, seen)
         x, log_w = bury(x, log_w, cloud.x)

@@ -7,7 +7,7 @@ counter-based stream, so a run's points depend on (seed, run, step, purpose) alo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Protocol
 
@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from pfbench.draws import Draws, MonteCarlo
+from pfbench.filter.derived_draws import Derived
 
 _EDGE = 1e-9  # a shifted point may fall on 0, whose normal is infinite
 _BITS = 30  # of a point of torch's Sobol engine
@@ -63,7 +64,7 @@ class Halton:
             raise ValueError(f"points.skip={self.skip}: give the number of points to leave out, 0 or more")
 
     def __call__(self, draws: Draws, first: int = 0) -> Draws:
-        return _Shifted(draws, self, first)
+        return _of_set(self, draws, first)
 
     def shifted(self, axes: range, n: int, shift: Tensor) -> Tensor:
         base = halton(self.skip, n, axes, self.permuted).to(shift.device)
@@ -75,7 +76,7 @@ class Sobol:
     """Sobol's points with the direction numbers of Joe and Kuo, shifted digit by digit: still a net after the shift."""
 
     def __call__(self, draws: Draws, first: int = 0) -> Draws:
-        return _Shifted(draws, self, first)
+        return _of_set(self, draws, first)
 
     def shifted(self, axes: range, n: int, shift: Tensor) -> Tensor:
         digits = sobol_digits(n, axes).to(shift.device).unsqueeze(1)
@@ -87,27 +88,14 @@ class _Set(Protocol):
         """Points 0..n-1 on these axes under a uniform shift [w, R, 1], each on the open interval (0, 1): [w, R, n]."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Shifted:
+def _of_set(points: _Set, draws: Draws, first: int) -> Draws:
     """Draws of a set's points: a new shift for each run, step, purpose and axis."""
 
-    draws: Draws
-    points: _Set
-    first: int
+    def uniforms(draws: Draws, purpose: str, n: int, w: int) -> Tensor:
+        shift = draws.uniform(purpose, 1, w).permute(2, 0, 1)
+        return points.shifted(range(first, first + w), n, shift).permute(1, 2, 0)
 
-    @property
-    def dtype(self) -> torch.dtype:
-        return self.draws.dtype
-
-    def at(self, step: int) -> Draws:
-        return replace(self, draws=self.draws.at(step))
-
-    def uniform(self, purpose: str, n: int, w: int) -> Tensor:
-        shift = self.draws.uniform(purpose, 1, w).permute(2, 0, 1)
-        return self.points.shifted(range(self.first, self.first + w), n, shift).permute(1, 2, 0)
-
-    def normal(self, purpose: str, n: int, w: int) -> Tensor:
-        return torch.special.ndtri(self.uniform(purpose, n, w)).to(self.dtype)
+    return Derived(draws, uniforms)
 
 
 @cache

@@ -19,10 +19,11 @@ from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter import belief
 from pfbench.filter.belief import Cloud
-from pfbench.filter.cells import Grid, Whitened, divide, whiten
+from pfbench.filter.cells import Grid, Whitened, divide
 from pfbench.filter.gaussian_particles import no_past
 from pfbench.filter.points import Halton, Points
 from pfbench.filter.resamplers import Systematic
+from pfbench.filter.whitening import whiten
 from pfbench.model.base import StateSpaceModel
 
 _EQUAL = 1e-5  # rounding of the effective size of a million equal weights in single precision

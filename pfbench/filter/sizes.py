@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -33,6 +33,33 @@ class Fixed:
 
 
 @dataclass(frozen=True)
+class Bounds:
+    """Numbers of particles between which a cloud grows and shrinks, and the one to begin with.
+
+    Raises:
+        ValueError: numbers that are out of order; at the start, fewer slots than `most`.
+    """
+
+    least: int
+    most: int
+    start: int
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.least <= self.start <= self.most:
+            raise ValueError(
+                f"size.bounds: least={self.least}, start={self.start}, most={self.most}; give 2 <= least <= start <= most"
+            )
+
+    def first(self, slots: int) -> int:
+        """The number to begin with, of so many slots."""
+        if self.most > slots:
+            raise ValueError(
+                f"size.bounds.most={self.most}: there are {slots} slots; raise filter.particles or lower most and start"
+            )
+        return self.start
+
+
+@dataclass(frozen=True)
 class EssStep:
     """One step up where ESS < threshold N, else one step down, within bounds [COFM-AMSSRCPF 2024, Measurement and Control].
 
@@ -41,77 +68,56 @@ class EssStep:
     ESS / N hardly depends on N, so that the number comes to rest at one of its bounds.
 
     Args:
-        step: up and down; 0 keeps the number at `start`.
+        step: up and down; 0 keeps the number at `bounds.start`.
         threshold: of ESS / N.
-        least, most, start: bounds, which the source leaves open [ours], and the number to begin with [ours].
+        bounds: the source leaves them open [ours].
 
     Raises:
-        ValueError: arguments that are out of order; at the start, fewer slots than `most`.
+        ValueError: a negative step, a threshold outside [0, 1].
     """
 
     step: int = 10
     threshold: float = 0.5
-    least: int = 100
-    most: int = 200
-    start: int = 150
+    bounds: Bounds = field(default_factory=lambda: Bounds(100, 200, 150))
 
     def __post_init__(self) -> None:
-        _check_bounds(self.least, self.start, self.most)
         if self.step < 0 or not 0.0 <= self.threshold <= 1.0:
             raise ValueError(f"size.step={self.step}, threshold={self.threshold}: give a step of 0 or more, a ratio from 0 to 1")
 
     def first(self, slots: int) -> int:
-        return _first(self.start, self.most, slots)
+        return self.bounds.first(slots)
 
     def __call__(self, cloud: Cloud) -> Tensor:
         n = _occupied(cloud)
         if self.step == 0:
-            return torch.full_like(n, self.start)
+            return torch.full_like(n, self.bounds.start)
         wanted = torch.where(ess(cloud.log_w).unsqueeze(1) < self.threshold * n, n + self.step, n - self.step)
-        return wanted.clamp(self.least, self.most)
+        return wanted.clamp(self.bounds.least, self.bounds.most)
 
 
 @dataclass(frozen=True)
 class EssTarget:
     """As many particles as would have had the effective size asked for, N target / ESS, within bounds [ours].
 
-    Args:
-        target: effective sample size.
-        least, most, start: bounds, and the number to begin with.
-
     Raises:
-        ValueError: arguments that are out of order; at the start, fewer slots than `most`.
+        ValueError: a target that is not positive.
     """
 
     target: float = 100.0
-    least: int = 100
-    most: int = 1000
-    start: int = 150
+    bounds: Bounds = field(default_factory=lambda: Bounds(100, 1000, 150))
 
     def __post_init__(self) -> None:
-        _check_bounds(self.least, self.start, self.most)
         if not self.target > 0.0:
             raise ValueError(f"size.target={self.target}: give a positive effective sample size")
 
     def first(self, slots: int) -> int:
-        return _first(self.start, self.most, slots)
+        return self.bounds.first(slots)
 
     def __call__(self, cloud: Cloud) -> Tensor:
         wanted = _occupied(cloud) * self.target / ess(cloud.log_w).unsqueeze(1)
-        return wanted.round().clamp(self.least, self.most)
+        return wanted.round().clamp(self.bounds.least, self.bounds.most)
 
 
 def _occupied(cloud: Cloud) -> Tensor:
     """Particles that weigh anything [R, 1], a whole number."""
     return (cloud.log_w > -torch.inf).sum(1, keepdim=True).to(cloud.log_w)
-
-
-def _first(start: int, most: int, slots: int) -> int:
-    if most > slots:
-        raise ValueError(f"size.most={most}: there are {slots} slots; raise filter.particles or lower most and start")
-    return start
-
-
-def _check_bounds(least: int, start: int, most: int) -> None:
-    if not 2 <= least <= start <= most:
-        raise ValueError(f"size.least={least}, start={start}, most={most}: give 2 <= least <= start <= most")

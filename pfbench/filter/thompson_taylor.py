@@ -11,8 +11,8 @@ from torch import Tensor
 from pfbench.covariance import factor
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, moments
-from pfbench.filter.cells import whiten
 from pfbench.filter.resamplers import Resample
+from pfbench.filter.whitening import whiten
 from pfbench.model.base import StateSpaceModel
 
 _PAIRS = 20_000_000  # distances held at a time

@@ -16,8 +16,10 @@ COLUMN = 3.5  # inches
 _INSTANTS = 300  # drawn at most: a column of print resolves no more
 RC: Any = {
     "font.size": 8,
+    "font.family": "DejaVu Sans",  # comes with matplotlib; a list of families would be searched for each text
     "axes.titlesize": 8,
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # no search for a place, which takes longer than drawing a panel
     "axes.grid": True,
     "axes.spines.top": False,
     "axes.spines.right": False,

@@ -11,7 +11,7 @@ import pandas as pd
 
 from pfbench import metrics, store
 from pfbench.report.claims import SCALED, Claim, Comparison
-from pfbench.report.frame import Cell, Job, blocks, cells, later
+from pfbench.report.frame import Cell, Job, at_instants, blocks, cells, later
 
 _COLUMNS = ["study", "cell", "label", "measure", "seed", "run", "lost", "unit", "value"]
 
@@ -152,16 +152,8 @@ def _growth(time: np.ndarray, error: np.ndarray, lost: np.ndarray) -> np.ndarray
 
 def _until(result: store.Result, end: float) -> store.Result:
     """Without the instants after `end`, seconds."""
-    steps = result.arrays["time"].size
     kept = result.arrays["time"] <= end
-    if kept.all() or not kept.any():
-        return result
-    whole = {"log_evidence", "lost"}
-    cut = {
-        name: a if name in whole else a[kept] if a.shape[0] == steps and name in ("time", "bound", "range") else a[:, kept]
-        for name, a in result.arrays.items()
-    }
-    return store.Result(result.meta, cut)
+    return at_instants(result, kept) if kept.any() else result
 
 
 def _rows(result: store.Result, head: Mapping[str, str], tests: Mapping[str, Comparison]) -> Iterator[pd.DataFrame]:

@@ -32,6 +32,7 @@ from pfbench.report.frame import Block, blocks
 
 Results = Mapping[str, store.Result]
 
+_FEW = 4  # filters of which each has a picture of its spread; of more, two have, chosen by `worth_a_spread` [ours]
 _BOUND: Any = {"color": "black", "ls": (0, (3, 1.2)), "lw": 0.8, "zorder": 4}
 _MEDIAN = 0.6745  # of the absolute value of a standard normal number
 
@@ -85,11 +86,10 @@ def drawings(
     if any("ess" in result.arrays for result in results.values()):
         text = f"Effective sample size of the particle filters, median and 5 to 95 % of the {kept}."
         found.append(Drawing("ess", text, partial(ess, results, style)))
-    for label, result in results.items():
-        if result.arrays["lost"].all() or not any(b.group in groups for b in blocks(result.meta["state"])):
-            continue
+    for label, why in worth_a_spread(results, runs, groups).items():
+        result = results[label]
         text = (
-            f"{label}: error over time, median and 5 to 95 % of the {kept} (shaded), and three times the filter's own "
+            f"{label}{why}: error over time, median and 5 to 95 % of the {kept} (shaded), and three times the filter's own "
             f"standard deviation, median over runs (dashed). The first fifth is cut where it dwarfs the rest."
         )
         if bound_of(result) is not None:
@@ -98,12 +98,49 @@ def drawings(
     return found
 
 
+def worth_a_spread(results: Results, runs: pd.DataFrame, groups: Sequence[str]) -> dict[str, str]:
+    """Filters whose spread is drawn, and why: every one where they are few, else the most and the least believable [ours].
+
+    Of more than four filters these are the one with the smallest median RMSE and the one whose NEES is farthest from its degrees
+    of freedom, as a ratio and in the median over runs; both of the position where it is shown, else of the first group.
+    """
+    drawable = {
+        label: block
+        for label, result in results.items()
+        if not result.arrays["lost"].all() and (block := _main(result.meta["state"], groups)) is not None
+    }
+    if len(drawable) <= _FEW:
+        return dict.fromkeys(drawable, "")
+    rmse_of, nees_of = {}, {}
+    for label, block in drawable.items():
+        own = runs[runs.label == label]
+        rmse_of[label] = _middle(own[(own.metric == "rmse") & (own.component == "norm") & (own.group == block.group)])
+        dof = len(results[label].meta["state"]["groups"][block.whole])
+        with np.errstate(divide="ignore"):
+            nees_of[label] = abs(np.log(_middle(own[(own.metric == "nees") & (own.group == block.whole)]) / dof))
+    chosen: dict[str, str] = {}
+    for value, better, said in (
+        (rmse_of, min, "the smallest median RMSE"),
+        (nees_of, max, "the NEES farthest from its degrees of freedom"),
+    ):
+        known = {label: number for label, number in value.items() if not np.isnan(number)}
+        if known:
+            label = better(known, key=lambda name: known[name])
+            of = f"{said} of {drawable[label].group}"
+            chosen[label] = f"{chosen[label]} and {of}" if label in chosen else f", of {len(drawable)} filters the one with {of}"
+    return chosen
+
+
 def save(drawing: Drawing, folder: Path, formats: Sequence[str]) -> list[Path]:
     """Draws and writes one file per format; the same drawing gives the same bytes."""
     folder.mkdir(parents=True, exist_ok=True)
     date = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     with matplotlib.rc_context(RC):
         figure = drawing.make()
+        engine = figure.get_layout_engine()
+        if engine is not None:  # laid out once and not by each format anew, which would be most of the work
+            engine.execute(figure)
+            figure.set_layout_engine(None)
         paths = [folder / f"{drawing.name}.{ending}" for ending in formats]
         for path, ending in zip(paths, formats, strict=True):
             figure.savefig(path, metadata=date.get(ending))
@@ -311,6 +348,17 @@ def _all_blocks(results: Results) -> list[Block]:
         for block in blocks(result.meta["state"]):
             found.setdefault(block.group, block)
     return list(found.values())
+
+
+def _main(state: Mapping[str, Any], groups: Sequence[str]) -> Block | None:
+    """The position where it is shown, else the first group that is."""
+    own = [block for block in blocks(state) if block.group in groups]
+    return next((block for block in own if block.group == "position"), own[0] if own else None)
+
+
+def _middle(rows: pd.DataFrame) -> float:
+    known = rows.value.dropna()
+    return float(known.median()) if len(known) else np.nan
 
 
 def _common_run(results: Results) -> int | None:

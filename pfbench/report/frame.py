@@ -20,6 +20,9 @@ _DISPLAY = {
     "m/s^2": ("mg", 1e3 / 9.80665),
 }
 
+COVERAGES = (50, 90, 99)  # per cent of the central regions
+_SCORES = ("crps", "pit", "energy")
+
 
 class Job(NamedTuple):
     """One file of a cell; its arrays are read when asked for.
@@ -91,7 +94,9 @@ def frame(
     Returns:
         Columns study, key, scenario, noise, model, filter, label, particles, seed, run, lost, group, component, unit,
         metric, value. Metrics: rmse (each component, and "norm" of the group), max_error, nees, ess (share of the
-        particles), log_evidence, seconds_per_step, converged. A lost run has infinite errors and NaN elsewhere.
+        particles), log_evidence, seconds_per_step, converged; and of jobs that were scored crps (each component, and "mean" of
+        the group), energy, and coverage_50, _90, _99, the share of truths in the central regions of these per cents. A lost run
+        has infinite errors and scores, and NaN elsewhere.
 
     Raises:
         FileNotFoundError: the study has no result; the message says which studies have.
@@ -147,12 +152,26 @@ def later(result: store.Result, from_time: float) -> store.Result:
     kept = time >= from_time
     if not kept.any():
         raise ValueError(f"from_time={from_time} s leaves nothing of {result.meta['key']}, which ends at {time[-1]} s")
+    return at_instants(result, kept)
+
+
+def at_instants(result: store.Result, kept: np.ndarray) -> store.Result:
+    """The same result at some of its instants, flags [T]; what is scored at none of them is left out."""
     if kept.all():
         return result
+    whole = ("log_evidence", "lost", "scored", *_SCORES)
+    common = ("time", "bound", "range")
+    cut = {name: a[kept] if name in common else a[:, kept] for name, a in result.arrays.items() if name not in whole}
     shared = {name: result.arrays[name] for name in ("log_evidence", "lost")}
-    common: dict[str, np.ndarray] = {name: result.arrays[name][kept] for name in ("bound", "range") if name in result.arrays}
-    traces = {name: a[:, kept] for name, a in result.arrays.items() if name not in ("time", *shared, *common)}
-    return store.Result(result.meta, {"time": time[kept], **traces, **common, **shared})
+    return store.Result(result.meta, {**cut, **shared, **_scores_at(result.arrays, kept)})
+
+
+def _scores_at(arrays: Mapping[str, np.ndarray], kept: np.ndarray) -> dict[str, np.ndarray]:
+    """Scores at the steps that are kept [T], and where these now stand; nothing where none is left."""
+    if "scored" not in arrays or not (left := kept[arrays["scored"]]).any():
+        return {}
+    found = {name: arrays[name][:, left] for name in _SCORES if name in arrays}
+    return {"scored": (np.cumsum(kept) - 1)[arrays["scored"][left]], **found}
 
 
 def tidy(cell: Cell, job: Job, result: store.Result, from_time: float, converged: Mapping[str, float]) -> pd.DataFrame:
@@ -186,6 +205,7 @@ def _rows(result: store.Result, converged: Mapping[str, float]) -> Iterator[pd.D
             yield _column("rmse", metrics.rmse_per_run(error[..., [k]], lost), block.group, name, block.unit)
         yield _column("rmse", metrics.rmse_per_run(error, lost), block.group, "norm", block.unit)
         yield _column("max_error", metrics.max_error(error, lost), block.group, "norm", block.unit)
+        yield from _scored(arrays, lost, block, list(meta["state"]["groups"]))
         if block.group in converged:
             when = metrics.convergence_time(arrays["time"], error, lost, converged[block.group])
             yield _column("converged", when, block.group, "norm", "s")
@@ -195,6 +215,22 @@ def _rows(result: store.Result, converged: Mapping[str, float]) -> Iterator[pd.D
         yield _column("ess", metrics.mean_per_run(arrays["ess"], lost) / meta["particles"])
     yield _column("log_evidence", np.where(lost, np.nan, arrays["log_evidence"]))
     yield _column("seconds_per_step", np.full(lost.size, meta["seconds"]["per_step"]), unit="s")
+
+
+def _scored(arrays: Mapping[str, np.ndarray], lost: np.ndarray, block: Block, groups: list[str]) -> Iterator[pd.DataFrame]:
+    """Scores of the whole law, where the job has them. The energy score of a group of mixed units has no unit, and no row."""
+    if "crps" in arrays:
+        crps = arrays["crps"][..., block.places].astype(np.float64) * block.scale
+        for k, name in enumerate(block.components):
+            yield _column("crps", metrics.score_per_run(crps[..., k], lost), block.group, name, block.unit)
+        yield _column("crps", metrics.score_per_run(crps, lost), block.group, "mean", block.unit)
+    if "energy" in arrays and block.group == block.whole:
+        energy = arrays["energy"][..., groups.index(block.whole)].astype(np.float64) * block.scale
+        yield _column("energy", metrics.score_per_run(energy, lost), block.group, "norm", block.unit)
+    if "pit" in arrays:
+        for level in COVERAGES:
+            share = metrics.coverage_per_run(arrays["pit"][..., block.places], lost, level / 100)
+            yield _column(f"coverage_{level}", share, block.group, "mean")
 
 
 def _column(metric: str, value: np.ndarray, group: str = "", component: str = "", unit: str = "") -> pd.DataFrame:

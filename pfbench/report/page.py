@@ -16,7 +16,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from pfbench import store
-from pfbench.report import across, budget, figures, ranking_figures, tables
+from pfbench.report import across, budget, calibration, figures, ranking_figures, tables
 from pfbench.report.across import Across
 from pfbench.report.canvas import looks, slug
 from pfbench.report.frame import Cell, blocks, cells, later, natural, tidy
@@ -160,6 +160,7 @@ def _section(
     fronts = [budget.front(cell.name, runs, group) for group in known]
     runs = runs[runs.group.isin(known)]
     decided = verdicts(runs, options.alpha, options.margin, options.wanted)
+    regions = calibration.calibrated(runs, options.alpha)
     note = budget.stated([job.meta for job in cell.jobs])
     prefix = slug(f"{cell.scenario}_{cell.noise}_{cell.model}")
     parts = []
@@ -173,13 +174,15 @@ def _section(
                 save_table(folder, f"{prefix}_{slug(group)}_pairs", pairs, note)
                 save_table(folder, f"{prefix}_{slug(group)}_effects", effects, note)
             front = next(front for front in fronts if front.group == group)
-            parts.append({"name": group, "accuracy": accuracy, "pairs": pairs, "effects": effects, **_said(own, front)})
+            shown = {"accuracy": accuracy, "pairs": pairs, "effects": effects, "regions": calibration.said(regions, group)}
+            parts.append({"name": group, **shown, **_said(own, front)})
     ran = tables.overview(used)
     save_table(folder, f"{prefix}_overview", ran, note)
-    shown = [
-        *figures.drawings(whole, runs, style, known, options.alpha), *ranking_figures.of_cell(decided, fronts, style)
+    drawings = [
+        *figures.drawings(whole, runs, style, known, options.alpha), *calibration.drawings(used, known, style, options.alpha),
+        *ranking_figures.of_cell(decided, fronts, style),
     ]  # fmt: skip
-    pictures = [drawn(drawing, prefix, folder, options.formats) for drawing in shown]
+    pictures = [drawn(drawing, prefix, folder, options.formats) for drawing in drawings]
     lost = [(label, int(result.arrays["lost"].sum()), result.meta["runs"]) for label, result in whole.items()]
     gone = [(label, int(tables.diverged(result).sum()), result.meta["runs"]) for label, result in used.items()]
     section: dict[str, Any] = {"budget": note, "name": cell.name, "anchor": prefix}

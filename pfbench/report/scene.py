@@ -28,13 +28,16 @@ def between_epochs(count: np.ndarray) -> bool:
     return bool((count == 0).any() and (count > 0).any())
 
 
+_ROUNDING = 1e-12  # in SI: quaternions of equal runs differ by so much
+
+
 def spreads(sheet: store.Result) -> list[tuple[Any, np.ndarray, np.ndarray, np.ndarray | None]]:
     """Each block whose truth differs between runs: its instants with truth, the spread and the bound there, in the unit shown."""
     found = []
     for block in blocks(sheet.meta["state"]):
         value = deviation(sheet.arrays, block.places) * block.scale
         known = ~np.isnan(value)
-        if known.any() and value[known].any():
+        if known.any() and (value[known] > _ROUNDING * block.scale).any():
             bound = None
             if "bound" in sheet.arrays:
                 bound = np.sqrt((sheet.arrays["bound"][known][:, block.places].astype(np.float64) ** 2).sum(-1)) * block.scale

@@ -223,7 +223,8 @@ def sensitivity(table: pd.DataFrame, alpha: float = 0.05) -> list[Sensitivity]:
     """The comparisons whose winner another rule for lost runs would change; arguments as `verdicts`."""
     if not np.isinf(table.value[(table.metric == "rmse") & (table.component == "norm")]).any():
         return []
-    by_rule = [_winners(table, alpha, rule) for rule in LOST_RULES]
+    known: dict[bytes, tuple[float, float]] = {}  # pairs without a lost run are the same by every rule
+    by_rule = [_winners(table, alpha, rule, known) for rule in LOST_RULES]
     found = []
     for (scenario, noise, model, group, a, b), worst in by_rule[0].items():
         key = (scenario, noise, model, group, a, b)
@@ -340,18 +341,31 @@ def _medians(d: Array, rng: np.random.Generator) -> Array:
     return np.asarray((ordered[low] + ordered[high]) / 2)
 
 
-def _winners(table: pd.DataFrame, alpha: float, rule: LostRule) -> dict[tuple[str, ...], str]:
+def _winners(
+    table: pd.DataFrame, alpha: float, rule: LostRule, known: dict[bytes, tuple[float, float]]
+) -> dict[tuple[str, ...], str]:
     found: dict[tuple[str, ...], str] = {}
     for cell, wide in losses(table, rule):
-        family = [(pair, log_ratio(*both.T)) for pair, both in _pairs(wide)]
-        for (pair, d), p in zip(family, holm([wilcoxon(d)[1] for _, d in family]), strict=True):
-            found[(*cell, *pair)] = _decided(*pair, rank_biserial(d), float(p), alpha)
+        family = [(pair, _tested(both, known)) for pair, both in _pairs(wide)]
+        for (pair, (_, effect)), p in zip(family, holm([p for _, (p, _) in family]), strict=True):
+            found[(*cell, *pair)] = _decided(*pair, effect, float(p), alpha)
     return found
 
 
+def _tested(both: Array, known: dict[bytes, tuple[float, float]]) -> tuple[float, float]:
+    """p and effect of a pair [n, 2]; those of the same numbers are looked up."""
+    key = both.tobytes()
+    if key not in known:
+        d = log_ratio(*both.T)
+        known[key] = wilcoxon(d)[1], rank_biserial(d)
+    return known[key]
+
+
 def _pairs(wide: pd.DataFrame) -> Iterator[tuple[tuple[str, str], Array]]:
-    for a, b in combinations(map(str, wide.columns), 2):
-        both = wide[[a, b]].dropna().to_numpy(dtype=np.float64)
+    values = wide.to_numpy(dtype=np.float64)  # not frame by frame, which takes longer than the tests
+    for (i, a), (j, b) in combinations(enumerate(map(str, wide.columns)), 2):
+        both = values[:, [i, j]]
+        both = both[~np.isnan(both).any(axis=1)]
         if len(both):
             yield (a, b), both
 

@@ -11,7 +11,7 @@ import pandas as pd
 
 from pfbench import metrics, store
 from pfbench.report.across import Across
-from pfbench.report.frame import Block, blocks
+from pfbench.report.frame import COVERAGES, Block, blocks
 from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Sensitivity, Verdict
 
 Results = Mapping[str, store.Result]
@@ -275,6 +275,7 @@ def _accuracy(result: store.Result, block: Block, alpha: float, bound: float | N
         "band at an instant": f"{number(float(low))} to {number(float(high))}",
         "instants in band in %": 100 * found.inside,
     }
+    row |= _scores(arrays, block, list(groups), unit)
     if "bound" in arrays:
         floor = arrays["bound"][:, block.places].astype(np.float64) * block.scale
         row["RMSE norm to Cramer-Rao bound"] = metrics.over_bound(error, lost, floor)
@@ -288,6 +289,21 @@ def _accuracy(result: store.Result, block: Block, alpha: float, bound: float | N
     return row
 
 
+def _scores(arrays: Mapping[str, np.ndarray], block: Block, groups: list[str], unit: str) -> dict[str, Any]:
+    """Of the whole law, over runs that were not lost; nothing of jobs that were not scored."""
+    lost, row = arrays["lost"], {}
+    if "crps" in arrays:
+        row[f"CRPS{unit}"] = block.scale * _kept(metrics.score_per_run(arrays["crps"][..., block.places], lost), lost)
+    if "energy" in arrays and block.group == block.whole:
+        energy = arrays["energy"][..., groups.index(block.whole)]
+        row[f"energy score{unit}"] = block.scale * _kept(metrics.score_per_run(energy, lost), lost)
+    if "pit" in arrays:
+        for level in COVERAGES:
+            share = metrics.coverage_per_run(arrays["pit"][..., block.places], lost, level / 100)
+            row[f"in {level} % region in %"] = 100 * _kept(share, lost)
+    return row
+
+
 def _standing(label: str, verdicts: Sequence[Verdict]) -> dict[str, Any]:
     met = [v for v in verdicts if label in (v.a, v.b)]
     beaten = sum(v.winner not in (label, NO_DIFFERENCE) for v in met)
@@ -297,6 +313,10 @@ def _standing(label: str, verdicts: Sequence[Verdict]) -> dict[str, Any]:
 def _whole(value: float) -> str:
     """A count that may be infinite or unknown."""
     return f"{value:.0f}" if np.isfinite(value) else number(float(value))
+
+
+def _kept(values: np.ndarray, lost: np.ndarray) -> float:
+    return _mean(values[~lost])
 
 
 def _mean(values: np.ndarray) -> float:

@@ -139,7 +139,7 @@ def test_the_rate_changes_nothing_but_the_sampling_of_ramps(path: Ramps) -> None
 
 @every_path
 def test_the_mechanisation_closes_along_ramps(path: Ramps) -> None:
-    """Ideal sensors bring the INS back to the path but for errors of at least second order in the sampling: nothing else is left."""
+    """Ideal sensors bring the INS back to the path but for errors of at least second order in the sampling, and nothing else."""
     left = []
     for rate in (50.0, 100.0):
         made = path.fly(rate)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import ndtr
 
 from pfbench import store
 
@@ -109,11 +110,23 @@ def _arrays(method: Method, noise: str, runs: int, steps: int, seed: int, name: 
         "lost": lost,
         "track": _track(time, runs).astype(np.float32),
     }
+    arrays |= _scores(error, sd)
     if method.particles is not None:
         share = np.clip(0.45 / method.size + 0.25 * np.sin(time / 3) * own.random((runs, 1)), 0.02, 1)
         arrays["ess"] = (method.particles * share).astype(np.float32)
         arrays["resampled"] = share < 0.3
     return arrays
+
+
+def _scores(error: np.ndarray, sd: np.ndarray, instants: int = 4) -> dict[str, np.ndarray]:
+    """Of the normal law of that deviation, but for the energy score, which is that of a law without spread."""
+    scored = (np.arange(1, instants + 1) * error.shape[1]) // instants - 1
+    error, sd = error[:, scored], sd[:, scored]
+    z = error / sd
+    crps = sd * (z * (2 * ndtr(z) - 1) + 2 * np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) - 1 / np.sqrt(np.pi))
+    energy = np.stack([np.linalg.norm(error[..., index], axis=-1) for index in STATE["groups"].values()], axis=-1)
+    found = {name: value.astype(np.float32) for name, value in (("crps", crps), ("pit", ndtr(-z)), ("energy", energy))}
+    return {"scored": scored, **found}
 
 
 def _smooth(rng: np.random.Generator, runs: int, steps: int) -> np.ndarray:

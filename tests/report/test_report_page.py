@@ -42,7 +42,7 @@ def test_every_figure_and_table_is_there_and_on_the_page(report):
     names = {path.stem for path in (report / "figures").iterdir()}
     kinds = {name.removeprefix("flight_surge_ins_gnss_") for name in names}
     assert kinds == {
-        "track", "error_attitude", "error_velocity", "error_position", "rmse", "front", "nees", "ess",
+        "track", "error_attitude", "error_velocity", "error_position", "rmse", "front", "nees", "ess", "calibration",
         "forest_attitude", "forest_velocity", "forest_position",
         "spread_ekf", "spread_ukf", "spread_sir", "spread_cofm_amssrcpf",
     }  # fmt: skip
