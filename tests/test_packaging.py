@@ -129,9 +129,8 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
         names = set(opened.namelist())
     wanted = {f"pfbench/{file.relative_to(ROOT / 'pfbench')}" for file in (ROOT / "pfbench").rglob("*.py")}
     wanted |= {f"pfbench/{file.relative_to(ROOT)}" for top in ("conf", "experiments") for file in (ROOT / top).rglob("*.yaml")}
-    wanted |= {
-        f"pfbench/report/{file.name}" for pattern in ("*.jinja", "*.css", "*.yaml") for file in (ROOT / "pfbench/report").glob(pattern)
-    }
+    report = [file for ending in ("jinja", "css", "yaml") for file in (ROOT / "pfbench/report").glob(f"*.{ending}")]
+    wanted |= {f"pfbench/report/{file.name}" for file in report}
     wanted |= {f"pfbench/{file}" for file in ("py.typed", "normals.cpp", "loops.cpp")}
     wanted |= {f"pfbench/{folder}/__init__.py" for folder in ("conf", "experiments")}
     assert wanted <= names
