@@ -101,8 +101,8 @@ def drawings(
 def worth_a_spread(results: Results, runs: pd.DataFrame, groups: Sequence[str]) -> dict[str, str]:
     """Filters whose spread is drawn, and why: every one where they are few, else the most and the least believable [ours].
 
-    Of more than four filters these are the one with the smallest median RMSE and the one whose NEES is farthest from its degrees
-    of freedom, as a ratio and in the median over runs; both of the position where it is shown, else of the first group.
+    Of more than four filters these are the one with the smallest median RMSE, of the position where it is shown and else of the
+    first group, and the one whose NEES is farthest from its degrees of freedom in any group, as a ratio, median over runs.
     """
     drawable = {
         label: block
@@ -115,18 +115,16 @@ def worth_a_spread(results: Results, runs: pd.DataFrame, groups: Sequence[str]) 
     for label, block in drawable.items():
         own = runs[runs.label == label]
         rmse_of[label] = _middle(own[(own.metric == "rmse") & (own.component == "norm") & (own.group == block.group)])
-        dof = len(results[label].meta["state"]["groups"][block.whole])
-        with np.errstate(divide="ignore"):
-            nees_of[label] = abs(np.log(_middle(own[(own.metric == "nees") & (own.group == block.whole)]) / dof))
+        nees_of[label] = _off(own[own.metric == "nees"], results[label].meta["state"], groups)
     chosen: dict[str, str] = {}
     for value, better, said in (
-        (rmse_of, min, "the smallest median RMSE"),
-        (nees_of, max, "the NEES farthest from its degrees of freedom"),
+        (rmse_of, min, "the smallest median RMSE of {}"),
+        (nees_of, max, "the NEES farthest from its degrees of freedom, of any group"),
     ):
         known = {label: number for label, number in value.items() if not np.isnan(number)}
         if known:
             label = better(known, key=lambda name: known[name])
-            of = f"{said} of {drawable[label].group}"
+            of = said.format(drawable[label].group)
             chosen[label] = f"{chosen[label]} and {of}" if label in chosen else f", of {len(drawable)} filters the one with {of}"
     return chosen
 
@@ -354,6 +352,15 @@ def _main(state: Mapping[str, Any], groups: Sequence[str]) -> Block | None:
     """The position where it is shown, else the first group that is."""
     own = [block for block in blocks(state) if block.group in groups]
     return next((block for block in own if block.group == "position"), own[0] if own else None)
+
+
+def _off(nees: pd.DataFrame, state: Mapping[str, Any], groups: Sequence[str]) -> float:
+    """Largest distance of the median NEES of a shown group from its degrees of freedom, on the logarithm."""
+    wholes = {block.whole for block in blocks(state) if block.group in groups}
+    with np.errstate(divide="ignore"):
+        off = [abs(np.log(_middle(nees[nees.group == whole]) / len(state["groups"][whole]))) for whole in sorted(wholes)]
+    known = [value for value in off if not np.isnan(value)]
+    return float(max(known)) if known else np.nan
 
 
 def _middle(rows: pd.DataFrame) -> float:
