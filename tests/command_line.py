@@ -6,6 +6,7 @@ import contextlib
 import io
 import logging
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -41,6 +42,14 @@ def pfbench(*words: object, home: Path) -> Said:
         finally:
             root.handlers[:], root.level = handlers, level  # Hydra's point at streams that close now
     return Said(code, out.getvalue(), err.getvalue())
+
+
+def block(code: str, home: Path) -> None:
+    """A page's block of commands, in this process; each line is one."""
+    for line in filter(None, code.splitlines()):
+        name, *words = shlex.split(line)
+        said = pfbench(*words, home=home)
+        assert (name, said.code) == ("pfbench", 0), line + said.err
 
 
 def process(*words: object, home: Path, cwd: Path, **more: str) -> Said:

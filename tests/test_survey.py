@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from command_line import pfbench
+from command_line import block, pfbench
 
 from pfbench import survey
 from pfbench.model.linear import LinearGaussian, linear_walk
@@ -123,13 +120,12 @@ def test_a_study_with_a_scenario_is_still_a_study(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_page_on_an_own_scene_runs_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     names: dict[str, object] = {}
     for language, code in re.findall(r"^```(python|bash)\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE):
         if language == "python":
             exec(compile(code, PAGE.name, "exec"), names)
         else:
-            subprocess.run(["bash", "-euc", code], check=True, capture_output=True, timeout=300)
+            block(code, tmp_path)
     assert (tmp_path / "reports" / "datasheets" / "survey_nominal" / "index.html").exists()
     assert len(list(tmp_path.glob("results/mine/*.npz"))) == 2
     assert "Cramer-Rao bound" in (tmp_path / "reports" / "mine" / "index.html").read_text()

@@ -99,6 +99,8 @@ def critical_difference(one: Across, style: Mapping[str, Look]) -> Figure:
     )  # fmt: skip
     for text in axis.texts:  # a light colour is a line, but no letter
         text.set_color("black")
+    for mark in (*axis.collections, *axis.lines):  # the first and the last stand on the edge
+        mark.set_clip_on(False)
     axis.spines["top"].set(visible=True, bounds=(1, k))
     axis.set_xlim(1, max(k, 1 + one.critical))
     axis.set_xticks(range(1, k + 1))

@@ -110,7 +110,7 @@ def test_same_results_same_bytes_whatever_the_order_of_files(results, tmp_path, 
 
 
 def test_a_new_report_leaves_no_figure_of_the_old_one(results, tmp_path):
-    page.write("demo", results, tmp_path, QUICK)
+    (tmp_path / "demo" / "figures").mkdir(parents=True)
     (tmp_path / "demo" / "figures" / "gone_cell.svg").write_text("old")
     (tmp_path / "demo" / "notes.txt").write_text("mine")
     page.write("demo", results, tmp_path, QUICK)

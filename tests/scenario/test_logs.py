@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from command_line import block
 from pymap3d import ned2geodetic
 from scipy.spatial.transform import Rotation
 from synthetic_log import GRAVITY, ORIGIN, drive, tables, write
@@ -251,13 +250,12 @@ def test_the_page_on_own_data_runs_as_it_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     names: dict[str, object] = {}
     for language, code in BLOCK.findall(PAGE.read_text()):
         if language == "python":
             exec(compile(code, PAGE.name, "exec"), names)
         else:
-            subprocess.run(["bash", "-euc", code], check=True, capture_output=True, timeout=300)
+            block(code, tmp_path)
     said = capsys.readouterr().out
     assert "3000 samples, 30 fixes" in said
     assert "turn 57 times as fast as reference.csv" in said
