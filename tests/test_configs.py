@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
+from recorded_data import DATA
 
 from pfbench import cli, job
 from pfbench.draws import MonteCarlo
@@ -22,7 +22,6 @@ from pfbench.noise.regimes import Nominal
 from pfbench.record import Channels, Episode, Record, map_inputs
 
 CONF = cli.conf_dir()
-DATA = os.environ.get("PFBENCH_DATA")
 FILES = [*sorted(CONF.rglob("*.yaml")), *sorted(cli.experiments_dir().glob("*.yaml"))]
 SEED, RUNS, STEPS = 1, torch.arange(2), 5
 GROUPS = {

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from recorded_data import recorded
 from scipy import stats
 from torch import Tensor
 
@@ -42,7 +42,6 @@ PATH = Ramps(
     rise=(Cycloid(30.0, 50.0, 10.0),),
 )
 RUNS = torch.arange(3)
-DATA = os.environ.get("PFBENCH_DATA")
 
 
 def world(receiver: Any = RECEIVER, runs: Tensor = RUNS) -> Episode:
@@ -411,7 +410,7 @@ def test_satellites_of_the_scenarios() -> None:
     assert int((slow[1:] != slow[:-1]).sum()) == 1
 
 
-@pytest.mark.skipif(DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets")
+@recorded
 def test_real_satellites_come_and_go() -> None:
     seen = visible("anshun_real_orbits")
     assert set(seen.sum(1).tolist()) == {9, 10, 11}

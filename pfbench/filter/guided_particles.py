@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.chart import Chart
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud
 from pfbench.filter.gaussian import GaussianFilter, update
@@ -20,7 +19,7 @@ from pfbench.filter.linearisation import quiet
 from pfbench.filter.points import Independent, Points
 from pfbench.filter.proposals import Bootstrap, Proposed
 from pfbench.filter.whitening import LOG_2PI, half_square, log_det
-from pfbench.model.base import AtRest, StateSpaceModel, dense_normal, independent_normal
+from pfbench.model.base import AtRest, StateSpaceModel, Wrapped, dense_normal, independent_normal
 from pfbench.record import Record
 
 
@@ -76,24 +75,12 @@ class GuidedParticles:
         return self.guide.init(model, runs, draws, seen.start, seen.spread).covariance.unsqueeze(1)
 
 
-class _Each(StateSpaceModel):
+class _Each(Wrapped):
     """A model to which every particle is a run of its own: what is [R N, P, ...] here is [R, N P, ...] there."""
 
     def __init__(self, model: StateSpaceModel, runs: int, n: int) -> None:
-        super().__init__()
-        self.model, self.runs, self.n = model, runs, n
-        self.names, self.units, self.groups, self.noise_dim = model.names, model.units, model.groups, model.noise_dim
-
-    @property
-    def chart(self) -> Chart:
-        return self.model.chart
-
-    @property
-    def noise(self) -> Distribution:
-        return self.model.noise
-
-    def initial(self, runs: int) -> Distribution:
-        return self.model.initial(runs)
+        super().__init__(model)
+        self.runs, self.n = runs, n
 
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
         inside, points = self.model.propagate(self._joined(x), u, self._joined(w)), x.shape[1]
@@ -109,9 +96,6 @@ class _Each(StateSpaceModel):
         if isinstance(law, torch.distributions.MultivariateNormal):
             return dense_normal(mean, law.scale_tril.reshape(*mean.shape, -1))
         return independent_normal(mean, law.stddev.reshape(mean.shape))
-
-    def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
-        return self.model.residual(y, y_hat)
 
     def _joined(self, a: Tensor) -> Tensor:
         return a.reshape(self.runs, -1, a.shape[-1])

@@ -148,14 +148,13 @@ class StateSpaceModel(nn.Module, ABC):
         raise TypeError(f"{name} returned {type(law).__name__}: return Independent or MultivariateNormal")
 
 
-class AtRest(StateSpaceModel):
-    """A model whose state does not move in this step: the first one of a model that observes its initial state."""
+class Wrapped(StateSpaceModel):
+    """A model around another, of which a subclass changes what it is there for; it says itself what it is then."""
 
     def __init__(self, model: StateSpaceModel) -> None:
         super().__init__()
         self.model = model
         self.names, self.units, self.groups, self.noise_dim = model.names, model.units, model.groups, model.noise_dim
-        self.linear, self.linear_given = model.linear, model.linear_given
 
     @property
     def chart(self) -> Chart:
@@ -166,6 +165,10 @@ class AtRest(StateSpaceModel):
         return self.model.origin
 
     @property
+    def anchor(self) -> Tensor:
+        return self.model.anchor
+
+    @property
     def noise(self) -> Distribution:
         return self.model.noise
 
@@ -173,13 +176,24 @@ class AtRest(StateSpaceModel):
         return self.model.initial(runs)
 
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        return x
+        return self.model.propagate(x, u, w)
 
     def observation(self, x: Tensor, u: Any) -> Distribution:
         return self.model.observation(x, u)
 
     def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
         return self.model.residual(y, y_hat)
+
+
+class AtRest(Wrapped):
+    """A model whose state does not move in this step: the first one of a model that observes its initial state."""
+
+    def __init__(self, model: StateSpaceModel) -> None:
+        super().__init__(model)
+        self.linear, self.linear_given = model.linear, model.linear_given
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return x
 
     def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
         return self.model.log_likelihood(y, x, u)

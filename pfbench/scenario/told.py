@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
 
-from pfbench.chart import Chart
 from pfbench.draws import Draws
-from pfbench.model.base import StateSpaceModel, dense_normal, independent_normal
+from pfbench.model.base import StateSpaceModel, Wrapped, dense_normal, independent_normal
 from pfbench.noise import laws
 from pfbench.noise.laws import Law, Mixture
 from pfbench.noise.regimes import Regime, step_process
@@ -62,7 +61,7 @@ class Known(NamedTuple):
     scale: Tensor
 
 
-class Told(StateSpaceModel):
+class Told(Wrapped):
     """`model`, knowing the regime: at each step the factor on Q and the law of the errors.
 
     The noise w is scaled about its mean by the root of the factor; the measurement's law is the regime's family, shifted and
@@ -81,10 +80,8 @@ class Told(StateSpaceModel):
     """
 
     def __init__(self, model: StateSpaceModel, regime: Regime, channels: Channels, time: Tensor) -> None:
-        super().__init__()
-        self.model = model
-        self.names, self.units, self.groups = model.names, model.units, model.groups
-        self.noise_dim, self.observes_initial = model.noise_dim, model.observes_initial
+        super().__init__(model)
+        self.observes_initial = model.observes_initial
         self.family, shift, scale = regime.law(channels, time)
         process = step_process(regime, time)
         self.swollen, self.moved = bool((process != 1.0).any()), bool((shift != 0.0).any() or (scale != 1.0).any())
@@ -94,22 +91,6 @@ class Told(StateSpaceModel):
         self.choices = (*model.choices, told)
         for name, value in (("root", process.sqrt()), ("shift", shift), ("scale", scale)):
             self.register_buffer(f"told_{name}", value.unsqueeze(0))
-
-    @property
-    def chart(self) -> Chart:
-        return self.model.chart
-
-    @property
-    def origin(self) -> Tensor:
-        return self.model.origin
-
-    @property
-    def anchor(self) -> Tensor:
-        return self.model.anchor
-
-    @property
-    def noise(self) -> Distribution:
-        return self.model.noise
 
     def prepare(self, record: Record) -> Record:
         if isinstance(record.u, Known):
@@ -121,9 +102,6 @@ class Told(StateSpaceModel):
         if record.y.shape[1] != own[0].shape[1]:
             raise ValueError(f"the record has {record.y.shape[1]} steps, the filter was told of {own[0].shape[1]}")
         return record._replace(u=Known(record.u, *own))
-
-    def initial(self, runs: int) -> Distribution:
-        return self.model.initial(runs)
 
     def propagate(self, x: Tensor, u: Known, w: Tensor) -> Tensor:
         if self.swollen:
@@ -160,9 +138,6 @@ class Told(StateSpaceModel):
         if isinstance(law, MultivariateNormal) and self.family is laws.normal:
             return dense_normal(law.mean + shift * law.stddev, scale.unsqueeze(-1) * law.scale_tril)
         raise ValueError(f"told=true: {type(self.model).__name__} has no independent normal measurement noise; give told=false")
-
-    def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
-        return self.model.residual(y, y_hat)
 
     def assemble(self, truth: dict[str, Tensor]) -> Tensor:
         return self.model.assemble(truth)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from datetime import datetime
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pandas as pd
 import pymap3d
 import pytest
 import torch
+from recorded_data import DATA, recorded
 from torch import Tensor
 
 from pfbench.nav import earth
@@ -28,8 +28,6 @@ from pfbench.nav.orbits import (
     transmit,
 )
 
-DATA = os.environ.get("PFBENCH_DATA")
-recorded = pytest.mark.skipif(DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets")
 TIMES = torch.arange(0.0, 7200.0, 240.0, dtype=torch.float64) + 13.0
 NOON = (datetime(2016, 6, 6, 12) - datetime(1980, 1, 6)).total_seconds()
 

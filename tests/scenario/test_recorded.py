@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +11,14 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from recorded_data import DATA, believed, recorded
 from synthetic_log import drive, tables, write
 
 from pfbench.draws import MonteCarlo
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.rules import Cubature, Jacobian, Points, Rule
-from pfbench.model.strapdown_total import Believed, Increments, StrapdownTotal
+from pfbench.model.strapdown_total import Increments, StrapdownTotal
 from pfbench.noise.regimes import Nominal, Outage
 from pfbench.record import Episode
 from pfbench.scenario.legs import cut, divide, interpolate, split, thin
@@ -26,22 +26,8 @@ from pfbench.scenario.logs import Files, Imu, Motion, read_log
 from pfbench.scenario.recorded import Receiver, RecordedDrive, RecordedFlights, locate
 
 CONF = Path(__file__).parents[2] / "conf"
-DATA = os.environ.get("PFBENCH_DATA")
-recorded = pytest.mark.skipif(DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets")
 
-BELIEVED = Believed(
-    gyro_density=1e-4,
-    accelerometer_density=1e-3,
-    gyro_bias_walk=1e-6,
-    accelerometer_bias_walk=1e-5,
-    position_sd=[1.0, 1.0, 2.0],
-    velocity_sd=None,
-    attitude_sd_deg=[0.5, 0.5, 2.0],
-    initial_velocity_sd=[0.2, 0.2, 0.1],
-    initial_position_sd=[1.0, 1.0, 2.0],
-    gyro_bias_sd_deg_s=0.01,
-    accelerometer_bias_sd=0.01,
-)
+BELIEVED = believed([1.0, 1.0, 2.0], None)
 
 
 @pytest.fixture(scope="module")

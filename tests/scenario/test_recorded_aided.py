@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from recorded_data import believed
 from scipy.spatial.transform import Rotation
 from synthetic_log import tables, write
 
 from pfbench.model.strapdown_aided import BelievedAided, StrapdownAided
-from pfbench.model.strapdown_total import Believed
 from pfbench.noise.regimes import Nominal, Outage
 from pfbench.noise.surges import Surge
 from pfbench.scenario.recorded import Receiver, RecordedDrive
@@ -21,19 +21,7 @@ from pfbench.scenario.told import Told, Witness
 from pfbench.scenario.withholding import Withholding
 
 FIELD, IRON = [0.17, 0.01, 0.52], [0.4, -0.2, 0.3]  # North, East, Down; forward, right, down
-MOTION = Believed(
-    gyro_density=1e-4,
-    accelerometer_density=1e-3,
-    gyro_bias_walk=1e-6,
-    accelerometer_bias_walk=1e-5,
-    position_sd=[1.0, 1.0, 2.0],
-    velocity_sd=[0.1, 0.1, 0.1],
-    attitude_sd_deg=[0.5, 0.5, 2.0],
-    initial_velocity_sd=[0.2, 0.2, 0.1],
-    initial_position_sd=[1.0, 1.0, 2.0],
-    gyro_bias_sd_deg_s=0.01,
-    accelerometer_bias_sd=0.01,
-)
+MOTION = believed([1.0, 1.0, 2.0], [0.1, 0.1, 0.1])
 BELIEVED = BelievedAided(MOTION, 1.0, [0.01] * 3, FIELD, 3.0, 0.1, 0.02, 1e-4)
 
 

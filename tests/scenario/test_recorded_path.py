@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from recorded_data import DATA, recorded
 from synthetic_log import GRAVITY, ORIGIN, drive, write
 
 from pfbench.draws import MonteCarlo
@@ -25,8 +25,6 @@ from pfbench.scenario.flight import SimulatedFlight
 from pfbench.scenario.recorded_path import RecordedPath, read_motion
 
 CONF = Path(__file__).parents[2] / "conf"
-DATA = os.environ.get("PFBENCH_DATA")
-recorded = pytest.mark.skipif(DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets")
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from recorded_data import DATA, recorded
 
 from pfbench.draws import MonteCarlo
 from pfbench.filter.gaussian import GaussianFilter
@@ -28,8 +28,6 @@ from pfbench.scenario.recorded_urban import Receiver, UrbanDrive, handed_out, re
 from pfbench.scenario.urban_law import Residuals, estimate_mixture, estimate_normal, residuals
 
 CONF = Path(__file__).parents[2] / "conf"
-DATA = os.environ.get("PFBENCH_DATA")
-recorded = pytest.mark.skipif(DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets")
 
 BELIEVED = Believed(
     distance_density=0.1,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from recorded_data import believed, recorded
 from synthetic_log import ORIGIN, drive, tables, write
 from torch import Tensor
 
@@ -22,7 +22,6 @@ from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import run_filter
 from pfbench.filter.rules import Jacobian
 from pfbench.model.strapdown_tight import BelievedTight, Scatter, Sighted, StrapdownTight
-from pfbench.model.strapdown_total import Believed
 from pfbench.nav import earth
 from pfbench.nav.orbits import Walker, azimuth_elevation, transmit
 from pfbench.nav.ranging import Clock
@@ -31,23 +30,9 @@ from pfbench.record import Channels, Episode
 from pfbench.scenario.recorded_walk import RawReceiver, RecordedWalk
 
 CONF = Path(__file__).parents[2] / "conf"
-DATA = os.environ.get("PFBENCH_DATA")
-recorded = pytest.mark.skipif(DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets")
 BIAS, DRIFT, OTHER = -4.6e5, -60.0, 12.0  # of the clock, and of the other system
 
-MOTION = Believed(
-    gyro_density=1e-4,
-    accelerometer_density=1e-3,
-    gyro_bias_walk=1e-6,
-    accelerometer_bias_walk=1e-5,
-    position_sd=[1.0, 1.0, 1.0],
-    velocity_sd=None,
-    attitude_sd_deg=[0.5, 0.5, 2.0],
-    initial_velocity_sd=[0.2, 0.2, 0.1],
-    initial_position_sd=[1.0, 1.0, 2.0],
-    gyro_bias_sd_deg_s=0.01,
-    accelerometer_bias_sd=0.01,
-)
+MOTION = believed([1.0, 1.0, 1.0], None)
 BELIEVED = BelievedTight(MOTION, Clock(4.0, 0.5, 0.1, 0.05), Scatter(1.0), Scatter(0.1), inter_system_sd=2.0)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,37 +12,24 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from recorded_data import DATA, believed, recorded
 from synthetic_log import tables, write
 
 from pfbench.draws import MonteCarlo
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.rules import Jacobian
-from pfbench.model.strapdown_total import Believed, StrapdownTotal
+from pfbench.model.strapdown_total import StrapdownTotal
 from pfbench.noise.regimes import Nominal, Outage
 from pfbench.scenario.recorded import Receiver, RecordedDrive
 from pfbench.scenario.withholding import Withholding
 
 CONF = Path(__file__).parents[2] / "conf"
-DATA = os.environ.get("PFBENCH_DATA")
-recorded = pytest.mark.skipif(DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets")
 MISSED = np.array([0.3, -0.2, 0.1])  # m North, East, down: the errors of the synthetic fixes
 
 AS_RECORDED = Receiver(position_sd=(0.0, 0.0, 0.0), velocity_sd=(0.0, 0.0, 0.0))
 
-BELIEVED = Believed(
-    gyro_density=1e-4,
-    accelerometer_density=1e-3,
-    gyro_bias_walk=1e-6,
-    accelerometer_bias_walk=1e-5,
-    position_sd=[1.0, 1.0, 2.0],
-    velocity_sd=[0.1, 0.1, 0.1],
-    attitude_sd_deg=[0.5, 0.5, 2.0],
-    initial_velocity_sd=[0.2, 0.2, 0.1],
-    initial_position_sd=[1.0, 1.0, 2.0],
-    gyro_bias_sd_deg_s=0.01,
-    accelerometer_bias_sd=0.01,
-)
+BELIEVED = believed([1.0, 1.0, 2.0], [0.1, 0.1, 0.1])
 
 
 @pytest.fixture(scope="module")
