@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo test test-fast test-slow test-study lint bench clean
+.PHONY: demo test test-fast test-slow lint bench clean
 
 # Installs everything once; runs again only when the requirements change.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -21,9 +21,6 @@ test-fast: $(VENV)/.installed
 
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 -m slow
-
-test-study: $(VENV)/.installed ## reproductions of the methods' tables, minutes each
-	$(BIN)/python -m pytest -n 2 -m study
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

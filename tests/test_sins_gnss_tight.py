@@ -419,7 +419,7 @@ def test_real_satellites_come_and_go() -> None:
     assert torch.equal(everyone.sum(1), seen[:1000].sum(1))  # the list leaves nobody out
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_the_flight_gives_the_published_accuracy() -> None:
     """RMSE of 30 runs, NIS and NEES; the prototype's 0.66, 0.58, 1.40 m are good to 10 %, mean NIS 16.0 to 0.4."""
     runs, level = 30, 1e-4
@@ -440,7 +440,7 @@ def test_the_flight_gives_the_published_accuracy() -> None:
         assert (z < high).all(), (t, torch.sqrt(z / runs))
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_the_take_off_shows_the_heading() -> None:
     """From 45 degrees the cubature filter comes below 1 degree within 20 s (half the runs) and 60 s (nearly all)."""
     cfg = composed("scenario=anshun_nl", "scenario.imu_rate=50", "scenario.path.duration=70")

@@ -452,7 +452,7 @@ TABLE = {
 }
 
 
-@pytest.mark.study
+@pytest.mark.slow
 @pytest.mark.parametrize("row", TABLE)
 def test_the_unscented_filter_gives_the_prototype_s_numbers(fixed: Episode, row: str) -> None:
     words = ["model=sins_gps_azimuth15"] if row == "15 states" else [f"model.q_inflation={row.split()[1]}"]
@@ -468,7 +468,7 @@ def test_the_unscented_filter_gives_the_prototype_s_numbers(fixed: Episode, row:
     assert ((ours - theirs).abs() < 3.5 * math.sqrt(3) * error + digits).all(), (ours / unit, theirs / unit)
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_the_filter_that_models_the_biases_is_consistent_and_the_others_are_not() -> None:
     runs, level = 40, 1e-4
     flight = job.build(composed("scenario=azimuth").scenario)

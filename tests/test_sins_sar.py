@@ -101,7 +101,7 @@ def test_the_model_follows_the_mechanisation_through_every_manoeuvre(initial: Al
     assert (grown[6:8] > 30.0).all()  # there was something to follow
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_the_model_follows_the_mechanisation_for_a_thousand_seconds() -> None:
     """To 0.1 m of a hundred kilometres, with misalignments of degrees; half of it is what the mechanisation itself leaves."""
     path = job.build(composed("scenario=sar_flight").scenario).path
@@ -430,7 +430,7 @@ def test_a_cloud_runs_and_stays_a_cloud_of_rotations(flight: Episode, model: Sin
     assert (estimate.mean[..., :4].norm(dim=-1) - 1).abs().max() < 1e-12
 
 
-@pytest.mark.study
+@pytest.mark.slow
 def test_the_extended_kalman_filter_is_consistent_on_the_flight() -> None:
     """NEES of every group in its band through the flight, and errors of the last half of the size of the prototype's."""
     runs, level = torch.arange(40), 1e-4

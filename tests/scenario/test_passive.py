@@ -346,7 +346,7 @@ def test_the_bound_of_the_experiments_is_that_of_another_prototype(scenario: str
     assert float(error[-20:].mean()) == pytest.approx(BOUNDS[scenario][1], abs=0.01)
 
 
-@pytest.mark.study
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [Jacobian(), Points(Cubature())], ids=["ekf", "ckf"])
 def test_gaussian_filters_are_consistent_where_what_they_are_told_is_true(rule: Any) -> None:
     """From a start 300 m and 5 m/s wrong, as told, the problem is nearly linear: NEES is chi-square at all looks.

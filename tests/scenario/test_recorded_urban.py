@@ -284,7 +284,7 @@ def conf(*overrides: str) -> tuple[UrbanDrive, UrbanGnss]:
 
 
 @recorded
-@pytest.mark.study
+@pytest.mark.slow
 def test_the_laws_of_the_yamls_are_those_of_the_training_stretch() -> None:
     """Three digits are written down; the search ends within much less."""
     drive, model = conf("model=urban_gnss_mixture")
@@ -347,7 +347,7 @@ def rms(error: torch.Tensor) -> float:
 
 
 @recorded
-@pytest.mark.study
+@pytest.mark.slow
 def test_the_extended_filter_is_as_good_as_the_data_sheet_says() -> None:
     """Over the whole drive, the receiver's own standard deviations taken at their word: 32 m, from a start 21 m off."""
     error = errors(GaussianFilter(Jacobian()), 1, "scenario.start=0.0", "model.law.factor=1.0")
@@ -356,7 +356,7 @@ def test_the_extended_filter_is_as_good_as_the_data_sheet_says() -> None:
 
 
 @recorded
-@pytest.mark.study
+@pytest.mark.slow
 def test_a_law_with_a_tail_is_worth_a_factor_of_two_to_particles() -> None:
     """The sheet: 23, 13 and 13 m with a tail set by hand, 48, 43 and 22 m without; here both laws come from other minutes."""
     normal = errors(ParticleFilter(1000), 8, "scenario.end=200.0")

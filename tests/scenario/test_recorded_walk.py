@@ -300,7 +300,7 @@ def test_single_points_are_as_good_as_the_data_sheet_says() -> None:
 
 
 @recorded
-@pytest.mark.study
+@pytest.mark.slow
 def test_the_filter_is_better_than_single_points() -> None:
     episode, model = configured(Nominal(), 3, *RAW)
     estimate = run_filter(GaussianFilter(Jacobian()), model, episode.record, MonteCarlo(1, torch.arange(3)))

@@ -142,7 +142,7 @@ def horizontal(error: torch.Tensor) -> float:
 
 
 @recorded
-@pytest.mark.study
+@pytest.mark.slow
 @pytest.mark.parametrize(("gap", "figure"), [(1, 1.8), (10, 8.3)])
 def test_the_filter_is_as_good_as_the_data_sheet_says(gap: int, figure: float) -> None:
     words = ["scenario.start=55", "scenario.withholding.begin=62", "scenario.step=0.5"]  # with take-off
@@ -155,7 +155,7 @@ def test_the_filter_is_as_good_as_the_data_sheet_says(gap: int, figure: float) -
 
 
 @recorded
-@pytest.mark.study
+@pytest.mark.slow
 def test_fixes_and_imu_have_the_same_clock(tmp_path: Path) -> None:
     """The evidence is highest where the fixes stand in time as the data sheet left them."""
     source, evidence = Path(DATA or "") / "fixedwing_uav", []
