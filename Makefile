@@ -32,8 +32,9 @@ lint: $(VENV)/.installed
 	.venv-bench/bin/python -m pip install --quiet -r benchmarks/requirements.txt
 	touch $@
 
-bench: $(VENV)/.installed .venv-bench/.installed   ## speed against peers: benchmarks/w4.md, some minutes on a quiet machine
+bench: $(VENV)/.installed .venv-bench/.installed   ## speed against peers and of all methods, ten minutes on a quiet machine
 	$(BIN)/python benchmarks/w4.py --peer .venv-bench/bin/python
+	$(BIN)/python benchmarks/methods.py
 
 clean:
 	rm -rf $(VENV) .venv-bench build dist *.egg-info
