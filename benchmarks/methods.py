@@ -116,7 +116,8 @@ def draw(order: list[str], ratios: dict[str, list[float]], found: dict[str, Any]
         middle = statistics.median(ratios[name])
         axis.plot([min(ratios[name]), max(ratios[name])], [place, place], color=colour, lw=1)
         axis.plot(middle, place, "o" if colour == "#0072B2" else "s", color=colour, ms=4)
-        axis.annotate(f"{middle:.2g}" if middle < 9.5 else f"{middle:.0f}", (max(ratios[name]), place), (5, 0), textcoords="offset points", va="center", fontsize=7)
+        said = f"{middle:.2g}" if middle < 9.5 else f"{middle:.0f}"
+        axis.annotate(said, (max(ratios[name]), place), (5, 0), textcoords="offset points", va="center", fontsize=7)
     axis.axvline(1.0, color="0.6", lw=0.8, zorder=0)
     axis.set_yticks(range(len(order)), order, fontsize=7)
     axis.set_ylim(len(order) - 0.4, -0.6)
