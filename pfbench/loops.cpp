@@ -18,11 +18,11 @@ void systematic(int64_t* ancestor, const T* weight, const double* wanted, const 
         const T whole = sums[slots - 1], n = static_cast<T>(wanted[r]), u = static_cast<T>(uniform[r]);
         for (int64_t i = 0; i < slots; ++i) {
             const T reach = sums[i] / whole * n;
-            // not simply ceil: n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0
+            // not simply ceil: n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0;
+            // the last sum is n exactly, being divided by itself, and NaN is not below n
             const T end = reach < n ? std::ceil(reach - u) : n;
             ends[i] = static_cast<int32_t>(end < 0 ? 0 : end);
         }
-        ends[slots - 1] = static_cast<int32_t>(n);  // whatever rounding did
         std::fill(ending.begin(), ending.end(), 0);
         for (int64_t i = 0; i < slots; ++i) ++ending[ends[i]];
         int64_t passed = 0;  // a slot belongs to the first particle that ends after it

@@ -108,7 +108,7 @@ def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
     a[3, 7] = a[4, -1] = 1.0
     a[5] = torch.nan
     n = torch.tensor([[N], [N // 3], [2], [N], [N], [N]], dtype=dtype)
-    u = torch.linspace(1e-9, 1.0 - 1e-9, 6, dtype=torch.float64)[:, None]
+    u = torch.linspace(1.0 - 1e-9, 1e-9, 6, dtype=torch.float64)[:, None]
     assert torch.equal(native.systematic(a, n, u), resamplers._counted_evenly(a, n, u))
     assert torch.equal(native.systematic(a[:1], n[:1], u[:1]), native.systematic(a, n[:1], u)[:1])
 
