@@ -69,7 +69,10 @@ def drawings(sheet: store.Result) -> list[Drawing]:
     if "range" in there:
         found.append(("range", "Horizontal range from the observer to the target.", scene_figures.distance))
     if "force" in there and "rate" in there:
-        text = "True specific force and angular rate in body axes, mean over each step."
+        text = (
+            "Specific force and angular rate in body axes, mean over each step: the true ones where the scene is simulated, of "
+            "the first run's IMU where it was recorded."
+        )
         found.append(("sensors", text, scene_figures.sensors))
     if "azimuth" in there:
         text = "Satellites above the horizon of the first run, zenith in the middle; an arrow shows the way each one goes."

@@ -51,6 +51,11 @@ class Leg(NamedTuple):
     def since_start(self) -> Array:
         return self.time - self.begin
 
+    def sensed(self) -> dict[str, Array]:
+        """Measured specific force and angular rate, mean over each step [T, 3]; NaN where the IMU has a hole."""
+        share = self.spans / np.where(self.spans.sum(1) > 0, self.spans.sum(1), np.nan)[:, None]
+        return {"force": (self.force * share[..., None]).sum(1), "rate": (self.rate * share[..., None]).sum(1)}
+
 
 def cut(
     log: Log, interval: float, step: float, velocity: bool = False, start: float | None = None, end: float | None = None

@@ -188,7 +188,9 @@ def assemble(
     record = Record(y, _increments(legs, which, believed), _start(legs, which, believed, draws))
     groups = {"attitude": truth[..., :4], "velocity": truth[..., 4:7], "position": truth[..., 7:]}
     notes = tuple(dict.fromkeys(note for leg in legs for note in leg.notes))
-    return Episode(record, t, groups, truth[..., 7:], notes)
+    first = legs[int(which[0])] if len(which) else longest
+    sheet = {name: _padded([part, np.empty((len(t), 3))], np.nan)[0] for name, part in first.sensed().items()}
+    return Episode(record, t, groups, truth[..., 7:], notes, sheet)
 
 
 def _start(legs: Sequence[Leg], which: Tensor, believed: Believed, draws: MonteCarlo) -> Tensor:

@@ -142,7 +142,7 @@ class RecordedWalk:
         record = Record(y, sighted(loose.record.u, sky), self._start(loose.record.start, draws))
         azimuth, elevation = (torch.from_numpy(a[1:]) for a in (sky.azimuth, sky.elevation))
         seen = {"azimuth": azimuth, "elevation": elevation, "satellites": spelled(sky.names)}
-        return Episode(record, loose.time, loose.truth, loose.track, (*loose.notes, *notes), seen)
+        return Episode(record, loose.time, loose.truth, loose.track, (*loose.notes, *notes), loose.sheet | seen)
 
     def _start(self, motion: Tensor | None, draws: MonteCarlo) -> Tensor:
         """Starts [R, 19] about which motion and clocks have the believed initial law; the clocks' true course is nominal."""

@@ -77,4 +77,4 @@ class Withholding:
         position, velocity = (torch.where(held, part, torch.nan) for part in recorded.split(3, -1))
         truth = {"attitude": world.truth["attitude"], "velocity": velocity, "position": position}
         record = world.record._replace(y=torch.where(held, torch.nan, world.record.y))
-        return Episode(record, world.time, truth, world.track, (*world.notes, *notes))
+        return Episode(record, world.time, truth, world.track, (*world.notes, *notes), world.sheet)

@@ -128,6 +128,18 @@ def test_nothing_is_seen_between_fixes(root: Path) -> None:
     assert np.allclose(episode.track[0], np.stack([there["pe"], there["pn"], 0 * there["pd"]], -1), atol=1e-3)
 
 
+def test_the_sheet_has_the_first_run_s_sensors(root: Path) -> None:
+    """Steps of a quarter of a second hold what the IMU's samples in them add up to; after a short flight there is nothing."""
+    sheet, imu = one_drive(root).draw(Nominal(), numbers(0), 1).sheet, read_log(root / "drive").imu
+    step = (imu.time > 5.0 + 1e-6) & (imu.time <= 5.25 + 1e-6)  # the twenty-first, between fixes
+    for name, samples in (("force", imu.force), ("rate", imu.rate)):
+        assert np.allclose(sheet[name][20], samples[step].mean(0), rtol=0, atol=1e-2 * np.abs(samples).max())
+    short = flights(root).draw(Nominal(), numbers(0, 1, 2), 1)
+    there = ~torch.isnan(short.truth["position"][0]).any(-1)
+    assert 0 < int(there.sum()) < len(there)
+    assert torch.equal(~torch.isnan(short.sheet["force"]).any(-1), there)
+
+
 def test_errors_of_the_receiver_have_the_size_asked_for(root: Path) -> None:
     episode = one_drive(root).draw(Nominal(), torch.arange(400), 1)
     error = (episode.record.y - episode.truth["position"])[:, 3::4]
