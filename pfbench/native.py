@@ -77,12 +77,12 @@ def moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
 def keep_memory() -> None:
     """Has the C library keep what is freed, for the next step, where it can be told so.
 
-    It gives blocks of some megabytes back to the system otherwise and fetches them again, page by page, at each step: up to a
-    third of a bootstrap filter's time. Of glibc; elsewhere nothing happens.
+    It gives blocks of some megabytes back to the system otherwise and fetches them again, page by page, at each step: about a
+    sixth of a bootstrap filter's time, 100 runs of 500 particles, was the system's. Of glibc; elsewhere nothing happens.
     """
-    for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
-        tell = getattr(ctypes.CDLL(None), "mallopt", None)
-        if tell is not None:
+    tell = getattr(ctypes.CDLL(None), "mallopt", None)
+    if tell is not None:
+        for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
             tell(option, 1 << 30)
 
 

@@ -148,7 +148,7 @@ def _errors(methods: dict[str, tuple[tuple[Adaptation, ...], tuple[Gain, ...]]],
     moved = 0.3 * torch.randn(runs, steps, 2, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(q), 1.0)
     x = torch.randn(runs, 1, 2, dtype=torch.float64, generator=draws) + moved.cumsum(1)
     noise = torch.randn(runs, steps, 5, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(r), 1.0)
-    figure, axes = plt.subplots(1, len(methods), figsize=(9.0, 3.7), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, len(methods), figsize=(9.0, 4.3), sharex=True, sharey=True, layout="constrained")
     for at, (name, (adaptations, gains)), colour in zip(axes, methods.items(), ("#0072B2", "#E69F00", "#009E73"), strict=True):
         method = GaussianFilter(Points(Product(Simplex3(), Radial5())), adaptations, gains)
         found = run_filter(
@@ -158,10 +158,10 @@ def _errors(methods: dict[str, tuple[tuple[Adaptation, ...], tuple[Gain, ...]]],
         at.scatter(*error.T, s=5, color="0.6", label="errors")
         centre, believed = torch.zeros(2, dtype=torch.float64), found.trace["p"][:, -1].median(0).values
         at.plot(*_ellipse(centre, torch.cov(error.T)), color="0.35", linestyle="--", label="their 2 sd")
-        at.plot(*_ellipse(centre, believed), color=colour, label="2 sd believed")
+        at.plot(*_ellipse(centre, believed), color=colour, label="2 sd believed, in colour")
         at.set(aspect="equal", title=f"{name}: rms {float(error.square().sum(-1).mean().sqrt()):.2f}", xlabel="error of state 1")
-        at.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=3, frameon=False, columnspacing=0.8)
     axes[0].set_ylabel("error of state 2")
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
