@@ -29,6 +29,12 @@ def factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(variance > 0, sd, 0.0).unsqueeze(-1) * lower, ok
 
 
+def squared_length(e: Tensor, covariance: Tensor) -> Tensor:
+    """e' covariance^-1 e: [..., d], [..., d, d] -> [...]; NaN or infinite where the covariance is singular."""
+    e = e.unsqueeze(-1)
+    return (e.mT @ torch.linalg.solve_ex(covariance, e)[0]).flatten(-3)
+
+
 def gaussian_log_density(r: Tensor, covariance: Tensor, seen: Tensor) -> Tensor:
     """log N(r; 0, covariance) over the components seen: r [..., D], covariance [..., D, D], seen [..., D] -> [...].
 

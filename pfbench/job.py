@@ -27,10 +27,11 @@ import pfbench
 from pfbench import fusion, native, store
 from pfbench.bound import posterior_bound
 from pfbench.draws import MonteCarlo
+from pfbench.filter.belief import Info
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.loop import Estimate, run_filter, runs_at_once
 from pfbench.filter.particle import ParticleFilter
-from pfbench.judge import Judge
+from pfbench.judge import Judge, Tally
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.regimes import Nominal
 from pfbench.record import Episode
@@ -114,23 +115,41 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
     truth = model.assemble(episode.truth).to(cfg.device, dtype)
     steps = episode.record.y.shape[1]
     draws = MonteCarlo(cfg.seed, runs.to(cfg.device), dtype)
-    judge = Judge(model, truth, cfg.scored)
+    # the processor's time is what the filter took whatever else the machine did; of several threads it would be their sum
+    clock = time.process_time if cfg.device == "cpu" and cfg.threads == 1 else time.perf_counter
+    judge, tally = Judge(model, truth, cfg.scored, clock), Tally(model)
+
+    def watch(t: int, info: Info) -> dict[str, Tensor]:
+        with tally.paused():
+            return judge(t, info)
+
+    if cfg.device != "cpu":
+        torch.cuda.reset_peak_memory_stats(cfg.device)
+    held = native.peak_from_here()
+    begun = clock()
     fuse = fuses(cfg.engine, method, model, cfg.runs * steps)
     with (
         fusion.fused(fuse),
         torch.no_grad(),
         tqdm(total=steps, desc=name, unit="step", delay=2, disable=None, leave=False) as bar,
     ):
-        estimate = run_filter(method, model, episode.record, draws, judge, bar.update, at_once(cfg, method, model))
+        estimate = run_filter(method, model, episode.record, draws, watch, bar.update, at_once(cfg, method, model))
     if cfg.device != "cpu":
         torch.cuda.synchronize()
-    ended = time.perf_counter()
-    spent = ended - bounded - judge.seconds
+    spent = clock() - begun - judge.seconds
     seconds = {
         "world": drawn - started, "bound": bounded - drawn, "scores": judge.seconds, "filter": spent, "per_step": spent / steps
     }  # fmt: skip
-    meta = describe(cfg, model, method, steps, seconds, episode.notes)
+    cost = {"memory": _taken(cfg.device, held), "likelihoods_per_step": tally.count / (cfg.runs * steps)}
+    meta = describe(cfg, model, method, steps, seconds, episode.notes) | cost
     return {**meta, "bound": said}, {**_arrays(episode, estimate, judge), **_shared(episode, least)}
+
+
+def _taken(device: str, held: int | None) -> int | None:
+    """Bytes that the filter took beyond what was held before; None where the system does not tell."""
+    if device != "cpu":
+        return int(torch.cuda.max_memory_allocated(device))
+    return None if held is None else max(0, native.peak() - held)
 
 
 def settings(cfg: DictConfig | Mapping[str, Any]) -> None:

@@ -8,14 +8,16 @@ histograms and the coverage of intervals come.
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple, TypeAlias
 
 import scoringrules
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
-from pfbench.covariance import factor
+from pfbench.covariance import factor, squared_length
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Info, weights
 from pfbench.model.base import StateSpaceModel
@@ -39,6 +41,34 @@ class Scores(NamedTuple):
     energy: Tensor
 
 
+class Tally:
+    """Counts how often a model's measurement law is evaluated, a state of a run at a time: what filters of one budget share.
+
+    Args:
+        model: whose method `observation` is watched from here on.
+    """
+
+    def __init__(self, model: StateSpaceModel) -> None:
+        self.count = 0
+        self._paused = False
+        law = model.observation
+
+        def counted(x: Tensor, u: Any) -> Distribution:
+            self.count += 0 if self._paused else x.shape[0] * x.shape[1]
+            return law(x, u)
+
+        model.observation = counted  # type: ignore[method-assign]
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Within it nothing counts: what the judge asks is no cost of a filter."""
+        self._paused = True
+        try:
+            yield
+        finally:
+            self._paused = False
+
+
 class Judge:
     """Watches a filter on its way, as run_filter's `watch`.
 
@@ -46,18 +76,23 @@ class Judge:
         model: what the filter believes.
         truth: the true state [R, T, D], NaN where there is none.
         instants: how many instants are scored, spread evenly, the last one among them; 0 scores nothing.
+        clock: by which it is told how long that took.
 
     Attributes:
         at: the steps scored [S].
         scores: of those that have been passed.
+        surprises: normalised innovation squared and components seen there, each [R]; of filters that tell.
         seconds: what scoring took.
     """
 
-    def __init__(self, model: StateSpaceModel, truth: Tensor, instants: int = 0) -> None:
+    def __init__(
+        self, model: StateSpaceModel, truth: Tensor, instants: int = 0, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
         steps = truth.shape[1]
-        self.model, self.truth = model, truth
+        self.model, self.truth, self.clock = model, truth, clock
         self.at = sorted({(k + 1) * steps // instants - 1 for k in range(instants)} - {-1})
         self.scores: list[Scores] = []
+        self.surprises: list[tuple[Tensor, Tensor]] = []
         self.seconds = 0.0
 
     def __call__(self, t: int, info: Info) -> dict[str, Tensor]:
@@ -68,22 +103,31 @@ class Judge:
         error = self.model.error(info.mean, self.truth[:, t])
         nees, covariance = [], info.covariance()
         for parts in map(list, self.model.groups.values()):
-            e = error[:, parts].unsqueeze(-1)
-            value = (e.mT @ torch.linalg.solve_ex(covariance[:, parts][:, :, parts], e)[0]).flatten()
-            known = ~torch.isnan(e).any(1).flatten()
+            e = error[:, parts]
+            value = squared_length(e, covariance[:, parts][:, :, parts])
+            known = ~torch.isnan(e).any(1)
             nees.append(torch.where(known & ~(value >= 0.0), torch.inf, value))
         if t in self.at:
-            begun = time.perf_counter()
+            begun = self.clock()
             self.scores.append(self._scored(t, error, covariance, info))
-            self.seconds += time.perf_counter() - begun
+            if info.nis is not None:
+                self.surprises.append(info.nis())
+            self.seconds += self.clock() - begun
         return {"error": error, "nees": torch.stack(nees, 1)}
 
     def arrays(self) -> dict[str, Tensor]:
-        """What was scored: steps [S], crps and pit [R, S, d], energy [R, S, G]; nothing where nothing was."""
+        """What was scored: steps [S], crps and pit [R, S, d], energy [R, S, G]; nothing where nothing was.
+
+        With them `nis` and `nis_dof` [R, S], from a filter that tells.
+        """
         if not self.scores:
             return {}
         parts = zip(Scores._fields, zip(*self.scores, strict=True), strict=True)
-        return {"scored": torch.tensor(self.at)} | {name: torch.stack(values, 1) for name, values in parts}
+        found = {"scored": torch.tensor(self.at)} | {name: torch.stack(values, 1) for name, values in parts}
+        if self.surprises:
+            nis, dof = zip(*self.surprises, strict=True)
+            found |= {"nis": torch.stack(nis, 1), "nis_dof": torch.stack(dof, 1)}
+        return found
 
     def _scored(self, t: int, error: Tensor, covariance: Tensor, info: Info) -> Scores:
         groups = self.model.groups.values()

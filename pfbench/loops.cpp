@@ -66,6 +66,18 @@ void log_normal(T* out, const T* y, const T* mean, const T* scale, const T* cons
     }
 }
 
+// How many of the values 0 to 2 N - 1 occur at slots that hold a particle.
+template <class T>
+void distinct(int64_t* count, const int64_t* value, const T* log_weight, int64_t runs, int64_t slots) {
+    std::vector<uint8_t> there(2 * slots);
+    for (int64_t r = 0; r < runs; ++r, value += slots, log_weight += slots) {
+        std::fill(there.begin(), there.end(), 0);
+        for (int64_t i = 0; i < slots; ++i) there[value[i]] |= log_weight[i] > -HUGE_VAL;
+        count[r] = 0;
+        for (const uint8_t one : there) count[r] += one;
+    }
+}
+
 template <class T>
 void moments(T* mean, T* variance, const T* x, const T* weight, int64_t components, int64_t runs, int64_t particles) {
     for (int64_t r = 0; r < runs; ++r)
@@ -89,8 +101,10 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
 #define LOG_NORMAL(T)                                                                                                       \
     (T* out, const T* y, const T* mean, const T* scale, const T* constant, const int64_t* stride, int64_t runs, int64_t n, int64_t k)
 #define MOMENTS(T) (T* mean, T* variance, const T* x, const T* w, int64_t d, int64_t runs, int64_t n)
+#define DISTINCT(T) (int64_t* count, const int64_t* value, const T* w, int64_t runs, int64_t slots)
 
 BOTH(systematic, SYSTEMATIC, (a, w, n, u, runs, slots))
 BOTH(gather, GATHER, (out, x, a, d, runs, slots, wanted))
 BOTH(log_normal, LOG_NORMAL, (out, y, mean, scale, constant, stride, runs, n, k))
+BOTH(distinct, DISTINCT, (count, value, w, runs, slots))
 BOTH(moments, MOMENTS, (mean, variance, x, w, d, runs, n))

@@ -65,6 +65,14 @@ def log_normal(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tens
     return out
 
 
+def distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:
+    """How many values there are in copy_of [R, N], below 2 N, at the slots whose log weight [R, N] is finite: [R]."""
+    runs, slots = copy_of.shape
+    counts = torch.empty(runs, dtype=torch.int64)
+    _call("distinct", log_w.dtype, counts, copy_of.contiguous(), log_w.contiguous(), runs, slots)
+    return counts
+
+
 def moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance [R, D] of x [R, N, D] by weights [R, N] whose sum is 1."""
     parts, (runs, particles, components) = x.permute(2, 0, 1).contiguous(), x.shape
@@ -84,6 +92,28 @@ def keep_memory() -> None:
     if tell is not None:
         for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
             tell(option, 1 << 30)
+
+
+def peak_from_here() -> int | None:
+    """The memory of the process, bytes, from which on `peak` is counted anew; None where the system does not tell (of Linux)."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:  # what an earlier job has left would hide what this one takes
+        trim(0)
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return None
+    return _memory("VmRSS")
+
+
+def peak() -> int:
+    """The most memory that the process has had since `peak_from_here`, bytes."""
+    return _memory("VmHWM")
+
+
+def _memory(name: str) -> int:
+    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name))
+    return 1024 * int(line.split()[1])
 
 
 def _drawn(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -11,11 +12,13 @@ from torch import Tensor
 
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Info
+from pfbench.filter.ensemble import EnsembleKalmanFilter
 from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.guided_noise import GuidedNoise
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.rules import Jacobian
-from pfbench.judge import Judge, of_cloud, of_normal
+from pfbench.judge import Judge, Tally, of_cloud, of_normal
 from pfbench.model.linear import linear_walk
 from pfbench.noise.regimes import Nominal
 from pfbench.scenario.model_world import ModelWorld
@@ -109,3 +112,41 @@ def test_an_honest_filter_is_calibrated_and_a_confident_one_is_not(method: Gauss
     assert p[1] < 1e-4
     assert (honest.arrays()["crps"] - proud.arrays()["crps"]).mean() < 0
     assert honest.seconds > 0
+
+
+@pytest.mark.parametrize("name", ["ekf", "sir", "enkf", "guided"])
+def test_the_normalised_innovation_is_chi_square_for_a_filter_that_is_right(name: str) -> None:
+    methods: dict[str, Any] = {
+        "ekf": GaussianFilter(Jacobian()),
+        "sir": ParticleFilter(2000),
+        "guided": ParticleFilter(2000, proposal=GuidedNoise(GaussianFilter(Jacobian()))),
+        "enkf": EnsembleKalmanFilter(2000),
+    }
+    runs, steps = 200, 10
+    episode = ModelWorld(MODEL, steps).draw(Nominal(), torch.arange(runs), 3)
+    y = episode.record.y.clone()
+    y[: runs // 2, 4] = torch.nan  # nothing is seen there
+    record = episode.record._replace(y=y)
+    judge = Judge(MODEL, MODEL.assemble(episode.truth), steps)
+    run_filter(methods[name], MODEL, record, MonteCarlo(3, torch.arange(runs)), judge)
+    found = judge.arrays()
+    nis, dof = found["nis"], found["nis_dof"]
+    assert torch.equal(dof, (~torch.isnan(y)).sum(-1))
+    assert (nis[dof == 0] == 0).all()
+    p = stats.kstest(nis[dof > 0].numpy(), stats.chi2(1).cdf).pvalue  # innovations of a right filter are independent
+    assert p > 1e-3, p
+    assert stats.kstest(1.2 * nis[dof > 0].numpy(), stats.chi2(1).cdf).pvalue < 1e-3  # one that is too sure would be seen
+
+
+def test_what_the_judge_asks_is_not_counted_as_the_filters_likelihoods() -> None:
+    model = linear_walk(1.0, 0.3, 1.0)
+    episode = ModelWorld(model, 6).draw(Nominal(), torch.arange(3), 3)
+    tally = Tally(model)
+    judge = Judge(model, model.assemble(episode.truth), 6)
+
+    def watch(t: int, info: Info) -> dict[str, Tensor]:
+        with tally.paused():
+            return judge(t, info)
+
+    run_filter(ParticleFilter(50), model, episode.record, MonteCarlo(3, torch.arange(3)), watch)
+    assert tally.count == 3 * 6 * 50

@@ -17,11 +17,15 @@ from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
+from pfbench import fusion, native
 from pfbench.chart import Chart, Euclidean, wrap
 from pfbench.draws import Draws, MonteCarlo
 from pfbench.filter.belief import Cloud, ess, weights
+from pfbench.filter.gaussian_particles import GaussianPrediction, GaussianRefresh
+from pfbench.filter.kernels import Flow
 from pfbench.filter.loop import Estimate, run_filter
-from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.moves import Metropolis
+from pfbench.filter.particle import ParticleFilter, distinct
 from pfbench.filter.preferences import LookAhead, Weights
 from pfbench.filter.proposals import Bootstrap, Proposed
 from pfbench.filter.resamplers import (
@@ -38,7 +42,9 @@ from pfbench.filter.resamplers import (
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear import LinearGaussian, linear_walk, local_level
 from pfbench.model.toys import Benes, Growth, Lorenz63, Pendulum, StochasticVolatility
+from pfbench.noise.regimes import Nominal
 from pfbench.record import Record
+from pfbench.scenario.model_world import ModelWorld
 
 SCHEMES: list[Scheme] = [Systematic(), Stratified(), Multinomial(), Residual(), Ssp(), Killing()]
 
@@ -639,3 +645,46 @@ def test_weights_of_particles_sum_to_one_in_both_precisions() -> None:
     lonely[0, 7] = 0.0
     assert float(ess(lonely)) == 1.0
     assert float(ess(torch.zeros(1, 100))) == pytest.approx(100.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Counting:
+    """The model's own noise; it notes how many different particles it is sent on from, in each run."""
+
+    different: list[list[int]]
+    exact = True
+
+    def __call__(self, model: StateSpaceModel, cloud: Cloud, seen: Record, draws: Draws) -> Proposed:
+        pairs = zip(cloud.x, torch.isfinite(cloud.log_w), strict=True)
+        self.different.append([len(set(map(tuple, own[live].tolist()))) for own, live in pairs])
+        return Bootstrap()(model, cloud, seen, draws)
+
+
+@pytest.mark.parametrize("fused", [False, True])
+@pytest.mark.parametrize("scheme", [Systematic(), Multinomial(), Killing()])
+@pytest.mark.parametrize("moving", [False, True])
+def test_distinct_particles_are_counted(fused: bool, scheme: Scheme, moving: bool) -> None:
+    model = linear_walk(1.0, 0.3, 0.3)
+    record = ModelWorld(model, 8).draw(Nominal(), torch.arange(4), 5).record
+    different: list[list[int]] = []
+    moves = (Metropolis(Flow(), sweeps=2),) if moving else ()
+    method = ParticleFilter(40, Resample(scheme), moves=moves, proposal=Counting(different))
+    with fusion.fused(fused):
+        trace = run_filter(method, model, record, MonteCarlo(5, torch.arange(4))).trace
+    assert bool(trace["resampled"].any())
+    assert trace["unique" if moving else "ancestors"].T.tolist() == different
+    assert ("unique" in trace) == moving
+    if moving:
+        assert bool((trace["unique"] >= trace["ancestors"]).all())
+        assert bool((trace["unique"] > trace["ancestors"]).any())
+
+
+def test_of_empty_slots_and_new_particles_no_ancestors_are_counted() -> None:
+    copies = torch.tensor([[0, 0, 2, 3], [1, 1, 5, 1]])
+    log_w = torch.tensor([[0.0, 0.0, -torch.inf, 0.0], [0.0, 0.0, 0.0, -torch.inf]], dtype=torch.float64)
+    for count in (distinct, native.distinct):
+        assert count(copies, log_w).tolist() == [2, 2]
+    method = ParticleFilter(10, resampler=GaussianRefresh(), proposal=GaussianPrediction())
+    model = linear_walk(1.0, 0.3, 0.3)
+    record = ModelWorld(model, 2).draw(Nominal(), torch.arange(2), 5).record
+    assert "ancestors" not in run_filter(method, model, record, MonteCarlo(5, torch.arange(2))).trace

@@ -27,6 +27,8 @@ class Cloud(NamedTuple):
         window: what moves need of the past, [R, N, L, ...], gathered with the particles.
         memory: the proposal's own, [R, N or 1, ...], gathered with the particles.
         past: what was seen at the steps in the window, oldest first, each as Record.at gives it.
+        copy_of: within a step, the slot that each particle copies since the refresh [R, N], N or more where a move made
+            it another one; None where particles were drawn anew.
     """
 
     x: Tensor
@@ -35,6 +37,7 @@ class Cloud(NamedTuple):
     window: dict[str, Tensor] = {}  # noqa: RUF012 (a NamedTuple default, never written to)
     memory: dict[str, Tensor] = {}  # noqa: RUF012
     past: tuple[Record, ...] = ()
+    copy_of: Tensor | None = None
 
 
 class Gaussian(NamedTuple):
@@ -63,6 +66,8 @@ class Info(NamedTuple):
         trace: anything per run, {name: [R]}, such as `ess` or `resampled`.
         cloud: gives the particles' deviations from the mean [R, N, d] and their log weights [R, N] to whoever asks; None from a
             filter whose law is the normal one.
+        nis: gives the normalised innovation squared [R] to whoever asks, that of what was seen under the mean and covariance that
+            the filter predicted for it, and how many components were seen [R]. None from a filter that does not tell.
     """
 
     mean: Tensor
@@ -70,6 +75,7 @@ class Info(NamedTuple):
     covariance: Callable[[], Tensor]
     trace: dict[str, Tensor]
     cloud: Callable[[], tuple[Tensor, Tensor]] | None = None
+    nis: Callable[[], tuple[Tensor, Tensor]] | None = None
 
 
 class Filter(Protocol):
@@ -98,6 +104,7 @@ def gather(cloud: Cloud, ancestors: Tensor) -> Cloud:
         log_w=cloud.log_w.gather(1, ancestors),
         window={k: _gather_rows(v, ancestors) for k, v in cloud.window.items()},
         memory={k: _gather_rows(v, ancestors) for k, v in cloud.memory.items()},
+        copy_of=ancestors,
     )
 
 
@@ -114,6 +121,7 @@ def where(hit: Tensor, new: Cloud, old: Cloud) -> Cloud:
         window={k: choose(v, old.window[k]) for k, v in new.window.items()},
         memory={k: choose(v, old.memory[k]) for k, v in new.memory.items()},
         past=new.past,
+        copy_of=None if new.copy_of is None else choose(new.copy_of, torch.arange(old.log_w.shape[1], device=hit.device)),
     )
 
 

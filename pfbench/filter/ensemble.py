@@ -129,6 +129,7 @@ class EnsembleKalmanFilter:
         d = self.inflation * chart.subtract(x, mean)
         x = chart.add(mean, d) if self.inflation != 1.0 else x
         forecast, log_like = _look(model, x, d, seen)
+        along = (forecast.r.unsqueeze(-2) @ forecast.vectors).squeeze(-2)
         moved = chart.add(mean, self.analysis(forecast, draws))
         sound = torch.isfinite(log_like) & torch.isfinite(moved).all(-1).all(-1)
         # a lost run stays lost (its evidence is -inf for good) but goes on from its prediction, so that nothing else breaks
@@ -136,7 +137,11 @@ class EnsembleKalmanFilter:
         cloud = belief._replace(x=torch.where(sound[:, None, None], moved, x), log_z=log_z)
         info = summarise(model, cloud, {})
         wider = n / (n - 1)
-        return cloud, info._replace(variance=wider * info.variance, covariance=lambda: wider * info.covariance())
+        return cloud, info._replace(
+            variance=wider * info.variance,
+            covariance=lambda: wider * info.covariance(),
+            nis=lambda: ((along.square() / (1.0 + forecast.values)).sum(-1), (~torch.isnan(seen.y)).sum(1)),
+        )
 
 
 def _look(model: StateSpaceModel, x: Tensor, d: Tensor, seen: Record) -> tuple[Forecast, Tensor]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from pfbench.covariance import factor
+from pfbench.covariance import factor, squared_length
 from pfbench.draws import Draws
 from pfbench.filter.belief import Gaussian, Info
 from pfbench.filter.rules import Linearised, Rule, Space
@@ -43,6 +43,10 @@ class Innovation(NamedTuple):
     def spread(self) -> Tensor:
         """Covariance of what is expected, for the state's spread alone [R, k, k]."""
         return self.m @ self.m.mT + (self.omega - self.noise)
+
+    def nis(self) -> tuple[Tensor, Tensor]:
+        """The normalised innovation squared and the number of components seen, each [R]."""
+        return squared_length(self.r, self.m @ self.m.mT + self.omega), self.seen.sum(1)
 
     def with_noise(self, noise: Tensor) -> Innovation:
         """The same with another measurement noise [R, k, k]; what is unseen keeps its 1."""
@@ -153,13 +157,13 @@ class GaussianFilter:
         """The belief at t-1 and what is seen at t -> the belief at t."""
         new = self.advance(model, belief, seen)
         covariance = new.root @ new.root.mT
-        info = Info(new.mean, covariance.diagonal(dim1=-2, dim2=-1), lambda: covariance, new.trace)
+        info = Info(new.mean, covariance.diagonal(dim1=-2, dim2=-1), lambda: covariance, new.trace, nis=new.innovation.nis)
         return Gaussian(new.mean, covariance, belief.log_z + new.log_like, new.memory), info
 
     def advance(self, model: StateSpaceModel, belief: Gaussian, seen: Record) -> Advance:
         """The same, with all that it took."""
         memory: dict[str, Tensor] = {}
-        predicted, rooted = self._predict(model, belief, seen.u)
+        predicted, rooted = self.predict(model, belief, seen.u)
         for adaptation in self.adaptations:
             predicted = adaptation.predict_scale(predicted, belief)
         covariance = predicted.m @ predicted.m.mT
@@ -183,7 +187,8 @@ class GaussianFilter:
         log_like = torch.where(rooted & positive & torch.isfinite(log_like), log_like, -torch.inf)
         return Advance(predicted.y, innovation.root, mean, innovation.root @ updated, innovation, log_like, memory, trace)
 
-    def _predict(self, model: StateSpaceModel, belief: Gaussian, u: Any) -> tuple[Linearised, Tensor]:
+    def predict(self, model: StateSpaceModel, belief: Gaussian, u: Any) -> tuple[Linearised, Tensor]:
+        """The step as the rule sees it, in coordinates whitened by the belief's root, and whether there is a root [R]."""
         chart, d = model.chart, model.chart.dimension
         root, ok = factor(belief.covariance)
         law = model.noise
@@ -270,14 +275,28 @@ def update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
     white = torch.linalg.solve_triangular(root, torch.cat([m, r.unsqueeze(-1)], -1), upper=False)  # Omega^-1/2 [M r]
     d = m.shape[-1]
     eye = torch.eye(d, dtype=m.dtype, device=m.device).expand(m.shape[0], -1, -1)
-    # least squares by QR: forming I + A' A would drown the 1 of a prior 1e8 times as wide as the measurement's noise
-    stacked = torch.cat([white, torch.nn.functional.pad(eye, (0, 1))], -2)
-    triangle = torch.linalg.qr(stacked, mode="r")[1]  # [[information root, score], [0, root of the distance]], of any sign
-    information, score, distance = triangle[:, :d, :d], triangle[:, :d, d:], triangle[:, d, d].square()
+    information, score, distance = _least_squares(white, eye)
     back = torch.linalg.solve_triangular(information, torch.cat([score, eye], -1), upper=True)
     scale = log_det(root) + log_det(information)
     log_like = -0.5 * distance - scale - 0.5 * LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float is float32
     return back[..., 0], back[..., 1:], torch.where(ok, log_like, torch.nan)
+
+
+def _least_squares(white: Tensor, eye: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of |A x - b|^2 + |x|^2, [A b] = `white`: root R of I + A' A, of any signs, R'^-1 A' b [R, d, 1], and the minimum [R].
+
+    By QR: forming I + A' A would drown the 1 of a prior 1e8 times as wide as the measurement's noise.
+    """
+    d = eye.shape[-1]
+    if not (white.requires_grad and torch.is_grad_enabled()):
+        triangle = torch.linalg.qr(torch.cat([white, torch.nn.functional.pad(eye, (0, 1))], -2), mode="r")[1]
+        return triangle[:, :d, :d], triangle[:, :d, d:], triangle[:, d, d].square()
+    # a gradient needs Q, and a triangle without zeros on its diagonal, where what was seen may be just what was expected
+    a, b = white[..., :d], white[..., d:]
+    q, information = torch.linalg.qr(torch.cat([a, eye], -2))
+    score = q[:, : a.shape[-2]].mT @ b
+    best = torch.linalg.solve_triangular(information, score, upper=True)
+    return information, score, (a @ best - b).square().sum((1, 2)) + best.square().sum((1, 2))
 
 
 def around_first(residual: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:

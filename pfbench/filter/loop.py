@@ -121,7 +121,16 @@ def _joined(infos: list[Info]) -> Info:
         deviations, log_w = zip(*(part() for part in clouds), strict=True)
         return torch.cat(deviations), torch.cat(log_w)
 
-    return Info(mean, variance, lambda: torch.cat([info.covariance() for info in infos]), trace, cloud if clouds else None)
+    surprises = [info.nis for info in infos if info.nis is not None]
+
+    def nis() -> tuple[Tensor, Tensor]:
+        lengths, counts = zip(*(part() for part in surprises), strict=True)
+        return torch.cat(lengths), torch.cat(counts)
+
+    def covariance() -> Tensor:
+        return torch.cat([info.covariance() for info in infos])
+
+    return Info(mean, variance, covariance, trace, cloud if clouds else None, nis if surprises else None)
 
 
 def fed_back(

@@ -142,9 +142,8 @@ class RaoBlackwellised:
         split = split_of(model, self.sampled)
         inner = ParticleFilter(self.particles, self.resampler, proposal=Marginalised(split), weigh=Given())
         cloud, info = inner.step(model, belief, seen, draws)
-        if not split.linear:
-            return cloud, info
-        return cloud, _with_conditional(info, cloud, split)
+        info = info._replace(nis=None)  # the ratio of its proposal holds what was seen
+        return cloud, _with_conditional(info, cloud, split) if split.linear else info
 
 
 def split_of(model: StateSpaceModel, sampled: Sequence[str] | None) -> Split:

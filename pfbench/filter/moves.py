@@ -80,12 +80,12 @@ class Metropolis:
             return cloud, rate
         if cloud.x.is_cuda:  # there a mask is cheaper than waiting for the number of runs
             moved, accepted = self._sweep(model, cloud, draws)
-            return _put(cloud, moved, None, hit), torch.where(hit, accepted, rate)
+            return _put(cloud, moved, None, hit), torch.where(hit, self._rate(accepted, cloud.log_w), rate)
         rows = hit.nonzero().squeeze(1)
         if len(rows) == 0:
             return cloud, rate
         moved, accepted = self._sweep(model, _pick(cloud, rows), of_runs(draws, rows))
-        return _put(cloud, moved, rows, hit), rate.index_copy(0, rows, accepted)
+        return _put(cloud, moved, rows, hit), rate.index_copy(0, rows, self._rate(accepted, moved.log_w))
 
     def _sweep(self, model: StateSpaceModel, cloud: Cloud, draws: Draws) -> tuple[Cloud, Tensor]:
         living = torch.isfinite(cloud.log_w)
@@ -97,7 +97,13 @@ class Metropolis:
             accept = toss < log_alpha  # never where it is NaN
             cloud = _choose(accept, proposed, cloud)
             accepted = accepted + (accept & living)
-        return cloud, accepted.sum(1) / (self.sweeps * living.sum(1))
+        if cloud.copy_of is not None:
+            itself = torch.arange(living.shape[1], 2 * living.shape[1], device=accepted.device)
+            cloud = cloud._replace(copy_of=torch.where(accepted > 0.0, itself, cloud.copy_of))
+        return cloud, accepted
+
+    def _rate(self, accepted: Tensor, log_w: Tensor) -> Tensor:
+        return accepted.sum(1) / (self.sweeps * torch.isfinite(log_w).sum(1))
 
 
 @dataclass(frozen=True)
@@ -153,6 +159,7 @@ def _pick(cloud: Cloud, rows: Tensor) -> Cloud:
         log_z=cloud.log_z[rows],
         window={name: of(a) for name, a in cloud.window.items()},
         past=tuple(Record(seen.y[rows], map_inputs(some, seen.u)) for seen in cloud.past),
+        copy_of=None if cloud.copy_of is None else cloud.copy_of[rows],
     )
 
 
@@ -167,7 +174,10 @@ def _put(cloud: Cloud, moved: Cloud, rows: Tensor | None, hit: Tensor) -> Cloud:
         return new if len(rows) == len(old) else old.index_copy(0, rows, new)
 
     window = {name: back(old, moved.window[name]) for name, old in cloud.window.items()}
-    return cloud._replace(x=back(cloud.x, moved.x), window=window)
+    copy_of = None
+    if cloud.copy_of is not None and moved.copy_of is not None:
+        copy_of = back(cloud.copy_of, moved.copy_of)
+    return cloud._replace(x=back(cloud.x, moved.x), window=window, copy_of=copy_of)
 
 
 def _choose(accept: Tensor, new: Cloud, old: Cloud) -> Cloud:

@@ -10,9 +10,12 @@ import torch
 from torch import Tensor
 
 from pfbench import native
+from pfbench.covariance import squared_length
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, Info, weights
 from pfbench.filter.derived_draws import named
+from pfbench.filter.gaussian import around_first
+from pfbench.filter.linearisation import where_seen
 from pfbench.filter.moves import Move, together
 from pfbench.filter.points import Independent, Points
 from pfbench.filter.preferences import Preference, Weights
@@ -106,18 +109,24 @@ class ParticleFilter:
         trace: dict[str, Tensor] = {}
         log_a = self.preference(model, belief, seen)
         cloud, trace["resampled"] = self.resampler(model, belief, log_a, self.size(belief), draws)
+        if cloud.copy_of is not None:
+            trace["ancestors"] = distinct(cloud.copy_of, cloud.log_w)
         for i, move in enumerate(self.moves):
             cloud, trace[f"accepted_{i}"] = move(model, cloud, trace["resampled"], named(draws, f"move_{i}."))
-        x, log_ratio, memory, w = self.proposal(model, cloud, seen, draws)
+        if self.moves and cloud.copy_of is not None:
+            trace["unique"] = distinct(cloud.copy_of, cloud.log_w)
+        x, log_ratio, memory, w, told = self.proposal(model, cloud, seen, draws)
         log_w = self.weigh(model, cloud.log_w, x, log_ratio, seen)
         x, log_w = bury(x, log_w, cloud.x)
+        predicted, expected = x, cloud.log_w + log_ratio
         # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
         log_w, total, trace["ess"] = _normalise(log_w)
         parents, keeper = cloud, self.keeper
-        cloud = cloud._replace(x=x, log_w=log_w, log_z=belief.log_z + total, memory=memory)
+        cloud = cloud._replace(x=x, log_w=log_w, log_z=belief.log_z + total, memory=memory, copy_of=None)
         if keeper is not None:
             cloud = keeper.follow(model, parents, cloud, w, seen)
-        return cloud, summarise(model, cloud, trace)
+        info = summarise(model, cloud, trace | told)
+        return cloud, info._replace(nis=lambda: surprise(model, predicted, expected, seen))
 
 
 def _normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,6 +135,29 @@ def _normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     lost = ~torch.isfinite(total)
     log_w = torch.where(lost[:, None], -math.log(log_w.shape[1]), log_w - total[:, None])
     return log_w, torch.where(lost, -torch.inf, total), 1.0 / torch.exp(2.0 * log_w).sum(1)
+
+
+def surprise(model: StateSpaceModel, x: Tensor, log_w: Tensor, seen: Record) -> tuple[Tensor, Tensor]:
+    """Normalised innovation squared [R] of a predicted cloud x [R, N, D], log weights [R, N]; components seen [R]."""
+    law: Any = model.observation(x, seen.u)
+    w, there = weights(log_w).unsqueeze(-1), ~torch.isnan(seen.y)
+    y_hat = around_first(model.residual)(law.mean, w.squeeze(-1))
+    off = torch.where(w > 0.0, model.residual(law.mean, y_hat.unsqueeze(1)), 0.0)
+    if isinstance(law, torch.distributions.MultivariateNormal):
+        noise = (w.unsqueeze(-1) * law.covariance_matrix).sum(1)
+    else:
+        noise = torch.diag_embed((w * law.variance).sum(1))
+    r = torch.where(there, model.residual(seen.y.nan_to_num(), y_hat), 0.0)
+    return squared_length(r, where_seen((w * off).mT @ off + noise, there)), there.sum(1)
+
+
+def _marked(copy_of: Tensor, log_w: Tensor) -> Tensor:
+    """How many values there are in copy_of [R, N], below 2 N, at the slots that hold a particle: [R]."""
+    marks = torch.zeros(len(copy_of), 2 * copy_of.shape[1], dtype=log_w.dtype, device=log_w.device)
+    return (marks.scatter_add_(1, copy_of, (log_w > -torch.inf).to(log_w.dtype)) > 0.0).sum(1)
+
+
+distinct = fusible(_marked, by_hand=native.distinct)
 
 
 def bury(x: Tensor, log_w: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,12 +22,14 @@ class Proposed(NamedTuple):
         log_ratio: [R, N] log p(w) - log q(w) of the noise that led there.
         memory: as in Cloud.
         w: that noise [R, N, W], for moves that need it; None from a proposal that does not go through the noise.
+        trace: anything per run, for the report {name: [R]}.
     """
 
     x: Tensor
     log_ratio: Tensor
     memory: dict[str, Tensor]
     w: Tensor | None = None
+    trace: dict[str, Tensor] = {}  # noqa: RUF012 (a NamedTuple default, never written to)
 
 
 class Proposal(Protocol):

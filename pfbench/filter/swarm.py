@@ -122,13 +122,14 @@ class Swarm:
         w = draw_noise(model, parents.shape[1], draws)
         x, log_w = bury(model.propagate(parents, seen.u, w), cloud.log_w, parents)
         frame = self.coordinates(model, x, weights(log_w), seen.u)
-        flock, _ = self.fly(model, frame, torch.isfinite(log_w), memory, seen, draws)
+        flock, flown = self.fly(model, frame, torch.isfinite(log_w), memory, seen, draws)
         here = model.log_likelihood(seen.y, frame.place(flock.q), seen.u)
         q, log_ratio = self.weights(frame, flock.q, here, log_w, draws)
         if self.perturbation:
             chaos = memory["swarm.chaos"].index_copy(-1, frame.components, flock.chaos.unsqueeze(1))
             memory = memory | {"swarm.chaos": chaos}
-        return Proposed(frame.place(q), torch.where(torch.isfinite(log_w), log_ratio, -torch.inf), memory)
+        log_ratio = torch.where(torch.isfinite(log_w), log_ratio, -torch.inf)
+        return Proposed(frame.place(q), log_ratio, memory, trace={"iterations": flown})
 
     def fly(
         self, model: StateSpaceModel, frame: Frame, live: Tensor, memory: dict[str, Tensor], seen: Record, draws: Draws

@@ -31,8 +31,8 @@ STATISTICS = {  # and what each needs beside a
     "within": "low high", "near": "printed", "flat": "", "falls": "", "share": "low", "cost": "", "report": "",
 }  # fmt: skip
 METRICS = (
-    "rmse", "max_error", "mean_abs", "settled", "growth", "sd", "nees", "ess", "effective", "accepted", "diverged",
-    "seconds_per_step",
+    "rmse", "max_error", "mean_abs", "settled", "growth", "sd", "nees", "ess", "effective", "ancestors",
+    "unique", "accepted", "iterations", "diverged", "seconds_per_step",
 )  # fmt: skip
 SCALED = ("rmse", "max_error", "mean_abs", "settled", "growth", "sd")  # of a block of components, in the unit shown
 GROUPS = (

@@ -11,7 +11,7 @@ import pandas as pd
 
 from pfbench import metrics, store
 from pfbench.report.claims import SCALED, Claim, Comparison
-from pfbench.report.frame import Cell, Job, at_instants, blocks, cells, later
+from pfbench.report.frame import Cell, Job, at_instants, blocks, cells, later, of_trace
 
 _COLUMNS = ["study", "cell", "label", "measure", "seed", "run", "lost", "unit", "value"]
 
@@ -62,7 +62,9 @@ def measured(result: store.Result, test: Comparison) -> np.ndarray:
         if test.group not in groups:
             raise ValueError(f"{result.meta['key']}: nees is of whole groups, and there is no {test.group!r} in {list(groups)}")
         return metrics.mean_per_run(arrays["nees"][..., list(groups).index(test.group)], lost)
-    if test.metric in ("ess", "effective", "accepted"):
+    if test.metric in ("ess", "ancestors", "unique", "iterations"):
+        return of_trace(result, test.metric)
+    if test.metric in ("effective", "accepted"):
         return _of_traces(result, test.metric)
     if test.metric == "diverged":
         dofs = [len(parts) for parts in groups.values()]
@@ -116,7 +118,7 @@ def _of_traces(result: store.Result, metric: str) -> np.ndarray:
         return np.full(lost.size, np.nan)
     if metric == "accepted":
         trace = np.where(arrays["resampled"], trace, np.nan)
-    return metrics.mean_per_run(trace, lost) / (result.meta["particles"] if metric == "ess" else 1)
+    return metrics.mean_per_run(trace, lost)
 
 
 def _of_errors(result: store.Result, test: Comparison) -> np.ndarray:

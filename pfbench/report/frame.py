@@ -21,7 +21,8 @@ _DISPLAY = {
 }
 
 COVERAGES = (50, 90, 99)  # per cent of the central regions
-_SCORES = ("crps", "pit", "energy")
+_COUNTED = ("ess", "ancestors", "unique")  # of particles
+_SCORES = ("crps", "pit", "energy", "nis", "nis_dof")
 
 
 class Job(NamedTuple):
@@ -93,8 +94,9 @@ def frame(
 
     Returns:
         Columns study, key, scenario, noise, model, filter, label, particles, seed, run, lost, group, component, unit,
-        metric, value. Metrics: rmse (each component, and "norm" of the group), max_error, nees, ess (share of the
-        particles), log_evidence, seconds_per_step, converged; and of jobs that were scored crps (each component, and "mean" of
+        metric, value. Metrics: rmse (each component, and "norm" of the group), max_error, nees, ess, ancestors and unique (shares of
+        the particles: effective, that are copied at a refresh, that differ after it and its moves), iterations (of a swarm),
+        log_evidence, seconds_per_step, converged; and of jobs that were scored nis (per component seen), crps (each component, and "mean" of
         the group), energy, and coverage_50, _90, _99, the share of truths in the central regions of these per cents. A lost run
         has infinite errors and scores, and NaN elsewhere.
 
@@ -211,10 +213,27 @@ def _rows(result: store.Result, converged: Mapping[str, float]) -> Iterator[pd.D
             yield _column("converged", when, block.group, "norm", "s")
     for g, group in enumerate(meta["state"]["groups"]):
         yield _column("nees", metrics.mean_per_run(arrays["nees"][..., g], lost), group, "norm")
-    if "ess" in arrays and meta.get("particles"):
-        yield _column("ess", metrics.mean_per_run(arrays["ess"], lost) / meta["particles"])
+    for name in (*_COUNTED, "iterations"):
+        trace = of_trace(result, name)
+        if not np.isnan(trace).all():
+            yield _column(name, trace)
+    if "nis" in arrays:
+        nis, dof = (metrics.mean_per_run(arrays[name], lost) for name in ("nis", "nis_dof"))
+        yield _column("nis", np.divide(nis, dof, out=np.full(lost.size, np.nan), where=dof > 0))
     yield _column("log_evidence", np.where(lost, np.nan, arrays["log_evidence"]))
     yield _column("seconds_per_step", np.full(lost.size, meta["seconds"]["per_step"]), unit="s")
+
+
+def of_trace(result: store.Result, name: str) -> np.ndarray:
+    """Mean over time of a trace, as a share of the particles where it counts them, on each run [R]; NaN where there is none.
+
+    Particles that no move has changed are as many as they have ancestors.
+    """
+    arrays, lost, particles = result.arrays, result.arrays["lost"], result.meta.get("particles")
+    trace = arrays.get("ancestors" if name == "unique" and "unique" not in arrays else name)
+    if trace is None or (name in _COUNTED and not particles):
+        return np.full(lost.size, np.nan)
+    return metrics.mean_per_run(trace, lost) / (particles if name in _COUNTED else 1)
 
 
 def _scored(arrays: Mapping[str, np.ndarray], lost: np.ndarray, block: Block, groups: list[str]) -> Iterator[pd.DataFrame]:
