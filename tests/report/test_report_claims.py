@@ -58,7 +58,7 @@ def swept(study: str) -> dict[str, set[str]]:
     for values in product(*params.values()):
         one = {**chosen, **dict(zip(params, values, strict=True))}
         model = chosen.get("model") or home(one["scenario"])
-        told = sorted(f"{key.removeprefix('filter.')}={value}" for key, value in one.items() if "." in key)
+        told = sorted(f"{key.removeprefix('filter.')}={value}" for key, value in one.items() if "." in key and len(params[key]) > 1)
         name = f"{one['filter']}[{','.join(told)}]" if told else one["filter"]
         ran.setdefault(f"{one['scenario']}/{one['noise']}/{model}", set()).add(name)
     return ran
