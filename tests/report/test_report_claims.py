@@ -58,7 +58,8 @@ def swept(study: str) -> dict[str, set[str]]:
     for values in product(*params.values()):
         one = {**chosen, **dict(zip(params, values, strict=True))}
         model = chosen.get("model") or home(one["scenario"])
-        told = sorted(f"{key.removeprefix('filter.')}={value}" for key, value in one.items() if "." in key and len(params[key]) > 1)
+        several = [key for key in one if "." in key and len(params[key]) > 1]
+        told = sorted(f"{key.removeprefix('filter.')}={one[key]}" for key in several)
         name = f"{one['filter']}[{','.join(told)}]" if told else one["filter"]
         ran.setdefault(f"{one['scenario']}/{one['noise']}/{model}", set()).add(name)
     return ran
