@@ -282,13 +282,15 @@ def test_the_linear_transition_carries_errors_of_constant_biases_over_a_whole_fl
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scenario", "seed"), [("t003", 11), ("t004", 12)])
-def test_the_kalman_filter_is_consistent_on_flights_that_its_model_did_not_draw(scenario: str, seed: int) -> None:
-    """Normalised errors at the end, state by state, and NEES of groups; both chi-square where the model is right."""
+def test_the_kalman_filter_is_consistent_on_flights_that_its_model_did_not_draw() -> None:
+    """Normalised errors at the end, state by state, and NEES of groups; both chi-square where the model is right.
+
+    Of 18 states; scenario/test_consistency.py has the 15 of t003, where the INS is corrected.
+    """
     runs, level = 40, 1e-4  # of each of some twenty bands
-    cfg = composed(f"scenario={scenario}", "worlds=null")
+    cfg = composed("scenario=t004", "scenario.imu_rate=20", "worlds=null")
     model = job.build(cfg.model)
-    episode = job.build(cfg.scenario).draw(Nominal(), torch.arange(runs), seed)
+    episode = job.build(cfg.scenario).draw(Nominal(), torch.arange(runs), 12)
     estimate = filtered(Points(Cubature()), model, episode)
     assert not estimate.lost.any()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -88,28 +89,35 @@ class SimulatedFlight:
 
     def fly(self, noise: Regime, runs: Tensor, seed: int) -> tuple[Flown, Arrays, Tensor, Arrays]:
         """The flight of these runs, the INS's true errors by group, the track [1, T, 3], and what a datasheet draws of it."""
-        flight = self.path.fly(self.imu_rate)
         per = round(self.imu_rate * self.interval)
+        path = cache(lambda: self.path.fly(self.imu_rate))  # once, and only where something is not on disk: it may be costly
+        course = cached(self.cache, ("course 1", self.path, self.imu_rate, self.interval), lambda: self._course(path(), per))
+        process = step_process(noise, course["samples"][1:])
+        swell = None if bool((process == 1.0).all()) else hashlib.sha256(process.numpy().tobytes()).hexdigest()
+        recipe = ("flight 6", self.path, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist(), swell)
+        world = cached(self.cache, recipe, lambda: self._simulate(path(), per, process, MonteCarlo(seed, runs)))
+        truth = {name[6:]: value for name, value in world.items() if name.startswith("truth.")}
+        intervals = strapdown.Intervals(*(world[name] for name in strapdown.Intervals._fields))
+        flown = Flown(course["time"], course["pos"], course["vel"], course["dcm"], intervals)
+        plan = earth.local_enu(flown.pos, course["origin"])[:, :2]
+        height = flown.pos[:, 2:] - course["origin"][2]  # above the ellipsoid: the tangent plane is 100 m up after 36 km
+        sheet = {name: course[name] for name in ("force", "rate")}
+        return flown, truth, torch.cat([plan, height], -1).unsqueeze(0), sheet
+
+    def _course(self, flight: trajectory.Flight, per: int) -> Arrays:
+        """The path at the ends of the intervals, what ideal sensors mean over each, and the times of all samples."""
         if len(flight.dtheta) % per:
             raise ValueError(
                 f"scenario.interval={self.interval}: the flight's {flight.time[-1]:g} s are no whole number of intervals; "
                 "give one that divides them, or make a segment longer"
             )
-        process = step_process(noise, flight.time[1:])
-        swell = None if bool((process == 1.0).all()) else hashlib.sha256(process.numpy().tobytes()).hexdigest()
-        recipe = ("flight 6", self.path, self.imu, self.initial, self.imu_rate, self.interval, seed, runs.tolist(), swell)
-        world = cached(self.cache, recipe, lambda: self._simulate(flight, per, process, MonteCarlo(seed, runs)))
-        truth = {name[6:]: value for name, value in world.items() if name.startswith("truth.")}
-        intervals = strapdown.Intervals(*(world[name] for name in strapdown.Intervals._fields))
-        ends = flight.time[per::per], flight.pos[per::per], flight.vel[per::per], flight.dcm[per::per]
-        flown = Flown(*ends, intervals)
-        plan = earth.local_enu(flown.pos, flight.pos[0])[:, :2]
-        height = flown.pos[:, 2:] - flight.pos[0, 2]  # above the ellipsoid: the tangent plane is 100 m up after 36 km
-        sheet = {
+        ends = {name: getattr(flight, name)[per::per].contiguous() for name in ("time", "pos", "vel", "dcm")}
+        return ends | {
+            "origin": flight.pos[0],
+            "samples": flight.time,
             "force": flight.dv.unflatten(0, (-1, per)).mean(1) * self.imu_rate,
             "rate": flight.dtheta.unflatten(0, (-1, per)).mean(1) * self.imu_rate,
         }
-        return flown, truth, torch.cat([plan, height], -1).unsqueeze(0), sheet
 
     def _simulate(self, flight: trajectory.Flight, per: int, process: Tensor, draws: MonteCarlo) -> Arrays:
         """True errors and nominal trajectory at the ends of the intervals."""

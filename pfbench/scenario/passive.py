@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from pfbench.chart import wrap
 from pfbench.draws import MonteCarlo
-from pfbench.model.passive_location import SPEED_OF_LIGHT, Platform, level_attitude, look, relative
+from pfbench.model.passive_location import Platform, level_attitude, look, relative
 from pfbench.noise.regimes import Regime, step_process
 from pfbench.record import Channels, Episode, Record
+from pfbench.scenario.first_look import FirstFix, Look, Start
 
 _KINDS = ("angle", "angle", "rate", "rate", "rate")
 
@@ -41,6 +42,9 @@ class AirborneLocation:
         steps: looks after the first.
         interval: s between looks.
         accelerating: the true Doppler rate feels the emitter's acceleration over the interval before (the models never do).
+        start: what filters make of the first look: the printed fix, or its moments.
+        drawn: each run draws its emitter from what `Moments` believes before the first look: in the direction of
+            `target_position` at a horizontal range between the limits, all as likely, with a velocity about 0.
 
     Raises:
         ValueError: an argument of the wrong length or sign; an aircraft without course; on drawing, a regime that hides the first
@@ -61,6 +65,8 @@ class AirborneLocation:
     steps: int = 100
     interval: float = 1.0
     accelerating: bool = False
+    start: Start = field(default_factory=FirstFix)
+    drawn: bool = False
 
     def __post_init__(self) -> None:
         sizes = {"target_position": 2, "target_velocity": 2, "aircraft_position": 3, "aircraft_velocity": 3}
@@ -90,17 +96,17 @@ class AirborneLocation:
         true, told = self._platforms(draws, time)
         y = self._seen(target, push, true) + noise.errors(draws, Channels(_vector(self.measurement_sd), _KINDS, (0,) * 5), time)
         y = torch.cat([wrap(y[..., :1]), y[..., 1:]], -1)
+        if bool(torch.isnan(y[:, 0]).any()):
+            raise ValueError("noise: the regime hides the first look, from which filters start; let its windows begin after 0 s")
         first = Platform(*(a[:, 0] for a in told))
-        start, spread, clipped = first_fix(
-            y[:, 0], first, _vector(self.measurement_sd), self.velocity_sd, (self.range_limits[0], self.range_limits[1])
-        )
+        limits = self.range_limits[0], self.range_limits[1]
+        start, spread, said = self.start.law(Look(y[:, 0], first, _vector(self.measurement_sd), self.velocity_sd, limits))
         record = Record(y[:, 1:], Platform(*(a[:, 1:] for a in told)), start, spread)
         truth = {"position": target[:, 1:, :2], "velocity": target[:, 1:, 2:]}
         track = torch.nn.functional.pad(truth["position"], (0, 1))
         planned = _vector(self.target_position) + time[1:, None] * _vector(self.target_velocity)
         away = (planned - true.position[0, 1:, :2]).norm(dim=-1)
-        share = f"range of the first look clipped in {int(clipped.sum())} of {len(runs)} runs"
-        return Episode(record, time[1:], truth, track, (share,), {"range": away})
+        return Episode(record, time[1:], truth, track, (said,), {} if self.drawn else {"range": away})
 
     def _wander(self, noise: Regime, draws: MonteCarlo, time: Tensor) -> tuple[Tensor, Tensor]:
         """The emitter [R, T + 1, 4] and its acceleration over the interval before, 0 at the start [R, T + 1, 2]."""
@@ -108,11 +114,22 @@ class AirborneLocation:
         swell = step_process(noise, time[1:]).sqrt()[:, None]
         push = self.acceleration_sd * swell * draws.normal("world.target", self.steps, 2)
         push = torch.nn.functional.pad(push, (0, 0, 1, 0))
-        velocity = _vector(self.target_velocity) + t * push.cumsum(1)
+        place, motion = self._emitters(draws)
+        velocity = motion + t * push.cumsum(1)
         # a step moves it by T v + T^2/2 a from the velocity before, that is by T v - T^2/2 a from the one after
-        position = _vector(self.target_position) + (t * velocity - 0.5 * t * t * push)[:, 1:].cumsum(1)
-        begin = _vector(self.target_position).expand(len(push), 1, 2)
-        return torch.cat([torch.cat([begin, position], 1), velocity], -1), push
+        position = place + (t * velocity - 0.5 * t * t * push)[:, 1:].cumsum(1)
+        return torch.cat([torch.cat([place.expand(len(push), 1, 2), position], 1), velocity], -1), push
+
+    def _emitters(self, draws: MonteCarlo) -> tuple[Tensor, Tensor]:
+        """Place and velocity at time 0, [2] or [R, 1, 2]."""
+        place, motion = _vector(self.target_position), _vector(self.target_velocity)
+        if not self.drawn:
+            return place, motion
+        here = _vector(self.aircraft_position)[:2]
+        ahead = (place - here) / (place - here).norm()
+        near, far = self.range_limits
+        away = near + (far - near) * draws.uniform("world.emitter.range", 1, 1)
+        return here + away * ahead, self.velocity_sd * draws.normal("world.emitter.velocity", 1, 2)
 
     def _platforms(self, draws: MonteCarlo, time: Tensor) -> tuple[Platform, Platform]:
         """The aircraft as it is [1, T + 1, ...], and as filters are given it [R or 1, T + 1, ...]."""
@@ -131,51 +148,6 @@ class AirborneLocation:
         p, v = relative(target.transpose(0, 1), at_all)  # [T + 1, R, 3]
         a = torch.nn.functional.pad(push, (0, 1)).transpose(0, 1) @ at_all.attitude.mT if self.accelerating else None
         return look(p, v, at_all.carrier.unsqueeze(-1), a).transpose(0, 1)
-
-
-def first_fix(
-    z: Tensor, own: Platform, sd: Tensor, velocity_sd: float, limits: tuple[float, float]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The initial law of a run from its first look [Pu and Qin, section 3.2; the covariance is in words there].
-
-    The range follows from the Doppler rate and the rates of the angles, r = -lambda fd' / (eps'^2 + beta'^2 cos^2 eps); it is
-    clipped to the limits. Along the horizontal line of sight the deviation is the range's to first order, at most a quarter of
-    the limits' distance; across it, range times that of the bearing. Velocity 0. [ours]
-
-    Args:
-        z: first look [R, 5].
-        own: the aircraft as it is given at that time [R or 1, ...].
-        sd: of the measurement [5].
-        velocity_sd: m/s.
-        limits: of the range, m.
-
-    Returns:
-        start [R, 4], Cholesky factor of the covariance [R, 4, 4], runs whose range was clipped [R].
-
-    Raises:
-        ValueError: a first look that is hidden.
-    """
-    if bool(torch.isnan(z).any()):
-        raise ValueError("noise: the regime hides the first look, from which filters start; let its windows begin after 0 s")
-    bearing, elevation, turning, rising, doppler = z.unbind(-1)
-    length = SPEED_OF_LIGHT / own.carrier
-    cos = torch.cos(elevation)
-    rate2 = rising.square() + (turning * cos).square()
-    raw = -length * doppler / rate2
-    r = raw.clamp(*limits)
-    slope = (length / rate2).square()
-    variance = slope * (sd[4] ** 2 + (2.0 * doppler / rate2).square() * ((turning * sd[2]).square() + (rising * sd[3]).square()))
-    along = cos * variance.sqrt().clamp(max=(limits[1] - limits[0]) / 4.0)
-    ahead = torch.stack([torch.sin(bearing), torch.cos(bearing), torch.zeros_like(bearing)], -1)
-    sight = torch.cat([ahead[..., :2] * cos.unsqueeze(-1), torch.sin(elevation).unsqueeze(-1)], -1)
-    fix = own.position + r.unsqueeze(-1) * (sight.unsqueeze(-2) @ own.attitude).squeeze(-2)
-    start = torch.cat([fix[..., :2], torch.zeros_like(fix[..., :2])], -1)
-    u = (ahead.unsqueeze(-2) @ own.attitude).squeeze(-2)[..., :2]
-    axes = torch.stack([u, torch.stack([-u[..., 1], u[..., 0]], -1)], -1)  # columns along and across
-    root = axes * torch.stack([along, r * cos * sd[0]], -1).unsqueeze(-2)
-    spread = torch.zeros(len(z), 4, 4, dtype=z.dtype) + velocity_sd * torch.eye(4, dtype=z.dtype)
-    spread[:, :2, :2] = torch.linalg.cholesky(root @ root.mT)
-    return start, spread, raw != r
 
 
 def _vector(values: Sequence[float]) -> Tensor:

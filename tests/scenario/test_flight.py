@@ -20,7 +20,7 @@ from pfbench.model.ins_gnss import InsGnss
 from pfbench.nav import attitude, earth, sensors
 from pfbench.nav.aiding import Alignment, Receiver
 from pfbench.nav.sensors import ImuErrors
-from pfbench.nav.trajectory import Manoeuvres, Start, accelerate, climb, cruise, turn
+from pfbench.nav.trajectory import Flight, Manoeuvres, Start, accelerate, climb, cruise, turn
 from pfbench.noise.regimes import Nominal, Outage, Outliers, Regime, StudentT
 from pfbench.record import Episode
 from pfbench.scenario.flight import SimulatedFlight
@@ -113,30 +113,55 @@ def test_a_cached_world_is_the_fresh_one(tmp_path: Path) -> None:
     fresh = world([0, 1])
     first = world([0, 1], flight=kept)
     files = sorted(tmp_path.iterdir())
-    stamp = files[0].stat().st_mtime_ns
+    stamps = [file.stat().st_mtime_ns for file in files]
     second = world([0, 1], flight=kept)
     assert same(fresh, first) == same(fresh, second) == []
-    assert [file.suffix for file in files] == [".npz"]  # one world, and no half-written file
+    assert [file.suffix for file in files] == [".npz"] * 2  # the path and one world, and no half-written file
     assert sorted(tmp_path.iterdir()) == files
-    assert files[0].stat().st_mtime_ns == stamp
+    assert [file.stat().st_mtime_ns for file in files] == stamps
 
 
 def test_the_cache_holds_no_receiver_noise_and_tells_worlds_apart(tmp_path: Path) -> None:
     kept = replace(FLIGHT, cache=str(tmp_path))
     for noise in REGIMES:
         assert same(world([0, 1], noise, flight=kept), world([0, 1], noise)) == []
-    assert len(list(tmp_path.iterdir())) == 1  # all regimes share one flown world
+    assert len(list(tmp_path.iterdir())) == 2  # all regimes share one path and one flown world
     others = [
         world([0, 2], flight=kept),
         world([0, 1], seed=SEED + 1, flight=kept),
         world([0, 1], flight=replace(kept, imu=replace(kept.imu, gyro_bias_deg_h=0.6))),
         world([0, 1], flight=replace(kept, initial=Alignment((10.0, 10.0, 60.0), (1.0, 1.0, 1.0), (10.0, 10.0, 11.0)))),
+    ]
+    assert len(list(tmp_path.iterdir())) == 2 + len(others)  # along the same path
+    others += [
         world([0, 1], flight=replace(kept, path=replace(PATH, segments=(*PATH.segments, cruise(1.0))))),
         world([0, 1], flight=replace(kept, interval=0.4)),
+        world([0, 1], flight=replace(kept, imu_rate=100.0)),
     ]
-    assert len(list(tmp_path.iterdir())) == 1 + len(others)
+    assert len(list(tmp_path.iterdir())) == 2 + len(others) + 3
     world([0, 1], flight=replace(kept, receiver=Receiver((1.0, 1.0, 1.0))))
-    assert len(list(tmp_path.iterdir())) == 1 + len(others)  # a receiver only measures
+    assert len(list(tmp_path.iterdir())) == 2 + len(others) + 3  # a receiver only measures
+
+
+def test_a_path_that_is_costly_is_flown_once(tmp_path: Path) -> None:
+    class Costly:
+        """A path that remembers how often it was flown."""
+
+        flown = 0
+
+        def __repr__(self) -> str:
+            return "costly"
+
+        def fly(self, rate: float) -> Flight:
+            Costly.flown += 1
+            return PATH.fly(rate)
+
+    kept = replace(FLIGHT, cache=str(tmp_path), path=Costly())
+    for _ in range(3):
+        assert same(world([0, 1], flight=kept), world([0, 1])) == []
+    assert Costly.flown == 1
+    world([2], StudentT(4), flight=kept)  # other sensors along it
+    assert Costly.flown == 2
 
 
 # the truth

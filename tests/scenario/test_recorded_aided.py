@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from recorded_data import believed
+from hydra import compose, initialize_config_dir
+from recorded_data import believed, recorded
 from scipy.spatial.transform import Rotation
 from synthetic_log import tables, write
 
+from pfbench import job
+from pfbench.cli import conf_dir
 from pfbench.model.strapdown_aided import BelievedAided, StrapdownAided
 from pfbench.noise.regimes import Nominal, Outage
 from pfbench.noise.surges import Surge
@@ -102,3 +105,23 @@ def test_what_cannot_be_read_is_refused(root: Path) -> None:
         Instruments(height_sd=-1.0)
     with pytest.raises(ValueError, match=r"data\.root is not set"):
         replace(wing(root), root=None).draw(Nominal(), torch.arange(1), 1)
+
+
+@recorded
+@pytest.mark.parametrize("run", [0, 1])
+def test_the_barometer_is_believed_as_the_fixes_of_the_run_itself_say(run: int) -> None:
+    """Pressure height less the fixes handed out to this run, on which it is not scored: mean squared change over some seconds.
+
+    Errors of size s that are forgotten in some seconds and a walk of density w give 2 s^2 + w^2 t. Over 40 s the walk is well
+    known, and 2 s^2 is what is left; s is believed to be twice that, since it is no white noise.
+    """
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        cfg = compose("config", ["scenario=fixed_wing_aided", "worlds=null"])
+    scene = job.build(cfg.scenario)
+    y = scene.draw(Nominal(), torch.arange(2), 1).record.y[run]
+    off = (y[:, 6] - y[:, 2])[torch.isfinite(y[:, 2])].numpy()  # of every second second
+    lags = np.array([6, 10, 20, 40])
+    change = [np.mean((off[lag // 2 :] - off[: -lag // 2]) ** 2) for lag in lags]
+    slope, level = np.polyfit(lags, change, 1)
+    assert slope == pytest.approx(scene.believed.height_bias_walk**2, rel=0.15)
+    assert 2.0 * np.sqrt(level / 2.0) == pytest.approx(scene.believed.height_sd, rel=0.15)
