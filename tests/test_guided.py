@@ -102,7 +102,7 @@ def test_the_ratio_of_any_law_of_noise_is_one_on_average(kind: type[LinearGaussi
     model = kind([[0.5]], [[1.0]], [[1.0]], [2.0], [0.0], [1.0])
     stage = GuidedNoise(EKF, widen=4.0)
     cloud, draws = cloud_of(ParticleFilter(100_000, proposal=stage), model, 2)
-    _, log_ratio, _, w = stage(model, cloud, Record(torch.full((2, 1), 1.5, dtype=torch.float64)), draws)
+    _, log_ratio, _, w, _ = stage(model, cloud, Record(torch.full((2, 1), 1.5, dtype=torch.float64)), draws)
     assert w is not None
     for value, expected in ((log_ratio.exp(), 1.0), (log_ratio.exp() * w[..., 0], 0.4)):
         assert abs(value.mean() - expected) < 4.5 * value.std() / math.sqrt(value.numel())
@@ -118,7 +118,7 @@ def test_guided_noise_is_optimal_on_linear_models(shared: bool, guide: GaussianF
     stage = GuidedNoise(guide)
     cloud, draws = cloud_of(ParticleFilter(50, proposal=stage), model, 3)
     y = torch.tensor([[2.0, 1.0], [0.5, math.nan], [math.nan, math.nan]], dtype=torch.float64)
-    x, log_ratio, _, w = stage(model, cloud, Record(y), draws)
+    x, log_ratio, _, w, _ = stage(model, cloud, Record(y), draws)
     total = log_ratio + model.log_likelihood(y, x, ())
     s = model.h @ model.g @ (model.h @ model.g).mT + torch.diag(model.r**2)
     y_hat = cloud.x @ (model.h @ model.f).mT
@@ -128,6 +128,28 @@ def test_guided_noise_is_optimal_on_linear_models(shared: bool, guide: GaussianF
     assert w is not None
     torch.testing.assert_close(x, model.propagate(cloud.x, (), w))
     torch.testing.assert_close(w[2], draws.normal("guide", 50, 1)[2])  # nothing seen: the model's own noise
+
+
+@pytest.mark.parametrize(("noise", "gain"), [(0.01, 1.0), (1.0, 1.2), (6.0, 3.0)])
+def test_guiding_the_noise_gains_what_the_noise_can_learn_and_no_more(noise: float, gain: float) -> None:
+    """ESS / N of a large normal cloud in closed form: E[w]^2 / E[w^2] of w = N(y; z, S), z ~ N(mu, B).
+
+    Bootstrap weighs children, S = R and B = H P- H'; the optimal proposal weighs parents, S = R + H Q H' and B = H F P F' H'.
+    Where one step's noise hardly moves what is seen the two are the same, whatever the proposal.
+    """
+    model = LinearGaussian([[1.0, 1.0], [0.0, 1.0]], [[0.5 * noise], [noise]], [[1.0, 0.0]], [0.7], [0.0, 0.5], [1.0, 1.0])
+    y, n = 1.5, 20_000
+    f, g, h = (getattr(model, k).numpy() for k in ("f", "g", "h"))
+    moved, stirred, r = (h @ f @ f.T @ h.T).item(), (h @ g @ g.T @ h.T).item(), 0.7**2
+    found = {}
+    for proposal, s, b in ((Bootstrap(), r, moved + stirred), (GuidedNoise(EKF), r + stirred, moved)):
+        once = Normal(0.5, math.sqrt(s + b)).log_prob(torch.tensor(y)).item()
+        twice = Normal(0.5, math.sqrt(s / 2 + b)).log_prob(torch.tensor(y)).item() - 0.5 * math.log(4 * math.pi * s)
+        estimate = run(ParticleFilter(n, proposal=proposal), model, torch.tensor([[y]], dtype=torch.float64), runs=4)
+        found[type(proposal)] = float(estimate.trace["ess"].mean()) / n
+        assert found[type(proposal)] == pytest.approx(math.exp(2 * once - twice), rel=0.03)
+    more = found[GuidedNoise] / found[Bootstrap]
+    assert more > gain if gain > 1.0 else more == pytest.approx(1.0, abs=0.01)
 
 
 def test_nothing_is_guided_where_nothing_moves() -> None:
@@ -217,7 +239,7 @@ def test_the_ratio_is_that_of_the_densities(model: StateSpaceModel, target: Any)
     cloud, draws = cloud_of(method, model, 2)
     seen = Record(torch.full((2, dy), 9.0 if dy == 3 else 1.4, dtype=torch.float64))
     cloud, _ = method.step(model, cloud, seen, draws)
-    x, log_ratio, _, _ = stage(model, cloud, seen, draws.at(2))
+    x, log_ratio, *_ = stage(model, cloud, seen, draws.at(2))
     before = stage._before(model, cloud, seen, draws)
     new, plain = guide.advance(model, before, seen), GaussianFilter(guide.rule).advance(model, before, seen)
 

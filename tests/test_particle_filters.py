@@ -39,6 +39,7 @@ from pfbench.filter.resamplers import (
     Stratified,
     Systematic,
 )
+from pfbench.filter.weights import Bayes, Floored
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear import LinearGaussian, linear_walk, local_level
 from pfbench.model.toys import Benes, Growth, Lorenz63, Pendulum, StochasticVolatility
@@ -587,6 +588,21 @@ def test_a_look_ahead_that_finds_nothing_possible_falls_back_on_the_weights() ->
     truth = law.cdf(3.5) - law.cdf(2.5)
     z = torch.exp(estimate.log_evidence).numpy()
     assert abs(z.mean() - truth) < 4 * z.std() / math.sqrt(len(z))
+
+
+def test_floored_weights_are_bayes_s_until_they_are_too_small_for_a_number() -> None:
+    floored, bayes = (ParticleFilter(300, Resample(Systematic(), 1.0), weigh=w) for w in (Floored(), Bayes()))
+    assert bayes.exact
+    assert not floored.exact
+    near = [run(method, WALK, WALK_Y, runs=3) for method in (floored, bayes)]
+    torch.testing.assert_close(near[0].mean, near[1].mean, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(near[0].log_evidence, near[1].log_evidence, rtol=1e-9, atol=1e-9)
+    far = [run(method, WALK, torch.tensor([[80.0]], dtype=torch.float64), runs=3) for method in (floored, bayes)]
+    assert far[0].trace["ess"].flatten().tolist() == pytest.approx([300.0] * 3)  # flat: nothing is learnt
+    assert float(far[1].trace["ess"].max()) < 3.0
+    assert float(far[1].mean[..., 0].min()) > float(far[0].mean[..., 0].max()) + 2.0
+    with pytest.raises(ValueError, match=r"weigh\.floor=0"):
+        Floored(0.0)
 
 
 # angles, precision, start

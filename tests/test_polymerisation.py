@@ -215,8 +215,10 @@ def test_equation_18_keeps_them_in_no_reading(displacement: str) -> None:
 class Lossy:
     """Proportional counts that keep silent about the chance of a cell."""
 
-    def __call__(self, share: Tensor, cell: Tensor, n: Tensor, draws: MonteCarlo) -> tuple[Tensor, Tensor, Tensor]:
-        slot, chance, taken = Proportional()(share, cell, n, draws)
+    def __call__(
+        self, share: Tensor, cell: Tensor, alive: Tensor, n: Tensor, draws: MonteCarlo
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        slot, chance, taken = Proportional()(share, cell, alive, n, draws)
         return slot, torch.ones_like(chance), taken
 
 
@@ -274,6 +276,34 @@ def test_kept_counts_keep_each_cell_s_number_and_mass() -> None:
     cell = divide(Whitened(), d[..., :2], before.log_w > -torch.inf, covariance[:, :2, :2])[0]
     expected = {(round(float((w[cell == c].sum() / (cell == c).sum()).log()), 9), int((cell == c).sum())) for c in cell.unique()}
     assert {(round(float(v), 9), int(k)) for v, k in zip(values, counts, strict=True)} == expected
+
+
+def test_cells_of_a_weight_too_small_for_a_number_keep_their_particles() -> None:
+    """As printed nothing is selected, not even by underflow: e^-2000 of the weight is a weight."""
+    before, n = one_cloud(2)
+    far = before.x[..., 0] > MEAN[0]
+    before = before._replace(log_w=torch.where(far, before.log_w - 2000.0, before.log_w).log_softmax(1))
+    after = refreshed(Polymerised(Raw(), Kept(), Stretched()), before, n)
+    assert bool(torch.isfinite(after.log_w).all())
+    lost = before.log_w < -1000.0
+    cell = divide(Raw(), before.x[..., :2], torch.isfinite(before.log_w), torch.eye(2).expand(2, -1, -1))
+    for r in range(2):
+        wholly = [bool(lost[r, cell[r] == c].all()) for c in range(int(cell[r].max()) + 1)]
+        number = sum(int((cell[r] == c).sum()) for c, all_of_it in enumerate(wholly) if all_of_it)
+        assert 0 < number == int((after.log_w[r] < -1000.0).sum())
+
+
+def test_kept_counts_share_another_number_in_proportion() -> None:
+    before, n = one_cloud(2, sharpness=3.0)
+    half = refreshed(Polymerised(counts=Kept()), before, n / 2)
+    assert torch.equal((half.log_w > -torch.inf).sum(1), torch.full((2,), N // 2))
+    cell = divide(Raw(4), before.x[..., :2], before.log_w > -torch.inf, torch.eye(2).expand(2, -1, -1))
+    slot, chance, taken = Kept()(torch.zeros(2, N), cell, before.log_w > -torch.inf, n / 2, MonteCarlo(1, torch.arange(2)).at(3))
+    for r in range(2):
+        had = torch.bincount(cell[r], minlength=N)
+        got = torch.bincount(slot[r, taken[r]], minlength=N)
+        assert bool(((got - had / 2).abs() < 1.0).all())
+        assert torch.allclose(chance[r], (had / 2.0).clamp(max=1.0).to(chance), atol=1e-9)
 
 
 def test_proportional_counts_select() -> None:

@@ -108,10 +108,10 @@ def mssrckf() -> None:
         moved = torch.stack([at[:, 0] * torch.cos(at[:, 1]), at[:, 0] * torch.sin(at[:, 1])], -1)
         mean = w @ moved
         right.plot(*_ellipse(mean, (w[:, None] * (moved - mean)).T @ (moved - mean)), color=colour, label=name)
-    left.set(aspect="equal", title="points for N(0, I), area: weight", xlim=(-2.9, 2.9), ylim=(-2.9, 2.9))
+    left.set(aspect="equal", title="points for N(0, I), area: weight", xlim=(-2.9, 2.9), ylim=(-2.5, 3.8))
     left.set(xlabel="state 1 in sd", ylabel="state 2 in sd")
     right.set(aspect="equal", title="after a turn: ellipses of 2 sd", xlabel="east", ylabel="north")
-    left.legend(fontsize=8, loc="upper right")
+    left.legend(fontsize=8, loc="upper center", ncols=4, columnspacing=0.7, handletextpad=0.1)
     right.legend(fontsize=8, loc="lower center")
     figure.savefig(HERE / "mssrckf.png", dpi=80)
 

@@ -46,13 +46,16 @@ class Polymers(NamedTuple):
 
 
 class Counts(Protocol):
-    """Cells' shares of the resampling probability [R, N], each particle's cell [R, N], the number n [R, 1] wanted.
+    """Cells' shares of the resampling probability [R, N], each slot's cell and whether it holds a particle [R, N], the number
+    n [R, 1] wanted.
 
     Returns: the cell of each slot of the new cloud [R, N], non-decreasing; the chance that a cell gets any [R, N]; which slots
     are taken [R or 1, N].
     """
 
-    def __call__(self, share: Tensor, cell: Tensor, n: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]: ...
+    def __call__(
+        self, share: Tensor, cell: Tensor, alive: Tensor, n: Tensor, draws: Draws
+    ) -> tuple[Tensor, Tensor, Tensor]: ...
 
 
 class Displacement(Protocol):
@@ -65,7 +68,9 @@ class Displacement(Protocol):
 class Proportional:
     """n W particles for a cell, rounded systematically: this selects, as any resampling does. [ours]"""
 
-    def __call__(self, share: Tensor, cell: Tensor, n: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
+    def __call__(
+        self, share: Tensor, cell: Tensor, alive: Tensor, n: Tensor, draws: Draws
+    ) -> tuple[Tensor, Tensor, Tensor]:
         chance = (n * share).clamp(torch.finfo(share.dtype).tiny, 1.0)
         slots = torch.arange(share.shape[1], device=share.device)
         return Systematic()(share, n, draws), chance, slots < n
@@ -73,10 +78,17 @@ class Proportional:
 
 @dataclass(frozen=True)
 class Kept:
-    """As many particles as the cell had, as printed: nothing is selected. It takes no notice of the number wanted."""
+    """As many particles as the cell had, as printed: nothing is selected.
 
-    def __call__(self, share: Tensor, cell: Tensor, n: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
-        return cell.sort(1).values, torch.ones_like(share), torch.ones_like(cell[:1], dtype=torch.bool)
+    Where another number is wanted than there are particles, or some have become impossible, cells share it in proportion to what
+    they had [ours].
+    """
+
+    def __call__(
+        self, share: Tensor, cell: Tensor, alive: Tensor, n: Tensor, draws: Draws
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        had = torch.zeros_like(share).scatter_add(1, cell, alive.to(share))
+        return Proportional()(had / had.sum(1, keepdim=True), cell, alive, n, draws)
 
 
 @dataclass(frozen=True)
@@ -179,12 +191,13 @@ class Polymerised:
         d = model.chart.subtract(cloud.x, mean.unsqueeze(1))
         covariance = (w.unsqueeze(-1) * d).mT @ d
         plane = list(self._plane(model))
-        cell = divide(self.grid, d[..., plane], w > 0, covariance[:, plane][:, :, plane])
+        alive = torch.isfinite(cloud.log_w)
+        cell = divide(self.grid, d[..., plane], alive, covariance[:, plane][:, :, plane])
         polymers = aggregate(cell, w, d, covariance)
         share = torch.zeros_like(a).scatter_add(1, cell, a)
-        slot, chance, taken = self.counts(share, cell, n, draws)
+        slot, chance, taken = self.counts(share, cell, alive, n, draws)
         moved, ok = self.displacement(polymers, slot, draws)
-        log_w = torch.where(taken & ok.unsqueeze(-1), _log_weights(polymers.weight, chance, slot, taken), -torch.inf)
+        log_w = torch.where(taken & ok.unsqueeze(-1), _log_weights(_log_sums(cell, cloud.log_w), chance, slot, taken), -torch.inf)
         fresh = cloud._replace(x=model.chart.add(mean.unsqueeze(1), moved), log_w=log_w)
         wanted = n.squeeze(1)
         hit = 1.0 / a.square().sum(-1) < self.threshold * (1.0 - _EQUAL) * wanted
@@ -217,10 +230,18 @@ def aggregate(cell: Tensor, w: Tensor, d: Tensor, covariance: Tensor) -> Polymer
     return Polymers(weight, centre, (w.unsqueeze(-1) * r).mT @ r, covariance)
 
 
-def _log_weights(weight: Tensor, chance: Tensor, slot: Tensor, taken: Tensor) -> Tensor:
+def _log_sums(cell: Tensor, log_w: Tensor) -> Tensor:
+    """log W of each cell [R, N], of cells too whose W is too small for a number."""
+    most = torch.full_like(log_w, -torch.inf).scatter_reduce(1, cell, log_w, "amax")
+    most = torch.where(torch.isfinite(most), most, 0.0)
+    parts = torch.exp(log_w - most.gather(1, cell))
+    return torch.zeros_like(log_w).scatter_add(1, cell, parts).log() + most
+
+
+def _log_weights(log_weight: Tensor, chance: Tensor, slot: Tensor, taken: Tensor) -> Tensor:
     """log W_i / (n_i chance_i) of each slot's cell i [R, N]."""
-    count = torch.zeros_like(weight).scatter_add(1, slot, taken.to(weight).expand_as(weight))
-    return (weight.log() - chance.log()).gather(1, slot) - count.gather(1, slot).log()
+    count = torch.zeros_like(log_weight).scatter_add(1, slot, taken.to(log_weight).expand_as(log_weight))
+    return (log_weight - chance.log()).gather(1, slot) - count.gather(1, slot).log()
 
 
 def _rows(a: Tensor, index: Tensor) -> Tensor:
