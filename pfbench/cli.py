@@ -1,4 +1,4 @@
-"""The command line: `pfbench run | report | list | check`."""
+"""The command line: `pfbench run | train | report | list | check`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from typing import Any
 
 import pfbench
 
+_EXTRAS = {"ray": "ray", "submitit": "slurm", "joblib": "launch"}  # of the package, by what stands in a launcher's name
+_RETRIES = 3  # of a sweep that lost a process; Ray counts likewise
+
 USAGE = """\
 pfbench {version}: benchmarks of particle filters in integrated navigation
 
@@ -19,8 +22,11 @@ pfbench {version}: benchmarks of particle filters in integrated navigation
       pfbench run scenario=t003 noise=nominal filter=sir runs=100 seed=1
       pfbench run -m scenario=t003 filter=ekf,sir noise=nominal,outliers study=mine
       pfbench run -m +experiment=quickstart
+  pfbench train key=value ...        fits the network of a neural_* filter; the file it makes is `checkpoint=` of a run
+      pfbench train filter=neural_sir scenario=passive_1 train=vsmc train.epochs=20
   pfbench report study=NAME          figures, tables and tests of a study, as a page
   pfbench report study=claims        every claim of the five papers, and what the studies say of it
+  pfbench report all                 every study that has results, and the claims: what `make report` does
   pfbench report scenario=NAME       the datasheet of a scene, as a page; also: noise=NAME, runs=20
   pfbench list [group]               what can be composed
   pfbench check                      composes everything; versions, threads, device, data root
@@ -30,7 +36,9 @@ pfbench {version}: benchmarks of particle filters in integrated navigation
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point. Exit code 0 if all went well, 1 if anything failed, 2 if the command was not understood."""
     words = list(sys.argv[1:] if argv is None else argv)
-    commands: dict[str, Callable[[list[str]], None]] = {"run": _run, "report": _report, "list": _list, "check": _check}
+    commands: dict[str, Callable[[list[str]], None]] = {
+        "run": _run, "train": _train, "report": _report, "list": _list, "check": _check
+    }  # fmt: skip
     if not words or words[0] in ("-h", "--help", "help"):
         print(USAGE.format(version=pfbench.__version__))
         return
@@ -79,28 +87,92 @@ def _run(words: list[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which explains them
     flags = [word for word in words if word in ("-m", "--multirun")]  # first, or argparse takes no key=value after them
     sys.argv = ["pfbench run", *flags, *(word for word in words if word not in flags)]
-    hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job.run)()
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    _again(hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job.run))
+
+
+def _again(sweep: Callable[[], Any]) -> None:
+    """Runs a sweep; where joblib lost one of its processes, and with it the whole sweep, once more: what is done is done."""
+    for left in reversed(range(_RETRIES + 1)):
+        try:
+            sweep()
+            return
+        except Exception as error:
+            if type(error).__name__ != "TerminatedWorkerError":
+                raise
+            if not left:
+                raise RuntimeError(
+                    f"a process of the sweep was killed {_RETRIES + 1} times, as a rule for want of memory: finished cells are "
+                    "kept; give fewer processes (hydra.launcher.n_jobs=2), or memory=... (GiB) for each cell"
+                ) from error
+            print("pfbench: a process of the sweep was killed; going on with the cells that are not done", file=sys.stderr)
+
+
+def _train(words: list[str]) -> None:
+    from pfbench import job, train
+
+    if {"-m", "--multirun"} & set(words):
+        raise ValueError("pfbench train fits one network at a time: leave out -m, and mix noise regimes by train.noises=[a,b]")
+    cfg, choices = _composition(words)
+    job.settings(cfg)
+    if cfg["told"]:
+        raise ValueError("told=true: a network is trained on the model itself; give told=false, and told=true when it is run")
+    names = list(cfg["train"]["noises"]) or [choices["noise"]]
+    regimes = {name: job.build(_compose([*words, f"noise={name}"])["noise"]) for name in names}
+    path = train.fit(cfg, choices, regimes, job.build, {"versions": job.versions()}, print)
+    usual = [word for word in words if not word.startswith(("train.", "train=", "fresh=", "checkpoint="))]
+    print(f"checkpoint: {path.resolve()}\n  pfbench run {' '.join(usual)} checkpoint={path}")
 
 
 def _report(words: list[str]) -> None:
-    from pfbench.report.page import Options, write
-
     named = {word.lstrip("+").partition("=")[0] for word in words}
+    if words[:1] == ["all"]:
+        return _reports(words[1:])
     if "scenario" in named and not named & {"study", "experiment"}:
         return _datasheet(words)
     cfg = _compose(words)
     if cfg["study"] == "datasheets":
         raise ValueError("study=datasheets: there lie the datasheets of scenes; give scenario=NAME to see one, or another study")
-    if cfg["study"] == "claims":
-        from pfbench.report import ledger
+    print(f"{'claims' if cfg['study'] == 'claims' else 'report'}: {_page(cfg).resolve()}")
 
-        said = cfg["report"]
-        page = ledger.write(cfg["results"], cfg["reports"], said["alpha"], conf_dir(), experiments_dir(), mixed=said["mixed"])
-        print(f"claims: {page.resolve()}")
-        return
+
+def _page(cfg: dict[str, Any]) -> Path:
+    """Writes the page of a study, or that of the claims."""
+    from pfbench.report import ledger
+    from pfbench.report.page import Options, write
+
     chosen: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in cfg["report"].items()}
-    page = write(cfg["study"], cfg["results"], cfg["reports"], Options(**chosen))
-    print(f"report: {page.resolve()}")
+    options = Options(**chosen)
+    if cfg["study"] != "claims":
+        return write(cfg["study"], cfg["results"], cfg["reports"], options)
+    places = cfg["results"], cfg["reports"], options.alpha, conf_dir(), experiments_dir()
+    return ledger.write(*places, mixed=options.mixed, formats=options.formats)
+
+
+def _reports(words: list[str]) -> None:
+    """Every study with results, as its experiment says, and the claims; what is published without results stays as it is."""
+    cfg = _compose(words)
+    there = {path.parent.name for path in Path(cfg["results"]).glob("*/*.npz")} - {"datasheets"}
+    published = {path.parent.name for path in Path(cfg["reports"]).glob("*/report.md")} - {"datasheets", "claims"}
+    missing, failed = sorted(published - there), []
+    for study in sorted(there):
+        chosen = f"+experiment={study}" if (experiments_dir() / f"{study}.yaml").exists() else f"study={study}"
+        try:
+            print(f"{study}: {_page(_compose([chosen, *words])).resolve()}")
+        except Exception as error:
+            failed.append(study)
+            print(f"{study}: failed: {explain(error, words)}", file=sys.stderr)
+    for study in missing:
+        print(
+            f"{study}: its report is published and stays as it is, for {cfg['results']} has no results of it; make them with: "
+            f"pfbench run -m +experiment={study}"
+        )
+    if lacking := [study for study in (*missing, *failed) if study.startswith("paper_")]:
+        print(f"claims: the ledger stays as it is, for it needs the results of {', '.join(lacking)} too")
+    else:
+        print(f"claims: {_page(_compose(['study=claims', *words])).resolve()}")
+    if failed:
+        raise ValueError(f"{len(failed)} of {len(there)} reports failed: {', '.join(failed)}; what each said is above")
 
 
 def _datasheet(words: list[str]) -> None:
@@ -222,6 +294,9 @@ def explain(error: BaseException, words: Sequence[str] = ()) -> str:
     text = f"{error}".strip() or type(error).__name__
     if found := re.search(r"Could not override '([^']+)'", text):
         return _no_key(found[1], words)
+    if found := re.search(r"[Cc]ould not (?:find|load) 'hydra/launcher/(ray|submitit|joblib)", text):
+        chosen = next((word for word in words if word.startswith("hydra/launcher=")), "hydra/launcher")
+        return f'{chosen}: its launcher is not installed; pip install "pfbench[{_EXTRAS[found[1]]}]"'
     if found := re.search(r"Could not find '(.+)/([^/']*)'", text):
         options = re.findall(r"^\t(\w+)$", text, re.M)
         return f"{found[1]}={found[2]}: there is no such {found[1]}{_near(found[2], options, '.')} There are {', '.join(options)}"

@@ -24,11 +24,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 import pfbench
-from pfbench import fusion, native, store
+from pfbench import fusion, memory, native, store
 from pfbench.bound import posterior_bound
 from pfbench.draws import MonteCarlo
-from pfbench.filter.belief import Info
+from pfbench.filter.belief import Cloud, Info, gather
 from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.learned_weights import by_content, origin
 from pfbench.filter.loop import Estimate, run_filter, runs_at_once
 from pfbench.filter.particle import ParticleFilter
 from pfbench.judge import Judge, Tally
@@ -44,13 +45,16 @@ DATASHEETS = "datasheets"  # the folder of results in which the scenes' own data
 
 # what changes where and how fast a job runs, not what it computes
 PLACES = (
-    "results", "reports", "worlds", "data", "study", "threads", "engine", "fresh", "report", "scenario.root", "scenario.cache",
+    "results", "reports", "worlds", "data", "study", "threads", "engine", "memory", "fresh", "report", "scenario.root",
+    "scenario.cache",
     "particles",  # counted where a filter uses it, as filter.particles
     "bound",  # stands beside what a filter does; fresh=true adds it to a finished job
+    "train", "checkpoint",  # a job depends on the weights that its filter has, which are named by what they are
 )  # fmt: skip
 # what says how jobs are compared and changes nothing in one: no part of its name while it is usual
 BUDGETS = ("same N", "same time per step", "same likelihood evaluations")  # what filters that are compared have alike
 USUAL: Mapping[str, Any] = {"budget": "same N"}
+SHARED = ("time", "bound", "range", "scored")  # arrays without an axis of runs
 _COMPILE_FROM = 5e8  # normals; compiling their kernel costs some seconds and saves 15 ms for each million
 
 
@@ -73,7 +77,7 @@ def run(cfg: DictConfig) -> float:
         log.info("%s: done already (%s)", name, path)
         return _headline(store.load(path).arrays, store.describe(path))
     try:
-        meta, arrays = compute(cfg, name)
+        meta, arrays = in_parts(cfg, name)
     except Exception as error:
         log.error("%s: failed, see %s", name, store.failed(path, choices, error) or f"the error; {path} is kept")
         raise
@@ -89,7 +93,76 @@ def run(cfg: DictConfig) -> float:
 
 def name_of(config: Mapping[str, Any]) -> str:
     """The key of a job: of what it computes, and of what it states of itself that is not usual."""
+    config = {**config, "filter": by_content(config.get("filter"))}
     return store.key(config, (*PLACES, *(name for name, usual in USUAL.items() if config.get(name) == usual)))
+
+
+def in_parts(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """`compute`; some of the runs after the others where all at once would not fit into the memory. The numbers are the same.
+
+    A bound that the runs have in common is then the mean of the parts' own.
+
+    Raises:
+        ValueError: not even one run would fit; worlds that last differently long; as `compute`.
+    """
+    size = runs_that_fit(cfg)
+    if size == cfg.runs:
+        return compute(cfg, name)
+    parts = []
+    for first in range(cfg.first_run, cfg.first_run + cfg.runs, size):
+        part = cfg.copy()
+        part.first_run, part.runs = first, min(size, cfg.first_run + cfg.runs - first)
+        parts.append(compute(part, f"{name}, runs from {first}"))
+    metas, found = zip(*parts, strict=True)
+    if any(arrays["time"].shape != found[0]["time"].shape for arrays in found):
+        raise ValueError(
+            "memory: these worlds last differently long, and a job that is done in parts needs them alike; give fewer runs in "
+            f"a job (runs={size}, first_run=...)"
+        )
+    shares = np.array([meta["runs"] for meta in metas]) / cfg.runs
+    arrays = {
+        name: found[0][name] if name in SHARED else np.concatenate([arrays[name] for arrays in found]) for name in found[0]
+    }
+    if "bound" in arrays:
+        square = sum(share * part["bound"].astype(float) ** 2 for share, part in zip(shares, found, strict=True))
+        arrays["bound"] = np.sqrt(square).astype(np.float32)
+    seconds = {name: sum(meta["seconds"][name] for meta in metas) for name in metas[0]["seconds"]}
+    taken = [meta["memory"] for meta in metas]
+    meta = {
+        **metas[0], "runs": cfg.runs, "first_run": cfg.first_run, "parts": len(parts), "seconds": seconds,
+        "memory": None if None in taken else max(taken),
+        "likelihoods_per_step": float(shares @ [meta["likelihoods_per_step"] for meta in metas]),
+    }  # fmt: skip
+    return meta, arrays
+
+
+def runs_that_fit(cfg: DictConfig) -> int:
+    """How many of a job's runs may be worked on at a time; found out by a trial where there may be too many.
+
+    Raises:
+        ValueError: not even one.
+    """
+    settings(cfg)
+    limit = memory.limit(cfg.memory, cfg.device)
+    model, method = build(cfg.model), build(cfg["filter"])
+    if limit is None or not memory.worth_asking(method, model, cfg.runs, limit):
+        return int(cfg.runs)
+    scenario, witness = build(cfg.scenario), Witness(build(cfg.noise))
+    episode = scenario.draw(witness, torch.arange(cfg.first_run, cfg.first_run + min(2, cfg.runs)), cfg.seed)
+    model = (witness.tell(model, episode.time) if cfg.told else model).to(cfg.device, getattr(torch, cfg.dtype))
+    truth = model.assemble(episode.truth).to(model.anchor)
+
+    def watch(runs: int, steps: int) -> Judge:
+        return Judge(model, truth[:runs, :steps], min(cfg.scored, 1))
+
+    needs = memory.needs(method, model, episode, lambda runs: at_once(cfg, method, model, runs), watch)
+    size = memory.fitting(needs, cfg.runs, limit)
+    if size < cfg.runs:
+        log.info(
+            "memory: %d runs at once would take about %.3g GiB, and %.3g GiB may be taken here (memory=...): %d at a time then, "
+            "with the same results", cfg.runs, needs.of(cfg.runs) / memory.GIB, limit / memory.GIB, size,
+        )  # fmt: skip
+    return size
 
 
 def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -102,6 +175,7 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
     # the model first: a scenario may hold it, and what is wrong with a model is told under its own name
     model, scenario, noise, method = (build(cfg[part]) for part in ("model", "scenario", "noise", "filter"))
     runs = torch.arange(cfg.first_run, cfg.first_run + cfg.runs)
+    trained = origin(OmegaConf.to_container(cfg["filter"], resolve=True), _choices()["scenario"], cfg.seed, runs)
     started = time.perf_counter()
     witness = Witness(noise)
     episode: Episode = scenario.draw(witness, runs, cfg.seed)
@@ -125,24 +199,34 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
 
     if cfg.device != "cpu":
         torch.cuda.reset_peak_memory_stats(cfg.device)
-    held = native.peak_from_here()
-    begun = clock()
+    compiling = time.perf_counter()
     fuse = fuses(cfg.engine, method, model, cfg.runs * steps)
+    compiled = time.perf_counter() - compiling
+    held, tidy = native.peak_from_here(), memory.Tidy()
+
+    def tick() -> None:
+        bar.update()
+        tidy()
+
+    begun = clock()
     with (
         fusion.fused(fuse),
         torch.no_grad(),
         tqdm(total=steps, desc=name, unit="step", delay=2, disable=None, leave=False) as bar,
     ):
-        estimate = run_filter(method, model, episode.record, draws, watch, bar.update, at_once(cfg, method, model))
+        estimate = run_filter(method, model, episode.record, draws, watch, tick, at_once(cfg, method, model, cfg.runs))
     if cfg.device != "cpu":
         torch.cuda.synchronize()
     spent = clock() - begun - judge.seconds
     seconds = {
-        "world": drawn - started, "bound": bounded - drawn, "scores": judge.seconds, "filter": spent, "per_step": spent / steps
+        "world": drawn - started, "bound": bounded - drawn, "scores": judge.seconds, "compile": compiled, "filter": spent,
+        "per_step": spent / steps,
     }  # fmt: skip
-    cost = {"memory": _taken(cfg.device, held), "likelihoods_per_step": tally.count / (cfg.runs * steps)}
+    likelihoods = tally.count / (cfg.runs * steps)
+    engine = "compiled" if fuse else "eager"
+    cost = {"engine": engine, "memory": _taken(cfg.device, held), "likelihoods_per_step": likelihoods}
     meta = describe(cfg, model, method, steps, seconds, episode.notes) | cost
-    return {**meta, "bound": said}, {**_arrays(episode, estimate, judge), **_shared(episode, least)}
+    return {**meta, "bound": said, "trained": trained}, {**_arrays(episode, estimate, judge), **_shared(episode, least)}
 
 
 def _taken(device: str, held: int | None) -> int | None:
@@ -165,6 +249,8 @@ def settings(cfg: DictConfig | Mapping[str, Any]) -> None:
         raise ValueError(f"told={cfg['told']}: give true (the filter knows the noise regime) or false")
     if cfg["bound"] not in (True, False, "auto"):
         raise ValueError(f"bound={cfg['bound']}: give auto (where the model's laws are the world's), true or false")
+    if cfg["memory"] is not None and not (isinstance(cfg["memory"], int | float) and cfg["memory"] > 0):
+        raise ValueError(f"memory={cfg['memory']}: give the GiB that a job may take, or null for most of what is free")
     if cfg["dtype"] not in ("float32", "float64"):
         raise ValueError(f"dtype={cfg['dtype']}: give float64 (the default) or float32")
     if cfg["budget"] not in BUDGETS:
@@ -184,24 +270,34 @@ def build(node: Any) -> Any:
     return hydra.utils.instantiate(node, _convert_="all")
 
 
-def at_once(cfg: DictConfig, method: Any, model: StateSpaceModel) -> int | None:
-    """Runs that a step takes together; None, all of them, on another device than the CPU."""
+def at_once(cfg: DictConfig, method: Any, model: StateSpaceModel, runs: int) -> int:
+    """Runs that a step takes together: all of them on another device than the CPU."""
     if cfg.device != "cpu" or not isinstance(method, ParticleFilter):
-        return None
-    return runs_at_once(cfg.runs, method.particles, model.chart.size)
+        return runs
+    return runs_at_once(runs, method.particles, model.chart.size)
 
 
 def fuses(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> bool:
-    """Are inner loops compiled: where it was asked for, or where a job is large enough to pay for the compilation?"""
+    """Are inner loops compiled: where it was asked for, or where a job is large enough to pay for the compilation?
+
+    What is compiled is kept on disk for later jobs; a compilation that took noticeably long is told.
+    """
     numbers = run_steps * method.particles * model.noise_dim if isinstance(method, ParticleFilter) else 0
     if engine == "eager" or (engine == "auto" and numbers < _COMPILE_FROM):
         return False
+    begun = time.perf_counter()
     try:
-        with fusion.fused():
-            MonteCarlo(0, torch.arange(2)).uniform("compiles", 2, 2)
+        with fusion.fused(), torch.no_grad():
+            draws = MonteCarlo(0, torch.arange(2, device=model.anchor.device))
+            draws.uniform("compiles", 2, 2)
+            x = draws.normal("compiles", 2, 2)
+            gather(Cloud(x, x[..., 0], x[:, 0, 0]), torch.zeros(2, 2, dtype=torch.int64, device=x.device))
     except Exception as error:  # torch raises many kinds where no C++ compiler is at hand
         log.warning("engine=%s: nothing compiles here (%s); going on eagerly", engine, type(error).__name__)
         return False
+    took = time.perf_counter() - begun
+    if took > 0.5:
+        log.info("engine=%s: inner loops compiled in %.1f s; later jobs find them ready", engine, took)
     return True
 
 

@@ -33,7 +33,7 @@ EXPERIMENTS = [file.stem for file in sorted(cli.experiments_dir().glob("*.yaml")
 def composed(*words: str) -> DictConfig:
     cli._offer_experiments()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", [*words, "worlds=null", "particles=30"])
+        return compose("config", ["checkpoint=untrained", "worlds=null", "particles=30", *words])
 
 
 def targets(node: Any) -> Iterator[str]:
@@ -89,13 +89,13 @@ def test_no_yaml_points_at_somebodys_disk(file: Path) -> None:
 # what runs
 
 
-def truncated(episode: Episode) -> Episode:
+def truncated(episode: Episode, steps: int = STEPS) -> Episode:
     """Its first steps."""
     record = episode.record
-    inputs = map_inputs(lambda a: a[:, :STEPS], record.u)
-    truth = {name: value[:, :STEPS] for name, value in episode.truth.items()}
-    cut = Record(record.y[:, :STEPS], inputs, record.start, record.spread, record.loop)
-    return Episode(cut, episode.time[:STEPS], truth, None, episode.notes)
+    inputs = map_inputs(lambda a: a[:, :steps], record.u)
+    truth = {name: value[:, :steps] for name, value in episode.truth.items()}
+    cut = Record(record.y[:, :steps], inputs, record.start, record.spread, record.loop)
+    return Episode(cut, episode.time[:steps], truth, None, episode.notes)
 
 
 WORLDS: dict[str, Episode] = {}

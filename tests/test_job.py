@@ -152,7 +152,7 @@ def test_the_worlds_of_a_study_are_flown_once_for_all_filters(tmp_path: Path) ->
     segments = "scenario.path.segments=[{_target_:pfbench.nav.trajectory.cruise,duration:10}]"
     said = pfbench("run", "-m", "scenario=t004", segments, "filter=ekf,sir", "noise=nominal,student", "runs=2", home=tmp_path)
     assert said.code == 0, said.err
-    assert len(list((tmp_path / "worlds").iterdir())) == 2  # the flights, and the bound in the nominal one
+    assert len(list((tmp_path / "worlds").iterdir())) == 3  # the path, the flights, and the bound in the nominal one
     found = [stored(file) for file in (tmp_path / "results" / "adhoc").glob("*.npz")]
     assert len(found) == 4
     tracks = [arrays["track"] for _, arrays in found]

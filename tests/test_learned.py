@@ -1,0 +1,520 @@
+"""Learned proposals: any network leaves the target as it is; a wrong ratio is seen; checkpoints are refused in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from test_moves import posterior
+from test_particle_filters import CASES, WALK, WALK_Y, check_unbiased, run
+from torch import Tensor, nn
+from torch.distributions import (
+    Beta,
+    Distribution,
+    Independent,
+    Laplace,
+    LowRankMultivariateNormal,
+    MixtureSameFamily,
+    MultivariateNormal,
+    Normal,
+    TransformedDistribution,
+)
+
+from pfbench.draws import MonteCarlo
+from pfbench.filter import learned_weights
+from pfbench.filter.belief import Cloud
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.guided_noise import GuidedNoise
+from pfbench.filter.learned import PAST, Learned
+from pfbench.filter.learned_draws import drawn
+from pfbench.filter.learned_inputs import Innovation, Inputs, Parent, Width, scene
+from pfbench.filter.learned_kernel import LearnedWalk
+from pfbench.filter.learned_laws import Diagonal, Flow, LowRank, Mixture
+from pfbench.filter.loop import run_filter
+from pfbench.filter.moves import Metropolis
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.proposals import Bootstrap, Proposed
+from pfbench.filter.resamplers import Resample, Systematic
+from pfbench.filter.rules import Cubature, Jacobian, Points
+from pfbench.model.base import StateSpaceModel
+from pfbench.model.linear import LinearGaussian
+from pfbench.record import Record
+
+ALWAYS = Resample(Systematic(), 1.0)
+EKF, CKF = GaussianFilter(Jacobian()), GaussianFilter(Points(Cubature()))
+SMALL = (8,)
+NETWORKS: dict[str, Callable[[int, int], nn.Module]] = {
+    "diagonal": partial(Diagonal, hidden=SMALL),
+    "low rank": partial(LowRank, hidden=SMALL),
+    "mixture": partial(Mixture, hidden=SMALL),
+    "flow": partial(Flow, hidden=SMALL),
+}
+
+
+def shaken(make: Callable[[int, int], nn.Module], size: float = 0.3) -> Callable[[int, int], nn.Module]:
+    """The network with weights of no sense: whatever training may have made of it."""
+
+    def made(features: int, noise: int) -> nn.Module:
+        network = make(features, noise)
+        with torch.no_grad():
+            for weight in network.parameters():
+                weight.add_(size * torch.randn_like(weight) / math.sqrt(weight.shape[-1]))
+        return network
+
+    return made
+
+
+def proposal(name: str, random: bool, **options: Any) -> Learned:
+    return Learned(shaken(NETWORKS[name]) if random else NETWORKS[name], **options)
+
+
+# the target stays
+
+
+@pytest.mark.parametrize("guide", [None, GuidedNoise(CKF)], ids=["prior", "guided"])
+@pytest.mark.parametrize("random", [False, True], ids=["untrained", "random"])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_ratio_is_one_on_average(name: str, random: bool, guide: GuidedNoise | None) -> None:
+    """E_q[p / q] = 1, and E_q[p / q w] = E_p[w] = 0, for each particle with its own parent."""
+    model, n = WALK, 20_000
+    method = proposal(name, random, guide=guide)
+    x = torch.tensor([[[0.4, -0.2], [2.0, 1.0]]], dtype=torch.float64).repeat_interleave(n // 2, 1)
+    cloud = Cloud(x, torch.full((1, n), -math.log(n), dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+    with torch.no_grad():
+        told = method(model, cloud, Record(torch.tensor([[1.5]], dtype=torch.float64)), MonteCarlo(3, torch.arange(1)))
+    ratio = told.log_ratio.exp()[0]
+    for value in (ratio - 1.0, *(ratio[:, None] * told.w[0]).T):
+        assert abs(value.mean()) < 4.5 * value.std() / math.sqrt(n) + 1e-9
+        assert value.std() < 12.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["growth", "level seen at once", "singular"])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_filters_with_random_networks_are_unbiased(name: str, case: str) -> None:
+    model, y, exact = CASES[case]()
+    method = ParticleFilter(60, ALWAYS, proposal=proposal(name, True))
+    assert method.exact
+    with torch.no_grad():
+        check_unbiased(method, model, y, exact, runs=600)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"guide": GuidedNoise(CKF)},
+        {"guide": GuidedNoise(EKF, shared=True, widen=1.5), "share": 0.3},
+        {"memory": 3},
+        {"share": 0.0},
+    ],
+    ids=["corrects the CKF", "corrects a wide EKF", "remembers", "keeps none"],
+)
+def test_they_are_unbiased_whatever_their_options(options: dict[str, Any]) -> None:
+    model, y, exact = CASES["growth"]()
+    with torch.no_grad():
+        check_unbiased(ParticleFilter(60, ALWAYS, proposal=proposal("diagonal", True, **options)), model, y, exact, runs=500)
+
+
+class Wrong(nn.Module):
+    """A learned proposal with a mistake in its ratio."""
+
+    exact = True
+
+    def __init__(self, inner: Learned, mistake: str) -> None:
+        super().__init__()
+        self.inner, self.mistake = inner, mistake
+
+    def forward(self, model: StateSpaceModel, cloud: Cloud, seen: Record, draws: MonteCarlo) -> Proposed:
+        right = self.inner(model, cloud, seen, draws)
+        log_p = -0.5 * right.w.square().sum(-1)
+        wrong = {
+            "no ratio": torch.zeros_like(right.log_ratio),
+            "p alone": log_p + 0.5 * right.w.shape[-1],
+            "q / p": -right.log_ratio,
+            "another particle's": right.log_ratio.roll(1, 1),
+        }
+        return right._replace(log_ratio=wrong[self.mistake])
+
+
+@pytest.mark.parametrize("mistake", ["no ratio", "p alone", "q / p", "another particle's"])
+def test_a_wrong_ratio_is_seen(mistake: str) -> None:
+    model, y, exact = CASES["growth"]()
+    method = ParticleFilter(60, ALWAYS, proposal=Wrong(proposal("diagonal", True, share=0.3), mistake))  # type: ignore[arg-type]
+    with torch.no_grad(), pytest.raises(AssertionError):
+        check_unbiased(method, model, y, exact, runs=500)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NETWORKS)
+def test_with_an_untrained_network_the_filter_goes_to_kalman(name: str) -> None:
+    """The error of the log evidence falls with the root of N, with a network of no sense as without."""
+    model, y, exact = CASES["singular"]()
+    errors = []
+    for n in (50, 800):
+        method = ParticleFilter(n, ALWAYS, proposal=proposal(name, True))
+        with torch.no_grad():
+            estimate = run(method, model, y, runs=100)
+        errors.append((estimate.log_evidence - exact.log_z).square().mean().sqrt().item())
+    assert errors[1] < 0.35
+    assert 2.0 < errors[0] / errors[1] < 8.0  # 4, give or take what 100 runs leave open
+
+
+# where it starts
+
+
+@pytest.mark.parametrize("case", ["growth", "singular", "level seen at once"])
+def test_an_untrained_proposal_is_the_one_it_corrects(case: str) -> None:
+    """To the last digit: same draws, same particles, same weights."""
+    model, y, _ = CASES[case]()
+    for guide, plain in ((None, Bootstrap()), (GuidedNoise(CKF), GuidedNoise(CKF)), (GuidedNoise(EKF), GuidedNoise(EKF))):
+        ours = ParticleFilter(50, proposal=Learned(Diagonal, guide=guide))
+        one, other = (run(method, model, y, runs=3) for method in (ours, ParticleFilter(50, proposal=plain)))
+        torch.testing.assert_close(one.mean, other.mean, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(one.log_evidence, other.log_evidence, rtol=1e-9, atol=1e-9)
+
+
+class Narrow(nn.Module):
+    """A network that is far too sure."""
+
+    def __init__(self, features: int, noise: int) -> None:
+        super().__init__()
+        self.sd = nn.Parameter(torch.full((noise,), 0.2))
+
+    def forward(self, told: Tensor) -> Distribution:
+        return Independent(Normal(torch.zeros_like(self.sd), self.sd).expand((*told.shape[:2], len(self.sd))), 1)
+
+
+def test_the_kept_share_bounds_every_weight() -> None:
+    """p / q <= 1 / share, whatever the network says; without it nothing does."""
+    x = torch.zeros(1, 4000, 2, dtype=torch.float64)
+    cloud = Cloud(x, torch.full((1, 4000), -math.log(4000), dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+    seen, draws = Record(torch.tensor([[9.0]], dtype=torch.float64)), MonteCarlo(1, torch.arange(1))
+    largest = []
+    for share in (0.0, 0.1):
+        method = Learned(Narrow, share=share)
+        with torch.no_grad():
+            largest.append(method(WALK, cloud, seen, draws).log_ratio.max().item())
+    assert largest[0] > math.log(10.0) + 1.0
+    assert largest[1] <= math.log(10.0) + 1e-9
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_gradients_reach_every_weight(name: str) -> None:
+    method = ParticleFilter(20, ALWAYS, proposal=proposal(name, True, memory=2))
+    run(method, WALK, WALK_Y, runs=4).log_evidence.mean().backward()
+    assert isinstance(method.proposal, Learned)
+    weights = dict(method.proposal.named_parameters())
+    assert len(weights) > 4
+    for key, weight in weights.items():
+        assert weight.grad is not None, key
+        assert torch.isfinite(weight.grad).all(), key
+        assert weight.grad.abs().max() > 0.0, key
+
+
+def test_a_run_cannot_feel_its_neighbours() -> None:
+    """Alone, in any batch, in blocks: the same numbers, with networks that remember and mixtures that choose."""
+    y = torch.stack([WALK_Y + k for k in range(3)])
+    method = ParticleFilter(20, proposal=proposal("mixture", True, memory=2))
+    with torch.no_grad():
+        whole = run_filter(method, WALK, Record(y), MonteCarlo(1, torch.arange(3)))
+        alone = run_filter(method, WALK, Record(y[1:2]), MonteCarlo(1, torch.tensor([1])))
+        blocks = run_filter(method, WALK, Record(y), MonteCarlo(1, torch.arange(3)), at_once=2)
+    torch.testing.assert_close(whole.mean[1:2], alone.mean, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(whole.mean, blocks.mean, rtol=1e-10, atol=1e-10)
+
+
+def test_what_was_seen_before_is_remembered_once_for_each_run() -> None:
+    method = ParticleFilter(20, ALWAYS, proposal=proposal("diagonal", True, memory=3))
+    cloud, model, draws = method.init(WALK, 2, MonteCarlo(1, torch.arange(2))), WALK, MonteCarlo(1, torch.arange(2))
+    pasts = []
+    with torch.no_grad():
+        for t, y in enumerate(WALK_Y[:2]):
+            cloud, _ = method.step(model, cloud, Record(torch.stack([y, y + 1.0])), draws.at(t + 1))
+            pasts.append(cloud.memory[PAST])
+    assert pasts[0].shape == (2, 1, 3)
+    assert (pasts[0] - pasts[1]).abs().max() > 1e-3
+    assert (pasts[1][0] - pasts[1][1]).abs().max() > 1e-3
+
+
+# what it is told
+
+
+def test_a_unit_of_measure_changes_nothing() -> None:
+    """Metres or kilometres: what the network is told is the same."""
+
+    def told(unit: float) -> Tensor:
+        f = torch.tensor([[1.0, 1.0], [0.0, 1.0]], dtype=torch.float64)
+        g = unit * torch.diag(torch.tensor([0.3, 0.1]))
+        model = LinearGaussian(f, g, [[1.0, 0.0]], [unit], [0.0, 0.0], [2.0 * unit, unit])
+        x = unit * MonteCarlo(1, torch.arange(1)).normal("x", 30, 2)
+        cloud = Cloud(x, torch.full((1, 30), -math.log(30.0), dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+        step = scene(model, cloud, Record(unit * torch.tensor([[2.5]], dtype=torch.float64)))
+        return torch.cat([part(step).expand(1, 30, -1) for part in (Innovation(), Parent(), Width())], -1)
+
+    torch.testing.assert_close(told(1.0), told(1e-6))
+    assert told(1.0).abs().max() < 5.0
+
+
+def test_an_input_is_asked_for_by_name() -> None:
+    cloud = ParticleFilter(5).init(WALK, 1, MonteCarlo(1, torch.arange(1)))
+    with pytest.raises(ValueError, match=r"features\.scales\.speed: the inputs have nothing"):
+        Inputs({"speed": 1.0})(scene(WALK, cloud, Record(WALK_Y[:1])))
+
+
+# draws of any law
+
+
+def laws() -> dict[str, Distribution]:
+    mean, sd = torch.tensor([0.5, -1.0], dtype=torch.float64), torch.tensor([0.3, 2.0], dtype=torch.float64)
+    root = torch.tensor([[1.0, 0.0], [-0.7, 0.5]], dtype=torch.float64)
+    parts = Independent(Normal(torch.stack([mean, -3.0 * mean]), torch.stack([sd, 0.5 * sd])), 1)
+    return {
+        "normal": Independent(Normal(mean, sd), 1),
+        "full": MultivariateNormal(mean, scale_tril=root),
+        "low rank": LowRankMultivariateNormal(mean, root[:, :1], sd.square()),
+        "mixture": MixtureSameFamily(torch.distributions.Categorical(torch.tensor([0.3, 0.7], dtype=torch.float64)), parts),
+        "laplace": Independent(Laplace(mean, sd), 1),
+        "transformed": TransformedDistribution(
+            Independent(Normal(mean, sd), 1), [torch.distributions.AffineTransform(mean, 2.0 * sd, event_dim=1)]
+        ),
+    }
+
+
+@pytest.mark.parametrize("name", laws())
+def test_draws_have_the_law_s_moments(name: str) -> None:
+    law, n, draws = laws()[name], 100_000, MonteCarlo(1, torch.arange(1))
+    if name == "transformed":  # x = m + 2 s (m + s z)
+        m, s = torch.tensor([0.5, -1.0]), torch.tensor([0.3, 2.0])
+        mean, sd = m + 2.0 * s * m, 2.0 * s * s
+    else:
+        mean, sd = law.mean, law.variance.sqrt()
+    x = drawn(law.expand((1, n)), draws.normal("z", n, 2), draws)[0]
+    torch.testing.assert_close(x.mean(0), mean.to(x), rtol=0, atol=4.5 * float(sd.max()) / math.sqrt(n))
+    torch.testing.assert_close(x.std(0), sd.to(x), rtol=0.03, atol=0)
+
+
+def test_gradients_of_a_mixture_s_draws_are_those_of_its_expectations() -> None:
+    """d E[x_0^2 x_1] of a mixture by its weights, means and scales, in closed form, against draws."""
+    logits = torch.tensor([0.2, -0.4], dtype=torch.float64, requires_grad=True)
+    mean = torch.tensor([[0.5, -1.0], [-0.7, 0.4]], dtype=torch.float64, requires_grad=True)
+    sd = torch.tensor([[0.6, 0.5], [0.9, 0.3]], dtype=torch.float64, requires_grad=True)
+    share = torch.softmax(logits, -1)
+    exact = torch.autograd.grad((share * (mean[:, 0] ** 2 + sd[:, 0] ** 2) * mean[:, 1]).sum(), (logits, mean, sd))
+    n, draws, rows = 10_000, MonteCarlo(2, torch.arange(1)), []
+    for k in range(12):
+        parts = Independent(Normal(mean, sd), 1).expand((1, n, 2))
+        law = MixtureSameFamily(torch.distributions.Categorical(logits=logits.expand(1, n, 2)), parts)
+        x = drawn(law, draws.at(k).normal("z", n, 2), draws.at(k))
+        found = torch.autograd.grad((x[..., 0] ** 2 * x[..., 1]).mean(), (logits, mean, sd))
+        rows.append(torch.cat([g.flatten() for g in found]))
+    values, wanted = torch.stack(rows), torch.cat([g.flatten() for g in exact])
+    error = values.std(0) / math.sqrt(len(rows))
+    assert ((values.mean(0) - wanted).abs() < 5.0 * error).all()
+    assert error.max() < 0.05
+
+
+def test_a_law_that_cannot_be_drawn_is_named() -> None:
+    one, draws = torch.ones(1, 5, 2, dtype=torch.float64), MonteCarlo(1, torch.arange(1))
+    with pytest.raises(ValueError, match="returned Beta, which cannot be made"):
+        drawn(Independent(Beta(one, one), 1), one, draws)
+
+
+class Heavy(nn.Module):
+    """A network that returns a law of its own kind: what a user may write."""
+
+    def __init__(self, features: int, noise: int) -> None:
+        super().__init__()
+        self.net = nn.Linear(features, noise)
+
+    def forward(self, told: Tensor) -> Distribution:
+        return Independent(Laplace(self.net(told), 1.5), 1)
+
+
+def test_any_law_may_be_proposed_from() -> None:
+    model, y, exact = CASES["growth"]()
+    with torch.no_grad():
+        check_unbiased(ParticleFilter(60, ALWAYS, proposal=Learned(Heavy)), model, y, exact, runs=500)
+
+
+# the learned kernel
+
+
+@dataclass(frozen=True)
+class Careless:
+    """The kernel with a part of its ratio left out."""
+
+    inner: LearnedWalk
+    mistake: str
+    exact = True
+
+    def propose(self, model: StateSpaceModel, cloud: Cloud, draws: Any) -> tuple[Cloud, Tensor]:
+        moved, log_alpha, step = self.inner.step(model, cloud, draws)
+        delta = step / (self.inner.scale * step.shape[-1] ** -0.5)
+        assert self.inner.network is not None
+        xi, new = (c.window["noise"][:, :, -self.inner.depth :].flatten(2) for c in (cloud, moved))
+        log_q = self.inner._law(model, moved, new).log_prob(-delta) - self.inner._law(model, cloud, xi).log_prob(delta)
+        prior = 0.5 * (xi.square() - new.square()).sum(-1)
+        return moved, {"no Hastings": log_alpha - log_q, "no prior": log_alpha - prior, "none": log_alpha}[self.mistake]
+
+
+def after(mistake: str, size: float, sweeps: int = 4) -> float:
+    """p-value of the drift of exact paths under the kernel."""
+    exact = posterior(0.5, 15_000)
+    cloud = exact.cloud()
+    kernel = LearnedWalk(shaken(NETWORKS["diagonal"], size), depth=2)
+    draws = MonteCarlo(5, torch.arange(1))
+    with torch.no_grad():
+        kernel.begin(exact.model, 1)
+        for sweep in range(sweeps):
+            proposed, log_alpha = Careless(kernel, mistake).propose(exact.model, cloud, draws.at(sweep))
+            toss = torch.log(draws.at(sweep).uniform("accept", log_alpha.shape[1], 1).squeeze(2))
+            accept = toss < log_alpha
+            window = {
+                name: torch.where(accept[..., None, None] if a.dim() == 4 else accept[..., None], proposed.window[name], a)
+                for name, a in cloud.window.items()
+                if a.shape[1] > 1
+            }
+            cloud = cloud._replace(window=cloud.window | window)
+        assert 0.1 < accept.double().mean() < 0.9
+    return exact.drift(cloud.window["states"][0].flatten(1).numpy())
+
+
+@pytest.mark.parametrize("size", [0.0, 0.6], ids=["untrained", "random"])
+def test_the_learned_kernel_leaves_the_law_of_the_path(size: float) -> None:
+    assert after("none", size) > 1e-4
+
+
+@pytest.mark.parametrize("mistake", ["no Hastings", "no prior"])
+def test_the_test_of_invariance_sees_mistakes_of_the_learned_kernel(mistake: str) -> None:
+    assert after(mistake, 0.6) < 1e-6
+
+
+def test_a_filter_with_the_learned_kernel_is_unbiased_and_moves() -> None:
+    model, y, exact = CASES["growth"]()
+    method = ParticleFilter(60, ALWAYS, moves=(Metropolis(LearnedWalk(shaken(Diagonal)), 2),))
+    assert method.exact
+    with torch.no_grad():
+        check_unbiased(method, model, y, exact, runs=300)
+        assert run(method, model, y, runs=20).trace["accepted_0"][:, 2:].mean() > 0.1
+
+
+# checkpoints are refused in words
+
+
+@pytest.fixture
+def kept(tmp_path: Any) -> Any:
+    """A checkpoint of a diagonal network of 8 hidden units on the walk."""
+    method = proposal("diagonal", True)
+    cloud = ParticleFilter(5).init(WALK, 1, MonteCarlo(1, torch.arange(1)))
+    method.begin(WALK, cloud, Record(WALK_Y[:1]))
+    content = {
+        "networks": {"proposal": learned_weights.flat(dict(method.named_children()))},
+        "sizes": {"proposal": list(method.sizes)},
+        "model": {"class": "LinearGaussian", "names": list(WALK.names)},
+        "choices": {"scenario": "linear_walk"},
+        "split": {"scenario": "linear_walk", "train": {"seed": 7, "runs": 10}, "validation": {"seed": 8, "runs": 4}},
+        "cost": {"seconds": 1.0},
+    }
+    learned_weights.write(tmp_path / "walk.pt", content)
+    return tmp_path / "walk.pt", method, content
+
+
+def used(path: Any, model: StateSpaceModel = WALK, y: Tensor = WALK_Y, **options: Any) -> Any:
+    method = ParticleFilter(20, proposal=Learned(options.pop("network", NETWORKS["diagonal"]), checkpoint=path, **options))
+    with torch.no_grad():
+        return run(method, model, y, runs=2)
+
+
+def test_a_checkpoint_brings_the_weights_back(kept: Any) -> None:
+    path, method, _ = kept
+    with torch.no_grad():
+        own = run(ParticleFilter(20, proposal=method), WALK, WALK_Y, runs=2)
+    torch.testing.assert_close(used(str(path)).mean, own.mean, rtol=0, atol=0)
+    assert (used("untrained").mean - own.mean).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"model": CASES["singular"]()[0], "y": CASES["singular"]()[1]}, "a model with 2 states .*position.*train on this"),
+        ({"network": partial(Diagonal, hidden=(9,))}, r"bent.0.bias has shape \(8,\), this filter's network has \(9,\)"),
+        ({"network": NETWORKS["mixture"]}, "proposal.network"),
+        ({"memory": 4}, "trained with memory=0 .* here it is 4; give the model"),
+        ({"features": [Innovation()]}, "trained with features=10 .* here it is 4"),
+        ({"path": None}, "checkpoint=null: .*pfbench train.*checkpoint=untrained"),
+        ({"path": "nowhere.pt"}, "checkpoint=nowhere.pt: there is no such file"),
+    ],
+    ids=["model", "hidden", "network", "memory", "features", "none", "missing"],
+)
+def test_another_model_s_checkpoint_is_refused_in_words(kept: Any, options: dict[str, Any], said: str) -> None:
+    given = {"path": str(kept[0])} | options
+    with pytest.raises(ValueError, match=said):
+        used(given.pop("path"), **given)
+
+
+def test_what_is_no_file_of_weights_is_never_run(tmp_path: Any) -> None:
+    class Evil:
+        def __reduce__(self) -> Any:
+            return print, ("run!",)
+
+    torch.save({"format": learned_weights.FORMAT, "networks": Evil()}, tmp_path / "evil.pt")
+    (tmp_path / "text.pt").write_text("weights?")
+    torch.save({"networks": {}}, tmp_path / "old.pt")
+    for name, said in (("evil", "nothing in it was run"), ("text", "not a file of weights"), ("old", "its format is None")):
+        with pytest.raises(ValueError, match=said):
+            learned_weights.read(tmp_path / f"{name}.pt")
+
+
+def test_a_key_depends_on_weights_not_on_paths(kept: Any, tmp_path: Any) -> None:
+    path, _, content = kept
+    (tmp_path / "elsewhere").mkdir()
+    path.rename(tmp_path / "elsewhere" / "b.pt")
+    learned_weights.write(path, content | {"cost": {"seconds": 2.0}})
+    changed = {key: a + 1e-12 for key, a in content["networks"]["proposal"].items()}
+    learned_weights.write(tmp_path / "c.pt", content | {"networks": {"proposal": changed}})
+    one, two, three = (
+        learned_weights.by_content({"filter": {"moves": [{"checkpoint": str(name)}]}, "checkpoint": None})
+        for name in (path, tmp_path / "elsewhere" / "b.pt", tmp_path / "c.pt")
+    )
+    assert one == two != three
+    assert learned_weights.by_content({"checkpoint": "untrained"}) == {"checkpoint": "untrained"}
+
+
+def test_worlds_that_were_learned_from_are_not_for_judging(kept: Any) -> None:
+    config = {"moves": [{"kernel": {"checkpoint": str(kept[0])}}]}
+    with pytest.raises(ValueError, match=r"seed=7: runs 0 to 9 of linear_walk .* learned from; give another seed"):
+        learned_weights.origin(config, "linear_walk", 7, torch.arange(5, 20))
+    with pytest.raises(ValueError, match="used to stop by"):
+        learned_weights.origin(config, "linear_walk", 8, torch.arange(1))
+    jobs = ("linear_walk", 7, torch.arange(10, 20)), ("t003", 7, torch.arange(3))
+    told, other = (learned_weights.origin(config, *job) for job in jobs)
+    assert told is not None
+    assert other is not None
+    assert told["cost"] == {"seconds": 1.0}
+    assert told["weights"] == other["weights"]
+    assert learned_weights.origin({"proposal": {"checkpoint": "untrained"}}, "linear_walk", 7, torch.arange(3)) is None
+
+
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (lambda: Learned(Diagonal, share=1.0), "share=1.0"),
+        (lambda: Learned(Diagonal, share=-0.1), "proposal.share=-0.1"),
+        (lambda: Learned(Diagonal, memory=-1), "memory=-1"),
+        (lambda: LearnedWalk(Diagonal, depth=0), "depth=0"),
+        (lambda: LearnedWalk(Diagonal, scale=0.0), "scale=0.0"),
+    ],
+)
+def test_learned_stages_refuse_values_of_no_use(make: Callable[[], Any], word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        make()
+
+
+def test_the_stages_of_a_recipe_may_be_replaced() -> None:
+    method = ParticleFilter(20, proposal=Learned(Diagonal))
+    assert replace(method, particles=5).proposal is method.proposal

@@ -1,0 +1,217 @@
+"""Memory: what a job takes is known before it starts, does not grow with R x N x T, and runs in parts give the same numbers."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_line import environment, pfbench
+
+from pfbench import memory, store
+from pfbench.draws import MonteCarlo
+from pfbench.filter.loop import run_filter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.model.linear import linear_walk
+from pfbench.noise.regimes import Nominal
+from pfbench.record import Episode
+from pfbench.scenario.model_world import ModelWorld
+
+MODEL = linear_walk(1.0, 0.3, 1.0)
+WALK = ("scenario=linear_walk", "scenario.steps=12", "runs=7", "particles=100", "filter=sir")
+
+
+def world(runs: int, steps: int) -> Episode:
+    return ModelWorld(MODEL, steps).draw(Nominal(), torch.arange(runs), 1)
+
+
+def counted(runs: int, particles: int, steps: int, at_once: int | None = None) -> int:
+    record, draws = world(runs, steps).record, MonteCarlo(1, torch.arange(runs))
+    with torch.no_grad(), memory.Counted() as count:
+        run_filter(ParticleFilter(particles), MODEL, record, draws, at_once=at_once)
+    return count.most
+
+
+def needs(runs: float = 1.0, stepped: float = 0.0, base: float = 0.0, left: float = 0.0) -> memory.Needs:
+    return memory.Needs(base, runs, stepped, left, at_once=lambda runs: min(runs, 10))
+
+
+# counting
+
+
+def test_live_bytes_are_counted_once_and_no_longer_than_they_live() -> None:
+    with memory.Counted() as count:
+        a = torch.zeros(1000, dtype=torch.float64)
+        b = a[:500]  # no bytes of its own
+        del a
+        c = torch.zeros(1000, dtype=torch.float64)
+        del b, c
+        torch.zeros(500, dtype=torch.float64)
+    assert count.most == 16000
+
+
+def test_a_filter_holds_no_more_at_later_steps_than_what_each_step_tells() -> None:
+    few, many = counted(4, 500, 5), counted(4, 500, 30)
+    told = 8 * 4 * (2 + 2 + 1 + 1)  # of each step: mean and variance of two states, effective size, resampled; in 4 runs
+    assert many - few < 3 * told * 25
+    assert many - few < 0.1 * 8 * 4 * 500 * 2 * 25  # the clouds of all steps
+
+
+def test_a_step_holds_a_block_of_runs_and_the_clouds_of_all() -> None:
+    clouds = 8 * 500 * 3  # two states and a weight
+    whole, blocks = counted(16, 500, 4), counted(16, 500, 4, at_once=2)
+    assert blocks < 0.5 * whole
+    assert blocks > 16 * clouds
+
+
+# the estimate
+
+
+def estimated(runs: int, particles: int, steps: int, of: int = 2) -> memory.Needs:
+    return memory.needs(ParticleFilter(particles), MODEL, world(of, steps), lambda runs: runs)
+
+
+@pytest.mark.parametrize(("runs", "particles"), [(16, 200), (8, 3000)])
+def test_the_trial_foretells_what_all_particles_and_runs_take(runs: int, particles: int) -> None:
+    found = estimated(runs, particles, 10)
+    told = (found.of(runs) - 256 * memory.MIB) / memory._HELD
+    assert 0.8 < told / counted(runs, particles, 10) < 1.3
+
+
+def test_the_trial_of_an_only_run_counts_all_of_it() -> None:
+    one, two = estimated(1, 200, 4, of=1), estimated(1, 200, 4)
+    assert one.of(1) == pytest.approx(two.of(1), rel=0.05)
+
+
+def test_longer_worlds_take_more_for_each_run() -> None:
+    short, long = estimated(1, 50, 100, of=1), estimated(1, 50, 1100, of=1)
+    # y and two true states while they are drawn, y again for the filter; mean, variance, and two traces told
+    world, told = memory._DRAWN * 3 + 2, memory._KEPT * 6
+    assert long.run - short.run == pytest.approx(1000 * 8 * (world + told), rel=0.1)
+
+
+def test_what_bends_upwards_is_followed() -> None:
+    sizes = (64, 128, 256)
+    square = [3.0 * n + 0.5 * n * n for n in sizes]
+    assert memory._extended(sizes, square, 5000) == pytest.approx(3.0 * 5000 + 0.5 * 5000**2)
+    assert memory._extended(sizes, [10.0 + 2.0 * n for n in sizes], 5000) == pytest.approx(10010.0)
+
+
+# how many runs fit
+
+
+@pytest.mark.parametrize(("limit", "size"), [(1000.0, 100), (100.0, 100), (99.0, 50), (40.0, 34), (1.0, 1)])
+def test_as_many_runs_as_fit_in_parts_of_equal_size(limit: float, size: int) -> None:
+    assert memory.fitting(needs(), 100, limit) == size
+
+
+def test_what_earlier_parts_leave_counts() -> None:
+    assert memory.fitting(needs(runs=1.0, left=0.1), 100, 19.0) == 10
+    with pytest.raises(ValueError, match=r"what 100 runs leave would take .*first_run=50"):
+        memory.fitting(needs(runs=1.0, left=0.5), 100, 30.0)
+
+
+def test_one_run_that_does_not_fit_is_told() -> None:
+    told = r"memory: one run alone would take about 3 GiB, and 2 GiB may be taken here; give fewer particles, dtype=float32"
+    with pytest.raises(ValueError, match=told):
+        memory.fitting(needs(runs=3.0 * memory.GIB), 100, 2.0 * memory.GIB)
+
+
+def test_small_jobs_are_not_tried() -> None:
+    assert not memory.worth_asking(ParticleFilter(500), MODEL, 100, 16.0 * memory.GIB)
+    assert memory.worth_asking(ParticleFilter(500), MODEL, 100000, 16.0 * memory.GIB)
+    assert memory.worth_asking(ParticleFilter(10**8), MODEL, 1, 16.0 * memory.GIB)
+
+
+# what there is
+
+
+@pytest.fixture
+def groups(tmp_path: Path) -> tuple[Path, Path]:
+    inner = tmp_path / "a" / "b"
+    inner.mkdir(parents=True)
+    (tmp_path / "a" / "memory.max").write_text("5000\n")
+    (tmp_path / "a" / "memory.current").write_text("3000\n")
+    (tmp_path / "a" / "memory.stat").write_text("anon 1\ninactive_file 400\nactive_file 7\n")
+    (inner / "memory.max").write_text("max\n")
+    (inner / "memory.current").write_text("10\n")
+    own = tmp_path / "self"
+    own.write_text("0::/a/b\n")
+    return tmp_path, own
+
+
+def test_the_tightest_group_decides_and_cached_files_are_free(groups: tuple[Path, Path]) -> None:
+    assert list(memory._of_the_groups(*groups)) == [5000.0 - 3000.0 + 400.0]
+
+
+def test_something_is_free_here() -> None:
+    free = memory.available()
+    assert free is None or 1e6 < free < 1e14
+    assert memory.limit(2.0, "cpu") == 2.0 * memory.GIB
+
+
+# whole jobs
+
+
+def stored(home: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    (file,) = (home / "results" / "adhoc").glob("*.npz")
+    found = store.load(file)
+    return found.meta, found.arrays
+
+
+def test_a_job_in_parts_gives_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert pfbench("run", *WALK, "bound=true", home=whole).code == 0
+    monkeypatch.setattr(memory, "fitting", lambda needs, runs, limit: 3)
+    monkeypatch.setattr(memory, "worth_asking", lambda *given: True)
+    said = pfbench("run", *WALK, "bound=true", "memory=4", home=parts)
+    assert said.code == 0, said.err
+    assert re.search(r"memory: 7 runs at once would take about \S+ GiB, and \S+ GiB may be taken here .*: 3 at a time", said.out)
+    (ours, a), (theirs, b) = stored(parts), stored(whole)
+    assert (ours["key"], ours["runs"], ours["parts"]) == (theirs["key"], 7, 3)
+    assert a.keys() == b.keys()
+    for name in a:
+        np.testing.assert_allclose(a[name], b[name], rtol=1e-6, err_msg=name)  # blocks of other sizes round differently
+
+
+def test_what_does_not_fit_at_all_is_refused_before_it_starts(tmp_path: Path) -> None:
+    said = pfbench("run", *WALK, "memory=0.01", home=tmp_path)
+    assert said.code == 1
+    assert "memory: one run alone would take about" in said.err
+    assert "0.01 GiB may be taken here" in said.err
+    assert not list((tmp_path / "results").rglob("*.npz"))
+
+
+@pytest.mark.parametrize("value", ["-1", "0", "much"])
+def test_a_limit_that_is_none_is_told(tmp_path: Path, value: str) -> None:
+    said = pfbench("run", *WALK, f"memory={value}", home=tmp_path)
+    assert (said.code, f"memory={value}: give the GiB" in said.err) == (1, True), said.err
+
+
+MEASURED = """
+import resource, sys
+from pfbench import cli
+cli.main(sys.argv[1:])
+print("kibibytes", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read as Linux tells it")
+def test_a_process_never_holds_the_clouds_of_all_steps(tmp_path: Path) -> None:
+    runs, particles, steps = 80, 1000, 1000
+    words = ("run", "scenario=linear_walk", f"scenario.steps={steps}", f"runs={runs}", f"particles={particles}", "bound=false")
+    env = os.environ | environment(tmp_path)
+    command = [sys.executable, "-c", MEASURED, *words, "engine=compiled"]
+    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, check=False, timeout=500)
+    assert done.returncode == 0, done.stderr
+    held = 1024 * int(done.stdout.rpartition("kibibytes")[2])
+    clouds = 8 * 2 * runs * particles * steps
+    assert clouds > 1.2e9
+    assert held < 0.8e9  # the libraries alone hold some 0.35e9
