@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo test test-fast test-slow lint bench clean
+.PHONY: demo report test test-fast test-slow lint bench clean
 
 # Installs everything once; runs again only when the requirements change.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -13,6 +13,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: $(VENV)/.installed        ## quickstart study: run, compare, report
 	$(BIN)/pfbench run -m +experiment=quickstart
 	$(BIN)/pfbench report study=quickstart
+
+report: $(VENV)/.installed      ## every published report again, from results/
+	$(BIN)/pfbench report all
 
 test: test-fast test-slow       ## fast and slow tests
 
@@ -26,15 +29,21 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-# The peer needs numpy below 2, so it lives beside the project's own environment.
+# The library particles needs numpy below 2 and JAX needs it above, so peers live beside the project's own environment.
 .venv-bench/.installed: benchmarks/requirements.txt
 	$(PYTHON) -m venv .venv-bench
 	.venv-bench/bin/python -m pip install --quiet -r benchmarks/requirements.txt
 	touch $@
 
-bench: $(VENV)/.installed .venv-bench/.installed   ## speed against peers and of all methods, ten minutes on a quiet machine
-	$(BIN)/python benchmarks/w4.py --peer .venv-bench/bin/python
+.venv-peers/.installed: benchmarks/requirements-peers.txt
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip install --quiet -r benchmarks/requirements-peers.txt
+	touch $@
+
+bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## speed against peers, of all methods, against size: half an hour on a quiet machine
+	$(BIN)/python benchmarks/compare.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python
 	$(BIN)/python benchmarks/methods.py
+	$(BIN)/python benchmarks/scaling.py
 
 clean:
-	rm -rf $(VENV) .venv-bench build dist *.egg-info
+	rm -rf $(VENV) .venv-bench .venv-peers build dist *.egg-info

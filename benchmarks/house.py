@@ -1,35 +1,96 @@
 """pfbench itself: its SIR filter in its own time loop, with mean, variance and traces at every step.
 
-    python house.py float32|float64 eager|compiled WORKLOAD
+W1 to W3 are single runs, W4 a batch. Of W3 the package has no model; `Radar` is one as a user would write it.
+
+    python house.py float32|float64 eager|compiled [sir|ckf] WORKLOAD
 """
 
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any
 
 import torch
+from hydra import compose, initialize_config_module
+from problems import GROWTH, RADAR, RADAR_SPREAD, RADAR_START, VOLATILITY
+from torch import Tensor
+from torch.distributions import Distribution
 from worker import Filter, serve
 from workload import ins_model
 
-from pfbench import fusion, native
+from pfbench import fusion, job, native
 from pfbench.draws import MonteCarlo
 from pfbench.filter.loop import run_filter, runs_at_once
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.resamplers import Resample, Systematic
+from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
 from pfbench.model.ins_gnss import Step
+from pfbench.model.toys import Growth, StochasticVolatility
 from pfbench.record import Record
+
+
+class Radar(StateSpaceModel):
+    """Constant velocity in the plane, seen by bearing from north and range: east, its rate, north, its rate."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        dt, q = RADAR["interval"], RADAR["acceleration_sd"]
+        eye = torch.eye(2, dtype=torch.float64)
+        self.register_buffer("phi", torch.kron(eye, torch.tensor([[1.0, dt], [0.0, 1.0]], dtype=torch.float64)))
+        self.register_buffer("gain", torch.kron(eye, q * torch.tensor([[0.5 * dt**2], [dt]], dtype=torch.float64)))
+        self.register_buffer("sd", torch.tensor([RADAR["bearing_sd"], RADAR["range_sd"]], dtype=torch.float64))
+        self.register_buffer("start", torch.tensor(RADAR_START, dtype=torch.float64))
+        self.register_buffer("spread", torch.tensor(RADAR_SPREAD, dtype=torch.float64))
+        self.names, self.units, self.noise_dim = ("east", "east rate", "north", "north rate"), ("m", "m/s") * 2, 2
+        self.groups = {"position": (0, 2), "velocity": (1, 3)}
+
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, self.spread, self.start)
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return x @ self.phi.mT + w @ self.gain.mT
+
+    def noise_gain(self, u: Any) -> Tensor:
+        return self.gain.unsqueeze(0)
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        east, north = x[..., 0], x[..., 2]
+        return independent_normal(torch.stack([torch.atan2(east, north), torch.hypot(east, north)], -1), self.sd)
+
+
+MODELS = {"growth": partial(Growth, **GROWTH), "volatility": partial(StochasticVolatility, **VOLATILITY), "radar": Radar}
+
+
+def model_and_record(work: Any, dtype: torch.dtype) -> tuple[StateSpaceModel, Record]:
+    """What the filter believes and is given."""
+    if str(getattr(work, "kind", "ins")) != "ins":
+        model = MODELS[str(work.kind)]().to(dtype)
+        return model, Record(torch.from_numpy(work.y)).to(model.anchor)
+    model = ins_model().to(dtype)
+    step, d = torch.from_numpy(work.step)[None], len(work.p0)
+    inputs = Step(step[..., :d].contiguous(), step[..., d:].contiguous())
+    return model, Record(torch.from_numpy(work.y), inputs).to(model.anchor)
 
 
 def sir(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
     """The project's SIR filter, resampling at every step; `compiled` fuses the kernels."""
-    model = ins_model().to(dtype)
-    step, d = torch.from_numpy(work.step)[None], len(work.p0)
-    inputs = Step(step[..., :d].contiguous(), step[..., d:].contiguous())
-    record = Record(torch.from_numpy(work.y), inputs).to(model.anchor)
     method = ParticleFilter(int(work.particles), Resample(Systematic(), threshold=1.0))
+    return of(method, method.particles, work, dtype, compiled)
+
+
+def ckf(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
+    """The project's cubature filter, as it is configured."""
+    with initialize_config_module("pfbench.conf", version_base="1.3"):
+        method = job.build(compose("config", ["filter=ckf"])["filter"])
+    return of(method, 1, work, dtype, compiled)
+
+
+def of(method: Any, particles: int, work: Any, dtype: torch.dtype, compiled: bool) -> Filter:
+    """A filter in the project's time loop, in blocks of runs as a job makes them."""
+    model, record = model_and_record(work, dtype)
     runs = torch.arange(len(work.y))
-    block = runs_at_once(len(runs), method.particles, d)
+    block = runs_at_once(len(runs), particles, model.chart.size)
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         with fusion.fused(compiled), torch.no_grad():
@@ -42,7 +103,8 @@ def sir(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
 def contestant(work: Any) -> tuple[Filter, dict[str, str]]:
     torch.set_num_threads(1)
     native.keep_memory()  # as a job does
-    run = sir(work, getattr(torch, sys.argv[1]), compiled=sys.argv[2] == "compiled")
+    filtered = ckf if "ckf" in sys.argv[3:-1] else sir
+    run = filtered(work, getattr(torch, sys.argv[1]), compiled=sys.argv[2] == "compiled")
     return run, {"torch": torch.__version__, "numpy": sys.modules["numpy"].__version__}
 
 

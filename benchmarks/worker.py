@@ -37,8 +37,15 @@ def serve(contestant: Callable[[Any], tuple[Filter, dict[str, str]]]) -> None:
 
 
 def quality(work: Any, log_evidence: np.ndarray, mean: np.ndarray) -> dict[str, list[float]]:
-    """Of each run: error of the log evidence; mean square errors against the truth, in exact posterior variances and in m^2."""
+    """Of each run: error of the log evidence; mean square errors against the truth, in exact posterior variances and in m^2.
+
+    Where nothing exact is known: log evidence itself, NaN from those that have none, and the mean square error, all of it and
+    of the first state.
+    """
     square = (mean.astype(float) - work.truth) ** 2
+    if not hasattr(work, "log_evidence"):
+        whole, first = square.mean((1, 2)).tolist(), square[..., 0].mean(1).tolist()
+        return {"evidence": np.asarray(log_evidence, float).tolist(), "normalised": whole, "position": first}
     return {
         "evidence": (log_evidence.astype(float) - work.log_evidence).tolist(),
         "normalised": (square / work.sd**2).mean((1, 2)).tolist(),

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from command_line import pfbench
 from torch import Tensor
 
-from pfbench import fusion, native
+from pfbench import fusion, job, native, store
 from pfbench.draws import MonteCarlo
 from pfbench.filter import particle, resamplers
 from pfbench.filter.belief import Cloud, gather
@@ -147,3 +150,51 @@ def test_a_gradient_goes_round_the_loops_by_hand() -> None:
 def test_small_numbers_are_still_numbers_after_the_loops_are_loaded() -> None:
     native.normals(torch.tensor([1, 2]), torch.tensor(0), *(torch.arange(2) for _ in range(3)))
     assert float(torch.tensor(1e-310, dtype=torch.float64) / 2) > 0.0  # -ffast-math, when linked, would make it 0
+
+
+WALK = ("run", "scenario=linear_walk", "scenario.steps=20", "runs=4", "particles=200", "fresh=true")
+
+
+@compiler
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_compiled_job_gives_the_numbers_of_an_eager_one(tmp_path: Path, dtype: str) -> None:
+    found = {}
+    for engine in ("eager", "compiled"):
+        said = pfbench(*WALK, f"engine={engine}", f"dtype={dtype}", home=tmp_path)
+        assert said.code == 0, said.err
+        (file,) = (tmp_path / "results" / "adhoc").glob("*.npz")  # one key: an engine changes no result
+        found[engine] = store.load(file)
+        assert found[engine].meta["engine"] == engine
+    # the same draws, to 1e-5; a particle in a few thousand falls to a neighbouring slot
+    eager, compiled = (found[engine].arrays for engine in ("eager", "compiled"))
+    for name in ("error", "sd", "log_evidence"):
+        assert np.allclose(compiled[name], eager[name], rtol=0, atol=2e-2), name
+
+
+def test_where_nothing_compiles_one_line_says_so(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    model, method = linear_walk(1.0, 0.3, 1.0), ParticleFilter(100)
+
+    def refused(*given: Any) -> None:
+        raise OSError("no C++ compiler")
+
+    monkeypatch.setattr(job.MonteCarlo, "uniform", refused)
+    assert not job.fuses("compiled", method, model, 10)
+    assert [record.getMessage() for record in caplog.records] == [
+        "engine=compiled: nothing compiles here (OSError); going on eagerly"
+    ]
+
+
+def test_small_jobs_are_not_compiled_unless_asked() -> None:
+    model, method = linear_walk(1.0, 0.3, 1.0), ParticleFilter(100)
+    assert not job.fuses("auto", method, model, 1000)
+    assert not job.fuses("eager", method, model, 10**9)
+
+
+@compiler
+def test_a_compilation_is_told_with_its_cost(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    clock = iter((0.0, 3.21))
+    monkeypatch.setattr(job.time, "perf_counter", lambda: next(clock))
+    assert job.fuses("compiled", ParticleFilter(100), linear_walk(1.0, 0.3, 1.0), 10)
+    assert "engine=compiled: inner loops compiled in 3.2 s; later jobs find them ready" in caplog.text

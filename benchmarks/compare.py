@@ -1,0 +1,237 @@
+"""W1 to W5: pfbench, its peers and a fused C loop side by side in one run. Writes compare.md and compare.png.
+
+    make bench      (or: python benchmarks/compare.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python --rounds 9)
+
+One thread each, one process at a time, interleaved rounds (see race.py), warm. All contestants of a workload filter the same
+data, deliver mean, variance and effective sample size at every step and the log evidence where they have one, and are checked
+to have computed the same thing. `--only W1 --scale 0.1` is for trying it out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import problems
+import workload
+from matplotlib.figure import Figure
+from race import HERE, Contestant, Result, race
+from w4 import cpu_name
+
+TOLERANCE = 4.5  # standard errors, in some hundred comparisons
+EXACT = 0.05  # of the log evidence, where filters draw nothing: two round differently, or add a jitter
+
+FLOAT32 = Contestant("pfbench float32, compiled", "own", ("house.py", "float32", "compiled"))
+EAGER = Contestant("pfbench float32, eager", "own", ("house.py", "float32", "eager"))
+FLOAT64 = Contestant("pfbench float64, compiled", "own", ("house.py", "float64", "compiled"))
+LIMIT = Contestant("fused C", "own", ("fused.py",))
+JAX = Contestant("JAX, jitted scan", "jax", ("peer_jax.py", "vmap"))
+CUTHBERT = Contestant("cuthbert", "jax", ("peer_cuthbert.py",))
+PYRO = Contestant("Pyro SMCFilter", "own", ("peer_pyro.py",))
+FILTERPY = Contestant("FilterPy", "jax", ("peer_filterpy.py", "sir"))
+NUMBA = Contestant("particles", "numba", ("peer_particles.py",))
+SMALL = (FLOAT32, EAGER, LIMIT, JAX, NUMBA, CUTHBERT, PYRO, FILTERPY)
+LARGE = (FLOAT32, EAGER, LIMIT, JAX, NUMBA, CUTHBERT)
+BATCH = (
+    FLOAT32, EAGER, FLOAT64, LIMIT, JAX, Contestant("JAX, run by run", "jax", ("peer_jax.py", "loop")),
+    Contestant("particles float32", "numba", ("peer.py", "float32")),
+    Contestant("particles float64", "numba", ("peer.py", "float64")), CUTHBERT,
+    Contestant("naive torch float32", "own", ("naive.py", "float32")),
+)  # fmt: skip
+GAUSSIAN = (
+    Contestant("pfbench float32, eager", "own", ("house.py", "float32", "eager", "ckf")),
+    Contestant("pfbench float64, eager", "own", ("house.py", "float64", "eager", "ckf")),
+    Contestant("dynamax", "jax", ("peer_dynamax.py",)),
+    Contestant("FilterPy", "jax", ("peer_filterpy.py", "ckf")),
+)
+LIBRARIES = ("JAX", "particles", "cuthbert", "Pyro SMCFilter", "FilterPy", "dynamax")
+COLOURS = {"pfbench": "#0072B2", "fused C": "#D55E00"}  # Okabe and Ito 2008; all others grey
+
+
+class Case(NamedTuple):
+    """A workload: name, what it is, sizes, who takes part, and the goals: times as fast as the fastest peer, slower than C."""
+
+    name: str
+    said: str
+    kind: str
+    runs: int
+    steps: int
+    particles: int
+    contestants: tuple[Contestant, ...]
+    must: float
+    limit: float | None
+
+
+CASES = (
+    Case("W1, N = 1e3", "growth model", "growth", 1, 100, 1000, SMALL, 1.0, 7.0),
+    Case("W1, N = 1e4", "growth model", "growth", 1, 100, 10_000, SMALL, 2.0, 3.0),
+    Case("W1, N = 1e5", "growth model", "growth", 1, 100, 100_000, LARGE, 2.0, 2.6),
+    Case("W2, N = 1e4", "stochastic volatility", "volatility", 1, 1000, 10_000, LARGE, 2.5, None),
+    Case("W3, N = 1e4", "constant velocity, bearing and range", "radar", 1, 100, 10_000, SMALL, 4.0, None),
+    Case("W4, N = 500", "15-state INS error model", "ins", 100, 200, 500, BATCH, 5.0, 2.6),
+    Case("W5", "cubature filter on W4's model", "ins", 100, 200, 500, GAUSSIAN, 1.6, None),
+)
+
+
+def work(case: Case, scale: float) -> Mapping[str, Any]:
+    """The workload's arrays; `scale` shortens it for a trial."""
+    steps = max(10, round(case.steps * scale))
+    if case.kind == "ins":
+        return {**workload.make(max(4, round(case.runs * scale)), steps, case.particles)._asdict(), "kind": np.array("ins")}
+    return problems.make(case.kind, steps, case.particles)._asdict()
+
+
+def disagreements(found: Mapping[Contestant, Result], exact: bool) -> list[str]:
+    """Contestants that did not compute the same: against the mean of all others, in standard errors over rounds and runs."""
+    said = []
+    for name, what in (("evidence", "log evidence"), ("normalised", "mean square error")):
+        values = {who: result.qualities[name] for who, result in found.items() if not np.isnan(result.qualities[name]).any()}
+        for who, own in values.items():
+            others = np.concatenate([other for key, other in values.items() if key is not who])
+            off = own.mean(0) - others.mean(0)  # of each run
+            if exact:
+                bad = bool(np.abs(off).max() > (EXACT if name == "evidence" else 1e-2 * others.mean()))
+                error = 0.0
+            elif len(off) > 1:
+                error = off.std(ddof=1) / np.sqrt(len(off))
+                bad = not abs(off.mean()) < TOLERANCE * error
+            else:
+                error = np.sqrt(own.var(ddof=1) / len(own) + others.var(ddof=1) / len(others))
+                bad = not abs(off.mean()) < TOLERANCE * error
+            if bad:
+                said.append(f"{who.label}: {what} differs from the others' by {off.mean():.3g} +- {error:.2g}")
+    return said
+
+
+def fastest(found: Mapping[Contestant, Result], wanted: Callable[[Contestant], bool]) -> Contestant | None:
+    """Of those that are wanted, the one with the smallest median."""
+    return min(filter(wanted, found), key=lambda who: float(np.median(found[who].cpu)), default=None)
+
+
+def ratio(slow: Result, fast: Result) -> tuple[float, float, float]:
+    """Quartiles of one's time over the other's, round by round."""
+    low, middle, high = np.quantile(slow.cpu / fast.cpu, [0.25, 0.5, 0.75])
+    return float(low), float(middle), float(high)
+
+
+def peer(who: Contestant) -> bool:
+    return who.label.startswith(LIBRARIES)
+
+
+def own(who: Contestant) -> bool:
+    return who.label.startswith("pfbench")
+
+
+def section(case: Case, found: Mapping[Contestant, Result], bad: list[str], scale: float) -> list[str]:
+    """The table of one workload."""
+    best, limit = fastest(found, peer), found.get(LIMIT)
+    runs, steps = next(iter(found.values())).qualities["evidence"].shape[1], max(10, round(case.steps * scale))
+    size = f"{case.said}; R = {runs}, T = {steps}"
+    lines = [
+        "", f"## {case.name}", "", f"{size[0].upper()}{size[1:]}.", "",
+        f"| | CPU ms, median (quartiles) | times as fast as {best.label if best else '-'} (quartiles) | times fused C's time "
+        "| log evidence | mean square error | s until warm |",
+        "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for who, result in found.items():
+        low, middle, high = np.quantile(result.cpu, [0.25, 0.5, 0.75])
+        quick = "{1:.2f} ({0:.2f}-{2:.2f})".format(*ratio(found[best], result)) if best else "-"
+        behind = f"{ratio(result, limit)[1]:.1f}" if limit else "-"
+        evidence, error = (result.qualities[name].mean(1) for name in ("evidence", "normalised"))
+        told = "-" if np.isnan(evidence).any() else f"{evidence.mean():.2f} ± {evidence.std(ddof=1) / len(evidence) ** 0.5:.2f}"
+        lines.append(
+            f"| {who.label} | {middle:.3g} ({low:.3g}-{high:.3g}) | {quick} | {behind} | {told} | {error.mean():.4g} "
+            f"| {result.start / 1e3:.1f} |"
+        )
+    lines += ["", "**Not the same work:** " + "; ".join(bad) + "." if bad else "All contestants agree."]
+    return lines
+
+
+def summary(found: Mapping[Case, Mapping[Contestant, Result]]) -> list[str]:
+    """The goals, and what became of them."""
+    lines = [
+        "| workload | pfbench's best | fastest peer | times as fast (quartiles) | goal | times fused C's time | goal |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for case, results in found.items():
+        ours, theirs, limit = fastest(results, own), fastest(results, peer), results.get(LIMIT)
+        if ours is None or theirs is None:
+            continue
+        low, middle, high = ratio(results[theirs], results[ours])
+        behind = ratio(results[ours], limit)[1] if limit else None
+        lines.append(
+            f"| {case.name} | {ours.label} | {theirs.label} | {middle:.2f} ({low:.2f}-{high:.2f}) | {_goal(middle, case.must)} "
+            f"| {f'{behind:.1f}' if behind else '-'} | {_goal(-behind, -case.limit) if behind and case.limit else '-'} |"
+        )
+    return lines
+
+
+def _goal(value: float, must: float) -> str:
+    return f"{abs(must):g}, {'met' if value >= must else 'missed'}"
+
+
+def draw(found: Mapping[Case, Mapping[Contestant, Result]], path: Path) -> None:
+    """One panel for each workload: median CPU time of each contestant on a logarithmic axis, quartiles as bars."""
+    figure = Figure(figsize=(7.5, 0.5 + sum(0.42 + 0.17 * len(results) for results in found.values())), layout="constrained")
+    axes = figure.subplots(len(found), 1, height_ratios=[len(results) for results in found.values()], squeeze=False)[:, 0]
+    for axis, (case, results) in zip(axes, found.items(), strict=True):
+        for place, (who, result) in enumerate(results.items()):
+            low, middle, high = np.quantile(result.cpu, [0.25, 0.5, 0.75])
+            colour = COLOURS.get("pfbench" if own(who) else who.label, "#777777")
+            axis.plot([low, high], [place, place], color=colour, lw=1.5)
+            axis.plot(middle, place, "o", color=colour, ms=4)
+            axis.annotate(f"{middle:.3g}", (high, place), (5, 0), textcoords="offset points", va="center", fontsize=7)
+        axis.set(xscale="log", ylim=(len(results) - 0.4, -0.6))
+        axis.set_yticks(range(len(results)), [who.label for who in results], fontsize=7)
+        axis.set_title(f"{case.name}: {case.said}", fontsize=8, loc="left")
+        axis.margins(x=0.12)
+        axis.tick_params(axis="x", labelsize=7)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[-1].set_xlabel("CPU time in ms, one thread (median, quartiles)", fontsize=8)
+    figure.savefig(path, dpi=150, metadata={"Software": None})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--numba", default="", help="Python that has the library particles; without, it takes no part")
+    parser.add_argument("--jax", default="", help="Python that has jax, cuthbert, dynamax and filterpy; likewise")
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--scale", type=float, default=1.0, help="below 1: shorter and smaller, to try it out")
+    parser.add_argument("--only", default="", help="workloads whose names begin so")
+    parser.add_argument("--out", type=Path, default=HERE, help="folder for compare.md and compare.png")
+    chosen = parser.parse_args()
+    places = {name: path for name, path in (("own", sys.executable), ("numba", chosen.numba), ("jax", chosen.jax)) if path}
+    found: dict[Case, dict[Contestant, Result]] = {}
+    lines, wrong, versions = [], [], {}
+    for case in (case for case in CASES if case.name.startswith(chosen.only)):
+        there = [who for who in case.contestants if who.place in places]
+        results = race(work(case, chosen.scale), there, places, chosen.rounds)
+        found[case] = {who: result for who, result in zip(there, results, strict=True) if result is not None}
+        failed = [f"{who.label}: it did not run" for who, result in zip(there, results, strict=True) if result is None]
+        bad = disagreements(found[case], exact=case.name == "W5") + failed
+        wrong += [f"{case.name}, {text}" for text in bad]
+        lines += section(case, found[case], bad, chosen.scale)
+        for result in found[case].values():
+            versions |= {name: value for name, value in result.versions.items() if name != "numpy"}
+    page = [
+        "# pfbench and its peers", "",
+        f"One thread each, one process at a time, {chosen.rounds} interleaved rounds after a warm-up; CPU time of the process; "
+        "systematic resampling at every step. Every contestant delivers mean, variance and effective sample size at every step "
+        "and, where it has one, the log evidence (of W4 and W5: minus the exact one). Ratios are taken round by round. Written "
+        "by `make bench`.", "", *summary(found), *lines, "",
+        ", ".join([f"{cpu_name()}; Python {platform.python_version()}", *map(" ".join, versions.items())]) + ".",
+        "",
+    ]  # fmt: skip
+    (chosen.out / "compare.md").write_text("\n".join(page))
+    draw(found, chosen.out / "compare.png")
+    print("\n".join(page))
+    sys.exit("; ".join(wrong) if wrong else 0)
+
+
+if __name__ == "__main__":
+    main()
