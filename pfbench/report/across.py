@@ -12,10 +12,10 @@ beside it. The Bayesian signed-rank test says how probable it is that a filter i
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 from typing import NamedTuple
 
@@ -202,6 +202,17 @@ def across(
     )  # fmt: skip
 
 
+def winners(table: pd.DataFrame, group: str, alpha: float, rule: LostRule) -> dict[tuple[str, str], str] | str:
+    """Winner of each pair by another rule for lost runs, or why no test is made; arguments as `across`."""
+    found = blocks(table, group, rule)
+    if why := _refusal(found):
+        return why
+    rank = ranks(found.values)
+    test, p = friedman(rank, alpha), nemenyi(rank)
+    pairs = combinations(range(len(found.filters)), 2)
+    return {(found.filters[i], found.filters[j]): _better(found, test, float(p[i, j]), i, j, alpha) for i, j in pairs}
+
+
 def blocks(table: pd.DataFrame, group: str, rule: LostRule = WORST) -> Blocks:
     """The cells in which all filters ran on the same worlds.
 
@@ -291,7 +302,7 @@ def wilcoxons(values: Array) -> dict[tuple[int, int], float]:
     return dict(zip(pairs, map(float, p), strict=True))
 
 
-def signed_rank(d: Array, rope: float, seed: int) -> tuple[float, float, float]:
+def signed_rank(d: Array, rope: float, seed: int = 0) -> tuple[float, float, float]:
     """Posterior probabilities that d [B] is centred below -rope, within the rope, or above it [Benavoli et al. 2014].
 
     The law of d is a Dirichlet process with half a pseudo-observation at zero; the three statements are weighed by the
@@ -300,12 +311,17 @@ def signed_rank(d: Array, rope: float, seed: int) -> tuple[float, float, float]:
     full = np.concatenate([[0.0], d])
     sums = full[:, None] + full
     below, above = (np.heaviside(side, 0.5) for side in (-sums - 2 * rope, sums - 2 * rope))
-    alpha = np.concatenate([[_PRIOR], np.ones(d.size)])
-    weight = np.random.default_rng(seed).dirichlet(alpha, _SAMPLES)
+    weight = _weights(d.size, seed)
     left, right = (np.einsum("si,si->s", weight @ law, weight) for law in (below, above))
     most = np.argmax(np.column_stack([left, 1 - left - right, right]), axis=1)
     first, second, third = np.bincount(most, minlength=3) / _SAMPLES
     return float(first), float(second), float(third)
+
+
+@lru_cache(maxsize=2)
+def _weights(n: int, seed: int) -> Array:
+    """Draws of the Dirichlet law over n differences and the pseudo-observation; the same for all pairs of a size."""
+    return np.random.default_rng([n, seed]).dirichlet(np.concatenate([[_PRIOR], np.ones(n)]), _SAMPLES)
 
 
 def profile(found: Blocks, at: Array) -> Array:
@@ -331,23 +347,28 @@ def _compared(found: Blocks, test: Friedman, alpha: float, margin: float) -> lis
     for i, j in by_wilcoxon:
         a, b = found.filters[i], found.filters[j]
         d = _difference(found.values, i, j)
-        seed = int(hashlib.sha256("\n".join((found.group, *found.cells, a, b)).encode()).hexdigest()[:16], 16)
-        left, equal, right = signed_rank(d, float(np.log1p(margin)), seed)
+        left, equal, right = signed_rank(d, float(np.log1p(margin)))
         shares = [improvement(own[:, i], own[:, j]) for own in found.runs]
         better, (low, high) = _mean_share(shares, 1 - alpha)
         middle = float(np.median(d))
         known = found.values[:, [i, j]]
         largest = np.abs(d[np.isfinite(known).all(axis=1)]).max(initial=0.0)
-        shown = test.p_f <= alpha and by_nemenyi[i, j] <= alpha
         pairs.append(AcrossPair(
             a, b, wins=int((d < 0).sum()), losses=int((d > 0).sum()), rank_a=float(test.ranks[i]),
             rank_b=float(test.ranks[j]), p_nemenyi=float(by_nemenyi[i, j]), p_conover=float(by_conover[i, j]),
             p_wilcoxon=by_wilcoxon[i, j], family=len(by_wilcoxon), effect=rank_biserial(d),
             ratio=math.exp(middle) if abs(middle) <= largest * (1 + 1e-12) else (math.inf if middle > 0 else 0.0),
             bayes_a=left, bayes_equal=equal, bayes_b=right, better=better, better_low=low, better_high=high,
-            winner=(a if test.ranks[i] < test.ranks[j] else b) if shown else NO_DIFFERENCE,
+            winner=_better(found, test, float(by_nemenyi[i, j]), i, j, alpha),
         ))  # fmt: skip
     return pairs
+
+
+def _better(found: Blocks, test: Friedman, p: float, i: int, j: int, alpha: float) -> str:
+    """The filter of the better rank, where the omnibus test and Nemenyi's p both show a difference."""
+    if test.p_f > alpha or p > alpha:
+        return NO_DIFFERENCE
+    return found.filters[i if test.ranks[i] < test.ranks[j] else j]
 
 
 def _mean_share(shares: Sequence[Share], level: float) -> tuple[float, tuple[float, float]]:

@@ -75,7 +75,7 @@ def said(found: Sequence[Calibrated], group: str) -> str:
 
 
 def drawings(
-    results: Mapping[str, store.Result], groups: Sequence[str], style: Mapping[str, Look], alpha: float = 0.05
+    results: Mapping[str, store.Result], groups: Sequence[str], style: Mapping[str, Look], alpha: float = 0.05, note: str = ""
 ) -> list[Drawing]:
     """The rank histograms of a cell, where anything was scored.
 
@@ -84,6 +84,7 @@ def drawings(
         groups: names of the blocks shown.
         style: from `looks`.
         alpha: probability outside the band, for one bin.
+        note: on who is drawn how.
     """
     shown = [group for group in groups if _numbers(results, group)]
     if not shown:
@@ -92,7 +93,7 @@ def drawings(
         "Rank histograms: how often the truth lay where a filter gives values below it so much probability; flat when it knows "
         "what it knows, high at both ends when its regions are too narrow, high in the middle when they are too wide. "
         f"Shaded: {100 * (1 - alpha):g} % binomial band of one bin, of as many numbers as runs, for components and instants of "
-        "one run hang together."
+        f"one run hang together.{note}"
     )
     return [Drawing("calibration", text, partial(histograms, results, shown, style, alpha))]
 
@@ -108,8 +109,7 @@ def histograms(
         for label, (pit, lost) in _numbers(results, group).items():
             found = metrics.rank_histogram(pit, lost, _BINS)
             look = style[label]
-            line: Any = {"color": look.colour, "ls": look.dash, "lw": look.width, "marker": look.marker, "ms": 2.5}
-            axis.plot(centres, 100 * found.value, label=label, **line)
+            axis.plot(centres, 100 * found.value, marker="" if look.quiet else look.marker, ms=2.5, **look.line(label))
             runs.append(found.runs)
         low, high = metrics.share_band(1 / _BINS, max(runs), alpha)
         axis.axhspan(100 * low, 100 * high, color="0.88", lw=0, zorder=0)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from itertools import cycle
 from typing import Any, NamedTuple
 
@@ -11,6 +13,7 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from PIL import Image
 
 COLUMN = 3.5  # inches
 _INSTANTS = 300  # drawn at most: a column of print resolves no more
@@ -41,12 +44,18 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 class Look(NamedTuple):
-    """How one filter is drawn in all figures of a study."""
+    """How one filter is drawn in all figures of a study; a quiet one is one of many, grey and without a name."""
 
     colour: str
     dash: _Dash
     marker: str
     width: float
+    quiet: bool = False
+
+    def line(self, label: str = "") -> dict[str, Any]:
+        """How its line is drawn, and named where it is."""
+        named = {} if self.quiet or not label else {"label": label}
+        return {"color": self.colour, "ls": self.dash, "lw": self.width, "zorder": 1.5 if self.quiet else 2.0, **named}
 
 
 def looks(labels: Sequence[str]) -> dict[str, Look]:
@@ -55,9 +64,19 @@ def looks(labels: Sequence[str]) -> dict[str, Look]:
     Later lines are thinner: where filters agree exactly, the earlier ones still show on both sides.
     """
     names = list(dict.fromkeys(labels))
-    widths = np.linspace(1.0 + min(0.25 * len(names), 1.0), 1.0, len(names)) if len(names) > 1 else [1.3]
+    first = min(len(names), 8)
+    widths = [*np.linspace(1.0 + min(0.25 * first, 1.0), 1.0, first), *[1.0] * (len(names) - first)] if first > 1 else [1.3]
     each = zip(names, cycle(_COLOURS), cycle(_DASHES), cycle(_MARKERS), widths, strict=False)
     return {label: Look(colour, dash, marker, float(width)) for label, colour, dash, marker, width in each}
+
+
+def dimmed(style: Mapping[str, Look], kept: Iterable[str]) -> dict[str, Look]:
+    """The same looks, with all but those kept made quiet."""
+    own = set(kept)
+    return {
+        label: look if label in own else look._replace(colour="0.78", dash="-", width=0.6, quiet=True)
+        for label, look in style.items()
+    }
 
 
 def stack(n: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
@@ -72,6 +91,28 @@ def legend(figure: Figure, axis: Axes, columns: int = 2) -> None:
     width, height = figure.get_size_inches()
     figure.set_size_inches(width, height + 0.1 + 0.16 * -(-len(labels) // columns))
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+
+
+def indexed(figure: Figure) -> bytes:
+    """The figure as a PNG of 74 colours: those of the filters and greys, in steps to white; a quarter as large."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    picture = Image.open(buffer).convert("RGB").quantize(palette=_palette(), dither=Image.Dither.NONE)
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+@cache
+def _palette() -> Image.Image:
+    colours = [*(colour for colour in _COLOURS if colour != "#000000"), "#B35900"]
+    pure = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours])
+    whiter = pure[:, None] + (255 - pure[:, None]) * np.linspace(0, 1, 8, endpoint=False)[:, None]
+    greys = np.repeat(np.linspace(0, 255, 18)[:, None], 3, axis=1)
+    steps = np.round(np.concatenate([whiter.reshape(-1, 3), greys])).astype(np.uint8)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate([steps, np.repeat(steps[-1:], 256 - len(steps), axis=0)]).tobytes())
+    return palette
 
 
 def labelled(what: str, unit: str) -> str:

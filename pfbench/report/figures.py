@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import seaborn as sns
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pfbench import metrics, store
@@ -18,6 +19,7 @@ from pfbench.report.canvas import (
     COLUMN,
     RC,
     Look,
+    indexed,
     jitter,
     labelled,
     legend,
@@ -35,6 +37,15 @@ Results = Mapping[str, store.Result]
 _FEW = 4  # filters of which each has a picture of its spread; of more, two have, chosen by `worth_a_spread` [ours]
 _BOUND: Any = {"color": "black", "ls": (0, (3, 1.2)), "lw": 0.8, "zorder": 4}
 _MEDIAN = 0.6745  # of the absolute value of a standard normal number
+_BOXES = 12  # filters that a figure of boxes and points holds; more have a row each, by rank
+_TRACES = {  # what a trace shows, the unit, and whether it is a share of the particles
+    "ess": ("effective sample size", "% of N", True),
+    "ancestors": ("number of distinct ancestors after resampling", "% of N", True),
+    "unique": ("number of unique particles after moves", "% of N", True),
+    "particles": ("number of particles", "", False),
+    "iterations": ("iterations until the swarm stopped", "", False),
+    "accepted_0": ("share of moves that were accepted, where there were any", "", False),
+}
 
 
 class Drawing(NamedTuple):
@@ -52,16 +63,25 @@ class Drawing(NamedTuple):
 
 
 def drawings(
-    results: Results, runs: pd.DataFrame, style: Mapping[str, Look], groups: Sequence[str], alpha: float = 0.05
+    results: Results,
+    runs: pd.DataFrame,
+    style: Mapping[str, Look],
+    groups: Sequence[str],
+    alpha: float = 0.05,
+    *,
+    brief: bool = False,
+    note: str = "",
 ) -> list[Drawing]:
     """All figures that a cell has data for.
 
     Args:
         results: by label, whole.
         runs: rows of `frame` of this cell.
-        style: from `looks`.
+        style: from `looks`, or from `dimmed`.
         groups: names of the blocks shown.
         alpha: probability outside the NEES band.
+        brief: leave out the track, the traces and the spread of single filters.
+        note: on who is drawn how, for captions of figures with a line per filter.
     """
     shown = [block for block in _all_blocks(results) if block.group in groups]
     if not shown:
@@ -69,24 +89,29 @@ def drawings(
     wholes = list(dict.fromkeys(block.whole for block in shown))
     kept = "runs that were not lost"
     found = []
-    row = _common_run(results)
+    row = None if brief else _common_run(results)
     if row is not None and any("track" in result.arrays for result in results.values()):
         number = row + int(next(iter(results.values())).meta.get("first_run", 0))
-        text = f"True and estimated track of run {number}, the first that no filter lost: plan view and height."
+        text = f"True and estimated track of run {number}, the first that no filter lost: plan view and height.{note}"
         found.append(Drawing("track", text, partial(track, results, row, style)))
     for block in shown:
         text = f"Absolute error of {block.group} over time, median of the {kept}."
         if any(bound_of(result) is not None for result in results.values()):
             text += " Dashed black: what the median is of a normal error that reaches the Cramer-Rao bound."
-        found.append(Drawing(f"error_{slug(block.group)}", text, partial(error, results, block, style)))
-    text = f"RMSE of each run: quartiles, whiskers to 1.5 quartile ranges, one point for each of the {kept}."
+        found.append(Drawing(f"error_{slug(block.group)}", text + note, partial(error, results, block, style)))
+    if len(results) > _BOXES:
+        text = f"RMSE of each run, filters by their median: median (dot), quartiles and 5 to 95 % of the {kept}."
+    else:
+        text = f"RMSE of each run: quartiles, whiskers to 1.5 quartile ranges, one point for each of the {kept}."
     found.append(Drawing("rmse", text, partial(rmse, runs, [block.group for block in shown], style)))
-    text = f"NEES averaged over the {kept}, with its two-sided {100 * (1 - alpha):g} % chi-square band."
+    text = f"NEES averaged over the {kept}, with its two-sided {100 * (1 - alpha):g} % chi-square band.{note}"
     found.append(Drawing("nees", text, partial(nees, results, wholes, style, alpha)))
-    if any("ess" in result.arrays for result in results.values()):
-        text = f"Effective sample size of the particle filters, median and 5 to 95 % of the {kept}."
-        found.append(Drawing("ess", text, partial(ess, results, style)))
-    for label, why in worth_a_spread(results, runs, groups).items():
+    traces = [name for name in _TRACES if any(name in result.arrays for result in results.values())]
+    for name in () if brief else traces:
+        what = _TRACES[name][0]
+        text = f"{what[0].upper()}{what[1:]}, median and 5 to 95 % of the {kept}.{note}"
+        found.append(Drawing(name, text, partial(trace, results, name, style)))
+    for label, why in ({} if brief else worth_a_spread(results, runs, groups)).items():
         result = results[label]
         text = (
             f"{label}{why}: error over time, median and 5 to 95 % of the {kept} (shaded), and three times the filter's own "
@@ -141,7 +166,10 @@ def save(drawing: Drawing, folder: Path, formats: Sequence[str]) -> list[Path]:
             figure.set_layout_engine(None)
         paths = [folder / f"{drawing.name}.{ending}" for ending in formats]
         for path, ending in zip(paths, formats, strict=True):
-            figure.savefig(path, metadata=date.get(ending))
+            if ending == "png":
+                path.write_bytes(indexed(figure))
+            else:
+                figure.savefig(path, metadata=date.get(ending))
     return paths
 
 
@@ -161,9 +189,8 @@ def track(results: Results, row: int, style: Mapping[str, Look]) -> Figure:
         off = result.arrays["error"][row][:, axes[0]].astype(np.float64) * axes[1]
         estimate = result.arrays["track"][row] + off
         known = ~np.isnan(estimate).any(-1)  # rare steps would leave gaps in which no line shows
-        line: Any = {"color": style[label].colour, "ls": style[label].dash, "lw": style[label].width}
-        plan.plot(estimate[known, 0], estimate[known, 1], label=label, **line)
-        height.plot(result.arrays["time"][known], estimate[known, 2], **line)
+        plan.plot(estimate[known, 0], estimate[known, 1], **style[label].line(label))
+        height.plot(result.arrays["time"][known], estimate[known, 2], **style[label].line())
     plan.set(xlabel="east in m", ylabel="north in m")
     plan.set_aspect("equal", adjustable="datalim")
     height.set(xlabel="time in s", ylabel="height in m")
@@ -180,9 +207,7 @@ def error(results: Results, block: Block, style: Mapping[str, Look]) -> Figure:
             if name in own:
                 time, (values,) = _kept(result, own.index(name), "error")
                 middle = quantiles(np.abs(values) * block.scale, [0.5])[0]
-                look = style[label]
-                line: Any = {"color": look.colour, "ls": look.dash, "lw": look.width, "marker": _mark(time)}
-                axis.plot(time, middle, label=label, **line)
+                axis.plot(time, middle, marker=_mark(time), **style[label].line(label))
     for name, axis in zip(block.components, panels, strict=True):
         for time, sd in _bounds(results, name):
             axis.plot(time, _MEDIAN * sd * block.scale, label="Cramer-Rao bound", marker=_mark(time), **_BOUND)
@@ -230,32 +255,53 @@ def spread(result: store.Result, groups: Sequence[str], look: Look) -> Figure:
 
 
 def rmse(runs: pd.DataFrame, groups: Sequence[str], style: Mapping[str, Look]) -> Figure:
-    """RMSE of the norm of each group, one box per filter and one point per run."""
+    """RMSE of the norm of each group: one box per filter and one point per run, or of many filters one row each."""
     rows = runs[(runs.metric == "rmse") & (runs.component == "norm")]
     labels = [label for label in style if (rows.label == label).any()]
-    figure, panels = stack(len(groups), 0.55 + 0.3 * len(labels), sharex=False)
+    many = len(labels) > _BOXES
+    figure, panels = stack(len(groups), 0.55 + (0.125 if many else 0.3) * len(labels), sharex=False)
     for group, axis in zip(groups, panels, strict=True):
         own = rows[rows.group == group]
         kept = own[np.isfinite(own.value)]
-        colours = {label: style[label].colour for label in labels}
-        sns.boxplot(
-            kept, x="value", y="label", hue="label", order=labels, hue_order=labels, palette=colours, legend=False,
-            orient="h", width=0.6, fliersize=0, linewidth=0.8, saturation=1, boxprops={"alpha": 0.45}, ax=axis,
-        )  # fmt: skip
-        for place, label in enumerate(labels):
-            value = kept.value[kept.label == label].to_numpy()
-            axis.scatter(value, place + jitter(value.size), s=5, color="0.15", alpha=0.55, lw=0, zorder=3)
+        middle = own.groupby("label").value.median()  # a lost run is worse than any other
+        order = sorted(labels, key=lambda label: (middle.get(label, np.inf), label)) if many else labels
+        (_rows if many else _boxes)(axis, kept, order, style)
+        for place, label in enumerate(order):
             lost = int(own.lost[own.label == label].sum())
             if lost:
                 place_of = axis.get_yaxis_transform()
-                axis.text(1.01, place, f"{lost} lost", transform=place_of, ha="left", va="center", fontsize=7)
+                size = 5.5 if many else 7
+                axis.text(1.01, place, f"{lost} lost", transform=place_of, ha="left", va="center", fontsize=size)
         # Said again because a filter that lost every run has no box, and its row must stay.
-        axis.set_yticks(range(len(labels)), labels)
-        axis.set_ylim(len(labels) - 0.5, -0.5)
+        axis.set_yticks(range(len(order)), order, fontsize=5.8 if many else None)
+        axis.set_ylim(len(order) - 0.5, -0.5)
         unit = str(own.unit.iloc[0]) if len(own) else ""
         axis.set(title=group, xlabel=labelled("RMSE per run", unit), ylabel="")
         log_if_wide(axis, axis.xaxis, [kept.value.to_numpy()])
     return figure
+
+
+def _boxes(axis: Axes, kept: pd.DataFrame, labels: Sequence[str], style: Mapping[str, Look]) -> None:
+    colours = {label: style[label].colour for label in labels}
+    sns.boxplot(
+        kept, x="value", y="label", hue="label", order=labels, hue_order=labels, palette=colours, legend=False,
+        orient="h", width=0.6, fliersize=0, linewidth=0.8, saturation=1, boxprops={"alpha": 0.45}, ax=axis,
+    )  # fmt: skip
+    for place, label in enumerate(labels):
+        value = kept.value[kept.label == label].to_numpy()
+        axis.scatter(value, place + jitter(value.size), s=5, color="0.15", alpha=0.55, lw=0, zorder=3)
+
+
+def _rows(axis: Axes, kept: pd.DataFrame, labels: Sequence[str], style: Mapping[str, Look]) -> None:
+    """Quartiles on a thin line from 5 to 95 %, the median a dot; named filters in their colour."""
+    for place, label in enumerate(labels):
+        value = kept.value[kept.label == label].to_numpy()
+        if value.size:
+            low, first, middle, third, high = np.quantile(value, [0.05, 0.25, 0.5, 0.75, 0.95])
+            colour = "0.45" if style[label].quiet else style[label].colour
+            axis.plot([low, high], [place, place], color=colour, lw=0.8)
+            axis.plot([first, third], [place, place], color=colour, lw=3, solid_capstyle="butt")
+            axis.plot(middle, place, marker="o", ms=3.2, mfc="white", mec="black", mew=0.7, ls="none")
 
 
 def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alpha: float = 0.05) -> Figure:
@@ -271,9 +317,8 @@ def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alp
                 found = metrics.consistency(result.arrays["nees"][..., place], result.arrays["lost"], dof, alpha)
                 thin = _thin(found.runs_at > 0)
                 time = result.arrays["time"][thin]
-                look = style[label]
-                line: Any = {"color": look.colour, "ls": look.dash, "lw": 0.8 * look.width, "marker": _mark(time)}
-                axis.plot(time, found.average[thin], label=label, **line)
+                look = style[label]._replace(width=0.8 * style[label].width)
+                axis.plot(time, found.average[thin], marker=_mark(time), **look.line(label))
                 lines.append(found.average)
                 bands.append((found.runs, time, found.low[thin], found.high[thin], dof))
         _, time, low, high, dof = max(bands, key=lambda band: band[0])
@@ -287,16 +332,19 @@ def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alp
     return figure
 
 
-def ess(results: Results, style: Mapping[str, Look]) -> Figure:
-    """Effective sample size over time as a share of the particles."""
+def trace(results: Results, name: str, style: Mapping[str, Look]) -> Figure:
+    """One trace of the filters that leave it over time."""
+    what, unit, share = _TRACES[name]
     figure, (axis,) = stack(1, 2.2)
     for label, result in results.items():
-        if "ess" in result.arrays and result.meta.get("particles"):
-            time, (values,) = _kept(result, None, "ess")
-            low, middle, high = quantiles(100 * values / result.meta["particles"], [0.05, 0.5, 0.95])
-            axis.fill_between(time, low, high, color=style[label].colour, alpha=0.18, lw=0)
-            axis.plot(time, middle, color=style[label].colour, ls=style[label].dash, label=label)
-    axis.set(xlabel="time in s", ylabel="effective sample size in % of N")
+        if name in result.arrays and (result.meta.get("particles") or not share):
+            time, (values,) = _kept(result, None, name)
+            scale = 100 / result.meta["particles"] if share else 1.0
+            low, middle, high = quantiles(scale * values, [0.05, 0.5, 0.95])
+            if not style[label].quiet:
+                axis.fill_between(time, low, high, color=style[label].colour, alpha=0.18, lw=0)
+            axis.plot(time, middle, marker=_mark(time), **style[label].line(label))
+    axis.set(xlabel="time in s", ylabel=labelled(what.partition(",")[0], unit))
     axis.set_ylim(bottom=0)
     legend(figure, axis)
     return figure

@@ -94,11 +94,11 @@ def frame(
 
     Returns:
         Columns study, key, scenario, noise, model, filter, label, particles, seed, run, lost, group, component, unit,
-        metric, value. Metrics: rmse (each component, and "norm" of the group), max_error, nees, ess, ancestors and unique (shares of
-        the particles: effective, that are copied at a refresh, that differ after it and its moves), iterations (of a swarm),
-        log_evidence, seconds_per_step, converged; and of jobs that were scored nis (per component seen), crps (each component, and "mean" of
-        the group), energy, and coverage_50, _90, _99, the share of truths in the central regions of these per cents. A lost run
-        has infinite errors and scores, and NaN elsewhere.
+        metric, value. Metrics: rmse (each component, and "norm" of the group), max_error, nees; ess, ancestors and unique
+        (shares of the particles: effective, copied at a refresh, different after it and its moves), iterations (of a swarm),
+        log_evidence, seconds_per_step, converged; and of jobs that were scored nis (per component seen), crps (each component,
+        and "mean" of the group), energy, and coverage_50, _90, _99, the share of truths in the central regions of these per
+        cents. A lost run has infinite errors and scores, and NaN elsewhere.
 
     Raises:
         FileNotFoundError: the study has no result; the message says which studies have.
@@ -227,13 +227,15 @@ def _rows(result: store.Result, converged: Mapping[str, float]) -> Iterator[pd.D
 def of_trace(result: store.Result, name: str) -> np.ndarray:
     """Mean over time of a trace, as a share of the particles where it counts them, on each run [R]; NaN where there is none.
 
-    Particles that no move has changed are as many as they have ancestors.
+    Ancestors, and particles that differ, are counted where a run was resampled; without moves these are as many as those.
     """
     arrays, lost, particles = result.arrays, result.arrays["lost"], result.meta.get("particles")
     trace = arrays.get("ancestors" if name == "unique" and "unique" not in arrays else name)
     if trace is None or (name in _COUNTED and not particles):
         return np.full(lost.size, np.nan)
-    return metrics.mean_per_run(trace, lost) / (particles if name in _COUNTED else 1)
+    if name in ("ancestors", "unique") and "resampled" in arrays:
+        trace = np.where(arrays["resampled"], trace, np.nan)
+    return metrics.mean_per_run(trace, lost) / (particles if particles and name in _COUNTED else 1)
 
 
 def _scored(arrays: Mapping[str, np.ndarray], lost: np.ndarray, block: Block, groups: list[str]) -> Iterator[pd.DataFrame]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pfbench.report import page, tables
-from pfbench.report.canvas import slug
-from pfbench.report.claims import PAPERS, load
+from pfbench.report import claim_figures, page, tables
+from pfbench.report.claims import PAPERS, Claim, load
 from pfbench.report.evidence import gather
 from pfbench.report.rulings import VERDICTS, Finding, Ruling, decide
 
@@ -29,8 +29,9 @@ def write(
     experiments: Path | None = None,
     *,
     mixed: bool = False,
+    formats: tuple[str, ...] = ("svg", "png"),
 ) -> Path:
-    """Writes `<out>/claims/`: index.html, report.md, verdicts.json, tables/. The same results give the same bytes.
+    """Writes `<out>/claims/`: index.html, report.md, verdicts.json, figures/, tables/. The same results give the same bytes.
 
     Args:
         results: folder of all studies; claims whose studies have no results are shown as not run.
@@ -38,6 +39,7 @@ def write(
         alpha: level after correction.
         conf, experiments: as `claims.load`.
         mixed: as in `frame`.
+        formats: of the figures.
 
     Returns:
         The page, index.html.
@@ -52,20 +54,36 @@ def write(
     page.save_table(folder, STUDY, table(rulings))
     plain = [_plain(ruling) for ruling in rulings]
     (folder / "verdicts.json").write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    shown = {study for ruling in rulings for study in ruling.claim.studies if (Path(out) / study / "index.html").is_file()}
-    context = {"papers": papers(rulings, shown), "verdicts": VERDICTS, "count": count(rulings), "alpha": alpha, "n": len(rulings)}
+    studies = {study for ruling in rulings for study in ruling.claim.studies}
+    context = {
+        "papers": papers(rulings, anchors(studies, out)),
+        "verdicts": VERDICTS,
+        "count": count(rulings),
+        "alpha": alpha,
+        "n": len(rulings),
+        "drawings": [page.drawn(drawing, STUDY, folder, formats) for drawing in claim_figures.drawings(rulings)],
+    }
     return page.render(STUDY, folder, context)
 
 
-def papers(rulings: Sequence[Ruling], reports: set[str] | None = None) -> list[dict[str, Any]]:
+def anchors(studies: Iterable[str], out: str | Path) -> dict[str, set[str]]:
+    """Of the studies that have a page, all that its parts can be linked to by."""
+    pages = {study: Path(out) / study / "index.html" for study in sorted(studies)}
+    return {
+        study: set(re.findall(r'<(?:section|figure|h3) id="([^"]+)"', path.read_text(encoding="utf-8")))
+        for study, path in pages.items() if path.is_file()
+    }  # fmt: skip
+
+
+def papers(rulings: Sequence[Ruling], reports: Mapping[str, Collection[str]] | None = None) -> list[dict[str, Any]]:
     """What the templates show: for each paper its title and the rows of its claims.
 
     Args:
         rulings: from `decide`.
-        reports: studies whose pages can be linked to; None links to none.
+        reports: of each study that has a page, its anchors; None links to none.
     """
     return [
-        {"key": key, "title": title, "rows": [_row(r, reports or set()) for r in rulings if r.claim.paper == key]}
+        {"key": key, "title": title, "rows": [_row(r, reports or {}) for r in rulings if r.claim.paper == key]}
         for key, title in PAPERS.items()
     ]
 
@@ -109,24 +127,25 @@ def said(found: Finding) -> str:
     return f"{tables.number(found.effect)}{between}{unit}{printed}"
 
 
-def _row(ruling: Ruling, reports: set[str]) -> dict[str, Any]:
+def _row(ruling: Ruling, reports: Mapping[str, Collection[str]]) -> dict[str, Any]:
     claim = ruling.claim
     everywhere = [f.comparison for findings in ruling.findings.values() for f in findings]
     lines: dict[Any, dict[str, Any]] = {}
     for form, f in ((form, f) for form, findings in ruling.findings.items() for f in findings):
         shared = everywhere.count(f.comparison) > 1  # asked of both forms: shown once, of neither
-        lines.setdefault(f.comparison, _line("" if shared else form, f, reports))
+        lines.setdefault(f.comparison, _line(claim, "" if shared else form, f, reports))
     reason = f": {ruling.reason}" if ruling.reason else ""
     return {"claim": claim, "verdict": ruling.verdict, "reason": reason, "note": ruling.note, "lines": list(lines.values())}
 
 
-def _line(form: str, found: Finding, reports: set[str]) -> dict[str, Any]:
+def _line(claim: Claim, form: str, found: Finding, reports: Mapping[str, Collection[str]]) -> dict[str, Any]:
     one = found.comparison
     sides = one.a
     if one.b:
         elsewhere = "" if not one.b_cell else f" in {one.b_cell.rsplit('/', 1)[0]}"
         sides += f" {'minus' if one.statistic == 'close' else 'to'} {one.b}{elsewhere}"
-    link = f"../{one.study}/index.html#{slug(one.cell.replace('/', '_'))}" if one.study in reports else ""
+    place, drawn = claim_figures.anchor(claim, one, reports.get(one.study, ()))
+    link = f"../{one.study}/index.html#{place}" if place else ""
     lost = f"{found.lost_a + found.lost_b} lost" if found.lost_a + found.lost_b else ""
     p = f"p Holm {tables.number(found.p_holm)}" if np.isfinite(found.p_holm) else ""
     more = ", ".join(text for text in (f"{found.pairs} runs" if found.pairs else "", p, lost) if text)
@@ -134,7 +153,7 @@ def _line(form: str, found: Finding, reports: set[str]) -> dict[str, Any]:
     shown = "measured" if one.statistic == "report" else found.outcome
     where = one.cell.replace("/", " / ")
     words = {"form": form, "sides": sides, "measure": one.measure, "asked": asked, "said": said(found), "more": more}
-    return {**words, "outcome": shown, "where": where, "study": one.study, "link": link}
+    return {**words, "outcome": shown, "where": where, "study": one.study, "link": link, "drawn": drawn}
 
 
 def _numbers(form: str, found: Finding) -> dict[str, Any]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
@@ -16,13 +17,17 @@ import pandas as pd
 from tqdm import tqdm
 
 from pfbench import store
-from pfbench.report import across, budget, calibration, figures, ranking_figures, tables
+from pfbench.report import across, budget, calibration, figures, paper_figures, ranking_figures, tables
 from pfbench.report.across import Across
-from pfbench.report.canvas import looks, slug
+from pfbench.report.canvas import Look, dimmed, looks, slug
 from pfbench.report.frame import Cell, blocks, cells, later, natural, tidy
 from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Verdict, over_page, sensitivity, verdicts
 
 _HERE = Path(__file__).parent
+_PLENTY = 50  # filters times cells; of more, a page shows the figures of one group per cell, and comparisons with the best [ours]
+_NAMED = 7  # filters of which each has a colour of its own; of more than eight the others are grey [ours]
+_PAIRS = 60  # of one group of one cell that a table holds
+_ROWS = 2000  # of the table of all comparisons
 _MIME = {"svg": "svg+xml", "png": "png"}
 _SHARED = (
     ("pfbench", "versions.pfbench"),
@@ -54,6 +59,9 @@ class Options:
         converged: bounds by group, in the unit shown, for the time to converge.
         margin: share by which RMSE may differ between filters that count as equal.
         wanted: share by which RMSE differs in the effect for which the needed number of runs is computed.
+        figures: names of `paper_figures.FIGURES` to draw; None for those of the paper that the study is named after.
+        highlight: filters in colour where there are more than eight, the others being grey; None for the best of each cell.
+        full: show all figures and comparisons; None for all where filters times cells are at most 50.
 
     Raises:
         ValueError: a value out of range.
@@ -67,6 +75,9 @@ class Options:
     converged: Mapping[str, float] = field(default_factory=dict)
     margin: float = 0.05
     wanted: float = 0.1
+    figures: tuple[str, ...] | None = None
+    highlight: tuple[str, ...] | None = None
+    full: bool | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 1:
@@ -96,17 +107,19 @@ def write(
 
     Raises:
         FileNotFoundError: the study has no results.
-        ValueError: results that do not belong together, or a group that no result has.
+        ValueError: results that do not belong together; a group, a filter or a figure that no result has.
     """
     options = options or Options()
     found = cells(study, results, mixed=options.mixed)
     groups = _groups(found, options.groups)
     folder = Path(out) / study
-    clear(folder)
-    style = looks(sorted((job.label for cell in found for job in cell.jobs), key=natural))
+    labels = sorted({job.label for cell in found for job in cell.jobs}, key=natural)
+    view = View(groups, looks(_first(labels, options.highlight)), folder, options, _is_brief(found, options))
+    redrawn = paper_figures.drawings(study, found, view.style, options.figures, options.from_time)
+    clear(folder)  # after all that may be refused
     sections, decided, runs = [], [], []
     for cell in tqdm(found, desc=f"report {study}", disable=None, delay=2):
-        section, own, rows = _section(cell, groups, style, folder, options)
+        section, own, rows = _section(cell, view)
         sections.append(section)
         decided += own
         runs.append(rows)
@@ -115,18 +128,21 @@ def write(
     scored = [group for group in groups if (table.group == group).any()]
     over_cells = [across.across(table, group, options.alpha, options.margin) for group in scored]
     note = budget.stated([job.meta for cell in found for job in cell.jobs])
+    listed = _listed(decided, sections)
     context = {
         "study": study,
         "options": options,
         "groups": groups,
+        "brief": view.brief,
         "cells": sections,
         "verdicts": decided,
-        "everything": tables.everything(decided),
+        "everything": tables.everything(listed),
+        "paper": [drawn(drawing, "paper", folder, options.formats) for drawing in redrawn],
         "page_shown": sum(v.p_page <= options.alpha for v in decided),
         "shown": sum(v.winner != NO_DIFFERENCE for v in decided),
         "family_sizes": sorted({v.family for v in decided}),
         "budget": note,
-        "across": _across(table, over_cells, decided, style, folder, options, note),
+        "across": _across(table, over_cells, decided, view, note),
         "lost_rules": [rule.name for rule in LOST_RULES],
         "bibtex": (bibtex := _bibtex(found)),
         "shared": _shared(found),
@@ -134,10 +150,40 @@ def write(
         "failures": store.failures(Path(results) / study),
     }
     (folder / "pfbench.bib").write_text(bibtex, encoding="utf-8")
-    for name, typed in (("verdicts", decided), ("across", over_cells)):
-        text = json.dumps([_plain(asdict(one)) for one in typed], indent=1, allow_nan=False)
-        (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+    context["verdict_file"] = save_typed(folder, "verdicts", decided)
+    save_typed(folder, "across", over_cells)
     return render("page", folder, context)
+
+
+class View(NamedTuple):
+    """What all parts of a page are made with.
+
+    Attributes:
+        groups: of the state, shown.
+        style: looks of the filters.
+        folder: of the report.
+        options: as given.
+        brief: the study is too large to show all.
+    """
+
+    groups: Sequence[str]
+    style: Mapping[str, Look]
+    folder: Path
+    options: Options
+    brief: bool
+
+
+def save_typed(folder: Path, name: str, typed: Sequence[Any]) -> str:
+    """Writes dataclasses as JSON, compressed and with nine digits where they are thousands; returns the name of the file."""
+    many = len(typed) > _ROWS
+    text = json.dumps([_plain(asdict(one), 9 if many else None) for one in typed], indent=None if many else 1, allow_nan=False)
+    for old in (folder / f"{name}.json", folder / f"{name}.json.gz"):
+        old.unlink(missing_ok=True)
+    if not many:
+        (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+        return f"{name}.json"
+    (folder / f"{name}.json.gz").write_bytes(gzip.compress(text.encode(), mtime=0))
+    return f"{name}.json.gz"
 
 
 def render(template: str, folder: Path, context: Mapping[str, Any]) -> Path:
@@ -149,38 +195,42 @@ def render(template: str, folder: Path, context: Mapping[str, Any]) -> Path:
     return folder / "index.html"
 
 
-def _section(
-    cell: Cell, groups: Sequence[str], style: Mapping[str, figures.Look], folder: Path, options: Options
-) -> tuple[dict[str, Any], list[Verdict], pd.DataFrame]:
+def _section(cell: Cell, view: View) -> tuple[dict[str, Any], list[Verdict], pd.DataFrame]:
     """What the templates need of one cell, what is decided in it, and its runs; writes its figures and tables."""
+    options, folder = view.options, view.folder
     whole = {job.label: job.load() for job in cell.jobs}
     used = {label: later(result, options.from_time) for label, result in whole.items()}
     runs = pd.concat([tidy(cell, job, whole[job.label], options.from_time, options.converged) for job in cell.jobs])
-    known = [group for group in groups if _scored(used, group)]
+    known = [group for group in view.groups if _scored(used, group)]
     fronts = [budget.front(cell.name, runs, group) for group in known]
     runs = runs[runs.group.isin(known)]
     decided = verdicts(runs, options.alpha, options.margin, options.wanted)
     regions = calibration.calibrated(runs, options.alpha)
     note = budget.stated([job.meta for job in cell.jobs])
     prefix = slug(f"{cell.scenario}_{cell.noise}_{cell.model}")
+    main = "position" if "position" in known else known[0] if known else ""
     parts = []
-    for group in known:
+    for group, front in zip(known, fronts, strict=True):
         own = [v for v in decided if v.group == group]
         accuracy = tables.accuracy(used, group, own, options.alpha, options.converged.get(group))
         if len(accuracy):
+            chosen = _with_best(own, front) if len(own) > _PAIRS else own
             save_table(folder, f"{prefix}_{slug(group)}", accuracy, note)
-            pairs, effects = tables.decisions(own), tables.effects(own)
-            if own:
+            pairs, effects = tables.decisions(chosen), tables.effects(chosen)
+            if chosen and (group == main or not view.brief):
                 save_table(folder, f"{prefix}_{slug(group)}_pairs", pairs, note)
                 save_table(folder, f"{prefix}_{slug(group)}_effects", effects, note)
-            front = next(front for front in fronts if front.group == group)
             shown = {"accuracy": accuracy, "pairs": pairs, "effects": effects, "regions": calibration.said(regions, group)}
-            parts.append({"name": group, **shown, **_said(own, front)})
+            best = _best_first([front], group)[0]
+            parts.append({"name": group, "main": group == main, "chosen": chosen, "best": best, **shown, **_said(own, front)})
     ran = tables.overview(used)
     save_table(folder, f"{prefix}_overview", ran, note)
+    seen = known if not view.brief else [main] if main else []
+    look, who = _looks_of(view, list(whole), _best_first(fronts, main), f"the smallest median RMSE of {main}")
     drawings = [
-        *figures.drawings(whole, runs, style, known, options.alpha), *calibration.drawings(used, known, style, options.alpha),
-        *ranking_figures.of_cell(decided, fronts, style),
+        *figures.drawings(whole, runs, look, seen, options.alpha, brief=view.brief, note=who),
+        *calibration.drawings(used, seen, look, options.alpha, who),
+        *ranking_figures.of_cell([v for v in decided if v.group in seen], [f for f in fronts if f.group in seen], look, who),
     ]  # fmt: skip
     pictures = [drawn(drawing, prefix, folder, options.formats) for drawing in drawings]
     lost = [(label, int(result.arrays["lost"].sum()), result.meta["runs"]) for label, result in whole.items()]
@@ -188,9 +238,68 @@ def _section(
     section: dict[str, Any] = {"budget": note, "name": cell.name, "anchor": prefix}
     section |= {"overview": ran, "parts": parts, "drawings": pictures}
     there = {block.group for result in used.values() for block in blocks(result.meta["state"])}
-    section["unscored"] = [group for group in groups if group in there and group not in known]
+    section["unscored"] = [group for group in view.groups if group in there and group not in known]
     section["bounds"] = _distinct(result.meta["bound"] for result in whole.values() if "bound" in result.meta)
     return {**section, "lost": [row for row in lost if row[1]], "diverged": [row for row in gone if row[1]]}, decided, runs
+
+
+def _looks_of(view: View, labels: Sequence[str], best: Sequence[str], by: str) -> tuple[Mapping[str, Look], str]:
+    """Looks for a figure with a line per filter, and who is grey, for its caption; all are named where they are few.
+
+    Args:
+        view: of the page.
+        labels: of the filters shown.
+        best: the same, best first.
+        by: what makes them best.
+    """
+    if len(labels) <= _NAMED + 1:
+        return view.style, ""
+    chosen = [label for label in view.options.highlight or () if label in labels]
+    if chosen:
+        others = len(labels) - len(chosen)
+        return dimmed(view.style, chosen), f" In colour: {', '.join(chosen)}; grey: the other {others}."
+    kept = sorted(best[:_NAMED], key=natural)
+    said = f" In colour: the {_NAMED} with {by}, in colours of these figures' own; grey: the other {len(labels) - len(kept)}."
+    return {**dimmed(view.style, kept), **looks(kept)}, said
+
+
+def _best_first(fronts: Sequence[budget.Front], group: str) -> list[str]:
+    return [label for f in fronts if f.group == group for _, label in sorted(zip(f.rmse, f.filters, strict=True))]
+
+
+def _with_best(own: Sequence[Verdict], front: budget.Front) -> list[Verdict]:
+    """The comparisons with the filter whose median RMSE is the smallest."""
+    best = _best_first([front], front.group)[0]
+    return [v for v in own if best in (v.a, v.b)]
+
+
+def _listed(decided: Sequence[Verdict], sections: Sequence[Mapping[str, Any]]) -> list[Verdict]:
+    """What the table of all comparisons holds: all, or where they are too many those with the best filter, of the main groups."""
+    if len(decided) <= _ROWS:
+        return list(decided)
+    kept = {_of(v) for section in sections for part in section["parts"] if part["main"] for v in part["chosen"]}
+    return [v for v in decided if _of(v) in kept]
+
+
+def _of(v: Verdict) -> tuple[str, ...]:
+    return v.scenario, v.noise, v.model, v.group, v.a, v.b
+
+
+def _first(labels: Sequence[str], highlight: Sequence[str] | None) -> list[str]:
+    """Labels with those in colour before the others, whose looks repeat.
+
+    Raises:
+        ValueError: a filter that did not run.
+    """
+    unknown = sorted(set(highlight or ()) - set(labels))
+    if unknown:
+        raise ValueError(f"report.highlight: no result is of {', '.join(unknown)}; there are {', '.join(labels)}")
+    return list(dict.fromkeys([*(highlight or ()), *labels]))
+
+
+def _is_brief(found: Sequence[Cell], options: Options) -> bool:
+    most = max(len(cell.jobs) for cell in found) * len(found)
+    return not options.full if options.full is not None else most > _PLENTY
 
 
 def _said(own: Sequence[Verdict], front: budget.Front) -> dict[str, Any]:
@@ -210,10 +319,10 @@ def _said(own: Sequence[Verdict], front: budget.Front) -> dict[str, Any]:
 
 
 def _across(
-    table: pd.DataFrame, found: Sequence[Across], decided: Sequence[Verdict], style: Mapping[str, figures.Look], folder: Path,
-    options: Options, note: str,
-) -> dict[str, Any]:  # fmt: skip
+    table: pd.DataFrame, found: Sequence[Across], decided: Sequence[Verdict], view: View, note: str
+) -> dict[str, Any]:
     """What the templates need of all cells together; writes its figures and tables."""
+    folder, options = view.folder, view.options
     sources = [across.blocks(table, one.group) for one in found]
     ranked, changed = tables.ranked(found), tables.sensitive(sensitivity(table, options.alpha))
     for name, one_table in (("ranks", ranked), ("lost_rules", changed)):
@@ -224,9 +333,15 @@ def _across(
         pairs = tables.across_pairs(one)
         if len(pairs):
             save_table(folder, f"across_{slug(one.group)}", pairs, note)
-        others = [across.across(table, one.group, options.alpha, options.margin, rule) for rule in LOST_RULES[1:]]
-        parts.append({"one": one, "pairs": pairs, "changed": _changed(one, others)})
-    drawings = ranking_figures.of_study(list(zip(found, sources, strict=True)), decided, style)
+        best = min(zip(one.ranks, one.filters, strict=True))[1] if one.ranks else ""
+        few = pairs[(pairs.a == best) | (pairs.b == best)] if len(pairs) > _PAIRS else pairs
+        others = {rule.name: across.winners(table, one.group, options.alpha, rule) for rule in LOST_RULES[1:]}
+        parts.append({"one": one, "pairs": few, "n": len(pairs), "best": best, "changed": _changed(one, others)})
+    drawings = []
+    for one, source in zip(found, sources, strict=True):
+        order = sorted(range(len(one.ranks)), key=lambda i: one.ranks[i])
+        look, who = _looks_of(view, one.filters, [one.filters[i] for i in order], f"the best mean ranks of {one.group}")
+        drawings += ranking_figures.of_study([(one, source)], decided, look, who)
     return {
         "parts": parts,
         "ranked": ranked,
@@ -236,15 +351,17 @@ def _across(
     }
 
 
-def _changed(one: Across, others: Sequence[Across]) -> list[str]:
+def _changed(one: Across, others: Mapping[str, dict[tuple[str, str], str] | str]) -> list[str]:
     """How many decisions across cells change under each other rule for lost runs."""
     if one.refused:
         return []
     said = []
-    for other in others:
-        winners = {(p.a, p.b): p.winner for p in other.pairs}
-        n = sum(winners.get((p.a, p.b)) != p.winner for p in one.pairs)
-        said.append(f"{other.rule}: {other.refused or f'{n} of {len(one.pairs)}'}")
+    for rule, winners in others.items():
+        if isinstance(winners, str):
+            said.append(f"{rule}: {winners}")
+        else:
+            n = sum(winners.get((p.a, p.b)) != p.winner for p in one.pairs)
+            said.append(f"{rule}: {n} of {len(one.pairs)}")
     return said
 
 
@@ -285,6 +402,7 @@ def drawn(drawing: figures.Drawing, prefix: str, folder: Path, formats: Sequence
         "caption": drawing.caption,
         "source": f"data:image/{_MIME[first.suffix[1:]]};base64,{data}",
         "name": drawing.name,
+        "anchor": slug(f"{prefix}_{drawing.name}"),
         "broad": drawing.name.startswith("spread_"),
     }
 
@@ -349,13 +467,17 @@ def _at(meta: Any, path: str) -> Any:
     return meta
 
 
-def _plain(value: Any) -> Any:
-    """For JSON, which has no infinity."""
+def _plain(value: Any, digits: int | None = None) -> Any:
+    """For JSON, which has no infinity; with so many digits, or all."""
     if isinstance(value, Mapping):
-        return {name: _plain(below) for name, below in value.items()}
+        return {name: _plain(below, digits) for name, below in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(below) for below in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+        return [_plain(below, digits) for below in value]
+    if not isinstance(value, float):
+        return value
+    if not math.isfinite(value):
+        return str(value)
+    return value if digits is None else float(f"{value:.{digits}g}")
 
 
 def _environment(escaping: bool) -> jinja2.Environment:

@@ -21,17 +21,19 @@ from pfbench.report.figures import Drawing
 from pfbench.report.significance import NO_DIFFERENCE, Verdict
 
 _PAIRS = 28  # of a forest that a column's height still holds
+_MANY = 12  # filters of a diagram of which each rank has a tick
+_SIDE = 10  # filters of a matrix that a column's width still holds
 _BETTER, _WORSE = "#0072B2", "#E69F00"  # apart in grey too: dark and light
 
 
-def of_cell(own: Sequence[Verdict], fronts: Sequence[Front], style: Mapping[str, Look]) -> list[Drawing]:
-    """Figures of one cell: the front of accuracy and time, and a forest of effects per group."""
+def of_cell(own: Sequence[Verdict], fronts: Sequence[Front], style: Mapping[str, Look], note: str = "") -> list[Drawing]:
+    """Figures of one cell: the front of accuracy and time, and a forest of effects per group; `note` says who is grey."""
     found = []
     shown = [front for front in fronts if np.isfinite(front.rmse).any()]
     if shown:
         text = (
             "Time per step against the median over runs of the RMSE, a lost run being worse than any other. Ringed and joined: "
-            "filters that no other one beats in both."
+            f"filters that no other one beats in both.{note}"
         )
         found.append(Drawing("front", text, partial(fronts_of, shown, style)))
     for group in dict.fromkeys(v.group for v in own):
@@ -48,9 +50,9 @@ def of_cell(own: Sequence[Verdict], fronts: Sequence[Front], style: Mapping[str,
 
 
 def of_study(
-    found: Sequence[tuple[Across, Blocks]], decided: Sequence[Verdict], style: Mapping[str, Look]
+    found: Sequence[tuple[Across, Blocks]], decided: Sequence[Verdict], style: Mapping[str, Look], note: str = ""
 ) -> list[Drawing]:
-    """Figures across the cells of a study."""
+    """Figures across the cells of a study; `note` says who is grey."""
     drawings = []
     for one, sources in found:
         name = slug(one.group)
@@ -66,11 +68,14 @@ def of_study(
                 f"{one.group}: cells in which the filter of the row is shown to be better than that of the column, and in "
                 "which it is shown to be worse, after Holm's correction within each cell."
             )
+            labels = _by_rank(own, one)
+            if len(labels) > _SIDE:
+                text += f" The {_SIDE} filters of {len(labels)} with the best mean ranks."
             drawings.append(Drawing(f"matrix_{name}", text + _starred(one), partial(matrix, own, one)))
         if len(sources.runs) > 1 and len(sources.filters) > 1:
             text = (
                 f"{one.group}: share of the runs in which the RMSE of a filter is at most so many times that of the best "
-                f"filter of the same run; {len(sources.cells)} cells of equal weight. A lost run never gets there."
+                f"filter of the same run; {len(sources.cells)} cells of equal weight. A lost run never gets there.{note}"
             )
             drawings.append(Drawing(f"profile_{name}", text, partial(profiles, sources, style)))
     return drawings
@@ -91,7 +96,7 @@ def critical_difference(one: Across, style: Mapping[str, Look]) -> Figure:
     posthocs.critical_difference_diagram(
         dict(zip(one.filters, one.ranks, strict=True)),
         pd.DataFrame(p, index=one.filters, columns=one.filters),
-        ax=axis, alpha=one.alpha, label_props={"fontsize": 7}, text_h_margin=0.1,
+        ax=axis, alpha=one.alpha, label_props={"fontsize": 7 if k <= _MANY else 5.5}, text_h_margin=0.1,
         color_palette={label: style[label].colour for label in one.filters},
         marker_props={"s": 14, "zorder": 4}, elbow_props={"linewidth": 0.9},
         crossbar_props={"linewidth": 2.2, "color": "0.25", "marker": "|"},
@@ -103,7 +108,7 @@ def critical_difference(one: Across, style: Mapping[str, Look]) -> Figure:
         mark.set_clip_on(False)
     axis.spines["top"].set(visible=True, bounds=(1, k))
     axis.set_xlim(1, max(k, 1 + one.critical))
-    axis.set_xticks(range(1, k + 1))
+    axis.set_xticks(range(1, k + 1) if k <= _MANY else [1, *range(5, k + 1, 5)])
     axis.plot([1, 1 + one.critical], [1.9, 1.9], color="0.25", lw=1.2, marker="|", ms=4, clip_on=False)
     axis.text(1 + one.critical / 2, 2.1, f"CD {one.critical:.2f}", ha="center", va="bottom", fontsize=7)
     axis.grid(False)
@@ -111,8 +116,9 @@ def critical_difference(one: Across, style: Mapping[str, Look]) -> Figure:
 
 
 def matrix(own: Sequence[Verdict], one: Across) -> Figure:
-    """Cells won and lost of each pair, rows against columns."""
-    labels = sorted(dict.fromkeys(label for v in own for label in (v.a, v.b)), key=lambda label: _rank(one, label))
+    """Cells won and lost of each pair, rows against columns; of many filters the best."""
+    labels = _by_rank(own, one)[:_SIDE]
+    own = [v for v in own if v.a in labels and v.b in labels]
     won, met = np.zeros((len(labels),) * 2, dtype=int), np.zeros((len(labels),) * 2, dtype=int)
     for v in own:
         i, j = labels.index(v.a), labels.index(v.b)
@@ -121,8 +127,7 @@ def matrix(own: Sequence[Verdict], one: Across) -> Figure:
         won[i, j] += v.winner == v.a
         won[j, i] += v.winner == v.b
     share = np.divide(won - won.T, met, out=np.full(met.shape, np.nan), where=met > 0)
-    side = max(COLUMN, 1.15 + 0.36 * len(labels))
-    figure = Figure(figsize=(side, side - 0.35), layout="constrained")
+    figure = Figure(figsize=(COLUMN, COLUMN - 0.25), layout="constrained")
     axis = figure.subplots()
     axis.imshow(share, cmap=_blue_and_orange(), vmin=-1, vmax=1)
     stars = {frozenset((p.a, p.b)) for p in one.pairs if p.winner != NO_DIFFERENCE}
@@ -131,9 +136,11 @@ def matrix(own: Sequence[Verdict], one: Across) -> Figure:
             if met[i, j]:
                 star = "*" if frozenset((row, column)) in stars else ""
                 ink = "white" if share[i, j] > 0.55 else "black"
-                axis.text(j, i, f"{won[i, j]}–{won[j, i]}{star}", ha="center", va="center", fontsize=6.5, color=ink)
-    axis.set_xticks(range(len(labels)), labels, rotation=40, ha="right", rotation_mode="anchor")
-    axis.set_yticks(range(len(labels)), labels)
+                size = min(6.5, 50 / len(labels))
+                axis.text(j, i, f"{won[i, j]}–{won[j, i]}{star}", ha="center", va="center", fontsize=size, color=ink)
+    small = min(7.0, 55 / len(labels))
+    axis.set_xticks(range(len(labels)), labels, rotation=40, ha="right", rotation_mode="anchor", fontsize=small)
+    axis.set_yticks(range(len(labels)), labels, fontsize=small)
     axis.set_xlabel(f"shown better – shown worse, of {met.max()} cells")
     axis.grid(False)
     axis.tick_params(length=0)
@@ -146,9 +153,7 @@ def profiles(sources: Blocks, style: Mapping[str, Look]) -> Figure:
     at = np.geomspace(1.0, reach, 200)
     figure, (axis,) = stack(1, 2.1)
     for label, share in zip(sources.filters, across.profile(sources, at), strict=True):
-        look = style[label]
-        line: Any = {"color": look.colour, "ls": look.dash, "lw": look.width}
-        axis.plot(at, 100 * share, label=label, **line)
+        axis.plot(at, 100 * share, **style[label].line(label))
     axis.set(xscale="log", xlabel="RMSE over that of the best filter of the run", ylabel="runs in %", ylim=(0, 102))
     plain_ticks(axis.xaxis, at)
     legend(figure, axis)
@@ -195,7 +200,10 @@ def fronts_of(fronts: Sequence[Front], style: Mapping[str, Look]) -> Figure:
         for label, time, error, kept in zip(front.filters, milliseconds, front.rmse, front.kept, strict=True):
             look = style[label]
             y = error if np.isfinite(error) else np.nan
-            axis.scatter(time, y, s=30, color=look.colour, marker=look.marker, label=label, zorder=3, lw=0)
+            named = "" if look.quiet else label
+            axis.scatter(time, y, s=12 if look.quiet else 30, color=look.colour, marker=look.marker, label=named, zorder=3, lw=0)
+            if kept and look.quiet:
+                axis.annotate(label, (time, y), (4, -7), textcoords="offset points", fontsize=5.5)
             if kept:
                 axis.scatter(time, y, s=95, facecolors="none", edgecolors="0.2", lw=0.9, zorder=2)
         finite = [e for e in front.rmse if np.isfinite(e)]
@@ -214,6 +222,10 @@ def fronts_of(fronts: Sequence[Front], style: Mapping[str, Look]) -> Figure:
 
 def _starred(one: Across) -> str:
     return f" A star: Nemenyi's test across {len(one.cells)} cells shows a difference." if one.shown else ""
+
+
+def _by_rank(own: Sequence[Verdict], one: Across) -> list[str]:
+    return sorted(dict.fromkeys(label for v in own for label in (v.a, v.b)), key=lambda label: _rank(one, label))
 
 
 def _rank(one: Across, label: str) -> float:

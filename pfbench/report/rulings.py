@@ -205,7 +205,10 @@ def _find(one: Comparison, series: Mapping[tuple[str, ...], pd.DataFrame], alpha
 
 def _median(known: Finding, s: Sample, alpha: float) -> Finding:
     low, high = median_interval(s.d, 1 - alpha)
-    found = replace(known, effect=_shown(float(np.median(s.d)), s), low=_shown(low, s), high=_shown(high, s))
+    # a level near a printed one is tested as its ratio to that, and shown as what it is
+    scale = known.comparison.printed if known.comparison.statistic == "near" else 1.0
+    effect, *between = (scale * _shown(value, s) for value in (float(np.median(s.d)), low, high))
+    found = replace(known, effect=effect, low=between[0], high=between[1])
     if known.comparison.statistic == "report":
         return found
     apart = low >= s.high - s.worth if s.worth else low > s.high

@@ -12,17 +12,15 @@ RMSE agree to the precision of what is stored [ours]. `sensitivity` decides anew
 
 from __future__ import annotations
 
-import hashlib
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.special import ndtr, ndtri, stdtrit
 
 from pfbench.metrics import Array
 from pfbench.report import power
@@ -259,15 +257,12 @@ def log_ratio(a: Array, b: Array) -> Array:
 
 def wilcoxon(d: Array) -> tuple[float, float]:
     """Wilcoxon's T and two-sided p of paired differences [n]; all zero gives p = 1."""
-    if not d.any():
-        return d.size * (d.size + 1) / 4, 1.0
-    statistic, p = stats.wilcoxon(d, zero_method="zsplit")
-    return float(statistic), float(p)
+    return power.signed_rank(d)
 
 
 def rank_biserial(d: Array) -> float:
     """Share of the rank sum with d < 0 less the share with d > 0: positive when a, of d = log(a / b), is smaller."""
-    rank = stats.rankdata(np.abs(d))
+    rank, _ = power.ranks_of(np.abs(d))
     return float((rank[d < 0].sum() - rank[d > 0].sum()) / rank.sum())
 
 
@@ -305,40 +300,59 @@ def share_interval(share: float, variance: float, runs: int, level: float) -> In
         edge = float(((1 - level) / 2) ** (1 / runs))
         return Interval(edge, 1.0, "exact") if share >= 1 else Interval(0.0, 1 - edge, "exact")
     middle = np.log(share / (1 - share))
-    reach = stats.t.isf((1 - level) / 2, runs - 1) * np.sqrt(variance) / (share * (1 - share))
+    reach = -stdtrit(runs - 1, (1 - level) / 2) * np.sqrt(variance) / (share * (1 - share))
     low, high = 1 / (1 + np.exp(-(middle + np.clip(np.array([-reach, reach]), -500, 500))))
     return Interval(float(low), float(high), "odds")
 
 
-def median_interval(d: Array, level: float, seed: int) -> Interval:
-    """Bootstrap interval of the median of d [n], BCa where it exists, else percentile."""
-    drawn = SimpleNamespace(bootstrap_distribution=_medians(d, np.random.default_rng(seed)))
-    for method in ("BCa", "percentile"):
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            # A constant sample has no BCa; the NaN it returns is caught below and the method used is named.
-            warnings.simplefilter("ignore")
-            found = stats.bootstrap(
-                (d,), np.median, n_resamples=0, confidence_level=level, method=method, bootstrap_result=drawn
-            ).confidence_interval  # fmt: skip
-        if np.isfinite([found.low, found.high]).all():
-            break
-    return Interval(float(found.low), float(found.high), method)
+def median_interval(d: Array, level: float, seed: int = 0) -> Interval:
+    """Bootstrap interval of the median of d [n], BCa [Efron 1987] where it exists, else percentile."""
+    ordered = np.sort(d)
+    drawn = _medians(ordered, seed)
+    median = np.median(d)
+    alpha = (1 - level) / 2
+    z = np.array([ndtri(alpha), -ndtri(alpha)])
+    with np.errstate(all="ignore"):  # a constant sample has no BCa; the method that was used is named
+        share = (np.count_nonzero(drawn < median) + np.count_nonzero(drawn <= median)) / (2 * drawn.size)
+        moved = ndtri(share) + z
+        levels = ndtr(ndtri(share) + moved / (1 - _acceleration(ordered) * moved))
+    method = "BCa" if np.isfinite(levels).all() else "percentile"
+    low, high = np.quantile(drawn, levels if method == "BCa" else [alpha, 1 - alpha])
+    return Interval(float(low), float(high), method)
 
 
-def _medians(d: Array, rng: np.random.Generator) -> Array:
-    """Medians of samples drawn from d with replacement, by the law of the middle ones of n uniform numbers.
+def _acceleration(ordered: Array) -> float:
+    """Of the median of sorted numbers [n], from the medians without each of them; NaN where these are all the same."""
+    n = ordered.size
+    h = n // 2
+    if n % 2:
+        sides = [(ordered[h] + ordered[h + 1]) / 2, (ordered[h - 1] + ordered[h]) / 2, (ordered[h - 1] + ordered[h + 1]) / 2]
+        left = np.repeat(sides, [h, h, 1])
+    else:
+        left = np.repeat([ordered[h], ordered[h - 1]], [h, h])
+    u = (left.mean() - left) * (n - 1) / n
+    return float((u**3).sum() / (u**2).sum() ** 1.5 / 6)
 
-    It is the bootstrap without its n draws, which took most of the time of a report.
+
+def _medians(ordered: Array, seed: int) -> Array:
+    """Medians of samples drawn from sorted numbers [n] with replacement."""
+    low, high = _middle(ordered.size, seed)
+    return np.asarray((ordered[low] + ordered[high]) / 2)
+
+
+@cache
+def _middle(n: int, seed: int) -> tuple[Array, Array]:
+    """Which of n sorted numbers are in the middle of samples drawn with replacement, by the law of the middle of n uniform ones.
+
+    It is the bootstrap without its n draws, and the same for all samples of a size: both took most of the time of a report.
     """
-    ordered, n = np.sort(d), d.size
+    rng = np.random.default_rng([n, seed])
     m = (n + 1) // 2
     first = rng.beta(m, n - m + 1, _RESAMPLES)
-    if n % 2:
-        return np.asarray(ordered[(n * first).astype(int).clip(max=n - 1)])
-    # The next of the n - m that lie above the first.
-    second = 1 - (1 - first) * rng.random(_RESAMPLES) ** (1 / (n - m))
+    # Of an even number, the next of the n - m that lie above the first.
+    second = first if n % 2 else 1 - (1 - first) * rng.random(_RESAMPLES) ** (1 / (n - m))
     low, high = ((n * u).astype(int).clip(max=n - 1) for u in (first, second))
-    return np.asarray((ordered[low] + ordered[high]) / 2)
+    return low, high
 
 
 def _winners(
@@ -376,9 +390,8 @@ def _compare(
     a, b = both.T
     d = log_ratio(a, b)
     statistic, p = wilcoxon(d)
-    seed = int(hashlib.sha256("\n".join((*cell, *labels)).encode()).hexdigest()[:16], 16)
     # An interval needs two runs; of one run the median itself is all there is.
-    interval = median_interval(d, 1 - alpha, seed) if d.size > 1 else Interval(-np.inf, np.inf, "none")
+    interval = median_interval(d, 1 - alpha) if d.size > 1 else Interval(-np.inf, np.inf, "none")
     finite = np.isfinite(a) & np.isfinite(b) & (a > 0) & (b > 0)
     largest = np.abs(d[finite]).max(initial=0.0)
     middle, low, high = (_ratio(value, largest) for value in (float(np.median(d)), interval.low, interval.high))

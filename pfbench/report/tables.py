@@ -15,6 +15,10 @@ from pfbench.report.frame import COVERAGES, Block, blocks
 from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Sensitivity, Verdict
 
 Results = Mapping[str, store.Result]
+_LATEX = str.maketrans({
+    "\\": r"\textbackslash ", "_": r"\_", "%": r"\%", "$": r"\$", "#": r"\#", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde ", "^": r"\textasciicircum ", "&": r"\&",
+})  # fmt: skip
 _LAST = 20  # steps over which a location is said to have settled [Pu and Qin, section 4]
 
 
@@ -193,14 +197,12 @@ def markdown(table: pd.DataFrame) -> str:
 def latex(table: pd.DataFrame, note: str = "") -> str:
     """A booktabs tabular; a note stands below its last rule."""
     layout = "".join("r" if _is_number(table[name]) else "l" for name in table)
-    style = table.style.format(number, escape="latex").format_index(escape="latex", axis=1).hide(axis="index")
-    text = style.to_latex(hrules=True, column_format=layout)
-    if not note:
-        return text
-    safe = pd.DataFrame([[note]]).style.format(escape="latex").hide(axis="index").hide(axis="columns").to_latex()
-    said = safe.splitlines()[1].removesuffix(r" \\")
-    below = rf"\multicolumn{{{len(table.columns)}}}{{l}}{{\footnotesize {said}}} \\"
-    return text.replace("\\end{tabular}", f"{below}\n\\end{{tabular}}")
+    rows = [[str(name) for name in table], *([number(v) for v in row] for row in table.itertuples(index=False))]
+    lines = [" & ".join(text.translate(_LATEX) for text in row) + r" \\" for row in rows]
+    body = ["\\toprule", lines[0], "\\midrule", *lines[1:], "\\bottomrule"]
+    if note:
+        body.append(rf"\multicolumn{{{len(table.columns)}}}{{l}}{{\footnotesize {note.translate(_LATEX)}}} \\")
+    return "\n".join([rf"\begin{{tabular}}{{{layout}}}", *body, r"\end{tabular}", ""])
 
 
 def csv(table: pd.DataFrame) -> str:

@@ -17,7 +17,9 @@ from statsmodels.stats.multitest import multipletests
 from synthetic_results import METHODS, STATE, write
 
 from pfbench import cli, store
-from pfbench.report import claims, evidence, ledger, rulings
+from pfbench.report import claim_figures, claims, evidence, ledger, rulings
+from pfbench.report import page as report_page
+from pfbench.report.canvas import slug
 from pfbench.report.claims import Claim, Comparison
 
 IDS = [
@@ -460,10 +462,84 @@ def test_the_page_has_the_numbers_and_a_link_to_the_cell(study: Path) -> None:
     test = Comparison("less", "s", CELL, "rmse", "cofm_amssrcpf", "ekf", group="position", printed=0.6)
     found = rulings.decide([claim(test)], evidence.gather([claim(test)], study))
     assert found[0].verdict == YES
-    (line,) = ledger.papers(found, {"s"})[0]["rows"][0]["lines"]
-    assert line["link"] == "../s/index.html#flight_surge_ins_gnss"
+    (line,) = ledger.papers(found, {"s": {"flight_surge_ins_gnss"}})[0]["rows"][0]["lines"]
+    assert (line["link"], line["drawn"]) == ("../s/index.html#flight_surge_ins_gnss", False)
     assert re.fullmatch(r"0\.6\d+ \[0\.\d+, 0\.\d+\], printed 0\.600", line["said"])
     assert ledger.papers(found)[0]["rows"][0]["lines"][0]["link"] == ""  # no page, no link
     assert ledger.count(found).set_index("paper").loc["all", "claims"] == 1
     assert ledger.of_study(found, "s") == found
     assert ledger.of_study(found, "t") == []
+
+
+def test_each_claim_links_to_a_figure_that_is_there(study: Path, tmp_path: Path) -> None:
+    """Of a study as it is published: every link of the ledger leads to an anchor of its page, and to the figure that shows it."""
+    out = tmp_path / "reports"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report_page, "drawn", lambda drawing, prefix, *_: {
+            "file": "", "caption": "", "source": "data:,", "name": drawing.name, "broad": False,
+            "anchor": slug(f"{prefix}_{drawing.name}"),
+        })  # fmt: skip
+        report_page.write("s", study, out, report_page.Options(groups=("position",)))
+    there = ledger.anchors(["s", "t"], out)
+    assert set(there) == {"s"}
+    shown_in = {
+        "rmse": "rmse", "max_error": "error_position", "growth": "error_position", "nees": "nees", "ess": "ess",
+        "seconds_per_step": "front", "accepted": "",
+    }  # fmt: skip
+    tests = [Comparison("report", "s", CELL, metric, "sir", group="position") for metric in shown_in]
+    rows = ledger.papers(rulings.decide([claim(*tests)], evidence.gather([claim(*tests)], study)), there)[0]["rows"]
+    for line, (metric, figure) in zip(rows[0]["lines"], shown_in.items(), strict=True):
+        wanted = f"flight_surge_ins_gnss_{figure}".rstrip("_")
+        assert (line["link"], line["drawn"]) == (f"../s/index.html#{wanted}", bool(figure)), metric
+        assert wanted in there["s"]
+
+
+def test_a_claim_links_to_the_papers_own_figure_where_it_is_drawn_anew() -> None:
+    known = {one.id: one for one in ALL}
+    cell = "sar_flight_nominal_sins_sar"
+    page = {cell, f"{cell}_rmse", f"paper_000_2_{cell}_attitude", f"paper_000_3_{cell}_position", "paper_001_2", "paper_001_4"}
+
+    def link(name: str, form: str) -> list[str]:
+        return [claim_figures.anchor(known[name], test, page)[0] for test in known[name].tests[form]]
+
+    assert set(link("C000-1", "repaired")) == {f"paper_000_2_{cell}_attitude"}
+    assert set(link("C000-2", "repaired")) == {f"paper_000_3_{cell}_position"}
+    assert link("C000-3", "printed") == [f"paper_000_2_{cell}_attitude", f"paper_000_3_{cell}_position"]
+    assert set(link("C001-6", "")) == {"paper_001_2"}
+    assert set(link("C001-4", "")) == {"paper_001_4"}
+    assert set(link("C001-7", "printed")) == {""}  # the abstract: no figure, and no such cell on this page
+
+
+def test_figures_are_read_from_a_source() -> None:
+    assert claim_figures.numbers("figures 2, 4 and 5") == {2, 4, 5}
+    assert claim_figures.numbers("figures 12 to 14") == {12, 13, 14}
+    assert claim_figures.numbers("figure 3, section 4") == {3}
+    assert claim_figures.numbers("eqs. 33 to 35, table 1") == set()
+
+
+def test_printed_numbers_stand_beside_measured_ones() -> None:
+    ratio, level = replace(LESS, printed=0.6), alone("near", printed=22.0)
+    values = losses(11, 0.65)
+    (found,) = rulings.decide([claim(ratio)], frame(ratio, **values))
+    (other,) = rulings.decide([claim(level, id="X-2")], frame(level, **only(10, 44.0)))
+    made = {drawing.name: drawing.make() for drawing in claim_figures.drawings([found, other])}
+    axis = made["printed_ratios"].axes[0]
+    points = {one.get_marker(): float(one.get_xdata()[0]) for one in axis.lines if len(one.get_xdata()) == 1}
+    assert points == {"x": 0.6, "o": pytest.approx(found.findings[""][0].effect)}
+    assert [text.get_text() for text in axis.get_yticklabels()] == ["X-1: a / b, position"]
+    bar = next(one.get_xdata() for one in axis.lines if len(one.get_xdata()) == 2 and one.get_xdata()[0] != one.get_xdata()[1])
+    assert tuple(bar) == (found.findings[""][0].low, found.findings[""][0].high)
+    shown = other.findings[""][0]
+    assert shown.low < shown.effect < shown.high
+    assert shown.effect == pytest.approx(44, rel=0.1)  # in its unit, beside the printed number
+    points = [float(one.get_xdata()[0]) for one in made["printed_levels"].axes[0].lines if one.get_marker() == "o"]
+    assert points == [pytest.approx(2.0, rel=0.1)]
+    assert claim_figures.drawings([]) == []
+
+
+def test_links_of_the_published_ledger_lead_somewhere() -> None:
+    published = STUDIES.parent / "reports"
+    links = re.findall(r'href="\.\./([^/"]+)/index\.html#([^"]+)"', (published / ledger.STUDY / "index.html").read_text())
+    there = ledger.anchors({study for study, _ in links}, published)
+    assert links
+    assert [link for link in links if link[1] not in there.get(link[0], ())] == []

@@ -97,3 +97,15 @@ def test_probability_of_improvement_by_counting():
     low, high, how = significance.share_interval(1.0, 0.0, 20, 0.95)
     assert (how, high) == ("exact", 1.0)
     assert low == pytest.approx(stats.beta.ppf(0.025, 20, 1))  # Clopper and Pearson
+
+
+@pytest.mark.parametrize("n", [9, 50, 51, 100])
+@pytest.mark.parametrize("digits", [0, 1, 9])  # with many ties and zeros, with some, with none
+def test_the_signed_rank_test_is_scipys(n, digits):
+    d = np.round(np.random.default_rng(n).normal(0.3, 1, n), digits)
+    for side in ("two-sided", "greater"):
+        expected = stats.wilcoxon(d, alternative=side, zero_method="zsplit")
+        assert power.signed_rank(d, side) == pytest.approx((expected.statistic, expected.pvalue), rel=1e-11)
+    ranks, ties = power.ranks_of(d)
+    np.testing.assert_array_equal(ranks, stats.rankdata(d))
+    assert ties.sum() == n

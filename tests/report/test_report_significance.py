@@ -1,5 +1,7 @@
 """The verdicts: against other implementations, by counting, and by how often they are wrong."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -230,3 +232,18 @@ def test_a_planted_difference_is_found(monkeypatch):
     # signed-rank test loses at most a few per cent of its sample to it [Hodges, Lehmann 1956].
     assert winners.count("a") / n > 0.9
     assert winners.count("b") == 0
+
+
+@pytest.mark.parametrize("n", [2, 7, 30, 101])
+def test_the_interval_of_the_median_is_scipys_of_the_same_draws(n):
+    d = np.random.default_rng(n).gamma(2, 1, n)
+    found = significance.median_interval(d, 0.9)
+    drawn = SimpleNamespace(bootstrap_distribution=significance._medians(np.sort(d), 0))
+    expected = stats.bootstrap((d,), np.median, n_resamples=0, confidence_level=0.9, method="BCa", bootstrap_result=drawn)
+    assert found.method == "BCa"
+    assert found[:2] == pytest.approx(tuple(expected.confidence_interval), rel=1e-12)
+    left = np.array([np.median(np.delete(d, i)) for i in range(n)])  # the interval hardly sees it, for medians are few
+    assert significance._acceleration(np.sort(d)) == pytest.approx(stats.skew(left.mean() - left) / (6 * np.sqrt(n)), abs=1e-12)
+    plain = stats.bootstrap((d,), np.median, n_resamples=9999, confidence_level=0.9, method="BCa", rng=np.random.default_rng(1))
+    width = found.high - found.low
+    assert np.allclose(found[:2], tuple(plain.confidence_interval), atol=0.15 * width)  # other draws

@@ -1,5 +1,6 @@
 """The page of a study of several cells: what it says across cells is what was decided, and every table names its budget."""
 
+import gzip
 import json
 import re
 
@@ -35,7 +36,8 @@ def report(results, tmp_path_factory):
 
     def stub(drawing, prefix, folder, formats):
         drawn.append(f"{prefix}_{drawing.name}")
-        return {"file": drawing.name, "caption": drawing.caption, "source": "data:,", "name": drawing.name, "broad": False}
+        return {"file": drawing.name, "caption": drawing.caption, "source": "data:,", "name": drawing.name, "broad": False,
+                "anchor": drawing.name}
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page, "drawn", stub)
@@ -148,3 +150,40 @@ def test_rules_for_lost_runs_that_decide_otherwise_are_listed():
     assert significance.sensitivity(rows[~rows.lost]) == []
     (verdict,) = significance.verdicts(rows)
     assert verdict.winner == "b"
+
+
+def test_a_study_too_large_to_show_all_says_what_it_shows(results, tmp_path):
+    """As one of 33 filters in 28 cells, at the size of this one: limits are lowered."""
+    drawn = []
+
+    def stub(drawing, prefix, folder, formats):
+        drawn.append(f"{prefix}_{drawing.name}")
+        return {"file": "", "caption": drawing.caption, "source": "data:,", "name": "", "broad": False, "anchor": "x"}
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"drawn": stub, "_PAIRS": 2, "_ROWS": 30, "_NAMED": 1, "_PLENTY": 17}.items():
+            patch.setattr(page, name, value)
+        made = page.write("many", results, tmp_path)
+    html = made.read_text()
+    decided = json.loads(gzip.decompress((made.parent / "verdicts.json.gz").read_bytes()))
+    assert len(decided) == 6 * 3 * 3
+    assert not (made.parent / "verdicts.json").exists()
+    assert "All 54 verdicts are in verdicts.json.gz" in html
+    sift = html[html.index('<div class="sift">') :]
+    rows = re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td>", sift[: sift.index("</table>")])
+    assert len(rows) == 6 * 2
+    assert {group for _, group, _, _ in rows} == {"position"}
+    assert all("apf" in (a, b) for _, _, a, b in rows)  # the best
+    assert f"The table holds {len(rows)} of the 54 comparisons" in html
+    assert "2 of 3 comparisons of position, those with apf, whose median RMSE is the smallest" in html
+    pairs = pd.read_csv(made.parent / "tables" / "flight_surge_ins_gnss_position_pairs.csv")
+    assert len(pairs) == 2
+    assert not (made.parent / "tables" / "flight_surge_ins_gnss_velocity_pairs.csv").exists()
+    assert (made.parent / "tables" / "flight_surge_ins_gnss_velocity.csv").exists()
+    own = {name.removeprefix("flight_surge_ins_gnss_") for name in drawn if name.startswith("flight_surge")}
+    assert own == {"error_position", "rmse", "nees", "calibration", "front", "forest_position"}
+    captions = re.findall(r"<figcaption>(.*?)</figcaption>", html)
+    assert sum("In colour: the 1 with" in text for text in captions) >= 6 * 3
+    assert "sir lost 4 of 15 runs" in html  # said in the section of each cell
+    first = html.index('<h2>In short</h2>')
+    assert "beaten by no other" not in html[first : html.index('<section id="across">')]

@@ -1,0 +1,72 @@
+"""`pfbench report all`, which `make report` runs: every study with results, as its experiment says, and nothing spoilt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import pfbench
+
+from pfbench.report import ledger, page
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
+    """Options of each report that was asked for; none is drawn."""
+    asked: dict[str, Any] = {}
+
+    def write(study: str, results: str, out: str, options: page.Options) -> Path:
+        if study == "broken":
+            raise ValueError("the cell holds results that differ")
+        asked[study] = options
+        return Path(out) / study / "index.html"
+
+    def claims(results: str, out: str, *_: Any, **__: Any) -> Path:
+        asked["claims"] = None
+        return Path(out) / "claims" / "index.html"
+
+    monkeypatch.setattr(page, "write", write)
+    monkeypatch.setattr(ledger, "write", claims)
+    monkeypatch.chdir(tmp_path)
+    return asked
+
+
+def there(home: Path, *files: str) -> None:
+    for name in files:
+        (home / name).parent.mkdir(parents=True, exist_ok=True)
+        (home / name).touch()
+
+
+@pytest.mark.slow
+def test_what_has_results_is_made_again_and_what_has_none_stays(made: dict[str, Any], tmp_path: Path) -> None:
+    there(tmp_path, "results/mine/a.npz", "results/recorded_car/a.npz", "results/datasheets/t004.npz", "results/empty/note.txt")
+    there(tmp_path, "reports/recorded_car/report.md", "reports/paper_001/report.md", "reports/claims/report.md")
+    said = pfbench("report", "all", "report.alpha=0.01", home=tmp_path)
+    assert said.code == 0
+    assert list(made) == ["mine", "recorded_car"]
+    assert (made["mine"].from_time, made["recorded_car"].from_time) == (0.0, 98.0)  # as its experiment says
+    assert {options.alpha for options in made.values()} == {0.01}
+    assert "paper_001: its report is published and stays as it is" in said.out
+    assert "pfbench run -m +experiment=paper_001" in said.out
+    assert "claims: the ledger stays as it is, for it needs the results of paper_001 too" in said.out
+    there(tmp_path, "results/paper_001/a.npz")
+    assert pfbench("report", "all", home=tmp_path).code == 0
+    assert list(made)[-1] == "claims"  # after the pages that it links to
+
+
+def test_one_report_that_fails_stops_no_other(made: dict[str, Any], tmp_path: Path) -> None:
+    there(tmp_path, "results/broken/a.npz", "results/mine/a.npz")
+    said = pfbench("report", "all", home=tmp_path)
+    assert said.code == 1
+    assert "mine" in made
+    assert "broken: failed: the cell holds results that differ" in said.err
+    assert "1 of 2 reports failed: broken" in said.err
+
+
+def test_without_any_results_everything_stays(made: dict[str, Any], tmp_path: Path) -> None:
+    there(tmp_path, "reports/paper_001/report.md")
+    said = pfbench("report", "all", home=tmp_path)
+    assert said.code == 0
+    assert made == {}
+    assert said.out.count("stays as it is") == 2
