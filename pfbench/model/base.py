@@ -132,8 +132,8 @@ class StateSpaceModel(nn.Module, ABC):
         seen = ~torch.isnan(y).unsqueeze(1)  # [R, 1, Dy]
         if isinstance(law, torch.distributions.Independent) and isinstance(law.base_dist, torch.distributions.Normal):
             sd = law.base_dist.scale
-            if sd.stride(0) == 0 and sd.stride(1) == 0:  # one scale for all particles, which torch has expanded
-                sd = sd[:1, :1]
+            if sd.stride(1) == 0:  # one scale for all particles, which torch has expanded
+                sd = sd[:, :1] if sd.stride(0) else sd[:1, :1]
             y, y_hat = y.nan_to_num().unsqueeze(1), law.base_dist.loc
             if type(self).residual is not StateSpaceModel.residual:  # a plain difference is taken within the fused loop
                 y, y_hat = torch.zeros_like(y), -self.residual(y, y_hat)
@@ -249,13 +249,24 @@ def initial_law(model: StateSpaceModel, runs: int, spread: Tensor | None = None)
     return dense_normal(spread.new_zeros(spread.shape[:-1]), spread)
 
 
+def numbers(values: Any) -> Tensor:
+    """A float64 tensor; numbers that are tensors themselves, in lists of lists too, keep their gradient."""
+    if _holds_tensors(values):
+        return torch.stack([numbers(value) for value in values])
+    return torch.as_tensor(values, dtype=torch.float64)
+
+
+def _holds_tensors(values: Any) -> bool:
+    return isinstance(values, list | tuple) and any(isinstance(v, Tensor) or _holds_tensors(v) for v in values)
+
+
 def positive(name: str, values: Any) -> Tensor:
     """A float64 tensor of strictly positive numbers.
 
     Raises:
         ValueError: names the key, the value and the remedy.
     """
-    tensor = torch.as_tensor(values, dtype=torch.float64)
+    tensor = numbers(values)
     if not bool(((tensor > 0) & torch.isfinite(tensor)).all()):
         raise ValueError(f"{name}={values}: give positive numbers (a standard deviation or variance cannot be 0 or negative)")
     return tensor

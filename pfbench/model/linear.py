@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.model.base import StateSpaceModel, dense_normal, independent_normal, positive
+from pfbench.model.base import StateSpaceModel, dense_normal, independent_normal, numbers, positive
 
 
 class LinearGaussian(StateSpaceModel):
@@ -50,17 +50,17 @@ class LinearGaussian(StateSpaceModel):
         observes_initial: bool = False,
     ) -> None:
         super().__init__()
-        f = torch.as_tensor(transition_matrix, dtype=torch.float64)
+        f = numbers(transition_matrix)
         d = f.shape[0]
-        factor = torch.as_tensor(initial_sd, dtype=torch.float64)
+        factor = numbers(initial_sd)
         if factor.dim() == 1:
             factor = torch.diag(positive("initial_sd", initial_sd))
         tensors = {
             "f": f,
-            "g": torch.as_tensor(noise_factor, dtype=torch.float64),
-            "h": torch.as_tensor(measurement_matrix, dtype=torch.float64),
+            "g": numbers(noise_factor),
+            "h": numbers(measurement_matrix),
             "r": positive("measurement_sd", measurement_sd),
-            "m0": torch.as_tensor(initial_mean, dtype=torch.float64),
+            "m0": numbers(initial_mean),
             "l0": factor,
         }
         dy = tensors["h"].shape[0]

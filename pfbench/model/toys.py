@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from pfbench.chart import Angles, Chart, Euclidean
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch, positive
+from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch, numbers, positive
 from pfbench.record import Record
 
 
@@ -64,17 +64,20 @@ class StochasticVolatility(StateSpaceModel):
     """
 
     sigma: Tensor
+    mu: Tensor
+    rho: Tensor
 
     def __init__(self, mu: float = -1.0, rho: float = 0.95, sigma: float = 0.3) -> None:
         super().__init__()
         if not -1.0 < rho < 1.0:
             raise ValueError(f"rho={rho}: the log-volatility is stationary only for |rho| < 1")
         self.register_buffer("sigma", positive("sigma", [sigma]))
-        self.mu, self.rho = mu, rho
+        self.register_buffer("mu", numbers([mu]))
+        self.register_buffer("rho", numbers([rho]))
         self.names, self.units, self.groups, self.noise_dim = ("log_volatility",), ("",), {"state": (0,)}, 1
 
     def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.sigma / math.sqrt(1.0 - self.rho**2), torch.full_like(self.sigma, self.mu))
+        return normal_batch(runs, self.sigma / torch.sqrt(1.0 - self.rho**2), self.mu)
 
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
         return self.mu + self.rho * (x - self.mu) + self.sigma * w
@@ -132,7 +135,7 @@ class Pendulum(StateSpaceModel):
     ) -> None:
         super().__init__()
         d = float(positive("step", step))
-        q = float(positive("noise", noise)) ** 2 * torch.tensor([[d**3 / 3, d**2 / 2], [d**2 / 2, d]], dtype=torch.float64)
+        q = positive("noise", noise) ** 2 * torch.tensor([[d**3 / 3, d**2 / 2], [d**2 / 2, d]], dtype=torch.float64)
         self.register_buffer("l", torch.linalg.cholesky(q))
         self.register_buffer("r", positive("measurement_sd", [measurement_sd]))
         self.register_buffer("p0", positive("initial_sd", list(initial_sd)))

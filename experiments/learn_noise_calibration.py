@@ -1,0 +1,107 @@
+"""Are inferred noise levels calibrated? Ranks of true ones among their draws, for PMMH and SVI on a toy and on passive location.
+
+    python -m pfbench.experiments.learn_noise_calibration
+
+Each algorithm is tried a second time with a likelihood that is wrong on purpose, which the ranks must show: a measurement noise
+that is half as large again as the numbers say.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from pyro.distributions import LogNormal
+
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.rules import Jacobian
+from pfbench.model.base import StateSpaceModel
+from pfbench.model.linear import local_level
+from pfbench.model.passive_location import PassiveLocation, Platform, level_attitude
+from pfbench.ppl.calibration import Ranks, calibrate, histograms
+from pfbench.ppl.gradients import normal_guide, variational
+from pfbench.ppl.pmmh import pmmh
+from pfbench.ppl.posterior import Posterior
+from pfbench.ppl.program import ExactHMM, Filtered, Unknown, program
+from pfbench.record import Record
+
+WRONG = 1.5
+LEVELS = {"level_sd": LogNormal(0.0, 0.7), "measurement_sd": LogNormal(0.0, 0.7)}
+SIGHTS = {"angle_sd": LogNormal(math.log(3e-3), 0.5)}  # rad; of bearing and elevation
+
+
+def level(level_sd: Any, measurement_sd: Any, wrong: float = 1.0) -> StateSpaceModel:
+    return local_level(level_sd, wrong * measurement_sd, 0.0, 2.0)
+
+
+def location(angle_sd: Any, wrong: float = 1.0) -> StateSpaceModel:
+    """An emitter 226 km away, known to 5 km per axis, heard every 10 s."""
+    sd = [wrong * angle_sd, wrong * angle_sd, 1e-4, 1e-4, 1.0]
+    return PassiveLocation(10.0, 0.1, sd, (160e3, 160e3, -15.0, 15.0), (5e3, 5e3, 10.0, 10.0))
+
+
+def flight(runs: int, steps: int) -> Record:
+    """An aircraft at 200 m/s in level flight."""
+    t = 10.0 * torch.arange(1, steps + 1, dtype=torch.float64)
+    velocity = torch.tensor([200.0, 0.0, 0.0], dtype=torch.float64)
+    place = torch.tensor([0.0, 0.0, 2000.0], dtype=torch.float64) + t[:, None] * velocity
+    attitude = level_attitude(velocity).expand(1, steps, 3, 3)
+    carrier = torch.full((1, steps), 1e10, dtype=torch.float64)
+    platform = Platform(place[None], velocity.expand(1, steps, 3), attitude, carrier)
+    return Record(torch.zeros(runs, steps, 5, dtype=torch.float64), platform)
+
+
+def by_pmmh(unknown: Unknown, particles: int, draws: int, warmup: int) -> Callable[[Record], Posterior]:
+    return lambda record: pmmh(unknown, ParticleFilter(particles), record, draws, warmup, chains=1, seed=3, apart=True)
+
+
+def by_svi(unknown: Unknown, likelihood: Any, steps: int) -> Callable[[Record], Posterior]:
+    def infer(record: Record) -> Posterior:
+        guide = normal_guide(unknown, apart=True)
+        return variational(program(unknown, likelihood, apart=True), record, guide, steps, 100, rate=0.1, seed=3).posterior
+
+    return infer
+
+
+def studies(runs: int, effort: int = 1) -> dict[str, tuple[Unknown, Record, Callable[[Record], Posterior]]]:
+    """The eight cases: world, shape of its records, algorithm."""
+    found = {}
+    for name, wrong in (("", 1.0), (", wrong", WRONG)):
+        toy, believed = Unknown(level, LEVELS), Unknown(lambda wrong=wrong, **values: level(**values, wrong=wrong), LEVELS)
+        shape = Record(torch.zeros(runs, 8, 1, dtype=torch.float64))
+        found[f"toy, PMMH{name}"] = toy, shape, by_pmmh(believed, 100, 120 * effort, 60 * effort)
+        found[f"toy, SVI{name}"] = toy, shape, by_svi(believed, ExactHMM(), 150 * effort)
+        far, believed = Unknown(location, SIGHTS), Unknown(lambda wrong=wrong, **values: location(**values, wrong=wrong), SIGHTS)
+        shape = flight(runs, 6)
+        found[f"location, PMMH{name}"] = far, shape, by_pmmh(believed, 1000, 120 * effort, 60 * effort)
+        found[f"location, SVI{name}"] = far, shape, by_svi(believed, Filtered(GaussianFilter(Jacobian())), 80 * effort)
+    return found
+
+
+def main(folder: Path, runs: int = 200, effort: int = 2) -> None:
+    torch.set_num_threads(1)
+    folder.mkdir(parents=True, exist_ok=True)
+    told: dict[str, Any] = {}
+    drawn: dict[str, dict[str, Ranks]] = {"toy": {}, "location": {}}
+    for name, (unknown, shape, infer) in studies(runs, effort).items():
+        began = time.perf_counter()
+        ranks = calibrate(unknown, shape, infer, draws=19, seed=7)
+        told[name] = {part: {"p": ranks.p_value(part), "counts": ranks.counts(part, 10).tolist()} for part in unknown.names}
+        drawn[name.split(",")[0]][name.split(", ", 1)[1]] = ranks
+        values = {part: f"{value['p']:.2g}" for part, value in told[name].items()}
+        print(name, values, f"{time.perf_counter() - began:.0f} s", flush=True)
+        (folder / "learn_noise_calibration.json").write_text(json.dumps({"runs": runs, **told}, indent=1))
+    for world, ranks in drawn.items():
+        histograms(ranks).savefig(folder / f"calibration_{world}.svg")
+
+
+if __name__ == "__main__":
+    main(Path(os.environ.get("PFBENCH_RESULTS", "results")) / "learn_noise_calibration", *map(int, sys.argv[1:]))

@@ -1,0 +1,171 @@
+"""Inferred noise levels against a dense grid of Kalman likelihoods; calibration by ranks, which the wrong ones fail."""
+
+import csv
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from oracles import kalman
+from pfbench.experiments.learn_noise_calibration import LEVELS, SIGHTS, by_pmmh, by_svi, flight, level, location
+from pyro.distributions import LogNormal
+from pyro.infer.autoguide import AutoMultivariateNormal
+
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.rules import Jacobian
+from pfbench.model.linear import linear_walk, local_level
+from pfbench.ppl.calibration import Ranks, calibrate, histograms
+from pfbench.ppl.gradients import normal_guide, nuts, variational
+from pfbench.ppl.online import online
+from pfbench.ppl.pmmh import pmmh
+from pfbench.ppl.program import ExactHMM, Filtered, Unknown, latent_program, program
+from pfbench.record import Record
+
+EKF, YEARS = GaussianFilter(Jacobian()), 12
+NILE = Unknown(
+    lambda level_sd, measurement_sd: local_level(level_sd, measurement_sd, 1000.0, 1000.0),
+    {"level_sd": LogNormal(3.5, 1.0), "measurement_sd": LogNormal(4.8, 0.5)},
+)
+WALK = Unknown(lambda noise: linear_walk(1.0, noise, 0.7), {"noise": LogNormal(0.0, 1.0)})
+
+
+@cache
+def nile(years: int) -> Record:
+    with (Path(__file__).parent / "nile.csv").open() as file:
+        volumes = [float(row["volume"]) for row in csv.DictReader(file)]
+    return Record(torch.tensor(volumes, dtype=torch.float64)[None, :years, None])
+
+
+@cache
+def grid(years: int) -> tuple[dict[str, tuple[float, float]], float]:
+    """Posterior mean and sd of each number by name, log evidence: quadrature in logarithms over Kalman filters of plain NumPy."""
+    at, y = [np.linspace(0.0, 7.0, 41), np.linspace(3.4, 6.4, 41)], nile(years).y[0].numpy()
+    one, log_p = np.eye(1), np.zeros((41, 41))
+    for i, a in enumerate(at[0]):
+        for j, b in enumerate(at[1]):
+            found = kalman(one, one * np.exp(2 * a), one, one * np.exp(2 * b), np.array([1000.0]), one * 1e6, y)
+            log_p[i, j] = found.log_evidence.sum() - 0.5 * ((a - 3.5) / 1.0) ** 2 - 0.5 * ((b - 4.8) / 0.5) ** 2
+    log_p -= np.log(2 * np.pi * 1.0 * 0.5)
+    p = np.exp(log_p - log_p.max())
+    p /= p.sum()
+    found = {}
+    for name, values, own in (("level_sd", np.exp(at[0]), p.sum(1)), ("measurement_sd", np.exp(at[1]), p.sum(0))):
+        mean = float(own @ values)
+        found[name] = mean, float(own @ (values - mean) ** 2) ** 0.5
+    cell = (at[0][1] - at[0][0]) * (at[1][1] - at[1][0])
+    return found, float(np.logaddexp.reduce(log_p.ravel()) + np.log(cell))
+
+
+def agrees(table, years: int, ess: float = 0.0, sds: float = 4.5) -> None:
+    """Means within Monte Carlo error by the effective number of draws, sds within 30 %."""
+    for name, (mean, sd) in grid(years)[0].items():
+        n = max(ess, float(table.ess[name]))
+        assert abs(table["mean"][name] - mean) < sds * sd / n**0.5, (name, table["mean"][name], mean, sd, n)
+        assert 0.7 < table.sd[name] / sd < 1.4, (name, table.sd[name], sd)
+
+
+@pytest.mark.slow
+def test_particle_marginal_chains_find_the_grid_s_posterior() -> None:
+    posterior = pmmh(NILE, ParticleFilter(60), nile(YEARS), draws=60, warmup=40, chains=24, seed=1)
+    assert posterior.accepted is not None
+    assert 0.1 < float(posterior.accepted.mean()) < 0.6
+    agrees(posterior.table(), YEARS)
+
+
+@pytest.mark.slow
+def test_metropolis_on_a_kalman_likelihood_finds_it_too() -> None:
+    agrees(pmmh(NILE, EKF, nile(YEARS), draws=60, warmup=40, chains=24, seed=2).table(), YEARS)
+
+
+@pytest.mark.slow
+def test_no_u_turns_and_variational_laws_find_it() -> None:
+    """SVI's law is normal in logarithms, and the posterior nearly so: means to a third of an sd, and the narrower sd."""
+    exact = program(NILE, ExactHMM())
+    agrees(nuts(exact, nile(YEARS), draws=80, warmup=40, chains=1, seed=3).table(), YEARS)
+    for guide in (normal_guide(NILE), AutoMultivariateNormal(exact)):
+        found = variational(exact, nile(YEARS), guide, steps=200, draws=300, seed=4)
+        assert np.mean(found.losses[-30:]) < np.mean(found.losses[:10])
+        assert abs(np.mean(found.losses[-60:]) + grid(YEARS)[1]) < 0.5  # the bound is nearly the evidence
+        for name, (mean, sd) in grid(YEARS)[0].items():
+            assert abs(found.posterior.table()["mean"][name] - mean) < 0.35 * sd, name
+
+
+@pytest.mark.slow
+def test_no_u_turns_through_an_extended_kalman_filter_and_through_the_path() -> None:
+    """One number of a walk: the filter's likelihood and the program that samples the noise have one posterior."""
+    record = Record(torch.tensor([0.3, 1.1, 2.9, 3.5, 5.2], dtype=torch.float64)[None, :, None])
+    at = torch.linspace(-5.0, 4.0, 91, dtype=torch.float64)
+    likelihood = Filtered(EKF)(WALK.apiece({"noise": at.exp()}), Record(record.y.expand(91, -1, -1)))
+    p = torch.softmax(likelihood - 0.5 * at**2, 0)
+    mean = float(p @ at)
+    sd = float(p @ (at - mean) ** 2) ** 0.5
+    for posterior in (
+        nuts(program(WALK, Filtered(EKF)), record, draws=40, warmup=60, chains=1),
+        nuts(latent_program(WALK), record, draws=80, warmup=60, chains=1),
+    ):
+        log_noise = posterior.flat("noise").log()
+        ess = min(float(posterior.table().ess["noise"]), log_noise.numel())
+        assert abs(float(log_noise.mean()) - mean) < 4.5 * sd / ess**0.5
+        assert 0.6 < float(log_noise.std()) / sd < 1.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "particles"), [(EKF, 400), (ParticleFilter(60), 200)], ids=["ibis", "smc2"])
+def test_online_learning_ends_in_the_grid_s_posterior(method, particles) -> None:
+    found = online(NILE, method, nile(YEARS), particles, seed=5)
+    moments, evidence = grid(YEARS)
+    for name, (mean, sd) in moments.items():
+        assert abs(float(found.mean[name][-1]) - mean) < 4.5 * sd / (0.2 * particles) ** 0.5, name  # 1 in 5 counts, at least
+        assert 0.6 < float(found.sd[name][-1]) / sd < 1.5
+    assert abs(float(found.log_evidence[-1]) - evidence) < 4.5 / (0.2 * particles) ** 0.5
+    assert float(found.ess.min()) < 0.5 * particles  # it was resampled
+    assert float(found.moved[~found.moved.isnan()].mean()) > 0.1
+
+
+RUNS, DRAWS = 40, 19
+
+
+def uniform(ranks: Ranks, names: tuple[str, ...]) -> bool:
+    """No departure at one in a thousand for each number."""
+    return all(ranks.p_value(name, 5) > 1e-3 for name in names)
+
+
+@pytest.mark.slow
+def test_ranks_on_a_toy_are_uniform_and_a_wrong_likelihood_shows() -> None:
+    shape, toy = Record(torch.zeros(RUNS, 8, 1, dtype=torch.float64)), Unknown(level, LEVELS)
+    believed = Unknown(lambda **values: level(**values, wrong=2.0), LEVELS)
+    right = {
+        "PMMH": calibrate(toy, shape, by_pmmh(toy, 40, 57, 30), DRAWS, seed=7),
+        "SVI": calibrate(toy, shape, by_svi(toy, ExactHMM(), 100), DRAWS, seed=7),
+    }
+    wrong = {
+        "PMMH": calibrate(toy, shape, by_pmmh(believed, 40, 57, 30), DRAWS, seed=7),
+        "SVI": calibrate(toy, shape, by_svi(believed, ExactHMM(), 100), DRAWS, seed=7),
+    }
+    for name, ranks in right.items():
+        assert uniform(ranks, toy.names), (name, ranks)
+    for name, ranks in wrong.items():
+        assert not uniform(ranks, toy.names), (name, ranks)
+    assert len(histograms(right, 5).axes) == 4
+
+
+@pytest.mark.slow
+def test_ranks_on_passive_location_are_uniform_and_a_wrong_likelihood_shows() -> None:
+    far, shape = Unknown(location, SIGHTS), flight(RUNS, 5)
+    believed = Unknown(lambda **values: location(**values, wrong=2.0), SIGHTS)
+    assert uniform(calibrate(far, shape, by_pmmh(far, 300, 38, 25), DRAWS, seed=8), far.names)
+    likelihood = Filtered(EKF)
+    assert uniform(calibrate(far, shape, by_svi(far, likelihood, 50), DRAWS, seed=8), far.names)
+    assert not uniform(calibrate(far, shape, by_svi(believed, likelihood, 50), DRAWS, seed=8), far.names)
+
+
+def test_ranks_are_told_apart() -> None:
+    ramp = torch.arange(100) % 20
+    even, odd = Ranks({"a": ramp}, 19), Ranks({"a": ramp.clamp(max=9)}, 19)
+    assert even.p_value("a", 10) == 1.0
+    assert odd.p_value("a", 10) < 1e-6
+    assert even.counts("a", 5).tolist() == [20] * 5
+    with pytest.raises(ValueError, match="20 ranks"):
+        even.counts("a", 7)
