@@ -177,3 +177,11 @@ def zoom(axis: Axes, curves: Sequence[np.ndarray]) -> None:
     rest = np.abs(_finite([curve[len(curve) // 5 :] for curve in curves])).max(initial=0.0)
     if np.abs(_finite(curves)).max(initial=0.0) > 3 * rest > 0:
         axis.set_ylim(-1.1 * rest, 1.1 * rest)
+
+
+def broken(label: str, width: int = 26) -> str:
+    """A filter's label on as many lines as a column has room for: settings in brackets on lines of their own."""
+    if len(label) <= width or "[" not in label:
+        return label
+    name, _, told = label.partition("[")
+    return f"{name}\n[{told}"

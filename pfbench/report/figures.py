@@ -19,6 +19,7 @@ from pfbench.report.canvas import (
     COLUMN,
     RC,
     Look,
+    broken,
     indexed,
     jitter,
     labelled,
@@ -273,7 +274,7 @@ def rmse(runs: pd.DataFrame, groups: Sequence[str], style: Mapping[str, Look]) -
                 size = 5.5 if many else 7
                 axis.text(1.01, place, f"{lost} lost", transform=place_of, ha="left", va="center", fontsize=size)
         # Said again because a filter that lost every run has no box, and its row must stay.
-        axis.set_yticks(range(len(order)), order, fontsize=5.8 if many else None)
+        axis.set_yticks(range(len(order)), list(map(broken, order)), fontsize=5.8 if many else None)
         axis.set_ylim(len(order) - 0.5, -0.5)
         unit = str(own.unit.iloc[0]) if len(own) else ""
         axis.set(title=group, xlabel=labelled("RMSE per run", unit), ylabel="")

@@ -284,11 +284,20 @@ def _told_apart(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> 
     if len({tuple(repr(one.get(name)) for name in of_filter) for one in flat}) == len(flat):
         names = of_filter
     own = _flat(meta["config"])
-    told = ",".join(f"{name.removeprefix('filter.')}={own.get(name, '-')}" for name in names)
+    told = ",".join(_setting(name.removeprefix("filter."), own.get(name, "-")) for name in names)
     return f"{meta['label']}[{told or meta['key']}]"
 
 
+def _setting(name: str, value: Any) -> str:
+    """A setting as a label says it; a class goes by its own name, not by where it lies."""
+    if name.endswith("._target_"):
+        return f"{name.removesuffix('._target_')}={str(value).rpartition('.')[2]}"
+    return f"{name}={value}"
+
+
 def _flat(config: Any, path: str = "") -> dict[str, Any]:
+    if isinstance(config, list) and any(isinstance(part, Mapping) for part in config):  # a filter's stages, by their place
+        config = dict(enumerate(config))
     if not isinstance(config, Mapping):
         return {path: config}
     return {k: v for name, below in config.items() for k, v in _flat(below, f"{path}.{name}" if path else name).items()}

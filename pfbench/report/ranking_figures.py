@@ -16,12 +16,13 @@ from matplotlib.ticker import MaxNLocator
 from pfbench.report import across
 from pfbench.report.across import Across, Blocks
 from pfbench.report.budget import Front
-from pfbench.report.canvas import COLUMN, Look, labelled, legend, plain_ticks, slug, stack
+from pfbench.report.canvas import COLUMN, Look, broken, labelled, legend, plain_ticks, slug, stack
 from pfbench.report.figures import Drawing
 from pfbench.report.significance import NO_DIFFERENCE, Verdict
 
 _PAIRS = 28  # of a forest that a column's height still holds
 _MANY = 12  # filters of a diagram of which each rank has a tick
+_LONG = 42  # letters of a pair that stand on one line of a column
 _SIDE = 10  # filters of a matrix that a column's width still holds
 _BETTER, _WORSE = "#0072B2", "#E69F00"  # apart in grey too: dark and light
 
@@ -139,8 +140,9 @@ def matrix(own: Sequence[Verdict], one: Across) -> Figure:
                 size = min(6.5, 50 / len(labels))
                 axis.text(j, i, f"{won[i, j]}–{won[j, i]}{star}", ha="center", va="center", fontsize=size, color=ink)
     small = min(7.0, 55 / len(labels))
-    axis.set_xticks(range(len(labels)), labels, rotation=40, ha="right", rotation_mode="anchor", fontsize=small)
-    axis.set_yticks(range(len(labels)), labels, fontsize=small)
+    names = list(map(broken, labels))
+    axis.set_xticks(range(len(labels)), names, rotation=40, ha="right", rotation_mode="anchor", fontsize=small)
+    axis.set_yticks(range(len(labels)), names, fontsize=small)
     axis.set_xlabel(f"shown better – shown worse, of {met.max()} cells")
     axis.grid(False)
     axis.tick_params(length=0)
@@ -162,7 +164,10 @@ def profiles(sources: Blocks, style: Mapping[str, Look]) -> Figure:
 
 def forest(pairs: Sequence[Verdict]) -> Figure:
     """Ratio of RMSE and its interval, one row per pair."""
-    figure = Figure(figsize=(COLUMN, 0.75 + 0.17 * len(pairs)), layout="constrained")
+    names = [f"{v.a} / {v.b}" for v in pairs]
+    if max(map(len, names)) > _LONG:
+        names = [f"{v.a}\n/ {v.b}" for v in pairs]
+    figure = Figure(figsize=(COLUMN, 0.75 + 0.17 * sum(1 + name.count("\n") for name in names)), layout="constrained")
     axis = figure.subplots()
     ends = [x for v in pairs for x in (v.low, v.ratio, v.high) if np.isfinite(x) and x > 0]
     low, high = min([*ends, 1 / (1 + pairs[0].margin)]), max([*ends, 1 + pairs[0].margin])
@@ -179,7 +184,7 @@ def forest(pairs: Sequence[Verdict]) -> Figure:
             float(np.clip(v.ratio, *edges)), row, ls="none", marker="s" if v.equivalent else "o", ms=4, mec=colour,
             mfc=colour if shown else "white", mew=0.9, zorder=3,
         )  # fmt: skip
-    axis.set_yticks(range(len(pairs)), [f"{v.a} / {v.b}" for v in pairs], fontsize=5.8)
+    axis.set_yticks(range(len(pairs)), names, fontsize=5.8)
     axis.set_ylim(len(pairs) - 0.4, -0.6)
     axis.set(xscale="log", xlim=edges, xlabel="ratio of RMSE")
     plain_ticks(axis.xaxis, [low, high])
