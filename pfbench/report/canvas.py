@@ -17,6 +17,7 @@ from PIL import Image
 
 COLUMN = 3.5  # inches
 _INSTANTS = 300  # drawn at most: a column of print resolves no more
+_BESIDE = 28  # letters of a label beside which another one has room
 RC: Any = {
     "font.size": 8,
     "font.family": "DejaVu Sans",  # comes with matplotlib; a list of families would be searched for each text
@@ -87,7 +88,7 @@ def stack(n: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes
 def legend(figure: Figure, axis: Axes, columns: int = 2) -> None:
     """A legend below the figure, which grows by the height of it."""
     handles, labels = axis.get_legend_handles_labels()
-    columns = min(columns, len(labels))
+    columns = 1 if max(map(len, labels), default=0) > _BESIDE else min(columns, len(labels))
     width, height = figure.get_size_inches()
     figure.set_size_inches(width, height + 0.1 + 0.16 * -(-len(labels) // columns))
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
