@@ -18,7 +18,7 @@ from problems import GROWTH, HALF_LOG_2PI, RADAR, RADAR_SPREAD, RADAR_START, VOL
 from worker import Filter, serve
 
 KINDS = {"growth": 0, "volatility": 1, "radar": 2, "ins": 3}
-FLAGS = ("-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
+FLAGS = ("-O3", "-march=native", "-ffast-math", "-fPIC", "-c")
 
 
 def library() -> Any:
@@ -31,8 +31,10 @@ def library() -> Any:
     if compiler is None:
         raise OSError("no C compiler")
     with tempfile.TemporaryDirectory() as folder:
-        built = Path(folder) / "fused.so"
-        subprocess.run([compiler, *FLAGS, "-o", str(built), str(Path(__file__).with_name("fused.c")), "-lm"], check=True)
+        part, built = Path(folder) / "fused.o", Path(folder) / "fused.so"
+        subprocess.run([compiler, *FLAGS, "-o", str(part), str(Path(__file__).with_name("fused.c"))], check=True)
+        # linked without -ffast-math, with which a library switches small numbers off in the whole process
+        subprocess.run([compiler, "-shared", "-o", str(built), str(part), "-lm"], check=True)
         found = ctypes.CDLL(str(built))
     found.run.restype = ctypes.c_double
     return found

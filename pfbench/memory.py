@@ -28,8 +28,8 @@ GIB, MIB = 1 << 30, 1 << 20
 _SHARE = 0.8  # of what is free: the estimate does not see allocators and libraries [ours]
 _STEPS = 8  # of the trial
 _FEW = 64  # particles of the trial; also twice and four times as many
-_DRAWN = 4  # bytes at work for each byte of a world that is drawn: sensors run faster than receivers [measured: 2 to 4]
-_KEPT = 3  # copies of what each step tells: the steps, all of them in one tensor, in single precision [measured]
+_DRAWN = 4  # bytes at work for each byte of a world that is drawn: sensors run faster than receivers [ours]
+_KEPT = 3  # copies of what each step tells: the steps, all of them in one tensor, in single precision [ours]
 _HELD = 2.0  # bytes that are held for each of live tensors: what operations use inside, and holes [measured: 1.5 to 2.3]
 _WORLD = 30e6  # bytes of a run's world beyond those of any scenario at hand: what decides whether to look at all
 
