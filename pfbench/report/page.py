@@ -223,7 +223,7 @@ def _section(cell: Cell, view: View) -> tuple[dict[str, Any], list[Verdict], pd.
             shown = {"accuracy": accuracy, "pairs": pairs, "effects": effects, "regions": calibration.said(regions, group)}
             best = _best_first([front], group)[0]
             parts.append({"name": group, "main": group == main, "chosen": chosen, "best": best, **shown, **_said(own, front)})
-    ran = tables.overview(used)
+    ran = tables.overview(used, options.alpha)
     save_table(folder, f"{prefix}_overview", ran, note)
     seen = known if not view.brief else [main] if main else []
     look, who = _looks_of(view, list(whole), _best_first(fronts, main), f"the smallest median RMSE of {main}")

@@ -11,7 +11,7 @@ import pandas as pd
 
 from pfbench import metrics, store
 from pfbench.report.across import Across
-from pfbench.report.frame import COVERAGES, Block, blocks
+from pfbench.report.frame import COVERAGES, Block, blocks, of_trace
 from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Sensitivity, Verdict
 
 Results = Mapping[str, store.Result]
@@ -19,16 +19,25 @@ _LATEX = str.maketrans({
     "\\": r"\textbackslash ", "_": r"\_", "%": r"\%", "$": r"\$", "#": r"\#", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde ", "^": r"\textasciicircum ", "&": r"\&",
 })  # fmt: skip
+_TOLD = (  # of the columns of the first table, those that not every kind of filter tells, nor results of before
+    "likelihoods per step", "memory in MiB", "ESS in %", "ancestors in %", "different in %", "accepted in %", "NIS", "NIS band"
+)  # fmt: skip
 _LAST = 20  # steps over which a location is said to have settled [Pu and Qin, section 4]
 
 
-def overview(results: Results) -> pd.DataFrame:
-    """What ran: one row per filter.
+def overview(results: Results, alpha: float = 0.05) -> pd.DataFrame:
+    """What ran: one row per filter. Figures that none of the filters has are left out.
+
+    Ancestors are particles that are copied at a refresh, different ones those that differ after it and its moves, both of all;
+    NIS is the normalised innovation squared per component seen, at the instants scored, with the band of a consistent filter,
+    whose innovations are independent; memory is what the filter took beyond what was held before.
 
     Args:
         results: by label, without the instants that are left out.
+        alpha: probability outside the band.
     """
-    return pd.DataFrame([_ran(label, result) for label, result in results.items()])
+    rows = pd.DataFrame([_ran(label, result, alpha) for label, result in results.items()])
+    return rows.drop(columns=[name for name in _TOLD if (rows[name].isna() | (rows[name] == "")).all()])
 
 
 def accuracy(
@@ -235,10 +244,12 @@ def diverged(result: store.Result) -> np.ndarray:
     return metrics.diverged(result.arrays["nees"], dofs, result.arrays["lost"])
 
 
-def _ran(label: str, result: store.Result) -> dict[str, Any]:
+def _ran(label: str, result: store.Result, alpha: float) -> dict[str, Any]:
     meta, arrays = result.meta, result.arrays
     lost, particles = arrays["lost"], meta.get("particles")
-    ess = metrics.mean_per_run(arrays["ess"], lost) / particles if "ess" in arrays and particles else np.array([np.nan])
+    moved = arrays.get("accepted_0", np.full(arrays["nees"].shape[:2], np.nan))
+    accepted = metrics.mean_per_run(np.where(arrays.get("resampled", True), moved, np.nan), lost)
+    nis, band = _nis(result, alpha)
     evidence = arrays["log_evidence"][~lost]
     return {
         "filter": label,
@@ -250,9 +261,29 @@ def _ran(label: str, result: store.Result) -> dict[str, Any]:
         "lost in %": 100 * float(metrics.lost_share(lost).value),
         "diverged": int(diverged(result).sum()),
         "time per step in ms": 1e3 * meta["seconds"]["per_step"],
-        "ESS in %": 100 * _mean(ess),
+        "likelihoods per step": meta.get("likelihoods_per_step", np.nan),
+        "memory in MiB": (meta.get("memory") or np.nan) / 2**20,
+        "ESS in %": 100 * _mean(of_trace(result, "ess")),
+        "ancestors in %": 100 * _mean(of_trace(result, "ancestors")),
+        "different in %": 100 * _mean(of_trace(result, "unique")) if "unique" in arrays else np.nan,
+        "accepted in %": 100 * _mean(accepted),
+        "NIS": nis,
+        "NIS band": band,
         "log evidence": _mean(evidence),
     }
+
+
+def _nis(result: store.Result, alpha: float) -> tuple[float, str]:
+    """Normalised innovation squared per component seen, over the runs that were not lost, and its band."""
+    if "nis" not in result.arrays:
+        return np.nan, ""
+    kept = ~result.arrays["lost"]
+    nis, dof = (np.asarray(result.arrays[name], dtype=np.float64)[kept] for name in ("nis", "nis_dof"))
+    count = int(np.nansum(dof))
+    if not count:
+        return np.nan, ""
+    low, high = metrics.nees_band(count, 1, alpha)
+    return float(np.nansum(nis) / count), f"{float(low) / count:.3g} to {float(high) / count:.3g}"
 
 
 def _accuracy(result: store.Result, block: Block, alpha: float, bound: float | None) -> dict[str, Any]:
