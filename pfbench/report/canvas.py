@@ -17,7 +17,7 @@ from PIL import Image
 
 COLUMN = 3.5  # inches
 _INSTANTS = 300  # drawn at most: a column of print resolves no more
-_BESIDE = 28  # letters of a label beside which another one has room
+_BESIDE = 24  # letters of a label beside which another one has room
 RC: Any = {
     "font.size": 8,
     "font.family": "DejaVu Sans",  # comes with matplotlib; a list of families would be searched for each text

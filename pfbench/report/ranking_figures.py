@@ -166,7 +166,7 @@ def forest(pairs: Sequence[Verdict]) -> Figure:
     """Ratio of RMSE and its interval, one row per pair."""
     names = [f"{v.a} / {v.b}" for v in pairs]
     if max(map(len, names)) > _LONG:
-        names = [f"{v.a}\n/ {v.b}" for v in pairs]
+        names = [f"{broken(v.a, _LONG)}\n/ {broken(v.b, _LONG)}" for v in pairs]
     figure = Figure(figsize=(COLUMN, 0.75 + 0.17 * sum(1 + name.count("\n") for name in names)), layout="constrained")
     axis = figure.subplots()
     ends = [x for v in pairs for x in (v.low, v.ratio, v.high) if np.isfinite(x) and x > 0]
