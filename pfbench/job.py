@@ -49,6 +49,7 @@ PLACES = (
     "scenario.cache",
     "particles",  # counted where a filter uses it, as filter.particles
     "bound",  # stands beside what a filter does; fresh=true adds it to a finished job
+    "runs_in",  # an experiment's table from which `runs` is taken
     "train", "checkpoint",  # a job depends on the weights that its filter has, which are named by what they are
 )  # fmt: skip
 # what says how jobs are compared and changes nothing in one: no part of its name while it is usual

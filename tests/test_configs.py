@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
 from recorded_data import DATA
 
 from pfbench import cli, job
@@ -228,7 +229,10 @@ def test_every_choice_of_every_experiment_composes(experiment: str) -> None:
         cells = [[values[k % len(values)] for values in swept] for k in range(number)]  # every value once: not every pair
         assert math.prod(map(len, swept)) > 1
         for cell in cells:
-            cfg = compose("config", [f"+experiment={experiment}", *cell, "data.root=somewhere"])
+            cfg = compose("config", [f"+experiment={experiment}", *cell, "data.root=somewhere"], return_hydra_config=True)
+            HydraConfig.instance().set_config(cfg)  # an experiment may look up what was chosen
+            with open_dict(cfg):
+                del cfg["hydra"]
             OmegaConf.to_container(cfg, resolve=True)
             job.build(cfg["filter"])
             job.build(cfg.model)
