@@ -21,6 +21,7 @@ from workload import ins_model
 
 from pfbench import fusion, job, native
 from pfbench.draws import MonteCarlo
+from pfbench.filter.compiled import Compiled
 from pfbench.filter.loop import run_filter, runs_at_once
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.resamplers import Resample, Systematic
@@ -89,6 +90,7 @@ def ckf(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
 def of(method: Any, particles: int, work: Any, dtype: torch.dtype, compiled: bool) -> Filter:
     """A filter in the project's time loop, in blocks of runs as a job makes them."""
     model, record = model_and_record(work, dtype)
+    method = Compiled(method) if compiled and isinstance(method, ParticleFilter) else method
     runs = torch.arange(len(work.y))
     block = runs_at_once(len(runs), particles, model.chart.size)
 

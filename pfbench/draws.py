@@ -90,7 +90,7 @@ class MonteCarlo:
     """Independent draws.
 
     Args:
-        seed: an integer from 0 to 2**32 - 1.
+        seed: an integer from 0 to 2**32 - 1; in a recorded step a tensor [], as `step` is.
         runs: run numbers, int64 [R]; a run's number, not its place in the batch, decides its draws.
         dtype: of the normals. They are made in single precision (24 bits of resolution, largest value 6.7) and then
             converted: no statistic of ours can tell their law from a double-precision one, and they cost a sixth.
@@ -100,13 +100,13 @@ class MonteCarlo:
         ValueError: seed out of range.
     """
 
-    seed: int
+    seed: int | Tensor
     runs: Tensor
     dtype: torch.dtype = torch.float64
-    step: int = 0
+    step: int | Tensor = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.seed <= _WORD:
+        if isinstance(self.seed, int) and not 0 <= self.seed <= _WORD:
             raise ValueError(f"seed={self.seed}: give an integer from 0 to 2**32 - 1")
 
     def at(self, step: int) -> MonteCarlo:
@@ -125,7 +125,8 @@ class MonteCarlo:
         def whole(value: object) -> Tensor:
             return torch.as_tensor(value, device=self.runs.device)
 
-        key = whole([self.seed, zlib.crc32(purpose.encode())])
+        own = zlib.crc32(purpose.encode())
+        key = whole([self.seed, own]) if isinstance(self.seed, int) else torch.stack([self.seed, torch.full_like(self.seed, own)])
         quarters = torch.arange(-(-n // 4), device=self.runs.device)
         return key, whole(self.step), self.runs, torch.arange(w, device=self.runs.device), quarters
 

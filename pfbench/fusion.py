@@ -6,7 +6,8 @@ does so once. Compiling costs some seconds, so they run eagerly until a job that
     with fusion.fused():
         run_filter(...)
 
-Only pieces are compiled, not the step: over a whole step the compiler computes the noise again for each state component.
+Where a whole step becomes a graph (pfbench.filter.compiled), the loops that are written by hand stay whole in it, as operators of
+their own: torch's compiler would compute the noise again for each state component.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any, TypeVar, cast
 
 import torch
 from torch.autograd import forward_ad
+from torch.utils import _pytree as pytree
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -28,6 +30,8 @@ log = logging.getLogger("pfbench")
 _failed: set[Callable[..., Any]] = set()  # what a compiler has refused once
 
 _fused: ContextVar[bool] = ContextVar("fused", default=False)
+_graph: ContextVar[bool] = ContextVar("graph", default=False)
+_operators = torch.library.Library("pfbench", "DEF")
 
 
 @contextmanager
@@ -38,6 +42,21 @@ def fused(wanted: bool = True) -> Iterator[None]:
         yield
     finally:
         _fused.reset(token)
+
+
+@contextmanager
+def graph() -> Iterator[None]:
+    """Within it a step is being recorded, to be compiled: nothing may look at numbers."""
+    token = _graph.set(True)
+    try:
+        yield
+    finally:
+        _graph.reset(token)
+
+
+def recording() -> bool:
+    """Is a step being recorded?"""
+    return _graph.get()
 
 
 def _plain(args: tuple[Any, ...]) -> bool:
@@ -55,6 +74,7 @@ def fusible(function: F, eager: F | None = None, by_hand: F | None = None) -> F:
         by_hand: is taken for what would be compiled on the CPU and one thread, where it works and no gradient is wanted.
     """
     separate = eager or function
+    operator = None if by_hand is None else _operator(by_hand, function)
 
     @cache
     def compiled() -> Callable[..., Any]:
@@ -71,6 +91,21 @@ def fusible(function: F, eager: F | None = None, by_hand: F | None = None) -> F:
 
     @wraps(function)
     def call(*args: Any) -> Any:
+        if _graph.get():
+            return (function if operator is None or args[0].is_cuda else operator)(*args)
         return (whole if _fused.get() else separate)(*args)
 
     return cast(F, call)
+
+
+def _operator(by_hand: Callable[..., Any], like: Callable[..., Any]) -> Callable[..., Any]:
+    """An operator that a graph holds as a whole; its results are contiguous, and have the shapes of `like`'s."""
+    name = by_hand.__name__
+    _operators.define(name + torch.library.infer_schema(by_hand, mutates_args=()))
+    _operators.impl(name, by_hand, "CPU")
+
+    def shapes(*args: Any) -> Any:
+        return pytree.tree_map(lambda a: a.new_empty(a.shape), like(*args))
+
+    torch.library.register_fake(f"pfbench::{name}", shapes, lib=_operators)
+    return cast(Callable[..., Any], getattr(torch.ops.pfbench, name).default)

@@ -10,7 +10,7 @@ import platform
 import re
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from pfbench import fusion, memory, native, store
 from pfbench.bound import posterior_bound
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Cloud, Info, gather
+from pfbench.filter.compiled import Compiled
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.learned_weights import by_content, origin
 from pfbench.filter.loop import Estimate, run_filter, runs_at_once
@@ -203,6 +204,7 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
     compiling = time.perf_counter()
     fuse = fuses(cfg.engine, method, model, cfg.runs * steps)
     compiled = time.perf_counter() - compiling
+    step = compiled_step(cfg.engine, fuse, method, tally, clock)
     held, tidy = native.peak_from_here(), memory.Tidy()
 
     def tick() -> None:
@@ -215,16 +217,17 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
         torch.no_grad(),
         tqdm(total=steps, desc=name, unit="step", delay=2, disable=None, leave=False) as bar,
     ):
-        estimate = run_filter(method, model, episode.record, draws, watch, tick, at_once(cfg, method, model, cfg.runs))
+        estimate = run_filter(step or method, model, episode.record, draws, watch, tick, at_once(cfg, method, model, cfg.runs))
     if cfg.device != "cpu":
         torch.cuda.synchronize()
-    spent = clock() - begun - judge.seconds
+    spent = clock() - begun - judge.seconds - (step.seconds if step else 0.0)
     seconds = {
-        "world": drawn - started, "bound": bounded - drawn, "scores": judge.seconds, "compile": compiled, "filter": spent,
+        "world": drawn - started, "bound": bounded - drawn, "scores": judge.seconds,
+        "compile": compiled + (step.seconds if step else 0.0), "filter": spent,
         "per_step": spent / steps,
     }  # fmt: skip
     likelihoods = tally.count / (cfg.runs * steps)
-    engine = "compiled" if fuse else "eager"
+    engine = "compiled" if step and any(step.graphs.values()) else "loops" if fuse else "eager"
     cost = {"engine": engine, "memory": _taken(cfg.device, held), "likelihoods_per_step": likelihoods}
     meta = describe(cfg, model, method, steps, seconds, episode.notes) | cost
     return {**meta, "bound": said, "trained": trained}, {**_arrays(episode, estimate, judge), **_shared(episode, least)}
@@ -256,8 +259,8 @@ def settings(cfg: DictConfig | Mapping[str, Any]) -> None:
         raise ValueError(f"dtype={cfg['dtype']}: give float64 (the default) or float32")
     if cfg["budget"] not in BUDGETS:
         raise ValueError(f"budget={cfg['budget']}: give one of {', '.join(BUDGETS)}")
-    if cfg["engine"] not in ("auto", "eager", "compiled"):
-        raise ValueError(f"engine={cfg['engine']}: give auto, eager or compiled")
+    if cfg["engine"] not in ("auto", "eager", "loops", "compiled"):
+        raise ValueError(f"engine={cfg['engine']}: give auto, eager, loops or compiled")
     if not re.fullmatch(r"cpu|cuda(:\d+)?", str(cfg["device"])):
         raise ValueError(f"device={cfg['device']}: give cpu, cuda, or one of several as cuda:1")
     if cfg["device"] != "cpu" and (torch.device(cfg["device"]).index or 0) >= torch.cuda.device_count():
@@ -300,6 +303,19 @@ def fuses(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> b
     if took > 0.5:
         log.info("engine=%s: inner loops compiled in %.1f s; later jobs find them ready", engine, took)
     return True
+
+
+def compiled_step(
+    engine: str, fuse: bool, method: Any, tally: Tally, clock: Callable[[], float]
+) -> Compiled | None:
+    """The filter with its step compiled as a whole, where that was asked for and can be."""
+    if engine != "compiled" or not fuse:
+        return None
+    if not isinstance(method, ParticleFilter) or method.keeper is not None:
+        what = "its moves carry a past" if isinstance(method, ParticleFilter) else f"it is a {type(method).__name__}"
+        log.info("engine=compiled: the step of this filter is not compiled as a whole (%s), only its inner loops", what)
+        return None
+    return Compiled(method, tally, clock)
 
 
 def lower_bound(

@@ -11,7 +11,7 @@ namespace {
 template <class T>
 void systematic(int64_t* ancestor, const T* weight, const double* wanted, const double* uniform, int64_t runs, int64_t slots) {
     std::vector<T> sums(slots);
-    std::vector<int32_t> ends(slots), ending(slots + 1);
+    std::vector<int32_t> ends(slots), first(slots + 1);
     for (int64_t r = 0; r < runs; ++r, weight += slots, ancestor += slots) {
         double sum = 0.0;
         for (int64_t i = 0; i < slots; ++i) sums[i] = static_cast<T>(sum += weight[i]);
@@ -23,10 +23,11 @@ void systematic(int64_t* ancestor, const T* weight, const double* wanted, const 
             const T end = reach < n ? std::ceil(reach - u) : n;
             ends[i] = static_cast<int32_t>(end < 0 ? 0 : end);
         }
-        std::fill(ending.begin(), ending.end(), 0);
-        for (int64_t i = 0; i < slots; ++i) ++ending[ends[i]];
-        int64_t passed = 0;  // a slot belongs to the first particle that ends after it
-        for (int64_t j = 0; j < slots; ++j) ancestor[j] = std::min(passed += ending[j], slots - 1);
+        // a particle's slots begin where its predecessor's end; of several that begin at a slot, the last one has it
+        std::fill(first.begin(), first.end(), 0);
+        for (int64_t i = 1; i < slots; ++i) first[ends[i - 1]] = static_cast<int32_t>(i);
+        int32_t latest = 0;
+        for (int64_t j = 0; j < slots; ++j) ancestor[j] = latest = std::max(latest, first[j]);
     }
 }
 
@@ -66,6 +67,47 @@ void log_normal(T* out, const T* y, const T* mean, const T* scale, const T* cons
     }
 }
 
+// out = phi x + gain w of each particle, by the coefficients that are not zero: in error models of an INS three in four are.
+template <class T>
+void affine(T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t one_phi, int64_t one_gain, int64_t runs,
+            int64_t particles, int64_t rows, int64_t states, int64_t noises) {
+    typedef T Lanes __attribute__((vector_size(64), aligned(sizeof(T)), may_alias));
+    constexpr int64_t WIDE = 4 * 64 / sizeof(T);  // numbers of a row that stay in four registers
+    struct Term { const T* from; T by; };
+    std::vector<Term> terms(rows * (states + noises));
+    std::vector<int64_t> last(rows);
+    const int64_t plane = runs * particles;
+    for (int64_t r = 0; r < runs; ++r) {
+        const T* a = phi + (one_phi ? 0 : r * rows * states);
+        const T* b = gain + (one_gain ? 0 : r * rows * noises);
+        int64_t count = 0;
+        for (int64_t d = 0; d < rows; ++d) {
+            for (int64_t k = 0; k < states; ++k)
+                if (const T c = a[d * states + k]; c != 0) terms[count++] = {x + k * plane + r * particles, c};
+            for (int64_t k = 0; k < noises; ++k)
+                if (const T c = b[d * noises + k]; c != 0) terms[count++] = {w + k * plane + r * particles, c};
+            last[d] = count;
+        }
+        for (int64_t next = 0; particles >= WIDE && next < particles; next += WIDE) {
+            const int64_t at = std::min(next, particles - WIDE);  // the last ones overlap
+            for (int64_t d = 0, t = 0; d < rows; ++d) {
+                Lanes sum[4] = {};
+                for (; t < last[d]; ++t) {
+                    const Lanes* from = reinterpret_cast<const Lanes*>(terms[t].from + at);
+                    for (int k = 0; k < 4; ++k) sum[k] += terms[t].by * from[k];
+                }
+                for (int k = 0; k < 4; ++k) reinterpret_cast<Lanes*>(out + d * plane + r * particles + at)[k] = sum[k];
+            }
+        }
+        for (int64_t at = 0; particles < WIDE && at < particles; ++at)
+            for (int64_t d = 0, t = 0; d < rows; ++d) {
+                T sum = 0;
+                for (; t < last[d]; ++t) sum += terms[t].by * terms[t].from[at];
+                out[d * plane + r * particles + at] = sum;
+            }
+    }
+}
+
 // How many of the values 0 to 2 N - 1 occur at slots that hold a particle.
 template <class T>
 void distinct(int64_t* count, const int64_t* value, const T* log_weight, int64_t runs, int64_t slots) {
@@ -100,11 +142,15 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
 #define GATHER(T) (T* out, const T* x, const int64_t* a, int64_t d, int64_t runs, int64_t slots, int64_t wanted)
 #define LOG_NORMAL(T)                                                                                                       \
     (T* out, const T* y, const T* mean, const T* scale, const T* constant, const int64_t* stride, int64_t runs, int64_t n, int64_t k)
+#define AFFINE(T)                                                                                                            \
+    (T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t one_phi, int64_t one_gain, int64_t runs, int64_t n, \
+     int64_t rows, int64_t states, int64_t noises)
 #define MOMENTS(T) (T* mean, T* variance, const T* x, const T* w, int64_t d, int64_t runs, int64_t n)
 #define DISTINCT(T) (int64_t* count, const int64_t* value, const T* w, int64_t runs, int64_t slots)
 
 BOTH(systematic, SYSTEMATIC, (a, w, n, u, runs, slots))
 BOTH(gather, GATHER, (out, x, a, d, runs, slots, wanted))
 BOTH(log_normal, LOG_NORMAL, (out, y, mean, scale, constant, stride, runs, n, k))
+BOTH(affine, AFFINE, (out, phi, x, gain, w, one_phi, one_gain, runs, n, rows, states, noises))
 BOTH(distinct, DISTINCT, (count, value, w, runs, slots))
 BOTH(moments, MOMENTS, (mean, variance, x, w, d, runs, n))

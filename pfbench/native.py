@@ -65,6 +65,19 @@ def log_normal(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tens
     return out
 
 
+def affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
+    """phi x + gain w [D, R, N]; x [R, N, D], w [R, N, W], phi [R or 1, D, D], gain [R or 1, D, W]."""
+    runs, particles, _ = x.shape
+    first, driven = x.permute(2, 0, 1).contiguous(), w.permute(2, 0, 1).contiguous()
+    shared = int(len(phi) == 1), int(len(gain) == 1)
+    out = x.new_empty(phi.shape[1], runs, particles)
+    _call(
+        "affine", x.dtype, out, phi.contiguous(), first, gain.contiguous(), driven, *shared, runs, particles,
+        *phi.shape[1:], gain.shape[2],
+    )  # fmt: skip
+    return out
+
+
 def distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:
     """How many values there are in copy_of [R, N], below 2 N, at the slots whose log weight [R, N] is finite: [R]."""
     runs, slots = copy_of.shape
@@ -76,7 +89,7 @@ def distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:
 def moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance [R, D] of x [R, N, D] by weights [R, N] whose sum is 1."""
     parts, (runs, particles, components) = x.permute(2, 0, 1).contiguous(), x.shape
-    mean, variance = x.new_empty(2, runs, components)
+    mean, variance = x.new_empty(runs, components), x.new_empty(runs, components)
     _call("moments", x.dtype, mean, variance, parts, w.contiguous(), components, runs, particles)
     return mean, variance
 

@@ -61,7 +61,7 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "huge seed": (("seed=4294967296",), ("seed=4294967296: give an integer from 0 to 2**32 - 1",)),
     "no threads": (("threads=0",), ("threads=0: give a whole number, 1 or more",)),
     "half precision": (("dtype=float16",), ("dtype=float16: give float64 (the default) or float32",)),
-    "unknown engine": (("engine=steam",), ("engine=steam: give auto, eager or compiled",)),
+    "unknown engine": (("engine=steam",), ("engine=steam: give auto, eager, loops or compiled",)),
     "unknown device": (("device=gpu",), ("device=gpu: give cpu, cuda",)),
     "regime": (("noise=outliers", "noise.probability=2"), ("noise.probability=2: give a probability between 0 and 1",)),
     "no such class": (("noise._target_=pfbench.noise.regimes.Louder",), ("noise: its values do not fit", "Louder")),

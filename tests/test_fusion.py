@@ -139,6 +139,22 @@ def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(order: tuple[int
 
 
 @compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("particles", [1, 63, 64, 200])
+def test_a_loop_by_hand_moves_by_the_coefficients_that_are_not_zero(dtype: torch.dtype, particles: int) -> None:
+    def some(purpose: str, n: int, w: int) -> Tensor:
+        return DRAWS.normal(purpose, n, w).to(dtype)
+
+    x, w = some("x", particles, D), some("w", particles, 2)
+    phi, gain = some("phi", D, D), some("gain", D, 2)
+    phi[:, :, 1], phi[:, 3], gain[1] = 0.0, 0.0, 0.0  # a state that nothing sees, one that is noise alone, a run without noise
+    for a, b in ((phi, gain), (phi[:1], gain[:1]), (phi[:1], gain)):
+        moved = torch.einsum("rij,rnj->irn", a.expand(RUNS, -1, -1), x) + torch.einsum("rij,rnj->irn", b.expand(RUNS, -1, -1), w)
+        torch.testing.assert_close(native.affine(a, x, b, w), moved)
+        torch.testing.assert_close(base._dense_affine(a, x, b, w), moved)
+
+
+@compiler
 def test_a_gradient_goes_round_the_loops_by_hand() -> None:
     x, w = DRAWS.normal("x", N, D).requires_grad_(), torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1)
     with fusion.fused():
@@ -160,14 +176,14 @@ WALK = ("run", "scenario=linear_walk", "scenario.steps=20", "runs=4", "particles
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_compiled_job_gives_the_numbers_of_an_eager_one(tmp_path: Path, dtype: str) -> None:
     found = {}
-    for engine in ("eager", "compiled"):
+    for engine in ("eager", "loops"):
         said = pfbench(*WALK, f"engine={engine}", f"dtype={dtype}", home=tmp_path)
         assert said.code == 0, said.err
         (file,) = (tmp_path / "results" / "adhoc").glob("*.npz")  # one key: an engine changes no result
         found[engine] = store.load(file)
         assert found[engine].meta["engine"] == engine
     # the same draws, to 1e-5; a particle in a few thousand falls to a neighbouring slot
-    eager, compiled = (found[engine].arrays for engine in ("eager", "compiled"))
+    eager, compiled = (found[engine].arrays for engine in ("eager", "loops"))
     for name in ("error", "sd", "log_evidence"):
         assert np.allclose(compiled[name], eager[name], rtol=0, atol=2e-2), name
 

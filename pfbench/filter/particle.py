@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -24,9 +24,24 @@ from pfbench.filter.resamplers import Resample, Resampler, Systematic
 from pfbench.filter.sizes import Fixed, Size
 from pfbench.filter.weights import Bayes, Weighing
 from pfbench.filter.window import Keeper
-from pfbench.fusion import fusible
+from pfbench.fusion import fusible, recording
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
+
+
+class Told(NamedTuple):
+    """What a step tells beside the cloud.
+
+    Attributes:
+        mean, variance: of the cloud [R, D], [R, d].
+        expected: log weights before what was seen [R, N], not normalised.
+        trace: {name: [R]}.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    expected: Tensor
+    trace: dict[str, Tensor]
 
 
 class Stage(Protocol):
@@ -106,6 +121,11 @@ class ParticleFilter:
 
     def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud, Info]:
         """The cloud at t-1 and what is seen at t -> the weighted cloud at t."""
+        cloud, told = self.advance(model, belief, seen, draws)
+        return cloud, self.tell(model, cloud, told, seen)
+
+    def advance(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud, Told]:
+        """The same, tensors alone."""
         trace: dict[str, Tensor] = {}
         log_a = self.preference(model, belief, seen)
         cloud, trace["resampled"] = self.resampler(model, belief, log_a, self.size(belief), draws)
@@ -118,15 +138,19 @@ class ParticleFilter:
         x, log_ratio, memory, w, told = self.proposal(model, cloud, seen, draws)
         log_w = self.weigh(model, cloud.log_w, x, log_ratio, seen)
         x, log_w = bury(x, log_w, cloud.x)
-        predicted, expected = x, cloud.log_w + log_ratio
+        expected = cloud.log_w + log_ratio
         # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
         log_w, total, trace["ess"] = _normalise(log_w)
         parents, keeper = cloud, self.keeper
         cloud = cloud._replace(x=x, log_w=log_w, log_z=belief.log_z + total, memory=memory, copy_of=None)
         if keeper is not None:
             cloud = keeper.follow(model, parents, cloud, w, seen)
-        info = summarise(model, cloud, trace | told)
-        return cloud, info._replace(nis=lambda: surprise(model, predicted, expected, seen))
+        return cloud, Told(*mean_and_variance(model, cloud), expected, trace | told)
+
+    def tell(self, model: StateSpaceModel, cloud: Cloud, told: Told, seen: Record) -> Info:
+        """For the report."""
+        info = described(model, cloud, told.mean, told.variance, told.trace)
+        return info._replace(nis=lambda: surprise(model, cloud.x, told.expected, seen))
 
 
 def _normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -165,6 +189,8 @@ def bury(x: Tensor, log_w: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
 
     Sums over particles would otherwise turn one NaN into the estimate of its run: 0 NaN is NaN.
     """
+    if recording():  # a recorded step tells when it must be done again
+        return x, log_w
     if not x.is_cuda and bool(torch.isfinite(x.sum())):  # looking costs next to nothing on the CPU
         return x, log_w
     healthy = torch.isfinite(x.sum(-1))
@@ -174,12 +200,21 @@ def bury(x: Tensor, log_w: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
 
 def summarise(model: StateSpaceModel, cloud: Cloud, trace: dict[str, Tensor]) -> Info:
     """Estimate and spread of a cloud, for the report: sums over particles, no copy of the cloud is kept."""
+    return described(model, cloud, *mean_and_variance(model, cloud), trace)
+
+
+def mean_and_variance(model: StateSpaceModel, cloud: Cloud) -> tuple[Tensor, Tensor]:
+    """Of a cloud: [R, D] and, in the chart about the mean, [R, d]."""
+    w = weights(cloud.log_w)
     if model.chart.flat:
-        mean, variance = _flat_moments(cloud.x, weights(cloud.log_w))
-    else:
-        w = weights(cloud.log_w)
-        mean = model.chart.mean(cloud.x, w)
-        variance = (w.unsqueeze(-2) @ model.chart.subtract(cloud.x, mean.unsqueeze(1)).square()).squeeze(-2)
+        mean, variance = _flat_moments(cloud.x, w)
+        return mean, variance
+    mean = model.chart.mean(cloud.x, w)
+    return mean, (w.unsqueeze(-2) @ model.chart.subtract(cloud.x, mean.unsqueeze(1)).square()).squeeze(-2)
+
+
+def described(model: StateSpaceModel, cloud: Cloud, mean: Tensor, variance: Tensor, trace: dict[str, Tensor]) -> Info:
+    """What a report wants of a cloud whose mean and variance are known."""
 
     def deviations() -> tuple[Tensor, Tensor]:
         return model.chart.subtract(cloud.x, mean.unsqueeze(1)), cloud.log_w

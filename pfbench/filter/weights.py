@@ -29,7 +29,7 @@ class Bayes:
 
     def __call__(self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, seen: Record) -> Tensor:
         value = log_w + model.log_likelihood(seen.y, x, seen.u) + log_ratio
-        return torch.where(torch.isnan(value), -torch.inf, value)
+        return torch.where(value == value, value, -torch.inf)  # not isnan: a compiler has no instruction for it
 
 
 @dataclass(frozen=True)

@@ -226,6 +226,25 @@ def _quadratic_of_each(y: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
 _quadratic = fusible(_run_quadratic, by_hand=native.log_normal)
 
 
+def affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
+    """phi x + gain w [R, N, D]; x [R, N, D], w [R, N, W], phi [R or 1, D, D], gain [R or 1, D, W].
+
+    Compiled, it leaves out coefficients that are zero, as most are in error models of an INS.
+    """
+    return _affine(phi, x, gain, w).permute(1, 2, 0)
+
+
+def _dense_affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
+    runs = x.shape[0]
+    if len(phi) == len(gain) == 1:  # the same for all runs: one product, components first in memory
+        moved = (gain[0] @ w.permute(2, 0, 1).flatten(1)).addmm_(phi[0], x.permute(2, 0, 1).flatten(1))
+        return moved.unflatten(1, x.shape[:2])
+    return torch.baddbmm(gain.expand(runs, -1, -1) @ w.mT, phi.expand(runs, -1, -1), x.mT).transpose(0, 1)
+
+
+_affine = fusible(_dense_affine, by_hand=native.affine)
+
+
 def independent_normal(mean: Tensor, sd: Tensor) -> Independent:
     """Independent normal components, event in the last axis; sd broadcasts against mean."""
     return Normal(mean, sd.expand_as(mean), validate_args=False).to_event(1)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from pfbench.covariance import factor
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel, affine, independent_normal, normal_batch
 from pfbench.nav import attitude, error_dynamics
 from pfbench.nav.aiding import Alignment, Inflation, Receiver
 from pfbench.nav.sensors import ImuErrors
@@ -144,12 +144,7 @@ class InsGnss(StateSpaceModel):
         return normal_batch(runs, self.p0)
 
     def propagate(self, x: Tensor, u: Step, w: Tensor) -> Tensor:
-        runs = x.shape[0]
-        if len(u.phi) == 1:  # one trajectory for all runs: one product, components first in memory
-            moved = (u.gain[0] @ w.permute(2, 0, 1).flatten(1)).addmm_(u.phi[0], x.permute(2, 0, 1).flatten(1))
-            return moved.unflatten(1, x.shape[:2]).permute(1, 2, 0)
-        driven = u.gain.expand(runs, -1, -1) @ w.mT
-        return torch.baddbmm(driven, u.phi, x.mT).mT
+        return affine(u.phi, x, u.gain, w)
 
     def noise_gain(self, u: Step) -> Tensor:
         return u.gain

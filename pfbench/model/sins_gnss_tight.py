@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
 from pfbench.covariance import factor
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel, affine, independent_normal, normal_batch
 from pfbench.nav import attitude, earth, error_dynamics
 from pfbench.nav.aiding import Alignment, Inflation
 from pfbench.nav.ranging import Clock, Sight, TightReceiver, Tracked
@@ -146,9 +146,7 @@ class SinsGnssTight(StateSpaceModel):
         return normal_batch(runs, self.p0)
 
     def propagate(self, x: Tensor, u: Step, w: Tensor) -> Tensor:
-        runs = x.shape[0]
-        driven = self.noise_gain(u).expand(runs, -1, -1) @ w.mT
-        return torch.baddbmm(driven, self.transition_matrix(u).expand(runs, -1, -1), x.mT).mT
+        return affine(self.transition_matrix(u), x, self.noise_gain(u), w)
 
     def transition_matrix(self, u: Step) -> Tensor:
         """Phi of one step [R or 1, 17, 17]."""

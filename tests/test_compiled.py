@@ -1,0 +1,157 @@
+"""A filter whose step is one compiled graph computes what it computes step by step."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_line import pfbench
+from torch import Tensor
+
+from pfbench import fusion, store
+from pfbench.draws import MonteCarlo
+from pfbench.filter import compiled
+from pfbench.filter.compiled import Compiled
+from pfbench.filter.loop import Estimate, run_filter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.proposals import Proposal
+from pfbench.judge import Tally
+from pfbench.model.base import StateSpaceModel
+from pfbench.model.linear import LinearGaussian, linear_walk
+from pfbench.model.toys import Growth
+from pfbench.noise.regimes import Nominal
+from pfbench.record import Record
+from pfbench.scenario.model_world import ModelWorld
+
+RUNS, STEPS = 4, 12
+compiler = pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no C++ compiler")
+
+
+def record_of(model: StateSpaceModel) -> Record:
+    """A record with a component missing at times, in some runs."""
+    record = ModelWorld(model, STEPS).draw(Nominal(), torch.arange(RUNS), 1).record
+    record.y[1, 4] = record.y[3, 7:9] = torch.nan
+    return record
+
+
+def run(method: Any, model: StateSpaceModel, record: Record, at_once: int | None = None) -> Estimate:
+    with fusion.fused(), torch.no_grad():
+        return run_filter(method, model, record, MonteCarlo(1, torch.arange(RUNS)), at_once=at_once)
+
+
+def agree(one: Estimate, other: Estimate) -> None:
+    """Every number of two estimates, to rounding."""
+    for name in ("mean", "variance", "log_evidence"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9, equal_nan=True)
+    assert one.trace.keys() == other.trace.keys()
+    for name, value in one.trace.items():
+        torch.testing.assert_close(value.double(), other.trace[name].double(), rtol=1e-9, atol=1e-9)
+
+
+class Failing(Growth):
+    """Particles that run beyond 15 become no number."""
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        moved = super().propagate(x, u, w)
+        return torch.where(moved > 15.0, torch.nan, moved)
+
+
+@pytest.mark.slow
+@compiler
+@pytest.mark.filterwarnings("ignore")  # the compiler's own
+def test_a_compiled_filter_draws_weighs_and_counts_as_it_does_step_by_step() -> None:
+    """Also where particles fail in some steps, and measurements are missing."""
+    model, method = Failing(), ParticleFilter(150)
+    record = record_of(Growth())
+    counts = []
+    found = []
+    for wrapped in (False, True):
+        own = Failing()
+        tally = Tally(own)
+        step = Compiled(method, tally) if wrapped else method
+        found.append(run(step, own, record))
+        counts.append(tally.count)
+    assert isinstance(step, Compiled)
+    assert [kind is not None for kind in step.graphs.values()] == [True]
+    assert step.seconds > 0.0
+    agree(*found)
+    assert counts[0] == counts[1] == RUNS * 150 * STEPS
+    failed = [bool(torch.isnan(model.propagate(x, u, w)).any()) for x, u, w in some_steps(model, record)]
+    assert any(failed)  # else nothing of it was tried
+
+
+def some_steps(model: StateSpaceModel, record: Record) -> list[tuple[Tensor, Any, Tensor]]:
+    prepared = model.prepare(record)
+    x, draws = 10.0 * torch.ones(RUNS, 150, 1, dtype=torch.float64), MonteCarlo(1, torch.arange(RUNS))
+    return [(x, prepared.at(t).u, draws.at(t + 1).normal("noise", 150, 1)) for t in range(3)]
+
+
+class Looking:
+    """A proposal that looks at numbers, which nobody can record."""
+
+    exact = True
+
+    def __init__(self, inner: Proposal) -> None:
+        self.inner = inner
+
+    def __call__(self, model: Any, cloud: Any, seen: Any, draws: Any) -> Any:
+        found = self.inner(model, cloud, seen, draws)
+        return found if float(found.x.sum()) < 1e9 else self.inner(model, cloud, seen, draws)
+
+
+def walk() -> LinearGaussian:
+    return linear_walk(1.0, 0.3, 1.0)
+
+
+@compiler
+def test_a_step_that_cannot_be_recorded_goes_on_as_it_is_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    model = walk()
+    method = ParticleFilter(50, proposal=Looking(ParticleFilter(50).proposal))
+    record = record_of(model)
+    step = Compiled(method)
+    agree(run(step, model, record), run(method, model, record))
+    assert list(step.graphs.values()) == [None]
+    (said,) = [entry.getMessage() for entry in caplog.records if entry.name == "pfbench"]
+    assert said.startswith("engine=compiled: this step cannot be compiled (RuntimeError: ")
+    assert said.endswith("going on with compiled loops alone")
+
+
+def test_blocks_of_runs_share_a_graph_where_they_are_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recorded step itself, as a graph has it, without the compiler: the same numbers, one recording for a size."""
+    recorded = []
+
+    def as_it_is(step: Any, tensors: list[Tensor]) -> Any:
+        recorded.append([tuple(a.shape) for a in tensors])
+        return lambda given: step(*given)
+
+    monkeypatch.setattr(compiled, "_compiled", as_it_is)
+    model = walk()
+    method, record = ParticleFilter(50), record_of(model)
+    step = Compiled(method)
+    agree(run(step, model, record, at_once=2), run(method, model, record))
+    assert len(recorded) == 1
+    agree(run(step, model, record, at_once=3), run(method, model, record))
+    assert len(recorded) == 3  # of two, of three, of one
+
+
+@pytest.mark.slow
+@compiler
+@pytest.mark.filterwarnings("ignore")
+def test_a_job_says_that_its_step_was_compiled(tmp_path: Path) -> None:
+    walk = ("run", "scenario=linear_walk", "scenario.steps=20", "runs=4", "particles=200", "fresh=true")
+    found = {}
+    for engine in ("loops", "compiled"):
+        said = pfbench(*walk, f"engine={engine}", home=tmp_path)
+        assert said.code == 0, said.err
+        (file,) = (tmp_path / "results" / "adhoc").glob("*.npz")  # one key: an engine changes no result
+        found[engine] = store.load(file)
+        assert found[engine].meta["engine"] == engine
+    loops, whole = (found[engine] for engine in ("loops", "compiled"))
+    assert whole.meta["seconds"]["compile"] > 0.0
+    assert whole.meta["likelihoods_per_step"] == loops.meta["likelihoods_per_step"] == 200.0
+    for name in ("error", "sd", "log_evidence", "nees"):
+        assert np.allclose(whole.arrays[name], loops.arrays[name], rtol=1e-5, atol=1e-6), name
