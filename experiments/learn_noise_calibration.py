@@ -1,9 +1,10 @@
 """Are inferred noise levels calibrated? Ranks of true ones among their draws, for PMMH and SVI on a toy and on passive location.
 
-    python -m pfbench.experiments.learn_noise_calibration
+    python -m pfbench.experiments.learn_noise_calibration [data sets [effort [world]]]
 
 Each algorithm is tried a second time with a likelihood that is wrong on purpose, which the ranks must show: a measurement noise
-that is half as large again as the numbers say.
+that is half as large again as the numbers say. Effort multiplies draws and steps. What is done is kept in the folder, and the
+same command goes on from there; `world` is the beginning of the names of the cases, `toy` or `location`.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from pfbench.ppl.program import ExactHMM, Filtered, Unknown, program
 from pfbench.record import Record
 
 WRONG = 1.5
+BINS = 10
 LEVELS = {"level_sd": LogNormal(0.0, 0.7), "measurement_sd": LogNormal(0.0, 0.7)}
 SIGHTS = {"angle_sd": LogNormal(math.log(3e-3), 0.5)}  # rad; of bearing and elevation
 
@@ -86,22 +88,37 @@ def studies(runs: int, effort: int = 1) -> dict[str, tuple[Unknown, Record, Call
     return found
 
 
-def main(folder: Path, runs: int = 200, effort: int = 2) -> None:
+def main(folder: Path, runs: int = 200, effort: int = 2, only: str = "") -> None:
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
-    told: dict[str, Any] = {}
-    drawn: dict[str, dict[str, Ranks]] = {"toy": {}, "location": {}}
+    path, asked = folder / "learn_noise_calibration.json", {"runs": runs, "effort": effort}
+    told: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    if {name: told.get(name) for name in asked} != asked:  # of another call: from the beginning
+        told = dict(asked)
+    drawn: dict[str, dict[str, Ranks]] = {}
     for name, (unknown, shape, infer) in studies(runs, effort).items():
-        began = time.perf_counter()
-        ranks = calibrate(unknown, shape, infer, draws=19, seed=7)
-        told[name] = {part: {"p": ranks.p_value(part), "counts": ranks.counts(part, 10).tolist()} for part in unknown.names}
-        drawn[name.split(",")[0]][name.split(", ", 1)[1]] = ranks
-        values = {part: f"{value['p']:.2g}" for part, value in told[name].items()}
-        print(name, values, f"{time.perf_counter() - began:.0f} s", flush=True)
-        (folder / "learn_noise_calibration.json").write_text(json.dumps({"runs": runs, **told}, indent=1))
+        if not name.startswith(only):
+            continue
+        if name not in told:
+            began = time.process_time()
+            found = calibrate(unknown, shape, infer, draws=19, seed=7)
+            told[name] = {part: told_of(found, part) for part in unknown.names} | {"seconds": time.process_time() - began}
+            path.write_text(json.dumps(told))
+        parts = {part: told[name][part] for part in unknown.names}
+        world, label = name.split(", ", 1)
+        drawn.setdefault(world, {})[label] = Ranks({part: torch.tensor(kept["ranks"]) for part, kept in parts.items()}, 19)
+        values = {part: (f"{kept['p']:.2g}", kept["counts"]) for part, kept in parts.items()}
+        print(name, values, f"{told[name]['seconds']:.0f} s", flush=True)
     for world, ranks in drawn.items():
         histograms(ranks).savefig(folder / f"calibration_{world}.svg")
 
 
+def told_of(ranks: Ranks, part: str) -> dict[str, Any]:
+    return {
+        "p": ranks.p_value(part, BINS), "counts": ranks.counts(part, BINS).tolist(), "ranks": ranks.ranks[part].tolist()
+    }  # fmt: skip
+
+
 if __name__ == "__main__":
-    main(Path(os.environ.get("PFBENCH_RESULTS", "results")) / "learn_noise_calibration", *map(int, sys.argv[1:]))
+    folder = Path(os.environ.get("PFBENCH_RESULTS", "results")) / "learn_noise_calibration"
+    main(folder, *map(int, sys.argv[1:3]), *sys.argv[3:])

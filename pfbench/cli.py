@@ -251,11 +251,13 @@ def _compose(overrides: list[str]) -> dict[str, Any]:
 def _composition(overrides: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
     """The same, and the names of what was chosen in each group."""
     from hydra import compose, initialize_config_dir
+    from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf, open_dict
 
     _offer_experiments()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         composed = compose("config", overrides, return_hydra_config=True)
+    HydraConfig.instance().set_config(composed)  # an experiment may look up what was chosen
     choices = {str(group): str(name) for group, name in composed.hydra.runtime.choices.items()}
     with open_dict(composed):
         del composed["hydra"]

@@ -34,7 +34,7 @@ from pfbench.filter.learned import PAST, Learned
 from pfbench.filter.learned_draws import drawn
 from pfbench.filter.learned_inputs import Innovation, Inputs, Parent, Width, scene
 from pfbench.filter.learned_kernel import LearnedWalk
-from pfbench.filter.learned_laws import Diagonal, Flow, LowRank, Mixture
+from pfbench.filter.learned_laws import Diagonal, Flow, LowRank, Mixture, Zuko
 from pfbench.filter.loop import run_filter
 from pfbench.filter.moves import Metropolis
 from pfbench.filter.particle import ParticleFilter
@@ -214,6 +214,14 @@ def test_gradients_reach_every_weight(name: str) -> None:
         assert weight.grad is not None, key
         assert torch.isfinite(weight.grad).all(), key
         assert weight.grad.abs().max() > 0.0, key
+
+
+@pytest.mark.parametrize("flow", ["NSF", "MAF", "NICE"])
+def test_flows_of_the_library_zuko_leave_the_target_too(flow: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    zuko = pytest.importorskip("zuko", reason="needs the extra zuko")
+    monkeypatch.setitem(NETWORKS, "zuko", partial(Zuko, flow=getattr(zuko.flows, flow), hidden=SMALL))
+    test_the_ratio_is_one_on_average("zuko", True, None)
+    test_gradients_reach_every_weight("zuko")
 
 
 def test_a_run_cannot_feel_its_neighbours() -> None:

@@ -342,6 +342,9 @@ def test_a_table_tells_chains_that_have_not_met() -> None:
     assert apart.run(2).draws["a"].shape == (4, 100)
     with pytest.raises(ValueError, match="run\\(r\\)"):
         apart.table()
+    short = Posterior({"a": met[:, :3]}, torch.full((4,), 0.3))
+    assert not short.mixed
+    assert math.isnan(short.table().r_hat["a"])
 
 
 REGIMES = Switching(LogNormal(0.0, 1.0), LogNormal(1.0, 0.5), Beta(9.0, 1.0), Beta(4.0, 1.0))

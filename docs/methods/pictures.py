@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from pfbench.draws import MonteCarlo
-from pfbench.filter.adaptations import ConstrainedNoise, Fading
-from pfbench.filter.belief import Cloud, moments, weights
+from pfbench.filter.adaptations import ConstrainedNoise, Fading, MatrixNoise
+from pfbench.filter.belief import Cloud, Gaussian, moments, weights
 from pfbench.filter.cells import Raw, Whitened, divide
 from pfbench.filter.control import Control
 from pfbench.filter.coordinates import Everything, Likelihood
@@ -124,6 +124,28 @@ def fm_mssrckf() -> None:
     figure.savefig(HERE / "fm_mssrckf.png", dpi=80)
 
 
+def fm_mssrckf_step() -> None:
+    """One step that surprises in velocity: what the adaptive factor makes of the cloud, as printed and weighted."""
+    model = LinearGaussian([[1.0, 1.0], [0.0, 1.0]], torch.eye(2) * 1e-3, torch.eye(2), [10.0, 0.1], [0.0, 0.0], [6.0, 0.15])
+    start, y = torch.diag(torch.tensor([36.0, 0.0225], dtype=torch.float64)), torch.tensor([[4.0, 1.2]], dtype=torch.float64)
+    belief = Gaussian(torch.zeros(1, 2, dtype=torch.float64), start[None], torch.zeros(1, dtype=torch.float64))
+    ways = {"MSSRCKF": (), "FM, printed: W = I": (AdaptiveFactor(weighted=False),), "FM: W = 1/R": (AdaptiveFactor(),)}
+    figure, axes = plt.subplots(1, 3, figsize=(9.0, 4.0), sharex=True, sharey=True, layout="constrained")
+    e = torch.randn(600, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    for at, (name, gains), colour in zip(axes, ways.items(), ("#0072B2", "#CC79A7", "#E69F00"), strict=True):
+        method = GaussianFilter(Points(Product(Simplex3(), Radial5())), (Fading(1.002),) if gains else (), gains)
+        new = method.advance(model, belief, Record(y))
+        wide = new.innovation.spread[0]  # of what is seen, which is the state itself: the prediction, as widened
+        cloud = e @ torch.linalg.cholesky(wide).mT
+        at.scatter(*cloud.T, s=3, color="0.75", label="cloud predicted, as widened")
+        at.plot(*_ellipse(new.mean[0], new.root[0] @ new.root[0].mT), color=colour, label="2 sd after the step, in colour")
+        at.errorbar(*y.T, xerr=20.0, yerr=0.2, color="0.2", capsize=2, linewidth=1, label="seen, 2 sd")
+        at.set(title=name, xlabel="position, m", xlim=(-45.0, 45.0), ylim=(-1.6, 1.8))
+    axes[0].set_ylabel("velocity, m/s")
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(HERE / "fm_mssrckf_step.png", dpi=80)
+
+
 def cofm_mssrckf() -> None:
     """Errors of 300 runs in the last step of a burst of measurement noise, and what the filters believe of them."""
     both = (Fading(1.002), ConstrainedNoise())
@@ -132,6 +154,7 @@ def cofm_mssrckf() -> None:
             "MSSRCKF": ((), ()),
             "FM-MSSRCKF": (both[:1], (AdaptiveFactor(),)),
             "COFM-MSSRCKF": (both, (AdaptiveFactor(), RatioBound())),
+            "COFM, printed": ((Fading(1.002), MatrixNoise(0.99)), (AdaptiveFactor(weighted=False), RatioBound())),
         },
         r=9.5,
     )
@@ -148,8 +171,9 @@ def _errors(methods: dict[str, tuple[tuple[Adaptation, ...], tuple[Gain, ...]]],
     moved = 0.3 * torch.randn(runs, steps, 2, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(q), 1.0)
     x = torch.randn(runs, 1, 2, dtype=torch.float64, generator=draws) + moved.cumsum(1)
     noise = torch.randn(runs, steps, 5, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(r), 1.0)
-    figure, axes = plt.subplots(1, len(methods), figsize=(9.0, 4.3), sharex=True, sharey=True, layout="constrained")
-    for at, (name, (adaptations, gains)), colour in zip(axes, methods.items(), ("#0072B2", "#E69F00", "#009E73"), strict=True):
+    size, colours = (3.0 * len(methods), 4.3), ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
+    figure, axes = plt.subplots(1, len(methods), figsize=size, sharex=True, sharey=True, layout="constrained")
+    for at, (name, (adaptations, gains)), colour in zip(axes, methods.items(), colours, strict=False):
         method = GaussianFilter(Points(Product(Simplex3(), Radial5())), adaptations, gains)
         found = run_filter(
             method, model, Record(x @ h.mT + noise), MonteCarlo(0, torch.arange(runs)), lambda t, i: {"p": i.covariance()}

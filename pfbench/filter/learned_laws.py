@@ -7,7 +7,7 @@ begins as the standard normal law itself: an untrained proposal then is the one 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, cast
 
@@ -115,6 +115,28 @@ class Flow(nn.Module):
         turned = transforms.Permute(torch.arange(mean.shape[-1] - 1, -1, -1, device=told.device))
         steps = [step for coupling in self.couplings for step in (cast(Any, coupling).condition(told), turned)]
         steps += [self.spline.condition(told), transforms.AffineTransform(mean, bounded(log_scale), event_dim=1)]
+        return TransformedDistribution(independent(torch.zeros_like(mean), torch.ones_like(mean)), steps, validate_args=False)
+
+
+class Zuko(nn.Module):
+    """A conditional flow of the library zuko (the extra `zuko`), then a shift and a scale: NSF, MAF, NICE, NAF and others.
+
+    Args:
+        features, noise: as of all networks here.
+        flow: makes it, one whose base is the standard normal law: `zuko.flows.NSF`, `MAF` or `NICE`, which are inverted in
+            closed form; others are by bisection, and their ratio is right to six digits.
+        hidden: sizes of hidden layers, those of the flow's own networks too.
+    """
+
+    def __init__(self, features: int, noise: int, flow: Callable[..., nn.Module], hidden: Sequence[int] = (32, 32)) -> None:
+        super().__init__()
+        self.net = Dense(features, 2 * noise, hidden)
+        self.flow = flow(noise, context=features, hidden_features=list(hidden))
+
+    def forward(self, told: Tensor) -> Distribution:
+        mean, log_scale = self.net(told).chunk(2, -1)
+        # zuko's leads from the data to the base, and its draws come from one stream for all runs: only the map is taken
+        steps = [self.flow(told).transform.inv, transforms.AffineTransform(mean, bounded(log_scale), event_dim=1)]
         return TransformedDistribution(independent(torch.zeros_like(mean), torch.ones_like(mean)), steps, validate_args=False)
 
 

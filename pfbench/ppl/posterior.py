@@ -47,7 +47,7 @@ class Posterior:
         """A row per number: mean, sd, median, the narrowest interval of this mass, split r-hat and effective sample size.
 
         Convergence is what Pyro makes of the chains; r-hat is NaN and the effective size that of independent draws where there
-        are no chains to compare (SVI).
+        are no chains to compare (SVI, or fewer than four draws).
 
         Raises:
             ValueError: runs with numbers of their own; ask run(r).
@@ -58,7 +58,7 @@ class Posterior:
                 raise ValueError("table: runs have numbers of their own here; ask posterior.run(r).table()")
             flat = a.flatten().double()
             low, high = hpdi(flat, mass).tolist()
-            chained = self.accepted is not None
+            chained = self.accepted is not None and a.shape[1] >= 4
             rows[name] = {
                 "mean": float(flat.mean()), "sd": float(flat.std()), "median": float(flat.median()), "low": low, "high": high,
                 "r_hat": float(split_gelman_rubin(a.double())) if chained else np.nan,
@@ -68,10 +68,11 @@ class Posterior:
 
     @property
     def mixed(self) -> bool:
-        """Have the chains of all numbers met: split r-hat below 1.05? Nothing to say (True) without chains."""
+        """Have the chains of all numbers met: split r-hat below 1.05? True without chains, False with fewer than four draws."""
         if self.accepted is None:
             return True
-        return all(bool((split_gelman_rubin(a.double()) < WELL_MIXED).all()) for a in self.draws.values())
+        drawn = [a.double() for a in self.draws.values()]
+        return all(a.shape[1] >= 4 and bool((split_gelman_rubin(a) < WELL_MIXED).all()) for a in drawn)
 
 
 def picture(

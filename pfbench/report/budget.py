@@ -6,6 +6,7 @@ likelihood. Which one was meant is said by the experiment (key `budget` of the j
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,7 @@ from pfbench.metrics import Array
 
 SAME_N = "same N"
 KINDS = (SAME_N, "same time per step", "same likelihood evaluations")
+_NAMED = 4  # filters whose other number of particles is said by name
 _CLOSE = 1.25  # times per step that differ by less are called the same: they scatter from job to job [ours]
 
 
@@ -91,6 +93,18 @@ def _kind(meta: Mapping[str, Any]) -> str:
     return kind
 
 
+def _numbers(metas: Sequence[Mapping[str, Any]]) -> str:
+    """The commonest number of particles, and which filters have others."""
+    by_label = [(int(meta["particles"]), str(meta.get("label", ""))) for meta in metas if meta.get("particles")]
+    count = Counter(number for number, _ in by_label)
+    (most, _), *others = sorted(count.items(), key=lambda item: (-item[1], item[0]))
+    told = []
+    for number, _ in sorted(others):
+        labels = sorted({label for own, label in by_label if own == number and label})
+        told.append(f"{number} of {', '.join(labels)}" if 0 < len(labels) <= _NAMED else str(number))
+    return f"N = {', '.join([str(most), *told])}"
+
+
 def _measured(kind: str, metas: Sequence[Mapping[str, Any]]) -> str:
     if kind == SAME_N:
         numbers = sorted({int(meta["particles"]) for meta in metas if meta.get("particles")})
@@ -98,7 +112,7 @@ def _measured(kind: str, metas: Sequence[Mapping[str, Any]]) -> str:
             return " (no particle filter here)"
         if len(numbers) == 1:
             return f" (N = {numbers[0]} of each particle filter)"
-        return f" was not kept (N = {', '.join(map(str, numbers))})"
+        return f" was not kept ({_numbers(metas)})"
     if kind == KINDS[1]:
         times = [1e3 * float(meta["seconds"]["per_step"]) for meta in metas]
         low, high = min(times), max(times)

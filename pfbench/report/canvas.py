@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 COLUMN = 3.5  # inches
-_INSTANTS = 300  # drawn at most: a column of print resolves no more
+INSTANTS = 180  # drawn at most: a column of print is 250 points wide
 _BESIDE = 24  # letters of a label beside which another one has room
 RC: Any = {
     "font.size": 8,
@@ -36,6 +36,7 @@ RC: Any = {
     "ytick.labelsize": 7,
     "savefig.dpi": 150,
     "svg.hashsalt": "pfbench",  # identifiers of an SVG are random otherwise
+    "svg.fonttype": "none",  # letters, which can be read and searched, and take less room than their outlines
 }
 # Okabe and Ito 2008, without the yellow that white paper swallows.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
@@ -45,13 +46,17 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 class Look(NamedTuple):
-    """How one filter is drawn in all figures of a study; a quiet one is one of many, grey and without a name."""
+    """How one filter is drawn in all figures of a study; a quiet one is one of many, grey and without a name.
+
+    Curves over time have so many instants at most, fewer where many curves share a column.
+    """
 
     colour: str
     dash: _Dash
     marker: str
     width: float
     quiet: bool = False
+    instants: int = INSTANTS
 
     def line(self, label: str = "") -> dict[str, Any]:
         """How its line is drawn, and named where it is."""
@@ -75,7 +80,9 @@ def dimmed(style: Mapping[str, Look], kept: Iterable[str]) -> dict[str, Look]:
     """The same looks, with all but those kept made quiet."""
     own = set(kept)
     return {
-        label: look if label in own else look._replace(colour="0.78", dash="-", width=0.6, quiet=True)
+        label: look._replace(instants=2 * INSTANTS // 5)
+        if label in own
+        else look._replace(colour="0.78", dash="-", width=0.6, quiet=True, instants=INSTANTS // 5)
         for label, look in style.items()
     }
 
@@ -88,6 +95,8 @@ def stack(n: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes
 def legend(figure: Figure, axis: Axes, columns: int = 2) -> None:
     """A legend below the figure, which grows by the height of it."""
     handles, labels = axis.get_legend_handles_labels()
+    if not labels:  # all are quiet
+        return
     columns = 1 if max(map(len, labels), default=0) > _BESIDE else min(columns, len(labels))
     width, height = figure.get_size_inches()
     figure.set_size_inches(width, height + 0.1 + 0.16 * -(-len(labels) // columns))
@@ -124,8 +133,8 @@ def slug(text: str) -> str:
     return "".join(c if c.isalnum() else "_" for c in text).strip("_")
 
 
-def thinned(size: int) -> np.ndarray:
-    return np.unique(np.linspace(0, size - 1, min(size, _INSTANTS)).astype(int))
+def thinned(size: int, most: int = INSTANTS) -> np.ndarray:
+    return np.unique(np.linspace(0, size - 1, min(size, most)).astype(int))
 
 
 def quantiles(values: np.ndarray, q: Sequence[float]) -> np.ndarray:

@@ -15,8 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pfbench import metrics, store
+from pfbench.report import vector
 from pfbench.report.canvas import (
     COLUMN,
+    INSTANTS,
     RC,
     Look,
     broken,
@@ -25,6 +27,7 @@ from pfbench.report.canvas import (
     labelled,
     legend,
     log_if_wide,
+    plain_ticks,
     quantiles,
     slug,
     stack,
@@ -37,6 +40,7 @@ Results = Mapping[str, store.Result]
 
 _FEW = 4  # filters of which each has a picture of its spread; of more, two have, chosen by `worth_a_spread` [ours]
 _BOUND: Any = {"color": "black", "ls": (0, (3, 1.2)), "lw": 0.8, "zorder": 4}
+_NARROW = 120  # instants of a panel of half a column
 _MEDIAN = 0.6745  # of the absolute value of a standard normal number
 _BOXES = 12  # filters that a figure of boxes and points holds; more have a row each, by rank
 _TRACES = {  # what a trace shows, the unit, and whether it is a share of the particles
@@ -81,7 +85,7 @@ def drawings(
         style: from `looks`, or from `dimmed`.
         groups: names of the blocks shown.
         alpha: probability outside the NEES band.
-        brief: leave out the track, the traces and the spread of single filters.
+        brief: leave out the track, NIS, cost, the traces and the spread of single filters.
         note: on who is drawn how, for captions of figures with a line per filter.
     """
     shown = [block for block in _all_blocks(results) if block.group in groups]
@@ -107,6 +111,19 @@ def drawings(
     found.append(Drawing("rmse", text, partial(rmse, runs, [block.group for block in shown], style)))
     text = f"NEES averaged over the {kept}, with its two-sided {100 * (1 - alpha):g} % chi-square band.{note}"
     found.append(Drawing("nees", text, partial(nees, results, wholes, style, alpha)))
+    if not brief and any(_innovations(result) is not None for result in results.values()):
+        text = (
+            f"NIS, the normalised innovation squared per component seen, over the {kept} at the instants scored, with its "
+            f"two-sided {100 * (1 - alpha):g} % chi-square band; 1 when measurements are as far from what was predicted as the "
+            f"filter says.{note}"
+        )
+        found.append(Drawing("nis", text, partial(nis, results, style, alpha)))
+    if not brief and len(results) > 1:
+        text = (
+            "What a filter costs: time per step of all runs together, and memory that its job took beyond what was held before. "
+            "Each is measured once, on one machine, and has no band."
+        )
+        found.append(Drawing("cost", text, partial(cost, results, style)))
     traces = [name for name in _TRACES if any(name in result.arrays for result in results.values())]
     for name in () if brief else traces:
         what = _TRACES[name][0]
@@ -158,7 +175,6 @@ def worth_a_spread(results: Results, runs: pd.DataFrame, groups: Sequence[str]) 
 def save(drawing: Drawing, folder: Path, formats: Sequence[str]) -> list[Path]:
     """Draws and writes one file per format; the same drawing gives the same bytes."""
     folder.mkdir(parents=True, exist_ok=True)
-    date = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     with matplotlib.rc_context(RC):
         figure = drawing.make()
         engine = figure.get_layout_engine()
@@ -170,7 +186,7 @@ def save(drawing: Drawing, folder: Path, formats: Sequence[str]) -> list[Path]:
             if ending == "png":
                 path.write_bytes(indexed(figure))
             else:
-                figure.savefig(path, metadata=date.get(ending))
+                path.write_text(vector.drawn(figure), encoding="utf-8")
     return paths
 
 
@@ -206,7 +222,7 @@ def error(results: Results, block: Block, style: Mapping[str, Look]) -> Figure:
         own = result.meta["state"]["names"]
         for name, axis in zip(block.components, panels, strict=True):
             if name in own:
-                time, (values,) = _kept(result, own.index(name), "error")
+                time, (values,) = _kept(result, own.index(name), "error", most=style[label].instants)
                 middle = quantiles(np.abs(values) * block.scale, [0.5])[0]
                 axis.plot(time, middle, marker=_mark(time), **style[label].line(label))
     for name, axis in zip(block.components, panels, strict=True):
@@ -234,7 +250,7 @@ def spread(result: store.Result, groups: Sequence[str], look: Look) -> Figure:
     for line, (block, own) in zip(panels, rows, strict=True):
         for axis, k in zip(line, own, strict=False):
             place = block.places[k]
-            time, (errors, sds) = _kept(result, place, "error", "sd")
+            time, (errors, sds) = _kept(result, place, "error", "sd", most=_NARROW)
             low, middle, high = quantiles(errors * block.scale, [0.05, 0.5, 0.95])
             own_sd = 3 * quantiles(sds * block.scale, [0.5])[0]
             axis.fill_between(time, low, high, color=look.colour, alpha=0.3, lw=0, label="5 to 95 % of runs")
@@ -295,14 +311,20 @@ def _boxes(axis: Axes, kept: pd.DataFrame, labels: Sequence[str], style: Mapping
 
 def _rows(axis: Axes, kept: pd.DataFrame, labels: Sequence[str], style: Mapping[str, Look]) -> None:
     """Quartiles on a thin line from 5 to 95 %, the median a dot; named filters in their colour."""
+    found: dict[str, list[tuple[int, np.ndarray]]] = {}
     for place, label in enumerate(labels):
         value = kept.value[kept.label == label].to_numpy()
         if value.size:
-            low, first, middle, third, high = np.quantile(value, [0.05, 0.25, 0.5, 0.75, 0.95])
             colour = "0.45" if style[label].quiet else style[label].colour
-            axis.plot([low, high], [place, place], color=colour, lw=0.8)
-            axis.plot([first, third], [place, place], color=colour, lw=3, solid_capstyle="butt")
-            axis.plot(middle, place, marker="o", ms=3.2, mfc="white", mec="black", mew=0.7, ls="none")
+            found.setdefault(colour, []).append((place, np.quantile(value, [0.05, 0.25, 0.5, 0.75, 0.95])))
+    for colour, own in found.items():  # one line, with gaps, of all that look alike: it takes less room in a file
+        places = np.array([[place, place, np.nan] for place, _ in own]).ravel()
+        for low, high, width in ((0, 4, 0.8), (1, 3, 3.0)):
+            ends = np.array([[q[low], q[high], np.nan] for _, q in own]).ravel()
+            axis.plot(ends, places, color=colour, lw=width, solid_capstyle="butt", zorder=2 + 0.1 * (low == 1))
+    middle = [(q[2], place) for own in found.values() for place, q in own]
+    if middle:
+        axis.plot(*np.array(middle).T, marker="o", ms=3.2, mfc="white", mec="black", mew=0.7, ls="none", zorder=3)
 
 
 def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alpha: float = 0.05) -> Figure:
@@ -316,7 +338,7 @@ def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alp
                 dof = len(own[group])
                 place = list(own).index(group)
                 found = metrics.consistency(result.arrays["nees"][..., place], result.arrays["lost"], dof, alpha)
-                thin = _thin(found.runs_at > 0)
+                thin = _thin(found.runs_at > 0, style[label].instants)
                 time = result.arrays["time"][thin]
                 look = style[label]._replace(width=0.8 * style[label].width)
                 axis.plot(time, found.average[thin], marker=_mark(time), **look.line(label))
@@ -333,13 +355,61 @@ def nees(results: Results, groups: Sequence[str], style: Mapping[str, Look], alp
     return figure
 
 
+def nis(results: Results, style: Mapping[str, Look], alpha: float = 0.05) -> Figure:
+    """NIS per component seen, of all runs together, with the chi-square band of as many components."""
+    figure, (axis,) = stack(1, 1.6)
+    lines, bands = [], []
+    for label, result in results.items():
+        own = _innovations(result)
+        if own is not None:
+            time, squared, seen = own
+            look = style[label]
+            axis.plot(time, squared / seen, marker="" if look.quiet else look.marker, ms=2.5, **look.line(label))
+            lines.append(squared / seen)
+            bands.append((float(seen.sum()), time, *metrics.nees_band(1, seen, alpha)))
+    _, time, low, high = max(bands, key=lambda band: band[0])
+    axis.fill_between(time, low, high, color="0.8", lw=0, zorder=0)
+    for edge in (low, high):
+        axis.plot(time, edge, color="0.35", lw=0.7, zorder=4)
+    axis.set(xlabel="time in s", ylabel="NIS per component")
+    log_if_wide(axis, axis.yaxis, lines)
+    legend(figure, axis)
+    return figure
+
+
+def cost(results: Results, style: Mapping[str, Look]) -> Figure:
+    """Time per step and memory of each filter, a row each."""
+    labels = list(results)
+    milliseconds = [1e3 * results[label].meta["seconds"]["per_step"] for label in labels]
+    mebibytes = [(results[label].meta.get("memory") or np.nan) / 2**20 for label in labels]
+    shown = [("time per step in ms", milliseconds), ("memory in MiB", mebibytes)]
+    shown = [(name, values) for name, values in shown if not np.isnan(values).all()]
+    figure = Figure(figsize=(COLUMN, 0.6 + 0.16 * sum(1 + broken(label).count("\n") for label in labels)), layout="constrained")
+    panels = figure.subplots(1, len(shown), squeeze=False, sharey=True)[0]
+    for axis, (name, values) in zip(panels, shown, strict=True):
+        for row, (label, value) in enumerate(zip(labels, values, strict=True)):
+            axis.plot([0, value], [row, row], color="0.8", lw=0.8, zorder=1)
+            axis.plot(value, row, ls="none", marker=style[label].marker, color=style[label].colour, ms=4)
+        known = np.array([value for value in values if value > 0])
+        axis.set_xlim(0, 1.1 * known.max(initial=1e-9))
+        axis.set(xlabel=name, yticks=range(len(labels)), yticklabels=list(map(broken, labels)))
+        axis.tick_params(axis="y", labelsize=6.5)
+        if known.size and known.max() > 10 * known.min():
+            axis.set_xscale("log")
+            axis.set_xlim(known.min() / 1.5, 1.5 * known.max())
+            plain_ticks(axis.xaxis, known)
+        axis.grid(False, axis="y")
+    panels[0].set_ylim(len(labels) - 0.5, -0.5)
+    return figure
+
+
 def trace(results: Results, name: str, style: Mapping[str, Look]) -> Figure:
     """One trace of the filters that leave it over time."""
     what, unit, share = _TRACES[name]
     figure, (axis,) = stack(1, 2.2)
     for label, result in results.items():
         if name in result.arrays and (result.meta.get("particles") or not share):
-            time, (values,) = _kept(result, None, name)
+            time, (values,) = _kept(result, None, name, most=style[label].instants)
             scale = 100 / result.meta["particles"] if share else 1.0
             low, middle, high = quantiles(scale * values, [0.05, 0.5, 0.95])
             if not style[label].quiet:
@@ -349,6 +419,21 @@ def trace(results: Results, name: str, style: Mapping[str, Look]) -> Figure:
     axis.set_ylim(bottom=0)
     legend(figure, axis)
     return figure
+
+
+def _innovations(result: store.Result) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Instants scored, and NIS and components seen there summed over the runs that were not lost; None where there are none."""
+    arrays = result.arrays
+    if "nis" not in arrays or "scored" not in arrays:
+        return None
+    kept = ~arrays["lost"]
+    squared, seen = (np.asarray(arrays[name], dtype=np.float64)[kept] for name in ("nis", "nis_dof"))
+    known = ~(np.isnan(squared) | np.isnan(seen))
+    squared, seen = np.where(known, squared, 0.0), np.where(known, seen, 0.0)
+    there = seen.sum(0) > 0
+    if not there.any():
+        return None
+    return arrays["time"][arrays["scored"][there]], squared.sum(0)[there], seen.sum(0)[there]
 
 
 def bound_of(result: store.Result) -> np.ndarray | None:
@@ -367,21 +452,21 @@ def _bounds(results: Results, component: str) -> list[tuple[np.ndarray, np.ndarr
     return []
 
 
-def _kept(result: store.Result, place: int | None, *names: str) -> tuple[np.ndarray, list[np.ndarray]]:
+def _kept(result: store.Result, place: int | None, *names: str, most: int = INSTANTS) -> tuple[np.ndarray, list[np.ndarray]]:
     """Instants and values [R, T] of the runs that were not lost, thinned; of one place in the state, or of a whole trace.
 
     Instants at which no run knows the first of them are left out before: where truth is rare, thinning would miss it.
     """
     kept = ~result.arrays["lost"]
     values = [result.arrays[name][kept] if place is None else result.arrays[name][kept][..., place] for name in names]
-    thin = _thin(~np.isnan(values[0]).all(0))
+    thin = _thin(~np.isnan(values[0]).all(0), most)
     return result.arrays["time"][thin], [value[:, thin].astype(np.float64) for value in values]
 
 
-def _thin(known: np.ndarray) -> np.ndarray:
+def _thin(known: np.ndarray, most: int = INSTANTS) -> np.ndarray:
     """Indices of the instants drawn, of those that are known [T]."""
     there = np.flatnonzero(known)
-    return there[thinned(there.size)]
+    return there[thinned(there.size, most)]
 
 
 def _mark(time: np.ndarray) -> str:

@@ -17,7 +17,18 @@ import pandas as pd
 from tqdm import tqdm
 
 from pfbench import store
-from pfbench.report import across, budget, calibration, figures, paper_figures, ranking_figures, tables
+from pfbench.report import (
+    across,
+    budget,
+    calibration,
+    figures,
+    headline,
+    headline_figures,
+    paper_figures,
+    ranking_figures,
+    tables,
+    vector,
+)
 from pfbench.report.across import Across
 from pfbench.report.canvas import Look, dimmed, looks, slug
 from pfbench.report.frame import Cell, blocks, cells, later, natural, tidy
@@ -28,7 +39,7 @@ _PLENTY = 50  # filters times cells; of more, a page shows the figures of one gr
 _NAMED = 7  # filters of which each has a colour of its own; of more than eight the others are grey [ours]
 _PAIRS = 60  # of one group of one cell that a table holds
 _ROWS = 2000  # of the table of all comparisons
-_MIME = {"svg": "svg+xml", "png": "png"}
+_FORMATS = ("svg", "png")
 _SHARED = (
     ("pfbench", "versions.pfbench"),
     ("commit", "versions.commit"),
@@ -54,7 +65,7 @@ class Options:
         groups: groups of the state, None for all.
         alpha: level of the tests after Holm's correction, and probability outside the bands.
         from_time: leave out of all figures of merit what came before, seconds; curves over time show all.
-        formats: of the figures: svg, png; the page carries png where there is one, which stays small when curves are long.
+        formats: of the figures: svg, png; the page carries of each figure the smaller one.
         mixed: accept results of several versions, seeds, runs or lengths side by side.
         converged: bounds by group, in the unit shown, for the time to converge.
         margin: share by which RMSE may differ between filters that count as equal.
@@ -85,8 +96,8 @@ class Options:
         for name in ("margin", "wanted"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}={getattr(self, name)} is no share by which errors differ; 0.05 is five per cent")
-        if not self.formats or set(self.formats) - set(_MIME):
-            raise ValueError(f"formats={list(self.formats)}: choose from {', '.join(_MIME)}")
+        if not self.formats or set(self.formats) - set(_FORMATS):
+            raise ValueError(f"formats={list(self.formats)}: choose from {', '.join(_FORMATS)}")
 
 
 def write(
@@ -125,8 +136,12 @@ def write(
         runs.append(rows)
     decided = over_page(decided)
     table = pd.concat(runs, ignore_index=True)
-    scored = [group for group in groups if (table.group == group).any()]
-    over_cells = [across.across(table, group, options.alpha, options.margin) for group in scored]
+    mains = {(cell.scenario, cell.noise, cell.model): section["main"] for cell, section in zip(found, sections, strict=True)}
+    rows, of_mains, name = headline.joined(table, decided, mains)
+    if view.brief and name == headline.MAIN:
+        table = pd.concat([rows, table], ignore_index=True)
+    scored = [group for group in (name, *groups) if (table.group == group).any()]
+    over_cells = [across.across(table, group, options.alpha, options.margin) for group in dict.fromkeys(scored)]
     note = budget.stated([job.meta for cell in found for job in cell.jobs])
     listed = _listed(decided, sections)
     context = {
@@ -142,10 +157,11 @@ def write(
         "shown": sum(v.winner != NO_DIFFERENCE for v in decided),
         "family_sizes": sorted({v.family for v in decided}),
         "budget": note,
-        "across": _across(table, over_cells, decided, view, note),
+        "across": _across(table, over_cells, [*of_mains, *decided] if scored[0] == headline.MAIN else decided, view, note),
+        "headline": _headline(table, over_cells[0], of_mains, mains, sections, view, note) if view.brief and over_cells else None,
         "lost_rules": [rule.name for rule in LOST_RULES],
         "bibtex": (bibtex := _bibtex(found)),
-        "shared": _shared(found),
+        "shared": [*_shared(found), *_trained(found)],
         "choices": _choices(found),
         "failures": store.failures(Path(results) / study),
     }
@@ -208,7 +224,7 @@ def _section(cell: Cell, view: View) -> tuple[dict[str, Any], list[Verdict], pd.
     regions = calibration.calibrated(runs, options.alpha)
     note = budget.stated([job.meta for job in cell.jobs])
     prefix = slug(f"{cell.scenario}_{cell.noise}_{cell.model}")
-    main = "position" if "position" in known else known[0] if known else ""
+    main = headline.main_group(known)
     parts = []
     for group, front in zip(known, fronts, strict=True):
         own = [v for v in decided if v.group == group]
@@ -220,7 +236,8 @@ def _section(cell: Cell, view: View) -> tuple[dict[str, Any], list[Verdict], pd.
             if chosen and (group == main or not view.brief):
                 save_table(folder, f"{prefix}_{slug(group)}_pairs", pairs, note)
                 save_table(folder, f"{prefix}_{slug(group)}_effects", effects, note)
-            shown = {"accuracy": accuracy, "pairs": pairs, "effects": effects, "regions": calibration.said(regions, group)}
+            short = tables.in_brief(accuracy) if view.brief and group != main else accuracy
+            shown = {"accuracy": short, "pairs": pairs, "effects": effects, "regions": calibration.said(regions, group)}
             best = _best_first([front], group)[0]
             parts.append({"name": group, "main": group == main, "chosen": chosen, "best": best, **shown, **_said(own, front)})
     ran = tables.overview(used, options.alpha)
@@ -233,14 +250,18 @@ def _section(cell: Cell, view: View) -> tuple[dict[str, Any], list[Verdict], pd.
         *ranking_figures.of_cell([v for v in decided if v.group in seen], [f for f in fronts if f.group in seen], look, who),
     ]  # fmt: skip
     pictures = [drawn(drawing, prefix, folder, options.formats) for drawing in drawings]
-    lost = [(label, int(result.arrays["lost"].sum()), result.meta["runs"]) for label, result in whole.items()]
-    gone = [(label, int(tables.diverged(result).sum()), result.meta["runs"]) for label, result in used.items()]
-    section: dict[str, Any] = {"budget": note, "name": cell.name, "anchor": prefix}
+    section: dict[str, Any] = {"budget": note, "name": cell.name, "anchor": prefix, "main": main}
+    section["fates"] = [
+        (label, int(whole[label].arrays["lost"].sum()), int(tables.diverged(result).sum()), result.meta["runs"])
+        for label, result in used.items()
+    ]
     section |= {"overview": ran, "parts": parts, "drawings": pictures}
     there = {block.group for result in used.values() for block in blocks(result.meta["state"])}
     section["unscored"] = [group for group in view.groups if group in there and group not in known]
     section["bounds"] = _distinct(result.meta["bound"] for result in whole.values() if "bound" in result.meta)
-    return {**section, "lost": [row for row in lost if row[1]], "diverged": [row for row in gone if row[1]]}, decided, runs
+    section["lost"] = [(label, lost, n) for label, lost, _, n in section["fates"] if lost]
+    section["diverged"] = [(label, off, n) for label, _, off, n in section["fates"] if off]
+    return section, decided, runs
 
 
 def _looks_of(view: View, labels: Sequence[str], best: Sequence[str], by: str) -> tuple[Mapping[str, Look], str]:
@@ -260,7 +281,8 @@ def _looks_of(view: View, labels: Sequence[str], best: Sequence[str], by: str) -
         return dimmed(view.style, chosen), f" In colour: {', '.join(chosen)}; grey: the other {others}."
     kept = sorted(best[:_NAMED], key=natural)
     said = f" In colour: the {_NAMED} with {by}, in colours of these figures' own; grey: the other {len(labels) - len(kept)}."
-    return {**dimmed(view.style, kept), **looks(kept)}, said
+    quiet = dimmed(view.style, kept)
+    return {**quiet, **{label: look._replace(instants=quiet[label].instants) for label, look in looks(kept).items()}}, said
 
 
 def _best_first(fronts: Sequence[budget.Front], group: str) -> list[str]:
@@ -324,7 +346,8 @@ def _across(
     """What the templates need of all cells together; writes its figures and tables."""
     folder, options = view.folder, view.options
     sources = [across.blocks(table, one.group) for one in found]
-    ranked, changed = tables.ranked(found), tables.sensitive(sensitivity(table, options.alpha))
+    own = table[table.group != headline.MAIN]
+    ranked, changed = tables.ranked(found), tables.sensitive(sensitivity(own, options.alpha))
     for name, one_table in (("ranks", ranked), ("lost_rules", changed)):
         if len(one_table):
             save_table(folder, f"across_{name}", one_table, note)
@@ -339,8 +362,10 @@ def _across(
         parts.append({"one": one, "pairs": few, "n": len(pairs), "best": best, "changed": _changed(one, others)})
     drawings = []
     for one, source in zip(found, sources, strict=True):
-        order = sorted(range(len(one.ranks)), key=lambda i: one.ranks[i])
-        look, who = _looks_of(view, one.filters, [one.filters[i] for i in order], f"the best mean ranks of {one.group}")
+        by = one.ranks or tuple(map(float, np.median(source.values, axis=0)))
+        best_first = [label for _, label in sorted(zip(by, one.filters, strict=True))]
+        what = f"the best mean ranks of {one.group}" if one.ranks else f"the smallest median RMSE of {one.group}"
+        look, who = _looks_of(view, one.filters, best_first, what)
         drawings += ranking_figures.of_study([(one, source)], decided, look, who)
     return {
         "parts": parts,
@@ -348,6 +373,29 @@ def _across(
         "sensitive": changed,
         "lost": bool(table.lost.any()),
         "drawings": [drawn(drawing, "across", folder, options.formats) for drawing in drawings],
+    }
+
+
+def _headline(
+    table: pd.DataFrame, one: Across, decided: Sequence[Verdict], mains: Mapping[headline.CellName, str],
+    sections: Sequence[Mapping[str, Any]], view: View, note: str,
+) -> dict[str, Any]:
+    """What a page of many cells says first; writes its figures and its table."""
+    folder, options = view.folder, view.options
+    source = across.blocks(table, one.group)
+    pairs = headline.planned(source, decided, options.alpha)
+    planned = tables.planned(pairs)
+    if pairs:
+        save_table(folder, "proposed", planned, note)
+        save_typed(folder, "proposed", pairs)
+    fates = [fate for section in sections for fate in section["fates"]]
+    said = headline.summary(one, decided, pairs, table[table.group == one.group], mains, fates)
+    drawings = headline_figures.drawings(one, source, pairs, options.alpha, said.group)
+    return {
+        "said": said,
+        "planned": planned,
+        "drawings": [drawn(drawing, "all", folder, options.formats) for drawing in drawings],
+        "critical": f"across_critical_difference_{slug(one.group)}",
     }
 
 
@@ -395,16 +443,22 @@ def _scored(results: Mapping[str, store.Result], group: str) -> bool:
 def drawn(drawing: figures.Drawing, prefix: str, folder: Path, formats: Sequence[str]) -> dict[str, Any]:
     """What the templates need of one figure; writes its files."""
     paths = figures.save(drawing._replace(name=f"{prefix}_{drawing.name}"), folder / "figures", formats)
-    first = min(paths, key=lambda path: path.suffix)
-    data = base64.b64encode(first.read_bytes()).decode("ascii")
+    first = max(paths, key=lambda path: path.suffix)  # svg where there is one
     return {
         "file": f"figures/{first.name}",
         "caption": drawing.caption,
-        "source": f"data:image/{_MIME[first.suffix[1:]]};base64,{data}",
+        "source": min(map(_address, paths), key=len),
         "name": drawing.name,
         "anchor": slug(f"{prefix}_{drawing.name}"),
         "broad": drawing.name.startswith("spread_"),
     }
+
+
+def _address(path: Path) -> str:
+    """The picture as an address that needs no file."""
+    if path.suffix == ".svg":
+        return vector.linked(path.read_text(encoding="utf-8"))
+    return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
 
 
 def save_table(folder: Path, name: str, table: pd.DataFrame, note: str = "") -> None:
@@ -444,6 +498,17 @@ def _shared(found: Sequence[Cell]) -> list[tuple[str, str]]:
         values = [_at(job.meta, path) for cell in found for job in cell.jobs]
         rows.append((name, ", ".join(_distinct(str(value) for value in values if value is not None)) or "not stated"))
     return rows
+
+
+def _trained(found: Sequence[Cell]) -> list[tuple[str, str]]:
+    """What networks were trained on, and what that cost, filter by filter."""
+    rows = []
+    for job in (job for cell in found for job in cell.jobs if job.meta.get("trained")):
+        split, cost = job.meta["trained"]["split"], job.meta["trained"]["cost"]
+        worlds = f"{split['train']['runs']} worlds of {split['scenario']}, " if split else ""
+        spent = f"{cost['updates']} updates, {cost['seconds']:.0f} s on {cost['device']} ({cost['threads']} threads)"
+        rows.append((f"training of {job.label}", worlds + spent))
+    return list(dict.fromkeys(rows))
 
 
 def _choices(found: Sequence[Cell]) -> list[tuple[str, str]]:

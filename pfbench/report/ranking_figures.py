@@ -22,6 +22,7 @@ from pfbench.report.significance import NO_DIFFERENCE, Verdict
 
 _PAIRS = 28  # of a forest that a column's height still holds
 _MANY = 12  # filters of a diagram of which each rank has a tick
+_APART = 1.4  # times the time per step of the name before, that the next name on a front stands clear of it
 _LONG = 42  # letters of a pair that stand on one line of a column
 _SIDE = 10  # filters of a matrix that a column's width still holds
 _BETTER, _WORSE = "#0072B2", "#E69F00"  # apart in grey too: dark and light
@@ -34,7 +35,7 @@ def of_cell(own: Sequence[Verdict], fronts: Sequence[Front], style: Mapping[str,
     if shown:
         text = (
             "Time per step against the median over runs of the RMSE, a lost run being worse than any other. Ringed and joined: "
-            f"filters that no other one beats in both.{note}"
+            f"filters that no other one beats in both{'; grey ones are named where there is room' if note else ''}.{note}"
         )
         found.append(Drawing("front", text, partial(fronts_of, shown, style)))
     for group in dict.fromkeys(v.group for v in own):
@@ -70,9 +71,12 @@ def of_study(
                 "which it is shown to be worse, after Holm's correction within each cell."
             )
             labels = _by_rank(own, one)
+            named = [label for label in labels if not style[label].quiet][:_SIDE] if len(labels) > _SIDE else []
             if len(labels) > _SIDE:
-                text += f" The {_SIDE} filters of {len(labels)} with the best mean ranks."
-            drawings.append(Drawing(f"matrix_{name}", text + _starred(one), partial(matrix, own, one)))
+                best = "best mean ranks" if one.ranks else "most won over lost comparisons"
+                who = f"those in colour elsewhere and, of the others, the {_SIDE - len(named)}" if named else f"the {_SIDE}"
+                text += f" Of {len(labels)} filters: {who} with the {best}."
+            drawings.append(Drawing(f"matrix_{name}", text + _starred(one), partial(matrix, own, one, named)))
         if len(sources.runs) > 1 and len(sources.filters) > 1:
             text = (
                 f"{one.group}: share of the runs in which the RMSE of a filter is at most so many times that of the best "
@@ -116,9 +120,11 @@ def critical_difference(one: Across, style: Mapping[str, Look]) -> Figure:
     return figure
 
 
-def matrix(own: Sequence[Verdict], one: Across) -> Figure:
-    """Cells won and lost of each pair, rows against columns; of many filters the best."""
-    labels = _by_rank(own, one)[:_SIDE]
+def matrix(own: Sequence[Verdict], one: Across, named: Sequence[str] = ()) -> Figure:
+    """Cells won and lost of each pair, rows against columns; of many filters those named, and the best of the others."""
+    ranked = _by_rank(own, one)
+    others = [label for label in ranked if label not in named][: _SIDE - len(named)]
+    labels = [label for label in ranked if label in named or label in others]
     own = [v for v in own if v.a in labels and v.b in labels]
     won, met = np.zeros((len(labels),) * 2, dtype=int), np.zeros((len(labels),) * 2, dtype=int)
     for v in own:
@@ -202,13 +208,15 @@ def fronts_of(fronts: Sequence[Front], style: Mapping[str, Look]) -> Figure:
         milliseconds = [1e3 * s for s in front.seconds]
         corner: Any = {"drawstyle": "steps-post", "color": "0.55", "lw": 0.9, "zorder": 1}
         axis.plot([milliseconds[i] for i in best], [front.rmse[i] for i in best], **corner)
+        last = 0.0
         for label, time, error, kept in zip(front.filters, milliseconds, front.rmse, front.kept, strict=True):
             look = style[label]
             y = error if np.isfinite(error) else np.nan
             named = "" if look.quiet else label
             axis.scatter(time, y, s=12 if look.quiet else 30, color=look.colour, marker=look.marker, label=named, zorder=3, lw=0)
-            if kept and look.quiet:
+            if kept and look.quiet and time > _APART * last:
                 axis.annotate(label, (time, y), (4, -7), textcoords="offset points", fontsize=5.5)
+                last = time
             if kept:
                 axis.scatter(time, y, s=95, facecolors="none", edgecolors="0.2", lw=0.9, zorder=2)
         finite = [e for e in front.rmse if np.isfinite(e)]
@@ -230,7 +238,11 @@ def _starred(one: Across) -> str:
 
 
 def _by_rank(own: Sequence[Verdict], one: Across) -> list[str]:
-    return sorted(dict.fromkeys(label for v in own for label in (v.a, v.b)), key=lambda label: _rank(one, label))
+    """Labels by mean rank, and where there is none by comparisons won less lost."""
+    labels = dict.fromkeys(label for v in own for label in (v.a, v.b))
+    lost = {label: sum(label in (v.a, v.b) and v.winner != NO_DIFFERENCE for v in own) for label in labels}
+    lost = {label: n - 2 * sum(v.winner == label for v in own) for label, n in lost.items()}
+    return sorted(labels, key=lambda label: (_rank(one, label), lost[label]))
 
 
 def _rank(one: Across, label: str) -> float:

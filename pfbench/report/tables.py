@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -12,6 +12,7 @@ import pandas as pd
 from pfbench import metrics, store
 from pfbench.report.across import Across
 from pfbench.report.frame import COVERAGES, Block, blocks, of_trace
+from pfbench.report.headline import Planned
 from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Sensitivity, Verdict
 
 Results = Mapping[str, store.Result]
@@ -59,6 +60,12 @@ def accuracy(
                 row = {"filter": label, **_accuracy(result, block, alpha, bound)}
                 rows.append({**row, **_standing(label, verdicts)} if verdicts else row)
     return pd.DataFrame(rows)
+
+
+def in_brief(table: pd.DataFrame) -> pd.DataFrame:
+    """The columns of `accuracy` that a large page shows of groups beside the main one."""
+    kept = ("filter", "runs used", "RMSE norm", "NEES", "in 90 % region", "RMSE norm to", "beats", "beaten by")
+    return table[[name for name in table if str(name).startswith(kept)]]
 
 
 def decisions(verdicts: Sequence[Verdict]) -> pd.DataFrame:
@@ -165,6 +172,28 @@ def across_pairs(one: Across) -> pd.DataFrame:
     )
 
 
+def planned(pairs: Sequence[Planned]) -> pd.DataFrame:
+    """Proposed methods beside their baselines: one row per pair."""
+    return pd.DataFrame(
+        [
+            {
+                "method": pair.method,
+                "baseline": pair.baseline,
+                "cells": len(pair.cells),
+                "better": pair.better,
+                "worse": pair.worse,
+                "no difference shown": len(pair.cells) - pair.better - pair.worse,
+                "RMSE to baseline in %": 100 * (pair.ratio - 1),
+                "effect": pair.effect,
+                "p": pair.p,
+                f"p Holm ({pair.family})": pair.p_holm,
+                "across cells": pair.winner,
+            }
+            for pair in pairs
+        ]
+    )
+
+
 def sensitive(found: Sequence[Sensitivity]) -> pd.DataFrame:
     """The decisions that another rule for lost runs would change."""
     rules = [rule.name for rule in LOST_RULES]
@@ -177,16 +206,20 @@ def sensitive(found: Sequence[Sensitivity]) -> pd.DataFrame:
 
 
 def html(table: pd.DataFrame) -> str:
-    """An HTML table; numbers are marked so that the style sheet can set them right."""
-    kinds = [' class="number"' if _is_number(table[name]) else "" for name in table]
+    """An HTML table; its heads say what is a number, and cells what is none, so that the style sheet can set them right.
 
-    def row(tag: str, texts: Iterable[str]) -> str:
-        cells = (f"<{tag}{kind}>{escape(text)}</{tag}>" for text, kind in zip(texts, kinds, strict=True))
-        return f"<tr>{''.join(cells)}</tr>"
-
-    head = row("th", map(str, table.columns))
-    body = "\n".join(row("td", map(number, values)) for values in table.itertuples(index=False))
-    return f'<div class="wide"><table>\n<thead>{head}</thead>\n<tbody>{body}</tbody>\n</table></div>'
+    Ends of cells and rows, which a browser needs not be told, were most of a page of tables.
+    """
+    numeric = [_is_number(table[name]) for name in table]
+    head = "".join(
+        f'<th{" class=number" if right else ""}>{escape(str(name))}' for name, right in zip(table, numeric, strict=True)
+    )
+    kinds = ["<td>" if right else "<td class=t>" for right in numeric]
+    body = "\n".join(
+        "<tr>" + "".join(kind + escape(number(value), quote=False) for kind, value in zip(kinds, values, strict=True))
+        for values in table.itertuples(index=False)
+    )
+    return f'<div class="wide"><table class="plain">\n<thead><tr>{head}</thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'
 
 
 def markdown(table: pd.DataFrame) -> str:

@@ -233,7 +233,7 @@ def test_steps_with_rare_truth_are_not_thinned_away(tmp_path: Path) -> None:
     np.testing.assert_array_equal(line.get_xdata(), result.arrays["time"][rare])
     panels = {axis.get_title(): axis for axis in figures.spread(result, ["attitude", "position"], style["ekf"]).axes}
     assert len(panels["position_E"].lines[0].get_xdata()) == 4
-    assert len(panels["attitude_E"].lines[0].get_xdata()) == 300  # where all is known, as many as ever
+    assert len(panels["attitude_E"].lines[0].get_xdata()) == 120  # where all is known, as many as ever
     plan = figures.track({"ekf": result}, 0, style).axes[0]
     assert len(next(line for line in plan.lines if line.get_label() == "ekf").get_xdata()) == 4
 

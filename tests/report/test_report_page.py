@@ -6,6 +6,7 @@ import re
 import shutil
 import tomllib
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
@@ -42,15 +43,18 @@ def test_every_figure_and_table_is_there_and_on_the_page(report):
     names = {path.stem for path in (report / "figures").iterdir()}
     kinds = {name.removeprefix("flight_surge_ins_gnss_") for name in names}
     assert kinds == {
-        "track", "error_attitude", "error_velocity", "error_position", "rmse", "front", "nees", "ess", "calibration",
+        "track", "error_attitude", "error_velocity", "error_position", "rmse", "front", "nees", "cost", "ess", "calibration",
         "forest_attitude", "forest_velocity", "forest_position",
         "spread_ekf", "spread_ukf", "spread_sir", "spread_cofm_amssrcpf",
     }  # fmt: skip
     assert {path.suffix for path in (report / "figures").iterdir()} == {".svg", ".png"}
-    carried = [base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', html)]
-    assert sorted(carried) == sorted(path.read_bytes() for path in (report / "figures").glob("*.png"))
-    for path in (report / "figures").glob("*.png"):
+    bitmaps = [base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', html)]
+    vectors = [re.sub(r"='([^']*)'", r'="\1"', unquote(data)) for data in re.findall(r'src="data:image/svg\+xml,([^"]+)"', html)]
+    carried = [*bitmaps, *vectors]
+    assert len(carried) == len(names)
+    for path in (report / "figures").glob("*.svg"):  # each of the two files is whole, the page has the smaller, and the text one
         assert f"](figures/{path.name})" in text
+        assert path.with_suffix(".png").read_bytes() in bitmaps or path.read_text() in vectors
     for path in (report / "tables").glob("*.csv"):
         table = pd.read_csv(path, keep_default_na=False)
         assert path.with_suffix(".tex").read_text().startswith(r"\begin{tabular}")

@@ -76,7 +76,8 @@ def test_every_table_names_its_budget(report):
         assert said in latex
         assert latex.rstrip().endswith("\\end{tabular}")
     html = (report / "index.html").read_text()
-    assert html.count("<table>") == len(re.findall(r"</table></div>(?:\n</div>)?\n<p class=\"note\">Budget: same N", html))
+    noted = re.findall(r"</table></div>(?:\n</div>)?\n<p class=\"note\">Budget: same N", html)
+    assert html.count('<table class="plain">') == len(noted)
 
 
 def test_the_page_carries_its_figures_and_its_filter(report):
@@ -170,7 +171,7 @@ def test_a_study_too_large_to_show_all_says_what_it_shows(results, tmp_path):
     assert not (made.parent / "verdicts.json").exists()
     assert "All 54 verdicts are in verdicts.json.gz" in html
     sift = html[html.index('<div class="sift">') :]
-    rows = re.findall(r"<tr><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td>", sift[: sift.index("</table>")])
+    rows = re.findall(r"<tr>" + 4 * r"<td class=t>(.*?)" + "<td>", sift[: sift.index("</table>")])
     assert len(rows) == 6 * 2
     assert {group for _, group, _, _ in rows} == {"position"}
     assert all("apf" in (a, b) for _, _, a, b in rows)  # the best
@@ -186,4 +187,7 @@ def test_a_study_too_large_to_show_all_says_what_it_shows(results, tmp_path):
     assert sum("In colour: the 1 with" in text for text in captions) >= 6 * 3
     assert "sir lost 4 of 15 runs" in html  # said in the section of each cell
     first = html.index('<h2>In short</h2>')
-    assert "beaten by no other" not in html[first : html.index('<section id="across">')]
+    short = html[first : html.index('<section id="across">')]
+    assert "position: beaten by no other" not in short
+    assert "3 filters in 6 cells (" in short
+    assert "Lost: 24 of 270 runs, by 1 of 3 filters; most by sir (24 of 90)." in short

@@ -1,0 +1,119 @@
+"""The studies of learned proposals: what they measure has a closed form, and they go on from where they stopped."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+from pfbench.experiments import learn_data_efficiency, learn_noise_calibration, learn_room
+from pfbench.experiments.learn_data_efficiency import World, against, interval, volatility
+
+from pfbench.draws import MonteCarlo
+from pfbench.filter.belief import Cloud
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.guided_noise import GuidedNoise
+from pfbench.filter.proposals import Bootstrap
+from pfbench.filter.rules import Jacobian
+from pfbench.model.linear import local_level
+from pfbench.ppl.calibration import Ranks
+from pfbench.record import Record
+
+
+def normal(r: torch.Tensor, variance: float) -> torch.Tensor:
+    return torch.exp(-0.5 * r**2 / variance) / math.sqrt(2 * math.pi * variance)
+
+
+def test_the_room_that_is_left_is_that_of_closed_forms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """y = x + b w + s e: sum (E v)^2 / sum E v^2 for v = p(y | x, w), one for the optimal law, and its nats."""
+    monkeypatch.setattr(learn_room, "CHILDREN", 1000)
+    b, s, y = 0.8, 0.6, 1.1
+    model, parents = local_level(b, s, 0.0, 1.0), torch.tensor([-0.5, 0.4, 1.5], dtype=torch.float64)
+    cloud = Cloud(parents[None, :, None], torch.full((1, 3), -math.log(3.0), dtype=torch.float64), torch.zeros(1))
+    seen, draws = Record(torch.tensor([[y]], dtype=torch.float64)), MonteCarlo(1, torch.arange(1))
+    chosen = torch.multinomial(torch.full((3,), 1.0), learn_room.PARENTS, True, generator=torch.Generator().manual_seed(0))
+    r = y - parents[chosen]
+    best = normal(r, b * b + s * s).square().sum()
+    wanted = {
+        "own": best / (normal(r, b * b + 0.5 * s * s) / (2 * s * math.sqrt(math.pi))).sum(),
+        "optimal": torch.tensor(1.0, dtype=torch.float64),
+    }
+    for name, proposal in (("own", Bootstrap()), ("optimal", GuidedNoise(GaussianFilter(Jacobian())))):
+        found = learn_room.share(learn_room.weighed(proposal, model, cloud, seen, draws))
+        torch.testing.assert_close(found[0], wanted[name], rtol=0.03 if name == "own" else 1e-3, atol=0.0)
+    torch.testing.assert_close(learn_room.nats(model, cloud, seen)[0].item(), 0.5 * math.log1p((b / s) ** 2))
+
+
+def test_steps_without_a_measurement_are_not_looked_at() -> None:
+    y = torch.full((2, 9, 1), torch.nan)
+    y[:, 2::3] = 0.0
+    y[0, 5] = torch.nan
+    assert learn_room.looked_at(Record(y)) == {2, 8}
+
+
+def test_an_interval_holds_what_differs_between_worlds_and_between_trainings() -> None:
+    worlds = np.random.default_rng(0).normal(size=400)
+    assert interval(worlds[None])[1] == pytest.approx(1.96 / math.sqrt(400), rel=0.1)
+    same = np.stack([worlds] * 3)
+    apart = same + np.array([-1.0, 0.0, 1.0])[:, None]
+    assert interval(same)[1] == pytest.approx(1.966 / math.sqrt(400), rel=0.1)
+    assert interval(apart)[1] == pytest.approx(4.303 * math.sqrt(1 / 3 + 1 / 400), rel=0.1)
+
+
+def test_scores_are_told_against_the_own_noise_s() -> None:
+    own, other = ({"ess": [0.4], "evidence": [e], "error": [x]} for e, x in ((-2.0, 4.0), (-1.5, 2.0)))
+    assert [float(against(other, own, name)[0]) for name in ("ess", "evidence", "error")] == [0.4, 0.5, math.log(0.5)]
+
+
+def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = World(volatility, "state", 6, 0.01, (1, 2), (1, 2), 8)
+    monkeypatch.setattr(learn_data_efficiency, "WORLDS", {"small": small})
+    learned, taught = [], learn_data_efficiency.taught
+
+    def counted(world, count, seed, objective, path):
+        learned.append((type(objective).__name__, count, seed))
+        if len(learned) == 4:
+            raise KeyboardInterrupt
+        return taught(world, count, seed, objective, path)
+
+    monkeypatch.setattr(learn_data_efficiency, "taught", counted)
+    with pytest.raises(KeyboardInterrupt):
+        learn_data_efficiency.main(tmp_path)
+    learn_data_efficiency.main(tmp_path)
+    assert len(learned) == 7
+    assert learned[3] == learned[4]
+    rows = (tmp_path / "tables.md").read_text().splitlines()
+    assert len([row for row in rows if row.startswith("| bound, ")]) == 2
+    assert (tmp_path / "data_efficiency.png").stat().st_size > 5000
+
+
+def test_few_worlds_come_again_and_no_others_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = {}
+    monkeypatch.setattr(learn_data_efficiency, "train", lambda plan, method, model, own, few, path: seen.update(own=own, few=few))
+    world = World(volatility, "state", 6, 0.01, (2, 40), (1,), 8)
+    learn_data_efficiency.taught(world, 2, 1, learn_data_efficiency.Bound(), tmp_path / "none.pt")
+    assert len(seen["own"].record.y) == 40
+    few = seen["own"].record.y[:2]
+    for worlds in seen.values():
+        torch.testing.assert_close(worlds.record.y, few.repeat(len(worlds.record.y) // 2 + 1, 1, 1)[: len(worlds.record.y)])
+    learn_data_efficiency.taught(world, 40, 1, learn_data_efficiency.Bound(), tmp_path / "none.pt")
+    torch.testing.assert_close(seen["own"].record.y[:2], few)
+    assert len(seen["own"].record.y.unique(dim=0)) == 40
+
+
+def test_a_study_of_calibration_goes_on_from_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def told(unknown, shape, infer, draws, seed):
+        asked.append(len(shape.y))
+        return Ranks({name: torch.arange(len(shape.y)) % 20 for name in unknown.names}, draws)
+
+    monkeypatch.setattr(learn_noise_calibration, "calibrate", told)
+    monkeypatch.setattr(learn_noise_calibration, "histograms", lambda ranks: Figure())
+    learn_noise_calibration.main(tmp_path, 30, 1, "toy")
+    learn_noise_calibration.main(tmp_path, 30, 1)
+    assert asked == [30] * 8
+    learn_noise_calibration.main(tmp_path, 31, 1, "location, SVI")  # another call, from the beginning
+    assert asked[8:] == [31, 31]
+    assert (tmp_path / "calibration_toy.svg").exists()
