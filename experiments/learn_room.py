@@ -45,7 +45,7 @@ SCENES = (
     "t003", "t004", "t004,model=ins_gnss_inflated", "gps_ins", "boreas", "sar_flight_short", "anshun_short", "anshun_nl",
     "berlin", "berlin,model=urban_gnss_mixture", "walk", "car_drive", "quad_flights", "fixed_wing", "fixed_wing_aided",
 )  # fmt: skip
-TOLD = "noise=outliers,told=true"  # the filter knows that one measurement in ten is five times as wrong: no normal law
+TOLD = "noise=outliers,told=true"  # the filter knows that one measurement in twenty is ten times as wrong: no normal law
 SCENES += tuple(f"{scene},{TOLD}" for scene in ("azimuth", "anshun_short", "passive_1"))
 RULES = {"own noise": None, "EKF": Jacobian(), "CKF": Points(Cubature())}
 PARENTS, CHILDREN, RUNS, LOOKS = 40, 50, 4, 25

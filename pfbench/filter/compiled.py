@@ -40,7 +40,8 @@ class Compiled:
 
     The first step runs as it is, since there a proposal may begin what it carries along. The second is recorded and
     compiled. From then on a step in which a particle has become NaN is done again uncompiled.
-    Where anything about this fails, the filter goes on uncompiled and says so.
+    Where anything about this fails, the filter goes on uncompiled and says so. A stage that kept numbers of its own from step to
+    step would have them frozen; stages keep none.
 
     Args:
         method: the filter. Moves carry a past that grows; with them it runs uncompiled.
