@@ -82,7 +82,7 @@ def _uniforms(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, partic
     return (torch.cat(_words(key, step, runs, component, particle), dim=-1).double() + 0.5) * 2.0**-32
 
 
-uniforms = fusible(_uniforms, by_hand=native.uniforms)
+uniforms = fusible(_uniforms, by_hand=native.uniforms, whole=False)
 
 
 @dataclass(frozen=True, eq=False)

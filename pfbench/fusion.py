@@ -65,22 +65,23 @@ def _plain(args: tuple[Any, ...]) -> bool:
     return torch.get_num_threads() == 1 and not args[0].is_cuda and not wanted
 
 
-def fusible(function: F, eager: F | None = None, by_hand: F | None = None) -> F:
+def fusible(function: F, eager: F | None = None, by_hand: F | None = None, whole: bool = True) -> F:
     """Makes a function of tensors one that can be fused.
 
     Args:
         function: what is compiled.
         eager: computes the same where nothing is fused, if separate operations have a faster way to do it.
         by_hand: is taken for what would be compiled on the CPU and one thread, where it works and no gradient is wanted.
+        whole: in a graph, too, as one operator. What the graph's compiler does well itself should not be: a call costs some 20 us.
     """
     separate = eager or function
-    operator = None if by_hand is None else _operator(by_hand, function)
+    operator = None if by_hand is None or not whole else _operator(by_hand, function)
 
     @cache
     def compiled() -> Callable[..., Any]:
         return torch.compile(function, dynamic=True)
 
-    def whole(*args: Any) -> Any:
+    def as_one(*args: Any) -> Any:
         if by_hand is not None and by_hand not in _failed and _plain(args):
             try:
                 return by_hand(*args)
@@ -93,7 +94,7 @@ def fusible(function: F, eager: F | None = None, by_hand: F | None = None) -> F:
     def call(*args: Any) -> Any:
         if _graph.get():
             return (function if operator is None or args[0].is_cuda else operator)(*args)
-        return (whole if _fused.get() else separate)(*args)
+        return (as_one if _fused.get() else separate)(*args)
 
     return cast(F, call)
 

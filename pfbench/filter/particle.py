@@ -240,4 +240,4 @@ def _fused_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     return mean.T, (w * d * d).sum(-1).T
 
 
-_flat_moments = fusible(_fused_moments, eager=_separate_moments, by_hand=native.moments)
+_flat_moments = fusible(_fused_moments, eager=_separate_moments, by_hand=native.moments, whole=False)

@@ -223,7 +223,7 @@ def _quadratic_of_each(y: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
     return -0.5 * (z * z).sum(-1)
 
 
-_quadratic = fusible(_run_quadratic, by_hand=native.log_normal)
+_quadratic = fusible(_run_quadratic, by_hand=native.log_normal, whole=False)
 
 
 def affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
