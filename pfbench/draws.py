@@ -106,7 +106,7 @@ class MonteCarlo:
     step: int | Tensor = 0
 
     def __post_init__(self) -> None:
-        if isinstance(self.seed, int) and not 0 <= self.seed <= _WORD:
+        if not isinstance(self.seed, Tensor) and not 0 <= self.seed <= _WORD:
             raise ValueError(f"seed={self.seed}: give an integer from 0 to 2**32 - 1")
 
     def at(self, step: int) -> MonteCarlo:
@@ -126,7 +126,8 @@ class MonteCarlo:
             return torch.as_tensor(value, device=self.runs.device)
 
         own = zlib.crc32(purpose.encode())
-        key = whole([self.seed, own]) if isinstance(self.seed, int) else torch.stack([self.seed, torch.full_like(self.seed, own)])
+        drawn = torch.stack([self.seed, torch.full_like(self.seed, own)]) if isinstance(self.seed, Tensor) else [self.seed, own]
+        key = whole(drawn)
         quarters = torch.arange(-(-n // 4), device=self.runs.device)
         return key, whole(self.step), self.runs, torch.arange(w, device=self.runs.device), quarters
 

@@ -72,7 +72,7 @@ def fusible(function: F, eager: F | None = None, by_hand: F | None = None, whole
         function: what is compiled.
         eager: computes the same where nothing is fused, if separate operations have a faster way to do it.
         by_hand: is taken for what would be compiled on the CPU and one thread, where it works and no gradient is wanted.
-        whole: in a graph, too, as one operator. What the graph's compiler does well itself should not be: a call costs some 20 us.
+        whole: in a graph, too, as one operator. What the compiler does well itself should not be: a call costs some 20 us.
     """
     separate = eager or function
     operator = None if by_hand is None or not whole else _operator(by_hand, function)

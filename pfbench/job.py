@@ -227,7 +227,7 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
         "per_step": spent / steps,
     }  # fmt: skip
     likelihoods = tally.count / (cfg.runs * steps)
-    engine = "compiled" if step and any(step.graphs.values()) else "loops" if fuse else "eager"
+    engine = "compiled" if step and step.at_work else "loops" if fuse else "eager"
     cost = {"engine": engine, "memory": _taken(cfg.device, held), "likelihoods_per_step": likelihoods}
     meta = describe(cfg, model, method, steps, seconds, episode.notes) | cost
     return {**meta, "bound": said, "trained": trained}, {**_arrays(episode, estimate, judge), **_shared(episode, least)}

@@ -63,6 +63,11 @@ class Compiled:
     def exact(self) -> bool:
         return self.method.exact
 
+    @property
+    def at_work(self) -> bool:
+        """Did any kind of step run compiled?"""
+        return any(isinstance(kind, tuple) for kind in self.graphs.values())
+
     def init(
         self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None, spread: Tensor | None = None
     ) -> Cloud | Gaussian:
