@@ -256,7 +256,11 @@ def test_the_ratio_is_that_of_the_densities(model: StateSpaceModel, target: Any)
         assert (new.innovation.noise > 1.2 * new.innovation.nominal).any()
     expected = prior + likelihood - density(new.mean, new.root, 1.7) - math.log(30)
     got = log_ratio + cloud.log_w + model.log_likelihood(seen.y, x, ())
-    torch.testing.assert_close(got, expected, rtol=0, atol=1e-7)
+    # a particle more than half a turn from x- or x+ has no one difference to them: what it was drawn with cannot be seen
+    tangent = model.chart.subtract(x, new.prior.unsqueeze(1)) - model.chart.subtract(x, new.mean.unsqueeze(1))
+    one = (tangent - model.chart.subtract(new.mean, new.prior).unsqueeze(1)).abs().amax(-1) < 1.0
+    assert one.sum() >= 58
+    torch.testing.assert_close(got[one], expected[one], rtol=0, atol=1e-7)
 
 
 def test_the_guide_starts_where_the_record_starts() -> None:

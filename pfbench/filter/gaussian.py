@@ -283,18 +283,22 @@ def update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _least_squares(white: Tensor, eye: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of |A x - b|^2 + |x|^2, [A b] = `white`: root R of I + A' A, of any signs, R'^-1 A' b [R, d, 1], and the minimum [R].
+    """Of |A x - b|^2 + |x|^2, [A b] = `white`: root R of I + A' A, R'^-1 A' b [R, d, 1], and the minimum [R].
 
     By QR: forming I + A' A would drown the 1 of a prior 1e8 times as wide as the measurement's noise.
     """
     d = eye.shape[-1]
     if not (white.requires_grad and torch.is_grad_enabled()):
         triangle = torch.linalg.qr(torch.cat([white, torch.nn.functional.pad(eye, (0, 1))], -2), mode="r")[1]
-        return triangle[:, :d, :d], triangle[:, :d, d:], triangle[:, d, d].square()
+        # QR leaves the signs of its rows to rounding; draws by such a root would depend on the batch that they are in
+        sign = torch.where(triangle.diagonal(dim1=-2, dim2=-1)[:, :d] < 0, -1, 1).to(triangle).unsqueeze(-1)
+        return sign * triangle[:, :d, :d], sign * triangle[:, :d, d:], triangle[:, d, d].square()
     # a gradient needs Q, and a triangle without zeros on its diagonal, where what was seen may be just what was expected
     a, b = white[..., :d], white[..., d:]
     q, information = torch.linalg.qr(torch.cat([a, eye], -2))
     score = q[:, : a.shape[-2]].mT @ b
+    sign = torch.where(information.diagonal(dim1=-2, dim2=-1) < 0, -1, 1).to(information).unsqueeze(-1)
+    information, score = sign * information, sign * score
     best = torch.linalg.solve_triangular(information, score, upper=True)
     return information, score, (a @ best - b).square().sum((1, 2)) + best.square().sum((1, 2))
 
