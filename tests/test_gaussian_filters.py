@@ -145,6 +145,21 @@ def test_equal_to_kalman_on_linear_models(rule: Rule, model: LinearGaussian, mis
     assert_kalman(estimate, model, y)
 
 
+@pytest.mark.parametrize("gradient", [False, True])
+def test_draws_by_the_posterior_root_do_not_hang_on_rounding(gradient: bool) -> None:
+    """Of noises that a measurement tells nothing of but for rounding, none may be drawn with the other sign."""
+    generator = torch.Generator().manual_seed(3)
+    m = torch.randn(1, 2, 4, generator=generator, dtype=torch.float64)
+    m[..., 2:] = 0.0
+    m = m + 1e-17 * torch.randn(64, 2, 4, generator=generator, dtype=torch.float64)
+    one, seen = torch.eye(2, dtype=torch.float64).expand(64, 2, 2), torch.ones(64, 2, dtype=torch.bool)
+    r = torch.ones(64, 2, dtype=torch.float64, requires_grad=gradient)
+    _, root, _ = update(Innovation(r, seen, m, one, one, one, torch.eye(4, dtype=torch.float64).expand(64, 4, 4)))
+    assert bool((root.diagonal(dim1=-2, dim2=-1) > 0.0).all())
+    torch.testing.assert_close(root, root[:1].expand_as(root), rtol=0, atol=1e-14)
+    torch.testing.assert_close(root @ root.mT, torch.linalg.inv(torch.eye(4, dtype=torch.float64) + m.mT @ m), rtol=0, atol=1e-14)
+
+
 class Hidden(LinearGaussian):
     """A linear model that keeps its noise gain to itself: the noise goes through the rule, as an unknown beside the state."""
 

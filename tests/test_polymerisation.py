@@ -589,6 +589,26 @@ def test_no_filter_beats_the_bound_and_the_repair_beats_the_print(scenario: str)
         assert stats.wilcoxon(error[name].log(), error[other].log(), alternative="less").pvalue < 1e-2
 
 
+@pytest.mark.slow
+def test_the_repaired_method_does_not_notice_where_north_lies() -> None:
+    """The paper's world, and the same turned by 45 degrees: the law of the cloud's width in position between the looks 10 and 30.
+
+    The printed boxes and moves follow the map's axes, and notice it.
+    """
+    turned = ["target_position=[0,226274.17]", "target_velocity=[-21.2132,0]", "aircraft_velocity=[141.42136,141.42136,0]"]
+    width: dict[str, list[Tensor]] = {"qmc_polymerised": [], "qmc_polymerised_printed": []}
+    for name, both in width.items():
+        for change in ([], [f"scenario.{c}" for c in turned]):
+            with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
+                cfg = compose("config", ["scenario=passive_1", "scenario.steps=30", f"filter={name}", "particles=200", *change])
+            runs = torch.arange(200)
+            model, episode = job.build(cfg.model), job.build(cfg.scenario).draw(Nominal(), runs, 1)
+            estimate = run_filter(job.build(cfg["filter"]), model, episode.record, MonteCarlo(1, runs))
+            both.append(estimate.variance[:, 10:, :2].sum(-1).log().mean(1))
+    assert stats.ttest_ind(*width["qmc_polymerised"]).pvalue > 0.01
+    assert stats.ttest_ind(*width["qmc_polymerised_printed"]).pvalue < 1e-4
+
+
 # refusals
 
 CLOUD, ONE = one_cloud(1)
