@@ -99,7 +99,7 @@ def test_probability_of_improvement_by_counting():
     assert low == pytest.approx(stats.beta.ppf(0.025, 20, 1))  # Clopper and Pearson
 
 
-@pytest.mark.parametrize("n", [9, 50, 51, 100])
+@pytest.mark.parametrize("n", [5, 9, 13, 14, 50, 51, 100])
 @pytest.mark.parametrize("digits", [0, 1, 9])  # with many ties and zeros, with some, with none
 def test_the_signed_rank_test_is_scipys(n, digits):
     d = np.round(np.random.default_rng(n).normal(0.3, 1, n), digits)
