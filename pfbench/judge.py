@@ -90,6 +90,12 @@ class Judge:
     ) -> None:
         steps = truth.shape[1]
         self.model, self.truth, self.clock = model, truth, clock
+        sizes = sorted({len(parts) for parts in model.groups.values()})
+        alike = [[g for g, parts in enumerate(model.groups.values()) if len(parts) == size] for size in sizes]
+        components = list(model.groups.values())
+        self._alike = [
+            (torch.tensor(each), torch.tensor([components[g] for g in each], device=truth.device)) for each in alike
+        ]
         self.at = sorted({(k + 1) * steps // instants - 1 for k in range(instants)} - {-1})
         self.scores: list[Scores] = []
         self.surprises: list[tuple[Tensor, Tensor]] = []
@@ -101,19 +107,19 @@ class Judge:
         A filter without a spread left (a cloud collapsed to one particle) has an infinite normalised error, not an unknown one.
         """
         error = self.model.error(info.mean, self.truth[:, t])
-        nees, covariance = [], info.covariance()
-        for parts in map(list, self.model.groups.values()):
+        nees = error.new_empty(len(error), len(self.model.groups))
+        for place, parts in self._alike:
             e = error[:, parts]
-            value = squared_length(e, covariance[:, parts][:, :, parts])
-            known = ~torch.isnan(e).any(1)
-            nees.append(torch.where(known & ~(value >= 0.0), torch.inf, value))
+            value = squared_length(e, info.covariance_of(parts))
+            known = ~torch.isnan(e).any(-1)
+            nees[:, place] = torch.where(known & ~(value >= 0.0), torch.inf, value)
         if t in self.at:
             begun = self.clock()
-            self.scores.append(self._scored(t, error, covariance, info))
+            self.scores.append(self._scored(t, error, info))
             if info.nis is not None:
                 self.surprises.append(info.nis())
             self.seconds += self.clock() - begun
-        return {"error": error, "nees": torch.stack(nees, 1)}
+        return {"error": error, "nees": nees}
 
     def arrays(self) -> dict[str, Tensor]:
         """What was scored: steps [S], crps and pit [R, S, d], energy [R, S, G]; nothing where nothing was.
@@ -129,12 +135,12 @@ class Judge:
             found |= {"nis": torch.stack(nis, 1), "nis_dof": torch.stack(dof, 1)}
         return found
 
-    def _scored(self, t: int, error: Tensor, covariance: Tensor, info: Info) -> Scores:
+    def _scored(self, t: int, error: Tensor, info: Info) -> Scores:
         groups = self.model.groups.values()
         if info.cloud is not None:
             return of_cloud(error, *info.cloud(), groups)
         draws = MonteCarlo(0, torch.zeros(1, dtype=torch.int64, device=error.device), error.dtype, t)  # the same for all runs
-        return of_normal(error, covariance, draws.normal("energy score", _POINTS, error.shape[1]), groups)
+        return of_normal(error, info.covariance(), draws.normal("energy score", _POINTS, error.shape[1]), groups)
 
 
 def of_cloud(error: Tensor, deviation: Tensor, log_w: Tensor, groups: Groups) -> Scores:

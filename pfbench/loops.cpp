@@ -120,6 +120,35 @@ void distinct(int64_t* count, const int64_t* value, const T* log_weight, int64_t
     }
 }
 
+// Covariances of the pairs of each group of components; x [R, N, K] lies as its strides say.
+template <class T>
+void spread(T* out, const T* x, const T* mean, const T* weight, const int64_t* component, const int64_t* stride, int64_t groups,
+            int64_t size, int64_t runs, int64_t particles, int64_t components) {
+    std::vector<T> own(size * particles), weighed(particles);
+    for (int64_t r = 0; r < runs; ++r, weight += particles)
+        for (int64_t g = 0; g < groups; ++g, out += size * size) {
+            for (int64_t a = 0; a < size; ++a) {
+                const int64_t k = component[g * size + a];
+                const T* from = x + r * stride[0] + k * stride[2];
+                const T centre = mean[r * components + k];
+                T* to = own.data() + a * particles;
+                if (stride[1] == 1)  // known to the compiler
+                    for (int64_t i = 0; i < particles; ++i) to[i] = from[i] - centre;
+                else
+                    for (int64_t i = 0; i < particles; ++i) to[i] = from[i * stride[1]] - centre;
+            }
+            for (int64_t a = 0; a < size; ++a) {
+                for (int64_t i = 0; i < particles; ++i) weighed[i] = weight[i] * own[a * particles + i];
+                for (int64_t b = a; b < size; ++b) {
+                    const T* other = own.data() + b * particles;
+                    T sum = 0;
+                    for (int64_t i = 0; i < particles; ++i) sum += weighed[i] * other[i];
+                    out[a * size + b] = out[b * size + a] = sum;
+                }
+            }
+        }
+}
+
 template <class T>
 void moments(T* mean, T* variance, const T* x, const T* weight, int64_t components, int64_t runs, int64_t particles) {
     for (int64_t r = 0; r < runs; ++r)
@@ -146,6 +175,9 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
     (T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t one_phi, int64_t one_gain, int64_t runs, int64_t n, \
      int64_t rows, int64_t states, int64_t noises)
 #define MOMENTS(T) (T* mean, T* variance, const T* x, const T* w, int64_t d, int64_t runs, int64_t n)
+#define SPREAD(T)                                                                                                      \
+    (T* out, const T* x, const T* mean, const T* w, const int64_t* c, const int64_t* stride, int64_t groups, int64_t size, \
+     int64_t runs, int64_t n, int64_t k)
 #define DISTINCT(T) (int64_t* count, const int64_t* value, const T* w, int64_t runs, int64_t slots)
 
 BOTH(systematic, SYSTEMATIC, (a, w, n, u, runs, slots))
@@ -153,4 +185,5 @@ BOTH(gather, GATHER, (out, x, a, d, runs, slots, wanted))
 BOTH(log_normal, LOG_NORMAL, (out, y, mean, scale, constant, stride, runs, n, k))
 BOTH(affine, AFFINE, (out, phi, x, gain, w, one_phi, one_gain, runs, n, rows, states, noises))
 BOTH(distinct, DISTINCT, (count, value, w, runs, slots))
+BOTH(spread, SPREAD, (out, x, mean, w, c, stride, groups, size, runs, n, k))
 BOTH(moments, MOMENTS, (mean, variance, x, w, d, runs, n))

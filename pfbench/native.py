@@ -94,6 +94,15 @@ def moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     return mean, variance
 
 
+def spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tensor:
+    """Covariance of groups of components [G, s] of x [R, N, K], by mean [R, K] and weights [R, N] -> [R, G, s, s]."""
+    (runs, particles, components), (many, size) = x.shape, groups.shape
+    out, strides = x.new_empty(runs, many, size, size), torch.tensor(x.stride())
+    parts = x, mean.contiguous(), w.contiguous(), groups.contiguous(), strides
+    _call("spread", x.dtype, out, *parts, many, size, runs, particles, components)
+    return out
+
+
 @cache
 def keep_memory() -> None:
     """Has the C library keep what is freed, for the next step, where it can be told so.

@@ -22,6 +22,7 @@ from pfbench.filter.belief import Gaussian
 from pfbench.filter.gains import AdaptiveFactor, RatioBound
 from pfbench.filter.gaussian import GaussianFilter, Innovation
 from pfbench.filter.loop import Estimate, run_filter
+from pfbench.filter.principal_axes import principal
 from pfbench.filter.rules import Axis3, Axis5, Jacobian, Points, Product, Radial3, Radial5, Rule, Simplex3, Simplex5
 from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
 from pfbench.model.linear import LinearGaussian
@@ -371,6 +372,19 @@ def test_fading_is_least_squares_with_falling_weights(rule: Rule) -> None:
         assert np.allclose(estimate.trace["covariance"][i, -1].numpy(), np.linalg.inv(information), rtol=1e-11)
 
 
+@pytest.mark.parametrize("through_the_rule", [False, True])
+def test_all_that_was_carried_over_fades_and_the_noise_does_not(through_the_rule: bool) -> None:
+    """P- = S C_f + Q, where C_f of a curved map is more than its linearisation tells."""
+    model, s = Steep(True), 1.3
+    if through_the_rule:
+        model.noise_gain = lambda u: None  # type: ignore[method-assign, assignment, return-value]
+    mean, seen = 0.3 * torch.ones(2, 6, dtype=torch.float64), Record(torch.zeros(2, 1, dtype=torch.float64))
+    belief = Gaussian(mean, 0.2 * torch.eye(6, dtype=torch.float64).expand(2, 6, 6), torch.zeros(2, dtype=torch.float64))
+    plain, faded = (GaussianFilter(MIXED, a).advance(model, belief, seen).prior_root for a in ((), (Fading(s),)))
+    noise = 0.01 * torch.eye(6, dtype=torch.float64)
+    assert torch.allclose(faded @ faded.mT - noise, s * (plain @ plain.mT - noise), rtol=1e-10, atol=1e-12)
+
+
 # the adaptive factor and the bound
 
 
@@ -421,6 +435,25 @@ def test_the_widened_ratio_stays_bounded() -> None:
     assert np.allclose(f, np.where(wide.numpy() * rho > 1.0, np.maximum(1.0, 1.0 / rho), wide.numpy()), rtol=1e-12)
     assert (wide.numpy() > f).any()
     assert (f > 1).any()
+
+
+def test_the_factor_widens_what_is_expected_of_a_curved_sight_as_a_whole() -> None:
+    """P_zz = C_zz / alpha + R, P_xz = C_xz / alpha, P+ = P- / alpha - K P_zz K', in which C_zz holds the curvature."""
+    model, y = Bearing(sd=(0.05, 0.1)), torch.tensor([[0.9, 3.1], [-0.4, 1.2]], dtype=torch.float64)
+    belief = GaussianFilter(MIXED).init(model, 2, MonteCarlo(0, torch.arange(2)))
+    whole = [GaussianFilter(MIXED, (), gains).advance(model, belief, Record(y)) for gains in ((), (AdaptiveFactor(1.1),))]
+    (plain, seen), (wide, f) = (whole[0], whole[0].innovation), (whole[1], whole[1].trace["widening"][:, None, None])
+    assert float(f.min()) > 1.2
+    left = seen.spread - seen.m @ seen.m.mT
+    assert float((left.diagonal(dim1=1, dim2=2) / seen.spread.diagonal(dim1=1, dim2=2)).max()) > 0.01
+    p = f * plain.prior_root @ plain.prior_root.mT
+    cross, total = f * plain.prior_root @ seen.m.mT, f * seen.spread + seen.nominal
+    gain = torch.linalg.solve(total, cross.mT).mT
+    mean = plain.prior + (gain @ seen.r.unsqueeze(-1)).squeeze(-1)
+    assert torch.allclose(wide.mean, mean, rtol=1e-9, atol=1e-11)
+    assert torch.allclose(wide.root @ wide.root.mT, p - gain @ total @ gain.mT, rtol=1e-8, atol=1e-11)
+    expected = torch.distributions.MultivariateNormal(torch.zeros(2).double(), total).log_prob(seen.r)
+    assert torch.allclose(wide.log_like, expected, rtol=1e-9)
 
 
 # what innovations tell of R and Q
@@ -494,13 +527,14 @@ def test_without_free_axes_the_measurement_noise_is_left_alone() -> None:
 # invariance
 
 
+@pytest.mark.parametrize("units", [(1e-3, 3.6), (1e-6, 1e-5)], ids=["km, km/h", "small numbers"])
 @pytest.mark.parametrize("name", ["cofm", "fading, alpha", "trace", "matrix"])
-def test_units_and_order_of_measurements_change_nothing(name: str) -> None:
+def test_units_and_order_of_measurements_change_nothing(name: str, units: tuple[float, float]) -> None:
     order = np.random.default_rng(3).permutation(11)
     y = simulate(Tight(), 3, 40, range(15, 25), r=9.0, q=50.0, missing=0.1)
-    scale = torch.tensor([1e-3] * 5 + [3.6] * 6, dtype=torch.float64)
+    scale = torch.tensor([units[0]] * 5 + [units[1]] * 6, dtype=torch.float64)
     one = run(METHODS[name], Tight(), y)
-    other = run(METHODS[name], Tight(order, (1e-3, 3.6)), (y * scale)[..., order])
+    other = run(METHODS[name], Tight(order, units), (y * scale)[..., order])
     assert torch.allclose(one.mean, other.mean, rtol=1e-6, atol=1e-8)
     assert torch.allclose(one.variance, other.variance, rtol=1e-6)
 
@@ -521,6 +555,42 @@ def test_a_component_that_is_never_seen_is_as_if_it_did_not_exist(method: Gaussi
     whole, part = run(method, Tight(), y), run(method, Tight(keep), y[..., keep])
     assert torch.allclose(whole.mean, part.mean, rtol=1e-7, atol=1e-9)
     assert torch.allclose(whole.log_evidence, part.log_evidence, rtol=1e-8)
+
+
+class Correlated(Tight):
+    """The same, sensors of a kind sharing a part of their noise."""
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        alike = (self.r.unsqueeze(-1) == self.r).to(self.r)
+        covariance = (0.6 * alike + 0.4 * torch.eye(len(self.r)).to(self.r)) * self.r.unsqueeze(-1) * self.r
+        return torch.distributions.MultivariateNormal(x @ self.h.mT, covariance.expand(*x.shape[:-1], -1, -1))
+
+
+@every_method
+def test_nor_is_one_whose_noise_the_others_share(method: GaussianFilter) -> None:
+    keep = [1, 2, 4, 6, 7, 9, 10]
+    y = simulate(Tight(), 3, 30, range(10, 20), r=9.0, q=50.0)
+    y[..., [0, 3, 5, 8]] = torch.nan
+    whole, part = run(method, Correlated(), y), run(method, Correlated(keep), y[..., keep])
+    assert torch.allclose(whole.mean, part.mean, rtol=1e-7, atol=1e-9)
+    assert torch.allclose(whole.log_evidence, part.log_evidence, rtol=1e-8)
+
+
+def test_axes_are_in_units_of_the_model_s_noise_whatever_is_in_use() -> None:
+    y, model = simulate(Tight(), 4, 1, missing=0.2)[:, 0], Tight()
+    seen = METHODS["plain"].advance(model, METHODS["plain"].init(model, 4, MonteCarlo(0, torch.arange(4))), Record(y)).innovation
+    for one, other in zip(principal(seen), principal(seen.with_noise(9.0 * seen.nominal)), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("kind", [Tight, Hidden])
+def test_fading_and_doubt_of_the_noise_come_in_any_order(kind: type[Tight]) -> None:
+    """P- = S C_f + q Q either way: the one leaves alone what the other scales."""
+    y = simulate(Tight(), 3, 30, range(10, 20), q=400.0)
+    for doubt in (ConstrainedNoise(), MatrixNoise(0.9)):
+        one, other = (run(GaussianFilter(MIXED, order), kind(), y) for order in ((Fading(1.2), doubt), (doubt, Fading(1.2))))
+        assert torch.allclose(one.mean, other.mean, rtol=1e-9, atol=1e-10)
+        assert torch.allclose(one.variance, other.variance, rtol=1e-9)
 
 
 @every_method

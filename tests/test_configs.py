@@ -15,9 +15,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 from recorded_data import DATA
 
-from pfbench import cli, job
+from pfbench import cli, job, store
 from pfbench.draws import MonteCarlo
-from pfbench.filter.loop import run_filter
+from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.loop import Estimate, run_filter
 from pfbench.judge import Judge
 from pfbench.noise.regimes import Nominal
 from pfbench.record import Channels, Episode, Record, map_inputs
@@ -117,7 +118,8 @@ def world(scenario: str) -> Episode:
     return WORLDS[scenario]
 
 
-def five_steps(scenario: str, *words: str) -> None:
+def five_steps(scenario: str, *words: str) -> Estimate:
+    """They run, and what the judge calls an error is what lies between estimate and truth."""
     cfg = composed(f"scenario={scenario}", *words)
     model, method, episode = job.build(cfg.model), job.build(cfg["filter"]), world(scenario)
     truth = model.assemble(episode.truth)
@@ -134,6 +136,9 @@ def five_steps(scenario: str, *words: str) -> None:
     assert estimate.trace["nees"].shape == (2, STEPS, len(model.groups))
     seen = truth.isfinite().all((0, 1))
     assert seen.any()
+    apart = torch.stack([model.error(estimate.mean[:, t], truth[:, t]) for t in range(STEPS)], 1)
+    torch.testing.assert_close(estimate.trace["error"], apart, rtol=0, atol=0, equal_nan=True)
+    return estimate
 
 
 RECORDED = [file.stem for file in sorted((CONF / "scenario").glob("*.yaml")) if "${data.root}" in file.read_text()]
@@ -156,7 +161,14 @@ def test_every_scenario_runs_with_the_default_filter(scenario: str) -> None:
 @pytest.mark.parametrize("method", GROUPS["filter"])
 @pytest.mark.parametrize("scenario", ["linear_walk", "t004"])
 def test_every_filter_runs(scenario: str, method: str) -> None:
-    five_steps(scenario, f"filter={method}", *(["model=ins_gnss_inflated"] if scenario == "t004" else []))
+    """Those of the Gaussian ones that leave noise and gain alone are the Kalman filter on a linear model, whatever their rule."""
+    found = five_steps(scenario, f"filter={method}", *(["model=ins_gnss_inflated"] if scenario == "t004" else []))
+    built = job.build(composed(f"scenario={scenario}", f"filter={method}")["filter"])
+    if scenario == "linear_walk" and isinstance(built, GaussianFilter) and built.plain:
+        kalman = five_steps(scenario, "filter=ekf")
+        for ours, theirs in ((found.mean, kalman.mean), (found.variance, kalman.variance)):
+            torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(found.log_evidence, kalman.log_evidence, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("method", GROUPS["filter"])
@@ -228,14 +240,17 @@ def test_every_choice_of_every_experiment_composes(experiment: str) -> None:
         number = max(map(len, swept))
         cells = [[values[k % len(values)] for values in swept] for k in range(number)]  # every value once: not every pair
         assert math.prod(map(len, swept)) > 1
+        names = set()
         for cell in cells:
             cfg = compose("config", [f"+experiment={experiment}", *cell, "data.root=somewhere"], return_hydra_config=True)
             HydraConfig.instance().set_config(cfg)  # an experiment may look up what was chosen
             with open_dict(cfg):
                 del cfg["hydra"]
-            OmegaConf.to_container(cfg, resolve=True)
+            config: Any = OmegaConf.to_container(cfg, resolve=True)
+            names.add(store.key(config, job.PLACES))
             job.build(cfg["filter"])
             job.build(cfg.model)
+        assert len(names) == number  # a choice that reached no job would make two cells one
 
 
 def test_the_scenario_brings_its_model_and_another_can_be_asked_for() -> None:

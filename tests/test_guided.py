@@ -495,6 +495,7 @@ def test_on_a_linear_model_the_number_comes_to_rest_at_its_least() -> None:
     own = gaussian(COFM, model, y, runs=5)
     off = (estimate.mean - own.mean).square().mean((0, 1)) / own.variance.mean((0, 1))
     assert (off < 3.0 / 100).all()  # sigma^2 / N, and a factor for its scatter over 60 values
+    torch.testing.assert_close(estimate.log_evidence, own.log_evidence, rtol=1e-9, atol=1e-9)  # however many particles
 
 
 def test_matching_needs_more_particles_than_states() -> None:
@@ -509,7 +510,7 @@ def test_bad_arguments_are_named(options: dict[str, Any]) -> None:
 
 
 def test_moments_of_empty_slots_are_nothing() -> None:
-    """Slots without a particle have no part in the matched draws, nor in the estimate."""
+    """Slots without a particle have no part in the matched draws, nor in the estimate, nor in the evidence."""
     stage = Guided(EKF, matched=True)
     method = ParticleFilter(50, ALWAYS, EssStep(0, 0.5, Bounds(10, 50, 20)), proposal=stage)
     cloud, draws = cloud_of(method, WALK, 2)
@@ -523,3 +524,4 @@ def test_moments_of_empty_slots_are_nothing() -> None:
     torch.testing.assert_close(mean, own.mean, rtol=0, atol=1e-10)
     torch.testing.assert_close(info.covariance(), own.covariance, rtol=0, atol=1e-10)
     torch.testing.assert_close(covariance, own.covariance, rtol=0, atol=1e-10)
+    torch.testing.assert_close(cloud.log_z, own.log_z, rtol=0, atol=1e-10)

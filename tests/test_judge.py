@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,13 +11,15 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from pfbench import fusion
+from pfbench.chart import Chart, Euclidean, Quaternion
 from pfbench.draws import MonteCarlo
-from pfbench.filter.belief import Info
+from pfbench.filter.belief import Cloud, Info
 from pfbench.filter.ensemble import EnsembleKalmanFilter
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.guided_noise import GuidedNoise
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.particle import ParticleFilter, summarise
 from pfbench.filter.rules import Jacobian
 from pfbench.judge import Judge, Tally, of_cloud, of_normal
 from pfbench.model.linear import linear_walk
@@ -98,7 +101,7 @@ def test_an_honest_filter_is_calibrated_and_a_confident_one_is_not(method: Gauss
     def confident(t: int, info: Info) -> dict[str, Tensor]:
         d, log_w = info.cloud() if info.cloud else (None, None)
         cloud = None if d is None else (lambda: (0.6 * d, log_w))
-        return proud(t, info._replace(covariance=lambda: 0.36 * info.covariance(), cloud=cloud))
+        return proud(t, info._replace(covariance=lambda: 0.36 * info.covariance(), cloud=cloud, some=None))
 
     honest, proud = Judge(MODEL, truth, 2), Judge(MODEL, truth, 2)
     for judge, watch in ((honest, honest), (proud, confident)):
@@ -112,6 +115,25 @@ def test_an_honest_filter_is_calibrated_and_a_confident_one_is_not(method: Gauss
     assert p[1] < 1e-4
     assert (honest.arrays()["crps"] - proud.arrays()["crps"]).mean() < 0
     assert honest.seconds > 0
+
+
+@pytest.mark.parametrize("fused", [False, True])
+@pytest.mark.parametrize("chart", [Chart((Euclidean(7),)), Chart((Quaternion(), Euclidean(4)))], ids=["flat", "quaternion"])
+def test_a_group_of_a_covariance_is_cut_from_the_whole(chart: Chart, fused: bool) -> None:
+    """Of clouds that lie in memory component by component and particle by particle."""
+    draws = MonteCarlo(5, torch.arange(3))
+    origin = torch.eye(chart.size, dtype=torch.float64)[:1].expand(3, 1, -1)
+    x, log_w = chart.add(origin, draws.normal("x", 40, chart.dimension)), draws.normal("w", 40, 1)[..., 0]
+    model: Any = SimpleNamespace(chart=chart)
+    groups = torch.tensor([[0, 1, 2], [3, 1, 5], [4, 6, 2]])
+    for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
+        with fusion.fused(fused):
+            info = summarise(model, Cloud(laid, log_w, torch.zeros(3, dtype=x.dtype)), {})
+            found = info.covariance_of(groups)
+        whole = info.covariance()
+        for g, parts in enumerate(groups):
+            torch.testing.assert_close(found[:, g], whole[:, parts][:, :, parts], rtol=1e-9, atol=0)
+        assert (found[:, 0].diagonal(dim1=-2, dim2=-1) > 0).all()
 
 
 @pytest.mark.parametrize("name", ["ekf", "sir", "enkf", "guided"])

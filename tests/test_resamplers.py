@@ -288,6 +288,9 @@ def test_threshold_is_a_ratio_of_the_effective_sample_size() -> None:
         assert bool(refresh(Resample(Systematic(), threshold), before)[1][0]) is expected
     assert bool(refresh(Resample(Systematic(), 1.0), before)[1].all())  # equal weights too
     assert not bool(refresh(Resample(Systematic(), 0.0), before)[1].any())
+    smaller, _ = refresh(Resample(Systematic(), 1.0), before, n=20)  # 20 equal ones in 50 slots: of the number that is wanted
+    for wanted, expected in ((20, False), (22, False), (23, True), (50, True)):
+        assert refresh(Resample(Systematic(), 0.9), smaller, n=wanted)[1].tolist() == [expected] * 6
 
 
 @resizing

@@ -15,7 +15,7 @@ from torch import Tensor
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Cloud, ess
 from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.preferences import Additive, Entropy, Flattened, Form, Mix, Temper
+from pfbench.filter.preferences import Additive, Entropy, Flattened, Form, Mix, Preference, Temper, Weights
 from pfbench.filter.resamplers import Multinomial, Resample, Scheme, Stratified, Systematic
 from pfbench.filter.sizes import Bounds, EssStep, EssTarget, Size
 from pfbench.record import Record
@@ -160,10 +160,12 @@ def test_a_changing_number_leaves_everything_unbiased(size: Size, threshold: flo
     check_unbiased(method, WALK, WALK_Y, kalman(WALK, WALK_Y))
 
 
-def test_the_number_changes_from_step_to_step_without_a_nan() -> None:
-    """What is decided at t - 1 holds at t; slots beyond it are empty; a run does not follow its neighbours."""
+@pytest.mark.parametrize("preference", [Weights(), Entropy(Temper(1.0))], ids=["weights", "entropy"])
+def test_the_number_changes_from_step_to_step_without_a_nan(preference: Preference) -> None:
+    """What is decided at t - 1 holds at t, by the weights and not by what a resampler prefers; slots beyond it are empty; a run
+    does not follow its neighbours."""
     size = EssStep(7, 0.6, FEW)
-    method = ParticleFilter(40, Resample(Systematic(), 1.0), size)
+    method = ParticleFilter(40, Resample(Systematic(), 1.0), size, preference)
     draws = MonteCarlo(1, torch.arange(30))
     belief, seen = method.init(WALK, 30, draws.at(0)), set()
     assert (belief.log_w > -torch.inf).sum(1).unique().tolist() == [25]

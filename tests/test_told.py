@@ -410,7 +410,7 @@ CANNOT = {"gauss_markov", "replay", "nlos_persistent"}
 
 
 def cell(scenario: str, noise: str, *words: str) -> None:
-    """The cell runs, told and untold; or it is refused by name."""
+    """The cell runs, told and untold, and what is told matters; or it is refused by name."""
     cfg = composed(f"scenario={scenario}", f"noise={noise}", "particles=30", *words)
     if scenario == "t004":
         cfg.scenario.path.segments = cfg.scenario.path.segments[:1]
@@ -428,10 +428,12 @@ def cell(scenario: str, noise: str, *words: str) -> None:
     else:
         models.append(witness.tell(model, episode.time))
     for method in (KALMAN, job.build(cfg["filter"])):
-        for each in models:
-            found = estimate(method, each, episode.record)
-            assert torch.isfinite(found.mean).all()
-            assert not found.lost.any()
+        found = [estimate(method, each, episode.record) for each in models]
+        for each in found:
+            assert torch.isfinite(each.mean).all()
+            assert not each.lost.any()
+    if len(found) > 1:  # particles, weighed by the law that was told: another one wherever the regime's is not the model's own
+        assert torch.equal(found[0].mean, found[1].mean) == (noise in ("nominal", "outage"))
 
 
 @pytest.mark.parametrize("noise", PRESETS)

@@ -68,6 +68,8 @@ class Info(NamedTuple):
             filter whose law is the normal one.
         nis: gives the normalised innovation squared [R] to whoever asks, that of what was seen under the mean and covariance that
             the filter predicted for it, and how many components were seen [R]. None from a filter that does not tell.
+        some: gives the covariance of groups of components [R, G, s, s], the groups being [G, s] indices, where that is cheaper
+            than the whole.
     """
 
     mean: Tensor
@@ -76,6 +78,13 @@ class Info(NamedTuple):
     trace: dict[str, Tensor]
     cloud: Callable[[], tuple[Tensor, Tensor]] | None = None
     nis: Callable[[], tuple[Tensor, Tensor]] | None = None
+    some: Callable[[Tensor], Tensor] | None = None
+
+    def covariance_of(self, groups: Tensor) -> Tensor:
+        """Of groups of components, indices [G, s], in the chart [R, G, s, s]."""
+        if self.some is not None:
+            return self.some(groups)
+        return self.covariance()[:, groups.unsqueeze(-1), groups.unsqueeze(-2)]
 
 
 class Filter(Protocol):

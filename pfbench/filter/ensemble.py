@@ -140,6 +140,7 @@ class EnsembleKalmanFilter:
         return cloud, info._replace(
             variance=wider * info.variance,
             covariance=lambda: wider * info.covariance(),
+            some=lambda groups: wider * info.covariance_of(groups),
             nis=lambda: ((along.square() / (1.0 + forecast.values)).sum(-1), (~torch.isnan(seen.y)).sum(1)),
         )
 

@@ -45,8 +45,8 @@ class Gaussian:
 
     def __call__(self, flock: Flock, live: Tensor, phase: float, draws: Draws, purpose: str) -> Tensor:
         n, k = flock.q.shape[1:]
-        own, common = draws.normal(purpose, n, 2 * k).abs().unflatten(-1, (2, k)).unbind(-2)
-        return own * (flock.best - flock.q) + common * (flock.leader() - flock.q)
+        own, common = draws.normal(purpose, n, 2 * k).unflatten(-1, (2, k)).unbind(-2)
+        return _drawn(flock.q, flock.best, flock.leader(), own, common)
 
 
 @dataclass(frozen=True)
@@ -85,11 +85,26 @@ class Inertia:
         n, k = flock.q.shape[1:]
         pulls = 4 if self.escape else 2
         r = draws.uniform(purpose, n, pulls * k).to(flock.q.dtype).unflatten(-1, (pulls, k)).unbind(-2)
-        v = self.inertia * flock.v + self.own * r[0] * (flock.best - flock.q) + self.common * r[1] * (flock.leader() - flock.q)
-        if self.escape:
-            away = r[2] * (flock.worst - flock.q) + r[3] * (flock.last(live) - flock.q)
-            v = v - self.escape_factor(phase) * away
-        return v
+        by = flock.q.new_tensor([self.inertia, self.own, self.common, self.escape_factor(phase)])
+        v = _pulled(flock.q, flock.v, flock.best, flock.leader(), r[0], r[1], by)
+        return _pushed(flock.q, v, flock.worst, flock.last(live), r[2], r[3], by) if self.escape else v
+
+
+def _drawn(q: Tensor, best: Tensor, leader: Tensor, own: Tensor, common: Tensor) -> Tensor:
+    return own.abs() * (best - q) + common.abs() * (leader - q)
+
+
+def _pulled(q: Tensor, v: Tensor, best: Tensor, leader: Tensor, own: Tensor, common: Tensor, by: Tensor) -> Tensor:
+    return by[0] * v + by[1] * own * (best - q) + by[2] * common * (leader - q)
+
+
+def _pushed(q: Tensor, v: Tensor, worst: Tensor, last: Tensor, own: Tensor, common: Tensor, by: Tensor) -> Tensor:
+    return v - by[3] * (own * (worst - q) + common * (last - q))
+
+
+def laid(a: Tensor, like: Tensor) -> Tensor:
+    """a in memory as `like` of the same shape is: loops over both are several times as fast."""
+    return torch.empty_like(like, dtype=a.dtype).copy_(a)
 
 
 def pick(q: Tensor, i: Tensor) -> Tensor:

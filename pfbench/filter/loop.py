@@ -130,7 +130,10 @@ def _joined(infos: list[Info]) -> Info:
     def covariance() -> Tensor:
         return torch.cat([info.covariance() for info in infos])
 
-    return Info(mean, variance, covariance, trace, cloud if clouds else None, nis if surprises else None)
+    def some(groups: Tensor) -> Tensor:
+        return torch.cat([info.covariance_of(groups) for info in infos])
+
+    return Info(mean, variance, covariance, trace, cloud if clouds else None, nis if surprises else None, some)
 
 
 def fed_back(

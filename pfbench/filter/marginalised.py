@@ -244,7 +244,7 @@ def _with_conditional(info: Info, cloud: Cloud, split: Split) -> Info:
         place = torch.eye(info.variance.shape[-1], dtype=p.dtype, device=p.device)[split.linear]
         return info.covariance() + place.mT @ p @ place
 
-    return info._replace(variance=variance, covariance=covariance)
+    return info._replace(variance=variance, covariance=covariance, some=None)
 
 
 def _check_normal(model: StateSpaceModel, what: str, law: Distribution) -> None:

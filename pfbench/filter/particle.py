@@ -223,7 +223,13 @@ def described(model: StateSpaceModel, cloud: Cloud, mean: Tensor, variance: Tens
         d, log_w = deviations()
         return (weights(log_w).unsqueeze(-1) * d).mT @ d
 
-    return Info(mean, variance, covariance, trace, deviations)
+    def some(groups: Tensor) -> Tensor:
+        w = weights(cloud.log_w)
+        if model.chart.flat:
+            return _spread(cloud.x, mean, w, groups)
+        return _spread(deviations()[0], torch.zeros_like(variance), w, groups)
+
+    return Info(mean, variance, covariance, trace, deviations, some=some)
 
 
 def _separate_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
@@ -240,4 +246,11 @@ def _fused_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     return mean.T, (w * d * d).sum(-1).T
 
 
+def _separate_spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tensor:
+    """Covariance of groups of components [G, s] of plain numbers [R, N, k], by mean [R, k] and weights [R, N] -> [R, G, s, s]."""
+    own = x.permute(0, 2, 1)[:, groups] - mean[:, groups].unsqueeze(-1)  # [R, G, s, N]
+    return (w[:, None, None] * own) @ own.mT
+
+
+_spread = fusible(_separate_spread, by_hand=native.spread, whole=False)
 _flat_moments = fusible(_fused_moments, eager=_separate_moments, by_hand=native.moments, whole=False)

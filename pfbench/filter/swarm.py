@@ -19,7 +19,7 @@ from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, weights
 from pfbench.filter.chaos import Perturbation, Prior, Start, logistic, seeds, settled
 from pfbench.filter.coordinates import Coordinates, Fitness, Frame, Observed, Posterior
-from pfbench.filter.flock import Flock, Inertia, Velocity, pick, where
+from pfbench.filter.flock import Flock, Inertia, Velocity, laid, pick, where
 from pfbench.filter.particle import bury
 from pfbench.filter.proposals import Proposed, draw_noise
 from pfbench.filter.swarm_weights import Mixture, Weights
@@ -147,52 +147,43 @@ class Swarm:
             value = model.log_likelihood(seen.y, frame.place(q), seen.u) + penalty(q)
             return torch.where(live & ~torch.isnan(value), value, -torch.inf)
 
-        flock = self._gathered(frame, fitness(frame.q), memory)
+        flock = begun = self._gathered(frame, fitness(frame.q), memory)
         spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
         scale = memory["swarm.scale"][..., frame.components] if self.limits.prior else spread
-        spare = seeds(draws.uniform("swarm.spare", *frame.q.shape[1:])) if self.perturbation else None
-        active = ~torch.isnan(seen.y).all(1)
+        spare = laid(seeds(draws.uniform("swarm.spare", *frame.q.shape[1:])), frame.q) if self.perturbation else None
+        active = sighted = ~torch.isnan(seen.y).all(1)
         flown = torch.zeros_like(active, dtype=torch.long)
         for i in range(1, self.iterations + 1):
             if not active.is_cuda and not bool(active.any()):
                 break
             v = self.velocity(flock, live, i / self.iterations, draws, f"swarm.velocity.{i}")
             flown = flown + active
-            flock = where(active, self._moved(flock, v, fitness, scale, spread, spare), flock)
+            moved = self._moved(flock, v, fitness, scale, spread, spare)
+            flock = where(active, moved, flock) if self.stop else moved
             if self.stop:
                 best = flock.best_fitness.argmax(1)
                 active = active & ~self.stop(model, pick(frame.place(flock.best), best), seen)
-        return flock, flown
+        return where(sighted, flock, begun), flown
 
     def _moved(
         self, flock: Flock, v: Tensor, fitness: Callable[[Tensor], Tensor], scale: Tensor, spread: Tensor, spare: Tensor | None
     ) -> Flock:
         """One iteration: x + v or, if it is fitter, x + v + Dx; and what is to be remembered of it."""
         fastest, chaos = 6.0 * self.limits.speed * scale, flock.chaos
-        v = torch.minimum(torch.maximum(v, -fastest), fastest)
-        q = self._boxed(flock.q + v, spread)
+        edge = torch.full_like(spread, torch.inf) if self.limits.box is None else self.limits.box * spread
+        v, q = _moves(flock.q, v, fastest, edge)
         value = fitness(q)
         if self.perturbation and spare is not None:
             chaos = logistic(chaos, spare)
-            other = self._boxed(flock.q + v + self.perturbation(chaos, scale), spread)
+            other = _beside(flock.q, v, self.perturbation(chaos, scale), edge)
             there = fitness(other)
-            q = torch.where((there > value).unsqueeze(-1), other, q)
-            value = torch.maximum(there, value)
-        better, worse = value > flock.best_fitness, value < flock.worst_fitness
-        best, worst = (torch.where(a.unsqueeze(-1), q, b) for a, b in ((better, flock.best), (worse, flock.worst)))
-        best_fitness, worst_fitness = torch.maximum(value, flock.best_fitness), torch.minimum(value, flock.worst_fitness)
-        return Flock(q, v, value, best, best_fitness, worst, worst_fitness, chaos)
-
-    def _boxed(self, q: Tensor, spread: Tensor) -> Tensor:
-        if self.limits.box is None:
-            return q
-        edge = self.limits.box * spread
-        return torch.minimum(torch.maximum(q, -edge), edge)
+            q, value = _fitter(q, value, other, there)
+        return Flock(q, v, value, *_remembered(q, value, *flock[3:7]), chaos)
 
     def _gathered(self, frame: Frame, fitness: Tensor, memory: dict[str, Tensor]) -> Flock:
         """The swarm before its first iteration: what the step before remembered is forgotten, but for the chaotic values."""
         q = frame.q
-        chaos = memory["swarm.chaos"][:, 0].index_select(-1, frame.components) if self.perturbation else q.new_zeros(len(q), 1, 1)
+        chaos = laid(memory["swarm.chaos"][:, 0, :, frame.components], q) if self.perturbation else q.new_zeros(len(q), 1, 1)
         return Flock(q, torch.zeros_like(q), fitness, q, fitness, q, fitness, chaos)
 
     def _begun(self, model: StateSpaceModel, cloud: Cloud, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
@@ -207,6 +198,31 @@ class Swarm:
         if self.perturbation:
             memory = memory | {"swarm.chaos": z.unsqueeze(1)}
         return self.start(model, cloud, z), memory
+
+
+def _moves(q: Tensor, v: Tensor, fastest: Tensor, edge: Tensor) -> tuple[Tensor, Tensor]:
+    """Velocities no greater than `fastest`, and where they lead, within `edge`; those [R, 1, k]."""
+    v = torch.clamp(v, -fastest, fastest)
+    return v, torch.clamp(q + v, -edge, edge)
+
+
+def _beside(q: Tensor, v: Tensor, by: Tensor, edge: Tensor) -> Tensor:
+    """Where the velocities lead, perturbed."""
+    return torch.clamp(q + v + by, -edge, edge)
+
+
+def _fitter(q: Tensor, value: Tensor, other: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+    """Of two places of each particle the fitter one, and its fitness."""
+    return torch.where((there > value).unsqueeze(-1), other, q), torch.maximum(there, value)
+
+
+def _remembered(
+    q: Tensor, value: Tensor, best: Tensor, best_fitness: Tensor, worst: Tensor, worst_fitness: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The best and worst places so far and their fitness."""
+    best = torch.where((value > best_fitness).unsqueeze(-1), q, best)
+    worst = torch.where((value < worst_fitness).unsqueeze(-1), q, worst)
+    return best, torch.maximum(value, best_fitness), worst, torch.minimum(value, worst_fitness)
 
 
 @cache
