@@ -143,16 +143,25 @@ def _drawn(
 ) -> Tensor:
     out = torch.empty(len(component), len(runs), 4 * len(particle), dtype=dtype)
     axes = [part for axis in (runs, component, particle) for part in (axis.contiguous(), len(axis))]
-    getattr(_library("normals"), name)(*_plain(out, *axes, int(step), *key.tolist()))
+    _run(_function("normals", name, None), out, *axes, int(step), *key.tolist())
     return out
 
 
 def _call(name: str, dtype: torch.dtype, *arguments: Tensor | int) -> None:
-    getattr(_library("loops"), f"{name}_{str(dtype).removeprefix('torch.')}")(*_plain(*arguments))
+    _run(_function("loops", name, dtype), *arguments)
 
 
-def _plain(*arguments: Tensor | int) -> list[Any]:
-    return [ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_int64(a) for a in arguments]
+def _run(function: Any, *arguments: Tensor | int) -> None:
+    if function.argtypes is None:  # told once: converting each number anew costs as much as a small cloud's loop
+        function.argtypes = [ctypes.c_void_p if isinstance(a, Tensor) else ctypes.c_int64 for a in arguments]
+    function(*[a.data_ptr() if isinstance(a, Tensor) else a for a in arguments])
+
+
+@cache
+def _function(source: str, name: str, dtype: torch.dtype | None) -> Any:
+    found = getattr(_library(source), name if dtype is None else f"{name}_{str(dtype).removeprefix('torch.')}")
+    found.restype = None
+    return found
 
 
 @cache

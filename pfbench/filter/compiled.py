@@ -8,6 +8,7 @@ What the compiler made is kept on disk by torch, for later jobs that are alike.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -89,7 +90,7 @@ class Compiled:
             return self.method.step(model, belief, seen, draws)
         run, asked = known
         out, told = run(tensors, draws)
-        if not told.mean.is_cuda and not bool(torch.isfinite(told.mean.sum())):
+        if not told.mean.is_cuda and not math.isfinite(float(told.mean.sum())):
             return self.method.step(model, belief, seen, draws)
         if self.counter:
             self.counter.count += asked

@@ -77,7 +77,7 @@ def run_filter(
     blocks = [slice(first, first + size) for first in range(0, runs, size)]
     parts = [(record.of(block), draws.of(block)) for block in blocks] if len(blocks) > 1 else [(record, draws)]
     beliefs: list[Any] = [method.init(model, len(part.y), own.at(0), part.start, part.spread) for part, own in parts]
-    means, variances, traces = [], [], []
+    means, variances, evidences, traces = [], [], [], []
     for t in range(record.y.shape[1]):
         stage = AtRest(model) if t == 0 and model.observes_initial else model
         infos = []
@@ -87,15 +87,17 @@ def run_filter(
             if closed is not None:
                 beliefs[k], info = fed_back(model, closed, beliefs[k], info)
             infos.append(info)
-        info, log_z = _joined(infos), torch.cat([belief.log_z for belief in beliefs])
-        alive = torch.isfinite(log_z).unsqueeze(-1)
-        means.append(torch.where(alive, info.mean, torch.nan))
-        variances.append(torch.where(alive, info.variance, torch.nan))
+        info = _joined(infos)
+        means.append(info.mean)
+        variances.append(info.variance)
+        evidences.append(torch.cat([belief.log_z for belief in beliefs]))
         traces.append(info.trace | (watch(t, info) if watch else {}))
         if tick:
             tick()
     trace = {name: torch.stack([step[name] for step in traces], 1) for name in traces[0]}
-    return Estimate(torch.stack(means, 1), torch.stack(variances, 1), log_z, trace)
+    alive = torch.isfinite(torch.stack(evidences, 1)).unsqueeze(-1)
+    mean, variance = (torch.where(alive, torch.stack(parts, 1), torch.nan) for parts in (means, variances))
+    return Estimate(mean, variance, evidences[-1], trace)
 
 
 def runs_at_once(runs: int, particles: int, dimension: int) -> int:
