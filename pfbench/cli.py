@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 import sys
@@ -131,6 +132,8 @@ def _report(words: list[str]) -> None:
     if "scenario" in named and not named & {"study", "experiment"}:
         return _datasheet(words)
     cfg = _compose(words)
+    if "experiment" not in named and (experiments_dir() / f"{cfg['study']}.yaml").exists():
+        cfg = _compose([f"+experiment={cfg['study']}", *words])  # a study is shown as its experiment says
     if cfg["study"] == "datasheets":
         raise ValueError("study=datasheets: there lie the datasheets of scenes; give scenario=NAME to see one, or another study")
     print(f"{'claims' if cfg['study'] == 'claims' else 'report'}: {_page(cfg).resolve()}")
@@ -142,18 +145,34 @@ def _page(cfg: dict[str, Any]) -> Path:
     from pfbench.report.page import Options, write
 
     chosen: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in cfg["report"].items()}
-    options = Options(**chosen)
+    options = Options(**chosen, planned=_planned(cfg["study"]))
     if cfg["study"] != "claims":
         return write(cfg["study"], cfg["results"], cfg["reports"], options)
     places = cfg["results"], cfg["reports"], options.alpha, conf_dir(), experiments_dir()
     return ledger.write(*places, mixed=options.mixed, formats=options.formats)
 
 
+def _planned(study: str) -> int | None:
+    """How many jobs the sweep of the experiment of that name has; None where there is no such experiment, or no sweep in it."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from omegaconf import OmegaConf
+
+    path = experiments_dir() / f"{study}.yaml"
+    if not path.exists():
+        return None
+    params = OmegaConf.select(OmegaConf.load(path), "hydra.sweeper.params")
+    if params is None:
+        return None
+    swept = OverridesParser.create().parse_overrides([f"{name}={value}" for name, value in params.items()])
+    return math.prod(len(list(one.sweep_string_iterator())) if one.is_sweep_override() else 1 for one in swept)
+
+
 def _reports(words: list[str]) -> None:
     """Every study with results, as its experiment says, and the claims; what is published without results stays as it is."""
     cfg = _compose(words)
     there = {path.parent.name for path in Path(cfg["results"]).glob("*/*.npz")} - {"datasheets"}
-    published = {path.parent.name for path in Path(cfg["reports"]).glob("*/report.md")} - {"datasheets", "claims"}
+    pages = {path.parent.name for name in ("report.md", "index.html") for path in Path(cfg["reports"]).glob(f"*/{name}")}
+    published = pages - {"datasheets", "claims"}
     missing, failed = sorted(published - there), []
     for study in sorted(there):
         chosen = f"+experiment={study}" if (experiments_dir() / f"{study}.yaml").exists() else f"study={study}"
@@ -167,7 +186,10 @@ def _reports(words: list[str]) -> None:
             f"{study}: its report is published and stays as it is, for {cfg['results']} has no results of it; make them with: "
             f"pfbench run -m +experiment={study}"
         )
-    if lacking := [study for study in (*missing, *failed) if study.startswith("paper_")]:
+    from pfbench.report import claims
+
+    asked = {study for claim in claims.load() for study in claim.studies}
+    if lacking := sorted((asked if "claims" in pages else asked & published) - there | asked & set(failed)):
         print(f"claims: the ledger stays as it is, for it needs the results of {', '.join(lacking)} too")
     else:
         print(f"claims: {_page(_compose(['study=claims', *words])).resolve()}")

@@ -230,6 +230,8 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
     engine = "compiled" if step and step.at_work else "loops" if fuse else "eager"
     cost = {"engine": engine, "memory": _taken(cfg.device, held), "likelihoods_per_step": likelihoods}
     meta = describe(cfg, model, method, steps, seconds, episode.notes) | cost
+    if (number := estimate.trace.get("particles")) is not None:
+        meta["particles_used"] = {"least": int(number.min()), "mean": float(number.mean()), "most": int(number.max())}
     return {**meta, "bound": said, "trained": trained}, {**_arrays(episode, estimate, judge), **_shared(episode, least)}
 
 

@@ -171,7 +171,8 @@ def test_the_number_changes_from_step_to_step_without_a_nan(preference: Preferen
     assert (belief.log_w > -torch.inf).sum(1).unique().tolist() == [25]
     for t in range(1, 15):
         wanted = size(belief).flatten()
-        belief, _ = method.step(WALK, belief, Record(torch.full((30, 1), 0.5 * t, dtype=torch.float64)), draws.at(t))
+        belief, info = method.step(WALK, belief, Record(torch.full((30, 1), 0.5 * t, dtype=torch.float64)), draws.at(t))
+        assert torch.equal(info.trace["particles"].double(), wanted)
         assert not torch.isnan(belief.log_w).any()
         assert torch.equal((belief.log_w > -torch.inf).sum(1).double(), wanted)
         assert ((belief.log_w > -torch.inf) == (torch.arange(40) < wanted[:, None])).all()

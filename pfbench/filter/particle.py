@@ -141,6 +141,8 @@ class ParticleFilter:
         expected = cloud.log_w + log_ratio
         # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
         log_w, total, trace["ess"] = _normalise(log_w)
+        if not isinstance(self.size, Fixed):
+            trace["particles"] = (cloud.log_w > -torch.inf).sum(1).to(log_w)
         parents, keeper = cloud, self.keeper
         cloud = cloud._replace(x=x, log_w=log_w, log_z=belief.log_z + total, memory=memory, copy_of=None)
         if keeper is not None:

@@ -102,7 +102,21 @@ def _numbers(metas: Sequence[Mapping[str, Any]]) -> str:
     for number, _ in sorted(others):
         labels = sorted({label for own, label in by_label if own == number and label})
         told.append(f"{number} of {', '.join(labels)}" if 0 < len(labels) <= _NAMED else str(number))
-    return f"N = {', '.join([str(most), *told])}"
+    return f"N = {', '.join([str(most), *told])}{_changing(metas)}"
+
+
+def _changing(metas: Sequence[Mapping[str, Any]]) -> str:
+    """Of filters that change their number within so many, how many they had."""
+    used: dict[str, list[Mapping[str, float]]] = {}
+    for meta in metas:
+        if "particles_used" in meta:
+            used.setdefault(str(meta.get("label", "")), []).append(meta["particles_used"])
+    said = [
+        f"{label} had {min(one['least'] for one in own)} to {max(one['most'] for one in own)}, "
+        f"{sum(one['mean'] for one in own) / len(own):.0f} on average"
+        for label, own in sorted(used.items())
+    ]
+    return "".join(f"; {text}" for text in said)
 
 
 def _measured(kind: str, metas: Sequence[Mapping[str, Any]]) -> str:

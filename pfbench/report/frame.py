@@ -21,6 +21,8 @@ _DISPLAY = {
 }
 
 COVERAGES = (50, 90, 99)  # per cent of the central regions
+_WORLD = ("scenario", "noise", "dtype")  # parts of a job's configuration that decide what a filter meets
+_PLACES = ("scenario.cache", "scenario.root")  # and do not
 _COUNTED = ("ess", "ancestors", "unique")  # of particles
 _SCORES = ("crps", "pit", "energy", "nis", "nis_dof")
 
@@ -121,8 +123,22 @@ def cells(study: str, results: str | Path = "results", *, mixed: bool = False) -
     together = [list(items) for _, items in groupby(found, key=lambda item: _cell(item[1]))]
     if not mixed:
         for items in together:
-            _one(items, ("seed", "first_run", "runs", "steps"), f"the cell {' / '.join(_cell(items[0][1]))}")
+            where = f"the cell {' / '.join(_cell(items[0][1]))}"
+            _one(items, ("seed", "first_run", "runs", "steps"), where)
+            _one(items, [f"config.{name}" for name in untold(_labelled(items))], where)
     return [Cell(*_cell(items[0][1]), _labelled(items)) for items in together]
+
+
+def differing(jobs: Sequence[Job]) -> list[str]:
+    """Settings of scenario, noise regime and number type in which the jobs of a cell differ, though the names are the same."""
+    flat = [_flat({name: job.meta["config"].get(name) for name in _WORLD}) for job in jobs]
+    names = sorted(set().union(*flat) - set(_PLACES))
+    return [name for name in names if len({repr(one.get(name)) for one in flat}) > 1]
+
+
+def untold(jobs: Sequence[Job]) -> list[str]:
+    """Those that not every label tells: filters that differ in them did not meet the same worlds, and nobody would see it."""
+    return [name for name in differing(jobs) if not all(f"{name}=" in job.label for job in jobs)]
 
 
 def blocks(state: Mapping[str, Any]) -> list[Block]:
@@ -179,7 +195,7 @@ def _scores_at(arrays: Mapping[str, np.ndarray], kept: np.ndarray) -> dict[str, 
 def tidy(cell: Cell, job: Job, result: store.Result, from_time: float, converged: Mapping[str, float]) -> pd.DataFrame:
     """The rows of one job; see `frame`."""
     lost = result.arrays["lost"]
-    rows = pd.concat(list(_rows(later(result, from_time), converged)), ignore_index=True)
+    rows = pd.concat([*_rows(later(result, from_time)), *_settled(result, converged)], ignore_index=True)
     first, runs = job.meta.get("first_run", 0), lost.size
     repeats = len(rows) // runs
     head = {
@@ -198,7 +214,16 @@ def tidy(cell: Cell, job: Job, result: store.Result, from_time: float, converged
     return pd.concat([pd.DataFrame(head, index=rows.index), rows], axis=1)
 
 
-def _rows(result: store.Result, converged: Mapping[str, float]) -> Iterator[pd.DataFrame]:
+def _settled(result: store.Result, converged: Mapping[str, float]) -> Iterator[pd.DataFrame]:
+    """When each run converged, by group; nothing is left out at the start, or none would have converged before."""
+    for block in blocks(result.meta["state"]):
+        if block.group in converged:
+            error = result.arrays["error"][..., block.places].astype(np.float64) * block.scale
+            when = metrics.convergence_time(result.arrays["time"], error, result.arrays["lost"], converged[block.group])
+            yield _column("converged", when, block.group, "norm", "s")
+
+
+def _rows(result: store.Result) -> Iterator[pd.DataFrame]:
     """One small table of R rows for each metric."""
     arrays, lost, meta = result.arrays, result.arrays["lost"], result.meta
     for block in blocks(meta["state"]):
@@ -208,9 +233,6 @@ def _rows(result: store.Result, converged: Mapping[str, float]) -> Iterator[pd.D
         yield _column("rmse", metrics.rmse_per_run(error, lost), block.group, "norm", block.unit)
         yield _column("max_error", metrics.max_error(error, lost), block.group, "norm", block.unit)
         yield from _scored(arrays, lost, block, list(meta["state"]["groups"]))
-        if block.group in converged:
-            when = metrics.convergence_time(arrays["time"], error, lost, converged[block.group])
-            yield _column("converged", when, block.group, "norm", "s")
     for g, group in enumerate(meta["state"]["groups"]):
         yield _column("nees", metrics.mean_per_run(arrays["nees"][..., g], lost), group, "norm")
     for name in (*_COUNTED, "iterations"):
@@ -235,7 +257,12 @@ def of_trace(result: store.Result, name: str) -> np.ndarray:
         return np.full(lost.size, np.nan)
     if name in ("ancestors", "unique") and "resampled" in arrays:
         trace = np.where(arrays["resampled"], trace, np.nan)
-    return metrics.mean_per_run(trace, lost) / (particles if particles and name in _COUNTED else 1)
+    return metrics.mean_per_run(trace / in_use(result) if name in _COUNTED else trace, lost)
+
+
+def in_use(result: store.Result) -> np.ndarray | int:
+    """The number of particles: [R, T] of a filter that changes it."""
+    return result.arrays["particles"] if "particles" in result.arrays else int(result.meta["particles"])
 
 
 def _scored(arrays: Mapping[str, np.ndarray], lost: np.ndarray, block: Block, groups: list[str]) -> Iterator[pd.DataFrame]:
@@ -279,7 +306,7 @@ def _told_apart(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> 
     if len(twins) == 1:
         return str(meta["label"])
     flat = [_flat(twin["config"]) for twin in twins]
-    names = sorted(name for name in set().union(*flat) if len({repr(one.get(name)) for one in flat}) > 1)
+    names = sorted(name for name in set().union(*flat) - set(_PLACES) if len({repr(one.get(name)) for one in flat}) > 1)
     of_filter = [name for name in names if name.startswith("filter.")]
     if len({tuple(repr(one.get(name)) for name in of_filter) for one in flat}) == len(flat):
         names = of_filter
@@ -303,7 +330,7 @@ def _flat(config: Any, path: str = "") -> dict[str, Any]:
     return {k: v for name, below in config.items() for k, v in _flat(below, f"{path}.{name}" if path else name).items()}
 
 
-def _one(items: Sequence[tuple[Path, dict[str, Any]]], names: tuple[str, ...], where: str) -> None:
+def _one(items: Sequence[tuple[Path, dict[str, Any]]], names: Sequence[str], where: str) -> None:
     """Raises ValueError where jobs that are to be compared differ in one of `names`."""
     for name in names:
         by_value: dict[str, list[str]] = {}

@@ -6,6 +6,7 @@ import base64
 import gzip
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -31,7 +32,7 @@ from pfbench.report import (
 )
 from pfbench.report.across import Across
 from pfbench.report.canvas import Look, dimmed, looks, slug
-from pfbench.report.frame import Cell, blocks, cells, later, natural, tidy
+from pfbench.report.frame import Cell, blocks, cells, differing, later, natural, tidy
 from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Verdict, over_page, sensitivity, verdicts
 
 _HERE = Path(__file__).parent
@@ -57,6 +58,9 @@ _SHARED = (
 )
 
 
+_TAKEN = {"filter": "filters", "scores": "scores", "world": "worlds", "bound": "bounds", "compile": "compilation"}
+
+
 @dataclass(frozen=True)
 class Options:
     """What a report shows.
@@ -67,12 +71,13 @@ class Options:
         from_time: leave out of all figures of merit what came before, seconds; curves over time show all.
         formats: of the figures: svg, png; the page carries of each figure the smaller one.
         mixed: accept results of several versions, seeds, runs or lengths side by side.
-        converged: bounds by group, in the unit shown, for the time to converge.
+        converged: bounds by group, in the unit shown, for the time to converge, which counts from the start of the record.
         margin: share by which RMSE may differ between filters that count as equal.
         wanted: share by which RMSE differs in the effect for which the needed number of runs is computed.
         figures: names of `paper_figures.FIGURES` to draw; None for those of the paper that the study is named after.
         highlight: filters in colour where there are more than eight, the others being grey; None for the best of each cell.
         full: show all figures and comparisons; None for all where filters times cells are at most 50.
+        planned: how many jobs the study's experiment asks for, where one does.
 
     Raises:
         ValueError: a value out of range.
@@ -89,6 +94,7 @@ class Options:
     figures: tuple[str, ...] | None = None
     highlight: tuple[str, ...] | None = None
     full: bool | None = None
+    planned: int | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 1:
@@ -123,6 +129,7 @@ def write(
     options = options or Options()
     found = cells(study, results, mixed=options.mixed)
     groups = _groups(found, options.groups)
+    _check_converged(found, options.converged)
     folder = Path(out) / study
     labels = sorted({job.label for cell in found for job in cell.jobs}, key=natural)
     view = View(groups, looks(_first(labels, options.highlight)), folder, options, _is_brief(found, options))
@@ -161,7 +168,7 @@ def write(
         "headline": _headline(table, over_cells[0], of_mains, mains, sections, view, note) if view.brief and over_cells else None,
         "lost_rules": [rule.name for rule in LOST_RULES],
         "bibtex": (bibtex := _bibtex(found)),
-        "shared": [*_shared(found), *_trained(found)],
+        "shared": [*_shared(found), *_spent(found, options.planned), *_trained(found)],
         "choices": _choices(found),
         "failures": store.failures(Path(results) / study),
     }
@@ -223,12 +230,14 @@ def _section(cell: Cell, view: View) -> tuple[dict[str, Any], list[Verdict], pd.
     decided = verdicts(runs, options.alpha, options.margin, options.wanted)
     regions = calibration.calibrated(runs, options.alpha)
     note = budget.stated([job.meta for job in cell.jobs])
+    if apart := differing(cell.jobs):
+        note += f" Jobs of this cell differ in {', '.join(apart)}: runs share their draws there, not their worlds."
     prefix = slug(f"{cell.scenario}_{cell.noise}_{cell.model}")
     main = headline.main_group(known)
     parts = []
     for group, front in zip(known, fronts, strict=True):
         own = [v for v in decided if v.group == group]
-        accuracy = tables.accuracy(used, group, own, options.alpha, options.converged.get(group))
+        accuracy = tables.accuracy(used, group, own, options.alpha, options.converged.get(group), whole)
         if len(accuracy):
             chosen = _with_best(own, front) if len(own) > _PAIRS else own
             save_table(folder, f"{prefix}_{slug(group)}", accuracy, note)
@@ -485,6 +494,12 @@ def _groups(found: Sequence[Cell], wanted: tuple[str, ...] | None) -> list[str]:
     return there if wanted is None else list(wanted)
 
 
+def _check_converged(found: Sequence[Cell], converged: Mapping[str, float]) -> None:
+    there = {block.group for cell in found for job in cell.jobs for block in blocks(job.meta["state"])}
+    if unknown := sorted(set(converged) - there):
+        raise ValueError(f"report.converged: no result has {', '.join(unknown)}; choose from {', '.join(sorted(there))}")
+
+
 def _unbeaten(own: Sequence[Verdict]) -> list[str]:
     labels = dict.fromkeys(label for v in own for label in (v.a, v.b))
     beaten = {v.b if v.winner == v.a else v.a for v in own if v.winner != NO_DIFFERENCE}
@@ -498,6 +513,24 @@ def _shared(found: Sequence[Cell]) -> list[tuple[str, str]]:
         values = [_at(job.meta, path) for cell in found for job in cell.jobs]
         rows.append((name, ", ".join(_distinct(str(value) for value in values if value is not None)) or "not stated"))
     return rows
+
+
+def _spent(found: Sequence[Cell], planned: int | None) -> list[tuple[str, str]]:
+    """How many jobs there are, and what they took, from the drawing of worlds to the scores."""
+    parts: Counter[str] = Counter()
+    jobs = [job for cell in found for job in cell.jobs]
+    for job in jobs:
+        parts.update({name: job.meta["seconds"].get(name, 0.0) for name in _TAKEN})
+    shares = ", ".join(f"{what} {100 * parts[name] / parts.total():.0f} %" for name, what in _TAKEN.items() if parts[name])
+    of = f" of {planned} that the experiment asks for" if planned else ""
+    took = f"{_duration(parts.total())} ({shares})" if shares else "not stated"
+    return [("jobs", f"{len(jobs)}{of}"), ("time of all jobs", took)]
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def _trained(found: Sequence[Cell]) -> list[tuple[str, str]]:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from command_line import pfbench
 
-from pfbench.report import ledger, page
+from pfbench.report import claims, ledger, page
 
 
 @pytest.fixture
@@ -22,12 +22,12 @@ def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
         asked[study] = options
         return Path(out) / study / "index.html"
 
-    def claims(results: str, out: str, *_: Any, **__: Any) -> Path:
+    def of_claims(results: str, out: str, *_: Any, **__: Any) -> Path:
         asked["claims"] = None
         return Path(out) / "claims" / "index.html"
 
     monkeypatch.setattr(page, "write", write)
-    monkeypatch.setattr(ledger, "write", claims)
+    monkeypatch.setattr(ledger, "write", of_claims)
     monkeypatch.chdir(tmp_path)
     return asked
 
@@ -49,10 +49,31 @@ def test_what_has_results_is_made_again_and_what_has_none_stays(made: dict[str, 
     assert {options.alpha for options in made.values()} == {0.01}
     assert "paper_001: its report is published and stays as it is" in said.out
     assert "pfbench run -m +experiment=paper_001" in said.out
-    assert "claims: the ledger stays as it is, for it needs the results of paper_001 too" in said.out
-    there(tmp_path, "results/paper_001/a.npz")
+    studies = sorted({study for claim in claims.load() for study in claim.studies})
+    assert f"claims: the ledger stays as it is, for it needs the results of {', '.join(studies)} too" in said.out
+    there(tmp_path, *(f"results/{study}/a.npz" for study in studies[1:]))
+    assert f"it needs the results of {studies[0]} too" in pfbench("report", "all", home=tmp_path).out
+    there(tmp_path, f"results/{studies[0]}/a.npz")
     assert pfbench("report", "all", home=tmp_path).code == 0
     assert list(made)[-1] == "claims"  # after the pages that it links to
+
+
+def test_a_page_alone_is_published_too_and_a_first_ledger_is_written_of_what_there_is(
+    made: dict[str, Any], tmp_path: Path
+) -> None:
+    there(tmp_path, "results/paper_001/a.npz", "reports/all_seven/index.html")
+    said = pfbench("report", "all", home=tmp_path)
+    assert "all_seven: its report is published and stays as it is" in said.out
+    assert list(made) == ["paper_001", "claims"]
+
+
+def test_a_study_is_shown_as_its_experiment_says(made: dict[str, Any], tmp_path: Path) -> None:
+    assert pfbench("report", "study=recorded_car", home=tmp_path).code == 0
+    assert made["recorded_car"].from_time == 98.0
+    assert pfbench("report", "study=recorded_car", "report.from_time=1.0", home=tmp_path).code == 0
+    assert pfbench("report", "study=my_own", home=tmp_path).code == 0
+    assert made["my_own"].from_time == 0.0
+    assert made["recorded_car"].from_time == 1.0  # the words come last
 
 
 def test_one_report_that_fails_stops_no_other(made: dict[str, Any], tmp_path: Path) -> None:

@@ -1,5 +1,8 @@
 """The tidy table: right numbers in right units, right labels, and no mixing of what does not belong together."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import synthetic_results as synthetic
@@ -127,6 +130,57 @@ def test_what_does_not_belong_together_is_refused_by_name(tmp_path, change, name
         frame.frame("demo", tmp_path)
     assert odd.name in str(refusal.value)
     assert set(frame.frame("demo", tmp_path, mixed=True).label) == {"ekf", "ukf"}
+
+
+def other_world(path: Path, **settings: Any) -> None:
+    meta, arrays = store.load(path)
+    store.save(path, {**meta, "config": {**meta["config"], **settings}}, arrays)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "named"),
+    [
+        ({"scenario": {"gps_sd": 1.0}}, {"scenario": {"gps_sd": 10.0}}, "config.scenario.gps_sd"),
+        ({"noise": {"scale": 2.0}}, {"noise": {"scale": 3.0}}, "config.noise.scale"),
+        ({"dtype": "float64"}, {"dtype": "float32"}, "config.dtype"),
+    ],
+)
+def test_filters_of_one_cell_met_the_same_worlds(tmp_path, first, second, named):
+    for name, settings in (("ekf", first), ("ukf", second)):
+        other_world(synthetic.write(tmp_path / "demo", synthetic.Method(name, 1.0), **SMALL), **settings)
+    with pytest.raises(ValueError, match=rf"differ in {named} "):
+        frame.cells("demo", tmp_path)
+    assert len(frame.cells("demo", tmp_path, mixed=True)) == 1
+
+
+def test_worlds_may_differ_where_every_label_tells_in_what(tmp_path):
+    for k, sd in enumerate((1.0, 10.0)):
+        for name in ("ekf", "ukf"):
+            path = synthetic.write(tmp_path / "demo", synthetic.Method(name, 1.0, 1.0, 100 + k), **SMALL)
+            meta, arrays = store.load(path)
+            settings = {"filter": {"name": name}, "scenario": {"gps_sd": sd, "cache": f"place{k}"}}
+            store.save(path, {**meta, "config": settings}, arrays)
+    (cell,) = frame.cells("demo", tmp_path)
+    assert [job.label for job in cell.jobs] == [
+        "ekf[scenario.gps_sd=1.0]", "ekf[scenario.gps_sd=10.0]", "ukf[scenario.gps_sd=1.0]", "ukf[scenario.gps_sd=10.0]",
+    ]  # fmt: skip
+    assert frame.differing(cell.jobs) == ["scenario.gps_sd"]
+
+
+def test_shares_are_of_the_particles_in_use(tmp_path):
+    """A filter that uses half of its slots and weighs them alike has an effective size of all, not of half."""
+    path = synthetic.write(tmp_path / "demo", synthetic.Method("cofm_amssrcpf", 1.0, 1.0, 200), **SMALL)
+    meta, arrays = store.load(path)
+    number = np.full_like(arrays["ess"], 100.0)
+    store.save(path, meta, {**arrays, "particles": number, "ess": number})
+    table = frame.frame("demo", tmp_path)
+    assert (table[table.metric == "ess"].value.dropna() == 1.0).all()
+
+
+def test_a_run_may_converge_before_the_time_from_which_errors_count(results):
+    table = frame.frame("demo", results, converged={"attitude": 1e6}, from_time=10.0)
+    found = table[(table.metric == "converged") & ~table.lost]
+    assert (found.value == 1.0).all()
 
 
 def test_an_empty_study_says_where_to_go(results):

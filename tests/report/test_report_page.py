@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -159,6 +160,32 @@ def test_a_filter_that_lost_every_run_is_reported(tmp_path):
     assert "doomed lost 8 of 8 runs" in made.read_text()
     table = (made.parent / "report.md").read_text()
     assert re.search(r"\| doomed +\| +0 \| +– \|", table)
+
+
+def test_the_page_says_what_its_jobs_took_and_how_many_were_asked_for(results, tmp_path):
+    page.write("demo", results, tmp_path, replace(QUICK, planned=6))
+    text = (tmp_path / "demo" / "report.md").read_text()
+    seconds = sum(1.0 + 1e-3 * method.milliseconds * 40 for method in synthetic.METHODS)  # a world each, and 40 steps
+    assert "jobs: 4 of 6 that the experiment asks for" in text
+    assert f"time of all jobs: {seconds:.0f} s (filters {100 * (1 - 4 / seconds):.0f} %, worlds" in text
+
+
+def test_the_time_to_converge_is_a_column_of_groups_that_have_a_bound(results, tmp_path):
+    page.write("demo", results, tmp_path, replace(QUICK, converged={"position": 1e9}, from_time=20.0))
+    text = (tmp_path / "demo" / "report.md").read_text()
+    assert "median time to 1e+09 m in s" in text
+    with pytest.raises(ValueError, match=r"report\.converged: no result has height"):
+        page.write("demo", results, tmp_path, replace(QUICK, converged={"height": 1.0}))
+
+
+def test_cells_whose_worlds_differ_by_name_say_so(tmp_path):
+    for k, sd in enumerate((1.0, 10.0)):
+        path = synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0, 1.0, 100 + k), runs=6, steps=20)
+        meta, arrays = store.load(path)
+        store.save(path, {**meta, "config": {"filter": {"name": "ekf"}, "scenario": {"gps_sd": sd}}}, arrays)
+    page.write("demo", tmp_path, tmp_path / "reports", QUICK)
+    text = (tmp_path / "reports" / "demo" / "report.md").read_text()
+    assert "Jobs of this cell differ in scenario.gps_sd: runs share their draws there, not their worlds." in text
 
 
 def test_options_are_checked():

@@ -129,6 +129,10 @@ def test_a_budget_that_was_not_kept_is_not_claimed():
 
     assert budget.stated([job(100), job(None)]) == "Budget: same N (N = 100 of each particle filter)."
     assert "was not kept (N = 100, 400)" in budget.stated([job(100), job(400)])
+    used = [{"least": low, "mean": mean, "most": 200} for low, mean in ((100, 120.0), (110, 140.0))]
+    changing = [{**job(200), "label": "grows", "particles_used": one} for one in used]
+    said = budget.stated([job(100), job(100), *changing, job(100)])
+    assert "N = 100, 200 of grows; grows had 100 to 200, 130 on average" in said
     kind = "same time per step"
     assert budget.stated([job(100, budget=kind), job(9, 1.1e-3, budget=kind)]) == f"Budget: {kind} (1 to 1.1 ms per step)."
     assert "was not kept" in budget.stated([job(100, budget=kind), job(9, 5e-3, budget=kind)])
