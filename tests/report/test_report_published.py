@@ -1,0 +1,62 @@
+"""The statistics against numbers that R prints in its help pages, and a filter against itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from pfbench.draws import MonteCarlo
+from pfbench.filter.loop import run_filter
+from pfbench.filter.particle import ParticleFilter
+from pfbench.model.linear import linear_walk
+from pfbench.noise.regimes import Nominal
+from pfbench.report import across, significance
+from pfbench.scenario.model_world import ModelWorld
+
+# R 4, ?friedman.test: 22 players round first base in three ways [Hollander, Wolfe 1973, p. 140]
+ROUNDING = np.array([
+    [5.40, 5.50, 5.55], [5.85, 5.70, 5.75], [5.20, 5.60, 5.50], [5.55, 5.50, 5.40], [5.90, 5.85, 5.70], [5.45, 5.55, 5.60],
+    [5.40, 5.40, 5.35], [5.45, 5.50, 5.35], [5.25, 5.15, 5.00], [5.85, 5.80, 5.70], [5.25, 5.20, 5.10], [5.65, 5.55, 5.45],
+    [5.60, 5.35, 5.45], [5.05, 5.00, 4.95], [5.50, 5.50, 5.40], [5.45, 5.55, 5.50], [5.55, 5.55, 5.35], [5.45, 5.50, 5.55],
+    [5.50, 5.45, 5.25], [5.65, 5.60, 5.40], [5.70, 5.65, 5.55], [6.30, 6.30, 6.25],
+])  # fmt: skip
+# R 4, ?wilcox.test: depression of nine patients at two visits [Hollander, Wolfe 1973, p. 29]
+FIRST = np.array([1.83, 0.50, 1.62, 2.48, 1.68, 1.88, 1.55, 3.06, 1.30])
+SECOND = np.array([0.878, 0.647, 0.598, 2.05, 1.06, 1.29, 1.06, 3.14, 1.29])
+
+
+def test_friedmans_test_is_that_of_r() -> None:
+    """friedman.test(RoundingTimes): Friedman chi-squared = 11.143, df = 2, p-value = 0.003805. There are ties."""
+    found = across.friedman(across.ranks(ROUNDING))
+    assert found.chi2 == pytest.approx(11.143, abs=5e-4)
+    assert found.p == pytest.approx(0.003805, abs=5e-7)
+
+
+def test_wilcoxons_test_is_that_of_r() -> None:
+    """wilcox.test(x, y, paired = TRUE, alternative = "greater"): V = 40, p-value = 0.01953, which is exact."""
+    statistic, p = significance.wilcoxon(FIRST - SECOND)
+    assert statistic in (40.0, 45.0 - 40.0)
+    assert p / 2 == pytest.approx(0.01953, abs=5e-6)
+
+
+@pytest.mark.slow
+def test_a_filter_under_two_names_beats_itself_as_seldom_as_alpha() -> None:
+    """Two sets of draws on the same worlds, 2000 studies of 15 paired runs each; with other numbers it does win."""
+    studies, size, steps, alpha = 2000, 15, 10, 0.05
+    runs = torch.arange(studies * size)
+    model = linear_walk(1.0, 0.3, 1.0)
+    episode = ModelWorld(model, steps).draw(Nominal(), runs, 1)
+    truth = model.assemble(episode.truth)
+
+    def loss(seed: int, particles: int) -> np.ndarray:
+        estimate = run_filter(ParticleFilter(particles), model, episode.record, MonteCarlo(seed, runs))
+        return (estimate.mean - truth)[..., 0].square().mean(1).sqrt().numpy().reshape(studies, size)
+
+    def share_of_wins(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.mean([significance.wilcoxon(d)[1] <= alpha for d in significance.log_ratio(a, b)]))
+
+    one, other, poor = loss(1, 20), loss(2, 20), loss(3, 4)
+    error = 4 * np.sqrt(alpha * (1 - alpha) / studies)
+    assert share_of_wins(one, other) == pytest.approx(alpha, abs=error)
+    assert share_of_wins(one, poor) > 0.5
