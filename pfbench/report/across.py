@@ -8,6 +8,9 @@ Nemenyi's test, Conover's with Holm's correction and Wilcoxon's with Holm's corr
 omnibus test and Nemenyi's both show it [ours]: that is what the critical-difference diagram shows; the other two are printed
 beside it. The Bayesian signed-rank test says how probable it is that a filter is better, or as good within a margin
 [Benavoli et al. 2014].
+
+Regimes of one world share its seeds, so that cells are more alike than independent blocks are: what the omnibus test says with
+worlds as blocks is printed beside it.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ import scikit_posthocs as posthocs
 from scipy import stats
 
 from pfbench.metrics import Array
+from pfbench.report import power
 from pfbench.report.frame import natural
 from pfbench.report.significance import (
     NO_DIFFERENCE,
@@ -42,6 +46,7 @@ from pfbench.report.significance import (
 )
 
 CELLS, FILTERS = 5, 3  # that a test across cells takes at least [ours]
+WORLDS = 3  # that one with worlds as blocks takes at least [ours]
 VALUE = "median over runs of log RMSE"
 _SAMPLES = 20_000
 _PRIOR = 0.5  # of the pseudo-observation at zero [Benavoli et al. 2014], as baycomp has it
@@ -129,6 +134,22 @@ class AcrossPair:
 
 
 @dataclass(frozen=True)
+class ByWorld:
+    """The omnibus test with worlds as blocks: of each filter the median, over the cells of a world, of its rank.
+
+    Attributes:
+        worlds: how many.
+        p, p_f: Friedman's, and in Iman and Davenport's form.
+        best: filters of the smallest mean rank; several where they tie.
+    """
+
+    worlds: int
+    p: float
+    p_f: float
+    best: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Across:
     """What is decided across the cells of a study, for one group of the state.
 
@@ -144,6 +165,7 @@ class Across:
         f, p_f: Iman and Davenport's.
         critical: Nemenyi's critical difference.
         pairs: all of them.
+        by_world: the test with worlds as blocks; None where each cell has a world of its own, or worlds are too few.
     """
 
     group: str
@@ -164,6 +186,22 @@ class Across:
     p_f: float = math.nan
     critical: float = math.nan
     pairs: tuple[AcrossPair, ...] = ()
+    by_world: ByWorld | None = None
+
+    @property
+    def worlds(self) -> int:
+        """Distinct worlds among the cells."""
+        return len(worlds_of(self.cells))
+
+    @property
+    def best(self) -> tuple[str, ...]:
+        """Filters of the smallest mean rank; several where they tie."""
+        return _first(self.filters, self.ranks)
+
+    @property
+    def least(self) -> int:
+        """Cells below which Wilcoxon's test with Holm's correction over all pairs can show no difference whatever."""
+        return power.least(self.alpha / max(1, len(self.pairs)))
 
     @property
     def unbeaten(self) -> list[str]:
@@ -198,7 +236,7 @@ def across(
     pairs = _compared(found, test, alpha, margin)
     return Across(
         *head, refused="", ranks=tuple(map(float, test.ranks)), chi2=test.chi2, p=test.p, f=test.f, p_f=test.p_f,
-        critical=test.critical, pairs=tuple(pairs),
+        critical=test.critical, pairs=tuple(pairs), by_world=_by_world(found),
     )  # fmt: skip
 
 
@@ -244,6 +282,11 @@ def blocks(table: pd.DataFrame, group: str, rule: LostRule = WORST) -> Blocks:
     with np.errstate(divide="ignore"):
         values = np.array([np.median(np.log(own), axis=0) for own in runs]).reshape(len(cells), len(filters))
     return Blocks(group, filters, tuple(cells), values, tuple(runs), tuple(left_out), len(worlds) - len(set(worlds)))
+
+
+def worlds_of(cells: Sequence[str]) -> list[str]:
+    """The distinct worlds of cells named `scenario / noise / model`, in their order."""
+    return list(dict.fromkeys(cell.split(" / ")[0] for cell in cells))
 
 
 def ranks(values: Array) -> Array:
@@ -362,6 +405,22 @@ def _compared(found: Blocks, test: Friedman, alpha: float, margin: float) -> lis
             winner=_better(found, test, float(by_nemenyi[i, j]), i, j, alpha),
         ))  # fmt: skip
     return pairs
+
+
+def _by_world(found: Blocks) -> ByWorld | None:
+    names = worlds_of(found.cells)
+    if not WORLDS <= len(names) < len(found.cells):
+        return None
+    own = ranks(found.values)
+    of_world = [[cell.split(" / ")[0] == name for cell in found.cells] for name in names]
+    # Ranks and not errors: those of a rough regime and of a quiet one have no common size to take a median of.
+    test = friedman(ranks(np.array([np.median(own[rows], axis=0) for rows in of_world])))
+    return ByWorld(len(names), test.p, test.p_f, _first(found.filters, test.ranks))
+
+
+def _first(filters: Sequence[str], rank: Sequence[float] | Array) -> tuple[str, ...]:
+    """Those of the smallest mean rank, to rounding."""
+    return tuple(label for label, value in zip(filters, rank, strict=False) if value <= min(rank) + SAME)
 
 
 def _better(found: Blocks, test: Friedman, p: float, i: int, j: int, alpha: float) -> str:

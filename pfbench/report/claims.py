@@ -1,5 +1,8 @@
 """What the papers claim, as records: each says which cells, measures and tests decide it, or why nothing can.
 
+A law or a count that takes no runs is decided by a test of this repository: its record has `shown`, "holds" or "fails", and the
+name of the test.
+
 The records lie in claims.yaml, where values of `all` hold for every test of a claim, lists within a test stand for as many
 tests, and `method` stands in turn for the filter as printed and as repaired. `evidence` measures, `rulings` decides, `ledger`
 shows.
@@ -9,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +28,8 @@ PAPERS = {
     "003": "DMC reconstruction for SINS/GPS with a large azimuth error",
     "004": "Tian et al., chaos particle swarm with escape factor for GPS/INS",
 }
-REASONS = ("not stated", "no experiment", "not run", "no power", "lost")
+REASONS = ("not stated", "not run", "no power", "lost")
+SHOWN = ("holds", "fails")
 STATISTICS = {  # and what each needs beside a
     "less": "b", "greater": "b", "equal": "b", "no_worse": "b", "close": "b", "below": "high", "above": "low",
     "within": "low high", "near": "printed", "flat": "", "falls": "", "share": "low", "cost": "", "report": "",
@@ -111,6 +115,7 @@ class Claim:
         tests: by form, "printed", "repaired", or "" where the claim is about no method of the paper's own.
         why: by form, or "", a reason and its explanation: why that form cannot be decided, or no experiment could decide.
         note: how the words were read [ours].
+        shown: by form, or "", "holds" or "fails", and what shows it, where no experiment is needed.
     """
 
     id: str
@@ -121,6 +126,7 @@ class Claim:
     tests: Mapping[str, tuple[Comparison, ...]]
     why: Mapping[str, tuple[str, str]]
     note: str = ""
+    shown: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     @property
     def studies(self) -> list[str]:
@@ -153,40 +159,45 @@ def load(conf: Path | None = None, experiments: Path | None = None, path: Path =
 
 def _claim(row: Mapping[str, Any]) -> Claim:
     missing = {"id", "paper", "claim", "source"} - set(row)
-    unknown = set(row) - {"id", "paper", "claim", "source", "printed", "forms", "why", "all", "tests", "note"}
+    unknown = set(row) - {"id", "paper", "claim", "source", "printed", "forms", "why", "shown", "all", "tests", "note"}
     name = row.get("id", "a record without id")
     if missing or unknown:
         raise ValueError(f"{name}: lacks {sorted(missing)}, does not know {sorted(unknown)}")
     if row["paper"] not in PAPERS:
         raise ValueError(f"{name}: paper={row['paper']!r}; give one of {', '.join(PAPERS)}, in quotes")
-    why = {form: _why(name, text) for form, text in _by_form(row.get("why", {})).items()}
-    forms: Mapping[str, str] = row.get("forms", {"": ""})
+    why = {form: _begun(name, "why", text, REASONS) for form, text in _by_form(row.get("why", {})).items()}
+    shown = {form: _begun(name, "shown", text, SHOWN) for form, text in _by_form(row.get("shown", {})).items()}
+    if shown and (why or row.get("tests")):
+        raise ValueError(f"{name}: what is shown without an experiment has neither tests nor a reason `why`")
+    forms: Mapping[str, str] = {} if shown else row.get("forms", {"": ""})
     tests = {form: tuple(_tests(row, form, method)) for form, method in forms.items() if form not in why and "" not in why}
-    if not why and not any(tests.values()):
+    if not why and not shown and not any(tests.values()):
         raise ValueError(f"{name}: it has neither tests nor a reason `why` nothing decides it")
-    if wrong := (set(forms) | set(why)) - {*FORMS, ""}:
+    if wrong := (set(forms) | set(why) | set(shown)) - {*FORMS, ""}:
         raise ValueError(f"{name}: forms are {', '.join(FORMS)}, not {', '.join(sorted(wrong))}")
     # what is reported without a decision is measured all the same
     reported = {"": tuple(_tests(row, "", ""))} if "" in why and row.get("tests") else {}
     texts = {key: str(row[key]).strip() for key in ("id", "paper", "claim", "source")}
     printed = "" if row.get("printed") is None else str(row["printed"])
-    return Claim(**texts, printed=printed, tests=tests or reported, why=why, note=str(row.get("note", "")).strip())
+    note = str(row.get("note", "")).strip()
+    return Claim(**texts, printed=printed, tests=tests or reported, why=why, note=note, shown=shown)
 
 
 def _by_form(why: Any) -> dict[str, str]:
     return {"": why} if isinstance(why, str) else dict(why)
 
 
-def _why(name: str, text: str) -> tuple[str, str]:
-    reason, _, rest = text.strip().partition(": ")
-    if reason not in REASONS or not rest:
-        raise ValueError(f"{name}: why={text!r}; begin with one of {', '.join(REASONS)} and a colon, then say it")
-    return reason, rest
+def _begun(name: str, key: str, text: str, known: Sequence[str]) -> tuple[str, str]:
+    """The word that a text begins with, one of those known, and what follows its colon."""
+    word, _, rest = text.strip().partition(": ")
+    if word not in known or not rest:
+        raise ValueError(f"{name}: {key}={text!r}; begin with one of {', '.join(known)} and a colon, then say it")
+    return word, rest
 
 
 def _tests(row: Mapping[str, Any], form: str, method: str) -> Iterator[Comparison]:
     """The tests of one form; lists of equal length are taken side by side."""
-    known = {field.name for field in fields(Comparison)}
+    known = {part.name for part in fields(Comparison)}
     for given in row.get("tests", ()):
         one = {**row.get("all", {}), **given}
         if one.pop("form", form) != form:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from pfbench import metrics, store
 from pfbench.report.claims import SCALED, Claim, Comparison
 from pfbench.report.frame import Cell, Job, at_instants, blocks, cells, later, of_trace
 
+Side = tuple[str, str, str]  # study, cell, label
 _COLUMNS = ["study", "cell", "label", "measure", "seed", "run", "lost", "unit", "value"]
 
 
@@ -30,21 +31,20 @@ def gather(claims: Sequence[Claim], results: str | Path = "results", *, mixed: b
     Raises:
         ValueError: results that do not belong together, or have no such group or component.
     """
-    wanted: dict[tuple[str, str, str], dict[str, Comparison]] = {}
-    for test in (t for claim in claims for tests in claim.tests.values() for t in tests):
+    wanted: dict[Side, dict[str, Comparison]] = {}
+    for test in _tests(claims):
         for side in test.sides:
             wanted.setdefault(side, {})[test.measure] = test
     parts = []
-    for study in sorted({side[0] for side in wanted}):
-        if not any((Path(results) / study).glob("*.npz")):
-            continue
-        for cell in cells(study, results, mixed=mixed):
-            name = f"{cell.scenario}/{cell.noise}/{cell.model}"
-            for job in cell.jobs:
-                for label in (label for *where, label in wanted if where == [study, name] and _is(job, cell, label)):
-                    head = {"study": study, "cell": name, "label": label}
-                    parts += list(_rows(job.load(), head, wanted[study, name, label]))
+    for side, job in _jobs(wanted, results, mixed):
+        parts += list(_rows(job.load(), dict(zip(_COLUMNS, side, strict=False)), wanted[side]))
     return pd.concat(parts, ignore_index=True)[_COLUMNS] if parts else pd.DataFrame(columns=_COLUMNS)
+
+
+def ran(claims: Sequence[Claim], results: str | Path = "results", *, mixed: bool = False) -> dict[Side, Mapping[str, Any]]:
+    """The description of each job that the claims' comparisons use, by study, cell and label; arguments as `gather`."""
+    sides = {side for test in _tests(claims) for side in test.sides}
+    return {side: job.meta for side, job in _jobs(sides, results, mixed)}
 
 
 def measured(result: store.Result, test: Comparison) -> np.ndarray:
@@ -70,6 +70,22 @@ def measured(result: store.Result, test: Comparison) -> np.ndarray:
         dofs = [len(parts) for parts in groups.values()]
         return (metrics.diverged(arrays["nees"], dofs, lost) | lost).astype(np.float64)
     return np.full(lost.size, result.meta["seconds"]["per_step"])
+
+
+def _tests(claims: Sequence[Claim]) -> Iterator[Comparison]:
+    return (test for claim in claims for tests in claim.tests.values() for test in tests)
+
+
+def _jobs(wanted: Collection[Side], results: str | Path, mixed: bool) -> Iterator[tuple[Side, Job]]:
+    """The job of each side that ran."""
+    for study in sorted({side[0] for side in wanted}):
+        if not any((Path(results) / study).glob("*.npz")):
+            continue
+        for cell in cells(study, results, mixed=mixed):
+            name = f"{cell.scenario}/{cell.noise}/{cell.model}"
+            for job in cell.jobs:
+                for label in (label for *where, label in wanted if where == [study, name] and _is(job, cell, label)):
+                    yield (study, name, label), job
 
 
 def _is(job: Job, cell: Cell, label: str) -> bool:

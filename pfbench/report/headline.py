@@ -4,7 +4,7 @@ The main group of a cell is the position or, where a world has none, the first g
 main groups together are compared across cells like any other group: ranks have no unit. A proposed method is compared with the
 baselines of its own paper, one pair at a time: Wilcoxon's test with cells as blocks and Holm's correction over these pairs alone,
 for they follow from what the papers compare and not from results [ours]. The filters of a cell saw the same worlds; cells of one
-world share its geometry.
+world share its geometry and its draws, and are no independent blocks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ import numpy as np
 import pandas as pd
 
 from pfbench.metrics import Array
-from pfbench.report.across import Across, Blocks
+from pfbench.report import power
+from pfbench.report.across import Across, Blocks, worlds_of
 from pfbench.report.frame import natural
 from pfbench.report.significance import NO_DIFFERENCE, Verdict, holm, log_ratio, rank_biserial, wilcoxon
 
@@ -52,6 +53,7 @@ class Planned:
         p_holm: corrected over `family` pairs.
         family: pairs.
         winner: method, baseline or "no difference shown".
+        least: cells below which this family can show no difference whatever.
     """
 
     method: str
@@ -65,6 +67,22 @@ class Planned:
     p_holm: float
     family: int
     winner: str
+    least: int = 0
+
+    @property
+    def possible(self) -> bool:
+        """Are there cells enough to show any difference?"""
+        return len(self.cells) >= self.least
+
+    @property
+    def decided(self) -> str:
+        """The winner, or why there is none, in words."""
+        return self.winner if self.possible else f"cannot be shown with {len(self.cells)} cells"
+
+    @property
+    def worlds(self) -> int:
+        """Distinct worlds among the cells."""
+        return len(worlds_of(self.cells))
 
     @property
     def better(self) -> int:
@@ -111,6 +129,12 @@ class Summary:
     lost: tuple[tuple[str, int, int], ...]
     diverged: tuple[tuple[str, int, int], ...]
     planned: tuple[Planned, ...]
+
+    @property
+    def foremost(self) -> tuple[tuple[str, int], ...]:
+        """The first six of `often`, and all that tie with the sixth: names decide nothing."""
+        least = self.often[:6][-1][1] if self.often else 0
+        return tuple(item for item in self.often if item[1] >= least)
 
 
 def main_group(known: Sequence[str]) -> str:
@@ -203,7 +227,8 @@ def _compared(method: str, baseline: str, cells: tuple[str, ...], a: Array, b: A
 
 def _decided(one: Planned, p: float, family: int, alpha: float) -> Planned:
     better = one.method if one.effect > 0 else one.baseline
-    return replace(one, p_holm=p, family=family, winner=better if p <= alpha and one.effect else NO_DIFFERENCE)
+    winner = better if p <= alpha and one.effect else NO_DIFFERENCE
+    return replace(one, p_holm=p, family=family, winner=winner, least=power.least(alpha / family))
 
 
 def _unbeaten(decided: Sequence[Verdict]) -> tuple[tuple[tuple[str, int], ...], int]:

@@ -13,10 +13,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pfbench.report import claim_figures, page, tables
+from pfbench.report import budget, claim_figures, page, tables
 from pfbench.report.claims import PAPERS, Claim, load
-from pfbench.report.evidence import gather
-from pfbench.report.rulings import VERDICTS, Finding, Ruling, decide
+from pfbench.report.evidence import Side, gather, ran
+from pfbench.report.frame import natural
+from pfbench.report.rulings import OPEN, VERDICTS, Finding, Ruling, decide
+
+Jobs = Mapping[Side, Mapping[str, Any]]
 
 STUDY = "claims"  # the folder of reports in which the page lies
 
@@ -55,8 +58,14 @@ def write(
     plain = [_plain(ruling) for ruling in rulings]
     (folder / "verdicts.json").write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     studies = {study for ruling in rulings for study in ruling.claim.studies}
+    jobs = ran(claims, results, mixed=mixed)
+    made = of_studies(jobs)
+    if len(made):
+        page.save_table(folder, "studies", made)
     context = {
-        "papers": papers(rulings, anchors(studies, out)),
+        "papers": papers(rulings, anchors(studies, out), jobs),
+        "made": made,
+        "commits": commits(jobs.values()),
         "verdicts": VERDICTS,
         "count": count(rulings),
         "alpha": alpha,
@@ -75,17 +84,47 @@ def anchors(studies: Iterable[str], out: str | Path) -> dict[str, set[str]]:
     }  # fmt: skip
 
 
-def papers(rulings: Sequence[Ruling], reports: Mapping[str, Collection[str]] | None = None) -> list[dict[str, Any]]:
+def papers(
+    rulings: Sequence[Ruling], reports: Mapping[str, Collection[str]] | None = None, jobs: Jobs | None = None
+) -> list[dict[str, Any]]:
     """What the templates show: for each paper its title and the rows of its claims.
 
     Args:
         rulings: from `decide`.
         reports: of each study that has a page, its anchors; None links to none.
+        jobs: from `evidence.ran`; None says nothing of them.
     """
     return [
-        {"key": key, "title": title, "rows": [_row(r, reports or {}) for r in rulings if r.claim.paper == key]}
+        {"key": key, "title": title, "rows": [_row(r, reports or {}, jobs or {}) for r in rulings if r.claim.paper == key]}
         for key, title in PAPERS.items()
     ]
+
+
+def of_studies(jobs: Jobs) -> pd.DataFrame:
+    """What each study ran with, one row each: of the jobs that claims use."""
+    rows = []
+    for study, metas in _by_study(jobs).items():
+        runs = " or ".join(_distinct(str(meta["runs"]) for meta in metas))
+        stated = budget.stated(metas).removeprefix("Budget: ").removesuffix(".")
+        rows.append({"study": study, "jobs": len(metas), "runs": runs, "budget": stated, "commit": ", ".join(commits(metas))})
+    return pd.DataFrame(rows)
+
+
+def commits(metas: Iterable[Mapping[str, Any]]) -> list[str]:
+    """At which jobs ran."""
+    return _distinct(str(meta.get("versions", {}).get("commit") or "not stated") for meta in metas)
+
+
+def with_what(claim: Claim, jobs: Jobs) -> list[str]:
+    """Runs and budget of the jobs that a claim's comparisons use, study by study; and the commit where the page has several."""
+    used = {side: jobs[side] for tests in claim.tests.values() for test in tests for side in test.sides if side in jobs}
+    several = len(commits(jobs.values())) > 1
+    lines = []
+    for study, metas in _by_study(used).items():
+        runs = " or ".join(_distinct(str(meta["runs"]) for meta in metas))
+        at = f" Commit {', '.join(commits(metas))}." if several else ""
+        lines.append(f"{study}: {runs} runs of each filter. {budget.stated(metas)}{at}")
+    return lines
 
 
 def of_study(rulings: Sequence[Ruling], study: str) -> list[Ruling]:
@@ -127,7 +166,28 @@ def said(found: Finding) -> str:
     return f"{tables.number(found.effect)}{between}{unit}{printed}"
 
 
-def _row(ruling: Ruling, reports: Mapping[str, Collection[str]]) -> dict[str, Any]:
+def enough(found: Finding) -> str:
+    """How many runs it would take, of what the runs were too few to tell; empty of the others."""
+    if found.outcome != OPEN or np.isnan(found.needed):
+        return ""
+    if np.isinf(found.needed):
+        return "no number of runs tells an effect of this size"
+    return f"power 0.8 at this effect takes {found.needed:.0f} runs a cell"
+
+
+def _by_study(jobs: Jobs) -> dict[str, list[Mapping[str, Any]]]:
+    """Descriptions of the jobs of each study, each job once."""
+    found: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for (study, _, _), meta in sorted(jobs.items(), key=lambda item: natural("/".join(item[0]))):
+        found.setdefault(study, {})[meta["key"]] = meta
+    return {study: list(metas.values()) for study, metas in found.items()}
+
+
+def _distinct(values: Iterable[str]) -> list[str]:
+    return sorted(set(values), key=natural)
+
+
+def _row(ruling: Ruling, reports: Mapping[str, Collection[str]], jobs: Jobs) -> dict[str, Any]:
     claim = ruling.claim
     everywhere = [f.comparison for findings in ruling.findings.values() for f in findings]
     lines: dict[Any, dict[str, Any]] = {}
@@ -135,7 +195,8 @@ def _row(ruling: Ruling, reports: Mapping[str, Collection[str]]) -> dict[str, An
         shared = everywhere.count(f.comparison) > 1  # asked of both forms: shown once, of neither
         lines.setdefault(f.comparison, _line(claim, "" if shared else form, f, reports))
     reason = f": {ruling.reason}" if ruling.reason else ""
-    return {"claim": claim, "verdict": ruling.verdict, "reason": reason, "note": ruling.note, "lines": list(lines.values())}
+    told = {"claim": claim, "verdict": ruling.verdict, "reason": reason, "note": ruling.note}
+    return {**told, "lines": list(lines.values()), "ran": with_what(claim, jobs)}
 
 
 def _line(claim: Claim, form: str, found: Finding, reports: Mapping[str, Collection[str]]) -> dict[str, Any]:
@@ -148,7 +209,7 @@ def _line(claim: Claim, form: str, found: Finding, reports: Mapping[str, Collect
     link = f"../{one.study}/index.html#{place}" if place else ""
     lost = f"{found.lost_a + found.lost_b} lost" if found.lost_a + found.lost_b else ""
     p = f"p Holm {tables.number(found.p_holm)}" if np.isfinite(found.p_holm) else ""
-    more = ", ".join(text for text in (f"{found.pairs} runs" if found.pairs else "", p, lost) if text)
+    more = ", ".join(text for text in (f"{found.pairs} runs" if found.pairs else "", p, lost, enough(found)) if text)
     asked = one.statistic.replace("_", " ")
     shown = "measured" if one.statistic == "report" else found.outcome
     where = one.cell.replace("/", " / ")
@@ -160,7 +221,7 @@ def _numbers(form: str, found: Finding) -> dict[str, Any]:
     one = found.comparison
     words = {"form": form, "asked": one.statistic, "a": one.a, "b": one.b, "measure": one.measure, "cell": one.cell}
     numbers = {"printed effect": one.printed, "effect": found.effect, "low": found.low, "high": found.high}
-    tested = {"p": found.p, "p Holm": found.p_holm, "runs": found.pairs}
+    tested = {"p": found.p, "p Holm": found.p_holm, "runs": found.pairs, "runs needed": found.needed}
     return {**words, "unit": found.unit, "outcome": found.outcome, **numbers, **tested}
 
 

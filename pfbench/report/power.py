@@ -53,6 +53,25 @@ def needed(
     return float(max(math.ceil(of_t / efficiency), least(alpha)))
 
 
+def needed_share(share: float, limit: float, alpha: float = 0.05, wanted: float = POWER) -> float:
+    """Runs that it takes to find on which side of a limit a probability lies; infinite at the limit.
+
+    By the normal law of counts, corrected for their steps as the exact test has them [Fleiss, Levin, Paik 2003].
+
+    Args:
+        share: the probability.
+        limit: that it is compared to.
+        alpha: level, one-sided.
+        wanted: power.
+    """
+    if share == limit:
+        return math.inf
+    spread = -ndtri(alpha) * math.sqrt(limit * (1 - limit)) + ndtri(wanted) * math.sqrt(share * (1 - share))
+    off = abs(share - limit)
+    smooth = (spread / off) ** 2
+    return float(math.ceil(smooth / 4 * (1 + math.sqrt(1 + 2 / (smooth * off))) ** 2))
+
+
 def detectable(
     sd: float, pairs: int, alpha: float = 0.05, wanted: float = POWER, efficiency: float = EFFICIENCY
 ) -> float:

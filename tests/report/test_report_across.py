@@ -8,7 +8,7 @@ import scikit_posthocs as posthocs
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from pfbench.report import across, significance
+from pfbench.report import across, page, significance
 
 # Demsar 2006, table 6: AUC of C4.5, C4.5+m, C4.5+cf, C4.5+m+cf; the rounded tie of "voting" in its published order.
 DEMSAR = np.array([
@@ -158,6 +158,67 @@ def test_worlds_that_two_cells_share_are_counted():
     both = pd.concat([table(cells), table(cells, model="other")])
     assert across.across(both, "position").shared == 4
     assert across.across(table(world(np.random.default_rng(8), 6, 5, (1.0, 1.1, 1.2))), "position").shared == 0
+
+
+def said(found):
+    """What a page says of it, without blank lines."""
+    text = page._environment(False).get_template("text.jinja").make_module({"options": page.Options()})
+    return [line for line in text.over_cells({"one": found, "changed": []}, False).split("\n") if line.strip()]
+
+
+def spread_over(worlds, cells):
+    """Rows of so many cells, of worlds by these names."""
+    parts = [table([cell]).assign(scenario=name, noise=f"n{k}") for k, (name, cell) in enumerate(zip(worlds, cells, strict=True))]
+    return pd.concat(parts, ignore_index=True)
+
+
+def test_regimes_of_one_world_are_one_block_of_a_second_test():
+    cells = world(np.random.default_rng(13), 8, 9, (1.0, 1.1, 1.3), 0.1)
+    found = across.across(table(cells), "position")  # two regimes of each of four worlds
+    rank = stats.rankdata([[np.median(cell[label]) for label in "abc"] for cell in cells], axis=1)
+    of_world = stats.rankdata(np.median(rank.reshape(4, 2, 3), axis=1), axis=1)
+    assert (found.worlds, found.by_world.worlds) == (4, 4)
+    assert found.by_world.p == pytest.approx(stats.friedmanchisquare(*of_world.T).pvalue)
+    assert found.by_world.p > found.p  # half of the blocks
+    text = said(found)
+    assert (
+        "position: 8 cells of 4 worlds: regimes of one world share their flights and draws, so blocks are not independent and "
+        "p-values across cells are too small."
+    ) in text
+    assert any("with the 4 worlds as blocks" in line and line.endswith("that of a, as over cells.") for line in text)
+    order = across.across(table(cells).sample(frac=1, random_state=3), "position")
+    assert order.by_world == found.by_world
+
+
+def test_a_world_of_many_regimes_does_not_choose_the_best_filter_of_worlds():
+    one, other = {"a": np.full(9, 2.0), "b": np.ones(9), "c": np.full(9, 3.0)}, {"a": [1.0], "b": [2.0], "c": [3.0]}
+    found = across.across(spread_over(["s0"] * 5 + ["s1", "s2"], [one] * 5 + [other] * 2), "position")
+    assert (found.best, found.by_world.best) == (("b",), ("a",))
+    assert any(line.endswith("the best mean rank is that of a, over cells that of b.") for line in said(found))
+    tied = across.across(spread_over(["s0", "s0", "s1", "s2", "s2", "s3"], [one] * 3 + [other] * 3), "position")
+    assert tied.best == tied.by_world.best == ("a", "b")
+
+
+def test_of_too_few_worlds_or_of_one_cell_each_nothing_is_tested_anew():
+    cells = world(np.random.default_rng(12), 6, 9, (1.0, 1.1, 1.3))
+    two = across.across(spread_over(["s0", "s1"] * 3, cells), "position")
+    assert (two.worlds, two.by_world) == (2, None)
+    assert any("6 cells of 2 worlds" in line for line in said(two))
+    assert any("no test with worlds as blocks is made: 2 are too few, it takes 3 at least" in line for line in said(two))
+    own = across.across(spread_over([f"s{k}" for k in range(6)], cells), "position")
+    assert (own.worlds, own.by_world) == (6, None)
+    assert not any("worlds" in line for line in said(own))
+
+
+@pytest.mark.parametrize("filters", [3, 4, 7])
+def test_of_fewer_cells_than_the_least_no_pair_can_be_shown_by_wilcoxon(filters):
+    for n in range(5, 13):
+        cells = [{"abcdefg"[k]: [1.0 + k + 0.01 * i * k] for k in range(filters)} for i in range(n)]  # the same order everywhere
+        found = across.across(spread_over([f"s{k}" for k in range(n)], cells), "position")
+        assert (min(p.p_wilcoxon for p in found.pairs) <= found.alpha) == (n >= found.least), n
+        (line,) = [line for line in said(found) if "takes" in line]
+        assert f"Holm's correction over {len(found.pairs)} pairs takes {found.least} cells at least to show anything" in line
+        assert (f"no difference of any pair can be shown with {n} cells" in line) == (n < found.least)
 
 
 def test_a_filter_lost_in_most_runs_is_last_and_nothing_breaks():

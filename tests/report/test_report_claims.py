@@ -14,10 +14,10 @@ import pytest
 import yaml
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
-from synthetic_results import METHODS, STATE, write
+from synthetic_results import METHODS, STATE, VERSIONS, Method, write
 
 from pfbench import cli, store
-from pfbench.report import claim_figures, claims, evidence, ledger, rulings
+from pfbench.report import claim_figures, claims, evidence, ledger, power, rulings
 from pfbench.report import page as report_page
 from pfbench.report.canvas import slug
 from pfbench.report.claims import Claim, Comparison
@@ -46,9 +46,25 @@ def test_each_of_the_71_claims_has_one_record() -> None:
 
 def test_each_claim_can_be_decided_or_says_why_not() -> None:
     for claim in ALL:
-        assert any(claim.tests.values()) or claim.why, claim.id
+        assert any(claim.tests.values()) or claim.why or claim.shown, claim.id
         assert claim.claim[0].isupper() or claim.claim[0].isdigit(), claim.id
         assert not claim.claim.endswith("."), claim.id
+
+
+def test_nothing_is_left_open_for_a_reason_of_our_own() -> None:
+    assert {reason for claim in ALL for reason, _ in claim.why.values()} <= {"not stated", "not run"}
+    assert set(claims.REASONS) == {"not stated", "not run", "no power", "lost"}
+
+
+def test_what_a_test_decides_names_a_test_that_is_there() -> None:
+    shown = {claim.id: text for claim in ALL for _, text in claim.shown.values()}
+    assert set(shown) == {"002-01", "002-02"}
+    for text in shown.values():
+        ((path, name),) = re.findall(r'(tests/\w+\.py), "([^"]+)"', text)
+        assert f"def test_{name.replace(' ', '_')}(" in (STUDIES.parent / path).read_text()
+    for _, text in next(claim for claim in ALL if claim.id == "C001-10").why.values():
+        (path,) = re.findall(r"tests/\w+\.py", text)
+        assert (STUDIES.parent / path).is_file()
 
 
 def swept(study: str) -> dict[str, set[str]]:
@@ -106,6 +122,8 @@ WRONG = {
     "half a cell": ("t004/nominal/ins_gnss", "t004/nominal", r"X-1: cell=t004/nominal, .*give scenario/noise/model"),
     "no tests": (RECORD[RECORD.index("  tests:") :], "  note: none", r"X-1: it has neither tests nor a reason"),
     "unknown paper": ('"000"', '"999"', r"X-1: paper='999'"),
+    "shown and tested": ("  tests:", "  shown: 'holds: it is a count'\n  tests:", r"X-1: what is shown without"),
+    "bad outcome": ("  tests:", "  shown: 'true: it is a count'\n  tests:", r"X-1: shown='true: .*begin with one of holds"),
     "bad reason": ("  tests:", "  why: because\n  tests:", r"X-1: why='because'; begin with one of not stated"),
     "uneven lists": ("b: ekf", "b: [ekf, ukf], from: [1, 2, 3]", r"X-1: lists of \[2, 3\] values"),
 }
@@ -232,6 +250,73 @@ def test_equivalence_needs_both_sides(ratio: float) -> None:
 def test_one_timing_within_a_tenth_decides_nothing() -> None:
     test = replace(LESS, statistic="cost", high=1.0)
     assert ruled(test, a=[1.05], b=[1.0]).reason == ruled(test, a=[0.95], b=[1.0]).reason == "no power"
+
+
+def test_the_verdict_on_times_says_that_there_is_one_timing_or_their_range() -> None:
+    test = replace(LESS, statistic="cost", high=1.0)
+    note = "time per step: one timing a job, no interval"
+    assert [ruled(test, a=[value], b=[1.0]).note for value in (0.8, 0.95, 1.3)] == [note] * 3
+    assert ruled(test, a=[0.8]).note == ""  # nothing was timed
+    assert ruled(LESS, **losses(1, 0.7)).note == ""
+    tests = [replace(test, cell=f"flight/{noise}/ins_gnss") for noise in ("surge", "nominal", "burst")]
+    rows = pd.concat([frame(one, a=[ratio], b=[1.0]) for one, ratio in zip(tests, (0.8, 0.5, 0.9), strict=True)])
+    (found,) = rulings.decide([claim(*tests)], rows)
+    assert (found.verdict, found.note) == (YES, "time per step of a to b: 0.5 to 0.9 over 3 cells, one timing a job")
+
+
+def test_a_claim_that_a_test_shows_is_decided_without_runs() -> None:
+    nothing = frame(LESS, a=[1.0])
+    record = replace(claim(LESS), tests={}, shown={"": ("holds", "tests/test_rules.py counts it")})
+    (found,) = rulings.decide([record], nothing)
+    assert (found.verdict, found.reason, found.note) == (YES, "", "tests/test_rules.py counts it")
+    against = replace(record, shown={"": ("fails", "tests/test_rules.py counts it")})
+    assert rulings.decide([against], nothing)[0].verdict == NO
+    forms = replace(record, shown={"printed": ("fails", "one"), "repaired": ("holds", "two")})
+    (found,) = rulings.decide([forms], nothing)
+    assert (found.verdict, found.note) == ("reproduced only as repaired", "as printed: one; as repaired: two")
+
+
+def normal(middle: float, scatter: float, runs: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Ratios whose logarithms have this median and deviation exactly."""
+    d = np.random.default_rng(seed).standard_normal(runs)
+    d = middle + scatter * (d - np.median(d)) / d.std(ddof=1)
+    return {"a": np.exp(d), "b": np.ones(runs)}
+
+
+def test_what_lacks_power_says_the_runs_that_it_takes() -> None:
+    """By hand, from the closed forms of `power`: for the claim at the corrected level, or against it by the interval."""
+    other = replace(LESS, a="n")
+    for middle in (-0.2, -0.02, 0.05):
+        values = normal(middle, 0.5, 20)
+        rows = frame([LESS, other], **values, n=np.exp(np.linspace(-1, 1.1, 20)))
+        found = rulings.decide([claim(LESS, other)], rows)[0].findings[""][0]
+        assert (found.outcome, found.why, found.family) == ("open", "no power", 2)
+        for_it = power.needed(-middle / 0.5, 2 * 0.05 / 2) if middle < 0 else np.inf
+        beyond = middle + np.log(1.1)  # worth the name is a tenth
+        against_it = power.needed(beyond / 0.5, 0.05, efficiency=2 / np.pi) if beyond > 0 else np.inf
+        assert found.needed == pytest.approx(min(for_it, against_it), abs=1)
+        assert f"power 0.8 at this effect takes {found.needed:.0f} runs a cell" in ledger.enough(found)
+    assert np.isnan(ruled(LESS, **losses(1, 0.7)).findings[""][0].needed)  # it was decided
+    assert np.isnan(ruled(replace(LESS, statistic="cost", high=1.0), a=[1.05], b=[1.0]).findings[""][0].needed)
+    share = alone("share", metric="diverged", low=0.05)
+    (found,) = ruled(share, a=np.arange(20) < 2).findings[""]
+    assert found.needed == power.needed_share(0.1, 0.05, 0.05)
+    open_one = ruled(LESS, **normal(-0.1, 0.5, 20))
+    assert ledger.table([open_one])["runs needed"].iloc[0] > 20
+    assert "power 0.8 at this effect takes" in ledger.papers([open_one])[0]["rows"][0]["lines"][0]["more"]
+
+
+@pytest.mark.parametrize(("middle", "outcome"), [(-0.12, "holds"), (0.0, "fails")])
+def test_so_many_runs_decide_as_often_as_said(middle: float, outcome: str) -> None:
+    (few,) = ruled(LESS, **normal(middle, 0.2, 6)).findings[""]
+    assert few.outcome == "open"
+    rng, trials = np.random.default_rng(23), 400
+    hits = 0
+    for _ in range(trials):
+        d = middle + 0.2 * rng.standard_normal(int(few.needed))
+        hits += ruled(LESS, a=np.exp(d), b=np.ones(d.size)).findings[""][0].outcome == outcome
+    # order statistics jump: their interval is wider than its level asks, by a few per cent of power
+    assert hits / trials == pytest.approx(0.8, abs=4 * np.sqrt(0.16 / trials) + 0.03)
 
 
 def test_the_order_of_rows_and_of_claims_changes_nothing() -> None:
@@ -454,7 +539,9 @@ def test_the_page_shows_every_claim(tmp_path: Path) -> None:
         assert text.count(f'<tr id="{claim_id}"') == 1
     assert "http" not in text  # it works offline
     markdown = (page.parent / "report.md").read_text()
-    assert len(re.findall(r"^### .+: cannot be decided: ", markdown, re.M)) == 71
+    assert len(re.findall(r"^### .+: cannot be decided: ", markdown, re.M)) == 69  # without a single run
+    assert len(re.findall(r"^### 002-0[12]: reproduced$", markdown, re.M)) == 2
+    assert "What ran" not in text
     assert {"verdicts.json", "tables"} <= {path.name for path in page.parent.iterdir()}
 
 
@@ -469,6 +556,42 @@ def test_the_page_has_the_numbers_and_a_link_to_the_cell(study: Path) -> None:
     assert ledger.count(found).set_index("paper").loc["all", "claims"] == 1
     assert ledger.of_study(found, "s") == found
     assert ledger.of_study(found, "t") == []
+
+
+def page_of(folder: Path, out: Path, *tests: Comparison) -> tuple[str, str]:
+    """The page of one claim, as Markdown and as HTML."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ledger, "load", lambda *_: [claim(*tests)])
+        patch.setattr(ledger.claim_figures, "drawings", lambda _: [])
+        path = ledger.write(folder, out)
+    return (path.parent / "report.md").read_text(), path.read_text()
+
+
+def test_the_page_says_what_each_claims_study_ran_with(study: Path, tmp_path: Path) -> None:
+    test = Comparison("less", "s", CELL, "rmse", "cofm_amssrcpf", "sir", group="position")
+    write(study / "s", Method("apf", 1.3, 0.8, 999), runs=20, steps=60)  # in the study, and not in the claim
+    for text in page_of(study, tmp_path / "out", test):
+        assert "s: 20 runs of each filter. Budget: same N (N = 200 of each particle filter)." in text
+        assert "All studies ran at one commit, 0123abc." in text
+        assert "Commit 0123abc" not in text
+        assert "N = 999" not in text
+    table = pd.read_csv(tmp_path / "out" / "claims" / "tables" / "studies.csv")
+    assert table.iloc[0].to_dict() == {
+        "study": "s", "jobs": 2, "runs": 20, "budget": "same N (N = 200 of each particle filter)", "commit": "0123abc",
+    }  # fmt: skip
+
+
+def test_the_page_says_which_commit_each_study_ran_at_where_they_differ(study: Path, tmp_path: Path) -> None:
+    for method in METHODS[:2]:
+        write(study / "t", method, runs=30, steps=60, versions={**VERSIONS, "commit": "feed123"})
+    one = Comparison("less", "s", CELL, "rmse", "ukf", "ekf", group="position")
+    for text in page_of(study, tmp_path / "out", one, replace(one, study="t")):
+        assert "The studies ran at different commits, 0123abc, feed123" in text
+        assert "s: 20 runs of each filter. Budget: same N (no particle filter here). Commit 0123abc." in text
+        assert "t: 30 runs of each filter. Budget: same N (no particle filter here). Commit feed123." in text
+    both = evidence.ran([claim(one, replace(one, study="t"))], study)
+    (line,) = ledger.with_what(claim(one), both)  # of its own studies alone
+    assert line.startswith("s: 20 runs")
 
 
 def test_each_claim_links_to_a_figure_that_is_there(study: Path, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from pfbench.report import across, canvas, frame, headline, headline_figures, ranking_figures
+from pfbench.report import across, canvas, frame, headline, headline_figures, page, ranking_figures
 from pfbench.report.significance import NO_DIFFERENCE, holm, verdicts
 
 WORLDS, REGIMES = ("plain", "hill", "lake"), ("nominal", "outliers")
@@ -69,6 +69,40 @@ def test_a_winner_needs_the_corrected_p_and_is_the_one_whose_errors_are_smaller(
     more = pd.concat([table, rows(seed=1).assign(model="n")], ignore_index=True)
     of = mains() | {(world, noise, "n"): group for (world, noise, _), group in mains().items()}
     assert [pair.winner for pair in found(more, of)[4]] == ["mcmc_rpf", "mcmc_rpf", "mssrckf"]
+
+
+def words():
+    return page._environment(False).get_template("text.jinja").make_module({"options": page.Options()})
+
+
+def test_what_cannot_be_shown_is_not_called_no_difference():
+    table = rows()
+    pairs = found(table)[4]
+    assert min(pair.p for pair in pairs) == 2 / 2**6  # all signs alike
+    assert {(pair.least, pair.possible, pair.decided) for pair in pairs} == {(7, False, "cannot be shown with 6 cells")}
+    text = words().told(pairs)
+    assert "over 6 cells of 3 worlds, which are no independent blocks: a difference cannot be shown with 6 cells" in text
+    assert "takes 7 cells at least to show anything" in text
+    assert "no difference shown" not in text
+    more = pd.concat([table, rows(seed=1).assign(model="n")], ignore_index=True)
+    of = mains() | {(world, noise, "n"): group for (world, noise, _), group in mains().items()}
+    pairs = found(more, of)[4]
+    assert [pair.decided for pair in pairs] == [pair.winner for pair in pairs] == ["mcmc_rpf", "mcmc_rpf", "mssrckf"]
+    assert "better in 2 (mcmc_rpf / sir, mcmc_rpf / rpf), worse in 1" in words().told(pairs)
+
+
+def test_filters_that_tie_with_the_sixth_are_named_and_the_others_counted():
+    table = rows()
+    own, decided, _, _, pairs = found(table)
+    one = across.across(own, "position")
+    said = headline.summary(one, decided, pairs, own, mains(), [])
+    often = tuple((f"f{k}", 6 if k < 8 else 2) for k in range(11))
+    tied = headline.replace(said, often=often)
+    assert [label for label, _ in tied.foremost] == [f"f{k}" for k in range(8)]
+    text = words().summary(tied, one)
+    assert "f5 in 6, f6 in 6, f7 in 6 of 6 cells; 3 other filters are so in fewer." in text
+    assert "of 6 cells; " not in words().summary(headline.replace(said, often=often[:8]), one)
+    assert headline.replace(said, often=()).foremost == ()
 
 
 def test_what_runs_are_lost_decides_and_is_said():

@@ -47,6 +47,20 @@ def test_needed_runs_smallest_effect_and_power_are_one_relation():
     assert power.power(9.0, 5) == 0.0
 
 
+@pytest.mark.parametrize(("share", "limit", "alpha"), [(0.15, 0.05, 0.05), (0.7, 0.5, 0.01), (0.3, 0.5, 0.025)])
+def test_the_runs_of_a_share_find_it_as_often_as_said(share, limit, alpha):
+    def exact(n):
+        """Power of the exact binomial test."""
+        if share > limit:
+            return stats.binom.sf(stats.binom.isf(alpha, n, limit), n, share)
+        return stats.binom.cdf(stats.binom.ppf(alpha, n, limit) - 1, n, share)
+
+    n = int(power.needed_share(share, limit, alpha))
+    # the exact test is cautious, and its power goes up and down with n
+    assert np.mean([exact(k) for k in range(n - 5, n + 6)]) == pytest.approx(0.8, abs=0.06)
+    assert power.needed_share(limit, limit) == np.inf
+
+
 def test_equivalence_is_shown_within_the_margin_only():
     d = np.linspace(-0.02, 0.02, 21)
     assert power.equivalence(d, 0.05) < 1e-4
