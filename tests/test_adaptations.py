@@ -657,6 +657,20 @@ def test_residuals_and_corrections_tell_the_noise_on_average() -> None:
     assert np.abs((process - expected) / size).max() < 5.0 * math.sqrt(2.0 / runs)
 
 
+def test_what_is_left_of_a_curved_sight_holds_its_curvature() -> None:
+    """e e' + C+_zz, where C+_zz is what the line through C_zz leaves after the update, and all that no line explains."""
+    model, y = Bearing(sd=(0.05, 0.1)), torch.tensor([[0.9, 3.1], [-0.4, 1.2]], dtype=torch.float64)
+    method = GaussianFilter(MIXED, (MatrixNoise(0.75),))
+    new = method.advance(model, method.init(model, 2, MonteCarlo(0, torch.arange(2))), Record(y))
+    seen = new.innovation
+    line = seen.m @ seen.m.mT
+    gain = torch.linalg.solve(seen.spread + seen.nominal, line).mT
+    e = seen.r.unsqueeze(-1) - gain @ seen.r.unsqueeze(-1)
+    left = line - gain @ line + (seen.spread - line)
+    assert float((seen.spread - line).abs().max()) > 0.1 * float(left.abs().max())
+    assert torch.allclose(new.memory["measurement"], 0.25 * (e @ e.mT + left), rtol=1e-9, atol=1e-12)
+
+
 def test_learned_matrices_are_used_and_forgotten_at_the_stated_rate() -> None:
     model = scalar(p=0.5)
     y = torch.tensor([[[1.0], [0.5], [2.0]]], dtype=torch.float64)
