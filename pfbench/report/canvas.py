@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from itertools import cycle
+from itertools import cycle, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,10 +14,14 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from PIL import Image
 
 COLUMN = 3.5  # inches
+SMALL = 6.5  # points of the smallest letters, where a name has to fit a row of many
+LETTER = 0.62 * SMALL  # points that one of them is wide, on average
 INSTANTS = 180  # drawn at most: a column of print is 250 points wide
+_CLOSE = 9  # points between marks of which each has a line to its name
 _BESIDE = 24  # letters of a label beside which another one has room
 RC: Any = {
     "font.size": 8,
@@ -34,14 +39,18 @@ RC: Any = {
     "lines.linewidth": 1.3,
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
+    "figure.dpi": 150,  # letters are as wide when a figure is laid out as when it is saved, and names are not cut
     "savefig.dpi": 150,
     "svg.hashsalt": "pfbench",  # identifiers of an SVG are random otherwise
     "svg.fonttype": "none",  # letters, which can be read and searched, and take less room than their outlines
 }
 # Okabe and Ito 2008, without the yellow that white paper swallows.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
+# From light to dark in equal steps of lightness, which every eye and a grey printer tell apart: tints and shades of one blue.
+SHADES = ("#dfedf5", "#aad0e5", "#74b2d5", "#3e94c5", "#0474b3", "#005788", "#003c5d", "#002235")
 _Dash = str | tuple[int, tuple[float, ...]]
 _DASHES: tuple[_Dash, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
@@ -92,6 +101,11 @@ def stack(n: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes
     return figure, list(figure.subplots(n, 1, squeeze=False, sharex=sharex)[:, 0])
 
 
+def roomy() -> ConstrainedLayoutEngine:
+    """A layout in which a name that takes all the room does not touch the edge."""
+    return ConstrainedLayoutEngine(w_pad=0.1)
+
+
 def legend(figure: Figure, axis: Axes, columns: int = 2) -> None:
     """A legend below the figure, which grows by the height of it."""
     handles, labels = axis.get_legend_handles_labels()
@@ -104,7 +118,7 @@ def legend(figure: Figure, axis: Axes, columns: int = 2) -> None:
 
 
 def indexed(figure: Figure) -> bytes:
-    """The figure as a PNG of 74 colours: those of the filters and greys, in steps to white; a quarter as large."""
+    """The figure as a PNG of 97 colours: the filters' in steps to white, shades of maps, and greys; a quarter as large."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     picture = Image.open(buffer).convert("RGB").quantize(palette=_palette(), dither=Image.Dither.NONE)
@@ -118,8 +132,9 @@ def _palette() -> Image.Image:
     colours = [*(colour for colour in _COLOURS if colour != "#000000"), "#B35900"]
     pure = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours])
     whiter = pure[:, None] + (255 - pure[:, None]) * np.linspace(0, 1, 8, endpoint=False)[:, None]
-    greys = np.repeat(np.linspace(0, 255, 18)[:, None], 3, axis=1)
-    steps = np.round(np.concatenate([whiter.reshape(-1, 3), greys])).astype(np.uint8)
+    shades = np.array([[int(shade[i : i + 2], 16) for i in (1, 3, 5)] for shade in SHADES])
+    greys = np.repeat(np.minimum(np.arange(0, 257, 8), 255)[:, None], 3, axis=1)  # so near that no tint is nearer to a grey
+    steps = np.round(np.concatenate([whiter.reshape(-1, 3), shades, greys])).astype(np.uint8)
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.concatenate([steps, np.repeat(steps[-1:], 256 - len(steps), axis=0)]).tobytes())
     return palette
@@ -176,10 +191,39 @@ def plain_ticks(side: Axis, values: Sequence[float] | np.ndarray) -> None:
         side.set_major_locator(ticker.MaxNLocator(4, steps=[1, 2, 5, 10]))
     else:
         side.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0) if reach < 100 else (1.0,), numticks=8))
-    side.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    side.set_major_formatter(_Numbers())
     if reach < 100:  # 1, 2 and 5 have their own; minor ones between them only cost time
         side.set_minor_locator(ticker.NullLocator())
     side.set_minor_formatter(ticker.NullFormatter())
+
+
+def told(values: Sequence[float]) -> list[str]:
+    """Numbers of one axis in one style: plain, and where the largest or the smallest takes many digits all in powers of ten."""
+    sizes = [abs(value) for value in values if value]
+    if not sizes or (max(sizes) < 1e5 and min(sizes) >= 1e-4):
+        return [f"{value:g}" for value in values]
+    return list(map(_power, values))
+
+
+def _power(value: float) -> str:
+    if not value:
+        return "0"
+    digits, _, exponent = f"{value:.3e}".partition("e")
+    factor, tens = float(digits), "10" + str(int(exponent)).translate(_RAISED)
+    return f"{factor:g}·{tens}" if abs(factor) != 1 else tens if factor > 0 else f"-{tens}"
+
+
+class _Numbers(ticker.Formatter):
+    """Ticks in the style of those of them that are seen."""
+
+    def __call__(self, value: float, pos: int | None = None) -> str:
+        return told([value])[0]
+
+    def format_ticks(self, values: Any) -> list[str]:
+        low, high = sorted(self.axis.get_view_interval()) if self.axis is not None else (-np.inf, np.inf)
+        near = 1e-9  # the ends of an axis are ticks too, but for rounding
+        seen = [value for value in values if low * (1 - near) <= value <= high * (1 + near)]
+        return [dict(zip(seen, told(seen), strict=True)).get(value, "") for value in values]
 
 
 def zoom(axis: Axes, curves: Sequence[np.ndarray]) -> None:
@@ -189,9 +233,91 @@ def zoom(axis: Axes, curves: Sequence[np.ndarray]) -> None:
         axis.set_ylim(-1.1 * rest, 1.1 * rest)
 
 
+def named_beside(axis: Axes, points: np.ndarray, names: Mapping[int, str], reach: np.ndarray, path: np.ndarray) -> None:
+    """Small names beside points of a panel that is laid out, each where it covers nothing, and a line where it is not close by.
+
+    A name takes the cheapest place of a grid over the panel: close to its point, and clear of marks, of the path, and of other
+    names and their lines; once all have a place, each looks for its own again.
+
+    Args:
+        axis: the panel.
+        points: all marks [n, 2].
+        names: by row of `points`.
+        reach: of each mark, in points of print [n].
+        path: corners of a line through the panel [m, 2].
+    """
+    scale = 72 / axis.figure.dpi
+    at, corners = (axis.transData.transform(values) * scale for values in (points, path))
+    low, high = axis.get_window_extent().get_points() * scale
+    parts = np.linspace(0, 1, 25)[:, None]
+    fixed = np.concatenate([at, *(a + parts * (b - a) for a, b in pairwise(corners))])
+    clear = np.concatenate([reach, np.full(len(fixed) - len(at), 1.0)])
+    weight = np.concatenate([np.full(len(at), 300.0), np.full(len(fixed) - len(at), 4.0)])
+    sizes = {k: _size(name) for k, name in names.items()}
+    found: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # corner of each name, and where its line ends
+    for k in 2 * sorted(names, key=lambda k: tuple(at[k])):
+        found.pop(k, None)
+        last = np.maximum(high - sizes[k] - 1, low + 1)
+        across, up = (np.arange(low[i] + 1, last[i] + 1, step) for i, step in enumerate((4, 2.5)))
+        boxes = np.stack(np.meshgrid(across, up), -1).reshape(-1, 2)
+        ends = np.clip(at[k], boxes, boxes + sizes[k])
+        cost = np.hypot(*(ends - at[k]).T) + 0.02 * np.abs(boxes + sizes[k] / 2 - at[k]).sum(-1)
+        cost += _covered(boxes, sizes[k], fixed, clear) @ weight
+        lines = at[k] + parts[::3] * (ends[:, None] - at[k])  # from the point to the name
+        others = at[np.hypot(*(at - at[k]).T) > _CLOSE]
+        cost += 20 * (((lines[:, :, None] - others) ** 2).sum(-1) < 3**2).any(1).sum(-1)
+        for j, (box, end) in found.items():
+            cost += 1000 * ((boxes < box + sizes[j] + 1) & (box < boxes + sizes[k] + 1)).all(-1)
+            cost += 300 * _covered(boxes, sizes[k], at[j] + parts * (end - at[j]), np.ones(len(parts))).any(-1)
+            cost += 300 * ((lines > box) & (lines < box + sizes[j])).all(-1).any(-1)
+            cost += 60 * _cross(at[k], ends, at[j], end)
+        best = int(np.argmin(cost))
+        found[k] = boxes[best], ends[best]
+    for k, (box, end) in found.items():
+        far = np.hypot(*(end - at[k])) > reach[k] + 3 or (np.hypot(*(at - at[k]).T) < _CLOSE).sum() > 1
+        line: Any = {"arrowstyle": "-", "lw": 0.4, "color": "0.35", "shrinkA": 0, "shrinkB": 0}
+        part = (end - box) / sizes[k]
+        side = 0.0 if part[0] < 0.1 else 1.0 if part[0] > 0.9 else 0.5  # the end that is held: how wide letters are is a guess
+        axis.annotate(
+            names[k], tuple(points[k]), tuple(box + (side, 0.5) * sizes[k] - at[k]), textcoords="offset points", fontsize=SMALL,
+            ha={0.0: "left", 0.5: "center", 1.0: "right"}[side], va="center", linespacing=1.0, zorder=5,
+            arrowprops=line | {"relpos": tuple(part)} if far else None, in_layout=False,
+        )  # fmt: skip
+
+
+def _size(text: str) -> np.ndarray:
+    """Width and height of small letters in points of print."""
+    lines = text.split("\\\n")
+    return np.array([max(map(len, lines)) * LETTER, 1.2 * SMALL * len(lines)])
+
+
+def _covered(boxes: np.ndarray, size: np.ndarray, points: np.ndarray, clear: np.ndarray) -> np.ndarray:
+    """Which points [n] lie in boxes [m, 2] of that size, or nearer to them than they may: [m, n]."""
+    off = np.clip(points, boxes[:, None], boxes[:, None] + size) - points
+    return np.asarray((off**2).sum(-1) < clear**2)
+
+
+def _cross(a: np.ndarray, ends: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Do lines from a to each of the ends [m, 2] meet that from c to d?"""
+    def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+        return np.asarray((q - p)[..., 0] * (r - p)[..., 1] - (q - p)[..., 1] * (r - p)[..., 0])
+
+    return np.asarray((side(a, ends, c) * side(a, ends, d) < 0) & (side(c, d, a) * side(c, d, ends) < 0))
+
+
 def broken(label: str, width: int = 26) -> str:
     """A filter's label on as many lines as a column has room for: settings in brackets on lines of their own."""
     if len(label) <= width or "[" not in label:
         return label
     name, _, told = label.partition("[")
     return f"{name}\n[{told}"
+
+
+def wrapped(label: str, width: int = 18) -> str:
+    """A filter's label on lines of no more letters where it can be broken: after a "_" or a ".", and before a "["."""
+    lines = [""]
+    for part in re.findall(r"\[?[^_.\[]+[_.]*|\[", label):
+        if lines[-1] and len(lines[-1]) + len(part) > width:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(lines)

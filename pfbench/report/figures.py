@@ -20,6 +20,7 @@ from pfbench.report.canvas import (
     COLUMN,
     INSTANTS,
     RC,
+    SMALL,
     Look,
     broken,
     indexed,
@@ -34,7 +35,7 @@ from pfbench.report.canvas import (
     thinned,
     zoom,
 )
-from pfbench.report.frame import Block, blocks
+from pfbench.report.frame import Block, blocks, in_use
 
 Results = Mapping[str, store.Result]
 
@@ -287,10 +288,10 @@ def rmse(runs: pd.DataFrame, groups: Sequence[str], style: Mapping[str, Look]) -
             lost = int(own.lost[own.label == label].sum())
             if lost:
                 place_of = axis.get_yaxis_transform()
-                size = 5.5 if many else 7
+                size = SMALL if many else 7
                 axis.text(1.01, place, f"{lost} lost", transform=place_of, ha="left", va="center", fontsize=size)
         # Said again because a filter that lost every run has no box, and its row must stay.
-        axis.set_yticks(range(len(order)), list(map(broken, order)), fontsize=5.8 if many else None)
+        axis.set_yticks(range(len(order)), list(map(broken, order)), fontsize=SMALL if many else None)
         axis.set_ylim(len(order) - 0.5, -0.5)
         unit = str(own.unit.iloc[0]) if len(own) else ""
         axis.set(title=group, xlabel=labelled("RMSE per run", unit), ylabel="")
@@ -393,7 +394,7 @@ def cost(results: Results, style: Mapping[str, Look]) -> Figure:
         known = np.array([value for value in values if value > 0])
         axis.set_xlim(0, 1.1 * known.max(initial=1e-9))
         axis.set(xlabel=name, yticks=range(len(labels)), yticklabels=list(map(broken, labels)))
-        axis.tick_params(axis="y", labelsize=6.5)
+        axis.tick_params(axis="y", labelsize=SMALL)
         if known.size and known.max() > 10 * known.min():
             axis.set_xscale("log")
             axis.set_xlim(known.min() / 1.5, 1.5 * known.max())
@@ -409,9 +410,10 @@ def trace(results: Results, name: str, style: Mapping[str, Look]) -> Figure:
     figure, (axis,) = stack(1, 2.2)
     for label, result in results.items():
         if name in result.arrays and (result.meta.get("particles") or not share):
-            time, (values,) = _kept(result, None, name, most=style[label].instants)
-            scale = 100 / result.meta["particles"] if share else 1.0
-            low, middle, high = quantiles(scale * values, [0.05, 0.5, 0.95])
+            whole = 100 * result.arrays[name] / in_use(result) if share else result.arrays[name]
+            shown = result._replace(arrays={**result.arrays, name: whole})
+            time, (values,) = _kept(shown, None, name, most=style[label].instants)
+            low, middle, high = quantiles(values, [0.05, 0.5, 0.95])
             if not style[label].quiet:
                 axis.fill_between(time, low, high, color=style[label].colour, alpha=0.18, lw=0)
             axis.plot(time, middle, marker=_mark(time), **style[label].line(label))

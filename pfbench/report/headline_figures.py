@@ -4,25 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from pfbench.report.across import Across, Blocks
-from pfbench.report.canvas import COLUMN, plain_ticks, slug
+from pfbench.report.canvas import COLUMN, SHADES, SMALL, plain_ticks, roomy, slug, wrapped
 from pfbench.report.figures import Drawing
 from pfbench.report.headline import Planned
 from pfbench.report.significance import NO_DIFFERENCE
 
 _BETTER, _WORSE, _OPEN = "#0072B2", "#E69F00", "0.72"  # apart in grey too: dark, light, and a ring
-# From light to dark, of the colours that a small PNG keeps: the blue of the palette in steps from white, then black.
-_SHADES = ("#dfeef6", "#bfdcec", "#9fcae3", "#7fb8d8", "#5faace", "#2080ba", "#0072B2", "#1a1a1a")
 _STEPS = (1.05, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)  # edges between the shades of the map
+_BESIDE = 170  # points beside the longest names, of those of a column
 _WIDE = 60  # cells of which each has a column of its own
+_HELD = 28  # cells that one column of print holds, with names of letters that can be read; more are drawn wider
 
 
 def drawings(one: Across, source: Blocks, pairs: Sequence[Planned], alpha: float, said: str) -> list[Drawing]:
@@ -47,7 +46,7 @@ def drawings(one: Across, source: Blocks, pairs: Sequence[Planned], alpha: float
 
 def proposed(pairs: Sequence[Planned]) -> Figure:
     """A row per pair, a dot per cell."""
-    figure = Figure(figsize=(COLUMN, 0.7 + 0.21 * len(pairs)), layout=_roomy())
+    figure = Figure(figsize=(COLUMN, 0.7 + 0.21 * len(pairs)), layout=roomy())
     axis = figure.subplots()
     ends = np.array([r for pair in pairs for r in pair.ratios if np.isfinite(r) and r > 0])
     low, high = float(np.quantile(ends, 0.01)), float(np.quantile(ends, 0.99))
@@ -65,12 +64,13 @@ def proposed(pairs: Sequence[Planned]) -> Figure:
         width = 0.9 if pair.winner == NO_DIFFERENCE else 2.4
         axis.plot([float(np.clip(pair.ratio, low, high))] * 2, [row - 0.38, row + 0.38], color="black", lw=width, zorder=3)
     names = [f"{pair.method} / {pair.baseline}" for pair in pairs]
-    axis.set_yticks(range(len(pairs)), names, fontsize=6)
+    axis.set_yticks(range(len(pairs)), names, fontsize=SMALL)
     axis.set_ylim(len(pairs) - 0.4, -0.6)
     for row in range(1, len(pairs)):
         if pairs[row].method != pairs[row - 1].method:
             axis.axhline(row - 0.5, color="0.8", lw=0.6, zorder=0)
-    axis.set(xscale="log", xlim=(low, high), xlabel="RMSE over that of the baseline")
+    axis.set(xscale="log", xlim=(low, high))
+    figure.supxlabel("RMSE over that of the baseline", fontsize=8)  # wider than a panel beside long names
     plain_ticks(axis.xaxis, [low, high])
     axis.grid(False, axis="y")
     return figure
@@ -84,31 +84,28 @@ def ratio_map(one: Across, source: Blocks) -> Figure:
     by = one.ranks or np.median(ratio, axis=0)
     order = sorted(range(len(source.filters)), key=lambda i: (by[i], source.filters[i]))
     shown = ratio[:, order].T
-    size = min(6.0, 200 / len(order))
-    figure = Figure(figsize=(COLUMN, 1.35 + 0.018 * size * len(order)), layout=_roomy())
+    wide = COLUMN + max(0, len(source.cells) - _HELD) * SMALL / 72
+    names = [wrapped(source.filters[i]) for i in order]
+    lines = max(1 + (a.count("\n") + b.count("\n")) / 2 for a, b in pairwise(names))  # neighbours do not touch
+    figure = Figure(figsize=(wide, 1.35 + 0.018 * SMALL * lines * len(order)), layout=roomy())
     axis = figure.subplots()
-    shades = to_rgba_array(_SHADES)
+    shades = to_rgba_array(SHADES)
     image = shades[np.searchsorted(_STEPS, np.where(np.isfinite(shown), shown, 1.0), side="right")]
     image[~np.isfinite(shown)] = (1, 1, 1, 1)
     axis.imshow(image, aspect="auto", interpolation="nearest")
     rows, columns = np.nonzero(~np.isfinite(shown))
     axis.plot(columns, rows, ls="none", marker="x", ms=2.5, color="0.4", mew=0.6)
-    axis.set_yticks(range(len(order)), [source.filters[i] for i in order], fontsize=size)
+    axis.set_yticks(range(len(order)), names, fontsize=SMALL, linespacing=1.0)
     _worlds(axis, source.cells)
     axis.grid(False)
     axis.tick_params(length=0)
-    for k, (edge, shade) in enumerate(zip(("1", *(f"{step:g}" for step in _STEPS)), shades, strict=True)):
-        axis.plot([], [], ls="none", marker="s", color=shade, label=f"from {edge}" if k == len(_STEPS) else edge)
+    for edge, shade in zip((1.0, *_STEPS), shades, strict=True):
+        axis.plot([], [], ls="none", marker="s", color=shade, label=f"{edge:g}")
     figure.legend(
-        loc="outside lower center", ncols=8, fontsize=5.5, handletextpad=0.1, columnspacing=0.9, title="times the best, from",
-        title_fontsize=6,
+        loc="outside lower center", ncols=8, fontsize=SMALL, handletextpad=0.1, columnspacing=0.7, title="times the best, from",
+        title_fontsize=SMALL,
     )  # fmt: skip
     return figure
-
-
-def _roomy() -> ConstrainedLayoutEngine:
-    """Long names are a little wider in a bitmap than the layout has counted on."""
-    return ConstrainedLayoutEngine(w_pad=0.1)
 
 
 def _worlds(axis: Any, cells: Sequence[str]) -> None:
@@ -121,10 +118,11 @@ def _worlds(axis: Any, cells: Sequence[str]) -> None:
         start += width
         if start < len(cells):
             axis.axvline(start - 0.5, color="white", lw=1.6)
-    small = min(5.5, 150 / len(cells))
-    axis.set_xticks(range(len(cells)), [cell.split(" / ")[1] for cell in cells], rotation=90, fontsize=small)
+    axis.set_xticks(range(len(cells)), [cell.split(" / ")[1] for cell in cells], rotation=90, fontsize=SMALL)
     above = axis.secondary_xaxis("top")
-    above.set_xticks(places, names, fontsize=5.5, rotation=25, ha="left", rotation_mode="anchor")
+    apart = min((b - a for a, b in pairwise(places)), default=len(cells)) * _BESIDE / max(len(cells), _HELD)
+    turned = max(25.0, np.degrees(np.arcsin(min(1.0, 1.2 * SMALL / apart))))  # lines of letters side by side need that much
+    above.set_xticks(places, names, fontsize=SMALL, rotation=turned, ha="left", rotation_mode="anchor")
     above.tick_params(length=0)
     above.spines["top"].set_visible(False)
 

@@ -10,11 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pfbench import metrics, store
-from pfbench.report.canvas import Look, labelled, legend, log_if_wide, quantiles, stack, thinned
+from pfbench.report.canvas import Look, labelled, legend, log_if_wide, quantiles, stack, thinned, told
 from pfbench.report.frame import Block
 
 SYMLOG = " Beyond the grey lines, where there are any, the scale is logarithmic."
 _BAND = (0.05, 0.5, 0.95)
+_SIDE = 3  # ticks on each side of 0 that a panel has room for
 Shown = Mapping[str, tuple[store.Result, Block]]
 
 
@@ -179,20 +180,33 @@ def _dots(axis: Axes, there: Sequence[tuple[float, np.ndarray]], look: Look, lab
         )  # fmt: skip
 
 
+def _late(curve: np.ndarray) -> float:
+    """What a filter's quantiles [q, T] come to: nine tenths of them after the first third are smaller; 0 where none is known."""
+    sizes = np.abs(curve[:, curve.shape[1] // 3 :])
+    known = sizes[np.isfinite(sizes)]
+    return float(np.quantile(known, 0.9)) if known.size else 0.0
+
+
 def _symlog_if_wide(axis: Axes, curves: Sequence[np.ndarray]) -> None:
-    """A scale that shows both a start and what comes after it where the one dwarfs the other."""
+    """A scale that shows both a start and what comes after it where the one dwarfs the other, and good filters beside bad ones.
+
+    It is linear up to what the best filter comes to: filters that are as good are told apart there, whatever the others do.
+    """
     sizes = np.concatenate([np.abs(curve).ravel() for curve in curves]) if curves else np.empty(0)
-    late = np.concatenate([np.abs(curve[:, curve.shape[1] // 3 :]).ravel() for curve in curves]) if curves else np.empty(0)
-    late, sizes = late[np.isfinite(late)], sizes[np.isfinite(sizes)]
-    if late.size and sizes.max(initial=0.0) > 8 * (level := float(np.quantile(late, 0.9))) > 0:
-        axis.set_yscale("symlog", linthresh=level, linscale=1.2)
+    sizes = sizes[np.isfinite(sizes)]
+    late = [_late(curve) for curve in curves]
+    level = min((size for size in late if size > 0), default=0.0)
+    if sizes.max(initial=0.0) > 8 * level > 0:
+        decades = float(np.log10(sizes.max() / level))
+        axis.set_yscale("symlog", linthresh=level, linscale=max(1.2, 0.7 * decades))  # two fifths are linear at least
         for edge in (level, -level):
             axis.axhline(edge, color="0.55", lw=0.7, zorder=1)
-        decades = 10.0 ** np.arange(np.floor(np.log10(level)), np.floor(np.log10(sizes.max())) + 1)
-        beyond = decades[decades >= 1.5 * level]
-        top = np.floor(sizes.max() / decades[-1]) * decades[-1]  # the largest number of one digit
+        tens = 10.0 ** np.arange(np.floor(np.log10(level)), np.floor(np.log10(sizes.max())) + 1)
+        beyond = tens[tens >= 1.5 * level]
+        top = np.floor(sizes.max() / tens[-1]) * tens[-1]  # the largest number of one digit
         if not beyond.size or top > 3 * beyond[-1]:
             beyond = np.append(beyond, top)
+        beyond = beyond[:: -(-beyond.size // _SIDE)]  # no more than have room
         ticks = [*(-beyond[::-1]), 0.0, *beyond]
-        axis.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.set_yticks(ticks, told(ticks))
         axis.minorticks_off()

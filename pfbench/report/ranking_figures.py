@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import scikit_posthocs as posthocs
+from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -16,14 +18,28 @@ from matplotlib.ticker import MaxNLocator
 from pfbench.report import across
 from pfbench.report.across import Across, Blocks
 from pfbench.report.budget import Front
-from pfbench.report.canvas import COLUMN, Look, broken, labelled, legend, plain_ticks, slug, stack
+from pfbench.report.canvas import (
+    COLUMN,
+    LETTER,
+    SMALL,
+    Look,
+    broken,
+    labelled,
+    legend,
+    named_beside,
+    plain_ticks,
+    roomy,
+    slug,
+    stack,
+    wrapped,
+)
 from pfbench.report.figures import Drawing
 from pfbench.report.significance import NO_DIFFERENCE, Verdict
 
 _PAIRS = 28  # of a forest that a column's height still holds
 _MANY = 12  # filters of a diagram of which each rank has a tick
-_APART = 1.4  # times the time per step of the name before, that the next name on a front stands clear of it
-_LONG = 42  # letters of a pair that stand on one line of a column
+_TITLE = 52  # letters of a line above a panel
+_LONG = 34  # letters of a pair that stand on one line of a column
 _SIDE = 10  # filters of a matrix that a column's width still holds
 _BETTER, _WORSE = "#0072B2", "#E69F00"  # apart in grey too: dark and light
 
@@ -35,7 +51,7 @@ def of_cell(own: Sequence[Verdict], fronts: Sequence[Front], style: Mapping[str,
     if shown:
         text = (
             "Time per step against the median over runs of the RMSE, a lost run being worse than any other. Ringed and joined: "
-            f"filters that no other one beats in both{'; grey ones are named where there is room' if note else ''}.{note}"
+            f"filters that no other one beats in both.{note}"
         )
         found.append(Drawing("front", text, partial(fronts_of, shown, style)))
     for group in dict.fromkeys(v.group for v in own):
@@ -90,7 +106,9 @@ def critical_difference(one: Across, style: Mapping[str, Look]) -> Figure:
     """Mean ranks on a line, bars over those that are not told apart [Demsar 2006, figure 1]."""
     k = len(one.filters)
     half = -(-k // 2)
-    figure = Figure(figsize=(COLUMN, 0.85 + 0.17 * (half + _bars(one))), layout="constrained")
+    names = {label: wrapped(label) for label in one.filters}
+    apart = 0.17 + 0.08 * max(name.count("\n") for name in names.values())
+    figure = Figure(figsize=(COLUMN, 0.85 + apart * (half + _bars(one))), layout=roomy())
     axis = figure.subplots()
     # Above the omnibus level nothing is told apart, whatever a single pair says.
     p = np.ones((k, k))
@@ -101,14 +119,17 @@ def critical_difference(one: Across, style: Mapping[str, Look]) -> Figure:
     posthocs.critical_difference_diagram(
         dict(zip(one.filters, one.ranks, strict=True)),
         pd.DataFrame(p, index=one.filters, columns=one.filters),
-        ax=axis, alpha=one.alpha, label_props={"fontsize": 7 if k <= _MANY else 5.5}, text_h_margin=0.1,
+        ax=axis, alpha=one.alpha, label_props={"fontsize": 7 if k <= _MANY else SMALL}, text_h_margin=0.1,
         color_palette={label: style[label].colour for label in one.filters},
         marker_props={"s": 14, "zorder": 4}, elbow_props={"linewidth": 0.9},
         crossbar_props={"linewidth": 2.2, "color": "0.25", "marker": "|"},
         label_fmt_left="{label} {rank:.2f} ", label_fmt_right=" {rank:.2f} {label}",
     )  # fmt: skip
     for text in axis.texts:  # a light colour is a line, but no letter
-        text.set_color("black")
+        text.set(color="black", linespacing=1.0)
+        for label, name in names.items():
+            if label in text.get_text().split():
+                text.set_text(text.get_text().replace(label, name.replace("\n", "\n ")))
     for mark in (*axis.collections, *axis.lines):  # the first and the last stand on the edge
         mark.set_clip_on(False)
     axis.spines["top"].set(visible=True, bounds=(1, k))
@@ -134,22 +155,25 @@ def matrix(own: Sequence[Verdict], one: Across, named: Sequence[str] = ()) -> Fi
         won[i, j] += v.winner == v.a
         won[j, i] += v.winner == v.b
     share = np.divide(won - won.T, met, out=np.full(met.shape, np.nan), where=met > 0)
-    figure = Figure(figsize=(COLUMN, COLUMN - 0.25), layout="constrained")
+    names = list(map(wrapped, labels))
+    high = max(0.27, 0.11 * (1 + max(name.count("\n") for name in names)))
+    figure = Figure(figsize=(COLUMN, max(COLUMN - 0.25, 1.0 + high * len(labels))), layout=roomy())
     axis = figure.subplots()
-    axis.imshow(share, cmap=_blue_and_orange(), vmin=-1, vmax=1)
+    axis.imshow(share, cmap=_blue_and_orange(), vmin=-1, vmax=1, aspect="auto")
     stars = {frozenset((p.a, p.b)) for p in one.pairs if p.winner != NO_DIFFERENCE}
+    longest = max(len(f"{a}–{b}") for a, b in zip(won[met > 0], won.T[met > 0], strict=True)) + bool(stars) if met.any() else 0
+    beside = 72 * COLUMN - 20 - LETTER * max(len(line) for name in names for line in name.split("\n"))
+    between = "–\n" if LETTER * longest > beside / len(labels) - 1 else "–"  # two lines where a square is too narrow for one
     for i, row in enumerate(labels):
         for j, column in enumerate(labels):
             if met[i, j]:
                 star = "*" if frozenset((row, column)) in stars else ""
                 ink = "white" if share[i, j] > 0.55 else "black"
-                size = min(6.5, 50 / len(labels))
-                axis.text(j, i, f"{won[i, j]}–{won[j, i]}{star}", ha="center", va="center", fontsize=size, color=ink)
-    small = min(7.0, 55 / len(labels))
-    names = list(map(broken, labels))
-    axis.set_xticks(range(len(labels)), names, rotation=40, ha="right", rotation_mode="anchor", fontsize=small)
-    axis.set_yticks(range(len(labels)), names, fontsize=small)
-    axis.set_xlabel(f"shown better – shown worse, of {met.max()} cells")
+                said: Any = {"ha": "center", "va": "center", "fontsize": SMALL, "linespacing": 1.0, "color": ink}
+                axis.text(j, i, f"{won[i, j]}{between}{won[j, i]}{star}", **said)
+    axis.set_xticks(range(len(labels)), names, rotation=40, ha="right", rotation_mode="anchor", fontsize=SMALL, linespacing=1.0)
+    axis.set_yticks(range(len(labels)), names, fontsize=SMALL, linespacing=1.0)
+    figure.supxlabel(f"shown better – shown worse, of {met.max()} cells", fontsize=8)  # wider than squares beside long names
     axis.grid(False)
     axis.tick_params(length=0)
     return figure
@@ -173,7 +197,7 @@ def forest(pairs: Sequence[Verdict]) -> Figure:
     names = [f"{v.a} / {v.b}" for v in pairs]
     if max(map(len, names)) > _LONG:
         names = [f"{broken(v.a, _LONG)}\n/ {broken(v.b, _LONG)}" for v in pairs]
-    figure = Figure(figsize=(COLUMN, 0.75 + 0.17 * sum(1 + name.count("\n") for name in names)), layout="constrained")
+    figure = Figure(figsize=(COLUMN, 0.75 + 0.17 * sum(1 + name.count("\n") for name in names)), layout=roomy())
     axis = figure.subplots()
     ends = [x for v in pairs for x in (v.low, v.ratio, v.high) if np.isfinite(x) and x > 0]
     low, high = min([*ends, 1 / (1 + pairs[0].margin)]), max([*ends, 1 + pairs[0].margin])
@@ -190,7 +214,7 @@ def forest(pairs: Sequence[Verdict]) -> Figure:
             float(np.clip(v.ratio, *edges)), row, ls="none", marker="s" if v.equivalent else "o", ms=4, mec=colour,
             mfc=colour if shown else "white", mew=0.9, zorder=3,
         )  # fmt: skip
-    axis.set_yticks(range(len(pairs)), names, fontsize=5.8)
+    axis.set_yticks(range(len(pairs)), names, fontsize=SMALL)
     axis.set_ylim(len(pairs) - 0.4, -0.6)
     axis.set(xscale="log", xlim=edges, xlabel="ratio of RMSE")
     plain_ticks(axis.xaxis, [low, high])
@@ -201,24 +225,27 @@ def forest(pairs: Sequence[Verdict]) -> Figure:
 
 
 def fronts_of(fronts: Sequence[Front], style: Mapping[str, Look]) -> Figure:
-    """Median RMSE against time per step, one panel per group, the front ringed and joined."""
-    figure, panels = stack(len(fronts), 1.6)
+    """Median RMSE against time per step, one panel per group, the front ringed and joined.
+
+    Named in the panel are those on the front and those in colour; the others are small and grey.
+    """
+    many = max(sum(kept or not style[label].quiet for label, kept in zip(f.filters, f.kept, strict=True)) for f in fronts)
+    figure, panels = stack(len(fronts), 1.5 + 0.06 * many)
     for front, axis in zip(fronts, panels, strict=True):
         best = [i for i, kept in enumerate(front.kept) if kept]
         milliseconds = [1e3 * s for s in front.seconds]
         corner: Any = {"drawstyle": "steps-post", "color": "0.55", "lw": 0.9, "zorder": 1}
         axis.plot([milliseconds[i] for i in best], [front.rmse[i] for i in best], **corner)
-        last = 0.0
         for label, time, error, kept in zip(front.filters, milliseconds, front.rmse, front.kept, strict=True):
             look = style[label]
-            y = error if np.isfinite(error) else np.nan
-            named = "" if look.quiet else label
-            axis.scatter(time, y, s=12 if look.quiet else 30, color=look.colour, marker=look.marker, label=named, zorder=3, lw=0)
-            if kept and look.quiet and time > _APART * last:
-                axis.annotate(label, (time, y), (4, -7), textcoords="offset points", fontsize=5.5)
-                last = time
+            if not np.isfinite(error):
+                continue
+            if look.quiet:
+                axis.scatter(time, error, s=9, color="0.45" if kept else look.colour, marker="o", zorder=2.5, lw=0)
+            else:  # a white rim tells marks apart that lie on each other
+                axis.scatter(time, error, s=26, color=look.colour, marker=look.marker, zorder=3, lw=0.4, edgecolors="white")
             if kept:
-                axis.scatter(time, y, s=95, facecolors="none", edgecolors="0.2", lw=0.9, zorder=2)
+                axis.scatter(time, error, s=80, facecolors="none", edgecolors="0.2", lw=0.9, zorder=2)
         finite = [e for e in front.rmse if np.isfinite(e)]
         axis.margins(0.15)
         if any(e > 0 for e in finite):
@@ -227,10 +254,31 @@ def fronts_of(fronts: Sequence[Front], style: Mapping[str, Look]) -> Figure:
             plain_ticks(axis.xaxis, milliseconds)
         lost = [label for label, e in zip(front.filters, front.rmse, strict=True) if np.isinf(e)]
         note = f" (off the chart, half of the runs lost: {', '.join(lost)})" if lost else ""
-        axis.set(title=front.group + note, ylabel=labelled("RMSE", front.unit))
+        axis.set(title=fill(front.group + note, _TITLE), ylabel=labelled("RMSE", front.unit))
     panels[-1].set_xlabel("time per step in ms")
+    if any(style[label].quiet for front in fronts for label in front.filters):
+        panels[0].scatter([], [], s=9, color="0.78", marker="o", lw=0, label="other filters")
     legend(figure, panels[0])
+    engine = figure.get_layout_engine()
+    if engine is not None:  # where names have room is known once the panels have their places
+        engine.execute(figure)
+    for front, axis in zip(fronts, panels, strict=True):
+        _name(axis, front, style)
     return figure
+
+
+def _name(axis: Axes, front: Front, style: Mapping[str, Look]) -> None:
+    """Names of those on the front and of those in colour beside their points."""
+    known = [i for i, error in enumerate(front.rmse) if np.isfinite(error)]
+    points = np.array([(1e3 * front.seconds[i], front.rmse[i]) for i in known])
+    names = {k: front.filters[i] for k, i in enumerate(known) if front.kept[i] or not style[front.filters[i]].quiet}
+    reach = np.array([6.0 if front.kept[i] else 4.0 if k in names else 2.0 for k, i in enumerate(known)])
+    best = points[[k for k, i in enumerate(known) if front.kept[i]]]
+    best = best[np.lexsort((-best[:, 1], best[:, 0]))]
+    corners = np.repeat(best, 2, axis=0)[1:]
+    corners[1::2, 1] = best[:-1, 1]  # at the error before until the next one's time
+    named_beside(axis, points, {k: broken(name) for k, name in names.items()}, reach, corners)
+
 
 
 def _starred(one: Across) -> str:

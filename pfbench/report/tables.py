@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
@@ -16,10 +18,28 @@ from pfbench.report.headline import Planned
 from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Sensitivity, Verdict
 
 Results = Mapping[str, store.Result]
+
+def _greek(letter: str) -> str:
+    return unicodedata.name(letter).split()[-1].lower().replace("lamda", "lambda")
+
+
+# Signs that LaTeX has in formulas alone, and "<", ">" and "|", which its first fonts show as others.
+_MATHS = {
+    "<": "<", ">": ">", "|": "|", "∞": r"\infty", "−": "-", "±": r"\pm", "×": r"\times", "÷": r"\div", "·": r"\cdot",
+    "°": r"^\circ", "′": "'", "″": "''", "≥": r"\ge", "≤": r"\le", "≈": r"\approx", "≠": r"\ne", "→": r"\to", "√": r"\surd",
+    "∑": r"\sum", "∂": r"\partial", "∈": r"\in", "‖": r"\|", "µ": r"\mu",
+    **{sign: f"^{said}" for sign, said in zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True)},
+    **{sign: f"_{said}" for sign, said in zip("₀₁₂₃₄₅₆₇₈₉", "0123456789", strict=True)},
+    **{letter: f"\\{_greek(letter)}" for letter in "αβγδεζηθικλμνξπρστυφχψω"},
+    **{letter: f"\\{_greek(letter).capitalize()}" for letter in "ΓΔΘΛΞΠΣΥΦΨΩ"},
+}  # fmt: skip
 _LATEX = str.maketrans({
     "\\": r"\textbackslash ", "_": r"\_", "%": r"\%", "$": r"\$", "#": r"\#", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde ", "^": r"\textasciicircum ", "&": r"\&",
+    "~": r"\textasciitilde ", "^": r"\textasciicircum ", "&": r"\&", "–": "--", "—": "---", "…": r"\dots ", "“": "``", "”": "''",
+    "‘": "`", "’": "'", "\u00a0": "~", "\u2009": r"\,", "\u202f": r"\,", "ß": r"\ss{}", "ø": r"\o{}", "Ø": r"\O{}",
+    **{sign: f"${said}$" for sign, said in _MATHS.items()},
 })  # fmt: skip
+_ACCENTS = dict(zip("\u0300\u0301\u0302\u0303\u0308\u030a\u030c\u0327", "`'^~\"rvc", strict=True))
 _TOLD = (  # of the columns of the first table, those that not every kind of filter tells, nor results of before
     "likelihoods per step", "memory in MiB", "ESS in %", "ancestors in %", "different in %", "accepted in %", "NIS", "NIS band"
 )  # fmt: skip
@@ -42,7 +62,12 @@ def overview(results: Results, alpha: float = 0.05) -> pd.DataFrame:
 
 
 def accuracy(
-    results: Results, group: str, verdicts: Sequence[Verdict] = (), alpha: float = 0.05, bound: float | None = None
+    results: Results,
+    group: str,
+    verdicts: Sequence[Verdict] = (),
+    alpha: float = 0.05,
+    bound: float | None = None,
+    whole: Results | None = None,
 ) -> pd.DataFrame:
     """How far off one group was, in the unit shown: one row per filter that has the group.
 
@@ -52,12 +77,15 @@ def accuracy(
         verdicts: of this group; adds how many filters each one beats and is beaten by.
         alpha: probability outside the NEES band.
         bound: adds the median time from which the error stays within it, seconds.
+        whole: the same results with all instants, of which that time is found.
     """
     rows = []
     for label, result in results.items():
         for block in blocks(result.meta["state"]):
             if block.group == group:
-                row = {"filter": label, **_accuracy(result, block, alpha, bound)}
+                row = {"filter": label, **_accuracy(result, block, alpha)}
+                if bound is not None:
+                    row |= _settled((whole or results)[label], block, bound)
                 rows.append({**row, **_standing(label, verdicts)} if verdicts else row)
     return pd.DataFrame(rows)
 
@@ -187,7 +215,7 @@ def planned(pairs: Sequence[Planned]) -> pd.DataFrame:
                 "effect": pair.effect,
                 "p": pair.p,
                 f"p Holm ({pair.family})": pair.p_holm,
-                "across cells": pair.winner,
+                "across cells": pair.decided,
             }
             for pair in pairs
         ]
@@ -240,11 +268,24 @@ def latex(table: pd.DataFrame, note: str = "") -> str:
     """A booktabs tabular; a note stands below its last rule."""
     layout = "".join("r" if _is_number(table[name]) else "l" for name in table)
     rows = [[str(name) for name in table], *([number(v) for v in row] for row in table.itertuples(index=False))]
-    lines = [" & ".join(text.translate(_LATEX) for text in row) + r" \\" for row in rows]
+    lines = [" & ".join(map(_tex, row)) + r" \\" for row in rows]
     body = ["\\toprule", lines[0], "\\midrule", *lines[1:], "\\bottomrule"]
     if note:
-        body.append(rf"\multicolumn{{{len(table.columns)}}}{{l}}{{\footnotesize {note.translate(_LATEX)}}} \\")
+        body.append(rf"\multicolumn{{{len(table.columns)}}}{{l}}{{\footnotesize {_tex(note)}}} \\")
     return "\n".join([rf"\begin{{tabular}}{{{layout}}}", *body, r"\end{tabular}", ""])
+
+
+def _tex(text: str) -> str:
+    """A text in letters that LaTeX reads as they are meant: a single other one stops a whole paper."""
+    return re.sub(r"[^\x00-\x7f]", _spelled, text.translate(_LATEX)).replace(r"$-$$\infty$", r"$-\infty$")
+
+
+def _spelled(sign: re.Match[str]) -> str:
+    """A letter with its accent as a command; what has no command as its number."""
+    parts = unicodedata.normalize("NFD", sign[0])
+    if len(parts) == 2 and parts[0].isascii() and parts[1] in _ACCENTS:
+        return rf"\{_ACCENTS[parts[1]]}{{{parts[0]}}}"
+    return f"(U+{ord(sign[0]):04X})"
 
 
 def csv(table: pd.DataFrame) -> str:
@@ -319,7 +360,13 @@ def _nis(result: store.Result, alpha: float) -> tuple[float, str]:
     return float(np.nansum(nis) / count), f"{float(low) / count:.3g} to {float(high) / count:.3g}"
 
 
-def _accuracy(result: store.Result, block: Block, alpha: float, bound: float | None) -> dict[str, Any]:
+def _settled(result: store.Result, block: Block, bound: float) -> dict[str, Any]:
+    error = result.arrays["error"][..., block.places].astype(np.float64) * block.scale
+    when = metrics.convergence_time(result.arrays["time"], error, result.arrays["lost"], bound)
+    return {f"median time to {bound:g} {block.unit} in s": float(np.median(when[~np.isnan(when)]))}
+
+
+def _accuracy(result: store.Result, block: Block, alpha: float) -> dict[str, Any]:
     arrays, lost, groups = result.arrays, result.arrays["lost"], result.meta["state"]["groups"]
     error = arrays["error"][..., block.places].astype(np.float64) * block.scale
     norm, each = metrics.rmse_norm(error, lost), metrics.rmse_component(error, lost).value
@@ -349,9 +396,6 @@ def _accuracy(result: store.Result, block: Block, alpha: float, bound: float | N
         for name, last in (("mean", None), (f"last {_LAST} steps", _LAST)):
             share = metrics.relative_error(error[..., :2] / block.scale, lost, arrays["range"], last)
             row[f"error in % of range, {name}"] = 100 * float(share.value)
-    if bound is not None:
-        when = metrics.convergence_time(arrays["time"], error, lost, bound)
-        row[f"median time to {bound:g} {block.unit} in s"] = float(np.median(when[~np.isnan(when)]))
     return row
 
 

@@ -145,6 +145,26 @@ def test_a_report_opens_whole_and_its_filter_filters(report: Path, dark: bool) -
     assert found["sorted"] == sorted(found["sorted"])
 
 
+def test_a_brief_report_in_its_usual_formats_opens_whole(tmp_path: Path) -> None:
+    """As a large study has it: figures of one group, those of many lines as PNG and the others as SVG within the page."""
+    for noise in ("nominal", "surge", "heavy"):
+        for method in synthetic.METHODS:
+            synthetic.write(tmp_path / "results" / "demo", method, noise=noise, runs=8, steps=12)
+    options = page.Options(groups=("velocity", "position"), full=False)
+    made = page.write("demo", tmp_path / "results", tmp_path / "reports", options)
+    text = made.read_text()
+    assert 'src="data:image/svg+xml,' in text
+    found = facts(made, "(facts) => {}", dark=False, width=420)
+    assert found["noted"] == found["resources"] == []
+    assert found["anchors"] == 0
+    names = {path.stem for path in (made.parent / "figures").iterdir()}
+    assert {path.suffix for path in (made.parent / "figures").iterdir()} == {".svg", ".png"}
+    assert "all_map_main_group" in names or "all_map_position" in names  # what only the brief form has
+    assert len(found["images"]) == len(found["captions"]) == len(names)
+    assert all(size > 100 for image in found["images"] for size in image)  # an SVG that is not well formed has no size
+    assert found["broad"] <= 0
+
+
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 def test_a_picture_of_a_report_is_not_blank(report: Path, dark: bool, tmp_path: Path) -> None:
     file = tmp_path / "page.png"

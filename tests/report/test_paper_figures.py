@@ -16,7 +16,7 @@ from PIL import Image
 
 from pfbench import cli, metrics, store
 from pfbench.report import figures, page, paper_figures, paper_plots
-from pfbench.report.canvas import dimmed, indexed, looks
+from pfbench.report.canvas import dimmed, indexed, looks, told
 from pfbench.report.frame import cells, frame
 from pfbench.report.paper_figures import FIGURES
 
@@ -102,9 +102,34 @@ def test_nothing_lies_beyond_the_axes(results: Path) -> None:
     panel = paper_plots.errors(own, looks(["cpso_escape"])).axes[0]
     assert panel.get_yscale() == "symlog"
     assert panel.get_ylim()[1] >= np.quantile(wild[:, 0, 6], 0.95)
-    labels = [float(text.get_text()) for text in panel.get_yticklabels()]
-    assert 0.0 in labels
-    assert max(labels) >= 100 * min(abs(label) for label in labels if label)
+    ticks = list(panel.get_yticks())
+    assert 0.0 in ticks
+    assert max(ticks) >= 100 * min(abs(tick) for tick in ticks if tick)
+    assert [text.get_text() for text in panel.get_yticklabels()] == told(ticks)
+
+
+@pytest.mark.parametrize("wild", [1e3, 1e7])
+def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float) -> None:
+    """The axis is linear for the good ones, in no small part of it, and its few ticks have one style."""
+    block = next(b for b in paper_figures.blocks(loaded(results, "sir").meta["state"]) if b.group == "attitude")
+    good = {label: loaded(results, label) for label in ("cpf", "cpso_escape")}
+    bad = loaded(results, "cofm_amssrcpf")
+    bad = store.Result(bad.meta, {**bad.arrays, "error": wild * bad.arrays["error"]})
+    own = {label: (result, block) for label, result in (*good.items(), ("cofm_amssrcpf", bad))}
+    figure = paper_plots.errors(own, looks(list(own)))
+    figure.draw_without_rendering()
+    for component, axis in enumerate(figure.axes):
+        assert axis.get_yscale() == "symlog"
+        late = [np.abs(line(figure, component, label)[1][10:]).max() for label in good]
+        to = axis.transData.transform
+        tall = axis.bbox.height
+        level = axis.yaxis.get_transform().linthresh
+        assert min(late) < 2 * level < 20 * max(late)
+        assert to((0, level))[1] - to((0, -level))[1] > 0.25 * tall
+        ticks = [text.get_text() for text in axis.get_yticklabels()]
+        assert 3 <= len(ticks) <= 7
+        assert not any("e" in text for text in ticks)
+        assert axis.get_ylim()[1] >= np.quantile(block.scale * bad.arrays["error"][:, 0, component], 0.95)
 
 
 def test_a_bias_stands_beside_itself_before_correction(results: Path) -> None:
