@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pfbench.report.canvas import COLUMN, plain_ticks, slug
+from pfbench.report.canvas import COLUMN, SMALL, plain_ticks, slug
 from pfbench.report.claims import Claim, Comparison
 from pfbench.report.figures import Drawing
 from pfbench.report.paper_figures import FIGURES
@@ -87,7 +87,7 @@ def forest(rows: Sequence[tuple[str, Finding]], relative: bool) -> Figure:
         if not relative:
             axis.plot(printed, place, ls="none", marker="x", ms=5, mew=1.2, color="black", zorder=4)
             seen.append(printed)
-    axis.set_yticks(range(len(rows)), [_name(claim, found.comparison) for claim, found in rows], fontsize=5.5)
+    axis.set_yticks(range(len(rows)), [_name(claim, found.comparison) for claim, found in rows], fontsize=SMALL)
     axis.set_ylim(len(rows) - 0.4, -0.6)
     known = [value for value in seen if np.isfinite(value) and value > 0]
     low, high = min(known), max(known)

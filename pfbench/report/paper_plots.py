@@ -66,6 +66,19 @@ def trace(
     return figure
 
 
+def escape(own: Mapping[str, tuple[float, int]], style: Mapping[str, Look]) -> Figure:
+    """Escape factors over the iterations, by their size and the number of iterations, as meant and as printed."""
+    figure, (axis,) = stack(1, 2.0)
+    for label, (size, most) in own.items():
+        k = np.arange(most + 1)
+        axis.plot(k, size * (1.0 - np.cos(np.pi * k / most)), marker="." if most < 10 else "", **style[label].line(label))
+        axis.plot(k, size - size * np.cos(np.pi * k) / most, color=style[label].colour, ls=":", lw=0.8)
+    axis.set(xlabel="iteration", ylabel="c3")
+    axis.set_ylim(bottom=0)
+    legend(figure, axis)
+    return figure
+
+
 def relatives(own: Mapping[str, Mapping[str, store.Result]], style: Mapping[str, Look]) -> Figure:
     """Horizontal error in % of the range over time, one panel per experiment."""
     figure, panels = stack(len(own), 1.6)

@@ -172,6 +172,23 @@ def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
     assert 0.02 < wide.get_ylim()[0] < 0.1  # on a logarithmic scale, all of it there
 
 
+def test_the_escape_factor_is_that_of_the_settings_that_ran(results: Path, tmp_path: Path) -> None:
+    for label, escape, most in (("cpso_escape", 0.12, 5), ("cpso_escape_printed", 0.3, 30)):
+        method = synthetic.Method(label, 1.0, particles=100)
+        settings = {"proposal": {"velocity": {"escape": escape}, "iterations": most}}
+        synthetic.write(tmp_path / "paper_004", method, noise="nominal", runs=6, steps=8, config=settings)
+    silent = synthetic.Method("cpso_escape_stopped", 1.0, particles=9)
+    synthetic.write(tmp_path / "paper_004", silent, noise="nominal", runs=6, steps=8)
+    ((_, figure),) = drawn(tmp_path, "004-1").values()
+    lines = {str(one.get_label()): one for one in figure.axes[0].lines if not str(one.get_label()).startswith("_")}
+    assert set(lines) == {"cpso_escape", "cpso_escape_printed"}
+    y = np.asarray(lines["cpso_escape_printed"].get_ydata())
+    assert (y[0], y[15], y[30]) == pytest.approx((0.0, 0.3, 0.6))  # from none to twice its size
+    assert np.asarray(lines["cpso_escape"].get_ydata()).max() == pytest.approx(0.24)
+    with pytest.raises(ValueError, match="004-1"):
+        drawn(results, "004-1")  # jobs that do not tell
+
+
 def test_largest_errors_stand_beside_the_printed_ones(results: Path) -> None:
     caption, figure = drawn(results, "002-maxima")["002-maxima_flight_paper_burst_ins_gnss_position"]
     assert "largest error of position after 10 s" in caption
