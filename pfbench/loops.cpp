@@ -120,33 +120,78 @@ void distinct(int64_t* count, const int64_t* value, const T* log_weight, int64_t
     }
 }
 
+// Sums of weight (a - its centre) (b - its centre) over particles for all pairs of S rows, in one pass.
+template <class T, int S>
+void products(T* out, const T* const* row, const T* centre, const T* weight, int64_t particles) {
+    typedef T Lanes __attribute__((vector_size(64), aligned(sizeof(T)), may_alias));
+    constexpr int64_t WIDE = 64 / sizeof(T);
+    Lanes sum[S * (S + 1) / 2] = {};
+    int64_t i = 0;
+    for (; i + WIDE <= particles; i += WIDE) {
+        Lanes off[S];
+        for (int a = 0; a < S; ++a) off[a] = *reinterpret_cast<const Lanes*>(row[a] + i) - centre[a];
+        for (int a = 0, k = 0; a < S; ++a) {
+            const Lanes weighed = *reinterpret_cast<const Lanes*>(weight + i) * off[a];
+            for (int b = a; b < S; ++b) sum[k++] += weighed * off[b];
+        }
+    }
+    for (int a = 0, k = 0; a < S; ++a)
+        for (int b = a; b < S; ++b, ++k) {
+            T whole = 0;
+            for (int64_t lane = 0; lane < WIDE; ++lane) whole += sum[k][lane];
+            for (int64_t j = i; j < particles; ++j) whole += weight[j] * (row[a][j] - centre[a]) * (row[b][j] - centre[b]);
+            out[a * S + b] = out[b * S + a] = whole;
+        }
+}
+
 // Covariances of the pairs of each group of components; x [R, N, K] lies as its strides say.
 template <class T>
 void spread(T* out, const T* x, const T* mean, const T* weight, const int64_t* component, const int64_t* stride, int64_t groups,
             int64_t size, int64_t runs, int64_t particles, int64_t components) {
-    std::vector<T> own(size * particles), weighed(particles);
+    std::vector<T> own(stride[1] == 1 ? 0 : size * particles), centre(size), pair(4);
+    std::vector<const T*> row(size);
     for (int64_t r = 0; r < runs; ++r, weight += particles)
         for (int64_t g = 0; g < groups; ++g, out += size * size) {
             for (int64_t a = 0; a < size; ++a) {
                 const int64_t k = component[g * size + a];
-                const T* from = x + r * stride[0] + k * stride[2];
-                const T centre = mean[r * components + k];
-                T* to = own.data() + a * particles;
-                if (stride[1] == 1)  // known to the compiler
-                    for (int64_t i = 0; i < particles; ++i) to[i] = from[i] - centre;
-                else
-                    for (int64_t i = 0; i < particles; ++i) to[i] = from[i * stride[1]] - centre;
+                centre[a] = mean[r * components + k];
+                row[a] = x + r * stride[0] + k * stride[2];
+                if (stride[1] == 1) continue;
+                for (int64_t i = 0; i < particles; ++i) own[a * particles + i] = row[a][i * stride[1]];
+                row[a] = own.data() + a * particles;
             }
-            for (int64_t a = 0; a < size; ++a) {
-                for (int64_t i = 0; i < particles; ++i) weighed[i] = weight[i] * own[a * particles + i];
-                for (int64_t b = a; b < size; ++b) {
-                    const T* other = own.data() + b * particles;
-                    T sum = 0;
-                    for (int64_t i = 0; i < particles; ++i) sum += weighed[i] * other[i];
-                    out[a * size + b] = out[b * size + a] = sum;
-                }
-            }
+            if (size == 1) products<T, 1>(out, row.data(), centre.data(), weight, particles);
+            else if (size == 2) products<T, 2>(out, row.data(), centre.data(), weight, particles);
+            else if (size == 3) products<T, 3>(out, row.data(), centre.data(), weight, particles);
+            else
+                for (int64_t a = 0; a < size; ++a)
+                    for (int64_t b = a; b < size; ++b) {
+                        const T* both[] = {row[a], row[b]};
+                        const T middle[] = {centre[a], centre[b]};
+                        products<T, 2>(pair.data(), both, middle, weight, particles);
+                        out[a * size + b] = out[b * size + a] = pair[1];
+                    }
         }
+}
+
+// Sum of weight (x - centre), or of weight times its square, by four sums at a time: one alone would wait for itself.
+template <class T, bool SQUARE>
+T weighed(const T* x, T centre, const T* weight, int64_t particles) {
+    typedef T Lanes __attribute__((vector_size(64), aligned(sizeof(T)), may_alias));
+    constexpr int64_t WIDE = 64 / sizeof(T);
+    Lanes sum[4] = {};
+    int64_t i = 0;
+    for (; i + 4 * WIDE <= particles; i += 4 * WIDE)
+        for (int k = 0; k < 4; ++k) {
+            const Lanes off = *reinterpret_cast<const Lanes*>(x + i + k * WIDE) - centre;
+            const Lanes w = *reinterpret_cast<const Lanes*>(weight + i + k * WIDE);
+            sum[k] += SQUARE ? w * off * off : w * off;
+        }
+    const Lanes all = (sum[0] + sum[1]) + (sum[2] + sum[3]);
+    T whole = 0;
+    for (int64_t lane = 0; lane < WIDE; ++lane) whole += all[lane];
+    for (; i < particles; ++i) whole += weight[i] * (x[i] - centre) * (SQUARE ? x[i] - centre : T(1));
+    return whole;
 }
 
 template <class T>
@@ -155,11 +200,9 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
         for (int64_t d = 0; d < components; ++d) {
             const T* row = x + (d * runs + r) * particles;
             const T* w = weight + r * particles;
-            T first = 0, second = 0;
-            for (int64_t i = 0; i < particles; ++i) first += w[i] * row[i];
-            for (int64_t i = 0; i < particles; ++i) second += w[i] * (row[i] - first) * (row[i] - first);
-            mean[r * components + d] = first;
-            variance[r * components + d] = second;
+            const T centre = weighed<T, false>(row, 0, w, particles);
+            mean[r * components + d] = centre;
+            variance[r * components + d] = weighed<T, true>(row, centre, w, particles);
         }
 }
 }  // namespace
