@@ -94,7 +94,7 @@ class Judge:
         alike = [[g for g, parts in enumerate(model.groups.values()) if len(parts) == size] for size in sizes]
         components = list(model.groups.values())
         self._alike = [
-            (torch.tensor(each), torch.tensor([components[g] for g in each], device=truth.device)) for each in alike
+            tuple(torch.tensor(index, device=truth.device) for index in (each, [components[g] for g in each])) for each in alike
         ]
         self.at = sorted({(k + 1) * steps // instants - 1 for k in range(instants)} - {-1})
         self.scores: list[Scores] = []

@@ -45,8 +45,8 @@ class Gaussian:
 
     def __call__(self, flock: Flock, live: Tensor, phase: float, draws: Draws, purpose: str) -> Tensor:
         n, k = flock.q.shape[1:]
-        own, common = draws.normal(purpose, n, 2 * k).unflatten(-1, (2, k)).unbind(-2)
-        return _drawn(flock.q, flock.best, flock.leader(), own, common)
+        own, common = draws.normal(purpose, n, 2 * k).abs().unflatten(-1, (2, k)).unbind(-2)
+        return own * (flock.best - flock.q) + common * (flock.leader() - flock.q)
 
 
 @dataclass(frozen=True)
@@ -85,21 +85,11 @@ class Inertia:
         n, k = flock.q.shape[1:]
         pulls = 4 if self.escape else 2
         r = draws.uniform(purpose, n, pulls * k).to(flock.q.dtype).unflatten(-1, (pulls, k)).unbind(-2)
-        by = flock.q.new_tensor([self.inertia, self.own, self.common, self.escape_factor(phase)])
-        v = _pulled(flock.q, flock.v, flock.best, flock.leader(), r[0], r[1], by)
-        return _pushed(flock.q, v, flock.worst, flock.last(live), r[2], r[3], by) if self.escape else v
-
-
-def _drawn(q: Tensor, best: Tensor, leader: Tensor, own: Tensor, common: Tensor) -> Tensor:
-    return own.abs() * (best - q) + common.abs() * (leader - q)
-
-
-def _pulled(q: Tensor, v: Tensor, best: Tensor, leader: Tensor, own: Tensor, common: Tensor, by: Tensor) -> Tensor:
-    return by[0] * v + by[1] * own * (best - q) + by[2] * common * (leader - q)
-
-
-def _pushed(q: Tensor, v: Tensor, worst: Tensor, last: Tensor, own: Tensor, common: Tensor, by: Tensor) -> Tensor:
-    return v - by[3] * (own * (worst - q) + common * (last - q))
+        v = self.inertia * flock.v + self.own * r[0] * (flock.best - flock.q) + self.common * r[1] * (flock.leader() - flock.q)
+        if self.escape:
+            away = r[2] * (flock.worst - flock.q) + r[3] * (flock.last(live) - flock.q)
+            v = v - self.escape_factor(phase) * away
+        return v
 
 
 def laid(a: Tensor, like: Tensor) -> Tensor:

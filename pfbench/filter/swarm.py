@@ -171,14 +171,19 @@ class Swarm:
         """One iteration: x + v or, if it is fitter, x + v + Dx; and what is to be remembered of it."""
         fastest, chaos = 6.0 * self.limits.speed * scale, flock.chaos
         edge = torch.full_like(spread, torch.inf) if self.limits.box is None else self.limits.box * spread
-        v, q = _moves(flock.q, v, fastest, edge)
+        v = torch.clamp(v, -fastest, fastest)
+        q = torch.clamp(flock.q + v, -edge, edge)
         value = fitness(q)
         if self.perturbation and spare is not None:
             chaos = logistic(chaos, spare)
-            other = _beside(flock.q, v, self.perturbation(chaos, scale), edge)
+            other = torch.clamp(flock.q + v + self.perturbation(chaos, scale), -edge, edge)
             there = fitness(other)
-            q, value = _fitter(q, value, other, there)
-        return Flock(q, v, value, *_remembered(q, value, *flock[3:7]), chaos)
+            q = torch.where((there > value).unsqueeze(-1), other, q)
+            value = torch.maximum(there, value)
+        better, worse = value > flock.best_fitness, value < flock.worst_fitness
+        best, worst = (torch.where(a.unsqueeze(-1), q, b) for a, b in ((better, flock.best), (worse, flock.worst)))
+        best_fitness, worst_fitness = torch.maximum(value, flock.best_fitness), torch.minimum(value, flock.worst_fitness)
+        return Flock(q, v, value, best, best_fitness, worst, worst_fitness, chaos)
 
     def _gathered(self, frame: Frame, fitness: Tensor, memory: dict[str, Tensor]) -> Flock:
         """The swarm before its first iteration: what the step before remembered is forgotten, but for the chaotic values."""
@@ -198,31 +203,6 @@ class Swarm:
         if self.perturbation:
             memory = memory | {"swarm.chaos": z.unsqueeze(1)}
         return self.start(model, cloud, z), memory
-
-
-def _moves(q: Tensor, v: Tensor, fastest: Tensor, edge: Tensor) -> tuple[Tensor, Tensor]:
-    """Velocities no greater than `fastest`, and where they lead, within `edge`; those [R, 1, k]."""
-    v = torch.clamp(v, -fastest, fastest)
-    return v, torch.clamp(q + v, -edge, edge)
-
-
-def _beside(q: Tensor, v: Tensor, by: Tensor, edge: Tensor) -> Tensor:
-    """Where the velocities lead, perturbed."""
-    return torch.clamp(q + v + by, -edge, edge)
-
-
-def _fitter(q: Tensor, value: Tensor, other: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
-    """Of two places of each particle the fitter one, and its fitness."""
-    return torch.where((there > value).unsqueeze(-1), other, q), torch.maximum(there, value)
-
-
-def _remembered(
-    q: Tensor, value: Tensor, best: Tensor, best_fitness: Tensor, worst: Tensor, worst_fitness: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The best and worst places so far and their fitness."""
-    best = torch.where((value > best_fitness).unsqueeze(-1), q, best)
-    worst = torch.where((value < worst_fitness).unsqueeze(-1), q, worst)
-    return best, torch.maximum(value, best_fitness), worst, torch.minimum(value, worst_fitness)
 
 
 @cache
