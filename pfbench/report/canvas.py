@@ -287,7 +287,7 @@ def named_beside(axis: Axes, points: np.ndarray, names: Mapping[int, str], reach
 
 def _size(text: str) -> np.ndarray:
     """Width and height of small letters in points of print."""
-    lines = text.split("\\\n")
+    lines = text.split("\n")
     return np.array([max(map(len, lines)) * LETTER, 1.2 * SMALL * len(lines)])
 
 

@@ -219,3 +219,9 @@ def test_of_few_filters_all_are_named_and_none_is_another(tmp_path: Path) -> Non
     figure = drawn(lambda: ranking_figures.fronts_of([one], canvas.looks(one.filters)), tmp_path)
     assert [text.get_text() for text in figure.axes[0].texts] == ["ekf", "sir"]
     assert not figure.legends
+
+
+def test_a_name_of_two_lines_takes_room_for_two():
+    one, two = (canvas._size(name) for name in ("sir[particles=100]", "sir\n[particles=100]"))
+    assert two[1] == 2 * one[1]
+    assert two[0] < one[0]
