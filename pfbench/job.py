@@ -24,7 +24,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import pfbench
-from pfbench import fusion, memory, native, store
+from pfbench import budget, fusion, memory, native, store
 from pfbench.bound import posterior_bound
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Cloud, Info, gather
@@ -54,8 +54,7 @@ PLACES = (
     "train", "checkpoint",  # a job depends on the weights that its filter has, which are named by what they are
 )  # fmt: skip
 # what says how jobs are compared and changes nothing in one: no part of its name while it is usual
-BUDGETS = ("same N", "same time per step", "same likelihood evaluations")  # what filters that are compared have alike
-USUAL: Mapping[str, Any] = {"budget": "same N"}
+USUAL: Mapping[str, Any] = {"budget": store.SAME_N}
 SHARED = ("time", "bound", "range", "scored")  # arrays without an axis of runs
 _COMPILE_FROM = 5e8  # normals; compiling their kernel costs some seconds and saves 15 ms for each million
 
@@ -107,9 +106,11 @@ def in_parts(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.n
     Raises:
         ValueError: not even one run would fit; worlds that last differently long; as `compute`.
     """
+    cfg, bought = within_budget(cfg)
     size = runs_that_fit(cfg)
     if size == cfg.runs:
-        return compute(cfg, name)
+        meta, arrays = compute(cfg, name)
+        return {**meta, "bought": bought}, arrays
     parts = []
     for first in range(cfg.first_run, cfg.first_run + cfg.runs, size):
         part = cfg.copy()
@@ -131,11 +132,44 @@ def in_parts(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.n
     seconds = {name: sum(meta["seconds"][name] for meta in metas) for name in metas[0]["seconds"]}
     taken = [meta["memory"] for meta in metas]
     meta = {
-        **metas[0], "runs": cfg.runs, "first_run": cfg.first_run, "parts": len(parts), "seconds": seconds,
+        **metas[0], "runs": cfg.runs, "first_run": cfg.first_run, "parts": len(parts), "seconds": seconds, "bought": bought,
         "memory": None if None in taken else max(taken),
         "likelihoods_per_step": float(shares @ [meta["likelihoods_per_step"] for meta in metas]),
     }  # fmt: skip
     return meta, arrays
+
+
+def within_budget(cfg: DictConfig) -> tuple[DictConfig, dict[str, float] | None]:
+    """The job with as many particles as its budget buys, and what was found; as it is where the budget is a number of particles.
+
+    A filter without particles, and one that was given a number of its own (filter.particles=...), stay as they are.
+
+    Raises:
+        ValueError: a step that is compiled as a whole, which costs what nobody knows before.
+    """
+    settings(cfg)
+    shared = "particles" in cfg["filter"] and OmegaConf.is_interpolation(cfg["filter"], "particles")
+    if cfg.budget == store.SAME_N or not shared:
+        return cfg, None
+    if cfg.engine == "compiled":
+        raise ValueError(f"engine=compiled with budget={cfg.budget}: trials are not compiled; give engine=auto or budget=same N")
+    model, scenario, witness, method = build(cfg.model), build(cfg.scenario), Witness(build(cfg.noise)), build(cfg["filter"])
+    episode = scenario.draw(witness, torch.arange(cfg.first_run, cfg.first_run + cfg.runs), cfg.seed)
+    model = (witness.tell(model, episode.time) if cfg.told else model).to(cfg.device, getattr(torch, cfg.dtype))
+    trial = budget.Trial(
+        model, episode.record, clock_of(cfg), cfg.seed, Tally(model), lambda method: at_once(cfg, method, model, cfg.runs)
+    )
+    with fusion.fused(fuses(cfg.engine, ParticleFilter(cfg.particles), model, cfg.runs * episode.record.y.shape[1])):
+        found = budget.bought(cfg.budget, method, cfg.particles, trial)
+    log.info("budget=%s: %d particles, as %d of sir", cfg.budget, found.particles, cfg.particles)
+    cfg = cfg.copy()
+    cfg["filter"].particles = found.particles
+    return cfg, found._asdict()
+
+
+def clock_of(cfg: DictConfig) -> Callable[[], float]:
+    """The processor's time: what a filter took whatever else the machine did. Of several threads it would be their sum."""
+    return time.process_time if cfg.device == "cpu" and cfg.threads == 1 else time.perf_counter
 
 
 def runs_that_fit(cfg: DictConfig) -> int:
@@ -191,8 +225,7 @@ def compute(cfg: DictConfig, name: str) -> tuple[dict[str, Any], dict[str, np.nd
     truth = model.assemble(episode.truth).to(cfg.device, dtype)
     steps = episode.record.y.shape[1]
     draws = MonteCarlo(cfg.seed, runs.to(cfg.device), dtype)
-    # the processor's time is what the filter took whatever else the machine did; of several threads it would be their sum
-    clock = time.process_time if cfg.device == "cpu" and cfg.threads == 1 else time.perf_counter
+    clock = clock_of(cfg)
     judge, tally = Judge(model, truth, cfg.scored, clock), Tally(model)
 
     def watch(t: int, info: Info) -> dict[str, Tensor]:
@@ -259,8 +292,8 @@ def settings(cfg: DictConfig | Mapping[str, Any]) -> None:
         raise ValueError(f"memory={cfg['memory']}: give the GiB that a job may take, or null for most of what is free")
     if cfg["dtype"] not in ("float32", "float64"):
         raise ValueError(f"dtype={cfg['dtype']}: give float64 (the default) or float32")
-    if cfg["budget"] not in BUDGETS:
-        raise ValueError(f"budget={cfg['budget']}: give one of {', '.join(BUDGETS)}")
+    if cfg["budget"] not in store.BUDGETS:
+        raise ValueError(f"budget={cfg['budget']}: give one of {', '.join(store.BUDGETS)}")
     if cfg["engine"] not in ("auto", "eager", "loops", "compiled"):
         raise ValueError(f"engine={cfg['engine']}: give auto, eager, loops or compiled")
     if not re.fullmatch(r"cpu|cuda(:\d+)?", str(cfg["device"])):

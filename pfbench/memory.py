@@ -195,7 +195,7 @@ def _trial(
     method: Any, model: StateSpaceModel, record: Record, runs: int, steps: int, at_once: int, watch: Any
 ) -> tuple[int, float, float]:
     """Most bytes of a filter over the first steps of the first runs; bytes that it leaves, and in single precision."""
-    part = _cut(record.of(slice(0, runs)), steps)
+    part = cut(record.of(slice(0, runs)), steps)
     draws = MonteCarlo(0, torch.arange(runs, device=model.anchor.device), model.anchor.dtype)
     with torch.no_grad(), Counted() as count:
         estimate = run_filter(method, model, part, draws, watch(runs, steps) if watch else None, at_once=at_once)
@@ -207,8 +207,8 @@ def _parts(estimate: Estimate) -> tuple[Any, ...]:
     return estimate.mean, estimate.variance, estimate.trace
 
 
-def _cut(record: Record, steps: int) -> Record:
-    """The first steps, in storages of their own."""
+def cut(record: Record, steps: int) -> Record:
+    """A record's first steps, in storages of their own."""
     start, spread = (None if a is None else a.clone() for a in (record.start, record.spread))
     return Record(record.y[:, :steps].clone(), map_inputs(lambda a: a[:, :steps].clone(), record.u), start, spread)
 

@@ -22,6 +22,7 @@ from uuid import uuid4
 import numpy as np
 
 FORMAT = 1
+SAME_N, SAME_TIME, SAME_LIKELIHOODS = BUDGETS = ("same N", "same time per step", "same likelihood evaluations")  # key `budget`
 
 # Axes that must agree across arrays: R runs, T steps, D components, G groups of components, S steps scored.
 _AXES = {

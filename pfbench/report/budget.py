@@ -1,7 +1,7 @@
 """What filters of a cell were given alike, and who is best at what he costs.
 
 A comparison is of equal budgets: the same number of particles, the same time per step, or the same number of evaluations of the
-likelihood. Which one was meant is said by the experiment (key `budget` of the job); what the jobs measured is said beside it.
+likelihood. Which one was kept is said by the experiment (key `budget` of the job); what the jobs measured is said beside it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import numpy as np
 import pandas as pd
 
 from pfbench.metrics import Array
+from pfbench.store import BUDGETS, SAME_N, SAME_TIME
 
-SAME_N = "same N"
-KINDS = (SAME_N, "same time per step", "same likelihood evaluations")
 _NAMED = 4  # filters whose other number of particles is said by name
 _CLOSE = 1.25  # times per step that differ by less are called the same: they scatter from job to job [ours]
 
@@ -50,7 +49,7 @@ def stated(metas: Sequence[Mapping[str, Any]]) -> str:
         metas: descriptions of the jobs.
 
     Raises:
-        ValueError: a job names a budget that is not one of `KINDS`.
+        ValueError: a job names a budget that is not one of `store.BUDGETS`.
     """
     kinds = list(dict.fromkeys(_kind(meta) for meta in metas))
     if len(kinds) > 1:
@@ -88,8 +87,8 @@ def undominated(cost: Array, loss: Array) -> np.ndarray:
 def _kind(meta: Mapping[str, Any]) -> str:
     config = meta.get("config")
     kind = str(meta.get("budget") or (config.get("budget") if isinstance(config, Mapping) else None) or SAME_N)
-    if kind not in KINDS:
-        raise ValueError(f"budget={kind} of job {meta.get('key')} is none that a report knows; give one of {', '.join(KINDS)}")
+    if kind not in BUDGETS:
+        raise ValueError(f"budget={kind} of job {meta.get('key')} is none that a report knows; give one of {', '.join(BUDGETS)}")
     return kind
 
 
@@ -120,21 +119,26 @@ def _changing(metas: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _measured(kind: str, metas: Sequence[Mapping[str, Any]]) -> str:
+    swarms = [meta for meta in metas if meta.get("particles")]
+    if not swarms:
+        return " (no particle filter here)"
     if kind == SAME_N:
-        numbers = sorted({int(meta["particles"]) for meta in metas if meta.get("particles")})
-        if not numbers:
-            return " (no particle filter here)"
-        if len(numbers) == 1:
-            return f" (N = {numbers[0]} of each particle filter)"
-        return f" was not kept ({_numbers(metas)})"
-    if kind == KINDS[1]:
-        times = [1e3 * float(meta["seconds"]["per_step"]) for meta in metas]
-        low, high = min(times), max(times)
-        said = f"{low:.3g} to {high:.3g} ms per step"
-        return f" ({said})" if high <= _CLOSE * low else f" was not kept ({said})"
-    counts = [float(meta["likelihoods_per_step"]) for meta in metas if meta.get("likelihoods_per_step") is not None]
-    if len(counts) < len(metas):
+        numbers = sorted({int(meta["particles"]) for meta in swarms})
+        return f" (N = {numbers[0]} of each particle filter)" if len(numbers) == 1 else f" was not kept ({_numbers(metas)})"
+    if kind == SAME_TIME:
+        return _kept([1e3 * float(meta["seconds"]["per_step"]) for meta in swarms], "ms per step", swarms)
+    if any(meta.get("likelihoods_per_step") is None for meta in swarms):
         return " (as the experiment states; the jobs do not count them)"
-    least, most = min(counts), max(counts)
-    said = f"{least:g} to {most:g} per step"
-    return f" ({said})" if most <= _CLOSE * least else f" was not kept ({said})"
+    return _kept([float(meta["likelihoods_per_step"]) for meta in swarms], "per step", swarms)
+
+
+def _kept(costs: Sequence[float], unit: str, metas: Sequence[Mapping[str, Any]]) -> str:
+    """What steps cost, in words; by name the filters that are far from the price, which is the middle of what jobs cost."""
+    said = f"{min(costs):.3g} to {max(costs):.3g} {unit}, particle filters alone; {_numbers(metas)}"
+    price = float(np.median(costs))
+    missed = [
+        f"{meta.get('label', '')} ({cost:.3g})"
+        for meta, cost in zip(metas, costs, strict=True)
+        if not price / _CLOSE <= cost <= price * _CLOSE
+    ]
+    return f" was not kept by {', '.join(missed)} ({said})" if missed else f" ({said})"

@@ -10,6 +10,7 @@ import pytest
 import synthetic_results as synthetic
 from matplotlib.figure import Figure
 
+from pfbench import store
 from pfbench.report import across, budget, frame, page, ranking_figures, significance, tables
 from pfbench.report.canvas import looks
 
@@ -134,8 +135,14 @@ def test_a_budget_that_was_not_kept_is_not_claimed():
     said = budget.stated([job(100), job(100), *changing, job(100)])
     assert "N = 100, 200 of grows; grows had 100 to 200, 130 on average" in said
     kind = "same time per step"
-    assert budget.stated([job(100, budget=kind), job(9, 1.1e-3, budget=kind)]) == f"Budget: {kind} (1 to 1.1 ms per step)."
-    assert "was not kept" in budget.stated([job(100, budget=kind), job(9, 5e-3, budget=kind)])
+    alike = [job(100, budget=kind), job(100, 1.05e-3, budget=kind), job(9, 1.1e-3, budget=kind)]
+    said = budget.stated([*alike, job(None, 1e-5, budget=kind)])  # a filter without particles has no number to keep it by
+    assert said == f"Budget: {kind} (1 to 1.1 ms per step, particle filters alone; N = 100, 9)."
+    assert f"{kind} was not kept by dear (5) (1 to 5 ms" in budget.stated([*alike, job(9, 5e-3, budget=kind) | {"label": "dear"}])
+    counted = [{**job(n, budget=store.BUDGETS[2]), "likelihoods_per_step": n * k} for n, k in ((100, 1.0), (10, 11.0))]
+    said = "(100 to 110 per step, particle filters alone; N = 10, 100)."
+    assert budget.stated(counted) == f"Budget: same likelihood evaluations {said}"
+    assert "do not count them" in budget.stated([*counted, job(1, budget=store.BUDGETS[2])])
     assert "not the same for all" in budget.stated([job(100), job(100, budget=kind)])
     with pytest.raises(ValueError, match="budget=fair"):
         budget.stated([job(1, budget="fair")])
