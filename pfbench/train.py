@@ -128,7 +128,7 @@ def train(
         tell: is told of each epoch in words, besides the bar.
 
     Raises:
-        ValueError: nothing to train; an objective that does not fit the filter.
+        ValueError: nothing to train; an objective that does not fit the filter; another training was stopped at this path.
     """
     path = Path(path)
     pupil = Pupil(training, method, model, worlds)
@@ -173,6 +173,8 @@ def fit(
     if path.exists() and not cfg["fresh"]:
         tell(f"trained already: {path}  (fresh=true trains again)")
         return path
+    if cfg["fresh"]:
+        path.with_name(path.name + ".part").unlink(missing_ok=True)
     lots = {"train": (plan.worlds, plan.seed), "validation": (plan.validation, plan.seed + 1)}
     worlds, others = (draw_worlds(scenario, [*regimes.values()], model, *lot, plan.steps) for lot in lots.values())
     split = {part: {"seed": seed, "runs": runs * len(regimes)} for part, (runs, seed) in lots.items()}
@@ -207,6 +209,12 @@ class Pupil:
         self.optimiser = torch.optim.Adam(self.weights, training.learning_rate)
         law: Any = initial_law(model, 1, None if some.record.spread is None else some.record.spread)
         self.scale = law.stddev
+        told = {"objective": type(training.objective).__name__, "resampler": type(training.resampler).__name__}
+        told |= {name: getattr(training, name) for name in ("particles", "seed", "segment", "batch", "learning_rate", "clip")}
+        self.same = told | {
+            "proposal": ", ".join(f"{part.learnable.frame} {part.sizes}" for part in self.parts.values()),
+            "worlds": learned_weights.digest({"worlds": {"y": worlds.record.y, "states": worlds.states}}),
+        }
 
     def epoch(self, progress: Progress, worlds: Worlds, validation: Worlds) -> dict[str, float]:
         """One round through the worlds, then the validation; the line of the log."""
@@ -292,13 +300,25 @@ class Pupil:
 
     def save(self, path: Path, progress: Progress) -> None:
         networks = {name: flat(_networks(part)) for name, part in self.parts.items()}
-        learned_weights.write(path, {"networks": networks, "optimiser": self.optimiser.state_dict(), "progress": vars(progress)})
+        kept = {"networks": networks, "optimiser": self.optimiser.state_dict(), "progress": vars(progress), "same": self.same}
+        learned_weights.write(path, kept)
 
     def restore(self, path: Path) -> Progress:
-        """Where an earlier training stopped, or the beginning."""
+        """Where an earlier training stopped, or the beginning.
+
+        Raises:
+            ValueError: it was another training.
+        """
         if not path.exists():
             return Progress()
         kept = learned_weights.read(path)
+        for name, here in self.same.items():
+            there = kept.get("same", {}).get(name)
+            if there != here:
+                raise ValueError(
+                    f"{path}: a training was stopped here that had {name}={there}, and this one has {name}={here}; give the "
+                    "words with which it was begun, another train.to, or fresh=true, which removes it"
+                )
         for name, part in self.parts.items():
             learned_weights.fill(str(path), kept["networks"][name], _networks(part))
         self.optimiser.load_state_dict(kept["optimiser"])
@@ -312,10 +332,11 @@ class Pupil:
             "particles": self.training.particles, "device": str(self.model.anchor.device), "threads": torch.get_num_threads(),
         }  # fmt: skip
         sizes = {name: list(part.sizes) for name, part in self.parts.items()}
+        frames = {name: part.learnable.frame for name, part in self.parts.items()}
         kept = {name: {key: a.cpu() for key, a in weights.items()} for name, weights in progress.kept.items()}
         told = {"class": type(self.model).__name__, "names": list(self.model.names)}
         return {
-            "choices": {}, **json.loads(json.dumps(about)), "networks": kept, "sizes": sizes, "model": told,
+            "choices": {}, **json.loads(json.dumps(about)), "networks": kept, "sizes": sizes, "frames": frames, "model": told,
             "losses": progress.losses, "best": progress.best, "cost": cost,
         }  # fmt: skip
 

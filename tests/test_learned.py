@@ -224,6 +224,22 @@ def test_flows_of_the_library_zuko_leave_the_target_too(flow: str, monkeypatch: 
     test_gradients_reach_every_weight("zuko")
 
 
+class Lying(Zuko):
+    """A flow that says its map is twice as wide as it is."""
+
+    def forward(self, told: Tensor) -> Distribution:
+        law: Any = super().forward(told)
+        law.transforms[-1].log_abs_det_jacobian = lambda x, y: math.log(2.0) * torch.ones_like(x[..., 0])
+        return law  # type: ignore[no-any-return]
+
+
+def test_a_flow_of_zuko_s_with_a_wrong_determinant_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    zuko = pytest.importorskip("zuko", reason="needs the extra zuko")
+    monkeypatch.setitem(NETWORKS, "lying", partial(Lying, flow=zuko.flows.NSF, hidden=SMALL))
+    with pytest.raises(AssertionError):
+        test_the_ratio_is_one_on_average("lying", True, None)
+
+
 def test_a_run_cannot_feel_its_neighbours() -> None:
     """Alone, in any batch, in blocks: the same numbers, with networks that remember and mixtures that choose."""
     y = torch.stack([WALK_Y + k for k in range(3)])
@@ -423,8 +439,9 @@ def kept(tmp_path: Any) -> Any:
     content = {
         "networks": {"proposal": learned_weights.flat(dict(method.named_children()))},
         "sizes": {"proposal": list(method.sizes)},
+        "frames": {"proposal": method.learnable.frame},
         "model": {"class": "LinearGaussian", "names": list(WALK.names)},
-        "choices": {"scenario": "linear_walk"},
+        "choices": {"scenario": "linear_walk", "model": "linear_walk", "filter": "neural_sir"},
         "split": {"scenario": "linear_walk", "train": {"seed": 7, "runs": 10}, "validation": {"seed": 8, "runs": 4}},
         "cost": {"seconds": 1.0},
     }
@@ -449,15 +466,19 @@ def test_a_checkpoint_brings_the_weights_back(kept: Any) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"model": CASES["singular"]()[0], "y": CASES["singular"]()[1]}, "a model with 2 states .*position.*train on this"),
+        (
+            {"model": CASES["singular"]()[0], "y": CASES["singular"]()[1]},
+            "a model with 2 states .*position.*train on this.* scenario=linear_walk model=linear_walk$",
+        ),
         ({"network": partial(Diagonal, hidden=(9,))}, r"bent.0.bias has shape \(8,\), this filter's network has \(9,\)"),
         ({"network": NETWORKS["mixture"]}, "proposal.network"),
         ({"memory": 4}, "trained with memory=0 .* here it is 4; give the model"),
         ({"features": [Innovation()]}, "trained with features=10 .* here it is 4"),
+        ({"guide": GuidedNoise(CKF)}, "corrects the model's own noise, .* what is guided by Cubature; give filter=neural_sir"),
         ({"path": None}, "checkpoint=null: .*pfbench train.*checkpoint=untrained"),
         ({"path": "nowhere.pt"}, "checkpoint=nowhere.pt: there is no such file"),
     ],
-    ids=["model", "hidden", "network", "memory", "features", "none", "missing"],
+    ids=["model", "hidden", "network", "memory", "features", "guide", "none", "missing"],
 )
 def test_another_model_s_checkpoint_is_refused_in_words(kept: Any, options: dict[str, Any], said: str) -> None:
     given = {"path": str(kept[0])} | options

@@ -244,6 +244,38 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Pat
     assert [float(line["loss"]) for line in lines] == [line["loss"] for line in one["losses"]]
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"learning_rate": 0.5}, "learning_rate=0.02, and this one has learning_rate=0.5"),
+        ({"objective": InferenceCompilation()}, "objective=Bound, and .* objective=InferenceCompilation"),
+        ({"worlds": 17}, "had worlds="),
+        ({"memory": 2}, "had proposal="),
+        ({"guide": GuidedNoise(GaussianFilter(Jacobian()))}, "own noise .*this one has proposal=what is guided by Jacobian"),
+    ],
+    ids=["rate", "objective", "worlds", "memory", "guide"],
+)
+def test_another_training_does_not_go_on_from_there(change: dict[str, Any], said: str, tmp_path: Path) -> None:
+    """Adam would take the stopped one's rate along, and weights of one filter would be finished as another's."""
+
+    def run(plan: Training, tell: Callable[[str], object] | None = None, **options: Any) -> None:
+        worlds = lessons(plan.worlds, plan.seed)
+        train(plan, fresh(**options), LEVEL, worlds, worlds, tmp_path / "one.pt", tell=tell)
+
+    def stop(line: str) -> None:
+        if line.startswith("epoch 2 "):  # the first one is kept
+            raise Stop
+
+    plan = replace(QUICK, epochs=2)
+    with pytest.raises(Stop):
+        run(plan, stop)
+    options = {name: value for name, value in change.items() if name in ("memory", "guide")}
+    with pytest.raises(ValueError, match=said):
+        run(replace(plan, **{name: value for name, value in change.items() if name not in options}), **options)
+    run(replace(plan, epochs=3, patience=5))  # more of the same is the same training
+    assert len(learned_weights.read(tmp_path / "one.pt")["losses"]) == 3
+
+
 def test_where_tensorboard_is_installed_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[tuple[str, str, int]] = []
 
@@ -369,12 +401,19 @@ def test_train_and_run_at_the_command_line(tmp_path: Path) -> None:
     assert kept["cost"]["seconds"] > 0.0
     assert "trained already" in pfbench("train", *words, *SHORT, "train.noises=[nominal,outliers]", home=tmp_path).out
 
+    part = path.with_name(path.name + ".part")
+    part.write_text("of something else")
+    again = pfbench("train", *words, *SHORT, "train.noises=[nominal,outliers]", "fresh=true", home=tmp_path)
+    assert again.code == 0, again.err  # from the beginning: it does not go on from there
+    assert not part.exists()
+    assert learned_weights.digest(learned_weights.read(path)["networks"]) == learned_weights.digest(kept["networks"])
+
     run = [*words, "runs=3", f"checkpoint={path}"]
     said = pfbench("run", *run, home=tmp_path)
     assert said.code == 0, said.err
     (result,) = store.results(tmp_path / "results" / "mine")
     assert result.meta["exact"]
-    assert result.meta["trained"]["cost"] == kept["cost"]
+    assert result.meta["trained"]["cost"] == learned_weights.read(path)["cost"]
     assert result.meta["trained"]["weights"] == learned_weights.digest(kept["networks"])
     moved = tmp_path / "moved.pt"
     moved.write_bytes(path.read_bytes())

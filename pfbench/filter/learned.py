@@ -81,7 +81,7 @@ class Learned(nn.Module):
             raise ValueError(f"proposal: share={share}, memory={memory}; give a share below 1 and 0 or more numbers to remember")
         self.make, self.guide, self.share, self.hidden = network, guide, share, memory
         self.told = Told() if features is None else Told(features)
-        self.learnable = Learnable(self.part, checkpoint, seed)
+        self.learnable = Learnable(self.part, checkpoint, seed, _frame(guide))
         self.network: nn.Module | None = None
         self.recurrent: nn.Module | None = None
         self.sizes = 0, 0, memory
@@ -173,6 +173,14 @@ class Learned(nn.Module):
         m, columns = sent[:, -width - 1], sent[:, -width:]
         zeta = torch.linalg.solve_ex((columns - m.unsqueeze(1)).mT, (xi.squeeze(1) - m).unsqueeze(-1))[0]
         return zeta.mT, log_det[:, -1:]
+
+
+def _frame(guide: GuidedNoise | None) -> str:
+    """What the network's law corrects, in words that a checkpoint keeps."""
+    if guide is None:
+        return "the model's own noise"
+    rule = guide.guide.rule
+    return f"what is guided by {type(getattr(rule, 'scheme', rule)).__name__}"
 
 
 def _joined(cloud: Cloud, more: Tensor) -> Cloud:

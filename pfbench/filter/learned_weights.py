@@ -35,11 +35,13 @@ class Learnable:
         part: its name in a checkpoint: `proposal` or `kernel`.
         checkpoint: a file, `untrained`, or None, which is refused on use.
         seed: of untrained weights.
+        frame: in words, what the network's law corrects: the same numbers mean another law in another frame.
     """
 
     part: str
     checkpoint: str | None
     seed: int
+    frame: str = ""
 
 
 def made(
@@ -67,7 +69,7 @@ def made(
         modules = {name: module.to(model.anchor) for name, module in make().items()}
     if path not in (None, UNTRAINED) and not fresh:
         kept = read(str(path))
-        _check_sizes(str(path), kept, learnable.part, sizes, model)
+        _check_sizes(str(path), kept, learnable, sizes, model)
         fill(str(path), kept["networks"][learnable.part], modules)
     return modules
 
@@ -179,16 +181,26 @@ def _named(path: str) -> str:
     return path if path == UNTRAINED else f"weights {digest(read(path)['networks'])}"
 
 
-def _check_sizes(path: str, kept: Mapping[str, Any], part: str, sizes: tuple[int, int, int], model: StateSpaceModel) -> None:
+def _check_sizes(
+    path: str, kept: Mapping[str, Any], learnable: Learnable, sizes: tuple[int, int, int], model: StateSpaceModel
+) -> None:
+    part, choices = learnable.part, kept["choices"]
     if part not in kept["networks"]:
         has = ", ".join(kept["networks"])
         raise ValueError(f"checkpoint={path}: it holds a learned {has}, this filter has a learned {part}; train this filter")
     trained = list(kept["model"]["names"])
     if trained != list(model.names):
+        words = [f"{group}={choices[group]}" for group in ("scenario", "model") if group in choices]
         raise ValueError(
             f"checkpoint={path}: it was trained on a model with {len(trained)} states ({', '.join(trained)}), and "
             f"{type(model).__name__} has {len(model.names)} ({', '.join(model.names)}); train on this model, or give "
-            f"scenario={kept['choices'].get('scenario', 'the one it was trained on')}"
+            f"{' '.join(words) or 'the scenario and the model it was trained on'}"
+        )
+    frame = kept.get("frames", {}).get(part, learnable.frame)  # those of before frames were kept are taken at their word
+    if frame != learnable.frame:
+        raise ValueError(
+            f"checkpoint={path}: its network corrects {frame}, this filter's corrects {learnable.frame}; give "
+            f"filter={choices.get('filter', 'the one')} with which it was trained, or train this one"
         )
     for (name, what), here, there in zip(SIZES.items(), sizes, kept["sizes"][part], strict=True):
         if here != there:
