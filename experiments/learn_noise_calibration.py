@@ -14,7 +14,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from pfbench.ppl.pmmh import pmmh
 from pfbench.ppl.posterior import Posterior
 from pfbench.ppl.program import ExactHMM, Filtered, Unknown, program
 from pfbench.record import Record
+from pfbench.report.canvas import indexed
 
 WRONG = 1.5
 BINS = 10
@@ -109,8 +110,20 @@ def main(folder: Path, runs: int = 200, effort: int = 2, only: str = "") -> None
         drawn.setdefault(world, {})[label] = Ranks({part: torch.tensor(kept["ranks"]) for part, kept in parts.items()}, 19)
         values = {part: (f"{kept['p']:.2g}", kept["counts"]) for part, kept in parts.items()}
         print(name, values, f"{told[name]['seconds']:.0f} s", flush=True)
+    (folder / "table.md").write_text("\n".join(table(told)) + "\n")
     for world, ranks in drawn.items():
-        histograms(ranks).savefig(folder / f"calibration_{world}.svg")
+        (folder / f"calibration_{world}.png").write_bytes(indexed(histograms(ranks)))
+
+
+def table(told: Mapping[str, Any]) -> list[str]:
+    """Lines of a table in Markdown: a row for each case that is done and each of its numbers."""
+    lines = ["| case | number | data sets in each tenth of the ranks | p | s of the processor |", "|" + " --- |" * 5]
+    for name, case in told.items():
+        parts = {part: kept for part, kept in case.items() if part != "seconds"} if isinstance(case, dict) else {}
+        for part, kept in parts.items():
+            counts = " ".join(map(str, kept["counts"]))
+            lines.append(f"| {name} | {part} | {counts} | {kept['p']:.2g} | {case['seconds']:.0f} |")
+    return lines
 
 
 def told_of(ranks: Ranks, part: str) -> dict[str, Any]:

@@ -67,7 +67,7 @@ def test_scores_are_told_against_the_own_noise_s() -> None:
 
 
 def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = World(volatility, "state", 6, 0.01, (1, 2), (1, 2), 8)
+    small = World(volatility, "state", 6, 0.01, (1, 2), (1, 2), 8, particles=20, few=4, dearer={"own noise": 60})
     monkeypatch.setattr(learn_data_efficiency, "WORLDS", {"small": small})
     learned, taught = [], learn_data_efficiency.taught
 
@@ -84,7 +84,10 @@ def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(tmp_path: Path
     assert len(learned) == 7
     assert learned[3] == learned[4]
     rows = (tmp_path / "tables.md").read_text().splitlines()
-    assert len([row for row in rows if row.startswith("| bound, ")]) == 2
+    assert [row.split(" | ")[0] for row in rows if row.startswith("| bound, ")] == [
+        "| bound, 1 world", "| bound, 2 worlds", *["| bound, 2 worlds"] * 4
+    ]  # fmt: skip
+    assert len([row for row in rows if row.startswith("| own noise, 60 particles | ")]) == 1
     assert (tmp_path / "data_efficiency.png").stat().st_size > 5000
 
 
@@ -116,4 +119,7 @@ def test_a_study_of_calibration_goes_on_from_where_it_stopped(tmp_path: Path, mo
     assert asked == [30] * 8
     learn_noise_calibration.main(tmp_path, 31, 1, "location, SVI")  # another call, from the beginning
     assert asked[8:] == [31, 31]
-    assert (tmp_path / "calibration_toy.svg").exists()
+    assert (tmp_path / "calibration_toy.png").exists()
+    rows = [row.split(" | ") for row in (tmp_path / "table.md").read_text().splitlines()[2:]]
+    assert [row[0] for row in rows] == ["| location, SVI", "| location, SVI, wrong"]
+    assert sum(map(int, rows[0][2].split())) == 31

@@ -20,6 +20,7 @@ from pfbench.ppl.calibration import Ranks, calibrate, histograms
 from pfbench.ppl.gradients import normal_guide, nuts, variational
 from pfbench.ppl.online import online
 from pfbench.ppl.pmmh import pmmh
+from pfbench.ppl.posterior import Posterior
 from pfbench.ppl.program import ExactHMM, Filtered, Unknown, latent_program, program
 from pfbench.record import Record
 
@@ -59,11 +60,27 @@ def grid(years: int) -> tuple[dict[str, tuple[float, float]], float]:
 
 
 def agrees(table, years: int, ess: float = 0.0, sds: float = 4.5) -> None:
-    """Means within Monte Carlo error by the effective number of draws, sds within 30 %."""
+    """Means within Monte Carlo error by the effective number of draws, sds within 30 %; of few draws nothing could be said."""
     for name, (mean, sd) in grid(years)[0].items():
         n = max(ess, float(table.ess[name]))
+        assert n > 40, (name, n)
         assert abs(table["mean"][name] - mean) < sds * sd / n**0.5, (name, table["mean"][name], mean, sd, n)
         assert 0.7 < table.sd[name] / sd < 1.4, (name, table.sd[name], sd)
+
+
+def test_what_disagrees_with_the_grid_is_seen() -> None:
+    """Draws with the grid's moments pass; a mean that is off by half an sd, a wrong sd, or too few draws do not."""
+
+    def told(shift: float = 0.0, scale: float = 1.0, draws: int = 200):
+        z = torch.randn(4, draws, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        z = (z - z.mean()) / z.std()
+        moments = grid(YEARS)[0].items()
+        return Posterior({name: mean + sd * (shift + scale * z) for name, (mean, sd) in moments}, None, "made").table()
+
+    agrees(told(), YEARS)
+    for wrong in ({"shift": 0.5}, {"shift": -0.5}, {"scale": 0.6}, {"scale": 1.5}, {"draws": 5}, {"shift": torch.nan}):
+        with pytest.raises(AssertionError):
+            agrees(told(**wrong), YEARS)
 
 
 @pytest.mark.slow

@@ -76,20 +76,17 @@ def histograms(found: Mapping[str, Ranks], bins: int = 10) -> Figure:
     """Rank histograms by label, a row for each number, with the band that holds 95 % of the bins of uniform ranks."""
     labels, names = list(found), list(next(iter(found.values())).ranks)
     with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(max(1.0, 0.5 * len(labels)) * COLUMN, 0.4 + 1.2 * len(names)), layout="constrained")
+        figure = Figure(figsize=(max(1.0, 0.5 * len(labels)) * COLUMN, 0.6 + 1.2 * len(names)), layout="constrained")
         axes = figure.subplots(len(names), len(labels), squeeze=False, sharex=True)
-        for row, name in zip(axes, names, strict=True):
+        for i, (row, name) in enumerate(zip(axes, names, strict=True)):
             for axis, label in zip(row, labels, strict=True):
                 counts = found[label].counts(name, bins)
                 low, high = binom.ppf([0.025, 0.975], counts.sum(), 1.0 / bins)
                 axis.axhspan(low, high, color="0.85", linewidth=0)
                 axis.bar((np.arange(bins) + 0.5) / bins, counts, width=0.9 / bins, color="#0072B2")
                 told = f"p = {found[label].p_value(name, bins):.2g}"
-                axis.text(0.03, 0.9, told, transform=axis.transAxes, va="top", fontsize=7)
+                axis.set_title(f"{label}\n{told}" if i == 0 else told)
                 axis.set_ylim(0, None)
             row[0].set_ylabel(name.replace("_", " "))
-        for axis, label in zip(axes[0], labels, strict=True):
-            axis.set_title(label)
-        for axis in axes[-1]:
-            axis.set_xlabel("rank of the truth among its draws")
+        figure.supxlabel("rank of the truth among its draws", fontsize=RC["font.size"])
     return figure
