@@ -44,6 +44,7 @@ bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## spe
 	$(BIN)/python benchmarks/compare.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python
 	$(BIN)/python benchmarks/methods.py
 	$(BIN)/python benchmarks/scaling.py
+	$(BIN)/python benchmarks/pages.py
 
 clean:
 	rm -rf $(VENV) .venv-bench .venv-peers build dist *.egg-info

@@ -142,7 +142,8 @@ def _report(words: list[str]) -> None:
 def _page(cfg: dict[str, Any]) -> Path:
     """Writes the page of a study, or that of the claims."""
     from pfbench.report import ledger
-    from pfbench.report.page import Options, write
+    from pfbench.report.page import write
+    from pfbench.report.view import Options
 
     chosen: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in cfg["report"].items()}
     options = Options(**chosen, planned=_planned(cfg["study"]))

@@ -13,7 +13,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from pfbench import metrics, store
-from pfbench.report import page, scene, scene_figures, tables
+from pfbench.report import files, scene, scene_figures, tables
 from pfbench.report.canvas import slug
 from pfbench.report.figures import Drawing
 from pfbench.report.frame import blocks
@@ -39,12 +39,12 @@ def write(file: str | Path, out: str | Path = "reports", formats: Sequence[str] 
     choices = sheet.meta["choices"]
     own = slug(f"{choices['scenario']}_{choices['noise']}")
     folder = Path(out) / "datasheets" / own
-    page.clear(folder)
-    drawn = [page.drawn(drawing, own, folder, formats) for drawing in drawings(sheet)]
+    files.clear(folder)
+    drawn = [files.drawn(drawing, own, folder, formats) for drawing in drawings(sheet)]
     residuals, spreads = whiteness(sheet), growth(sheet)
     for name, table in (("residuals", residuals), ("spread", spreads)):
         if len(table):
-            page.save_table(folder, name, table)
+            files.save_table(folder, name, table)
     context = {
         "name": f"{choices['scenario']} / {choices['noise']}",
         "meta": sheet.meta,
@@ -55,7 +55,7 @@ def write(file: str | Path, out: str | Path = "reports", formats: Sequence[str] 
         "spread": spreads,
         "settings": json.dumps(sheet.meta["config"]["scenario"], indent=1),
     }
-    return page.render("datasheet", folder, context)
+    return files.render("datasheet", folder, context)
 
 
 def drawings(sheet: store.Result) -> list[Drawing]:

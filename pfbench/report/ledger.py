@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pfbench.report import budget, claim_figures, page, tables
+from pfbench.report import budget, claim_figures, files, tables
 from pfbench.report.claims import PAPERS, Claim, load
 from pfbench.report.evidence import Side, gather, ran
 from pfbench.report.frame import natural
@@ -53,15 +53,15 @@ def write(
     claims = load(conf, experiments)
     rulings = decide(claims, gather(claims, results, mixed=mixed), alpha)
     folder = Path(out) / STUDY
-    page.clear(folder)
-    page.save_table(folder, STUDY, table(rulings))
+    files.clear(folder)
+    files.save_table(folder, STUDY, table(rulings))
     plain = [_plain(ruling) for ruling in rulings]
     (folder / "verdicts.json").write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     studies = {study for ruling in rulings for study in ruling.claim.studies}
     jobs = ran(claims, results, mixed=mixed)
     made = of_studies(jobs)
     if len(made):
-        page.save_table(folder, "studies", made)
+        files.save_table(folder, "studies", made)
     context = {
         "papers": papers(rulings, anchors(studies, out), jobs),
         "made": made,
@@ -70,9 +70,9 @@ def write(
         "count": count(rulings),
         "alpha": alpha,
         "n": len(rulings),
-        "drawings": [page.drawn(drawing, STUDY, folder, formats) for drawing in claim_figures.drawings(rulings)],
+        "drawings": [files.drawn(drawing, STUDY, folder, formats) for drawing in claim_figures.drawings(rulings)],
     }
-    return page.render(STUDY, folder, context)
+    return files.render(STUDY, folder, context)
 
 
 def anchors(studies: Iterable[str], out: str | Path) -> dict[str, set[str]]:

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from pfbench import cli, metrics, store
-from pfbench.report import figures, page, paper_figures, paper_plots
+from pfbench.report import figures, page, paper_figures, paper_plots, section
 from pfbench.report.canvas import dimmed, indexed, looks, told
 from pfbench.report.frame import cells, frame
 from pfbench.report.paper_figures import FIGURES
@@ -218,7 +218,7 @@ def test_the_page_links_to_each_of_them(results: Path, tmp_path: Path) -> None:
     options = page.Options(formats=("png",), groups=("position",), figures=("004-iterations",))
     with pytest.MonkeyPatch.context() as patch:  # what else is on a page is tested elsewhere
         patch.setattr(figures, "drawings", lambda *_, **__: [])
-        patch.setattr(page.calibration, "drawings", lambda *_: [])
+        patch.setattr(section.calibration, "drawings", lambda *_: [])
         patch.setattr(page.ranking_figures, "of_cell", lambda *_: [])
         patch.setattr(page.ranking_figures, "of_study", lambda *_: [])
         made = page.write("paper_004", results, tmp_path, options)

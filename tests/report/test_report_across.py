@@ -8,7 +8,7 @@ import scikit_posthocs as posthocs
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from pfbench.report import across, page, significance
+from pfbench.report import across, files, page, significance
 
 # Demsar 2006, table 6: AUC of C4.5, C4.5+m, C4.5+cf, C4.5+m+cf; the rounded tie of "voting" in its published order.
 DEMSAR = np.array([
@@ -162,7 +162,7 @@ def test_worlds_that_two_cells_share_are_counted():
 
 def said(found):
     """What a page says of it, without blank lines."""
-    text = page._environment(False).get_template("text.jinja").make_module({"options": page.Options()})
+    text = files._environment(False).get_template("text.jinja").make_module({"options": page.Options()})
     return [line for line in text.over_cells({"one": found, "changed": []}, False).split("\n") if line.strip()]
 
 

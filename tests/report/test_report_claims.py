@@ -17,7 +17,7 @@ from statsmodels.stats.multitest import multipletests
 from synthetic_results import METHODS, STATE, VERSIONS, Method, write
 
 from pfbench import cli, store
-from pfbench.report import claim_figures, claims, evidence, ledger, power, rulings
+from pfbench.report import claim_figures, claims, evidence, files, ledger, power, rulings
 from pfbench.report import page as report_page
 from pfbench.report.canvas import slug
 from pfbench.report.claims import Claim, Comparison
@@ -598,7 +598,7 @@ def test_each_claim_links_to_a_figure_that_is_there(study: Path, tmp_path: Path)
     """Of a study as it is published: every link of the ledger leads to an anchor of its page, and to the figure that shows it."""
     out = tmp_path / "reports"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report_page, "drawn", lambda drawing, prefix, *_: {
+        patch.setattr(files, "drawn", lambda drawing, prefix, *_: {
             "file": "", "caption": "", "source": "data:,", "name": drawing.name, "broad": False,
             "anchor": slug(f"{prefix}_{drawing.name}"),
         })  # fmt: skip

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from pfbench.report import across, canvas, frame, headline, headline_figures, page, ranking_figures
+from pfbench.report import across, canvas, files, frame, headline, headline_figures, page, ranking_figures
 from pfbench.report.significance import NO_DIFFERENCE, holm, verdicts
 
 WORLDS, REGIMES = ("plain", "hill", "lake"), ("nominal", "outliers")
@@ -72,7 +72,7 @@ def test_a_winner_needs_the_corrected_p_and_is_the_one_whose_errors_are_smaller(
 
 
 def words():
-    return page._environment(False).get_template("text.jinja").make_module({"options": page.Options()})
+    return files._environment(False).get_template("text.jinja").make_module({"options": page.Options()})
 
 
 def test_what_cannot_be_shown_is_not_called_no_difference():

@@ -13,7 +13,7 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench import store
-from pfbench.report import across, frame, page, significance
+from pfbench.report import across, files, frame, page, significance
 
 NOISES = ("nominal", "surge", "heavy", "outage", "jam")
 METHODS = synthetic.METHODS[1:]
@@ -90,7 +90,7 @@ def test_order_of_files_and_workers_change_no_verdict(tmp_path: Path) -> None:
     for turn in (0, 7):
         folder = study(tmp_path / f"results{turn}" / "demo", turn)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(page, "drawn", lambda drawing, *_: {
+            patch.setattr(files, "drawn", lambda drawing, *_: {
                 "file": "", "caption": drawing.caption, "source": "data:,", "name": drawing.name, "broad": False, "anchor": "x",
             })  # fmt: skip
             made = page.write("demo", folder.parent, tmp_path / f"reports{turn}", options)

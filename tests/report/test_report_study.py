@@ -11,7 +11,7 @@ import synthetic_results as synthetic
 from matplotlib.figure import Figure
 
 from pfbench import store
-from pfbench.report import across, budget, frame, page, ranking_figures, significance, tables
+from pfbench.report import across, budget, files, frame, page, ranking_figures, section, significance, tables, view
 from pfbench.report.canvas import looks
 
 METHODS = (
@@ -41,7 +41,7 @@ def report(results, tmp_path_factory):
                 "anchor": drawing.name}
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page, "drawn", stub)
+        patch.setattr(files, "drawn", stub)
         folder = page.write("many", results, tmp_path_factory.mktemp("reports"), page.Options(groups=("position",))).parent
     (folder / "drawn.json").write_text(json.dumps(drawn))
     return folder
@@ -173,8 +173,11 @@ def test_a_study_too_large_to_show_all_says_what_it_shows(results, tmp_path):
         return {"file": "", "caption": drawing.caption, "source": "data:,", "name": "", "broad": False, "anchor": "x"}
 
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"drawn": stub, "_PAIRS": 2, "_ROWS": 30, "_NAMED": 1, "_PLENTY": 17}.items():
-            patch.setattr(page, name, value)
+        for module, name, value in (
+            (files, "drawn", stub), (page, "PAIRS", 2), (section, "PAIRS", 2),
+            (page, "_ROWS", 30), (files, "_MANY", 30), (view, "_NAMED", 1), (view, "_PLENTY", 17),
+        ):  # fmt: skip
+            patch.setattr(module, name, value)
         made = page.write("many", results, tmp_path)
     html = made.read_text()
     decided = json.loads(gzip.decompress((made.parent / "verdicts.json.gz").read_bytes()))
