@@ -66,6 +66,34 @@ def test_scores_are_told_against_the_own_noise_s() -> None:
     assert [float(against(other, own, name)[0]) for name in ("ess", "evidence", "error")] == [0.4, 0.5, math.log(0.5)]
 
 
+def test_verdicts_name_the_better_one_and_tables_count_what_a_step_costs() -> None:
+    """Errors a quarter of own noise's in each world, and twice those of the dearer one; no difference is none."""
+    scatter = np.exp(0.1 * np.random.default_rng(1).normal(size=40))
+
+    def scores(error: float, evidence: float, **more: list[float]) -> dict[str, list[float]]:
+        found = {"ess": [0.25] * 40, "evidence": [*(evidence + scatter)], "error": [*(error * scatter)], "seconds": [0.8]}
+        return found | more
+
+    each = {"1": scores(1.0, 2.0, training=[3.0]), "2": scores(1.0, 2.0, training=[5.0])}
+    by_hand = {learn_data_efficiency.OWN: scores(4.0, 1.0), "as good": scores(1.0, 2.0)}
+    told = {"by hand": by_hand, "dearer": {"as good": scores(0.5, 2.5, particles=[80])}, "inference compilation": {"1": each}}
+    told["bound"] = {"1": {name: scores(1.1, 2.0, training=[1.0]) for name in each}, "3": each}
+    rows = [row.strip("| ").split(" | ") for row in learn_data_efficiency.verdicts(told)[2:]]
+    others = ("own noise", "as good", "as good, 80 particles")
+    assert [row[:2] for row in rows[3:]] == [["bound, 3 worlds", name] for name in others]
+    own, same, dear = rows[:3]
+    assert own[2].startswith("0.250 (0.250 to 0.250)")
+    assert dear[2].startswith("2.000 (2.000 to 2.000)")
+    assert [float(x) for x in (own[4], same[4], dear[4])] == pytest.approx([1.0, 0.0, -0.5])
+    assert max(float(row[k]) for row in (own, dear) for k in (3, 5)) < 1e-6
+    assert float(same[3]) == float(same[5]) == 1.0
+
+    world = World(volatility, "state", 10, 0.01, (1,), (1, 2), 40, particles=20)
+    table = {row.split(" | ")[0]: row.strip("| ").split(" | ") for row in learn_data_efficiency.table(told, world)}
+    assert table["| as good, 80 particles"][-2:] == ["80.0", "0.2"]  # 0.8 s in 10 steps, a quarter of 80 particles
+    assert table["| bound, 3 worlds"][-3:] == ["80.0", "0.1", "4"]
+
+
 def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = World(volatility, "state", 6, 0.01, (1, 2), (1, 2), 8, particles=20, few=4, dearer={"own noise": 60})
     monkeypatch.setattr(learn_data_efficiency, "WORLDS", {"small": small})
