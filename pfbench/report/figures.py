@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -43,6 +44,7 @@ _FEW = 4  # filters of which each has a picture of its spread; of more, two have
 _BOUND: Any = {"color": "black", "ls": (0, (3, 1.2)), "lw": 0.8, "zorder": 4}
 _NARROW = 120  # instants of a panel of half a column
 _MEDIAN = 0.6745  # of the absolute value of a standard normal number
+_LETTERS = 30  # beside a panel, as high as one of these figures
 _BOXES = 12  # filters that a figure of boxes and points holds; more have a row each, by rank
 _TRACES = {  # what a trace shows, the unit, and whether it is a share of the particles
     "ess": ("effective sample size", "% of N", True),
@@ -96,7 +98,7 @@ def drawings(
     kept = "runs that were not lost"
     found = []
     row = None if brief else _common_run(results)
-    if row is not None and any("track" in result.arrays for result in results.values()):
+    if row is not None and any("track" in r.arrays and _east_north_up(r.meta["state"]) for r in results.values()):
         number = row + int(next(iter(results.values())).meta.get("first_run", 0))
         text = f"True and estimated track of run {number}, the first that no filter lost: plan view and height.{note}"
         found.append(Drawing("track", text, partial(track, results, row, style)))
@@ -211,6 +213,7 @@ def track(results: Results, row: int, style: Mapping[str, Look]) -> Figure:
         height.plot(result.arrays["time"][known], estimate[known, 2], **style[label].line())
     plan.set(xlabel="east in m", ylabel="north in m")
     plan.set_aspect("equal", adjustable="datalim")
+    plan.locator_params(axis="x", nbins=4)
     height.set(xlabel="time in s", ylabel="height in m")
     legend(figure, plan)
     return figure
@@ -417,7 +420,7 @@ def trace(results: Results, name: str, style: Mapping[str, Look]) -> Figure:
             if not style[label].quiet:
                 axis.fill_between(time, low, high, color=style[label].colour, alpha=0.18, lw=0)
             axis.plot(time, middle, marker=_mark(time), **style[label].line(label))
-    axis.set(xlabel="time in s", ylabel=labelled(what.partition(",")[0], unit))
+    axis.set(xlabel="time in s", ylabel=fill(labelled(what.partition(",")[0], unit), _LETTERS))
     axis.set_ylim(bottom=0)
     legend(figure, axis)
     return figure

@@ -11,14 +11,17 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
+import synthetic_results as synthetic
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from pfbench.report import across, budget, canvas, headline, headline_figures, ranking_figures
+from pfbench import store
+from pfbench.report import across, budget, canvas, figures, headline, headline_figures, ranking_figures
 from pfbench.report.budget import Front
 from pfbench.report.figures import Drawing, save
+from pfbench.report.frame import cells, tidy
 from pfbench.report.significance import verdicts
 
 BASES = ("sir", "rpf", "mcmc_rpf", "gpf", "qmc_gpf", "qmc_polymerised", "mssrckf", "fm_mssrckf", "cofm_mssrckf")
@@ -87,6 +90,36 @@ def test_letters_of_figures_of_many_filters_can_be_read_and_are_not_cut(worlds: 
         assert figure.get_figwidth() <= 3.5, kind  # a column of print
         assert small(figure) == [], kind
         assert cut(figure) == [], kind
+
+
+def test_the_longest_name_beside_a_trace_is_not_cut(tmp_path: Path) -> None:
+    synthetic.study(tmp_path / "demo", runs=6, steps=12)
+    (cell,) = cells("demo", tmp_path)
+    loaded = {job.label: job.load() for job in cell.jobs}
+    swarms = {name: r for name, r in loaded.items() if "ess" in r.arrays}
+    loaded = {name: r._replace(arrays={**r.arrays, "ancestors": r.arrays["ess"]}) for name, r in swarms.items()}
+    style = canvas.looks(list(loaded))
+    figure = drawn(lambda: figures.trace(loaded, "ancestors", style), tmp_path)
+    name = figure.axes[0].get_ylabel()
+    assert "ancestors" in name
+    assert name not in cut(figure)
+
+
+def test_a_track_is_shown_where_somebody_estimated_it(tmp_path: Path) -> None:
+    synthetic.study(tmp_path / "demo", runs=6, steps=12)
+    (cell,) = cells("demo", tmp_path)
+    loaded = {job.label: job.load() for job in cell.jobs}
+    runs, look = tidy(cell, cell.jobs[0], next(iter(loaded.values())), 0.0, {}), canvas.looks(list(loaded))
+
+    def drawings(results: dict[str, store.Result]) -> set[str]:
+        return {one.name for one in figures.drawings(results, runs, look, ["position"], 0.05)}
+
+    assert "track" in drawings(loaded)
+    plane = {}
+    for label, r in loaded.items():  # as of an emitter in the plane: x and y, no height
+        state = {**r.meta["state"], "names": [name.replace("position_", "place_") for name in r.meta["state"]["names"]]}
+        plane[label] = r._replace(meta={**r.meta, "state": state})
+    assert "track" not in drawings(plane)
 
 
 def test_numbers_of_a_matrix_stay_in_their_squares(tmp_path: Path) -> None:
@@ -158,6 +191,19 @@ def test_ticks_of_an_axis_have_one_style(ends: tuple[float, float]) -> None:
     assert not any("e" in text for text in said)
     assert len({"10" in text and text[-1] in "⁰¹²³⁴⁵⁶⁷⁸⁹" for text in said}) == 1
     assert all(len(text) <= 6 for text in said)
+
+
+def test_long_numbers_that_lie_abreast_do_not_touch() -> None:
+    with matplotlib.rc_context(canvas.RC):
+        figure, (axis,) = canvas.stack(1, 1.4)
+        axis.plot([1500.0, 6e4], [0.0, 1.0])
+        axis.set_xscale("log")
+        canvas.plain_ticks(axis.xaxis, [1500.0, 6e4])
+        axis.set_yticks([0, 1], ["dmc_reconstructed_printed", "sir"])
+        figure.draw_without_rendering()
+        boxes = sorted((text.get_window_extent() for text in axis.get_xticklabels() if text.get_text()), key=lambda box: box.x0)
+    assert len(boxes) > 1
+    assert all(a.x1 + 6 < b.x0 for a, b in pairwise(boxes))
 
 
 def test_powers_are_those_of_the_values() -> None:
