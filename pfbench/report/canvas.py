@@ -182,16 +182,20 @@ def log_if_wide(axis: Axes, side: Axis, values: Sequence[np.ndarray]) -> None:
         plain_ticks(side, flat)
 
 
-def plain_ticks(side: Axis, values: Sequence[float] | np.ndarray) -> None:
-    """Plain numbers on a logarithmic axis: 1, 2, 5 where it is short (1, 3 where long ones lie abreast), else decades."""
+def plain_ticks(side: Axis, values: Sequence[float] | np.ndarray, narrow: bool = False) -> None:
+    """Plain numbers on a logarithmic axis: 1, 2, 5 where it is short, decades where it is long.
+
+    1 and 3 where there is little room: where it is said, and where long numbers lie abreast.
+    """
     flat = _finite([np.asarray(values)])
     flat = flat[flat > 0]
     reach = flat.max() / flat.min() if flat.size else 1.0
     if reach < 10:
         side.set_major_locator(ticker.MaxNLocator(4, steps=[1, 2, 5, 10]))
     else:
-        few = (1.0, 3.0) if side is side.axes.xaxis and flat.max(initial=0.0) >= 1e4 else (1.0, 2.0, 5.0)
-        side.set_major_locator(ticker.LogLocator(subs=few if reach < 100 else (1.0,), numticks=8))
+        narrow = narrow or (side is side.axes.xaxis and flat.max() >= 1e4)
+        short = (1.0, 3.0) if narrow else (1.0, 2.0, 5.0)
+        side.set_major_locator(ticker.LogLocator(subs=short if reach < 100 else (1.0,), numticks=8))
     side.set_major_formatter(_Numbers())
     if reach < 100:  # 1, 2 and 5 have their own; minor ones between them only cost time
         side.set_minor_locator(ticker.NullLocator())

@@ -401,7 +401,7 @@ def cost(results: Results, style: Mapping[str, Look]) -> Figure:
         if known.size and known.max() > 10 * known.min():
             axis.set_xscale("log")
             axis.set_xlim(known.min() / 1.5, 1.5 * known.max())
-            plain_ticks(axis.xaxis, known)
+            plain_ticks(axis.xaxis, known, narrow=True)
         axis.grid(False, axis="y")
     panels[0].set_ylim(len(labels) - 0.5, -0.5)
     return figure
@@ -410,6 +410,7 @@ def cost(results: Results, style: Mapping[str, Look]) -> Figure:
 def trace(results: Results, name: str, style: Mapping[str, Look]) -> Figure:
     """One trace of the filters that leave it over time."""
     what, unit, share = _TRACES[name]
+    unit = unit.replace(" ", "\N{NO-BREAK SPACE}")
     figure, (axis,) = stack(1, 2.2)
     for label, result in results.items():
         if name in result.arrays and (result.meta.get("particles") or not share):

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import synthetic_results as synthetic
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -201,9 +202,27 @@ def test_long_numbers_that_lie_abreast_do_not_touch() -> None:
         canvas.plain_ticks(axis.xaxis, [1500.0, 6e4])
         axis.set_yticks([0, 1], ["dmc_reconstructed_printed", "sir"])
         figure.draw_without_rendering()
-        boxes = sorted((text.get_window_extent() for text in axis.get_xticklabels() if text.get_text()), key=lambda box: box.x0)
+    assert min(gaps(axis)) > 6
+
+
+def gaps(axis: Axes) -> list[float]:
+    """Between the numbers below a panel."""
+    boxes = sorted((text.get_window_extent() for text in axis.get_xticklabels() if text.get_text()), key=lambda box: box.x0)
     assert len(boxes) > 1
-    assert all(a.x1 + 6 < b.x0 for a, b in pairwise(boxes))
+    return [b.x0 - a.x1 for a, b in pairwise(boxes)]
+
+
+def test_numbers_of_costs_do_not_touch(tmp_path: Path) -> None:
+    synthetic.study(tmp_path / "demo", runs=6, steps=12)
+    (cell,) = cells("demo", tmp_path)
+    loaded = [job.load() for job in cell.jobs[:3]]
+    times = dict(zip(("dmc_reconstructed_printed", "ekf", "sir"), (0.25, 0.05, 0.01), strict=True))
+    dear = {
+        name: result._replace(meta={**result.meta, "seconds": {"per_step": time}, "memory": 1e9 * time})
+        for (name, time), result in zip(times.items(), loaded, strict=True)
+    }
+    figure = drawn(lambda: figures.cost(dear, canvas.looks(list(dear))), tmp_path)
+    assert all(min(gaps(axis)) > 4 for axis in figure.axes)
 
 
 def test_powers_are_those_of_the_values() -> None:
