@@ -31,7 +31,6 @@ _failed: set[Callable[..., Any]] = set()  # what a compiler has refused once
 
 _fused: ContextVar[bool] = ContextVar("fused", default=False)
 _graph: ContextVar[bool] = ContextVar("graph", default=False)
-_operators = torch.library.Library("pfbench", "DEF")
 
 
 @contextmanager
@@ -75,7 +74,9 @@ def fusible(function: F, eager: F | None = None, by_hand: F | None = None, whole
         whole: in a graph, too, as one operator. What the compiler does well itself should not be: a call costs some 20 us.
     """
     separate = eager or function
-    operator = None if by_hand is None or not whole else _operator(by_hand, function)
+    in_graph = by_hand if by_hand is not None and whole else None
+    if in_graph is not None:
+        _shaped(in_graph, function)
 
     @cache
     def compiled() -> Callable[..., Any]:
@@ -93,20 +94,16 @@ def fusible(function: F, eager: F | None = None, by_hand: F | None = None, whole
     @wraps(function)
     def call(*args: Any) -> Any:
         if _graph.get():
-            return (function if operator is None or args[0].is_cuda else operator)(*args)
+            return (function if in_graph is None or args[0].is_cuda else in_graph)(*args)
         return (as_one if _fused.get() else separate)(*args)
 
     return cast(F, call)
 
 
-def _operator(by_hand: Callable[..., Any], like: Callable[..., Any]) -> Callable[..., Any]:
-    """An operator that a graph holds as a whole; its results are contiguous, and have the shapes of `like`'s."""
-    name = by_hand.__name__
-    _operators.define(name + torch.library.infer_schema(by_hand, mutates_args=()))
-    _operators.impl(name, by_hand, "CPU")
+def _shaped(by_hand: Callable[..., Any], like: Callable[..., Any]) -> None:
+    """Tells torch's compiler what comes out of an operator: contiguous results, with the shapes of `like`'s."""
 
     def shapes(*args: Any) -> Any:
         return pytree.tree_map(lambda a: a.new_empty(a.shape), like(*args))
 
-    torch.library.register_fake(f"pfbench::{name}", shapes, lib=_operators)
-    return cast(Callable[..., Any], getattr(torch.ops.pfbench, name).default)
+    torch.library.register_fake(f"pfbench::{by_hand.__name__}", shapes)

@@ -1,10 +1,24 @@
 // The loops over particles of a bootstrap filter's step, one run at a time, so that a run's particles stay in the first-level cache.
 //
 // Particles lie component by component: x [D, R, N]. Compiled without -ffinite-math-only: NaN and infinity keep their meaning.
+// At the end, each loop becomes an operator of torch's, since a small step would take longer to hand pointers over from Python
+// than to use them. Through torch's stable interface, whose headers are few.
+#include <torch/csrc/inductor/aoti_torch/c/shim.h>
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/tensor.h>
+
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
+#include <tuple>
+#include <type_traits>
 #include <vector>
+
+// of normals.cpp
+typedef const int64_t* Axis;
+extern "C" void normals(float*, Axis, int64_t, Axis, int64_t, Axis, int64_t, int64_t, int64_t, int64_t);
+extern "C" void uniforms(double*, Axis, int64_t, Axis, int64_t, Axis, int64_t, int64_t, int64_t, int64_t);
 
 namespace {
 // One uniform u for all slots, positions (j + u) / n: slot j goes to the first particle whose sum of weights lies beyond its position.
@@ -205,28 +219,185 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
             variance[r * components + d] = weighed<T, true>(row, centre, w, particles);
         }
 }
+
+using torch::stable::Tensor;
+
+template <class T>
+int32_t kind() {
+    return std::is_same_v<T, float> ? aoti_torch_dtype_float32() : std::is_same_v<T, double> ? aoti_torch_dtype_float64()
+                                                                                             : aoti_torch_dtype_int64();
+}
+
+int32_t kind(const Tensor& a) {
+    int32_t found;
+    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_dtype(a.get(), &found));
+    return found;
+}
+
+template <class T>
+T* numbers(const Tensor& a) {
+    STD_TORCH_CHECK(kind(a) == kind<T>(), "pfbench: a loop's tensors are of different types");
+    return static_cast<T*>(a.data_ptr());
+}
+
+// A new tensor, contiguous.
+template <class T>
+Tensor fresh(const std::vector<int64_t>& size) {
+    std::vector<int64_t> stride(size.size(), 1);
+    for (size_t k = size.size() - 1; k > 0; --k) stride[k - 1] = stride[k] * size[k];
+    AtenTensorHandle made;
+    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_empty_strided(
+        static_cast<int64_t>(size.size()), size.data(), stride.data(), kind<T>(), aoti_torch_device_type_cpu(), 0, &made));
+    return Tensor(made);
+}
+
+// A tensor's numbers one after the other, its axes in the order given, outermost first; copied only where they lie otherwise.
+template <class T>
+class Packed {
+    std::vector<T> own;
+
+  public:
+    const T* data;
+
+    explicit Packed(const Tensor& a, std::array<int64_t, 3> order = {0, 1, 2}) : data(numbers<T>(a)) {
+        std::array<int64_t, 3> size, step;
+        const auto sizes = a.sizes(), strides = a.strides();
+        int64_t count = 1;
+        bool apart = false;
+        for (int k = 2; k >= 0; --k) {
+            const bool there = order[k] < static_cast<int64_t>(sizes.size());
+            size[k] = there ? sizes[order[k]] : 1;
+            step[k] = there ? strides[order[k]] : 0;
+            apart |= size[k] != 1 && step[k] != count;
+            count *= size[k];
+        }
+        if (!apart) return;
+        own.reserve(count);
+        for (int64_t i = 0; i < size[0]; ++i)
+            for (int64_t j = 0; j < size[1]; ++j)
+                for (int64_t k = 0; k < size[2]; ++k) own.push_back(data[i * step[0] + j * step[1] + k * step[2]]);
+        data = own.data();
+    }
+    Packed(const Packed&) = delete;
+};
+
+// A few numbers of any type, [R or 1, K or 1] or [R or 1], as [R, K] of another.
+template <class T>
+std::vector<T> few(const Tensor& a, int64_t rows, int64_t columns = 1) {
+    const int64_t down = a.size(0) == 1 ? 0 : a.stride(0), across = a.dim() < 2 || a.size(1) == 1 ? 0 : a.stride(1);
+    std::vector<T> all;
+    all.reserve(rows * columns);
+    const auto fill = [&](const auto* from) {
+        for (int64_t r = 0; r < rows; ++r)
+            for (int64_t k = 0; k < columns; ++k) all.push_back(static_cast<T>(from[r * down + k * across]));
+    };
+    if (kind(a) == kind<float>()) fill(numbers<float>(a));
+    else if (kind(a) == kind<double>()) fill(numbers<double>(a));
+    else fill(numbers<int64_t>(a));
+    return all;
+}
+
+template <class F>
+auto by_type(const Tensor& like, F work) {
+    return kind(like) == kind<float>() ? work(float{}) : work(double{});
+}
+
+constexpr std::array<int64_t, 3> COMPONENTS_FIRST = {2, 0, 1};
+
+template <class T, void (*DRAW)(T*, Axis, int64_t, Axis, int64_t, Axis, int64_t, int64_t, int64_t, int64_t)>
+Tensor drawn(Tensor key, Tensor step, Tensor runs, Tensor component, Tensor particle) {
+    const Tensor out = fresh<T>({component.size(0), runs.size(0), 4 * particle.size(0)});
+    const Packed<int64_t> words(key), run(runs), row(component), quarter(particle);
+    DRAW(numbers<T>(out), run.data, runs.size(0), row.data, component.size(0), quarter.data, particle.size(0),
+         *numbers<int64_t>(step), words.data[0], words.data[1]);
+    return out;
+}
+
+Tensor systematic_operator(Tensor a, Tensor n, Tensor u) {
+    const int64_t runs = a.size(0), slots = a.size(1);
+    const Tensor out = fresh<int64_t>({runs, slots});
+    const auto wanted = few<double>(n, runs), uniform = few<double>(u, runs);
+    by_type(a, [&](auto one) {
+        systematic(numbers<int64_t>(out), Packed<decltype(one)>(a).data, wanted.data(), uniform.data(), runs, slots);
+    });
+    return out;
+}
+
+Tensor gather_operator(Tensor x, Tensor ancestors) {
+    const int64_t components = x.size(0), runs = x.size(1), wanted = ancestors.size(1);
+    const Packed<int64_t> from(ancestors);
+    return by_type(x, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({components, runs, wanted});
+        gather(numbers<T>(out), Packed<T>(x).data, from.data, components, runs, x.size(2), wanted);
+        return out;
+    });
+}
+
+Tensor log_normal_operator(Tensor y, Tensor mean, Tensor scale, Tensor constant) {
+    const int64_t runs = mean.size(0), particles = mean.size(1), components = mean.size(2);
+    return by_type(mean, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({runs, particles});
+        log_normal(numbers<T>(out), few<T>(y, runs, components).data(), numbers<T>(mean), few<T>(scale, runs, components).data(),
+                   few<T>(constant, runs).data(), mean.strides().data(), runs, particles, components);
+        return out;
+    });
+}
+
+Tensor affine_operator(Tensor phi, Tensor x, Tensor gain, Tensor w) {
+    const int64_t runs = x.size(0), particles = x.size(1), rows = phi.size(1);
+    return by_type(x, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({rows, runs, particles});
+        affine(numbers<T>(out), Packed<T>(phi).data, Packed<T>(x, COMPONENTS_FIRST).data, Packed<T>(gain).data,
+               Packed<T>(w, COMPONENTS_FIRST).data, phi.size(0) == 1, gain.size(0) == 1, runs, particles, rows, phi.size(2),
+               gain.size(2));
+        return out;
+    });
+}
+
+Tensor distinct_operator(Tensor copy_of, Tensor log_w) {
+    const int64_t runs = copy_of.size(0);
+    const Tensor out = fresh<int64_t>({runs});
+    by_type(log_w, [&](auto one) {
+        distinct(numbers<int64_t>(out), Packed<int64_t>(copy_of).data, Packed<decltype(one)>(log_w).data, runs, copy_of.size(1));
+    });
+    return out;
+}
+
+std::tuple<Tensor, Tensor> moments_operator(Tensor x, Tensor w) {
+    const int64_t runs = x.size(0), components = x.size(2);
+    return by_type(x, [&](auto one) {
+        using T = decltype(one);
+        const Tensor mean = fresh<T>({runs, components}), variance = fresh<T>({runs, components});
+        moments(numbers<T>(mean), numbers<T>(variance), Packed<T>(x, COMPONENTS_FIRST).data, Packed<T>(w).data, components, runs,
+                x.size(1));
+        return std::make_tuple(mean, variance);
+    });
+}
+
+Tensor spread_operator(Tensor x, Tensor mean, Tensor w, Tensor groups) {
+    const int64_t runs = x.size(0), many = groups.size(0), size = groups.size(1);
+    const Packed<int64_t> components(groups);
+    return by_type(x, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({runs, many, size, size});
+        spread(numbers<T>(out), numbers<T>(x), Packed<T>(mean).data, Packed<T>(w).data, components.data, x.strides().data(), many,
+               size, runs, x.size(1), x.size(2));
+        return out;
+    });
+}
 }  // namespace
 
-#define BOTH(name, parameters_of, arguments)                             \
-    extern "C" void name##_float32 parameters_of(float) { name arguments; } \
-    extern "C" void name##_float64 parameters_of(double) { name arguments; }
-#define SYSTEMATIC(T) (int64_t* a, const T* w, const double* n, const double* u, int64_t runs, int64_t slots)
-#define GATHER(T) (T* out, const T* x, const int64_t* a, int64_t d, int64_t runs, int64_t slots, int64_t wanted)
-#define LOG_NORMAL(T)                                                                                                       \
-    (T* out, const T* y, const T* mean, const T* scale, const T* constant, const int64_t* stride, int64_t runs, int64_t n, int64_t k)
-#define AFFINE(T)                                                                                                            \
-    (T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t one_phi, int64_t one_gain, int64_t runs, int64_t n, \
-     int64_t rows, int64_t states, int64_t noises)
-#define MOMENTS(T) (T* mean, T* variance, const T* x, const T* w, int64_t d, int64_t runs, int64_t n)
-#define SPREAD(T)                                                                                                      \
-    (T* out, const T* x, const T* mean, const T* w, const int64_t* c, const int64_t* stride, int64_t groups, int64_t size, \
-     int64_t runs, int64_t n, int64_t k)
-#define DISTINCT(T) (int64_t* count, const int64_t* value, const T* w, int64_t runs, int64_t slots)
-
-BOTH(systematic, SYSTEMATIC, (a, w, n, u, runs, slots))
-BOTH(gather, GATHER, (out, x, a, d, runs, slots, wanted))
-BOTH(log_normal, LOG_NORMAL, (out, y, mean, scale, constant, stride, runs, n, k))
-BOTH(affine, AFFINE, (out, phi, x, gain, w, one_phi, one_gain, runs, n, rows, states, noises))
-BOTH(distinct, DISTINCT, (count, value, w, runs, slots))
-BOTH(spread, SPREAD, (out, x, mean, w, c, stride, groups, size, runs, n, k))
-BOTH(moments, MOMENTS, (mean, variance, x, w, d, runs, n))
+STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
+    library.impl("normals", TORCH_BOX((&drawn<float, normals>)));
+    library.impl("uniforms", TORCH_BOX((&drawn<double, uniforms>)));
+    library.impl("systematic", TORCH_BOX(&systematic_operator));
+    library.impl("gather", TORCH_BOX(&gather_operator));
+    library.impl("log_normal", TORCH_BOX(&log_normal_operator));
+    library.impl("affine", TORCH_BOX(&affine_operator));
+    library.impl("distinct", TORCH_BOX(&distinct_operator));
+    library.impl("moments", TORCH_BOX(&moments_operator));
+    library.impl("spread", TORCH_BOX(&spread_operator));
+}
