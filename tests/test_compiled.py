@@ -11,10 +11,12 @@ import pytest
 import torch
 from command_line import pfbench
 from torch import Tensor
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from pfbench import fusion, store
 from pfbench.draws import MonteCarlo
 from pfbench.filter import compiled
+from pfbench.filter.belief import Info
 from pfbench.filter.compiled import Compiled
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
@@ -140,6 +142,104 @@ def test_blocks_of_runs_share_a_graph_where_they_are_alike(monkeypatch: pytest.M
     assert len(recorded) == 1
     agree(run(step, model, record, at_once=3), run(method, model, record))
     assert len(recorded) == 3  # of two, of three, of one
+
+
+@pytest.fixture
+def recorded(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
+    """The step recorded but not compiled; the numbers of the steps that it was asked for, of each recording."""
+    asked: list[list[int]] = []
+
+    def as_it_is(step: Any, example: list[Tensor]) -> Any:
+        numbers: list[int] = []
+        asked.append(numbers)
+        graph = make_fx(step)(*example)
+
+        def call(given: list[Tensor]) -> Any:
+            numbers.append(int(next(a for a in given if a.dim() == 0)))
+            return graph(*given)
+
+        return call
+
+    monkeypatch.setattr(compiled, "_compiled", as_it_is)
+    return asked
+
+
+class Fragile(Growth):
+    """All particles of run 2 become no number at step 7, those of run 0 fit nothing that is seen at step 10."""
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        broken = (u.t == 7.0).reshape(-1, 1, 1) & (torch.arange(len(x)) == 2).reshape(-1, 1, 1)
+        return torch.where(broken, torch.nan, super().propagate(x, u, w))
+
+    def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
+        hopeless = (u.t == 10.0).reshape(-1, 1) & (torch.arange(len(x)) == 0).reshape(-1, 1)
+        return torch.where(hopeless, -torch.inf, super().log_likelihood(y, x, u))
+
+
+@compiler
+def test_steps_taken_together_are_the_steps_taken_one_by_one(recorded: list[list[int]]) -> None:
+    """With inputs and draws that change at each step, measurements missing, a NaN in the middle and a run lost there."""
+    record = record_of(Growth())
+    tally = Tally(model := Fragile())
+    method, ticks = ParticleFilter(40), []
+    step = Compiled(method, tally)
+
+    def watch(t: int, info: Info) -> dict[str, Tensor]:
+        ticks.append(t)
+        assert info.cloud is not None
+        assert info.nis is not None
+        with tally.paused():
+            return {"nis": info.nis()[0], "covariance": info.covariance(), "farthest": info.cloud()[0].abs().amax((1, 2))}
+
+    draws = MonteCarlo(1, torch.arange(RUNS))
+    with fusion.fused(), torch.no_grad():
+        together, counted = run_filter(step, model, record, draws, watch), tally.count
+        apart = run_filter(method, model, record, draws, watch)
+    agree(together, apart)
+    assert together.lost.tolist() == [True, False, True, False]
+    assert bool(torch.isnan(together.mean[2, 6:]).all())
+    assert ticks == [*range(STEPS), *range(STEPS)]
+    assert counted == tally.count - counted == RUNS * 40 * STEPS
+    # one, two, four of which the last fails; that one again as it is; one, two and the last two
+    assert recorded == [[2, 2, 3, 4, 5, 6, 7, 8, 8, 9, 10, 11, 12]]
+
+
+@compiler
+def test_a_graph_that_held_its_step_s_number_fast_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The comparison of the test above is worth something: with the number of the first step for ever, it fails."""
+
+    def frozen(step: Any, example: list[Tensor]) -> Any:
+        place = next(k for k, a in enumerate(example) if a.dim() == 0)
+        return lambda given: step(*given[:place], example[place], *given[place + 1 :])
+
+    monkeypatch.setattr(compiled, "_compiled", frozen)
+    model, method = walk(), ParticleFilter(50)
+    record = record_of(model)
+    with pytest.raises(AssertionError):
+        agree(run(Compiled(method), model, record), run(method, model, record))
+
+
+def test_inputs_reach_their_steps_whatever_their_shape() -> None:
+    """Of all runs or of each one, numbers, vectors and matrices: as a single step would have stored them."""
+    for shape in ((3, 5), (1, 5), (3, 5, 2), (3, 5, 2, 4), (1, 5, 4, 4)):
+        a = torch.randn(shape)
+        for t, given in enumerate(compiled._by_step(a)):
+            assert torch.equal(given, compiled._stored(a[:, t]))
+            assert given.is_contiguous()
+
+
+@compiler
+def test_large_steps_go_one_by_one(recorded: list[list[int]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What steps keep together stays small: nothing is computed of the next one before this one has been told."""
+    monkeypatch.setattr(compiled, "_AHEAD", 1)
+    model, method, told = walk(), ParticleFilter(50), []
+
+    def watch(t: int, info: Info) -> dict[str, Tensor]:
+        told.append((t + 1, recorded[0][-1] if recorded else 1))
+        return {}
+
+    run_filter(Compiled(method), model, record_of(model), MonteCarlo(1, torch.arange(RUNS)), watch)
+    assert told == [(t, t) for t in range(1, STEPS + 1)]
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -20,13 +20,14 @@ from torch import Tensor
 from pfbench import fusion
 from pfbench.draws import Draws, MonteCarlo
 from pfbench.filter.belief import Cloud, Gaussian, Info
+from pfbench.filter.loop import stage
 from pfbench.filter.particle import ParticleFilter, Told
 from pfbench.model.base import StateSpaceModel
-from pfbench.record import Record
+from pfbench.record import Record, map_inputs
 
 log = logging.getLogger("pfbench")
 
-Graph = Callable[[list[Tensor]], Any]
+_AHEAD = 1 << 18  # numbers that steps taken together may keep: they then share what steps cost beside them, and stay in a cache
 
 
 class Counter(Protocol):
@@ -35,12 +36,59 @@ class Counter(Protocol):
     count: int
 
 
+Step = Callable[[list[Tensor]], Sequence[Tensor]]
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """A step of one kind of belief and record.
+
+    Attributes:
+        run: belief, number of the step, what is seen, seed and runs -> the next belief, mean, variance, weights expected, trace.
+        asked: how often it evaluates the model's law.
+        memory, trace: names of what the belief carries, and of what the step traces.
+        most: steps that may be taken together.
+        model: of which it is; held, since graphs are known by its identity.
+    """
+
+    run: Step
+    asked: int
+    memory: list[str]
+    trace: list[str]
+    most: int
+    model: StateSpaceModel
+
+    def follow(self, belief: Cloud, record: Record, draws: MonteCarlo) -> list[tuple[Cloud, Told]]:
+        """The beliefs after each step of a record, up to the first one in which a particle has become NaN.
+
+        Nobody looks at the numbers of one step before the next one begins. `draws` are at the first step.
+        """
+        first, many, carried = int(draws.step), record.y.shape[1], 3 + len(self.memory)
+        state = [_stored(a) for a in _tensors((belief.x, belief.log_w, belief.log_z, belief.memory))]
+        seen = [torch.arange(first, first + many), *map(_by_step, _tensors((record.y, record.u)))]
+        shared = [*map(_stored, _tensors((record.start, record.spread))), torch.as_tensor(draws.seed), draws.runs]
+        found: list[Sequence[Tensor]] = []
+        for parts in zip(*(a.unbind() for a in seen), strict=True):
+            found.append(self.run([*state, *parts, *shared]))
+            state = list(found[-1][:carried])
+        return [self._named(out) for out in found[: _healthy([out[carried] for out in found])]]
+
+    def _named(self, out: Sequence[Tensor]) -> tuple[Cloud, Told]:
+        x, log_w, log_z, *rest = [_seen_as(a) if a.dim() > 2 else a for a in out]
+        carried = len(self.memory)
+        memory = dict(zip(self.memory, rest[:carried], strict=True))
+        mean, variance, expected, *trace = rest[carried:]
+        told = Told(mean, variance, expected, dict(zip(self.trace, trace, strict=True)))
+        return Cloud(x, log_w, log_z, memory=memory), told
+
+
 @dataclass(eq=False)
 class Compiled:
     """A particle filter whose steps run compiled, with the same draws and, to rounding, the same results.
 
-    The first step runs as it is, since there a proposal may begin what it carries along. The second is recorded and
-    compiled. From then on a step in which a particle has become NaN is done again uncompiled.
+    The first step of a record runs as it is, since there a proposal may begin what it carries along. The second is recorded and
+    compiled. From then on small steps are taken several together; one in which a particle has become NaN is done again
+    uncompiled, and those after it with it.
     Where anything about this fails, the filter goes on uncompiled and says so. A stage that kept numbers of its own from step to
     step would have them frozen; stages keep none.
 
@@ -58,7 +106,7 @@ class Compiled:
     counter: Counter | None = None
     clock: Callable[[], float] = time.perf_counter
     seconds: float = 0.0
-    graphs: dict[Any, Any] = field(default_factory=dict)
+    graphs: dict[Any, Graph | None] = field(default_factory=dict)
 
     @property
     def exact(self) -> bool:
@@ -67,7 +115,7 @@ class Compiled:
     @property
     def at_work(self) -> bool:
         """Did any kind of step run compiled?"""
-        return any(isinstance(kind, tuple) for kind in self.graphs.values())
+        return any(graph is not None for graph in self.graphs.values())
 
     def init(
         self, model: StateSpaceModel, runs: int, draws: Draws, start: Tensor | None = None, spread: Tensor | None = None
@@ -75,40 +123,54 @@ class Compiled:
         return self.method.init(model, runs, draws, start, spread)
 
     def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud, Info]:
+        """A step alone, where nobody knows yet what comes after it."""
+        if not isinstance(draws, MonteCarlo):
+            return self.method.step(model, belief, seen, draws)
+        alone = seen._replace(y=seen.y.unsqueeze(1), u=map_inputs(lambda a: a.unsqueeze(1), seen.u))
+        (found,) = self.walk(model, belief, alone, draws, int(draws.step) - 1)
+        return found
+
+    def walk(
+        self, model: StateSpaceModel, belief: Cloud, record: Record, draws: Draws, before: int = 0
+    ) -> Iterator[tuple[Cloud, Info]]:
+        """The belief after each step of a record, and what the step tells; `before` it there were other steps."""
+        t, many, length = 0, 1, record.y.shape[1]
+        while t < length:
+            own = draws.at(before + t + 1)
+            graph = self._graph(model, belief, record.at(t), own) if before + t > 0 else None
+            if graph is not None and isinstance(own, MonteCarlo):
+                many = min(many, graph.most, length - t)
+                followed = graph.follow(belief, _during(record, slice(t, t + many)), own)
+                for belief, told in followed:
+                    yield belief, self.method.tell(model, belief, told, record.at(t))
+                    t += 1
+                if self.counter:
+                    self.counter.count += len(followed) * graph.asked
+                if len(followed) == many:
+                    many *= 2
+                    continue
+                many, own = 1, draws.at(before + t + 1)
+            belief, info = self.method.step(stage(model, before + t), belief, record.at(t), own)
+            yield belief, info
+            t += 1
+
+    def _graph(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> Graph | None:
+        """The step of such a belief and record; None where it cannot be had."""
         if not isinstance(draws, MonteCarlo) or self.method.keeper is not None:
-            return self.method.step(model, belief, seen, draws)
-        tensors: list[Tensor] = []
-        _collect((belief.x, belief.log_w, belief.log_z, belief.memory, seen), tensors)
-        key = id(model), belief.x.shape, len(tensors)
+            return None
+        key = id(model), belief.x.shape, len(_tensors((belief, seen)))
         if key not in self.graphs:
-            self.graphs[key] = _Once()
-            return self.method.step(model, belief, seen, draws)
-        known = self.graphs[key]
-        if isinstance(known, _Once):
-            known = self.graphs[key] = self._recorded(model, belief, seen, draws, tensors)
-        if known is None:
-            return self.method.step(model, belief, seen, draws)
-        run, asked = known
-        out, told = run(tensors, draws)
-        if not told.mean.is_cuda and not math.isfinite(float(told.mean.sum())):
-            return self.method.step(model, belief, seen, draws)
-        if self.counter:
-            self.counter.count += asked
-        return out, self.method.tell(model, out, told, seen)
+            self.graphs[key] = self._recorded(model, belief, seen, draws)
+        return self.graphs[key]
 
-    def _recorded(
-        self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: MonteCarlo, tensors: list[Tensor]
-    ) -> tuple[Callable[[list[Tensor], MonteCarlo], tuple[Cloud, Told]], int] | None:
-        """The step of such a belief and record as a function of its tensors, and how often it evaluates the model's law.
-
-        None where it cannot be had.
-        """
+    def _recorded(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: MonteCarlo) -> Graph | None:
         begun = self.clock()
         names: list[list[str]] = []
+        state = _tensors((belief.x, belief.log_w, belief.log_z, belief.memory))
 
         def step(*flat: Tensor) -> list[Tensor]:
-            *given, seed, runs, number = flat
-            rest = map(_seen_as, given)
+            number, *given, seed, runs = flat[len(state) :]
+            rest = map(_seen_as, [*flat[: len(state)], *given])
             x, log_w, log_z = (next(rest) for _ in range(3))
             memory, record = _replaced(belief.memory, rest), _replaced(seen, rest)
             with torch.no_grad(), fusion.graph():
@@ -118,15 +180,13 @@ class Compiled:
             found = [cloud.x, cloud.log_w, cloud.log_z, *cloud.memory.values(), *told[:3], *told.trace.values()]
             return [_stored(part) for part in found]
 
-        def run_of(draws: MonteCarlo) -> list[Tensor]:
-            return [torch.as_tensor(draws.seed), draws.runs, torch.as_tensor(draws.step)]
-
         counted = self.counter.count if self.counter else 0
-        example = [_stored(a) for a in tensors] + run_of(draws)
+        shared = [torch.as_tensor(draws.seed), draws.runs]
+        example = [*map(_stored, state), torch.as_tensor(draws.step), *map(_stored, _tensors(seen)), *shared]
         try:
             run = _compiled(step, example)
-            per_step = (self.counter.count if self.counter else 0) - counted
-            run(example)
+            asked = (self.counter.count if self.counter else 0) - counted
+            out = run(example)
         except Exception as error:  # torch raises many kinds
             why = f"{type(error).__name__}: {error}".splitlines()[0]
             log.warning("engine=compiled: this step cannot be compiled (%s); going on with compiled loops alone", why)
@@ -134,28 +194,16 @@ class Compiled:
         finally:
             if self.counter:
                 self.counter.count = counted
-        memory_names, trace_names = names
-        first = 3 + len(memory_names)
-
-        def call(given: list[Tensor], draws: MonteCarlo) -> tuple[Cloud, Told]:
-            found = [_seen_as(part) for part in run([_stored(a) for a in given] + run_of(draws))]
-            x, log_w, log_z = found[:3]
-            mean, variance, expected = found[first : first + 3]
-            memory = dict(zip(memory_names, found[3:first], strict=True))
-            trace = dict(zip(trace_names, found[first + 3 :], strict=True))
-            return Cloud(x, log_w, log_z, memory=memory), Told(mean, variance, expected, trace)
-
         took = self.clock() - begun
         self.seconds += took
         log.info("engine=compiled: the step compiled in %.1f s", took)
-        return call, per_step
+        memory, trace = names
+        stays = [a.shape for a in out[: 3 + len(memory)]] == [a.shape for a in example[: len(state)]]
+        most = max(1, _AHEAD // sum(a.numel() for a in out)) if stays else 1
+        return Graph(run, asked, memory, trace, most, model)
 
 
-class _Once:
-    """A kind of step that was met once."""
-
-
-def _compiled(step: Callable[..., list[Tensor]], tensors: list[Tensor]) -> Graph:
+def _compiled(step: Callable[..., list[Tensor]], tensors: list[Tensor]) -> Step:
     """By torch's compiler, of which these are inner parts: its cache on disk wants to know the shapes from stand-ins."""
     from torch._guards import TracingContext, tracing
     from torch._inductor.compile_fx import compile_fx  # takes seconds to import
@@ -164,19 +212,21 @@ def _compiled(step: Callable[..., list[Tensor]], tensors: list[Tensor]) -> Graph
     from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
     graph = make_fx(step)(*tensors)
+    # on the CPU what calls the kernels is compiled with them, in the same time: from Python it takes half as long again
+    options = {"cpp_wrapper": not any(a.is_cuda for a in tensors)}
     stand_ins = FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True)
     with tracing(TracingContext(stand_ins)):
-        run: Any = compile_fx(graph, [stand_ins.from_tensor(a, static_shapes=True) for a in tensors])
+        examples = [stand_ins.from_tensor(a, static_shapes=True) for a in tensors]
+        run: Any = compile_fx(graph, examples, config_patches=options)
     return lambda given: run(*given)
 
 
-def _collect(tree: Any, into: list[Tensor]) -> None:
-    """Tensors of nested tuples and dicts, in their order."""
-    for part in tree.values() if isinstance(tree, dict) else tree:
-        if isinstance(part, Tensor):
-            into.append(part)
-        elif isinstance(part, tuple | dict):
-            _collect(part, into)
+def _tensors(tree: Any) -> list[Tensor]:
+    """Those of nested tuples and dicts, in their order."""
+    if isinstance(tree, Tensor):
+        return [tree]
+    parts = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, tuple) else ()
+    return [a for part in parts for a in _tensors(part)]
 
 
 def _replaced(tree: Any, tensors: Iterator[Tensor]) -> Any:
@@ -199,3 +249,19 @@ def _stored(a: Tensor) -> Tensor:
 def _seen_as(a: Tensor) -> Tensor:
     """What `_stored` was given."""
     return a.permute(a.dim() - 2, a.dim() - 1, *range(a.dim() - 2)) if a.dim() > 2 else a
+
+
+def _by_step(a: Tensor) -> Tensor:
+    """Inputs [R, T, ...] as [T, ...], each step's as `_stored` would have them."""
+    return a.permute(1, *range(3, a.dim()), 0, *range(2, min(a.dim(), 3))).contiguous()
+
+
+def _during(record: Record, steps: slice) -> Record:
+    return record._replace(y=record.y[:, steps], u=map_inputs(lambda a: a[:, steps], record.u))
+
+
+def _healthy(means: list[Tensor]) -> int:
+    """How many of the first steps' means [R, D] are finite. On a GPU nobody looks: there the graph itself sees to it."""
+    if means[0].is_cuda or math.isfinite(float(torch.stack(means).sum())):
+        return len(means)
+    return next((t for t, mean in enumerate(means) if not math.isfinite(float(mean.sum()))), len(means))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from pfbench.draws import Source
+from pfbench.draws import Draws, Source
 from pfbench.filter.belief import Cloud, Filter, Gaussian, Info
 from pfbench.filter.rules import Jacobian, Space
 from pfbench.model.base import AtRest, StateSpaceModel
@@ -39,6 +39,16 @@ class Estimate(NamedTuple):
     def lost(self) -> Tensor:
         """Runs whose filter failed [R]."""
         return ~torch.isfinite(self.log_evidence)
+
+
+@runtime_checkable
+class Walker(Protocol):
+    """A filter that may take several steps of a record together."""
+
+    def walk(
+        self, model: StateSpaceModel, belief: Any, record: Record, draws: Draws
+    ) -> Iterator[tuple[Cloud | Gaussian, Info]]:
+        """The belief after each step of a record, and what the step tells; step t = 1, 2, ... has its draws at t."""
 
 
 def run_filter(
@@ -76,21 +86,12 @@ def run_filter(
     size = runs if at_once is None or closed is not None else at_once
     blocks = [slice(first, first + size) for first in range(0, runs, size)]
     parts = [(record.of(block), draws.of(block)) for block in blocks] if len(blocks) > 1 else [(record, draws)]
-    beliefs: list[Any] = [method.init(model, len(part.y), own.at(0), part.start, part.spread) for part, own in parts]
     means, variances, evidences, traces = [], [], [], []
-    for t in range(record.y.shape[1]):
-        stage = AtRest(model) if t == 0 and model.observes_initial else model
-        infos = []
-        for k, (part, own) in enumerate(parts):
-            seen = part.at(t) if closed is None else model.prepare(closed.at(t)).to(model.anchor).at(0)
-            beliefs[k], info = method.step(stage, beliefs[k], seen, own.at(t + 1))
-            if closed is not None:
-                beliefs[k], info = fed_back(model, closed, beliefs[k], info)
-            infos.append(info)
-        info = _joined(infos)
+    for t, found in enumerate(zip(*(_walk(method, model, part, own, closed) for part, own in parts), strict=True)):
+        info = _joined([info for _, info in found])
         means.append(info.mean)
         variances.append(info.variance)
-        evidences.append(torch.cat([belief.log_z for belief in beliefs]))
+        evidences.append(found[0][0].log_z if len(found) == 1 else torch.cat([belief.log_z for belief, _ in found]))
         traces.append(info.trace | (watch(t, info) if watch else {}))
         if tick:
             tick()
@@ -98,6 +99,27 @@ def run_filter(
     alive = torch.isfinite(torch.stack(evidences, 1)).unsqueeze(-1)
     mean, variance = (torch.where(alive, torch.stack(parts, 1), torch.nan) for parts in (means, variances))
     return Estimate(mean, variance, evidences[-1], trace)
+
+
+def _walk(
+    method: Filter, model: StateSpaceModel, record: Record, draws: Draws, closed: Underway | None
+) -> Iterator[tuple[Cloud | Gaussian, Info]]:
+    """The belief after each step, and what the step tells."""
+    belief: Any = method.init(model, len(record.y), draws.at(0), record.start, record.spread)
+    if closed is None and isinstance(method, Walker):
+        yield from method.walk(model, belief, record, draws)
+        return
+    for t in range(record.y.shape[1]):
+        seen = record.at(t) if closed is None else model.prepare(closed.at(t)).to(model.anchor).at(0)
+        belief, info = method.step(stage(model, t), belief, seen, draws.at(t + 1))
+        if closed is not None:
+            belief, info = fed_back(model, closed, belief, info)
+        yield belief, info
+
+
+def stage(model: StateSpaceModel, t: int) -> StateSpaceModel:
+    """What a step believes before which there were t others."""
+    return AtRest(model) if t == 0 and model.observes_initial else model
 
 
 def runs_at_once(runs: int, particles: int, dimension: int) -> int:
