@@ -79,14 +79,15 @@ def test_verdicts_name_the_better_one_and_tables_count_what_a_step_costs() -> No
     told = {"by hand": by_hand, "dearer": {"as good": scores(0.5, 2.5, particles=[80])}, "inference compilation": {"1": each}}
     told["bound"] = {"1": {name: scores(1.1, 2.0, training=[1.0]) for name in each}, "3": each}
     rows = [row.strip("| ").split(" | ") for row in learn_data_efficiency.verdicts(told)[2:]]
-    others = ("own noise", "as good", "as good, 80 particles")
-    assert [row[:2] for row in rows[3:]] == [["bound, 3 worlds", name] for name in others]
+    others = ("own noise", "as good", "as good, 80 particles", "bound, 1 world")
+    assert [row[:2] for row in rows[4:]] == [["bound, 3 worlds", name] for name in others]
     own, same, dear = rows[:3]
     assert own[2].startswith("0.250 (0.250 to 0.250)")
     assert dear[2].startswith("2.000 (2.000 to 2.000)")
     assert [float(x) for x in (own[4], same[4], dear[4])] == pytest.approx([1.0, 0.0, -0.5])
     assert max(float(row[k]) for row in (own, dear) for k in (3, 5)) < 1e-6
     assert float(same[3]) == float(same[5]) == 1.0
+    assert rows[-1][2].startswith("0.909 (0.909 to 0.909)")
 
     world = World(volatility, "state", 10, 0.01, (1,), (1, 2), 40, particles=20)
     table = {row.split(" | ")[0]: row.strip("| ").split(" | ") for row in learn_data_efficiency.table(told, world)}
@@ -113,7 +114,7 @@ def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(tmp_path: Path
     assert learned[3] == learned[4]
     rows = (tmp_path / "tables.md").read_text().splitlines()
     assert [row.split(" | ")[0] for row in rows if row.startswith("| bound, ")] == [
-        "| bound, 1 world", "| bound, 2 worlds", *["| bound, 2 worlds"] * 4
+        "| bound, 1 world", "| bound, 2 worlds", *["| bound, 2 worlds"] * 5
     ]  # fmt: skip
     assert len([row for row in rows if row.startswith("| own noise, 60 particles | ")]) == 1
     assert (tmp_path / "data_efficiency.png").stat().st_size > 5000
