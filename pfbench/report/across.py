@@ -462,14 +462,11 @@ def _complete(present: Mapping[str, set[str]]) -> tuple[tuple[str, ...], set[str
 def _refusal(found: Blocks) -> str:
     cells, filters = len(found.cells), len(found.filters)
     if filters < FILTERS:
-        return (
-            f"No test across cells is made for {found.group}: it compares {FILTERS} filters at least, and "
-            f"{_counted(filters, 'filter')} ran in the same cells."
-        )
+        return f"it compares {FILTERS} filters at least, and {_counted(filters, 'filter')} ran in the same cells"
     if cells < CELLS:
         return (
-            f"No test across cells is made for {found.group}: it takes {CELLS} cells at least, and the {filters} filters have "
-            f"{_counted(cells, 'cell')} in common; runs of one cell are no cells of their own."
+            f"it takes {CELLS} cells at least, and the {filters} filters have {_counted(cells, 'cell')} in common; runs of one "
+            "cell are no cells of their own"
         )
     return ""
 

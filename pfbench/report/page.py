@@ -131,8 +131,13 @@ def _across(
         what = f"the best mean ranks of {one.group}" if one.ranks else f"the smallest median RMSE of {one.group}"
         look, who = looks_of(view, one.filters, best_first, what)
         drawings += ranking_figures.of_study([(one, source)], decided, look, who)
+    refused: dict[str, list[str]] = {}
+    for one in found:
+        if one.refused:
+            refused.setdefault(one.refused, []).append(one.group)
     return {
         "parts": parts,
+        "refused": refused,
         "ranked": ranked,
         "sensitive": changed,
         "lost": bool(table.lost.any()),

@@ -195,6 +195,15 @@ def test_options_are_checked():
         page.Options(formats=("gif",))
 
 
+def test_why_no_test_across_cells_is_made_is_said_once(report):
+    why = "No test across cells is made for "
+    for name in ("report.md", "index.html"):
+        (line,) = (line for line in (report / name).read_text().splitlines() if why in line)
+        said = line.partition(why)[2].partition(":")[0]
+        assert sorted(said.split(", ")) == ["attitude", "position", "velocity"]
+        assert "have 1 cell in common" in line
+
+
 def test_unknown_group_is_refused(results, tmp_path):
     with pytest.raises(ValueError, match="no result has height; choose from attitude, velocity, position"):
         page.write("demo", results, tmp_path, page.Options(groups=("height",)))
