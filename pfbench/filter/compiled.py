@@ -86,9 +86,9 @@ class Graph:
 class Compiled:
     """A particle filter whose steps run compiled, with the same draws and, to rounding, the same results.
 
-    The first step of a record runs as it is, since there a proposal may begin what it carries along. The second is recorded and
+    The very first step runs as it is, since there a proposal may begin what it carries along. The second is recorded and
     compiled. From then on small steps are taken several together; one in which a particle has become NaN is done again
-    uncompiled, and those after it with it.
+    uncompiled, and so are, compiled, those that were taken after it.
     Where anything about this fails, the filter goes on uncompiled and says so. A stage that kept numbers of its own from step to
     step would have them frozen; stages keep none.
 
@@ -137,7 +137,7 @@ class Compiled:
         t, many, length = 0, 1, record.y.shape[1]
         while t < length:
             own = draws.at(before + t + 1)
-            graph = self._graph(model, belief, record.at(t), own) if before + t > 0 else None
+            graph = self._graph(stage(model, before + t), belief, record.at(t), own, first=before + t == 0)
             if graph is not None and isinstance(own, MonteCarlo):
                 many = min(many, graph.most, length - t)
                 followed = graph.follow(belief, _during(record, slice(t, t + many)), own)
@@ -149,17 +149,19 @@ class Compiled:
                 if len(followed) == many:
                     many *= 2
                     continue
-                many, own = 1, draws.at(before + t + 1)
-            belief, info = self.method.step(stage(model, before + t), belief, record.at(t), own)
+                many = 1
+            belief, info = self.method.step(stage(model, before + t), belief, record.at(t), draws.at(before + t + 1))
             yield belief, info
             t += 1
 
-    def _graph(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> Graph | None:
-        """The step of such a belief and record; None where it cannot be had."""
+    def _graph(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws, first: bool) -> Graph | None:
+        """The step of such a belief and record; None where it cannot be had, and for a first step of no kind known before."""
         if not isinstance(draws, MonteCarlo) or self.method.keeper is not None:
             return None
         key = id(model), belief.x.shape, len(_tensors((belief, seen)))
         if key not in self.graphs:
+            if first:
+                return None
             self.graphs[key] = self._recorded(model, belief, seen, draws)
         return self.graphs[key]
 
