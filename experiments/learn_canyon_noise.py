@@ -151,7 +151,7 @@ def main(folder: Path, draws: int = 100) -> None:
         print(laws[f"normal, {stretch}"], laws[f"mixture, {stretch}"], flush=True)
         if not draws:
             continue
-        posteriors[stretch] = learn(stretch, draws, 100)
+        posteriors[stretch] = learn(stretch, draws, max(100, draws))  # chains that are to meet need as long to get there
         told[f"posterior, {stretch}"] = posteriors[stretch].table().to_dict("index")
         print(stretch, posteriors[stretch].table().to_string(), posteriors[stretch].accepted, sep="\n", flush=True)
         laws[f"posterior, {stretch}"] = law_of(posteriors[stretch])
