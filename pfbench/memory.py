@@ -27,6 +27,7 @@ from pfbench.record import Episode, Record, map_inputs
 GIB, MIB = 1 << 30, 1 << 20
 _SHARE = 0.8  # of what is free: the estimate does not see allocators and libraries [ours]
 _STEPS = 8  # of the trial
+_ASKED = 10  # steps from one look at what is held to the next
 _FEW = 64  # particles of the trial; also twice and four times as many
 _DRAWN = 4  # bytes at work for each byte of a world that is drawn: sensors run faster than receivers [ours]
 _KEPT = 3  # copies of what each step tells: the steps, all of them in one tensor, in single precision [ours]
@@ -153,15 +154,18 @@ class Tidy:
 
     `native.keep_memory` has the C library keep it, and small things that stay then lie between holes into which the next step's
     tensors do not fit: within a hundred steps a job with 60 MB of live tensors held 850 MB [measured]. Giving all back costs some
-    milliseconds, so it happens only where a half more is held than at the step after the last time, and 256 MiB more.
+    milliseconds, so it happens only where a half more is held than at the step after the last time, and 256 MiB more. Asking the
+    system takes as long as a small step, so it is asked at every tenth.
     """
 
     def __init__(self) -> None:
         self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         self._floor: int | None = None  # what the first step leaves
+        self._step = 0
 
     def __call__(self) -> None:
-        now = held()
+        self._step += 1
+        now = held() if self._step % _ASKED == 1 else None
         if self._trim is None or now is None:
             return
         if self._floor is None:
