@@ -141,9 +141,13 @@ def test_single_precision_is_close_to_double(tmp_path: Path, method: str) -> Non
         assert apart.max() < 1e-4  # 25 steps, numbers of size 100 beside errors of size 1: 1e-7 grows to about 1e-5
         assert np.allclose(single["log_evidence"], double["log_evidence"], atol=1e-3)
     else:
-        # a rounding may send a slot to the neighbouring ancestor, and that alone: one particle of 500 at a time
-        assert np.sqrt((apart**2).mean()) < 0.1 / math.sqrt(500)
-        assert np.allclose(single["log_evidence"], double["log_evidence"], atol=0.1)
+        # A rounding may send a slot to the neighbouring ancestor; which slots do so hangs on the processor. From there on the run
+        # is another one of the same law, so that it differs as two clouds of 500 do; few of the runs meet it.
+        each = np.sqrt((apart**2).mean((1, 2)))
+        evidence = np.abs(single["log_evidence"] - double["log_evidence"])
+        assert (each < 1e-4).mean() >= 0.75
+        assert (evidence < 1e-3).mean() >= 0.75
+        assert each.max() < 4 / math.sqrt(500)
     assert single["error"].dtype == np.float32
     assert single["log_evidence"].dtype == np.float64
 
