@@ -126,19 +126,28 @@ def _measured(kind: str, metas: Sequence[Mapping[str, Any]]) -> str:
         numbers = sorted({int(meta["particles"]) for meta in swarms})
         return f" (N = {numbers[0]} of each particle filter)" if len(numbers) == 1 else f" was not kept ({_numbers(metas)})"
     if kind == SAME_TIME:
-        return _kept([1e3 * float(meta["seconds"]["per_step"]) for meta in swarms], "ms per step", swarms)
+        return _kept([float(meta["seconds"]["per_step"]) for meta in swarms], 1e3, "ms per step", swarms)
     if any(meta.get("likelihoods_per_step") is None for meta in swarms):
         return " (as the experiment states; the jobs do not count them)"
-    return _kept([float(meta["likelihoods_per_step"]) for meta in swarms], "per step", swarms)
+    return _kept([float(meta["likelihoods_per_step"]) for meta in swarms], 1.0, "per step", swarms)
 
 
-def _kept(costs: Sequence[float], unit: str, metas: Sequence[Mapping[str, Any]]) -> str:
-    """What steps cost, in words; by name the filters that are far from the price, which is the middle of what jobs cost."""
-    said = f"{min(costs):.3g} to {max(costs):.3g} {unit}, particle filters alone; {_numbers(metas)}"
-    price = float(np.median(costs))
-    missed = [
-        f"{meta.get('label', '')} ({cost:.3g})"
-        for meta, cost in zip(metas, costs, strict=True)
-        if not price / _CLOSE <= cost <= price * _CLOSE
-    ]
+def _kept(costs: Sequence[float], scale: float, unit: str, metas: Sequence[Mapping[str, Any]]) -> str:
+    """What steps cost, in words; by name the filters that are far from the price.
+
+    The price is the job's own, which is another one in each cell; where none was set, the middle of what jobs cost.
+    """
+    middle = float(np.median(costs))
+    prices = [(meta.get("bought") or {}).get("price", middle) for meta in metas]
+    far: dict[str, list[float]] = {}
+    for meta, cost, price in zip(metas, costs, prices, strict=True):
+        if not price / _CLOSE <= cost <= price * _CLOSE:
+            far.setdefault(str(meta.get("label", "")), []).append(cost / price)
+    said = f"{scale * min(costs):.3g} to {scale * max(costs):.3g} {unit}, particle filters alone; {_numbers(metas)}"
+    missed = [f"{label} ({_range(ratios)} of the price)" for label, ratios in far.items()]
     return f" was not kept by {', '.join(missed)} ({said})" if missed else f" ({said})"
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = (f"{value:.2g}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"

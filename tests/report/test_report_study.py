@@ -138,7 +138,13 @@ def test_a_budget_that_was_not_kept_is_not_claimed():
     alike = [job(100, budget=kind), job(100, 1.05e-3, budget=kind), job(9, 1.1e-3, budget=kind)]
     said = budget.stated([*alike, job(None, 1e-5, budget=kind)])  # a filter without particles has no number to keep it by
     assert said == f"Budget: {kind} (1 to 1.1 ms per step, particle filters alone; N = 100, 9)."
-    assert f"{kind} was not kept by dear (5) (1 to 5 ms" in budget.stated([*alike, job(9, 5e-3, budget=kind) | {"label": "dear"}])
+    dear = job(9, 5e-3, budget=kind) | {"label": "dear"}
+    assert f"{kind} was not kept by dear (4.7 of the price) (1 to 5 ms" in budget.stated([*alike, dear])
+    priced = [{**one, "bought": {"price": 1e-3}} for one in alike]
+    slow = [{**job(9, k * 1e-2, budget=kind), "bought": {"price": 1e-2}} for k in (1, 1.1)]  # a cell where SIR takes longer
+    assert "was not kept" not in budget.stated([*priced, *slow])
+    twice = [{**dear, "bought": {"price": price}} for price in (1e-3, 2e-3)]
+    assert "was not kept by dear (2.5 to 5 of the price)" in budget.stated([*priced, *twice])
     counted = [{**job(n, budget=store.BUDGETS[2]), "likelihoods_per_step": n * k} for n, k in ((100, 1.0), (10, 11.0))]
     said = "(100 to 110 per step, particle filters alone; N = 10, 100)."
     assert budget.stated(counted) == f"Budget: same likelihood evaluations {said}"
