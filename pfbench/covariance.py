@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from pfbench.fusion import recording
+
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -20,13 +22,14 @@ def factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     sd = torch.sqrt(torch.where(variance > 0, variance, 1.0))
     correlation = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
-    jitter = 1e-6 if covariance.dtype == torch.float32 else 1e-12
-    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-    plain, info = torch.linalg.cholesky_ex(correlation)
-    healed, still = torch.linalg.cholesky_ex(correlation + jitter * eye)
-    lower = torch.where((info == 0)[..., None, None], plain, healed)
-    ok = ((info == 0) | (still == 0)) & (variance >= 0).all(-1)
-    return torch.where(variance > 0, sd, 0.0).unsqueeze(-1) * lower, ok
+    lower, info = torch.linalg.cholesky_ex(correlation)
+    ok = info == 0
+    if covariance.is_cuda or recording() or not bool(ok.all()):  # looking costs next to nothing on the CPU
+        jitter = 1e-6 if covariance.dtype == torch.float32 else 1e-12
+        eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+        healed, still = torch.linalg.cholesky_ex(correlation + jitter * eye)
+        lower, ok = torch.where(ok[..., None, None], lower, healed), ok | (still == 0)
+    return torch.where(variance > 0, sd, 0.0).unsqueeze(-1) * lower, ok & (variance >= 0).all(-1)
 
 
 def squared_length(e: Tensor, covariance: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ void systematic(int64_t* ancestor, const T* weight, const double* wanted, const 
 }
 
 template <class T>
-void gather(T* out, const T* x, const int64_t* ancestor, int64_t components, int64_t runs, int64_t slots, int64_t wanted) {
+void copied(T* out, const T* x, const int64_t* ancestor, int64_t components, int64_t runs, int64_t slots, int64_t wanted) {
     std::vector<int32_t> from(wanted);
     for (int64_t r = 0; r < runs; ++r) {
         for (int64_t j = 0; j < wanted; ++j) from[j] = static_cast<int32_t>(ancestor[r * wanted + j]);
@@ -81,19 +81,43 @@ void log_normal(T* out, const T* y, const T* mean, const T* scale, const T* cons
     }
 }
 
+// A coefficient that is not zero, and the row that it is for.
+template <class T>
+struct Term {
+    const T* from;
+    T by;
+};
+
+// Rows of sums of terms, the ends of which are in `last`, for particles that fill S registers or more.
+template <class T, int S>
+void summed(T* out, const Term<T>* terms, const std::vector<int64_t>& last, int64_t plane, int64_t particles) {
+    typedef T Lanes __attribute__((vector_size(64), aligned(sizeof(T)), may_alias));
+    constexpr int64_t WIDE = S * 64 / sizeof(T);
+    for (int64_t next = 0; next < particles; next += WIDE) {
+        const int64_t at = std::min(next, particles - WIDE);  // the last ones overlap
+        for (int64_t d = 0, t = 0; d < static_cast<int64_t>(last.size()); ++d) {
+            Lanes sum[S] = {};
+            for (; t < last[d]; ++t) {
+                const Lanes* from = reinterpret_cast<const Lanes*>(terms[t].from + at);
+                for (int k = 0; k < S; ++k) sum[k] += terms[t].by * from[k];
+            }
+            for (int k = 0; k < S; ++k) reinterpret_cast<Lanes*>(out + d * plane + at)[k] = sum[k];
+        }
+    }
+}
+
 // out = phi x + gain w of each particle, by the coefficients that are not zero: in error models of an INS three in four are.
 template <class T>
 void affine(T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t one_phi, int64_t one_gain, int64_t runs,
             int64_t particles, int64_t rows, int64_t states, int64_t noises) {
-    typedef T Lanes __attribute__((vector_size(64), aligned(sizeof(T)), may_alias));
-    constexpr int64_t WIDE = 4 * 64 / sizeof(T);  // numbers of a row that stay in four registers
-    struct Term { const T* from; T by; };
-    std::vector<Term> terms(rows * (states + noises));
+    constexpr int64_t WIDE = 64 / sizeof(T);
+    std::vector<Term<T>> terms(rows * (states + noises));
     std::vector<int64_t> last(rows);
     const int64_t plane = runs * particles;
     for (int64_t r = 0; r < runs; ++r) {
         const T* a = phi + (one_phi ? 0 : r * rows * states);
         const T* b = gain + (one_gain ? 0 : r * rows * noises);
+        T* to = out + r * particles;
         int64_t count = 0;
         for (int64_t d = 0; d < rows; ++d) {
             for (int64_t k = 0; k < states; ++k)
@@ -102,32 +126,32 @@ void affine(T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t
                 if (const T c = b[d * noises + k]; c != 0) terms[count++] = {w + k * plane + r * particles, c};
             last[d] = count;
         }
-        for (int64_t next = 0; particles >= WIDE && next < particles; next += WIDE) {
-            const int64_t at = std::min(next, particles - WIDE);  // the last ones overlap
+        if (particles >= 4 * WIDE) summed<T, 4>(to, terms.data(), last, plane, particles);
+        else if (particles >= WIDE) summed<T, 1>(to, terms.data(), last, plane, particles);
+        else
             for (int64_t d = 0, t = 0; d < rows; ++d) {
-                Lanes sum[4] = {};
-                for (; t < last[d]; ++t) {
-                    const Lanes* from = reinterpret_cast<const Lanes*>(terms[t].from + at);
-                    for (int k = 0; k < 4; ++k) sum[k] += terms[t].by * from[k];
-                }
-                for (int k = 0; k < 4; ++k) reinterpret_cast<Lanes*>(out + d * plane + r * particles + at)[k] = sum[k];
-            }
-        }
-        for (int64_t at = 0; particles < WIDE && at < particles; ++at)
-            for (int64_t d = 0, t = 0; d < rows; ++d) {
-                T sum = 0;
-                for (; t < last[d]; ++t) sum += terms[t].by * terms[t].from[at];
-                out[d * plane + r * particles + at] = sum;
+                for (int64_t at = 0; at < particles; ++at) to[d * plane + at] = 0;
+                for (; t < last[d]; ++t)
+                    for (int64_t at = 0; at < particles; ++at) to[d * plane + at] += terms[t].by * terms[t].from[at];
             }
     }
 }
 
-// How many of the values 0 to 2 N - 1 occur at slots that hold a particle.
+// How many of the values 0 to 2 N - 1 occur at slots that hold a particle. Where values do not fall from slot to slot, as after
+// systematic resampling, each new one begins where it differs from the one before.
 template <class T>
 void distinct(int64_t* count, const int64_t* value, const T* log_weight, int64_t runs, int64_t slots) {
-    std::vector<uint8_t> there(2 * slots);
+    std::vector<uint8_t> there;
     for (int64_t r = 0; r < runs; ++r, value += slots, log_weight += slots) {
-        std::fill(there.begin(), there.end(), 0);
+        int64_t falls = 0, holes = 0, begun = 1;
+        for (int64_t i = 1; i < slots; ++i) falls |= value[i] < value[i - 1];
+        for (int64_t i = 0; i < slots; ++i) holes |= !(log_weight[i] > -HUGE_VAL);
+        for (int64_t i = 1; i < slots; ++i) begun += value[i] != value[i - 1];
+        if (!falls && !holes) {
+            count[r] = begun;
+            continue;
+        }
+        there.assign(2 * slots, 0);
         for (int64_t i = 0; i < slots; ++i) there[value[i]] |= log_weight[i] > -HUGE_VAL;
         count[r] = 0;
         for (const uint8_t one : there) count[r] += one;
@@ -220,6 +244,49 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
         }
 }
 
+// Of |A x - b|^2 + |x|^2, [A b] = white [R, K, D + 1]: the triangle [R, D, D + 1] that [I 0] becomes when the rows of [A b] are taken
+// up into it, its diagonal positive, and the square of what is then left of b, the minimum [R]. By Householder's reflections, of
+// many runs side by side: their matrices are too small to be worked on one by one.
+template <class T>
+void triangle(T* upper, T* least, const T* white, int64_t runs, int64_t rows, int64_t d) {
+    typedef T Lanes __attribute__((vector_size(64), aligned(sizeof(T)), may_alias));
+    constexpr int64_t WIDE = 64 / sizeof(T);
+    const int64_t width = d + 1;
+    std::vector<std::array<T, WIDE>> a(rows * width), u(d * width);
+    Lanes* const low = reinterpret_cast<Lanes*>(a.data());
+    Lanes* const high = reinterpret_cast<Lanes*>(u.data());
+    for (int64_t first = 0; first < runs; first += WIDE) {
+        const int64_t many = std::min(WIDE, runs - first);
+        for (int64_t lane = 0; lane < WIDE; ++lane)  // lanes without a run repeat the last one
+            for (int64_t i = 0; i < rows * width; ++i) a[i][lane] = white[(first + std::min(lane, many - 1)) * rows * width + i];
+        for (int64_t i = 0; i < d; ++i)
+            for (int64_t c = 0; c < width; ++c) high[i * width + c] = Lanes{} + T(i == c);
+        for (int64_t j = 0; j < d; ++j) {
+            Lanes square = {}, norm;
+            for (int64_t k = 0; k < rows; ++k) square += low[k * width + j] * low[k * width + j];
+            const Lanes pivot = high[j * width + j], whole = pivot * pivot + square;
+            for (int64_t lane = 0; lane < WIDE; ++lane) norm[lane] = std::sqrt(whole[lane]);
+            // v = (pivot - norm, column) is reflected to its negative; v'v = -2 norm (pivot - norm), and 0 where the column is
+            const Lanes head = -square / (pivot + norm);
+            const Lanes share = square > 0 ? -(pivot + norm) / (norm * square) : Lanes{};
+            high[j * width + j] = norm;
+            for (int64_t c = j + 1; c < width; ++c) {
+                Lanes along = head * high[j * width + c];
+                for (int64_t k = 0; k < rows; ++k) along += low[k * width + j] * low[k * width + c];
+                high[j * width + c] += along / norm;
+                along *= share;
+                for (int64_t k = 0; k < rows; ++k) low[k * width + c] += along * low[k * width + j];
+            }
+        }
+        for (int64_t lane = 0; lane < many; ++lane) {
+            for (int64_t i = 0; i < d * width; ++i) upper[(first + lane) * d * width + i] = u[i][lane];
+            T left = 0;
+            for (int64_t k = 0; k < rows; ++k) left += a[k * width + d][lane] * a[k * width + d][lane];
+            least[first + lane] = left;
+        }
+    }
+}
+
 using torch::stable::Tensor;
 
 template <class T>
@@ -272,10 +339,11 @@ class Packed {
             count *= size[k];
         }
         if (!apart) return;
-        own.reserve(count);
+        own.resize(count);
+        T* to = own.data();
         for (int64_t i = 0; i < size[0]; ++i)
-            for (int64_t j = 0; j < size[1]; ++j)
-                for (int64_t k = 0; k < size[2]; ++k) own.push_back(data[i * step[0] + j * step[1] + k * step[2]]);
+            for (int64_t j = 0; j < size[1]; ++j, to += size[2])
+                for (int64_t k = 0; k < size[2]; ++k) to[k] = data[i * step[0] + j * step[1] + k * step[2]];
         data = own.data();
     }
     Packed(const Packed&) = delete;
@@ -323,13 +391,13 @@ Tensor systematic_operator(Tensor a, Tensor n, Tensor u) {
     return out;
 }
 
-Tensor gather_operator(Tensor x, Tensor ancestors) {
+Tensor copied_operator(Tensor x, Tensor ancestors) {
     const int64_t components = x.size(0), runs = x.size(1), wanted = ancestors.size(1);
     const Packed<int64_t> from(ancestors);
     return by_type(x, [&](auto one) {
         using T = decltype(one);
         const Tensor out = fresh<T>({components, runs, wanted});
-        gather(numbers<T>(out), Packed<T>(x).data, from.data, components, runs, x.size(2), wanted);
+        copied(numbers<T>(out), Packed<T>(x).data, from.data, components, runs, x.size(2), wanted);
         return out;
     });
 }
@@ -347,12 +415,13 @@ Tensor log_normal_operator(Tensor y, Tensor mean, Tensor scale, Tensor constant)
 
 Tensor affine_operator(Tensor phi, Tensor x, Tensor gain, Tensor w) {
     const int64_t runs = x.size(0), particles = x.size(1), rows = phi.size(1);
-    return by_type(x, [&](auto one) {
-        using T = decltype(one);
+    const bool one = phi.size(0) == 1 && gain.size(0) == 1;  // runs then lie side by side as particles of one run do
+    return by_type(x, [&](auto like) {
+        using T = decltype(like);
         const Tensor out = fresh<T>({rows, runs, particles});
         affine(numbers<T>(out), Packed<T>(phi).data, Packed<T>(x, COMPONENTS_FIRST).data, Packed<T>(gain).data,
-               Packed<T>(w, COMPONENTS_FIRST).data, phi.size(0) == 1, gain.size(0) == 1, runs, particles, rows, phi.size(2),
-               gain.size(2));
+               Packed<T>(w, COMPONENTS_FIRST).data, phi.size(0) == 1, gain.size(0) == 1, one ? 1 : runs,
+               one ? runs * particles : particles, rows, phi.size(2), gain.size(2));
         return out;
     });
 }
@@ -364,6 +433,16 @@ Tensor distinct_operator(Tensor copy_of, Tensor log_w) {
         distinct(numbers<int64_t>(out), Packed<int64_t>(copy_of).data, Packed<decltype(one)>(log_w).data, runs, copy_of.size(1));
     });
     return out;
+}
+
+std::tuple<Tensor, Tensor> triangle_operator(Tensor white) {
+    const int64_t runs = white.size(0), rows = white.size(1), d = white.size(2) - 1;
+    return by_type(white, [&](auto one) {
+        using T = decltype(one);
+        const Tensor upper = fresh<T>({runs, d, d + 1}), least = fresh<T>({runs});
+        triangle(numbers<T>(upper), numbers<T>(least), Packed<T>(white).data, runs, rows, d);
+        return std::make_tuple(upper, least);
+    });
 }
 
 std::tuple<Tensor, Tensor> moments_operator(Tensor x, Tensor w) {
@@ -388,16 +467,44 @@ Tensor spread_operator(Tensor x, Tensor mean, Tensor w, Tensor groups) {
         return out;
     });
 }
+
+// The same, called by what torch's compiler makes, which would take longer to look an operator up than a small loop takes.
+template <class Work, class... Handles>
+AOTITorchError directly(Work work, AtenTensorHandle* out, Handles... given) {
+    const auto borrowed = [](AtenTensorHandle a) {
+        AtenTensorHandle own;
+        STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_new_tensor_handle(a, &own));
+        return Tensor(own);
+    };
+    try {
+        return aoti_torch_new_tensor_handle(work(borrowed(given)...).get(), out);
+    } catch (...) {
+        return AOTI_TORCH_FAILURE;
+    }
+}
 }  // namespace
+
+typedef AtenTensorHandle In;
+typedef AtenTensorHandle* Out;
+extern "C" {
+AOTITorchError aoti_torch_cpu_normals(In key, In step, In runs, In component, In particle, Out out) {
+    return directly(drawn<float, normals>, out, key, step, runs, component, particle);
+}
+AOTITorchError aoti_torch_cpu_systematic(In a, In n, In u, Out out) { return directly(systematic_operator, out, a, n, u); }
+AOTITorchError aoti_torch_cpu_copied(In x, In ancestors, Out out) { return directly(copied_operator, out, x, ancestors); }
+AOTITorchError aoti_torch_cpu_affine(In phi, In x, In gain, In w, Out out) { return directly(affine_operator, out, phi, x, gain, w); }
+AOTITorchError aoti_torch_cpu_distinct(In copy_of, In log_w, Out out) { return directly(distinct_operator, out, copy_of, log_w); }
+}
 
 STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
     library.impl("normals", TORCH_BOX((&drawn<float, normals>)));
     library.impl("uniforms", TORCH_BOX((&drawn<double, uniforms>)));
     library.impl("systematic", TORCH_BOX(&systematic_operator));
-    library.impl("gather", TORCH_BOX(&gather_operator));
+    library.impl("copied", TORCH_BOX(&copied_operator));
     library.impl("log_normal", TORCH_BOX(&log_normal_operator));
     library.impl("affine", TORCH_BOX(&affine_operator));
     library.impl("distinct", TORCH_BOX(&distinct_operator));
+    library.impl("triangle", TORCH_BOX(&triangle_operator));
     library.impl("moments", TORCH_BOX(&moments_operator));
     library.impl("spread", TORCH_BOX(&spread_operator));
 }

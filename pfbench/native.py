@@ -12,6 +12,7 @@ import hashlib
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -26,6 +27,7 @@ _TORCH = Path(torch.__file__).parent
 _COMMON = ("-O3", "-march=native", "-fopenmp-simd", "-fPIC", "-std=c++17", "-c")
 _FLAGS = {
     "normals": (*_COMMON, "-ffast-math", "-mno-recip"),
+    "steps": _COMMON,
     "loops": (*_COMMON, "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"),
 }
 _operators = torch.library.Library("pfbench", "DEF")
@@ -46,9 +48,9 @@ def systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     return _operator("systematic")(a, n, u)
 
 
-def gather(x: Tensor, ancestors: Tensor) -> Tensor:
+def copied(x: Tensor, ancestors: Tensor) -> Tensor:
     """x [D, R, N] by ancestors [R, M] -> [D, R, M]."""
-    return _operator("gather")(x, ancestors)
+    return _operator("copied")(x, ancestors)
 
 
 def log_normal(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tensor:
@@ -71,13 +73,60 @@ def moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     return _operator("moments")(x, w)
 
 
+def triangle(white: Tensor) -> tuple[Tensor, Tensor]:
+    """Of |A x - b|^2 + |x|^2, [A b] = `white` [R, K, D + 1]: triangle [R, D, D + 1] of a positive diagonal, the minimum [R]."""
+    return _operator("triangle")(white)
+
+
 def spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tensor:
     """Covariance of groups of components [G, s] of x [R, N, K], by mean [R, K] and weights [R, N] -> [R, G, s, s]."""
     return _operator("spread")(x, mean, w, groups)
 
 
-for _loop in (normals, uniforms, systematic, gather, log_normal, affine, distinct, moments, spread):
+def follow(
+    step: int, outputs: int, constants: list[Tensor], state: list[Tensor], seen: list[Tensor], shared: list[Tensor]
+) -> list[Tensor]:
+    """What a compiled step at this address leaves, `outputs` tensors for each of T steps, one after the other.
+
+    It is given the constants, the state (its own first outputs, the next time), its part of what is seen [T, ...], and what all
+    steps share.
+    """
+    found: list[Tensor] = _operator("follow")(step, outputs, constants, state, seen, shared)
+    return found
+
+
+for _loop in (normals, uniforms, systematic, copied, log_normal, affine, distinct, moments, spread, triangle, follow):
     _operators.define(_loop.__name__ + torch.library.infer_schema(_loop, mutates_args=()))
+
+_CALLED = {"normals": 5, "systematic": 3, "copied": 2, "affine": 4, "distinct": 2}  # tensors that each is given
+
+
+class ByName(dict[str, list[str]]):
+    """Knows operators by their names: torch keys its cache on disk by what it is told, and cannot write an operator down."""
+
+    def __contains__(self, operator: object) -> bool:
+        return super().__contains__(str(operator))
+
+
+def shims() -> ByName:
+    """C declarations of the operators that compiled code may call by their names, in place of having torch look them up."""
+
+    def declared(name: str, count: int) -> str:
+        return f"AOTITorchError aoti_torch_cpu_{name}({count * 'AtenTensorHandle, '}AtenTensorHandle*)"
+
+    _load()
+    return ByName({f"pfbench.{name}.default": [declared(name, count)] for name, count in _CALLED.items()})
+
+
+def address(library: str, function: str) -> int:
+    """Of a function in a library that is loaded already.
+
+    Raises:
+        AttributeError: it has no such function.
+    """
+    found = ctypes.cast(getattr(ctypes.CDLL(library), function), ctypes.c_void_p).value
+    assert found is not None
+    return found
 
 
 @cache
@@ -140,7 +189,9 @@ def _load() -> None:
                 command = [compiler, *_FLAGS[source], f"-I{_TORCH / 'include'}", "-o", str(part), str(_HERE / f"{source}.cpp")]
                 subprocess.run(command, check=True, capture_output=True)
             # linked without -ffast-math, with which a library switches small numbers off in the whole process
-            libraries = f"-L{_TORCH / 'lib'}", "-ltorch_cpu", "-lm"
+            libraries = [f"-L{_TORCH / 'lib'}", "-ltorch_cpu", "-lm"]
+            if sys.platform == "darwin":  # as elsewhere by itself, Python is found when the library is loaded
+                libraries.append("-Wl,-undefined,dynamic_lookup")
             subprocess.run([compiler, "-shared", "-o", new, *parts, *libraries], check=True, capture_output=True)
             os.replace(new, built)
-    ctypes.CDLL(str(built))
+    ctypes.CDLL(str(built), mode=ctypes.RTLD_GLOBAL)  # what a compiler makes of a step calls the loops by their names

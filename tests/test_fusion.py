@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pfbench import fusion, job, native, store
 from pfbench.draws import MonteCarlo
-from pfbench.filter import particle, resamplers
+from pfbench.filter import gaussian, particle, resamplers
 from pfbench.filter.belief import Cloud, gather
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
@@ -117,11 +117,35 @@ def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
 
 
 @compiler
+@pytest.mark.parametrize(("runs", "rows", "d"), [(3, 1, 1), (5, 20, 4), (19, 2, 9), (100, 6, 15)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_loop_by_hand_takes_rows_up_into_a_triangle(dtype: torch.dtype, runs: int, rows: int, d: int) -> None:
+    """T'T = I + [A b]'[A b], where nothing is seen too, and priors are 1e4 times as wide as noise; a NaN stays in its run."""
+    white = DRAWS.normal("white", runs * rows * (d + 1), 1)[0].to(dtype).view(runs, rows, d + 1)
+    white = white * torch.logspace(-4, 4, d + 1, dtype=dtype)
+    white[0] = 0.0
+    white[1] = torch.nan
+    fine = torch.arange(runs) != 1
+    prior = torch.diag(torch.cat([torch.ones(d), torch.zeros(1)])).double()
+    wanted = prior + white.double().mT @ white.double()
+    scale = wanted.diagonal(dim1=-2, dim2=-1).sqrt().clamp(min=1e-30)
+    for upper, least in (native.triangle(white), gaussian._separate_triangle(white)):
+        assert torch.equal(torch.isfinite(upper.sum((1, 2)) + least), fine)
+        assert bool((upper.diagonal(dim1=-2, dim2=-1)[fine] > 0.0).all())
+        found = upper.double().mT @ upper.double()
+        found[:, d, d] += least
+        off = (found - wanted) / (scale.unsqueeze(-1) * scale.unsqueeze(-2))
+        assert float(off[fine].abs().max()) < 20.0 * (rows + d) * torch.finfo(dtype).eps
+        below = torch.tril(upper[fine], -1).abs().amax(1)
+        assert bool((below <= 20.0 * (rows + d) * torch.finfo(dtype).eps * scale[fine]).all())
+
+
+@compiler
 def test_a_loop_by_hand_gathers() -> None:
     x, ancestors = DRAWS.normal("x", N, D).permute(2, 0, 1), (DRAWS.uniform("a", 3 * N, 1)[..., 0] * N).long()
     expected = x.gather(2, ancestors.expand(D, -1, -1))
-    assert torch.equal(native.gather(x, ancestors), expected)
-    assert torch.equal(native.gather(x.contiguous().float(), ancestors), expected.float())
+    assert torch.equal(native.copied(x, ancestors), expected)
+    assert torch.equal(native.copied(x.contiguous().float(), ancestors), expected.float())
 
 
 @compiler

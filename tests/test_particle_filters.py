@@ -696,10 +696,11 @@ def test_distinct_particles_are_counted(fused: bool, scheme: Scheme, moving: boo
 
 
 def test_of_empty_slots_and_new_particles_no_ancestors_are_counted() -> None:
-    copies = torch.tensor([[0, 0, 2, 3], [1, 1, 5, 1]])
-    log_w = torch.tensor([[0.0, 0.0, -torch.inf, 0.0], [0.0, 0.0, 0.0, -torch.inf]], dtype=torch.float64)
+    copies = torch.tensor([[0, 0, 2, 3], [1, 1, 5, 1], [0, 2, 2, 3], [3, 2, 2, 3], [1, 1, 1, 1]])
+    log_w = torch.zeros(5, 4, dtype=torch.float64)
+    log_w[0, 2] = log_w[1, 3] = -torch.inf
     for count in (distinct, native.distinct):
-        assert count(copies, log_w).tolist() == [2, 2]
+        assert count(copies, log_w).tolist() == [2, 2, 3, 2, 1]
     method = ParticleFilter(10, resampler=GaussianRefresh(), proposal=GaussianPrediction())
     model = linear_walk(1.0, 0.3, 0.3)
     record = ModelWorld(model, 2).draw(Nominal(), torch.arange(2), 5).record

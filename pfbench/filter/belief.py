@@ -167,7 +167,7 @@ def _flat_select(first: Tensor, ancestors: Tensor) -> Tensor:
     return first.reshape(d, runs * n).index_select(1, flat.flatten()).reshape(d, *ancestors.shape)
 
 
-_picked = fusible(_flat_select, by_hand=native.gather)
+_picked = fusible(_flat_select, by_hand=native.copied)
 
 
 def _gather_rows(a: Tensor, ancestors: Tensor) -> Tensor:

@@ -7,17 +7,20 @@ What the compiler made is kept on disk by torch, for later jobs that are alike.
 
 from __future__ import annotations
 
+import inspect
 import logging
 import math
+import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from pfbench import fusion
+from pfbench import fusion, native
 from pfbench.draws import Draws, MonteCarlo
 from pfbench.filter.belief import Cloud, Gaussian, Info
 from pfbench.filter.loop import stage
@@ -27,7 +30,7 @@ from pfbench.record import Record, map_inputs
 
 log = logging.getLogger("pfbench")
 
-_AHEAD = 1 << 18  # numbers that steps taken together may keep: they then share what steps cost beside them, and stay in a cache
+_AHEAD = 1 << 20  # numbers that steps taken together may keep: they then share what steps cost beside them
 
 
 class Counter(Protocol):
@@ -37,6 +40,7 @@ class Counter(Protocol):
 
 
 Step = Callable[[list[Tensor]], Sequence[Tensor]]
+_ENTRY = "_Z19inductor_entry_implPP16AtenTensorOpaqueS1_"  # the function that torch's compiler makes of a step, as C++ names it
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +49,7 @@ class Graph:
 
     Attributes:
         run: belief, number of the step, what is seen, seed and runs -> the next belief, mean, variance, weights expected, trace.
+        direct: where it can be called without Python, and what it is given first; None where it cannot.
         asked: how often it evaluates the model's law.
         memory, trace: names of what the belief carries, and of what the step traces.
         most: steps that may be taken together.
@@ -52,6 +57,7 @@ class Graph:
     """
 
     run: Step
+    direct: tuple[int, list[Tensor]] | None
     asked: int
     memory: list[str]
     trace: list[str]
@@ -67,18 +73,28 @@ class Graph:
         state = [_stored(a) for a in _tensors((belief.x, belief.log_w, belief.log_z, belief.memory))]
         seen = [torch.arange(first, first + many), *map(_by_step, _tensors((record.y, record.u)))]
         shared = [*map(_stored, _tensors((record.start, record.spread))), torch.as_tensor(draws.seed), draws.runs]
-        found: list[Sequence[Tensor]] = []
-        for parts in zip(*(a.unbind() for a in seen), strict=True):
-            found.append(self.run([*state, *parts, *shared]))
-            state = list(found[-1][:carried])
-        return [self._named(out) for out in found[: _healthy([out[carried] for out in found])]]
+        found: list[list[Tensor]] = []
+        if self.direct is not None:
+            step, constants = self.direct
+            outputs = carried + 3 + len(self.trace)
+            flat = native.follow(step, outputs, constants, state, seen, shared)
+            found = [flat[k : k + outputs] for k in range(0, len(flat), outputs)]
+        else:
+            for parts in zip(*(a.unbind() for a in seen), strict=True):
+                found.append(list(self.run([*state, *parts, *shared])))
+                state = found[-1][:carried]
+        turned = [k for k, a in enumerate(found[0]) if a.dim() > 2]
+        return [self._named(out, turned) for out in found[: _healthy([out[carried] for out in found])]]
 
-    def _named(self, out: Sequence[Tensor]) -> tuple[Cloud, Told]:
-        x, log_w, log_z, *rest = [_seen_as(a) if a.dim() > 2 else a for a in out]
-        carried = len(self.memory)
-        memory = dict(zip(self.memory, rest[:carried], strict=True))
-        mean, variance, expected, *trace = rest[carried:]
-        told = Told(mean, variance, expected, dict(zip(self.trace, trace, strict=True)))
+    def _named(self, out: list[Tensor], turned: list[int]) -> tuple[Cloud, Told]:
+        """What a step leaves, by its names; `turned` are laid out as a graph stores them."""
+        for k in turned:
+            out[k] = _seen_as(out[k])
+        carried = 3 + len(self.memory)
+        x, log_w, log_z = out[:3]
+        mean, variance, expected = out[carried : carried + 3]
+        memory = dict(zip(self.memory, out[3:carried], strict=True))
+        told = Told(mean, variance, expected, dict(zip(self.trace, out[carried + 3 :], strict=True)))
         return Cloud(x, log_w, log_z, memory=memory), told
 
 
@@ -87,8 +103,8 @@ class Compiled:
     """A particle filter whose steps run compiled, with the same draws and, to rounding, the same results.
 
     The very first step runs as it is, since there a proposal may begin what it carries along. The second is recorded and
-    compiled. From then on small steps are taken several together; one in which a particle has become NaN is done again
-    uncompiled, and so are, compiled, those that were taken after it.
+    compiled. From then on small steps are taken many together; one in which a particle has become NaN is done again
+    uncompiled, and so are, compiled, those that were taken after it: at first one alone, then two, four and so on.
     Where anything about this fails, the filter goes on uncompiled and says so. A stage that kept numbers of its own from step to
     step would have them frozen; stages keep none.
 
@@ -134,7 +150,7 @@ class Compiled:
         self, model: StateSpaceModel, belief: Cloud, record: Record, draws: Draws, before: int = 0
     ) -> Iterator[tuple[Cloud, Info]]:
         """The belief after each step of a record, and what the step tells; `before` it there were other steps."""
-        t, many, length = 0, 1, record.y.shape[1]
+        t, many, length = 0, record.y.shape[1], record.y.shape[1]
         while t < length:
             own = draws.at(before + t + 1)
             graph = self._graph(stage(model, before + t), belief, record.at(t), own, first=before + t == 0)
@@ -142,7 +158,7 @@ class Compiled:
                 many = min(many, graph.most, length - t)
                 followed = graph.follow(belief, _during(record, slice(t, t + many)), own)
                 for belief, told in followed:
-                    yield belief, self.method.tell(model, belief, told, record.at(t))
+                    yield belief, self.method.tell(model, belief, told, partial(record.at, t))
                     t += 1
                 if self.counter:
                     self.counter.count += len(followed) * graph.asked
@@ -186,7 +202,7 @@ class Compiled:
         shared = [torch.as_tensor(draws.seed), draws.runs]
         example = [*map(_stored, state), torch.as_tensor(draws.step), *map(_stored, _tensors(seen)), *shared]
         try:
-            run = _compiled(step, example)
+            run, direct = _compiled(step, example)
             asked = (self.counter.count if self.counter else 0) - counted
             out = run(example)
         except Exception as error:  # torch raises many kinds
@@ -202,25 +218,75 @@ class Compiled:
         memory, trace = names
         stays = [a.shape for a in out[: 3 + len(memory)]] == [a.shape for a in example[: len(state)]]
         most = max(1, _AHEAD // sum(a.numel() for a in out)) if stays else 1
-        return Graph(run, asked, memory, trace, most, model)
+        return Graph(run, direct, asked, memory, trace, most, model)
 
 
-def _compiled(step: Callable[..., list[Tensor]], tensors: list[Tensor]) -> Step:
+def _compiled(step: Callable[..., list[Tensor]], tensors: list[Tensor]) -> tuple[Step, tuple[int, list[Tensor]] | None]:
     """By torch's compiler, of which these are inner parts: its cache on disk wants to know the shapes from stand-ins."""
+    from torch._functorch.config import patch as whole_cache
     from torch._guards import TracingContext, tracing
-    from torch._inductor.compile_fx import compile_fx  # takes seconds to import
+    from torch._inductor.compile_fx import compile_fx, compile_fx_inner  # takes seconds to import
     from torch._subclasses import FakeTensorMode
     from torch.fx.experimental.proxy_tensor import make_fx
     from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
-    graph = make_fx(step)(*tensors)
+    graph = make_fx(step, decomposition_table={torch.ops.aten.stack.default: _stacked})(*tensors)
+    on_cpu = not any(a.is_cuda for a in tensors)
     # on the CPU what calls the kernels is compiled with them, in the same time: from Python it takes half as long again
-    options = {"cpp_wrapper": not any(a.is_cuda for a in tensors)}
+    by_name = {"aot_inductor.custom_ops_to_c_shims": native.shims()} if on_cpu else {}
+    options = {"cpp_wrapper": on_cpu, "size_asserts": False, **by_name}  # a graph is only given what it was recorded with
+    made: list[Any] = []
+
+    def inner(*args: Any, **words: Any) -> Any:
+        made.append(compile_fx_inner(*args, **words))
+        return made[-1]
+
     stand_ins = FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True)
-    with tracing(TracingContext(stand_ins)):
+    with tracing(TracingContext(stand_ins)), whole_cache(enable_autograd_cache=False):  # the other one hides what is made
         examples = [stand_ins.from_tensor(a, static_shapes=True) for a in tensors]
-        run: Any = compile_fx(graph, examples, config_patches=options)
-    return lambda given: run(*given)
+        run: Any = compile_fx(graph, examples, inner_compile=inner, config_patches=options)
+    return lambda given: run(*given), _direct(made, run, tensors) if on_cpu else None
+
+
+def _stacked(parts: Sequence[Tensor], dim: int = 0) -> Tensor:
+    """torch.stack, component by component in memory where parts [R, N] become components: those can be computed side by side."""
+    last = parts[0].dim()
+    if dim not in (-1, last) or last < 2:
+        return torch.cat([part.unsqueeze(dim) for part in parts], dim)
+    return torch.cat([part.unsqueeze(0) for part in parts]).permute(*range(1, last + 1), 0)
+
+
+def _direct(made: list[Any], run: Any, tensors: list[Tensor]) -> tuple[int, list[Tensor]] | None:
+    """Where the C++ function lies that `run` comes down to, and the constants that it is given before the step's tensors.
+
+    None, and a line, where what torch has made is not as expected: the step is then called from Python.
+    """
+    given: list[Tensor] = []
+    try:
+        (graph,) = made
+        call = graph.current_callable
+
+        def noted(args: list[Tensor]) -> Any:
+            given.extend(args)
+            return call(args)
+
+        graph.current_callable = noted
+        try:
+            wanted = run(*tensors)
+        finally:
+            graph.current_callable = call
+        constants, own = given[: -len(tensors)], given[-len(tensors) :]
+        if not all(a is b for a, b in zip(own, tensors, strict=True)):
+            raise TypeError("its arguments are in another order")
+        entry = inspect.getclosurevars(call).nonlocals["f"]
+        where = native.address(entry.__self__.__file__, _ENTRY)
+        found = native.follow(where, len(wanted), constants, [], [a.unsqueeze(0) for a in tensors], [])
+        if not all(torch.allclose(a.double(), b.double(), equal_nan=True) for a, b in zip(found, wanted, strict=True)):
+            raise TypeError("its results differ")
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, OSError, subprocess.CalledProcessError) as error:
+        log.info("engine=compiled: steps are called from Python (%s: %s)", type(error).__name__, error)
+        return None
+    return where, constants
 
 
 def _tensors(tree: Any) -> list[Tensor]:

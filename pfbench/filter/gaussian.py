@@ -9,11 +9,13 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from pfbench import native
 from pfbench.covariance import factor, squared_length
 from pfbench.draws import Draws
 from pfbench.filter.belief import Gaussian, Info
 from pfbench.filter.rules import Linearised, Rule, Space
 from pfbench.filter.whitening import LOG_2PI, log_det
+from pfbench.fusion import fusible
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
 
@@ -289,10 +291,8 @@ def _least_squares(white: Tensor, eye: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     d = eye.shape[-1]
     if not (white.requires_grad and torch.is_grad_enabled()):
-        triangle = torch.linalg.qr(torch.cat([white, torch.nn.functional.pad(eye, (0, 1))], -2), mode="r")[1]
-        # QR leaves the signs of its rows to rounding; draws by such a root would depend on the batch that they are in
-        sign = torch.where(triangle.diagonal(dim1=-2, dim2=-1)[:, :d] < 0, -1, 1).to(triangle).unsqueeze(-1)
-        return sign * triangle[:, :d, :d], sign * triangle[:, :d, d:], triangle[:, d, d].square()
+        upper, least = _triangle(white)
+        return upper[..., :d], upper[..., d:], least
     # a gradient needs Q, and a triangle without zeros on its diagonal, where what was seen may be just what was expected
     a, b = white[..., :d], white[..., d:]
     q, information = torch.linalg.qr(torch.cat([a, eye], -2))
@@ -301,6 +301,19 @@ def _least_squares(white: Tensor, eye: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     information, score = sign * information, sign * score
     best = torch.linalg.solve_triangular(information, score, upper=True)
     return information, score, (a @ best - b).square().sum((1, 2)) + best.square().sum((1, 2))
+
+
+def _separate_triangle(white: Tensor) -> tuple[Tensor, Tensor]:
+    """[A b] [R, K, D + 1] on top of [I 0] as a triangle [R, D, D + 1] with a positive diagonal, and the square left of b [R]."""
+    d = white.shape[-1] - 1
+    below = torch.eye(d, d + 1, dtype=white.dtype, device=white.device).expand(white.shape[0], -1, -1)
+    whole = torch.linalg.qr(torch.cat([white, below], -2), mode="r")[1]
+    # QR leaves the signs of its rows to rounding; draws by such a root would depend on the batch that they are in
+    sign = torch.where(whole.diagonal(dim1=-2, dim2=-1)[:, :d] < 0, -1, 1).to(whole).unsqueeze(-1)
+    return sign * whole[:, :d], whole[:, d, d].square()
+
+
+_triangle = fusible(_separate_triangle, by_hand=native.triangle)
 
 
 def around_first(residual: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:

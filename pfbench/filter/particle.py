@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -122,7 +123,7 @@ class ParticleFilter:
     def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud, Info]:
         """The cloud at t-1 and what is seen at t -> the weighted cloud at t."""
         cloud, told = self.advance(model, belief, seen, draws)
-        return cloud, self.tell(model, cloud, told, seen)
+        return cloud, self.tell(model, cloud, told, lambda: seen)
 
     def advance(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud, Told]:
         """The same, tensors alone."""
@@ -140,27 +141,39 @@ class ParticleFilter:
         x, log_w = bury(x, log_w, cloud.x)
         expected = cloud.log_w + log_ratio
         # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
-        log_w, total, trace["ess"] = _normalise(log_w)
+        log_w, total, heft = _normalise(log_w)
+        trace["ess"] = 1.0 / heft.square().sum(1)
         if not isinstance(self.size, Fixed):
             trace["particles"] = (cloud.log_w > -torch.inf).sum(1).to(log_w)
         parents, keeper = cloud, self.keeper
         cloud = cloud._replace(x=x, log_w=log_w, log_z=belief.log_z + total, memory=memory, copy_of=None)
         if keeper is not None:
             cloud = keeper.follow(model, parents, cloud, w, seen)
-        return cloud, Told(*mean_and_variance(model, cloud), expected, trace | told)
+        return cloud, Told(*mean_and_variance(model, cloud, heft), expected, trace | told)
 
-    def tell(self, model: StateSpaceModel, cloud: Cloud, told: Told, seen: Record) -> Info:
-        """For the report."""
-        info = described(model, cloud, told.mean, told.variance, told.trace)
-        return info._replace(nis=lambda: surprise(model, cloud.x, told.expected, seen))
+    def tell(self, model: StateSpaceModel, cloud: Cloud, told: Told, seen: Callable[[], Record]) -> Info:
+        """For the report, which seldom asks for what was `seen`."""
+
+        def nis() -> tuple[Tensor, Tensor]:
+            return surprise(model, cloud.x, told.expected, seen())
+
+        return described(model, cloud, told.mean, told.variance, told.trace, nis)
 
 
 def _normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Log weights -> normalised (flat where none is finite), their logsumexp (then -inf) [R], effective sample size [R]."""
-    total = log_w.logsumexp(1)
-    lost = ~torch.isfinite(total)
-    log_w = torch.where(lost[:, None], -math.log(log_w.shape[1]), log_w - total[:, None])
-    return log_w, torch.where(lost, -torch.inf, total), 1.0 / torch.exp(2.0 * log_w).sum(1)
+    """Log weights -> normalised (flat where none is finite), their logsumexp (then -inf) [R], the weights themselves.
+
+    One exponential for each particle: they cost more than all else of a small step that is not drawn or copied.
+    """
+    top = log_w.detach().amax(1, keepdim=True)
+    top = torch.where(torch.isfinite(top), top, 0.0)
+    part = torch.exp(log_w - top)
+    whole = part.sum(1, keepdim=True)
+    lost = ~(torch.isfinite(whole) & (whole > 0.0))
+    whole = torch.where(lost, 1.0, whole)
+    total, flat = top + torch.log(whole), 1.0 / log_w.shape[1]
+    log_w, heft = torch.where(lost, math.log(flat), log_w - total), torch.where(lost, flat, part / whole)
+    return log_w, torch.where(lost, -torch.inf, total).squeeze(1), heft
 
 
 def surprise(model: StateSpaceModel, x: Tensor, log_w: Tensor, seen: Record) -> tuple[Tensor, Tensor]:
@@ -202,12 +215,11 @@ def bury(x: Tensor, log_w: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
 
 def summarise(model: StateSpaceModel, cloud: Cloud, trace: dict[str, Tensor]) -> Info:
     """Estimate and spread of a cloud, for the report: sums over particles, no copy of the cloud is kept."""
-    return described(model, cloud, *mean_and_variance(model, cloud), trace)
+    return described(model, cloud, *mean_and_variance(model, cloud, weights(cloud.log_w)), trace)
 
 
-def mean_and_variance(model: StateSpaceModel, cloud: Cloud) -> tuple[Tensor, Tensor]:
-    """Of a cloud: [R, D] and, in the chart about the mean, [R, d]."""
-    w = weights(cloud.log_w)
+def mean_and_variance(model: StateSpaceModel, cloud: Cloud, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Of a cloud with weights w [R, N]: [R, D] and, in the chart about the mean, [R, d]."""
     if model.chart.flat:
         mean, variance = _flat_moments(cloud.x, w)
         return mean, variance
@@ -215,7 +227,14 @@ def mean_and_variance(model: StateSpaceModel, cloud: Cloud) -> tuple[Tensor, Ten
     return mean, (w.unsqueeze(-2) @ model.chart.subtract(cloud.x, mean.unsqueeze(1)).square()).squeeze(-2)
 
 
-def described(model: StateSpaceModel, cloud: Cloud, mean: Tensor, variance: Tensor, trace: dict[str, Tensor]) -> Info:
+def described(
+    model: StateSpaceModel,
+    cloud: Cloud,
+    mean: Tensor,
+    variance: Tensor,
+    trace: dict[str, Tensor],
+    nis: Callable[[], tuple[Tensor, Tensor]] | None = None,
+) -> Info:
     """What a report wants of a cloud whose mean and variance are known."""
 
     def deviations() -> tuple[Tensor, Tensor]:
@@ -231,7 +250,7 @@ def described(model: StateSpaceModel, cloud: Cloud, mean: Tensor, variance: Tens
             return _spread(cloud.x, mean, w, groups)
         return _spread(deviations()[0], torch.zeros_like(variance), w, groups)
 
-    return Info(mean, variance, covariance, trace, deviations, some=some)
+    return Info(mean, variance, covariance, trace, deviations, nis, some)
 
 
 def _separate_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:

@@ -75,7 +75,7 @@ class Points:
         values, covariance = f(xi.expand(like.shape[0], -1, -1))
         y = space.mean(values, w_mean.expand(values.shape[:2]))
         r = space.subtract(values, y.unsqueeze(1))
-        m = (w_cov[:, None] * r).mT @ xi
+        m = r.mT @ (w_cov[:, None] * xi)
         left = r - xi @ m.mT
         own = (w_mean[:, None, None] * covariance).sum(1) if covariance.shape[1] > 1 else covariance[:, 0]
         return Linearised(y, m, (w_cov[:, None] * left).mT @ left + own, own)
