@@ -5,10 +5,13 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from pyro import poutine
 from pyro.distributions import Beta, LogNormal, Normal
+from scipy.stats import f as f_law
+from scipy.stats import kstest, multivariate_t
 from torch import Tensor
 from torch.distributions import Independent
 
@@ -26,7 +29,7 @@ from pfbench.model.toys import Growth, Pendulum, StochasticVolatility
 from pfbench.model.urban_gnss import TailedNormal
 from pfbench.ppl.apiece import Apiece
 from pfbench.ppl.online import online
-from pfbench.ppl.pmmh import Held, Ordered, pmmh, tiled
+from pfbench.ppl.pmmh import Held, Ordered, _Walk, pmmh, tiled
 from pfbench.ppl.posterior import Posterior, picture
 from pfbench.ppl.program import ExactHMM, Filtered, Unknown, latent_program, program, simulate, unrolled
 from pfbench.ppl.switching import Switching, emission
@@ -305,8 +308,41 @@ def test_correlated_draws_make_the_likelihood_s_ratio_less_noisy_if_particles_ar
     assert ordered < 0.7 * spread(0.99, always)
 
 
+def test_leaps_are_of_a_t_law_and_know_its_density() -> None:
+    """Squared lengths under a law of t with 5 degrees of freedom are 3 F(3, 5) in three dimensions; SciPy has its density."""
+    root = torch.tensor([[1.0, 0.0, 0.0], [0.4, 0.7, 0.0], [-0.3, 0.2, 2.0]], dtype=torch.float64)
+    mean, covariance = torch.tensor([[1.0, -2.0, 0.5]], dtype=torch.float64), (root @ root.mT)[None]
+    z = mean + 2.0 * torch.randn(2000, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    walk = _Walk(mean, covariance, torch.zeros(1, dtype=torch.float64))
+    new, log_back = walk.leap(z, MonteCarlo(1, torch.arange(2000)).at(1))
+    law = multivariate_t(mean[0].numpy(), covariance[0].numpy() + 1e-6 * np.eye(3), df=5)
+    np.testing.assert_allclose(log_back[:, 0], law.logpdf(z[:, 0].numpy()) - law.logpdf(new[:, 0].numpy()), atol=1e-9)
+    length = torch.linalg.solve_triangular(root, (new - mean).mT, upper=False).square().sum((1, 2)) / 3.0
+    assert kstest(length.numpy(), f_law(3, 5).cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("leaps", [1, 10**6])
+def test_chains_that_start_elsewhere_come_to_the_posterior_by_steps_and_by_leaps(leaps: int) -> None:
+    """Nothing is measured, so that the posterior is the prior; in the second case they only leap."""
+    start = {"a": LogNormal(0.6, 0.9), "b": LogNormal(-0.6, 0.9)}
+    ticks: list[None] = []
+    found = pmmh(
+        LEVELS, EKF, Record(torch.full((1, 1, 1), torch.nan, dtype=torch.float64)), 5, 16, chains=120, seed=3, thin=4,
+        start=start, leaps=leaps, tick=lambda: ticks.append(None),
+    )  # fmt: skip
+    assert len(ticks) == 36
+    for name, law in LEVELS.prior.items():
+        z = (found.flat(name).log() - law.loc) / law.scale
+        assert abs(z.mean()) < 0.2
+        assert 0.75 < z.square().mean() < 1.3
+
+
 def test_pmmh_says_what_it_cannot_do() -> None:
     record = Record(torch.zeros(1, 3, 1, dtype=torch.float64))
+    with pytest.raises(ValueError, match="leaps=-1"):
+        pmmh(LEVELS, EKF, record, 1, 1, leaps=-1)
+    with pytest.raises(ValueError, match=r"start of \['a'\]; give a law for each of \['a', 'b'\]"):
+        pmmh(LEVELS, EKF, record, 1, 1, start={"a": LogNormal(0.0, 1.0)})
     with pytest.raises(ValueError, match="rho=1"):
         pmmh(LEVELS, EKF, record, 1, 1, rho=1.0)
     with pytest.raises(ValueError, match="draws=0"):
@@ -338,6 +374,8 @@ def test_a_table_tells_chains_that_have_not_met() -> None:
         assert abs(table[column]["a"] - truth) < 0.2
     figure = picture({"both": posterior}, {"a": Normal(0.0, 2.0), "b": LogNormal(1.0, 1.0)}, {"a": 0.0})
     assert len(figure.axes) == 4
+    named = picture({"both": posterior}, {"a": Normal(0.0, 2.0), "b": LogNormal(1.0, 1.0)}, names={"b": "b, m"})
+    assert [axis.get_ylabel() for axis in named.axes[::2]] == ["a", "b, m"]
     apart = Posterior({"a": met.view(4, 100, 5)}, torch.full((4, 5), 0.3))
     assert apart.run(2).draws["a"].shape == (4, 100)
     with pytest.raises(ValueError, match="run\\(r\\)"):

@@ -92,8 +92,9 @@ def test_particle_marginal_chains_find_the_grid_s_posterior() -> None:
 
 
 @pytest.mark.slow
-def test_metropolis_on_a_kalman_likelihood_finds_it_too() -> None:
-    agrees(pmmh(NILE, EKF, nile(YEARS), draws=60, warmup=40, chains=24, seed=2).table(), YEARS)
+@pytest.mark.parametrize("leaps", [0, 3])
+def test_metropolis_on_a_kalman_likelihood_finds_it_too(leaps: int) -> None:
+    agrees(pmmh(NILE, EKF, nile(YEARS), draws=60, warmup=40, chains=24, seed=2, leaps=leaps).table(), YEARS)
 
 
 @pytest.mark.slow

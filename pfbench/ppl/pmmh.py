@@ -6,6 +6,7 @@ All chains walk at once, as runs of one batch: the Python loop is over iteration
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -19,11 +20,12 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.resamplers import Resampler
 from pfbench.model.base import StateSpaceModel
 from pfbench.ppl.posterior import Posterior
-from pfbench.ppl.program import Unknown
+from pfbench.ppl.program import Law, Unknown
 from pfbench.record import Record, map_inputs
 
 _ASKED = 0.25  # acceptance that the walk's size is tuned to: near the optimum for few dimensions and a noisy likelihood
 _TRIES = 20
+_FREEDOM = 5  # of the t law of leaps: tails heavier than the posterior's, so that no chain is left behind in one
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,28 +108,45 @@ class _Walk(NamedTuple):
     log_size: Tensor
 
     def root(self) -> Tensor:
-        p = self.mean.shape[-1]
-        eye = torch.eye(p, dtype=self.mean.dtype)
-        return torch.exp(self.log_size)[:, None, None] * torch.linalg.cholesky(self.covariance + 1e-6 * eye)
+        return torch.linalg.cholesky(self.covariance + 1e-6 * torch.eye(self.mean.shape[-1], dtype=self.mean.dtype))
 
-    def learned(self, z: Tensor, share: Tensor, rate: float) -> _Walk:
-        """One step of stochastic approximation, by chains z [C, Q, P] and their acceptance share [Q]."""
+    def step(self, z: Tensor, own: Draws) -> tuple[Tensor, Tensor]:
+        """A proposal around z [C, Q, P], and log q(z | new) - log q(new | z) [C, Q]."""
+        e = own.normal("pmmh.walk", 1, z.shape[-1]).view_as(z)
+        root = torch.exp(self.log_size)[:, None, None] * self.root()
+        return z + (root @ e.unsqueeze(-1)).squeeze(-1), torch.zeros_like(z[..., 0])
+
+    def leap(self, z: Tensor, own: Draws) -> tuple[Tensor, Tensor]:
+        """The same for one that does not know where z is: a t law with the posterior's mean and covariance."""
+        e, root = own.normal("pmmh.leap", 1, z.shape[-1]).view_as(z), self.root()
+        scale = own.normal("pmmh.tail", 1, _FREEDOM).square().mean(-1).view_as(z[..., 0]).rsqrt().unsqueeze(-1)
+        before = torch.linalg.solve_triangular(root, (z - self.mean).unsqueeze(-1), upper=False).squeeze(-1)
+
+        def log_q(off: Tensor) -> Tensor:
+            return -0.5 * (_FREEDOM + off.shape[-1]) * torch.log1p(off.square().sum(-1) / _FREEDOM)
+
+        return self.mean + scale * (root @ e.unsqueeze(-1)).squeeze(-1), log_q(before) - log_q(scale * e)
+
+    def learned(self, z: Tensor, share: Tensor | None, rate: float) -> _Walk:
+        """One step of stochastic approximation, by chains z [C, Q, P] and, of a step, their acceptance share [Q]."""
         d = z - self.mean
         spread = (d.unsqueeze(-1) * d.unsqueeze(-2)).mean(0)
-        size = self.log_size + rate * (share - _ASKED)
+        size = self.log_size if share is None else self.log_size + rate * (share - _ASKED)
         return _Walk(self.mean + rate * d.mean(0), self.covariance + rate * (spread - self.covariance), size)
 
 
 def pmmh(
     unknown: Unknown, method: Filter, record: Record, draws: int, warmup: int, chains: int = 4, seed: int = 0,
-    apart: bool = False, rho: float = 0.0, thin: int = 1,
+    apart: bool = False, rho: float = 0.0, thin: int = 1, start: Mapping[str, Law] | None = None, leaps: int = 0,
+    tick: Callable[[], object] | None = None,
 ) -> Posterior:  # fmt: skip
     """Draws from p(numbers | y_1:T), exact for any number of particles if the filter's likelihood estimate is unbiased [Andrieu,
     Doucet and Holenstein 2010]. With a Gaussian filter it is plain Metropolis-Hastings on that filter's likelihood.
 
     The walk is on the whole real line (logarithms of scales), normal with a covariance and a size that are learned in the
     warm-up from all chains of a posterior [Andrieu and Thoms 2008, algorithm 4] and then stay as they are. Chains start from the
-    prior, and anew where the filter is lost.
+    prior, and anew where the filter is lost. Where the posterior is about normal, leaps between the steps of the walk mix better:
+    proposals from a t law with the learned mean and covariance, wherever the chain is.
 
     Args:
         unknown: the model and the prior of its numbers.
@@ -141,39 +160,51 @@ def pmmh(
         rho: correlation of the filter's draws from iteration to iteration; memory holds them all. Needs a resampler that is
             `Ordered` and, for more than a few states, helps little.
         thin: iterations for each draw kept.
+        start: laws that chains start from and the walk's first covariance is of, by the numbers' names, with the prior's
+            supports; wider than the posterior, so that r-hat can tell whether they have met. None takes the prior.
+        leaps: after every step of the walk.
+        tick: called after each iteration (a progress bar).
 
     Raises:
-        ValueError: no draws or chains, rho outside [0, 1); chains that find no start.
+        ValueError: no draws or chains, rho outside [0, 1); a start of other numbers; chains that find no start.
     """
-    for name, value, least in (("draws", draws, 1), ("warmup", warmup, 0), ("chains", chains, 1), ("thin", thin, 1)):
-        if value < least:
-            raise ValueError(f"pmmh: {name}={value}; give a whole number, {least} or more")
+    least = {"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1), "thin": (thin, 1), "leaps": (leaps, 0)}
+    for name, (value, low) in least.items():
+        if value < low:
+            raise ValueError(f"pmmh: {name}={value}; give a whole number, {low} or more")
+    if start is not None and set(start) != set(unknown.names):
+        raise ValueError(f"pmmh: start of {sorted(start)}; give a law for each of {sorted(unknown.names)}")
     if not 0.0 <= rho < 1.0:
         raise ValueError(f"pmmh: rho={rho}; give a correlation, 0 or more and below 1")
-    target = _Target(unknown, method, record, chains, seed, apart, rho)
+    first = unknown if start is None else Unknown(unknown.make, {name: start[name] for name in unknown.names})
+    target = _Target(unknown, first, method, record, chains, seed, apart, rho)
     with torch.no_grad():
-        return _walked(target, draws, warmup, thin)
+        return _walked(target, draws, warmup, thin, leaps, tick)
 
 
-def _walked(target: _Target, draws: int, warmup: int, thin: int) -> Posterior:
+def _walked(
+    target: _Target, draws: int, warmup: int, thin: int, leaps: int, tick: Callable[[], object] | None
+) -> Posterior:
     z, log_p = target.start()
-    walk = _Walk(z.mean(0), target.prior_covariance(), torch.full((z.shape[1],), -0.5, dtype=z.dtype))
+    walk = _Walk(z.mean(0), target.first_covariance(), torch.full((z.shape[1],), -0.5, dtype=z.dtype))
     kept, hits = [], torch.zeros_like(log_p)
     for i in range(1, warmup + draws * thin + 1):
         own = MonteCarlo(target.seed, torch.arange(log_p.numel())).at(i)
-        e = own.normal("pmmh.walk", 1, z.shape[-1]).view_as(z)
-        new = z + (walk.root() @ e.unsqueeze(-1)).squeeze(-1)
+        stepping = i % (leaps + 1) == 0
+        new, log_back = walk.step(z, own) if stepping else walk.leap(z, own)
         log_new, held = target(new, i)
-        share = torch.exp(log_new - log_p).clamp(max=1.0)
+        share = torch.exp(log_new - log_p + log_back).clamp(max=1.0)
         hit = own.uniform("pmmh.accept", 1, 1).view_as(share) < share
         target.keep(held, hit)
         z, log_p = torch.where(hit.unsqueeze(-1), new, z), torch.where(hit, log_new, log_p)
         if i <= warmup:
-            walk = walk.learned(z, share.mean(0), (i + 1.0) ** -0.6)
+            walk = walk.learned(z, share.mean(0) if stepping else None, (i + 1.0) ** -0.6)
         else:
             hits += hit
             if (i - warmup) % thin == 0:
                 kept.append(z)
+        if tick:
+            tick()
     values, _ = target.unknown.constrained(torch.stack(kept, 1))  # {name: [C, S, Q]}
     accepted = hits / (draws * thin)
     if not target.apart:
@@ -185,9 +216,9 @@ class _Target:
     """log p(z) + log p(y | z) of chains z [C, Q, P] (Q = R posteriors apart, 1 together), estimated anew at every call."""
 
     def __init__(
-        self, unknown: Unknown, method: Filter, record: Record, chains: int, seed: int, apart: bool, rho: float
+        self, unknown: Unknown, first: Unknown, method: Filter, record: Record, chains: int, seed: int, apart: bool, rho: float
     ) -> None:
-        self.unknown, self.method, self.seed, self.apart, self.rho = unknown, method, seed, apart, rho
+        self.unknown, self.first, self.method, self.seed, self.apart, self.rho = unknown, first, method, seed, apart, rho
         self.runs = len(record.y)
         self.shape = (chains, self.runs if apart else 1)
         self.each = 1 if apart else self.runs
@@ -224,20 +255,20 @@ class _Target:
             if bool(torch.isfinite(log_p).all()):
                 return z, log_p
         lost = int((~torch.isfinite(log_p)).sum())
-        raise ValueError(f"pmmh: {lost} chains are lost at {_TRIES} draws from the prior each; narrow it, or take more particles")
+        raise ValueError(f"pmmh: {lost} chains are lost at {_TRIES} draws of a start; narrow the prior, or take more particles")
 
     @property
     def somewhere(self) -> dict[str, Tensor]:
         return {name: a.median() for name, a in self.unknown.draw(101, self.seed).items()}
 
-    def prior_covariance(self) -> Tensor:
-        z = self.unknown.unconstrained(self.unknown.draw(1000, self.seed))
+    def first_covariance(self) -> Tensor:
+        z = self.unknown.unconstrained(self.first.draw(1000, self.seed))
         p = z.shape[-1]
         return torch.cov(z.T).view(1, p, p).repeat(self.shape[1], 1, 1)
 
     def _drawn(self, attempt: int) -> Tensor:
         count = self.shape[0] * self.shape[1]
-        return self.unknown.unconstrained(self.unknown.draw(count, self.seed + 7919 * (attempt + 1))).view(*self.shape, -1)
+        return self.unknown.unconstrained(self.first.draw(count, self.seed + 7919 * (attempt + 1))).view(*self.shape, -1)
 
 
 def tiled(record: Record, copies: int) -> Record:

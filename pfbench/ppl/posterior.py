@@ -34,6 +34,18 @@ class Posterior:
     accepted: Tensor | None = None
     how: str = ""
 
+    def told(self) -> dict[str, Any]:
+        """As JSON can hold it; `heard` is the way back."""
+        accepted = None if self.accepted is None else self.accepted.tolist()
+        return {"draws": {name: a.tolist() for name, a in self.draws.items()}, "accepted": accepted, "how": self.how}
+
+    @staticmethod
+    def heard(told: Mapping[str, Any]) -> Posterior:
+        """The posterior that told so."""
+        draws = {name: torch.tensor(a, dtype=torch.float64) for name, a in told["draws"].items()}
+        accepted = None if told["accepted"] is None else torch.tensor(told["accepted"], dtype=torch.float64)
+        return Posterior(draws, accepted, told["how"])
+
     def run(self, r: int) -> Posterior:
         """Of one run that has numbers of its own."""
         accepted = None if self.accepted is None else self.accepted[..., r]
@@ -76,21 +88,23 @@ class Posterior:
 
 
 def picture(
-    posteriors: Mapping[str, Posterior], prior: Mapping[str, Any], truth: Mapping[str, float] | None = None
-) -> Figure:
+    posteriors: Mapping[str, Posterior], prior: Mapping[str, Any], truth: Mapping[str, float] | None = None,
+    names: Mapping[str, str] | None = None,
+) -> Figure:  # fmt: skip
     """Traces of the chains and densities of the draws, a row for each number, an algorithm a colour; dotted is the prior.
 
     Args:
         posteriors: by label.
         prior: laws of the numbers.
         truth: by number, where it is known: a vertical line.
+        names: what to call a number at its axes, with its unit; None as in the prior.
     """
-    names, truth = list(prior), truth or {}
+    truth, called = truth or {}, {name: name.replace("_", " ") for name in prior} | dict(names or {})
     drawn = looks(list(posteriors))
     with matplotlib.rc_context(RC):
-        figure = Figure(figsize=(2 * COLUMN, 0.3 + 1.5 * len(names)), layout="constrained")
-        axes = figure.subplots(len(names), 2, squeeze=False, width_ratios=(1.4, 1.0))
-        for (trace, density), name in zip(axes, names, strict=True):
+        figure = Figure(figsize=(2 * COLUMN, 0.3 + 1.5 * len(prior)), layout="constrained")
+        axes = figure.subplots(len(prior), 2, squeeze=False, width_ratios=(1.4, 1.0))
+        for (trace, density), name in zip(axes, prior, strict=True):
             for label, posterior in posteriors.items():
                 chains = posterior.draws[name].double().numpy()
                 if posterior.accepted is not None:
@@ -105,8 +119,8 @@ def picture(
             density.plot(wide, prior[name].log_prob(wide).exp(), color="0.5", linestyle=":", label="prior")
             if name in truth:
                 density.axvline(truth[name], color="black", linewidth=0.8, label="truth")
-            trace.set_ylabel(name.replace("_", " "))
-            density.set_xlabel(name.replace("_", " "))
+            trace.set_ylabel(called[name])
+            density.set_xlabel(called[name])
             density.set_yticks([])
         axes[0, 0].set_title("chains")
         axes[0, 1].set_title("density")
