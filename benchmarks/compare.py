@@ -20,13 +20,13 @@ import numpy as np
 import problems
 import workload
 from matplotlib.figure import Figure
-from race import HERE, Contestant, Result, race
-from w4 import cpu_name
+from race import HERE, Contestant, Result, cpu_name, race
 
 TOLERANCE = 4.5  # standard errors, in some hundred comparisons
 EXACT = 0.05  # of the log evidence, where filters draw nothing: two round differently, or add a jitter
 
 FLOAT32 = Contestant("pfbench float32, compiled", "own", ("house.py", "float32", "compiled"))
+LOOPS = Contestant("pfbench float32, C++ loops", "own", ("house.py", "float32", "loops"))
 EAGER = Contestant("pfbench float32, eager", "own", ("house.py", "float32", "eager"))
 FLOAT64 = Contestant("pfbench float64, compiled", "own", ("house.py", "float64", "compiled"))
 LIMIT = Contestant("fused C", "own", ("fused.py",))
@@ -34,22 +34,25 @@ JAX = Contestant("JAX, jitted scan", "jax", ("peer_jax.py", "vmap"))
 CUTHBERT = Contestant("cuthbert", "jax", ("peer_cuthbert.py",))
 PYRO = Contestant("Pyro SMCFilter", "own", ("peer_pyro.py",))
 FILTERPY = Contestant("FilterPy", "jax", ("peer_filterpy.py", "sir"))
+STONESOUP = Contestant("Stone Soup", "jax", ("peer_stonesoup.py", "sir"))
 NUMBA = Contestant("particles", "numba", ("peer_particles.py",))
-SMALL = (FLOAT32, EAGER, LIMIT, JAX, NUMBA, CUTHBERT, PYRO, FILTERPY)
-LARGE = (FLOAT32, EAGER, LIMIT, JAX, NUMBA, CUTHBERT)
+SMALL = (FLOAT32, LOOPS, EAGER, LIMIT, JAX, NUMBA, CUTHBERT, PYRO, FILTERPY, STONESOUP)
+LARGE = (FLOAT32, LOOPS, EAGER, LIMIT, JAX, NUMBA, CUTHBERT)
 BATCH = (
-    FLOAT32, EAGER, FLOAT64, LIMIT, JAX, Contestant("JAX, run by run", "jax", ("peer_jax.py", "loop")),
+    FLOAT32, LOOPS, EAGER, FLOAT64, LIMIT, JAX, Contestant("JAX, run by run", "jax", ("peer_jax.py", "loop")),
     Contestant("particles float32", "numba", ("peer.py", "float32")),
     Contestant("particles float64", "numba", ("peer.py", "float64")), CUTHBERT,
     Contestant("naive torch float32", "own", ("naive.py", "float32")),
 )  # fmt: skip
 GAUSSIAN = (
+    Contestant("pfbench float32, C++ loops", "own", ("house.py", "float32", "loops", "ckf")),
     Contestant("pfbench float32, eager", "own", ("house.py", "float32", "eager", "ckf")),
-    Contestant("pfbench float64, eager", "own", ("house.py", "float64", "eager", "ckf")),
+    Contestant("pfbench float64, C++ loops", "own", ("house.py", "float64", "loops", "ckf")),
     Contestant("dynamax", "jax", ("peer_dynamax.py",)),
     Contestant("FilterPy", "jax", ("peer_filterpy.py", "ckf")),
+    Contestant("Stone Soup", "jax", ("peer_stonesoup.py", "ckf")),
 )
-LIBRARIES = ("JAX", "particles", "cuthbert", "Pyro SMCFilter", "FilterPy", "dynamax")
+LIBRARIES = ("JAX", "particles", "cuthbert", "Pyro SMCFilter", "FilterPy", "dynamax", "Stone Soup")
 COLOURS = {"pfbench": "#0072B2", "fused C": "#D55E00"}  # Okabe and Ito 2008; all others grey
 
 
@@ -76,6 +79,11 @@ CASES = (
     Case("W4, N = 500", "15-state INS error model", "ins", 100, 200, 500, BATCH, 5.0, 2.6),
     Case("W5", "cubature filter on W4's model", "ins", 100, 200, 500, GAUSSIAN, 1.6, None),
 )
+ALSO = (  # a contestant of ours, a rival, and the goal
+    ("W4, N = 500", LOOPS.label, "particles", 3.0),
+    ("W4, N = 500", FLOAT64.label, "particles", 2.5),
+    ("W5", GAUSSIAN[0].label, "FilterPy", 25.0),
+)
 
 
 def work(case: Case, scale: float) -> Mapping[str, Any]:
@@ -91,19 +99,19 @@ def disagreements(found: Mapping[Contestant, Result], exact: bool) -> list[str]:
     said = []
     for name, what in (("evidence", "log evidence"), ("normalised", "mean square error")):
         values = {who: result.qualities[name] for who, result in found.items() if not np.isnan(result.qualities[name]).any()}
-        for who, own in values.items():
+        for who, own in values.items() if len(values) > 1 else ():
             others = np.concatenate([other for key, other in values.items() if key is not who])
             off = own.mean(0) - others.mean(0)  # of each run
             if exact:
-                bad = bool(np.abs(off).max() > (EXACT if name == "evidence" else 1e-2 * others.mean()))
-                error = 0.0
-            elif len(off) > 1:
+                most = float(np.abs(off).max())
+                if not most <= (EXACT if name == "evidence" else 1e-2 * others.mean()):
+                    said.append(f"{who.label}: {what} differs from the others' by up to {most:.2g}")
+                continue
+            if len(off) > 1:
                 error = off.std(ddof=1) / np.sqrt(len(off))
-                bad = not abs(off.mean()) < TOLERANCE * error
             else:
                 error = np.sqrt(own.var(ddof=1) / len(own) + others.var(ddof=1) / len(others))
-                bad = not abs(off.mean()) < TOLERANCE * error
-            if bad:
+            if not abs(off.mean()) < TOLERANCE * error:
                 said.append(f"{who.label}: {what} differs from the others' by {off.mean():.3g} +- {error:.2g}")
     return said
 
@@ -111,6 +119,11 @@ def disagreements(found: Mapping[Contestant, Result], exact: bool) -> list[str]:
 def fastest(found: Mapping[Contestant, Result], wanted: Callable[[Contestant], bool]) -> Contestant | None:
     """Of those that are wanted, the one with the smallest median."""
     return min(filter(wanted, found), key=lambda who: float(np.median(found[who].cpu)), default=None)
+
+
+def starting(label: str) -> Callable[[Contestant], bool]:
+    """Those whose labels begin so."""
+    return lambda who: who.label.startswith(label)
 
 
 def ratio(slow: Result, fast: Result) -> tuple[float, float, float]:
@@ -168,6 +181,14 @@ def summary(found: Mapping[Case, Mapping[Contestant, Result]]) -> list[str]:
             f"| {case.name} | {ours.label} | {theirs.label} | {middle:.2f} ({low:.2f}-{high:.2f}) | {_goal(middle, case.must)} "
             f"| {f'{behind:.1f}' if behind else '-'} | {_goal(-behind, -case.limit) if behind and case.limit else '-'} |"
         )
+    by_name = {case.name: results for case, results in found.items()}
+    for name, label, rival, must in ALSO:
+        results = by_name.get(name, {})
+        ours, theirs = fastest(results, starting(label)), fastest(results, starting(rival))
+        if ours and theirs:
+            low, middle, high = ratio(results[theirs], results[ours])
+            quick = f"{middle:.2f} ({low:.2f}-{high:.2f})"
+            lines.append(f"| {name} | {label} | {theirs.label} | {quick} | {_goal(middle, must)} | - | - |")
     return lines
 
 
@@ -185,11 +206,12 @@ def draw(found: Mapping[Case, Mapping[Contestant, Result]], path: Path) -> None:
             colour = COLOURS.get("pfbench" if own(who) else who.label, "#777777")
             axis.plot([low, high], [place, place], color=colour, lw=1.5)
             axis.plot(middle, place, "o", color=colour, ms=4)
-            axis.annotate(f"{middle:.3g}", (high, place), (5, 0), textcoords="offset points", va="center", fontsize=7)
+            told = f"{middle:,.0f}" if middle >= 100.0 else f"{middle:.3g}"
+            axis.annotate(told, (high, place), (5, 0), textcoords="offset points", va="center", fontsize=7)
         axis.set(xscale="log", ylim=(len(results) - 0.4, -0.6))
         axis.set_yticks(range(len(results)), [who.label for who in results], fontsize=7)
         axis.set_title(f"{case.name}: {case.said}", fontsize=8, loc="left")
-        axis.margins(x=0.12)
+        axis.margins(x=0.15)
         axis.tick_params(axis="x", labelsize=7)
         axis.spines[["top", "right"]].set_visible(False)
     axes[-1].set_xlabel("CPU time in ms, one thread (median, quartiles)", fontsize=8)
@@ -199,7 +221,7 @@ def draw(found: Mapping[Case, Mapping[Contestant, Result]], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--numba", default="", help="Python that has the library particles; without, it takes no part")
-    parser.add_argument("--jax", default="", help="Python that has jax, cuthbert, dynamax and filterpy; likewise")
+    parser.add_argument("--jax", default="", help="Python that has jax, cuthbert, dynamax, filterpy and stonesoup; likewise")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--scale", type=float, default=1.0, help="below 1: shorter and smaller, to try it out")
     parser.add_argument("--only", default="", help="workloads whose names begin so")

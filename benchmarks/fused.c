@@ -6,6 +6,9 @@
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
+#ifdef __SSE2__
+#include <immintrin.h>
+#endif
 
 static uint32_t s[4];
 
@@ -94,24 +97,25 @@ static void fill(float *out, int n) {
   }
 }
 
-/* Weighs by log_w, sums up, and tells which particles to go on from; returns the step's log evidence. */
-static double settle(int n, const float *log_w, float *w, int32_t *ancestor, float *ess) {
+/* Weighs by log_w, sums up, and tells which particles to go on from; returns the step's log evidence. Without a branch on what
+   was drawn: slots of a particle end where its sum of weights does, and of several that begin at a slot the last one has it. */
+static double settle(int n, const float *log_w, float *w, int32_t *ancestor, int32_t *first, float *ess) {
   float top = log_w[0];
   for (int i = 1; i < n; i++) top = log_w[i] > top ? log_w[i] : top;
-  double total = 0.0, square = 0.0;
+  float total = 0.0f, square = 0.0f;
   for (int i = 0; i < n; i++) w[i] = expf(log_w[i] - top);
-  for (int i = 0; i < n; i++) { total += w[i]; square += (double)w[i] * w[i]; }
-  const float scale = (float)(1.0 / total);
-  double reached = 0.0, at = uniform() * total / n;
-  const double step = total / n;
-  int j = 0;
-  for (int i = 0; i < n; i++) {
-    reached += w[i];
-    while (j < n && at < reached) { ancestor[j++] = i; at += step; }
-    w[i] *= scale;
+  for (int i = 0; i < n; i++) { total += w[i]; square += w[i] * w[i]; }
+  const float scale = 1.0f / total, slots = n * scale, u = uniform();
+  for (int i = 0; i <= n; i++) first[i] = 0;
+  double reached = 0.0;
+  for (int i = 0; i + 1 < n; i++) {
+    const int32_t end = (int32_t)ceilf((float)(reached += w[i]) * slots - u);
+    first[end < 0 ? 0 : end > n ? n : end] = i + 1;
   }
-  while (j < n) ancestor[j++] = n - 1;
-  *ess = (float)(total * total / square);
+  int32_t latest = 0;
+  for (int j = 0; j < n; j++) ancestor[j] = latest = first[j] > latest ? first[j] : latest;
+  for (int i = 0; i < n; i++) w[i] *= scale;
+  *ess = total * total / square;
   return top + log(total / n);
 }
 
@@ -153,7 +157,11 @@ double run(int kind, int n, int d, int k, int steps, int first, const float *par
            double *mean, double *variance, float *ess) {
   float *x = malloc(sizeof(float) * n * d), *next = malloc(sizeof(float) * n * d), *log_w = malloc(sizeof(float) * n);
   float *w = malloc(sizeof(float) * n), *z = malloc(sizeof(float) * n * 2 * d);
-  int32_t *ancestor = malloc(sizeof(int32_t) * n);
+  int32_t *ancestor = malloc(sizeof(int32_t) * n), *first_of = malloc(sizeof(int32_t) * (n + 1));
+#ifdef __SSE2__
+  const unsigned usual = _mm_getcsr();
+  _mm_setcsr(usual | 0x8040); /* numbers below the smallest normal one count as 0: they cost a hundred times as much */
+#endif
   double log_z = 0.0;
   for (int c = 0; c < d; c++)
     for (int i = 0; i < n; i++) x[(size_t)c * n + i] = (kind == 3 ? 0.0f : par[8 + c]) + (kind == 3 ? par[c] : par[12 + c]) * normal();
@@ -207,10 +215,13 @@ double run(int kind, int n, int d, int k, int steps, int first, const float *par
         for (int i = 0; i < n; i++) { const float e = (seen[c] - p[i]) * r; log_w[i] -= 0.5f * e * e; }
       }
     }
-    log_z += settle(n, log_w, w, ancestor, ess + t);
+    log_z += settle(n, log_w, w, ancestor, first_of, ess + t);
     moments(n, d, next, w, mean + (size_t)t * d, variance + (size_t)t * d);
     float *swap = x; x = next; next = swap;
   }
-  free(x); free(next); free(log_w); free(w); free(z); free(ancestor);
+  free(x); free(next); free(log_w); free(w); free(z); free(ancestor); free(first_of);
+#ifdef __SSE2__
+  _mm_setcsr(usual);
+#endif
   return log_z;
 }

@@ -2,7 +2,7 @@
 
 W1 to W3 are single runs, W4 a batch. Of W3 the package has no model; `Radar` is one as a user would write it.
 
-    python house.py float32|float64 eager|compiled [sir|ckf] WORKLOAD
+    python house.py float32|float64 eager|loops|compiled [sir|ckf] WORKLOAD
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pfbench.filter.compiled import Compiled
 from pfbench.filter.loop import run_filter, runs_at_once
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.resamplers import Resample, Systematic
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel, affine, independent_normal, normal_batch
 from pfbench.model.ins_gnss import Step
 from pfbench.model.toys import Growth, StochasticVolatility
 from pfbench.record import Record
@@ -50,7 +50,7 @@ class Radar(StateSpaceModel):
         return normal_batch(runs, self.spread, self.start)
 
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        return x @ self.phi.mT + w @ self.gain.mT
+        return affine(self.phi[None], x, self.gain[None], w)
 
     def noise_gain(self, u: Any) -> Tensor:
         return self.gain.unsqueeze(0)
@@ -74,28 +74,28 @@ def model_and_record(work: Any, dtype: torch.dtype) -> tuple[StateSpaceModel, Re
     return model, Record(torch.from_numpy(work.y), inputs).to(model.anchor)
 
 
-def sir(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
-    """The project's SIR filter, resampling at every step; `compiled` fuses the kernels."""
+def sir(work: Any, dtype: torch.dtype, engine: str = "eager") -> Filter:
+    """The project's SIR filter, resampling at every step; `engine` as in a job."""
     method = ParticleFilter(int(work.particles), Resample(Systematic(), threshold=1.0))
-    return of(method, method.particles, work, dtype, compiled)
+    return of(method, method.particles, work, dtype, engine)
 
 
-def ckf(work: Any, dtype: torch.dtype, compiled: bool = False) -> Filter:
+def ckf(work: Any, dtype: torch.dtype, engine: str = "eager") -> Filter:
     """The project's cubature filter, as it is configured."""
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         method = job.build(compose("config", ["filter=ckf"])["filter"])
-    return of(method, 1, work, dtype, compiled)
+    return of(method, 1, work, dtype, engine)
 
 
-def of(method: Any, particles: int, work: Any, dtype: torch.dtype, compiled: bool) -> Filter:
+def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) -> Filter:
     """A filter in the project's time loop, in blocks of runs as a job makes them."""
     model, record = model_and_record(work, dtype)
-    method = Compiled(method) if compiled and isinstance(method, ParticleFilter) else method
+    method = Compiled(method) if engine == "compiled" and isinstance(method, ParticleFilter) else method
     runs = torch.arange(len(work.y))
     block = runs_at_once(len(runs), particles, model.chart.size)
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        with fusion.fused(compiled), torch.no_grad():
+        with fusion.fused(engine != "eager"), torch.no_grad():
             estimate = run_filter(method, model, record, MonteCarlo(seed, runs, dtype), at_once=block)
         return estimate.log_evidence, estimate.mean
 
@@ -106,7 +106,7 @@ def contestant(work: Any) -> tuple[Filter, dict[str, str]]:
     torch.set_num_threads(1)
     native.keep_memory()  # as a job does
     filtered = ckf if "ckf" in sys.argv[3:-1] else sir
-    run = filtered(work, getattr(torch, sys.argv[1]), compiled=sys.argv[2] == "compiled")
+    run = filtered(work, getattr(torch, sys.argv[1]), sys.argv[2])
     return run, {"torch": torch.__version__, "numpy": sys.modules["numpy"].__version__}
 
 

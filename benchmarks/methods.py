@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
-from w4 import cpu_name
+from race import cpu_name
 
 from pfbench import fusion, job, native
 from pfbench.draws import MonteCarlo

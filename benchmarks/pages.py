@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from w4 import cpu_name
+from race import cpu_name
 
 HERE = Path(__file__).parent
 FILTERS = ("ekf", "ukf", "ckf", "sir", "apf", "rpf", "gpf")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import subprocess
 import sys
 import tempfile
@@ -103,3 +104,11 @@ def _result(answers: list[dict[str, Any]], versions: dict[str, str], start: floa
     cpu, wall = (np.array([1e3 * answer[clock] for answer in answers]) for clock in ("cpu", "wall"))
     qualities = {name: np.array([answer[name] for answer in answers], dtype=float) for name in QUALITIES}
     return Result(cpu, wall, qualities, versions, start)
+
+
+def cpu_name() -> str:
+    """Model of the processor, never the name of the machine."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from w4 import cpu_name
+from race import cpu_name
 
 from pfbench import fusion, native
 from pfbench.draws import MonteCarlo

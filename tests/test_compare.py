@@ -17,9 +17,10 @@ import fused
 import house
 import problems
 import scaling
-from race import Result
+from race import Result, race
 
 SEEDS = range(24)
+PEERS = compare.HERE.parent / ".venv-peers" / "bin" / "python"
 
 
 def work(kind: str) -> Work:
@@ -70,6 +71,25 @@ def test_filters_that_draw_nothing_agree_to_rounding() -> None:
     assert compare.disagreements(same, exact=True) == []
     other = {who: result(np.full((9, 5), 1.0 + 0.1 * k)) for k, who in enumerate(names)}
     assert len(compare.disagreements(other, exact=True)) == 2
+
+
+def test_every_contestant_has_a_script_and_peers_are_known_as_such() -> None:
+    for who in {who for case in compare.CASES for who in case.contestants}:
+        assert (compare.HERE / who.words[0]).exists(), who.label
+        assert compare.peer(who) == who.words[0].startswith("peer"), who.label
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PEERS.exists(), reason="no .venv-peers, see the Makefile")
+@pytest.mark.parametrize("name", ["W1, N = 1e3", "W3, N = 1e4", "W5"])
+def test_peers_compute_the_same(name: str) -> None:
+    case = next(case for case in compare.CASES if case.name == name)
+    there = [who for who in case.contestants if who.place == "jax"]
+    work = compare.work(case._replace(runs=4, particles=500), 0.1)
+    results = race(work, there, {"jax": str(PEERS)}, rounds=2 if name == "W5" else 60)
+    found = {who: result for who, result in zip(there, results, strict=True) if result is not None}
+    assert list(found) == there
+    assert compare.disagreements(found, exact=name == "W5") == []
 
 
 def test_the_exponent_is_that_of_the_upper_half() -> None:

@@ -39,6 +39,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "survey": MODELLED | PLAIN | FAST | {"filter", "bound", "judge", "scenario", "job"},
     "report": PLAIN,
     "cli": MODELLED | PLAIN | {"filter", "scenario", "job", "survey", "train", "ppl", "report"},
+    "pieces": set(),
     "__main__": {"cli"},
 }
 UPSTAIRS = {"job", "train", "cli"}  # may ask the package itself, for its version
