@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from pfbench.fusion import recording
+from pfbench import native
+from pfbench.fusion import fusible, recording
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
@@ -19,6 +20,13 @@ def factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
     indefinite, a relative 1e-12 (1e-6 in float32) is added to the diagonal; a covariance that this does not heal is
     reported, never repaired in silence. A component without spread has none in the root either.
     """
+    if covariance.dim() == 3:
+        return _rooted(covariance)
+    lower, ok = _rooted(covariance.reshape(-1, *covariance.shape[-2:]))
+    return lower.reshape(covariance.shape), ok.reshape(covariance.shape[:-2])
+
+
+def _separate_root(covariance: Tensor) -> tuple[Tensor, Tensor]:
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     sd = torch.sqrt(torch.where(variance > 0, variance, 1.0))
     correlation = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
@@ -30,6 +38,9 @@ def factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
         healed, still = torch.linalg.cholesky_ex(correlation + jitter * eye)
         lower, ok = torch.where(ok[..., None, None], lower, healed), ok | (still == 0)
     return torch.where(variance > 0, sd, 0.0).unsqueeze(-1) * lower, ok & (variance >= 0).all(-1)
+
+
+_rooted = fusible(_separate_root, by_hand=native.rooted, compiles=False)
 
 
 def squared_length(e: Tensor, covariance: Tensor) -> Tensor:

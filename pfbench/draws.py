@@ -53,19 +53,24 @@ class Source(Draws, Protocol):
         """The same source for some of the runs."""
 
 
-def blocked_normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+def blocked_normals(seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int) -> Tensor:
     """`normals`, component by component where the whole would fall out of the cache; the same numbers."""
-    size = max(1, _BLOCK // max(1, runs.shape[0] * particle.shape[0]))
-    return torch.cat([_normals(key, step, runs, block, particle) for block in component.split(size)])
+    size = max(1, _BLOCK // max(1, runs.shape[0] * quarters))
+    blocks = torch.arange(components, device=runs.device).split(size)
+    return torch.cat([_boxed(_words((seed, purpose), step, runs, block, quarters)) for block in blocks])
 
 
-def _normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+def _normals(seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int) -> Tensor:
     """Standard normals by Box and Muller, float32 [w, R, 4 q]: four for each counter (quarter, component, step, run).
 
-    Args: key [2], step [], runs [R], component [w], particle [q]; all int64.
+    Args: seed [] and the purpose's number are the key; step [], runs [R], w components and q quarters the counter.
     """
+    return _boxed(_words((seed, purpose), step, runs, torch.arange(components, device=runs.device), quarters))
+
+
+def _boxed(words: Words) -> Tensor:
     parts = []
-    a, b, c, d = _words(key, step, runs, component, particle)
+    a, b, c, d = words
     for radial, angular in ((a, b), (c, d)):
         # + 1/2 keeps the logarithm away from 0; a word that rounds up to 1 gives radius 0, which is harmless
         radius = torch.sqrt(-2.0 * torch.log((radial.float() + 0.5) * 2.0**-32))
@@ -77,12 +82,13 @@ def _normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particl
 normals = fusible(_normals, eager=blocked_normals, by_hand=native.normals)
 
 
-def _uniforms(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+def _uniforms(seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int) -> Tensor:
     """Uniforms on the open interval (0, 1), float64 [w, R, 4 q]; arguments as for `normals`."""
-    return (torch.cat(_words(key, step, runs, component, particle), dim=-1).double() + 0.5) * 2.0**-32
+    words = _words((seed, purpose), step, runs, torch.arange(components, device=runs.device), quarters)
+    return (torch.cat(words, dim=-1).double() + 0.5) * 2.0**-32
 
 
-uniforms = fusible(_uniforms, by_hand=native.uniforms, whole=False)
+uniforms = fusible(_uniforms, by_hand=native.uniforms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,33 +127,28 @@ class MonteCarlo:
     def uniform(self, purpose: str, n: int, w: int) -> Tensor:
         return uniforms(*self._counter(purpose, n, w))[..., :n].permute(1, 2, 0)
 
-    def _counter(self, purpose: str, n: int, w: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        def whole(value: object) -> Tensor:
-            return torch.as_tensor(value, device=self.runs.device)
-
-        own = zlib.crc32(purpose.encode())
-        drawn = torch.stack([self.seed, torch.full_like(self.seed, own)]) if isinstance(self.seed, Tensor) else [self.seed, own]
-        key = whole(drawn)
-        quarters = torch.arange(-(-n // 4), device=self.runs.device)
-        return key, whole(self.step), self.runs, torch.arange(w, device=self.runs.device), quarters
+    def _counter(self, purpose: str, n: int, w: int) -> tuple[Tensor, int, Tensor, Tensor, int, int]:
+        seed, step = (torch.as_tensor(value, device=self.runs.device) for value in (self.seed, self.step))
+        return seed, zlib.crc32(purpose.encode()), step, self.runs, w, -(-n // 4)
 
 
-def _words(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Words:
+def _words(key: tuple[Tensor, int], step: Tensor, runs: Tensor, component: Tensor, quarters: int) -> Words:
     """Four random words for each (component, run, quarter of the particles): [w, R, q] each."""
-    shape = (component.shape[0], runs.shape[0], particle.shape[0])
+    particle = torch.arange(quarters, device=runs.device)
+    shape = (component.shape[0], runs.shape[0], quarters)
     counter = (particle, component[:, None, None], step, runs[:, None])
     c0, c1, c2, c3 = (part.expand(shape) for part in counter)
-    return philox((c0, c1, c2, c3), (key[0], key[1]))
+    return philox((c0, c1, c2, c3), key)
 
 
-def philox(counter: Words, key: tuple[Tensor, Tensor], rounds: int = 10) -> Words:
+def philox(counter: Words, key: tuple[Tensor | int, Tensor | int], rounds: int = 10) -> Words:
     """Philox4x32: counter and key as int64 tensors that hold 32-bit words, to four tensors of 32-bit random words.
 
     Agrees with the generator's published known-answer vectors. A 32 x 32 -> 64 bit product wraps around in int64; what the
     arithmetic shift drags along and the high half of the other product are masked away together, after the exclusive or.
     """
     c0, c1, c2, c3 = counter
-    turn = torch.arange(rounds, device=key[0].device)
+    turn = torch.arange(rounds, device=counter[0].device)
     keys = zip(*(((k + weyl * turn) & _WORD).unbind(0) for k, weyl in zip(key, _WEYL, strict=True)), strict=True)
     for k0, k1 in keys:
         p0, p1 = c0 * _MULTIPLY[0], c2 * _MULTIPLY[1]

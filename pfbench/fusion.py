@@ -1,7 +1,8 @@
 """Inner loops that a compiler may fuse.
 
-A fusible function takes and gives tensors only. Eagerly each of its operations passes over all particles; fused, the whole of it
-does so once. Compiling costs some seconds, so they run eagerly until a job that is large enough asks otherwise:
+A fusible function takes tensors, the first argument among them, and whole numbers; it gives tensors only. Eagerly each of its
+operations passes over all particles; fused, the whole of it does so once. Compiling costs some seconds, so they run eagerly until
+a job that is large enough asks otherwise:
 
     with fusion.fused():
         run_filter(...)
@@ -60,23 +61,28 @@ def recording() -> bool:
 
 def _plain(args: tuple[Any, ...]) -> bool:
     """Numbers on the CPU, to be worked on by one thread, and no gradient of them is wanted."""
-    wanted = any((a.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(a).tangent is not None for a in args)
+    tensors = [a for a in args if isinstance(a, torch.Tensor)]
+    wanted = any((a.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(a).tangent is not None for a in tensors)
     return torch.get_num_threads() == 1 and not args[0].is_cuda and not wanted
 
 
-def fusible(function: F, eager: F | None = None, by_hand: F | None = None, whole: bool = True) -> F:
+def fusible(
+    function: F, eager: F | None = None, by_hand: F | None = None, whole: bool | Callable[..., bool] = True, compiles: bool = True
+) -> F:
     """Makes a function of tensors one that can be fused.
 
     Args:
         function: what is compiled.
         eager: computes the same where nothing is fused, if separate operations have a faster way to do it.
         by_hand: is taken for what would be compiled on the CPU and one thread, where it works and no gradient is wanted.
-        whole: in a graph, too, as one operator. What the compiler does well itself should not be: a call costs some 20 us.
+        whole: in a graph, too, as one operator, or for which tensors. What the compiler does well itself should not be.
+        compiles: by torch's compiler, too, where it cannot be taken by hand; linear algebra gains nothing from it.
     """
     separate = eager or function
     in_graph = by_hand if by_hand is not None and whole else None
     if in_graph is not None:
         _shaped(in_graph, function)
+    taken = whole if callable(whole) else lambda *_: True
 
     @cache
     def compiled() -> Callable[..., Any]:
@@ -87,14 +93,15 @@ def fusible(function: F, eager: F | None = None, by_hand: F | None = None, whole
             try:
                 return by_hand(*args)
             except (OSError, subprocess.CalledProcessError) as error:
-                log.warning("%s does not compile here (%s); torch compiles it instead", by_hand.__name__, type(error).__name__)
+                what = "torch compiles it instead" if compiles else "torch's own functions do it"
+                log.warning("%s does not compile here (%s); %s", by_hand.__name__, type(error).__name__, what)
                 _failed.add(by_hand)
-        return compiled()(*args)
+        return (compiled() if compiles else separate)(*args)
 
     @wraps(function)
     def call(*args: Any) -> Any:
         if _graph.get():
-            return (function if in_graph is None or args[0].is_cuda else in_graph)(*args)
+            return (function if in_graph is None or args[0].is_cuda or not taken(*args) else in_graph)(*args)
         return (as_one if _fused.get() else separate)(*args)
 
     return cast(F, call)

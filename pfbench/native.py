@@ -29,18 +29,19 @@ _FLAGS = {
     "normals": (*_COMMON, "-ffast-math", "-mno-recip"),
     "steps": _COMMON,
     "loops": (*_COMMON, "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"),
+    "matrices": (*_COMMON, "-fno-math-errno", "-fno-trapping-math"),
 }
 _operators = torch.library.Library("pfbench", "DEF")
 
 
-def normals(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+def normals(seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int) -> Tensor:
     """Standard normals, float32 [w, R, 4 q], as draws.normals makes them, to 5e-6."""
-    return _operator("normals")(key, step, runs, component, particle)
+    return _operator("normals")(seed, purpose, step, runs, components, quarters)
 
 
-def uniforms(key: Tensor, step: Tensor, runs: Tensor, component: Tensor, particle: Tensor) -> Tensor:
+def uniforms(seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int) -> Tensor:
     """Uniforms, float64 [w, R, 4 q], as draws.uniforms makes them, to the last digit."""
-    return _operator("uniforms")(key, step, runs, component, particle)
+    return _operator("uniforms")(seed, purpose, step, runs, components, quarters)
 
 
 def systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
@@ -68,14 +69,33 @@ def distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:
     return _operator("distinct")(copy_of, log_w)
 
 
+def totals(part: Tensor) -> tuple[Tensor, Tensor]:
+    """Sums of parts [R, N], and of their squares: [R, 1] each."""
+    return _operator("totals")(part)
+
+
 def moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance [R, D] of x [R, N, D] by weights [R, N] whose sum is 1."""
     return _operator("moments")(x, w)
 
 
-def triangle(white: Tensor) -> tuple[Tensor, Tensor]:
-    """Of |A x - b|^2 + |x|^2, [A b] = `white` [R, K, D + 1]: triangle [R, D, D + 1] of a positive diagonal, the minimum [R]."""
-    return _operator("triangle")(white)
+def rooted(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """covariance.factor of [R, d, d]: lower triangular roots [R, d, d], and which exist, bool [R]."""
+    return _operator("rooted")(covariance)
+
+
+def updated(m: Tensor, r: Tensor, omega: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """For r = m xi + e, xi ~ N(0, I), Cov e = omega; m [R, k, d], r [R, k], omega [R, k, k]: what xi is then.
+
+    Its mean [R, d] and root [R, d, d], the normalised distance [R], diagonals of the roots of omega and of xi's information
+    [R, k + d], and where omega has a root, bool [R].
+    """
+    return _operator("updated")(m, r, omega)
+
+
+def fitted(r: Tensor, xi: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """r [R, P, k] at points xi [P, d] of weights w [P]: slopes M [R, k, d], and the covariance of what they leave [R, k, k]."""
+    return _operator("fitted")(r, xi, w)
 
 
 def spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tensor:
@@ -95,10 +115,15 @@ def follow(
     return found
 
 
-for _loop in (normals, uniforms, systematic, copied, log_normal, affine, distinct, moments, spread, triangle, follow):
+_LOOPS = normals, uniforms, systematic, copied, log_normal, affine, distinct, totals, moments, spread, rooted, updated, fitted
+for _loop in (*_LOOPS, follow):
     _operators.define(_loop.__name__ + torch.library.infer_schema(_loop, mutates_args=()))
 
-_CALLED = {"normals": 5, "systematic": 3, "copied": 2, "affine": 4, "distinct": 2}  # tensors that each is given
+_KINDS = {"T": "AtenTensorHandle", "i": "int64_t"}
+_CALLED = {  # what each is given, and gives
+    "normals": ("TiTTii", "T"), "uniforms": ("TiTTii", "T"), "systematic": ("TTT", "T"), "copied": ("TT", "T"),
+    "affine": ("TTTT", "T"), "distinct": ("TT", "T"), "totals": ("T", "TT"), "moments": ("TT", "TT"),
+}  # fmt: skip
 
 
 class ByName(dict[str, list[str]]):
@@ -111,11 +136,12 @@ class ByName(dict[str, list[str]]):
 def shims() -> ByName:
     """C declarations of the operators that compiled code may call by their names, in place of having torch look them up."""
 
-    def declared(name: str, count: int) -> str:
-        return f"AOTITorchError aoti_torch_cpu_{name}({count * 'AtenTensorHandle, '}AtenTensorHandle*)"
+    def declared(name: str, given: str, found: str) -> str:
+        words = [*(_KINDS[kind] for kind in given), *(f"{_KINDS[kind]}*" for kind in found)]
+        return f"AOTITorchError aoti_torch_cpu_{name}({', '.join(words)})"
 
     _load()
-    return ByName({f"pfbench.{name}.default": [declared(name, count)] for name, count in _CALLED.items()})
+    return ByName({f"pfbench.{name}.default": [declared(name, *kinds)] for name, kinds in _CALLED.items()})
 
 
 def address(library: str, function: str) -> int:
@@ -178,7 +204,8 @@ def _load() -> None:
         raise OSError("no C++ compiler")
     what = (compiler, _FLAGS, os.cpu_count(), torch.__version__)
     sources = {name: (_HERE / f"{name}.cpp").read_bytes() for name in _FLAGS}
-    name = hashlib.sha256(b"".join(sources.values()) + repr(what).encode()).hexdigest()[:16]
+    text = b"".join(sources.values()) + (_HERE / "tensors.h").read_bytes()
+    name = hashlib.sha256(text + repr(what).encode()).hexdigest()[:16]
     folder = Path(tempfile.gettempdir()) / f"pfbench_{os.getuid()}"
     built = folder / f"{name}.so"
     if not built.exists():

@@ -13,10 +13,10 @@ constexpr int BLOCK = 64;  // counters whose words stay in the first-level cache
 
 constexpr uint32_t M0 = 0xD2511F53u, M1 = 0xCD9E8D57u, W0 = 0x9E3779B9u, W1 = 0xBB67AE85u;
 
-// Four words for each of n counters (quarter, component, step, run).
-inline void words(const int64_t* quarter, uint32_t component, uint32_t step, uint32_t run, uint32_t k0, uint32_t k1, int n,
+// Four words for each of n counters (quarter, component, step, run), quarters from `first` on.
+inline void words(uint32_t first, uint32_t component, uint32_t step, uint32_t run, uint32_t k0, uint32_t k1, int n,
                   uint32_t* a, uint32_t* b, uint32_t* c, uint32_t* d) {
-    for (int i = 0; i < n; ++i) a[i] = static_cast<uint32_t>(quarter[i]);
+    for (int i = 0; i < n; ++i) a[i] = first + static_cast<uint32_t>(i);
     int i = 0;
 #ifdef __AVX2__
     const auto multiply = [](__m256i v, __m256i m, __m256i& low) {  // both halves of eight 32 x 32 bit products
@@ -79,15 +79,15 @@ inline void pairs(const uint32_t* radial, const uint32_t* angular, int n, float*
 }
 }  // namespace
 
-// out [W, R, 4 Q] of runs [R], components [W] and quarters [Q].
-extern "C" void normals(float* out, const int64_t* run, int64_t runs, const int64_t* component, int64_t components,
-                        const int64_t* quarter, int64_t quarters, int64_t step, int64_t key0, int64_t key1) {
+// out [W, R, 4 Q] of runs [R], W components and Q quarters.
+extern "C" void normals(float* out, const int64_t* run, int64_t runs, int64_t components, int64_t quarters, int64_t step, int64_t key0,
+                        int64_t key1) {
     alignas(64) uint32_t a[BLOCK], b[BLOCK], c[BLOCK], d[BLOCK];
     for (int64_t w = 0; w < components; ++w)
         for (int64_t r = 0; r < runs; ++r, out += 4 * quarters)
             for (int64_t q = 0; q < quarters; q += BLOCK) {
                 const int n = static_cast<int>(quarters - q < BLOCK ? quarters - q : BLOCK);
-                words(quarter + q, static_cast<uint32_t>(component[w]), static_cast<uint32_t>(step), static_cast<uint32_t>(run[r]),
+                words(static_cast<uint32_t>(q), static_cast<uint32_t>(w), static_cast<uint32_t>(step), static_cast<uint32_t>(run[r]),
                       static_cast<uint32_t>(key0), static_cast<uint32_t>(key1), n, a, b, c, d);
                 pairs(a, b, n, out + q, out + quarters + q);
                 pairs(c, d, n, out + 2 * quarters + q, out + 3 * quarters + q);
@@ -95,14 +95,14 @@ extern "C" void normals(float* out, const int64_t* run, int64_t runs, const int6
 }
 
 // Uniforms on (0, 1): out [W, R, 4 Q], as normals.
-extern "C" void uniforms(double* out, const int64_t* run, int64_t runs, const int64_t* component, int64_t components,
-                         const int64_t* quarter, int64_t quarters, int64_t step, int64_t key0, int64_t key1) {
+extern "C" void uniforms(double* out, const int64_t* run, int64_t runs, int64_t components, int64_t quarters, int64_t step, int64_t key0,
+                         int64_t key1) {
     alignas(64) uint32_t word[4][BLOCK];
     for (int64_t w = 0; w < components; ++w)
         for (int64_t r = 0; r < runs; ++r, out += 4 * quarters)
             for (int64_t q = 0; q < quarters; q += BLOCK) {
                 const int n = static_cast<int>(quarters - q < BLOCK ? quarters - q : BLOCK);
-                words(quarter + q, static_cast<uint32_t>(component[w]), static_cast<uint32_t>(step), static_cast<uint32_t>(run[r]),
+                words(static_cast<uint32_t>(q), static_cast<uint32_t>(w), static_cast<uint32_t>(step), static_cast<uint32_t>(run[r]),
                       static_cast<uint32_t>(key0), static_cast<uint32_t>(key1), n, word[0], word[1], word[2], word[3]);
                 for (int k = 0; k < 4; ++k)
                     for (int i = 0; i < n; ++i) out[k * quarters + q + i] = (word[k][i] + 0.5) * 0x1p-32;

@@ -108,8 +108,8 @@ def test_drawing_leaves_the_global_generator_alone() -> None:
 
 @pytest.mark.parametrize("word", [0, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFF])
 def test_extreme_words(monkeypatch: pytest.MonkeyPatch, word: int) -> None:
-    def constant(key: torch.Tensor, step: torch.Tensor, runs: torch.Tensor, component: torch.Tensor, particle: torch.Tensor):
-        return (torch.full((len(runs), len(component), len(particle)), word),) * 4
+    def constant(key: object, step: torch.Tensor, runs: torch.Tensor, component: torch.Tensor, quarters: int):
+        return (torch.full((len(runs), len(component), quarters), word),) * 4
 
     monkeypatch.setattr(module, "_words", constant)
     u, z = source().uniform("x", 8, 1), source().normal("x", 8, 1)

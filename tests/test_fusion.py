@@ -12,12 +12,13 @@ import torch
 from command_line import pfbench
 from torch import Tensor
 
-from pfbench import fusion, job, native, store
+from pfbench import covariance, fusion, job, native, store
 from pfbench.draws import MonteCarlo
-from pfbench.filter import gaussian, particle, resamplers
+from pfbench.filter import gaussian, particle, resamplers, rules
 from pfbench.filter.belief import Cloud, gather
 from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
+from pfbench.filter.rules import Cubature, Product, Radial5, Simplex3, Unscented
 from pfbench.model import base
 from pfbench.model.linear import linear_walk
 from pfbench.noise.regimes import Nominal
@@ -117,27 +118,85 @@ def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
 
 
 @compiler
+@pytest.mark.parametrize("d", [1, 4, 15])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_roots_by_hand_exist_where_roots_do(dtype: torch.dtype, d: int) -> None:
+    """A A' = covariance, A lower triangular, for scales of 1e-4 to 1e4; what has no root does no harm to its neighbours."""
+    runs, eps = 21, torch.finfo(dtype).eps
+    half = DRAWS.normal("half", runs * d * d, 1)[0].to(dtype).view(runs, d, d) * torch.logspace(-4, 4, d, dtype=dtype)[:, None]
+    whole = half @ half.mT
+    whole[1] = torch.nan
+    whole[2, 0, 0] *= -1.0
+    whole[3, -1], whole[3, :, -1] = 0.0, 0.0  # no spread, and none in the root
+    whole[4] = torch.outer(half[4, 0], half[4, 0])  # of rank 1: rounding decides, and a little more on the diagonal heals it
+    whole[5, 0, -1] = whole[5, -1, 0] = whole[5].diagonal().max() * 1e3  # correlated above 1, unless there is but one component
+    for found, fine in (native.rooted(whole), covariance._separate_root(whole)):
+        assert fine.tolist() == [k not in (1, 2, *([5] if d > 1 else [])) for k in range(runs)]
+        sd = whole[fine].diagonal(dim1=-2, dim2=-1).sqrt().clamp(min=1e-15)
+        off = (found[fine] @ found[fine].mT - whole[fine]) / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
+        jitter = 2e-6 if dtype == torch.float32 else 2e-12
+        assert float(off.abs().max()) < max(jitter, 20.0 * d * eps)
+        assert float(off[[0, *range(4, len(off))]].abs().max()) < 20.0 * d * eps  # without those that were healed
+        assert torch.equal(found[fine].triu(1), torch.zeros_like(found[fine]))
+        assert bool((found[3, -1] == 0.0).all())
+        assert torch.isfinite(found[fine]).all()
+
+
+@compiler
 @pytest.mark.parametrize(("runs", "rows", "d"), [(3, 1, 1), (5, 20, 4), (19, 2, 9), (100, 6, 15)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_loop_by_hand_takes_rows_up_into_a_triangle(dtype: torch.dtype, runs: int, rows: int, d: int) -> None:
-    """T'T = I + [A b]'[A b], where nothing is seen too, and priors are 1e4 times as wide as noise; a NaN stays in its run."""
-    white = DRAWS.normal("white", runs * rows * (d + 1), 1)[0].to(dtype).view(runs, rows, d + 1)
-    white = white * torch.logspace(-4, 4, d + 1, dtype=dtype)
-    white[0] = 0.0
-    white[1] = torch.nan
-    fine = torch.arange(runs) != 1
-    prior = torch.diag(torch.cat([torch.ones(d), torch.zeros(1)])).double()
-    wanted = prior + white.double().mT @ white.double()
-    scale = wanted.diagonal(dim1=-2, dim2=-1).sqrt().clamp(min=1e-30)
-    for upper, least in (native.triangle(white), gaussian._separate_triangle(white)):
-        assert torch.equal(torch.isfinite(upper.sum((1, 2)) + least), fine)
-        assert bool((upper.diagonal(dim1=-2, dim2=-1)[fine] > 0.0).all())
-        found = upper.double().mT @ upper.double()
-        found[:, d, d] += least
-        off = (found - wanted) / (scale.unsqueeze(-1) * scale.unsqueeze(-2))
-        assert float(off[fine].abs().max()) < 20.0 * (rows + d) * torch.finfo(dtype).eps
-        below = torch.tril(upper[fine], -1).abs().amax(1)
-        assert bool((below <= 20.0 * (rows + d) * torch.finfo(dtype).eps * scale[fine]).all())
+def test_an_update_by_hand_solves_the_least_squares(dtype: torch.dtype, runs: int, rows: int, d: int) -> None:
+    """Root^-T root^-1 = I + M' Omega^-1 M, of nothing seen too, of priors 1e4 times as wide as noise; NaN stays alone."""
+    m = DRAWS.normal("m", runs * rows * d, 1)[0].to(dtype).view(runs, rows, d) * torch.logspace(-4, 4, d, dtype=dtype)
+    half = DRAWS.normal("noise", runs * rows * rows, 1)[0].to(dtype).view(runs, rows, rows)
+    omega, r = half @ half.mT + torch.eye(rows, dtype=dtype), DRAWS.normal("r", runs * rows, 1)[0].to(dtype).view(runs, rows)
+    m[0], m[1] = 0.0, torch.nan
+    omega[2, 0, 0] = -1.0
+    fine = torch.tensor([k != 1 for k in range(runs)])
+    rooted = torch.tensor([k != 2 for k in range(runs)])
+    own = fine & rooted
+    exact_m, exact_r, noise = m[own].double(), r[own].double().unsqueeze(-1), omega[own].double()
+    information = torch.eye(d).double() + exact_m.mT @ torch.linalg.solve(noise, exact_m)
+    size = information.diagonal(dim1=-2, dim2=-1).sqrt()
+    for shift, root, least, scales, ok in (native.updated(m, r, omega), gaussian._separate_update(m, r, omega)):
+        assert torch.equal(ok, rooted)
+        assert torch.equal(torch.isfinite(shift.sum(1) + root.sum((1, 2)) + least)[rooted], fine[rooted])
+        assert torch.equal(root[own].tril(-1), torch.zeros_like(root[own]))
+        back, at = torch.linalg.inv(root[own].double()), shift[own].double().unsqueeze(-1)
+        eps = 50.0 * (rows + d) * torch.finfo(dtype).eps * float(torch.linalg.cond(noise).max())
+        off = (back.mT @ back - information) / (size.unsqueeze(-1) * size.unsqueeze(-2))
+        assert float(off.abs().max()) < eps
+        slope = (information @ at - exact_m.mT @ torch.linalg.solve(noise, exact_r)).squeeze(-1) / size
+        assert float(slope.abs().max()) < eps * (1.0 + float((size * at.squeeze(-1)).abs().max()))
+        residual = exact_r - exact_m @ at
+        distance = (residual.mT @ torch.linalg.solve(noise, residual) + at.mT @ at).flatten()
+        assert torch.allclose(least[own].double(), distance, rtol=eps, atol=eps)
+        logs = 0.5 * torch.linalg.slogdet(noise + exact_m @ exact_m.mT)[1]
+        assert torch.allclose(scales[own].double().log().sum(1), logs, rtol=0, atol=max(eps, 1e-8))  # the sum has rounded, too
+
+
+@compiler
+@pytest.mark.parametrize("scheme", [Cubature(), Product(Simplex3(), Radial5()), Unscented(kappa=1.0)])
+@pytest.mark.parametrize("k", [1, 3, 4, 6, 15])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_fit_by_hand_is_the_weighted_one(dtype: torch.dtype, k: int, scheme: Any) -> None:
+    """Of curved values that lie in either order of memory; NaN stays in its run."""
+    runs, d = 21, 5
+    xi, _, w = (a.to(dtype) for a in scheme(d))
+    bent = DRAWS.normal("bent", runs * len(xi) * k, 1)[0].to(dtype).view(runs, len(xi), k)
+    slope = DRAWS.normal("slope", runs * k * d, 1)[0].to(dtype).view(runs, k, d)
+    r = xi @ slope.mT + 0.1 * bent
+    r[1] = torch.nan
+    fine, off = torch.arange(runs) != 1, r.double()
+    wanted = torch.einsum("p,rpk,pd->rkd", w.double(), off, xi.double())
+    left = off - torch.einsum("rkd,pd->rpk", wanted, xi.double())
+    both = torch.einsum("p,rpk,rpl->rkl", w.double(), left, left)
+    for lie in (r, r.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
+        for m, omega in (native.fitted(lie, xi, w), rules._separate_fit(lie, xi, w)):
+            assert torch.equal(torch.isfinite(m.sum((1, 2)) + omega.sum((1, 2))), fine)
+            eps = 100.0 * torch.finfo(dtype).eps
+            assert torch.allclose(m[fine].double(), wanted[fine], rtol=eps, atol=eps * 10.0)
+            assert torch.allclose(omega[fine].double(), both[fine], rtol=eps, atol=eps * 10.0)
 
 
 @compiler
@@ -160,6 +219,8 @@ def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(order: tuple[int
         native.log_normal(y, x, scale, constant), base._run_quadratic(y, x, scale, constant), equal_nan=True
     )
     torch.testing.assert_close(native.moments(x, w), particle._separate_moments(x, w), equal_nan=True)
+    w[2, 3] = torch.nan
+    torch.testing.assert_close(native.totals(w), particle._separate_totals(w), equal_nan=True)
 
 
 @compiler
@@ -188,7 +249,7 @@ def test_a_gradient_goes_round_the_loops_by_hand() -> None:
 
 @compiler
 def test_small_numbers_are_still_numbers_after_the_loops_are_loaded() -> None:
-    native.normals(torch.tensor([1, 2]), torch.tensor(0), *(torch.arange(2) for _ in range(3)))
+    native.normals(torch.tensor(1), 2, torch.tensor(0), torch.arange(2), 2, 2)
     assert float(torch.tensor(1e-310, dtype=torch.float64) / 2) > 0.0  # -ffast-math, when linked, would make it 0
 
 

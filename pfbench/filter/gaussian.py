@@ -14,7 +14,7 @@ from pfbench.covariance import factor, squared_length
 from pfbench.draws import Draws
 from pfbench.filter.belief import Gaussian, Info
 from pfbench.filter.rules import Linearised, Rule, Space
-from pfbench.filter.whitening import LOG_2PI, log_det
+from pfbench.filter.whitening import LOG_2PI
 from pfbench.fusion import fusible
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
@@ -249,9 +249,8 @@ class GaussianFilter:
         return again._replace(m=m, r=again.r + (m @ shift.unsqueeze(-1)).squeeze(-1), root=root)
 
     def _positive(self, innovation: Innovation) -> tuple[Innovation, Tensor]:
-        m = innovation.m
         # what M sees needs no root, but with it goes the whole law of state and measurement: Omega alone must be positive
-        omega, mended = self._mended(innovation.omega, innovation.noise, torch.zeros_like(m @ m.mT))
+        omega, mended = self._mended(innovation.omega, innovation.noise, torch.zeros_like(innovation.omega))
         return innovation._replace(omega=omega), mended
 
     def _mended(self, omega: Tensor, noise: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
@@ -273,15 +272,25 @@ class GaussianFilter:
 def update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
     """Whitened posterior: mean [R, d], square root [R, d, d] and log evidence of the step [R] (NaN where there is no root)."""
     r, seen, m, omega, *_ = innovation
+    shift, root, distance, scales, ok = _updated(m, r, omega)
+    # int64 times a float is float32
+    log_like = -0.5 * distance - scales.abs().log().sum(-1) - 0.5 * LOG_2PI * seen.sum(-1, dtype=r.dtype)
+    return shift, root, torch.where(ok, log_like, torch.nan)
+
+
+def _separate_update(m: Tensor, r: Tensor, omega: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """As native.updated."""
     root, ok = factor(omega)
     white = torch.linalg.solve_triangular(root, torch.cat([m, r.unsqueeze(-1)], -1), upper=False)  # Omega^-1/2 [M r]
     d = m.shape[-1]
     eye = torch.eye(d, dtype=m.dtype, device=m.device).expand(m.shape[0], -1, -1)
     information, score, distance = _least_squares(white, eye)
     back = torch.linalg.solve_triangular(information, torch.cat([score, eye], -1), upper=True)
-    scale = log_det(root) + log_det(information)
-    log_like = -0.5 * distance - scale - 0.5 * LOG_2PI * seen.sum(-1, dtype=r.dtype)  # int64 times a float is float32
-    return back[..., 0], back[..., 1:], torch.where(ok, log_like, torch.nan)
+    scales = torch.cat([part.diagonal(dim1=-2, dim2=-1) for part in (root, information)], -1)
+    return back[..., 0], back[..., 1:], distance, scales, ok
+
+
+_updated = fusible(_separate_update, by_hand=native.updated, compiles=False)
 
 
 def _least_squares(white: Tensor, eye: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -303,7 +312,7 @@ def _least_squares(white: Tensor, eye: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return information, score, (a @ best - b).square().sum((1, 2)) + best.square().sum((1, 2))
 
 
-def _separate_triangle(white: Tensor) -> tuple[Tensor, Tensor]:
+def _triangle(white: Tensor) -> tuple[Tensor, Tensor]:
     """[A b] [R, K, D + 1] on top of [I 0] as a triangle [R, D, D + 1] with a positive diagonal, and the square left of b [R]."""
     d = white.shape[-1] - 1
     below = torch.eye(d, d + 1, dtype=white.dtype, device=white.device).expand(white.shape[0], -1, -1)
@@ -311,9 +320,6 @@ def _separate_triangle(white: Tensor) -> tuple[Tensor, Tensor]:
     # QR leaves the signs of its rows to rounding; draws by such a root would depend on the batch that they are in
     sign = torch.where(whole.diagonal(dim1=-2, dim2=-1)[:, :d] < 0, -1, 1).to(whole).unsqueeze(-1)
     return sign * whole[:, :d], whole[:, d, d].square()
-
-
-_triangle = fusible(_separate_triangle, by_hand=native.triangle)
 
 
 def around_first(residual: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:

@@ -141,8 +141,7 @@ class ParticleFilter:
         x, log_w = bury(x, log_w, cloud.x)
         expected = cloud.log_w + log_ratio
         # a lost run stays lost (its evidence is -inf for good) but goes on with flat weights, so that nothing else breaks
-        log_w, total, heft = _normalise(log_w)
-        trace["ess"] = 1.0 / heft.square().sum(1)
+        log_w, total, heft, trace["ess"] = _normalise(log_w)
         if not isinstance(self.size, Fixed):
             trace["particles"] = (cloud.log_w > -torch.inf).sum(1).to(log_w)
         parents, keeper = cloud, self.keeper
@@ -160,20 +159,34 @@ class ParticleFilter:
         return described(model, cloud, told.mean, told.variance, told.trace, nis)
 
 
-def _normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Log weights -> normalised (flat where none is finite), their logsumexp (then -inf) [R], the weights themselves.
+def _normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Log weights -> normalised (flat where none is finite), logsumexp (then -inf) [R], the weights, their effective number [R].
 
     One exponential for each particle: they cost more than all else of a small step that is not drawn or copied.
     """
     top = log_w.detach().amax(1, keepdim=True)
     top = torch.where(torch.isfinite(top), top, 0.0)
     part = torch.exp(log_w - top)
-    whole = part.sum(1, keepdim=True)
+    whole, square = _totals(part)
     lost = ~(torch.isfinite(whole) & (whole > 0.0))
-    whole = torch.where(lost, 1.0, whole)
-    total, flat = top + torch.log(whole), 1.0 / log_w.shape[1]
-    log_w, heft = torch.where(lost, math.log(flat), log_w - total), torch.where(lost, flat, part / whole)
-    return log_w, torch.where(lost, -torch.inf, total).squeeze(1), heft
+    whole, slots = torch.where(lost, 1.0, whole), log_w.shape[1]
+    total = top + torch.log(whole)
+    log_w, heft = torch.where(lost, -math.log(slots), log_w - total), torch.where(lost, 1.0 / slots, part * (1.0 / whole))
+    ess = torch.where(lost, slots, whole * whole / square).squeeze(1)
+    return log_w, torch.where(lost, -torch.inf, total).squeeze(1), heft, ess
+
+
+def _separate_totals(part: Tensor) -> tuple[Tensor, Tensor]:
+    """Sums of parts [R, N], and of their squares: [R, 1] each."""
+    return part.sum(1, keepdim=True), part.square().sum(1, keepdim=True)
+
+
+def _long(a: Tensor, *_: Tensor) -> bool:
+    """Rows [R, N, ...] that torch's compiler sums through memory, for precision; shorter ones it sums best itself."""
+    return a.shape[1] > 4096
+
+
+_totals = fusible(_separate_totals, by_hand=native.totals, whole=_long)
 
 
 def surprise(model: StateSpaceModel, x: Tensor, log_w: Tensor, seen: Record) -> tuple[Tensor, Tensor]:
@@ -274,4 +287,4 @@ def _separate_spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tens
 
 
 _spread = fusible(_separate_spread, by_hand=native.spread, whole=False)
-_flat_moments = fusible(_fused_moments, eager=_separate_moments, by_hand=native.moments, whole=False)
+_flat_moments = fusible(_fused_moments, eager=_separate_moments, by_hand=native.moments, whole=_long)

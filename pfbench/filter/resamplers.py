@@ -65,7 +65,7 @@ class Resample:
     def __call__(
         self, model: StateSpaceModel, cloud: Cloud, log_a: Tensor, n: Tensor, draws: Draws
     ) -> tuple[Cloud, Tensor]:
-        a = belief.weights(log_a)
+        a = torch.exp(log_a)
         hit = torch.ones_like(cloud.log_z, dtype=torch.bool)
         if self.threshold < 1.0:
             hit = 1.0 / a.square().sum(-1) < self.threshold * n.squeeze(1)

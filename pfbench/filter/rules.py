@@ -17,6 +17,9 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from pfbench import native
+from pfbench.fusion import fusible
+
 Map: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
 """xi [R, P, d] -> mean [R, P, k] and covariance [R or 1, P or 1, k, k] of a law given each point."""
 
@@ -75,10 +78,19 @@ class Points:
         values, covariance = f(xi.expand(like.shape[0], -1, -1))
         y = space.mean(values, w_mean.expand(values.shape[:2]))
         r = space.subtract(values, y.unsqueeze(1))
-        m = r.mT @ (w_cov[:, None] * xi)
-        left = r - xi @ m.mT
+        m, left = _fitted(r, xi, w_cov)
         own = (w_mean[:, None, None] * covariance).sum(1) if covariance.shape[1] > 1 else covariance[:, 0]
-        return Linearised(y, m, (w_cov[:, None] * left).mT @ left + own, own)
+        return Linearised(y, m, left + own, own)
+
+
+def _separate_fit(r: Tensor, xi: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """r [R, P, k] at points xi [P, d] of weights w [P]: slopes M [R, k, d], and the covariance of what they leave [R, k, k]."""
+    m = r.mT @ (w[:, None] * xi)
+    left = r - xi @ m.mT
+    return m, (w[:, None] * left).mT @ left
+
+
+_fitted = fusible(_separate_fit, by_hand=native.fitted, compiles=False)
 
 
 @dataclass(frozen=True)
