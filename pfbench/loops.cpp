@@ -154,58 +154,72 @@ void distinct(int64_t* count, const int64_t* value, const T* log_weight, int64_t
     }
 }
 
-// Sums of weight (a - its centre) (b - its centre) over particles for all pairs of S rows, in one pass.
-template <class T, int S>
-void products(T* out, const T* const* row, const T* centre, const T* weight, int64_t particles) {
+// Adds the products of A rows with B others, lane by lane, to A x B sums; rows of both lie `chunk` numbers apart. Nine sums and what
+// goes into them fit where there are sixteen registers.
+template <class T, int A, int B>
+void products(T* sums, int64_t down, const T* some, const T* others, int64_t chunk, int64_t particles) {
     typedef T Lanes __attribute__((vector_size(REGISTER), aligned(sizeof(T)), may_alias));
     constexpr int64_t WIDE = REGISTER / sizeof(T);
-    Lanes sum[S * (S + 1) / 2] = {};
-    int64_t i = 0;
-    for (; i + WIDE <= particles; i += WIDE) {
-        Lanes off[S];
-        for (int a = 0; a < S; ++a) off[a] = *reinterpret_cast<const Lanes*>(row[a] + i) - centre[a];
-        for (int a = 0, k = 0; a < S; ++a) {
-            const Lanes weighed = *reinterpret_cast<const Lanes*>(weight + i) * off[a];
-            for (int b = a; b < S; ++b) sum[k++] += weighed * off[b];
+    Lanes sum[A][B];
+    for (int a = 0; a < A; ++a)
+        for (int b = 0; b < B; ++b) sum[a][b] = *reinterpret_cast<const Lanes*>(sums + a * down + b * WIDE);
+    for (int64_t i = 0; i < particles; i += WIDE) {
+        Lanes left[A];
+        for (int a = 0; a < A; ++a) left[a] = *reinterpret_cast<const Lanes*>(some + a * chunk + i);
+        for (int b = 0; b < B; ++b) {
+            const Lanes right = *reinterpret_cast<const Lanes*>(others + b * chunk + i);
+            for (int a = 0; a < A; ++a) sum[a][b] += left[a] * right;
         }
     }
-    for (int a = 0, k = 0; a < S; ++a)
-        for (int b = a; b < S; ++b, ++k) {
-            T whole = 0;
-            for (int64_t lane = 0; lane < WIDE; ++lane) whole += sum[k][lane];
-            for (int64_t j = i; j < particles; ++j) whole += weight[j] * (row[a][j] - centre[a]) * (row[b][j] - centre[b]);
-            out[a * S + b] = out[b * S + a] = whole;
-        }
+    for (int a = 0; a < A; ++a)
+        for (int b = 0; b < B; ++b) *reinterpret_cast<Lanes*>(sums + a * down + b * WIDE) = sum[a][b];
 }
 
-// Covariances of the pairs of each group of components; x [R, N, K] lies as its strides say.
+// Covariances of the pairs of each group of components; x [R, N, K] lies as its strides say. Particles are taken by chunks that stay
+// in the first-level cache, and pairs by threes with threes, so that a number that is loaded goes into three sums.
 template <class T>
 void spread(T* out, const T* x, const T* mean, const T* weight, const int64_t* component, const int64_t* stride, int64_t groups,
             int64_t size, int64_t runs, int64_t particles, int64_t components) {
-    std::vector<T> own(stride[1] == 1 ? 0 : size * particles), centre(size), pair(4);
-    std::vector<const T*> row(size);
-    for (int64_t r = 0; r < runs; ++r, weight += particles)
-        for (int64_t g = 0; g < groups; ++g, out += size * size) {
-            for (int64_t a = 0; a < size; ++a) {
-                const int64_t k = component[g * size + a];
-                centre[a] = mean[r * components + k];
-                row[a] = x + r * stride[0] + k * stride[2];
-                if (stride[1] == 1) continue;
-                for (int64_t i = 0; i < particles; ++i) own[a * particles + i] = row[a][i * stride[1]];
-                row[a] = own.data() + a * particles;
+    constexpr int64_t WIDE = REGISTER / sizeof(T), CHUNK = 1024 / sizeof(T);
+    typedef void (*Tile)(T*, int64_t, const T*, const T*, int64_t, int64_t);
+    constexpr Tile TILES[3][3] = {{products<T, 1, 1>, products<T, 1, 2>, products<T, 1, 3>},
+                                  {products<T, 2, 1>, products<T, 2, 2>, products<T, 2, 3>},
+                                  {products<T, 3, 1>, products<T, 3, 2>, products<T, 3, 3>}};
+    const int64_t down = size * WIDE;
+    std::vector<T> off(size * CHUNK), weighed(size * CHUNK), sums(groups * size * down);
+    for (int64_t r = 0; r < runs; ++r, weight += particles) {
+        std::fill(sums.begin(), sums.end(), T(0));
+        for (int64_t first = 0; first < particles; first += CHUNK) {
+            const int64_t many = std::min(CHUNK, particles - first), whole = (many + WIDE - 1) / WIDE * WIDE;
+            for (int64_t g = 0; g < groups; ++g) {
+                for (int64_t a = 0; a < size; ++a) {
+                    const int64_t k = component[g * size + a];
+                    const T* from = x + r * stride[0] + first * stride[1] + k * stride[2];
+                    const T centre = mean[r * components + k];
+                    T *const __restrict plain = off.data() + a * CHUNK, *const __restrict heavy = weighed.data() + a * CHUNK;
+                    if (stride[1] == 1)  // known to the compiler
+                        for (int64_t i = 0; i < many; ++i) heavy[i] = weight[first + i] * (plain[i] = from[i] - centre);
+                    else
+                        for (int64_t i = 0; i < many; ++i)
+                            heavy[i] = weight[first + i] * (plain[i] = from[i * stride[1]] - centre);
+                    for (int64_t i = many; i < whole; ++i) plain[i] = heavy[i] = 0;
+                }
+                for (int64_t a = 0; a < size; a += 3)
+                    for (int64_t b = a; b < size; b += 3)
+                        TILES[std::min<int64_t>(size - a, 3) - 1][std::min<int64_t>(size - b, 3) - 1](
+                            sums.data() + (g * size + a) * down + b * WIDE, down, weighed.data() + a * CHUNK,
+                            off.data() + b * CHUNK, CHUNK, whole);
             }
-            if (size == 1) products<T, 1>(out, row.data(), centre.data(), weight, particles);
-            else if (size == 2) products<T, 2>(out, row.data(), centre.data(), weight, particles);
-            else if (size == 3) products<T, 3>(out, row.data(), centre.data(), weight, particles);
-            else
-                for (int64_t a = 0; a < size; ++a)
-                    for (int64_t b = a; b < size; ++b) {
-                        const T* both[] = {row[a], row[b]};
-                        const T middle[] = {centre[a], centre[b]};
-                        products<T, 2>(pair.data(), both, middle, weight, particles);
-                        out[a * size + b] = out[b * size + a] = pair[1];
-                    }
         }
+        for (int64_t g = 0; g < groups; ++g, out += size * size)
+            for (int64_t a = 0; a < size; ++a)
+                for (int64_t b = a; b < size; ++b) {
+                    const T* lanes = sums.data() + (g * size + a) * down + b * WIDE;
+                    T all = 0;
+                    for (int64_t lane = 0; lane < WIDE; ++lane) all += lanes[lane];
+                    out[a * size + b] = out[b * size + a] = all;
+                }
+    }
 }
 
 // Sum of weight (x - centre), or of weight times its square, by four sums at a time: one alone would wait for itself.

@@ -225,6 +225,22 @@ def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(order: tuple[int
 
 @compiler
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 7, 9])
+def test_a_loop_by_hand_spreads_about_the_mean_in_any_memory_order(dtype: torch.dtype, size: int) -> None:
+    """One particle, several chunks of them and a rest; a particle that is not finite stays in its run and groups."""
+    groups = torch.stack([torch.arange(size), torch.arange(size).flip(0) + 2])
+    for particles in (1, 50, 300, 1000):
+        x, w = DRAWS.normal("x", particles, 11).to(dtype), torch.softmax(DRAWS.normal("w", particles, 1)[..., 0].to(dtype), -1)
+        x[1, particles // 2, 0] = torch.nan
+        mean = DRAWS.normal("mean", 1, 11)[:, 0].to(dtype)
+        for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
+            found, wanted = native.spread(laid, mean, w, groups), particle._separate_spread(x, mean, w, groups)
+            eps = torch.finfo(dtype).eps
+            torch.testing.assert_close(found, wanted, equal_nan=True, rtol=1e3 * eps, atol=20 * eps)
+
+
+@compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("particles", [1, 63, 64, 200])
 def test_a_loop_by_hand_moves_by_the_coefficients_that_are_not_zero(dtype: torch.dtype, particles: int) -> None:
     def some(purpose: str, n: int, w: int) -> Tensor:
