@@ -43,10 +43,13 @@ def _separate_root(covariance: Tensor) -> tuple[Tensor, Tensor]:
 _rooted = fusible(_separate_root, by_hand=native.rooted, compiles=False)
 
 
-def squared_length(e: Tensor, covariance: Tensor) -> Tensor:
+def _solved_length(e: Tensor, covariance: Tensor) -> Tensor:
     """e' covariance^-1 e: [..., d], [..., d, d] -> [...]; NaN or infinite where the covariance is singular."""
     e = e.unsqueeze(-1)
     return (e.mT @ torch.linalg.solve_ex(covariance, e)[0]).flatten(-3)
+
+
+squared_length = fusible(_solved_length, by_hand=native.squared_length, whole=False, compiles=False)
 
 
 def gaussian_log_density(r: Tensor, covariance: Tensor, seen: Tensor) -> Tensor:

@@ -178,6 +178,38 @@ void fitted(Lanes<T>* m, Lanes<T>* omega, Lanes<T>* r, const std::vector<Term<T>
         else squares<T, FEW>(omega, r, weight, points, k, a);
 }
 
+// e' covariance^-1 e by elimination on the lower triangle, which is lost: a sum of squares over pivots, infinite or NaN where one is 0.
+template <class T>
+Lanes<T> squared_length(Lanes<T>* e, Lanes<T>* covariance, int64_t d) {
+    Lanes<T> sum = {};
+    for (int64_t j = 0; j < d; ++j) {
+        sum += e[j] * e[j] / covariance[j * d + j];
+        for (int64_t i = j + 1; i < d; ++i) {
+            const Lanes<T> by = covariance[i * d + j] / covariance[j * d + j];
+            e[i] -= by * e[j];
+            for (int64_t k = j + 1; k <= i; ++k) covariance[i * d + k] -= by * covariance[k * d + j];
+        }
+    }
+    return sum;
+}
+
+Tensor squared_length_operator(Tensor e, Tensor covariance) {
+    const int64_t systems = e.size(0), d = e.size(1);
+    return by_type(e, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({systems});
+        const View<T> of_e(e), of_covariance(covariance);
+        Side<T> left(d), whole(d * d);
+        for (int64_t first = 0; first < systems; first += Side<T>::WIDE) {
+            of_e.load(left.data(), first, 1);
+            of_covariance.load(whole.data(), first, d);
+            const Lanes<T> sum = squared_length<T>(left.data(), whole.data(), d);
+            store(numbers<T>(out), &sum, first, systems, 1);
+        }
+        return out;
+    });
+}
+
 std::tuple<Tensor, Tensor> rooted_operator(Tensor covariance) {
     const int64_t runs = covariance.size(0), d = covariance.size(1);
     return by_type(covariance, [&](auto one) {
@@ -273,6 +305,7 @@ std::tuple<Tensor, Tensor> fitted_operator(Tensor r, Tensor xi, Tensor w) {
 }  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
+    library.impl("squared_length", TORCH_BOX(&squared_length_operator));
     library.impl("rooted", TORCH_BOX(&rooted_operator));
     library.impl("updated", TORCH_BOX(&updated_operator));
     library.impl("fitted", TORCH_BOX(&fitted_operator));

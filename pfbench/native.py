@@ -30,6 +30,7 @@ _FLAGS = {
     "steps": _COMMON,
     "loops": (*_COMMON, "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"),
     "matrices": (*_COMMON, "-fno-math-errno", "-fno-trapping-math"),
+    "scores": (*_COMMON, "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math"),
 }
 _operators = torch.library.Library("pfbench", "DEF")
 
@@ -103,6 +104,22 @@ def spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tensor:
     return _operator("spread")(x, mean, w, groups)
 
 
+def squared_length(e: Tensor, covariance: Tensor) -> Tensor:
+    """e' covariance^-1 e: [..., d], symmetric [..., d, d] -> [...]."""
+    d = e.shape[-1]
+    return _operator("squared_length")(e.reshape(-1, d), covariance.expand(*e.shape, d).reshape(-1, d, d)).view(e.shape[:-1])
+
+
+def marginal_scores(error: Tensor, deviation: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """CRPS and probability below 0 [R, d] of particles at error [R, d] + deviation [R, N, d] by weights [R, N] whose sum is 1."""
+    return _operator("marginal_scores")(error, deviation, w)
+
+
+def energy_score(points: Tensor) -> Tensor:
+    """Energy score of equally weighted points [R, n, s] against 0: [R]."""
+    return _operator("energy_score")(points)
+
+
 def follow(
     step: int, outputs: int, constants: list[Tensor], state: list[Tensor], seen: list[Tensor], shared: list[Tensor]
 ) -> list[Tensor]:
@@ -115,8 +132,9 @@ def follow(
     return found
 
 
-_LOOPS = normals, uniforms, systematic, copied, log_normal, affine, distinct, totals, moments, spread, rooted, updated, fitted
-for _loop in (*_LOOPS, follow):
+_STEP = normals, uniforms, systematic, copied, log_normal, affine, distinct, totals, moments, rooted, updated, fitted, follow
+_REPORT = spread, squared_length, marginal_scores, energy_score
+for _loop in _STEP + _REPORT:
     _operators.define(_loop.__name__ + torch.library.infer_schema(_loop, mutates_args=()))
 
 _KINDS = {"T": "AtenTensorHandle", "i": "int64_t"}

@@ -12,7 +12,7 @@ import torch
 from command_line import pfbench
 from torch import Tensor
 
-from pfbench import covariance, fusion, job, native, store
+from pfbench import covariance, fusion, job, judge, native, store
 from pfbench.draws import MonteCarlo
 from pfbench.filter import gaussian, particle, resamplers, rules
 from pfbench.filter.belief import Cloud, gather
@@ -237,6 +237,89 @@ def test_a_loop_by_hand_spreads_about_the_mean_in_any_memory_order(dtype: torch.
             found, wanted = native.spread(laid, mean, w, groups), particle._separate_spread(x, mean, w, groups)
             eps = torch.finfo(dtype).eps
             torch.testing.assert_close(found, wanted, equal_nan=True, rtol=1e3 * eps, atol=20 * eps)
+
+
+@compiler
+@pytest.mark.parametrize(("systems", "d"), [(1, 1), (3, 2), (5, 3), (100, 15)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_loop_by_hand_measures_by_a_covariance(dtype: torch.dtype, systems: int, d: int) -> None:
+    """Metres beside radians, a rounding below zero, several groups of a run, one covariance for all; a NaN stays in its place."""
+    root = DRAWS.normal("root", d * systems * (d + 2), 1)[0].to(dtype).view(systems, d, d + 2)
+    e, unit = DRAWS.normal("e", systems * d, 1)[0].to(dtype).view(systems, d), torch.logspace(-6, 6, d, dtype=dtype)
+    wide = root.double() @ root.double().mT
+    wide[-1, -1, -1] *= -1.0
+    given = ((unit[:, None] * unit).double() * wide).to(dtype)
+    found, wanted = native.squared_length(unit * e, given), covariance._solved_length(e.double(), wide).to(dtype)
+    # by the inverse's elements, which two systems of 15 x 17 numbers have up to 1e3 of
+    torch.testing.assert_close(found, wanted, rtol=1e5 * torch.finfo(dtype).eps, atol=0.0)
+    grouped = native.squared_length(e.unsqueeze(1).expand(-1, 2, -1), wide.to(dtype).unsqueeze(1).expand(-1, 2, -1, -1))
+    torch.testing.assert_close(grouped, wanted.unsqueeze(1).expand(-1, 2), rtol=1e5 * torch.finfo(dtype).eps, atol=0.0)
+    one = torch.linalg.inv(wide[:1]) * e.double().unsqueeze(1) * e.double().unsqueeze(2)
+    torch.testing.assert_close(
+        native.squared_length(e, wide[:1].to(dtype)).double(), one.sum((1, 2)), rtol=1e6 * torch.finfo(dtype).eps, atol=1e-6
+    )
+    e[0], given[:, 0], given[:, :, 0] = torch.nan, 0.0, 0.0
+    assert torch.isnan(native.squared_length(e, wide.to(dtype))).tolist() == [True] + [False] * (systems - 1)
+    for lost in (given, torch.zeros_like(given)):
+        assert not torch.isfinite(native.squared_length(e, lost)).any()
+        assert not torch.isfinite(covariance._solved_length(e, lost)).any()
+
+
+@compiler
+@pytest.mark.parametrize("particles", [1, 2, 50, 700])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_loop_by_hand_scores_components(dtype: torch.dtype, particles: int) -> None:
+    """Equal particles, those at the truth, empty slots, one far off, no spread, no truth, tiny numbers, an infinite one."""
+    x = DRAWS.normal("x", particles, 9).to(dtype)
+    x[..., 1] = (2.0 * x[..., 1]).round()  # so that many are equal, and some at the truth
+    x[..., 2] = torch.exp(12.0 * x[..., 2])
+    x[..., 3] = 0.25
+    x[:, particles // 2, 4] = 1e30
+    x[:, : particles // 2, 5] *= 1e-30
+    x[..., 8] *= 1e-40 if dtype == torch.float32 else 1e-310
+    x[:, 0, 7] = torch.inf
+    error = DRAWS.normal("error", 1, 9)[:, 0].to(dtype)
+    error[:, [1, 2, 8]], error[0, 3], error[1, 3] = 0.0, -0.25, -0.5
+    error[2, 6] = x[0, particles // 2, 0] = torch.nan
+    log_w = DRAWS.normal("w", particles, 1)[..., 0].to(dtype)
+    log_w[1, 1 : particles // 3] = -torch.inf
+    log_w[2] = 0.0
+    w = torch.softmax(log_w, -1)
+    crps, below = judge._separate_marginals(error.double(), x.double(), w.double())
+    eps, known, far = torch.finfo(dtype).eps, ~torch.isnan(crps), (w.unsqueeze(-1) * (error.unsqueeze(1) + x).abs()).sum(1)
+    for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
+        found = native.marginal_scores(error, laid, w)
+        off = torch.where(torch.isinf(crps) & (found[0] == crps), 0.0, (found[0].double() - crps).abs())
+        assert (off[known] <= 20 * eps * (far[known] + torch.finfo(dtype).tiny)).all()
+        torch.testing.assert_close(found[1].double(), below, rtol=0.0, atol=100 * eps)
+        assert torch.isnan(found[0]).nonzero().tolist() == [[0, 0], [2, 6]]
+
+
+@compiler
+@pytest.mark.parametrize("points", [1, 7, 64])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_loop_by_hand_scores_vectors(dtype: torch.dtype, points: int) -> None:
+    x = 3.0 + DRAWS.normal("x", points, 6).to(dtype)
+    x[1, 0, 2] = torch.nan
+    for parts in ([0], [3, 1, 5], [0, 1, 2, 3, 4, 5]):
+        found, wanted = native.energy_score(x[:, :, parts]), judge._separate_energy(x[:, :, parts])
+        torch.testing.assert_close(found, wanted, rtol=1e2 * torch.finfo(dtype).eps, atol=0.0, equal_nan=True)
+
+
+def test_what_no_compiler_improves_runs_eagerly_where_its_loop_does_not_compile(caplog: pytest.LogCaptureFixture) -> None:
+    def refused(a: Tensor) -> Tensor:
+        raise OSError("no C++ compiler")
+
+    compiled: list[bool] = []
+
+    def separate(a: Tensor) -> Tensor:
+        compiled.append(torch.compiler.is_compiling())
+        return 2.0 * a
+
+    with fusion.fused():
+        assert float(fusion.fusible(separate, by_hand=refused, whole=False, compiles=False)(torch.ones(()))) == 2.0
+    assert compiled == [False]
+    assert "refused does not compile here (OSError); it runs eagerly instead" in caplog.text
 
 
 @compiler

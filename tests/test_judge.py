@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +20,7 @@ from pfbench.filter.ensemble import EnsembleKalmanFilter
 from pfbench.filter.gaussian import GaussianFilter
 from pfbench.filter.guided_noise import GuidedNoise
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import ParticleFilter, summarise
+from pfbench.filter.particle import ParticleFilter, described, summarise
 from pfbench.filter.rules import Jacobian
 from pfbench.judge import Judge, Tally, of_cloud, of_normal
 from pfbench.model.linear import linear_walk
@@ -36,6 +37,14 @@ def law(runs: int = 3) -> tuple[Tensor, Tensor]:
     return torch.tensor([[0.0, 0.0], [1.0, -2.0], [6.0, 0.5]], dtype=torch.float64)[:runs], covariance
 
 
+@pytest.fixture(params=[False, True], ids=["eager", "fused"])
+def both(request: pytest.FixtureRequest) -> Iterator[None]:
+    """By the library, and by loops of the project's own."""
+    with fusion.fused(request.param):
+        yield
+
+
+@pytest.mark.usefixtures("both")
 def test_a_large_cloud_of_a_normal_law_scores_as_the_law() -> None:
     error, covariance = law()
     n, root = 40_000, torch.linalg.cholesky(covariance)
@@ -53,6 +62,7 @@ def test_a_large_cloud_of_a_normal_law_scores_as_the_law() -> None:
     torch.testing.assert_close(one.crps[:, 0], expected)
 
 
+@pytest.mark.usefixtures("both")
 def test_the_energy_score_of_one_component_is_its_crps() -> None:
     error, _ = law()
     deviation = MonteCarlo(2, torch.arange(3)).normal("z", 64, 2)
@@ -60,6 +70,7 @@ def test_the_energy_score_of_one_component_is_its_crps() -> None:
     torch.testing.assert_close(scores.energy[:, :2], scores.crps)
 
 
+@pytest.mark.usefixtures("both")
 def test_a_weighted_particle_is_as_many_particles() -> None:
     error, _ = law()
     deviation = MonteCarlo(2, torch.arange(3)).normal("z", 16, 2)
@@ -71,6 +82,7 @@ def test_a_weighted_particle_is_as_many_particles() -> None:
     torch.testing.assert_close(one._asdict(), of_cloud(error, repeated, torch.zeros(3, 32, dtype=w.dtype), GROUPS)._asdict())
 
 
+@pytest.mark.usefixtures("both")
 def test_a_point_scores_its_distance() -> None:
     error, covariance = law()
     point = of_cloud(error, torch.zeros(3, 5, 2, dtype=torch.float64), torch.zeros(3, 5, dtype=torch.float64), GROUPS)
@@ -80,11 +92,35 @@ def test_a_point_scores_its_distance() -> None:
         torch.testing.assert_close(scores.energy[:, 2], error.norm(dim=1))
 
 
+@pytest.mark.usefixtures("both")
 def test_without_a_truth_there_is_no_score() -> None:
     error = torch.tensor([[0.5, torch.nan]], dtype=torch.float64)
     scores = of_cloud(error, torch.zeros(1, 4, 2, dtype=torch.float64), torch.zeros(1, 4, dtype=torch.float64), GROUPS)
     assert torch.isnan(scores.crps).tolist() == torch.isnan(scores.pit).tolist() == [[False, True]]
     assert torch.isnan(scores.energy).tolist() == [[False, True, True]]
+
+
+@pytest.mark.usefixtures("both")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_filter_without_spread_has_an_infinite_normalised_error(dtype: torch.dtype) -> None:
+    """Without a truth it is unknown, whatever the spread; one run's says nothing of another's."""
+    x = MonteCarlo(2, torch.arange(4)).normal("x", 20, 2).to(dtype)
+    x[1], x[3, :, 1] = x[1, :1], x[3, :1, 1]
+    truth = torch.zeros(4, 1, 2, dtype=dtype)
+    truth[2] = torch.nan
+    cloud = Cloud(x, torch.full((4, 20), -math.log(20), dtype=dtype), torch.zeros(4, dtype=torch.float64))
+    info = summarise(MODEL, cloud, {})
+    level = torch.where(torch.tensor([[False], [True], [False], [False]]), x[:, 0], info.mean)  # free of its rounding
+    level[3, 1] = x[3, 0, 1]
+    found = Judge(MODEL, truth, 1)(0, described(MODEL, cloud, level, info.variance, {}))
+    nees = found["nees"]
+    assert torch.isinf(nees[1]).all()
+    assert torch.isnan(nees[2]).all()
+    assert torch.isfinite(nees[0]).all()
+    assert torch.isinf(nees[3]).any()
+    off, d = level[0].double(), x[0].double() - level[0].double()
+    wanted = off @ torch.linalg.inv(d.mT @ d / 20) @ off
+    assert float(nees[0, -1]) == pytest.approx(float(wanted), rel=1e-4 if dtype == torch.float32 else 1e-9)
 
 
 @pytest.mark.parametrize(("instants", "at"), [(0, []), (1, [9]), (3, [2, 5, 9]), (10, list(range(10))), (99, list(range(10)))])
@@ -136,6 +172,7 @@ def test_a_group_of_a_covariance_is_cut_from_the_whole(chart: Chart, fused: bool
         assert (found[:, 0].diagonal(dim1=-2, dim2=-1) > 0).all()
 
 
+@pytest.mark.usefixtures("both")
 @pytest.mark.parametrize("name", ["ekf", "sir", "enkf", "guided"])
 def test_the_normalised_innovation_is_chi_square_for_a_filter_that_is_right(name: str) -> None:
     methods: dict[str, Any] = {

@@ -200,7 +200,9 @@ def surprise(model: StateSpaceModel, x: Tensor, log_w: Tensor, seen: Record) -> 
     else:
         noise = torch.diag_embed((w * law.variance).sum(1))
     r = torch.where(there, model.residual(seen.y.nan_to_num(), y_hat), 0.0)
-    return squared_length(r, where_seen((w * off).mT @ off + noise, there)), there.sum(1)
+    every = torch.arange(off.shape[-1], device=off.device).unsqueeze(0)
+    spread = _spread(off, torch.zeros_like(y_hat), w.squeeze(-1), every).squeeze(1)
+    return squared_length(r, where_seen(spread + noise, there)), there.sum(1)
 
 
 def _marked(copy_of: Tensor, log_w: Tensor) -> Tensor:
