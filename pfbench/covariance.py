@@ -13,20 +13,13 @@ from pfbench.fusion import fusible, recording
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-def factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
+def _factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Lower triangular A with A A' = covariance, and whether it exists: [..., d, d] -> [..., d, d], bool [...].
 
     Works on the correlation matrix, so that metres beside radians do no harm. Where rounding has left it slightly
     indefinite, a relative 1e-12 (1e-6 in float32) is added to the diagonal; a covariance that this does not heal is
     reported, never repaired in silence. A component without spread has none in the root either.
     """
-    if covariance.dim() == 3:
-        return _rooted(covariance)
-    lower, ok = _rooted(covariance.reshape(-1, *covariance.shape[-2:]))
-    return lower.reshape(covariance.shape), ok.reshape(covariance.shape[:-2])
-
-
-def _separate_root(covariance: Tensor) -> tuple[Tensor, Tensor]:
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     sd = torch.sqrt(torch.where(variance > 0, variance, 1.0))
     correlation = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
@@ -40,7 +33,7 @@ def _separate_root(covariance: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(variance > 0, sd, 0.0).unsqueeze(-1) * lower, ok & (variance >= 0).all(-1)
 
 
-_rooted = fusible(_separate_root, by_hand=native.rooted, compiles=False)
+factor = fusible(_factor, by_hand=native.rooted, compiles=False)
 
 
 def _solved_length(e: Tensor, covariance: Tensor) -> Tensor:

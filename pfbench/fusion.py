@@ -93,7 +93,7 @@ def fusible(
             try:
                 return by_hand(*args)
             except (OSError, subprocess.CalledProcessError) as error:
-                what = "torch compiles it instead" if compiles else "torch's own functions do it"
+                what = "torch compiles it instead" if compiles else "it runs eagerly instead"
                 log.warning("%s does not compile here (%s); %s", by_hand.__name__, type(error).__name__, what)
                 _failed.add(by_hand)
         return (compiled() if compiles else separate)(*args)

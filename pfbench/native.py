@@ -81,8 +81,9 @@ def moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def rooted(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """covariance.factor of [R, d, d]: lower triangular roots [R, d, d], and which exist, bool [R]."""
-    return _operator("rooted")(covariance)
+    """Lower triangular roots [..., d, d], as covariance.factor makes them, and which exist, bool [...]."""
+    lower, fine = _operator("rooted")(covariance.reshape(-1, *covariance.shape[-2:]))
+    return lower.view(covariance.shape), fine.view(covariance.shape[:-2])
 
 
 def updated(m: Tensor, r: Tensor, omega: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -130,7 +130,7 @@ def test_roots_by_hand_exist_where_roots_do(dtype: torch.dtype, d: int) -> None:
     whole[3, -1], whole[3, :, -1] = 0.0, 0.0  # no spread, and none in the root
     whole[4] = torch.outer(half[4, 0], half[4, 0])  # of rank 1: rounding decides, and a little more on the diagonal heals it
     whole[5, 0, -1] = whole[5, -1, 0] = whole[5].diagonal().max() * 1e3  # correlated above 1, unless there is but one component
-    for found, fine in (native.rooted(whole), covariance._separate_root(whole)):
+    for found, fine in (native.rooted(whole), covariance._factor(whole)):
         assert fine.tolist() == [k not in (1, 2, *([5] if d > 1 else [])) for k in range(runs)]
         sd = whole[fine].diagonal(dim1=-2, dim2=-1).sqrt().clamp(min=1e-15)
         off = (found[fine] @ found[fine].mT - whole[fine]) / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
