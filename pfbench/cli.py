@@ -289,15 +289,25 @@ def _composition(overrides: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
     return {str(key): value for key, value in cfg.items()}, choices
 
 
+_offered: dict[str, tuple[Path, int]] = {}  # experiments that Hydra has been given, and when each was written
+
+
 def _offer_experiments() -> None:
-    """Makes experiments/NAME.yaml known to Hydra as the group `experiment`, which lies outside conf/."""
+    """Makes experiments/NAME.yaml known to Hydra as the group `experiment`, which lies outside conf/.
+
+    Reading them all takes as long as composing, so those that Hydra has are left.
+    """
     from hydra.core.config_store import ConfigStore
     from omegaconf import OmegaConf
 
+    known = ConfigStore.instance().repo.get("experiment", {})
     for path in experiments_dir().glob("*.yaml"):
-        ConfigStore.instance().store(
-            group="experiment", name=path.stem, node=OmegaConf.load(path), package="_global_", provider="pfbench.experiments"
-        )
+        written = path, path.stat().st_mtime_ns
+        if _offered.get(path.stem) != written or path.name not in known:
+            ConfigStore.instance().store(
+                group="experiment", name=path.stem, node=OmegaConf.load(path), package="_global_", provider="pfbench.experiments"
+            )
+            _offered[path.stem] = written
 
 
 def _groups() -> dict[str, list[Path]]:

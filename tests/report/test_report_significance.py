@@ -34,10 +34,23 @@ def skill(rng, runs, factor):
     return a, factor * b
 
 
-def _without_intervals(monkeypatch):
-    """They take most of the time and no part in the decision; statsmodels collects garbage at each correction."""
-    monkeypatch.setattr("gc.collect", lambda *_: 0)
+def _winners_alone(monkeypatch):
+    """Intervals, equivalence and the runs that are needed take most of the time and no part in the decision."""
     monkeypatch.setattr(significance, "median_interval", lambda *_: significance.Interval(0.0, 0.0, "none"))
+    monkeypatch.setattr(significance.power, "equivalence", lambda *_: np.nan)
+    monkeypatch.setattr(significance, "_power", lambda *_: (np.nan, np.nan))
+
+
+def families(losses, alpha=0.05):
+    """The verdicts of many studies, losses [studies, runs] by label: each is a cell of one table, which is made once."""
+    n, runs = next(iter(losses.values())).shape
+    rows = table({name: values.ravel() for name, values in losses.items()})
+    rows = rows.assign(noise=rows.run // runs, run=rows.run % runs)
+    found = significance.verdicts(rows, alpha)
+    size = len(found) // n
+    family = [found[k : k + size] for k in range(0, len(found), size)]
+    assert [{v.noise for v in own} for own in family] == [{str(k)} for k in range(n)]
+    return family
 
 
 def test_p_is_that_of_scipy_on_log_ratios():
@@ -208,26 +221,25 @@ def test_same_table_same_verdicts_in_any_order_of_rows():
 
 @pytest.mark.slow
 def test_false_winners_are_as_rare_as_alpha(monkeypatch):
-    _without_intervals(monkeypatch)
+    _winners_alone(monkeypatch)
     rng, n, alpha = np.random.default_rng(11), 1000, 0.05
-    families = pairs = 0
-    for _ in range(n):
-        world = np.exp(0.5 * rng.standard_normal(30))
-        losses = {name: world * np.exp(0.2 * rng.standard_normal(30)) for name in "abc"}
-        found = significance.verdicts(table(losses), alpha)
-        families += any(v.winner != significance.NO_DIFFERENCE for v in found)
-        pairs += found[0].p <= alpha
+    world = np.exp(0.5 * rng.standard_normal((n, 30)))
+    losses = {name: world * np.exp(0.2 * rng.standard_normal((n, 30))) for name in "abc"}
+    found = families(losses, alpha)
+    won = np.mean([any(v.winner != significance.NO_DIFFERENCE for v in family) for family in found])
+    first = np.mean([family[0].p <= alpha for family in found])
     error = 4 * np.sqrt(alpha * (1 - alpha) / n)
-    assert pairs / n == pytest.approx(alpha, abs=error)
-    assert families / n <= alpha + error
-    assert families / n >= alpha / 3  # a test that never rejects would pass the line above
+    assert first == pytest.approx(alpha, abs=error)
+    assert won <= alpha + error
+    assert won >= alpha / 3  # a test that never rejects would pass the line above
 
 
 @pytest.mark.slow
 def test_a_planted_difference_is_found(monkeypatch):
-    _without_intervals(monkeypatch)
+    _winners_alone(monkeypatch)
     rng, n = np.random.default_rng(12), 200
-    winners = [one(*skill(rng, 40, 1.2)).winner for _ in range(n)]
+    a, b = (np.stack(values) for values in zip(*(skill(rng, 40, 1.2) for _ in range(n)), strict=True))
+    winners = [v.winner for (v,) in families({"a": a, "b": b})]
     # log 1.2 is 0.64 standard deviations of the paired difference; the t-test has power 0.97 with 40 pairs, and the
     # signed-rank test loses at most a few per cent of its sample to it [Hodges, Lehmann 1956].
     assert winners.count("a") / n > 0.9
