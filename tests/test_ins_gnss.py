@@ -263,7 +263,7 @@ def test_improper_initial_laws_are_refused() -> None:
 def test_the_linear_transition_carries_errors_of_constant_biases_over_a_whole_flight() -> None:
     """500 s open loop against the mechanisation: 0.2-0.7 m of 110-400 m, 0.002 m/s, 0.01 arcsec; ten times that is allowed."""
     constant = ["scenario.imu.gyro_markov_deg_h=0", "scenario.imu.accelerometer_markov_ug=0"]
-    flight = job.build(composed("scenario=t004", "worlds=null", *constant).scenario)
+    flight = job.build(composed("scenario=t004", "scenario.imu_rate=20", "worlds=null", *constant).scenario)
     episode = flight.draw(Nominal(), torch.arange(10), 3)
     believed = ImuErrors(0.05, 0.05, 3600.0, accelerometer_bias_ug=100.0)  # no correlation time: the bias does not decay
     model = InsGnss(believed, RECEIVER, INITIAL, markov=True)
@@ -288,7 +288,7 @@ def test_the_kalman_filter_is_consistent_on_flights_that_its_model_did_not_draw(
     Of 18 states; scenario/test_consistency.py has the 15 of t003, where the INS is corrected.
     """
     runs, level = 40, 1e-4  # of each of some twenty bands
-    cfg = composed("scenario=t004", "scenario.imu_rate=20", "worlds=null")
+    cfg = composed("scenario=t004", "scenario.imu_rate=10", "worlds=null")
     model = job.build(cfg.model)
     episode = job.build(cfg.scenario).draw(Nominal(), torch.arange(runs), 12)
     estimate = filtered(Points(Cubature()), model, episode)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -139,29 +140,39 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 
+ASK = """
+import sys
+import pfbench
+from pfbench import cli
+
+print(pfbench.__file__, cli.conf_dir(), cli.experiments_dir(), sep="\\n")
+for words in sys.argv[1:]:
+    print("pfbench:", words)
+    cli.main(words.split())
+"""
+
+
 @pytest.mark.slow
 def test_the_installed_package_needs_no_checkout(installed: Path, tmp_path: Path) -> None:
-    ask = "import pfbench, pfbench.cli as c; print(pfbench.__file__, c.conf_dir(), c.experiments_dir(), sep='\\n')"
-    env = os.environ | {"PYTHONPATH": str(installed)}
-    where = subprocess.run([sys.executable, "-c", ask], env=env, cwd=tmp_path, capture_output=True, text=True, check=True)
-    module, conf, experiments = map(Path, where.stdout.splitlines())
-    assert module == installed / "pfbench" / "__init__.py"
-    assert conf == installed / "pfbench" / "conf"
-    assert experiments == installed / "pfbench" / "experiments"
-
-    listed = elsewhere(installed, tmp_path, "list")
-    assert listed.code == 0, listed.err
-    assert all(name in listed.out for name in ("sir", "t004", "quickstart"))
-    checked = elsewhere(installed, tmp_path, "check")
-    assert checked.code == 0, checked.err
-    files = [*cli.conf_dir().glob("*/*.yaml"), *cli.experiments_dir().glob("*.yaml")]
-    assert f"composed   {len(files)} of {len(files)} configurations" in checked.out
+    """A job by the command itself; all else in one process, since each takes seconds to start."""
     ran = elsewhere(installed, tmp_path, "run", "scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=50")
     assert ran.code == 0, ran.err
     assert len(list((tmp_path / "results" / "adhoc").glob("*.npz"))) == 1
-    told = elsewhere(installed, tmp_path, "report", "study=adhoc", "report.formats=[svg]")
-    assert told.code == 0, told.err
+
+    env = os.environ | environment(tmp_path) | {"PYTHONPATH": str(installed)}
+    words = ("list", "report study=adhoc report.formats=[svg]", "check")
+    command = [sys.executable, "-c", ASK, *words]
+    done = subprocess.run(command, env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    where, listed, _, checked = re.split(r"^pfbench: .*\n", done.stdout, flags=re.M)
+    module, conf, experiments = map(Path, where.splitlines())
+    assert module == installed / "pfbench" / "__init__.py"
+    assert conf == installed / "pfbench" / "conf"
+    assert experiments == installed / "pfbench" / "experiments"
+    assert all(name in listed for name in ("sir", "t004", "quickstart"))
     assert (tmp_path / "reports" / "adhoc" / "index.html").is_file()
+    files = [*cli.conf_dir().glob("*/*.yaml"), *cli.experiments_dir().glob("*.yaml")]
+    assert f"composed   {len(files)} of {len(files)} configurations" in checked
 
 
 PROGRAM = """

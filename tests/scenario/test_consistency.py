@@ -27,10 +27,10 @@ FALSE_ALARM = 1e-2
 
 # Words beside each scene. The IMU is read less often than in the scenes, which is cheap and changes no law.
 CONSISTENT: dict[str, tuple[str, ...]] = {
-    "t003_closed": ("scenario.imu_rate=20",),
-    "gps_ins_markov": ("scenario.imu_rate=20",),
-    "azimuth_small": ("scenario.imu_rate=20",),
-    "anshun_nl_small": ("scenario.imu_rate=20", "scenario.path.duration=100"),
+    "t003_closed": ("scenario.imu_rate=10",),
+    "gps_ins_markov": ("scenario.imu_rate=10",),
+    "azimuth_small": ("scenario.imu_rate=10",),
+    "anshun_nl_small": ("scenario.imu_rate=10", "scenario.path.duration=100"),
     "passive_1_drawn": (),
     "passive_3_drawn": (),
 }
