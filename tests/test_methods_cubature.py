@@ -45,8 +45,8 @@ def beginning(record: Record, steps: int) -> Record:
 
 
 def drawn(noise: str, runs: int, *words: str) -> tuple[Any, Episode]:
-    """The paper's flight with sensors at 20 Hz."""
-    cfg = composed("scenario=anshun_fit", "scenario.imu_rate=20", f"noise={noise}", *words)
+    """The paper's flight with sensors at 10 Hz."""
+    cfg = composed("scenario=anshun_fit", "scenario.imu_rate=10", f"noise={noise}", *words)
     return job.build(cfg.model), job.build(cfg.scenario).draw(job.build(cfg.noise), torch.arange(runs), 9)
 
 

@@ -424,7 +424,7 @@ def test_the_flight_gives_the_published_accuracy() -> None:
 @pytest.mark.slow
 def test_the_take_off_shows_the_heading() -> None:
     """From 45 degrees the cubature filter comes below 1 degree within 20 s (half the runs) and 60 s (nearly all)."""
-    cfg = composed("scenario=anshun_nl", "scenario.imu_rate=50", "scenario.path.duration=70")
+    cfg = composed("scenario=anshun_nl", "scenario.imu_rate=20", "scenario.path.duration=70")
     model, runs = job.build(cfg.model), torch.arange(40)
     episode = job.build(cfg.scenario).draw(Nominal(), runs, 3)
     truth = model.assemble(episode.truth)

@@ -440,7 +440,7 @@ def test_the_names_of_the_18_state_scene() -> None:
 
 @pytest.fixture(scope="module")
 def fixed() -> Episode:
-    return job.build(composed("scenario=azimuth_fixed", "scenario.imu_rate=50").scenario).draw(Nominal(), torch.arange(40), 1)
+    return job.build(composed("scenario=azimuth_fixed", "scenario.imu_rate=20").scenario).draw(Nominal(), torch.arange(40), 1)
 
 
 # root mean square after 60 s of the prototype's 20 runs: tilts E, N and azimuth (arcmin), velocity E, N, U, position E, N, U
