@@ -179,10 +179,20 @@ def test_report_with_a_misspelt_key(tmp_path: Path) -> None:
     assert "stdy=nope: there is no key 'stdy'; did you mean study?" in said.err
 
 
-def test_check_finds_nothing_wrong(tmp_path: Path) -> None:
+def test_check_finds_nothing_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It asks for every file. Here every tenth is composed: test_configs composes each, and so does the installed package's."""
+    compose, asked = cli._compose, []
+
+    def tenth(words: list[str]) -> dict[str, Any]:
+        asked.append(words[0] if words else "")
+        return compose(words) if len(asked) % 10 == 1 or asked[-1].startswith(("report=", "train=")) else {}
+
+    monkeypatch.setattr(cli, "_compose", tenth)
     said = pfbench("check", home=tmp_path)
     assert said.code == 0, said.err
     files = [*cli.conf_dir().glob("*/*.yaml"), *cli.experiments_dir().glob("*.yaml")]
+    named = [("+experiment" if file.parent.name == "experiments" else file.parent.name, file.stem) for file in files]
+    assert sorted(asked) == sorted(["", *(f"{group}={name}" for group, name in named)])
     assert f"composed   {len(files)} of {len(files)} configurations" in said.out
     for line in (f"pfbench    {package.__version__}", f"torch      {torch.__version__}", "data root  not set"):
         assert line in said.out
