@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -400,7 +402,9 @@ def test_a_record_of_another_length_and_a_silent_witness_are_refused() -> None:
 # the switch
 
 
+@cache
 def composed(*words: str) -> Any:
+    """For reading: the same words are composed once."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", [*words, "worlds=null"])
 
@@ -409,13 +413,19 @@ PRESETS = [file.stem for file in sorted((CONF / "noise").glob("*.yaml"))]
 CANNOT = {"gauss_markov", "replay", "nlos_persistent"}
 
 
-def cell(scenario: str, noise: str, *words: str) -> None:
-    """The cell runs, told and untold, and what is told matters; or it is refused by name."""
-    cfg = composed(f"scenario={scenario}", f"noise={noise}", "particles=30", *words)
+def cell(scenario: str, noise: str) -> None:
+    """The cell runs, told and untold, and what is told matters; or it is refused by name.
+
+    A regime takes nothing from the scene, and is composed beside it.
+    """
+    windows = ["noise.windows=[[6.0,9.0]]"] if noise.endswith("outage") else []
+    short = ["scenario.steps=20"] if scenario != "t004" else []
+    cfg = deepcopy(composed(f"scenario={scenario}", "particles=30", "data.root=null", *short))
+    regime = composed(f"noise={noise}", "data.root=null", *windows).noise
     if scenario == "t004":
         cfg.scenario.path.segments = cfg.scenario.path.segments[:1]
         cfg.scenario.imu_rate = 20.0
-    witness, model = Witness(job.build(cfg.noise)), job.build(cfg.model)
+    witness, model = Witness(job.build(regime)), job.build(cfg.model)
     if noise == "replay":
         with pytest.raises(ValueError, match=r"data\.root is not set"):
             job.build(cfg.scenario).draw(witness, torch.arange(2), 1)
@@ -439,8 +449,7 @@ def cell(scenario: str, noise: str, *words: str) -> None:
 @pytest.mark.parametrize("noise", PRESETS)
 @pytest.mark.parametrize("scenario", ["linear_walk", "growth", "t004"])
 def test_every_regime_runs_told_and_untold_or_says_why_not(scenario: str, noise: str) -> None:
-    windows = ["noise.windows=[[6.0,9.0]]"] if noise.endswith("outage") else []
-    cell(scenario, noise, *windows, *(["scenario.steps=20"] if scenario != "t004" else []), "data.root=null")
+    cell(scenario, noise)
 
 
 def test_the_switch_reaches_the_result(tmp_path: Path) -> None:
