@@ -321,7 +321,11 @@ def fuses(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> b
 
     What is compiled is kept on disk for later jobs; a compilation that took noticeably long is told.
     """
-    numbers = run_steps * method.particles * model.noise_dim if isinstance(method, ParticleFilter) else 0
+    numbers = 0
+    if isinstance(method, ParticleFilter):
+        numbers = run_steps * method.particles * model.noise_dim
+    elif isinstance(method, GaussianFilter):  # linear algebra by hand saves it as much as eight normals for each entry of a covariance
+        numbers = run_steps * 8 * model.chart.dimension**2
     if engine == "eager" or (engine == "auto" and numbers < _COMPILE_FROM):
         return False
     begun = time.perf_counter()

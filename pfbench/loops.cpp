@@ -7,6 +7,7 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <memory>
 #include <tuple>
 #include <vector>
 
@@ -20,21 +21,29 @@ namespace {
 // One uniform u for all slots, positions (j + u) / n: slot j goes to the first particle whose sum of weights lies beyond its position.
 template <class T>
 void systematic(int64_t* ancestor, const T* weight, const double* wanted, const double* uniform, int64_t runs, int64_t slots) {
-    std::vector<T> sums(slots);
-    std::vector<int32_t> ends(slots), first(slots + 1);
+    constexpr int64_t PARTS = 4;  // are summed side by side: one sum alone would wait for itself
+    const int64_t part = slots / PARTS;
+    const std::unique_ptr<double[]> sums(new double[slots]);
+    const std::unique_ptr<int32_t[]> ends(new int32_t[slots]), first(new int32_t[slots + 1]);
     for (int64_t r = 0; r < runs; ++r, weight += slots, ancestor += slots) {
-        double sum = 0.0;
-        for (int64_t i = 0; i < slots; ++i) sums[i] = static_cast<T>(sum += weight[i]);
-        const T whole = sums[slots - 1], n = static_cast<T>(wanted[r]), u = static_cast<T>(uniform[r]);
-        for (int64_t i = 0; i < slots; ++i) {
-            const T reach = sums[i] / whole * n;
-            // not simply ceil: n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0;
-            // the last sum is n exactly, being divided by itself, and NaN is not below n
-            const T end = reach < n ? std::ceil(reach - u) : n;
-            ends[i] = static_cast<int32_t>(end < 0 ? 0 : end);
+        double sum[PARTS] = {};
+        for (int64_t i = 0; i < part; ++i)
+            for (int64_t k = 0; k < PARTS; ++k) sums[k * part + i] = sum[k] += weight[k * part + i];
+        for (int64_t i = PARTS * part; i < slots; ++i) sums[i] = sum[PARTS - 1] += weight[i];
+        for (int64_t k = 1; k < PARTS; ++k) sum[k] += sum[k - 1];
+        const T whole = static_cast<T>(sum[PARTS - 1]), n = static_cast<T>(wanted[r]), u = static_cast<T>(uniform[r]);
+        for (int64_t k = 0; k < PARTS; ++k) {
+            const double before = k ? sum[k - 1] : 0.0;
+            for (int64_t i = k * part; i < (k < PARTS - 1 ? (k + 1) * part : slots); ++i) {
+                const T reach = static_cast<T>(before + sums[i]) / whole * n;
+                // not simply ceil: n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0;
+                // the last sum is n exactly, being divided by itself, and NaN is not below n
+                const T end = reach < n ? std::ceil(reach - u) : n;
+                ends[i] = static_cast<int32_t>(end < 0 ? 0 : end);
+            }
         }
         // a particle's slots begin where its predecessor's end; of several that begin at a slot, the last one has it
-        std::fill(first.begin(), first.end(), 0);
+        std::fill(first.get(), first.get() + slots + 1, 0);
         for (int64_t i = 1; i < slots; ++i) first[ends[i - 1]] = static_cast<int32_t>(i);
         int32_t latest = 0;
         for (int64_t j = 0; j < slots; ++j) ancestor[j] = latest = std::max(latest, first[j]);
@@ -43,14 +52,17 @@ void systematic(int64_t* ancestor, const T* weight, const double* wanted, const 
 
 template <class T>
 void copied(T* out, const T* x, const int64_t* ancestor, int64_t components, int64_t runs, int64_t slots, int64_t wanted) {
-    std::vector<int32_t> from(wanted);
+    const auto one = [&](int64_t row, const auto* from) {
+        for (int64_t j = 0; j < wanted; ++j) out[row * wanted + j] = x[row * slots + from[j]];
+    };
+    if (components == 1) {
+        for (int64_t r = 0; r < runs; ++r) one(r, ancestor + r * wanted);
+        return;
+    }
+    std::vector<int32_t> from(wanted);  // half as long
     for (int64_t r = 0; r < runs; ++r) {
         for (int64_t j = 0; j < wanted; ++j) from[j] = static_cast<int32_t>(ancestor[r * wanted + j]);
-        for (int64_t d = 0; d < components; ++d) {
-            const T* row = x + (d * runs + r) * slots;
-            T* to = out + (d * runs + r) * wanted;
-            for (int64_t j = 0; j < wanted; ++j) to[j] = row[from[j]];
-        }
+        for (int64_t d = 0; d < components; ++d) one(d * runs + r, from.data());
     }
 }
 

@@ -15,7 +15,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from functools import cache
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -231,9 +232,12 @@ def _load() -> None:
         folder.mkdir(mode=0o700, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             parts, new = [Path(scratch) / f"{source}.o" for source in sources], Path(scratch) / built.name
-            for source, part in zip(sources, parts, strict=True):
-                command = [compiler, *_FLAGS[source], f"-I{_TORCH / 'include'}", "-o", str(part), str(_HERE / f"{source}.cpp")]
-                subprocess.run(command, check=True, capture_output=True)
+            commands = [
+                [compiler, *_FLAGS[source], f"-I{_TORCH / 'include'}", "-o", str(part), str(_HERE / f"{source}.cpp")]
+                for source, part in zip(sources, parts, strict=True)
+            ]
+            with ThreadPoolExecutor() as together:
+                list(together.map(partial(subprocess.run, check=True, capture_output=True), commands))
             # linked without -ffast-math, with which a library switches small numbers off in the whole process
             libraries = [f"-L{_TORCH / 'lib'}", "-ltorch_cpu", "-lm"]
             if sys.platform == "darwin":  # as elsewhere by itself, Python is found when the library is loaded

@@ -389,6 +389,14 @@ def test_small_jobs_are_not_compiled_unless_asked() -> None:
     model, method = linear_walk(1.0, 0.3, 1.0), ParticleFilter(100)
     assert not job.fuses("auto", method, model, 1000)
     assert not job.fuses("eager", method, model, 10**9)
+    assert not job.fuses("auto", gaussian.GaussianFilter(rules.Points(Cubature())), model, 10**6)
+
+
+@compiler
+def test_large_jobs_are_compiled_unasked() -> None:
+    model = linear_walk(1.0, 0.3, 1.0)
+    for method in (ParticleFilter(100), gaussian.GaussianFilter(rules.Points(Cubature()))):
+        assert job.fuses("auto", method, model, 10**9)
 
 
 @compiler

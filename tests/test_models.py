@@ -231,6 +231,14 @@ def test_unseen_components_weigh_nothing() -> None:
     assert np.all(value[1] == 0.0)
 
 
+def test_the_volatility_weighs_as_its_law_does() -> None:
+    model = StochasticVolatility()
+    x, y = 20.0 * normal(3, 50, 1), torch.tensor([[0.3], [-40.0], [torch.nan]], dtype=torch.float64)
+    value = model.log_likelihood(y, x, ()).numpy()
+    assert np.allclose(value[:2], stats.norm.logpdf(y[:2], scale=np.exp(0.5 * x[:2, :, 0])), rtol=1e-12)
+    assert np.all(value[2] == 0.0)
+
+
 def test_dropping_a_component_equals_a_model_without_it() -> None:
     f, g, h = np.array([[0.9, 0.2], [0.0, 0.7]]), np.eye(2), np.array([[1.0, 0.5], [0.2, 1.0], [1.0, -1.0]])
     whole = LinearGaussian(f, g, h, [1.0, 2.0, 3.0], [0.0, 0.0], [1.0, 1.0])

@@ -17,7 +17,7 @@ from pfbench.covariance import gaussian_log_density
 from pfbench.fusion import fusible
 from pfbench.record import Record
 
-_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class Standard(Normal):
@@ -205,7 +205,7 @@ def _log_normal(y: Tensor, mean: Tensor, sd: Tensor, seen: Tensor) -> Tensor:
     Scales are of a run or, [R, N, Dy], of each particle. Does what torch's log_prob does in one pass over the particles
     instead of eight: half of a step was spent there.
     """
-    scale, constant = seen / sd, ((torch.log(sd) + _HALF_LOG_2PI) * seen).sum(-1)
+    scale, constant = seen / sd, ((torch.log(sd) + HALF_LOG_2PI) * seen).sum(-1)
     if scale.shape[1] == 1:
         return _quadratic(y[:, 0], mean, scale[:, 0], constant[:, 0])
     return _quadratic_of_each(y, mean, scale) - constant

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from pfbench.chart import Angles, Chart, Euclidean
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch, numbers, positive
+from pfbench.model.base import HALF_LOG_2PI, StateSpaceModel, independent_normal, normal_batch, numbers, positive
 from pfbench.record import Record
 
 
@@ -87,6 +87,11 @@ class StochasticVolatility(StateSpaceModel):
 
     def observation(self, x: Tensor, u: Any) -> Distribution:
         return independent_normal(torch.zeros_like(x), torch.exp(0.5 * x))
+
+    def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
+        """As the observation's law has it, by one exponential for each particle instead of one, a quotient and a logarithm."""
+        square, log_variance = y.nan_to_num().square(), x[..., 0]
+        return torch.where(torch.isnan(y), 0.0, -0.5 * (square * torch.exp(-log_variance) + log_variance) - HALF_LOG_2PI)
 
     def transition(self, x: Tensor, u: Any) -> Distribution:
         return independent_normal(self.mu + self.rho * (x - self.mu), self.sigma)
