@@ -56,7 +56,7 @@ PLACES = (
 # what says how jobs are compared and changes nothing in one: no part of its name while it is usual
 USUAL: Mapping[str, Any] = {"budget": store.SAME_N}
 SHARED = ("time", "bound", "range", "scored")  # arrays without an axis of runs
-_COMPILE_FROM = 5e8  # normals; compiling their kernel costs some seconds and saves 15 ms for each million
+_COMPILE_FROM = 5e8  # normals; compiling the loops costs some seconds and saves 15 ms for each million
 
 
 def run(cfg: DictConfig) -> float:
@@ -324,7 +324,7 @@ def fuses(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> b
     numbers = 0
     if isinstance(method, ParticleFilter):
         numbers = run_steps * method.particles * model.noise_dim
-    elif isinstance(method, GaussianFilter):  # linear algebra by hand saves it as much as eight normals for each entry of a covariance
+    elif isinstance(method, GaussianFilter):  # by its linear algebra: eight normals for each entry of a covariance
         numbers = run_steps * 8 * model.chart.dimension**2
     if engine == "eager" or (engine == "auto" and numbers < _COMPILE_FROM):
         return False

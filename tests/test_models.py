@@ -235,7 +235,7 @@ def test_the_volatility_weighs_as_its_law_does() -> None:
     model = StochasticVolatility()
     x, y = 20.0 * normal(3, 50, 1), torch.tensor([[0.3], [-40.0], [torch.nan]], dtype=torch.float64)
     value = model.log_likelihood(y, x, ()).numpy()
-    assert np.allclose(value[:2], stats.norm.logpdf(y[:2], scale=np.exp(0.5 * x[:2, :, 0])), rtol=1e-12)
+    assert np.allclose(value[:2], stats.norm.logpdf(y[:2].numpy(), scale=np.exp(0.5 * x[:2, :, 0].numpy())), rtol=1e-12)
     assert np.all(value[2] == 0.0)
 
 
