@@ -127,7 +127,7 @@ def follow(
 ) -> list[Tensor]:
     """What a compiled step at this address leaves, `outputs` tensors for each of T steps, one after the other.
 
-    It is given the constants, the state (its own first outputs, the next time), its part of what is seen [T, ...], and what all
+    What it leaves as [..., R, N] comes as [R, N, ...]. It is given the constants, the state (its own first outputs, the next time), its part of what is seen [T, ...], and what all
     steps share.
     """
     found: list[Tensor] = _operator("follow")(step, outputs, constants, state, seen, shared)

@@ -51,7 +51,21 @@ AtenTensorHandle at(const Tensor& a, int64_t t) {
     return made;
 }
 
-// All that each step leaves, one step after the other. A step is given `constants`, `state` (which is what the one before left
+// [..., R, N] as [R, N, ...], which shares its memory.
+AtenTensorHandle particles_first(const Tensor& a) {
+    const int64_t axes = a.dim();
+    std::vector<int64_t> size, stride;
+    for (int64_t k = 0; k < axes; ++k) {
+        const int64_t from = k < 2 ? axes - 2 + k : k - 2;
+        size.push_back(a.size(from));
+        stride.push_back(a.stride(from));
+    }
+    AtenTensorHandle made;
+    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(a.get(), axes, size.data(), stride.data(), 0, &made));
+    return made;
+}
+
+// All that each step leaves, one step after the other, with the axes of particles first. A step is given `constants`, `state` (which is what the one before left
 // first), its part of `seen` [T, ...] and `shared`.
 std::vector<Tensor> follow(int64_t step, int64_t outputs, std::vector<Tensor> constants, std::vector<Tensor> state,
                            std::vector<Tensor> seen, std::vector<Tensor> shared) {
@@ -68,8 +82,11 @@ std::vector<Tensor> follow(int64_t step, int64_t outputs, std::vector<Tensor> co
         for (const Tensor& a : seen) given.push_back(at(a, t));
         for (const Tensor& a : shared) given.push_back(again(a));
         reinterpret_cast<Step>(step)(given.data(), left.data());
-        for (AtenTensorHandle a : left) all.emplace_back(a);
-        for (size_t k = 0; k < state.size(); ++k) state[k] = all[t * outputs + k];
+        for (size_t k = 0; k < left.size(); ++k) {
+            const Tensor a(left[k]);
+            all.push_back(a.dim() > 2 ? Tensor(particles_first(a)) : a);
+            if (k < state.size()) state[k] = a;
+        }
     }
     return all;
 }

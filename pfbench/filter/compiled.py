@@ -81,15 +81,13 @@ class Graph:
             found = [flat[k : k + outputs] for k in range(0, len(flat), outputs)]
         else:
             for parts in zip(*(a.unbind() for a in seen), strict=True):
-                found.append(list(self.run([*state, *parts, *shared])))
-                state = found[-1][:carried]
-        turned = [k for k, a in enumerate(found[0]) if a.dim() > 2]
-        return [self._named(out, turned) for out in found[: _healthy([out[carried] for out in found])]]
+                left = self.run([*state, *parts, *shared])
+                found.append([_seen_as(a) for a in left])
+                state = list(left[:carried])
+        return [self._named(out) for out in found[: _healthy([out[carried] for out in found])]]
 
-    def _named(self, out: list[Tensor], turned: list[int]) -> tuple[Cloud, Told]:
-        """What a step leaves, by its names; `turned` are laid out as a graph stores them."""
-        for k in turned:
-            out[k] = _seen_as(out[k])
+    def _named(self, out: list[Tensor]) -> tuple[Cloud, Told]:
+        """What a step leaves, by its names."""
         carried = 3 + len(self.memory)
         x, log_w, log_z = out[:3]
         mean, variance, expected = out[carried : carried + 3]
@@ -281,7 +279,7 @@ def _direct(made: list[Any], run: Any, tensors: list[Tensor]) -> tuple[int, list
         entry = inspect.getclosurevars(call).nonlocals["f"]
         where = native.address(entry.__self__.__file__, _ENTRY)
         found = native.follow(where, len(wanted), constants, [], [a.unsqueeze(0) for a in tensors], [])
-        if not all(torch.allclose(a.double(), b.double(), equal_nan=True) for a, b in zip(found, wanted, strict=True)):
+        if not all(torch.allclose(a.double(), _seen_as(b).double(), equal_nan=True) for a, b in zip(found, wanted, strict=True)):
             raise TypeError("its results differ")
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, OSError, subprocess.CalledProcessError) as error:
         log.info("engine=compiled: steps are called from Python (%s: %s)", type(error).__name__, error)
