@@ -1,4 +1,4 @@
-"""The loops that are written in C++, compiled on the spot where there is a compiler: see normals.cpp and loops.cpp.
+"""The loops that are written in C++, compiled on the spot where there is a compiler; each file (`*.cpp`) says what it is for.
 
 They are operators of torch's. Each computes what the torch function of its place does, on the CPU and one thread, and raises
 OSError or CalledProcessError where there is no C++ compiler, or one that does not understand the source. Gradients do not pass
