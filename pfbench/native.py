@@ -127,8 +127,8 @@ def follow(
 ) -> list[Tensor]:
     """What a compiled step at this address leaves, `outputs` tensors for each of T steps, one after the other.
 
-    What it leaves as [..., R, N] comes as [R, N, ...]. It is given the constants, the state (its own first outputs, the next time), its part of what is seen [T, ...], and what all
-    steps share.
+    What it leaves as [..., R, N] comes as [R, N, ...]. It is given the constants, the state (its own first outputs, the next
+    time), its part of what is seen [T, ...], and what all steps share.
     """
     found: list[Tensor] = _operator("follow")(step, outputs, constants, state, seen, shared)
     return found
