@@ -16,10 +16,10 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 from torch.distributions import Independent, MultivariateNormal, Normal
 
 from pfbench.covariance import factor
+from pfbench.derivatives import slopes
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.record import Record
 
@@ -32,7 +32,7 @@ def posterior_bound(
 ) -> Tensor:
     """The bound on the covariance of any filter's error, in the chart about the truth: [T, d, d].
 
-    Expectations are means over the runs at hand, with Jacobians by forward-mode differentiation along their true states. What a
+    Expectations are means over the runs at hand, with exact Jacobians along their true states. What a
     measurement component that is missing (NaN) in some runs tells is the mean over the runs. A normal law whose covariance
     depends on the state informs by that too. On a linear model each run has its own recursion and the bound is the mean of the
     runs' Kalman covariances.
@@ -180,14 +180,7 @@ def _dense_looks(h: Tensor, covariance: Tensor, change: Tensor, there: Tensor) -
 
 def _slopes(f: Callable[[Tensor], Tensor], like: Tensor, d: int, subtract: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """Jacobian [R, k, d] at 0 of a map of differences [R, P, d], its values differing by `subtract`."""
-    value = f(like.new_zeros(len(like), 1, d))
-    directions = torch.eye(d, dtype=like.dtype, device=like.device).expand(len(like), -1, -1).contiguous()
-    with forward_ad.dual_level():
-        moved = f(forward_ad.make_dual(torch.zeros_like(directions), directions))
-        slopes = forward_ad.unpack_dual(subtract(moved, value)).tangent
-    if slopes is None:  # it does not depend on the state
-        return like.new_zeros(len(like), value.shape[-1], d)
-    return slopes.mT
+    return slopes(f, f(like.new_zeros(len(like), 1, d)), d, subtract)
 
 
 def _pooled(rows: Tensor, apart: bool) -> Tensor:

@@ -17,7 +17,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 # what each part of the house may import; a part may always import itself
 FAST = {"fusion", "native"}
-GROUND = {"record", "draws", "covariance"}
+GROUND = {"record", "draws", "covariance", "derivatives"}
 CHARTED = GROUND | {"nav", "chart"}
 MODELLED = CHARTED | {"model", "noise"}
 PLAIN = {"metrics", "store"}
