@@ -35,10 +35,11 @@ FIRST = "sir"
 
 
 def methods(particles: int) -> dict[str, Any]:
-    """Every filter that can be composed, by the name of its yaml."""
+    """Every filter that can be composed, by the name of its yaml; networks cost the same before they are trained."""
     names = sorted(path.stem for path in (HERE.parent / "conf" / "filter").glob("*.yaml"))
     with initialize_config_module("pfbench.conf", version_base="1.3"):
-        return {name: job.build(compose("config", [f"filter={name}", f"particles={particles}"])["filter"]) for name in names}
+        words = (f"particles={particles}", "checkpoint=untrained")
+        return {name: job.build(compose("config", [f"filter={name}", *words])["filter"]) for name in names}
 
 
 def flights(runs: int, steps: int) -> tuple[Any, Record]:
