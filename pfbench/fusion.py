@@ -25,6 +25,8 @@ import torch
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
+from pfbench import cuda
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 log = logging.getLogger("pfbench")
@@ -60,10 +62,15 @@ def recording() -> bool:
 
 
 def _plain(args: tuple[Any, ...]) -> bool:
-    """Numbers on the CPU, to be worked on by one thread, and no gradient of them is wanted."""
+    """Numbers of which no gradient is wanted."""
     tensors = [a for a in args if isinstance(a, torch.Tensor)]
-    wanted = any((a.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(a).tangent is not None for a in tensors)
-    return torch.get_num_threads() == 1 and not args[0].is_cuda and not wanted
+    return not any(
+        (a.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(a).tangent is not None for a in tensors
+    )
+
+
+def _on_cuda(args: tuple[Any, ...]) -> bool:
+    return cuda.available() and any(isinstance(a, torch.Tensor) and a.is_cuda for a in args)
 
 
 def fusible(
@@ -74,8 +81,9 @@ def fusible(
     Args:
         function: what is compiled.
         eager: computes the same where nothing is fused, if separate operations have a faster way to do it.
-        by_hand: is taken for what would be compiled on the CPU and one thread, where it works and no gradient is wanted.
-        whole: in a graph, too, as one operator, or for which tensors. What the compiler does well itself should not be.
+        by_hand: is taken for what would be compiled on the CPU and one thread, or on a CUDA device by a kernel of its name if
+            there is one, where it works and no gradient is wanted.
+        whole: in a graph of the CPU, too, as one operator, or for which tensors; not what the compiler does well itself.
         compiles: by torch's compiler, too, where it cannot be taken by hand; linear algebra gains nothing from it.
     """
     separate = eager or function
@@ -88,8 +96,13 @@ def fusible(
     def compiled() -> Callable[..., Any]:
         return torch.compile(function, dynamic=True)
 
+    def kernel(args: tuple[Any, ...]) -> Callable[..., Any] | None:
+        return cuda.kernel(by_hand.__name__, args) if by_hand is not None and _plain(args) else None
+
     def as_one(*args: Any) -> Any:
-        if by_hand is not None and by_hand not in _failed and _plain(args):
+        if _on_cuda(args):
+            return (kernel(args) or (compiled() if compiles else separate))(*args)
+        if by_hand is not None and by_hand not in _failed and torch.get_num_threads() == 1 and _plain(args):
             try:
                 return by_hand(*args)
             except (OSError, subprocess.CalledProcessError) as error:
@@ -101,7 +114,9 @@ def fusible(
     @wraps(function)
     def call(*args: Any) -> Any:
         if _graph.get():
-            return (function if in_graph is None or args[0].is_cuda or not taken(*args) else in_graph)(*args)
+            if _on_cuda(args):
+                return (kernel(args) or function)(*args)
+            return (function if in_graph is None or not taken(*args) else in_graph)(*args)
         return (as_one if _fused.get() else separate)(*args)
 
     return cast(F, call)

@@ -23,6 +23,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from pfbench import cuda
+
 _HERE = Path(__file__).parent
 _TORCH = Path(torch.__file__).parent
 _COMMON = ("-O3", "-march=native", "-fopenmp-simd", "-fPIC", "-std=c++17", "-c")
@@ -64,6 +66,16 @@ def log_normal(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tens
 def affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
     """phi x + gain w [D, R, N]; x [R, N, D], w [R, N, W], phi [R or 1, D, D], gain [R or 1, D, W]."""
     return _operator("affine")(phi, x, gain, w)
+
+
+def driven(
+    phi: Tensor, x: Tensor, ancestors: Tensor, gain: Tensor, seed: Tensor, purpose: int, step: Tensor, runs: Tensor
+) -> Tensor:
+    """phi x[ancestors] + gain w [D, R, M]: `copied`, `normals` and `affine` in one pass, of a CUDA device alone.
+
+    x [D, R, N], ancestors [R, M], phi [R or 1, D, D], gain [R or 1, D, W]; the others as for `normals`.
+    """
+    return cast(Tensor, torch.ops.pfbench.driven.default(phi, x, ancestors, gain, seed, purpose, step, runs))
 
 
 def distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:
@@ -134,10 +146,13 @@ def follow(
     return found
 
 
-_STEP = normals, uniforms, systematic, copied, log_normal, affine, distinct, totals, moments, rooted, updated, fitted, follow
+_STEP = normals, uniforms, systematic, copied, log_normal, affine, driven, distinct, totals, moments, follow
+_GAUSSIAN = rooted, updated, fitted
 _REPORT = spread, squared_length, marginal_scores, energy_score
-for _loop in _STEP + _REPORT:
+for _loop in _STEP + _GAUSSIAN + _REPORT:
     _operators.define(_loop.__name__ + torch.library.infer_schema(_loop, mutates_args=()))
+cuda.register(_operators)
+torch.library.register_fake("pfbench::driven", lambda phi, x, ancestors, *_: x.new_empty(x.shape[0], *ancestors.shape))
 
 _KINDS = {"T": "AtenTensorHandle", "i": "int64_t"}
 _CALLED = {  # what each is given, and gives

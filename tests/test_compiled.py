@@ -13,7 +13,7 @@ from command_line import pfbench
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from pfbench import fusion, store
+from pfbench import fusion, native, store
 from pfbench.draws import MonteCarlo
 from pfbench.filter import compiled
 from pfbench.filter.belief import Info
@@ -22,7 +22,7 @@ from pfbench.filter.loop import Estimate, run_filter
 from pfbench.filter.particle import ParticleFilter
 from pfbench.filter.proposals import Proposal
 from pfbench.judge import Tally
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import StateSpaceModel, affine
 from pfbench.model.linear import LinearGaussian, linear_walk
 from pfbench.model.toys import Growth
 from pfbench.noise.regimes import Nominal
@@ -246,6 +246,63 @@ def test_inputs_reach_their_steps_whatever_their_shape() -> None:
 
 
 @compiler
+def as_graph(model: StateSpaceModel, method: ParticleFilter) -> tuple[Any, list[Tensor]]:
+    """A step's operations, not compiled, and what it is given."""
+    kept: list[Any] = []
+
+    def noted(step: Any, example: list[Tensor]) -> Any:
+        kept[:] = [make_fx(step)(*example), example]
+        raise RuntimeError("only noted")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled, "_compiled", noted)
+        run(Compiled(method), model, record_of(model))
+    return kept[0], kept[1]
+
+
+class Moved(LinearGaussian):
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return affine(self.f[None], x, self.g[None], w)
+
+
+class Weary(Moved):
+    """Its parents are looked at twice."""
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return super().propagate(x, u, w) - 0.1 * x
+
+
+class Crossed(Moved):
+    """Its noise comes in another order."""
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return super().propagate(x, u, w.flip(-1))
+
+
+@compiler
+@pytest.mark.parametrize("particles", [60, 61])  # with and without draws that nobody wants
+@pytest.mark.parametrize(("kind", "joined"), [(Moved, True), (Weary, True), (Crossed, False)])
+def test_copies_noise_and_move_are_joined_where_nothing_comes_between(kind: Any, joined: bool, particles: int) -> None:
+    """As for a CUDA device; here `driven` is what it stands for."""
+
+    def driven(phi: Tensor, x: Tensor, ancestors: Tensor, gain: Tensor, *key: Any) -> Tensor:
+        noise = native.normals(*key, gain.shape[-1], -(-ancestors.shape[1] // 4))[..., : ancestors.shape[1]]
+        return native.affine(phi, native.copied(x, ancestors).permute(1, 2, 0), gain, noise.permute(1, 2, 0).to(x.dtype))
+
+    model = kind([[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.1], [0.2, 0.5]], [[1.0, 0.0]], [0.5], [0.3, -0.2], [1.5, 1.0])
+    graph, given = as_graph(model, ParticleFilter(particles))
+    wanted = graph(*given)
+    compiled._join(graph.graph)
+    graph.recompile()
+    assert ("pfbench.driven" in graph.code) == joined
+    assert ("pfbench.normals" in graph.code) == (not joined)
+    with torch.library._scoped_library("pfbench", "IMPL") as library:
+        library.impl("driven", driven, "CPU")
+        found = graph(*given)
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+
+
 def test_large_steps_go_one_by_one(recorded: list[list[int]], monkeypatch: pytest.MonkeyPatch) -> None:
     """What steps keep together stays small: nothing is computed of the next one before this one has been told."""
     monkeypatch.setattr(compiled, "_AHEAD", 1)

@@ -22,8 +22,9 @@ CHARTED = GROUND | {"nav", "chart"}
 MODELLED = CHARTED | {"model", "noise"}
 PLAIN = {"metrics", "store"}
 MAY_IMPORT: dict[str, set[str]] = {
-    **{part: FAST for part in GROUND},
-    **{part: set() for part in PLAIN | FAST},
+    **{part: FAST | {"cuda"} for part in GROUND},
+    **{part: set() for part in PLAIN | {"cuda"}},
+    **{part: {"cuda"} for part in FAST},
     "nav": GROUND,
     "chart": GROUND | {"nav"},
     "model": CHARTED | FAST,

@@ -19,6 +19,8 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor
+from torch.fx import Graph as Operations
+from torch.fx import Node
 
 from pfbench import fusion, native
 from pfbench.draws import Draws, MonteCarlo
@@ -31,6 +33,7 @@ from pfbench.record import Record, map_inputs
 log = logging.getLogger("pfbench")
 
 _AHEAD = 1 << 20  # numbers that steps taken together may keep: they then share what steps cost beside them
+_AHEAD_CUDA = 64  # steps
 
 
 class Counter(Protocol):
@@ -206,6 +209,7 @@ class Compiled:
         except Exception as error:  # torch raises many kinds
             why = f"{type(error).__name__}: {error}".splitlines()[0]
             log.warning("engine=compiled: this step cannot be compiled (%s); going on with compiled loops alone", why)
+            log.debug("why", exc_info=True)
             return None
         finally:
             if self.counter:
@@ -215,7 +219,7 @@ class Compiled:
         log.info("engine=compiled: the step compiled in %.1f s", took)
         memory, trace = names
         stays = [a.shape for a in out[: 3 + len(memory)]] == [a.shape for a in example[: len(state)]]
-        most = max(1, _AHEAD // sum(a.numel() for a in out)) if stays else 1
+        most = _together(out) if stays else 1
         return Graph(run, direct, asked, memory, trace, most, model)
 
 
@@ -230,6 +234,9 @@ def _compiled(step: Callable[..., list[Tensor]], tensors: list[Tensor]) -> tuple
 
     graph = make_fx(step, decomposition_table={torch.ops.aten.stack.default: _stacked})(*tensors)
     on_cpu = not any(a.is_cuda for a in tensors)
+    if not on_cpu:
+        _join(graph.graph)
+        graph.recompile()
     # on the CPU what calls the kernels is compiled with them, in the same time: from Python it takes half as long again
     by_name = {"aot_inductor.custom_ops_to_c_shims": native.shims()} if on_cpu else {}
     options = {"cpp_wrapper": on_cpu, "size_asserts": False, **by_name}  # a graph is only given what it was recorded with
@@ -244,6 +251,44 @@ def _compiled(step: Callable[..., list[Tensor]], tensors: list[Tensor]) -> tuple
         examples = [stand_ins.from_tensor(a, static_shapes=True) for a in tensors]
         run: Any = compile_fx(graph, examples, inner_compile=inner, config_patches=options)
     return lambda given: run(*given), _direct(made, run, tensors) if on_cpu else None
+
+
+def _together(out: Sequence[Tensor]) -> int:
+    """Steps that may be taken one after the other before anybody looks: on a GPU, which would wait, large ones, too."""
+    if not out[0].is_cuda:
+        return max(1, _AHEAD // sum(a.numel() for a in out))
+    free = torch.cuda.mem_get_info(out[0].device)[0]
+    return max(1, min(_AHEAD_CUDA, free // 8 // sum(a.nbytes for a in out)))
+
+
+def _join(graph: Operations) -> None:
+    """Has parents copied, noise drawn and both moved to the next step in one pass, where a graph does so for nothing else."""
+    for node in graph.find_nodes(op="call_function", target=torch.ops.pfbench.affine.default):
+        phi, x, gain, w = node.args
+        copied, drawn = _origin(x, torch.ops.pfbench.copied.default), _origin(w, torch.ops.pfbench.normals.default)
+        if copied is None or drawn is None:
+            continue
+        seed, purpose, step, runs, *_ = drawn.args
+        with graph.inserting_before(node):
+            joined = graph.call_function(
+                torch.ops.pfbench.driven.default, (phi, *copied.args, gain, seed, purpose, step, runs)
+            )
+        node.replace_all_uses_with(joined)
+    graph.eliminate_dead_code()
+
+
+def _origin(node: Any, operator: Any) -> Any:
+    """The call of this operator of which a node is all particles, seen as [R, N, ...]; None where it is something else."""
+    aten, turned = torch.ops.aten, 0
+    same = aten.alias.default, aten._to_copy.default
+    while isinstance(node, Node) and node.target is not operator:
+        of, *how = node.args
+        if node.target is aten.permute.default and how == [[1, 2, 0]]:
+            turned += 1
+        elif node.target not in same and not (node.target is aten.slice.Tensor and how[:2] == [2, 0]):
+            return None
+        node = of
+    return node if isinstance(node, Node) and turned == 1 else None
 
 
 def _stacked(parts: Sequence[Tensor], dim: int = 0) -> Tensor:
@@ -327,7 +372,7 @@ def _during(record: Record, steps: slice) -> Record:
 
 
 def _healthy(means: list[Tensor]) -> int:
-    """How many of the first steps' means [R, D] are finite. On a GPU nobody looks: there the graph itself sees to it."""
-    if means[0].is_cuda or math.isfinite(float(torch.stack(means).sum())):
+    """How many of the first steps' means [R, D] are finite."""
+    if math.isfinite(float(torch.stack(means).sum())):
         return len(means)
     return next((t for t, mean in enumerate(means) if not math.isfinite(float(mean.sum()))), len(means))

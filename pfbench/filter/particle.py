@@ -219,7 +219,7 @@ def bury(x: Tensor, log_w: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
 
     Sums over particles would otherwise turn one NaN into the estimate of its run: 0 NaN is NaN.
     """
-    if recording() and not x.is_cuda:  # whoever runs the graph looks, and does the step again
+    if recording():  # whoever runs the graph looks, and does the step again
         return x, log_w
     if not x.is_cuda and bool(torch.isfinite(x.sum())):  # looking costs next to nothing on the CPU
         return x, log_w

@@ -71,12 +71,14 @@ class Resample:
             hit = 1.0 / a.square().sum(-1) < self.threshold * n.squeeze(1)
         ancestors = self.scheme(a, n, draws)
         slots = torch.arange(a.shape[1], device=a.device)
+        if self.threshold < 1.0:
+            ancestors = torch.where(hit.unsqueeze(1), ancestors, slots)
         fresh = belief.gather(cloud, ancestors)
         log_w = -torch.log(n.to(a.dtype))
         if log_a is not cloud.log_w:  # preferred by something else than the weights, which then carry the correction
             log_w = log_w + (cloud.log_w - log_a).gather(1, ancestors)
-        fresh = fresh._replace(log_w=torch.where(slots < n, log_w, -torch.inf))
-        return (belief.where(hit, fresh, cloud) if self.threshold < 1.0 else fresh), hit
+        log_w = torch.where(slots < n, log_w, -torch.inf)
+        return fresh._replace(log_w=log_w if self.threshold == 1.0 else torch.where(hit.unsqueeze(1), log_w, cloud.log_w)), hit
 
 
 class Smoothing(Protocol):
