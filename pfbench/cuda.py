@@ -156,6 +156,8 @@ _FIT: dict[str, Callable[..., bool]] = {
 def _launch(name: str, grid: tuple[int, int, int], threads: int, *given: Tensor | int, shared: int = 0) -> None:
     """Runs a kernel of loops.cu, in the current stream of the device on which its first argument lies."""
     assert isinstance(given[0], Tensor)
+    if 0 in grid:  # nothing to be done, which the driver refuses
+        return None
     device = given[0].device
     if torch.cuda.current_device() != device.index:
         with torch.cuda.device(device):

@@ -95,6 +95,10 @@ def test_draws(loop: Loop, runs: int, n: int, d: int) -> None:
     assert torch.equal(loop("uniforms", *key), draws._uniforms(*key))
 
 
+def test_nothing_is_drawn_where_nothing_is_wanted(loop: Loop) -> None:
+    assert loop("normals", torch.tensor(1), 2, torch.tensor(3), torch.arange(4), 0, 5).shape == (0, 4, 20)
+
+
 @pytest.mark.parametrize("dtype", REAL)
 @pytest.mark.parametrize(("runs", "n", "d"), CLOUDS)
 def test_resampling(loop: Loop, runs: int, n: int, d: int, dtype: torch.dtype) -> None:
