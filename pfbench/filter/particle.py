@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -259,11 +260,14 @@ def described(
         d, log_w = deviations()
         return (weights(log_w).unsqueeze(-1) * d).mT @ d
 
+    @cache
+    def w() -> Tensor:  # for groups of each size, and without another sum over what sums to 1
+        return torch.exp(cloud.log_w)
+
     def some(groups: Tensor) -> Tensor:
-        w = weights(cloud.log_w)
         if model.chart.flat:
-            return _spread(cloud.x, mean, w, groups)
-        return _spread(deviations()[0], torch.zeros_like(variance), w, groups)
+            return _spread(cloud.x, mean, w(), groups)
+        return _spread(deviations()[0], torch.zeros_like(variance), w(), groups)
 
     return Info(mean, variance, covariance, trace, deviations, nis, some)
 
