@@ -5,8 +5,8 @@
 
 A step that writes down nothing but its particles has to move NEEDED bytes for each of them. That times the particle-steps of a
 second, over the bytes that a copy of a large tensor reads and writes in a second on the same device, is the share of the device
-that is put to use. What the eager engine really moves is counted, operation by operation (`Traffic`), what the compiled one does from
-its kernels (`COMPILED`).
+that is put to use. What the eager engine really moves is counted, operation by operation (`Traffic`), what the compiled one does
+from its kernels (`COMPILED`).
 """
 
 from __future__ import annotations

@@ -262,7 +262,7 @@ def _together(out: Sequence[Tensor]) -> int:
 
 
 def _join(graph: Operations) -> None:
-    """Has parents copied, noise drawn and both moved to the next step in one pass, as a CUDA device can: nothing is kept between."""
+    """Has parents copied, noise drawn and both moved to the next step in one pass, as a CUDA device can."""
     for node in graph.find_nodes(op="call_function", target=torch.ops.pfbench.affine.default):
         phi, x, gain, w = node.args
         copied, drawn = _origin(x, torch.ops.pfbench.copied.default), _origin(w, torch.ops.pfbench.normals.default)
