@@ -160,7 +160,7 @@ def test_a_group_of_a_covariance_is_cut_from_the_whole(chart: Chart, fused: bool
     """Of clouds that lie in memory component by component and particle by particle."""
     draws = MonteCarlo(5, torch.arange(3))
     origin = torch.eye(chart.size, dtype=torch.float64)[:1].expand(3, 1, -1)
-    x, log_w = chart.add(origin, draws.normal("x", 43, chart.dimension)), draws.normal("w", 43, 1)[..., 0]
+    x, log_w = chart.add(origin, draws.normal("x", 43, chart.dimension)), draws.normal("w", 43, 1)[..., 0].log_softmax(1)
     model: Any = SimpleNamespace(chart=chart)
     for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
         with fusion.fused(fused):
