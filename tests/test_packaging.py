@@ -132,7 +132,7 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     wanted |= {f"pfbench/{file.relative_to(ROOT)}" for top in ("conf", "experiments") for file in (ROOT / top).rglob("*.yaml")}
     report = [file for ending in ("jinja", "css", "yaml") for file in (ROOT / "pfbench/report").glob(f"*.{ending}")]
     wanted |= {f"pfbench/report/{file.name}" for file in report}
-    loops = [file for ending in ("cpp", "h") for file in (ROOT / "pfbench").glob(f"*.{ending}")]
+    loops = [file for ending in ("cpp", "cu", "h") for file in (ROOT / "pfbench").glob(f"*.{ending}")]
     wanted |= {f"pfbench/{file}" for file in ("py.typed", *(file.name for file in loops))}
     wanted |= {"pfbench/conf/__init__.py"} | {f"pfbench/{file.relative_to(ROOT)}" for file in (ROOT / "experiments").glob("*.py")}
     assert wanted <= names
