@@ -306,7 +306,8 @@ template <typename T> __global__ void distinct(long long* out, const long long* 
 
 // Mean and variance [R, D] of x[D, R, N] by weights [R, N], in one pass: about the particle that weighs most, which is close to
 // the mean, so that nothing is lost by taking squares from each other.
-template <typename T, int D> __global__ void __launch_bounds__(256, 2) moments(T* mean, T* variance, const T* x, const T* w, int R, int N) {
+template <typename T, int D>
+__global__ void __launch_bounds__(256, 2) moments(T* mean, T* variance, const T* x, const T* w, int R, int N) {
     constexpr int SUMS = 2 * D + 1;
     __shared__ wide tops[32];
     __shared__ T parts[32][SUMS];
