@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.distributions import Independent, MultivariateNormal, Normal
 
 from pfbench import native
 from pfbench.fusion import fusible, recording
@@ -34,6 +36,21 @@ def _factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
 
 
 factor = fusible(_factor, by_hand=native.rooted, compiles=False)
+
+
+def covariance_of(law: Any) -> Tensor:
+    """Covariance [..., k, k] of a law with independent components or a multivariate normal one."""
+    return law.covariance_matrix if isinstance(law, MultivariateNormal) else torch.diag_embed(law.variance)
+
+
+def common_covariance_of(law: Any) -> Tensor:
+    """The same of laws with batch [R, N]; [R, 1, k, k] of normal ones whose scale torch has expanded to all N."""
+    if isinstance(law, MultivariateNormal) and law.scale_tril.stride(1) == 0:
+        root = law.scale_tril[:, :1]
+        return root @ root.mT
+    if isinstance(law, Independent) and isinstance(law.base_dist, Normal) and law.base_dist.scale.stride(1) == 0:
+        return torch.diag_embed(law.base_dist.scale[:, :1].square())
+    return covariance_of(law)
 
 
 def _solved_length(e: Tensor, covariance: Tensor) -> Tensor:

@@ -329,15 +329,27 @@ Tensor log_normal_operator(Tensor y, Tensor mean, Tensor scale, Tensor constant)
     });
 }
 
+// Whether all particles share one noise, of zeros: a prediction without noise.
+template <class T>
+bool quiet(const Tensor& w) {
+    if (w.size(0) * w.size(1) == 0 || w.stride(0) != 0 || w.stride(1) != 0) return false;
+    for (int64_t k = 0; k < w.size(2); ++k)
+        if (numbers<T>(w)[k * w.stride(2)] != 0) return false;
+    return true;
+}
+
 Tensor affine_operator(Tensor phi, Tensor x, Tensor gain, Tensor w) {
     const int64_t runs = x.size(0), particles = x.size(1), rows = phi.size(1);
     const bool one = phi.size(0) == 1 && gain.size(0) == 1;  // runs then lie side by side as particles of one run do
     return by_type(x, [&](auto like) {
         using T = decltype(like);
         const Tensor out = fresh<T>({rows, runs, particles});
-        affine(numbers<T>(out), Packed<T>(phi).data, Packed<T>(x, COMPONENTS_FIRST).data, Packed<T>(gain).data,
-               Packed<T>(w, COMPONENTS_FIRST).data, phi.size(0) == 1, gain.size(0) == 1, one ? 1 : runs,
-               one ? runs * particles : particles, rows, phi.size(2), gain.size(2));
+        const auto work = [&](const T* by, const T* noise, int64_t noises) {
+            affine(numbers<T>(out), Packed<T>(phi).data, Packed<T>(x, COMPONENTS_FIRST).data, by, noise, phi.size(0) == 1,
+                   gain.size(0) == 1, one ? 1 : runs, one ? runs * particles : particles, rows, phi.size(2), noises);
+        };
+        if (quiet<T>(w)) work(nullptr, nullptr, 0);
+        else work(Packed<T>(gain).data, Packed<T>(w, COMPONENTS_FIRST).data, gain.size(2));
         return out;
     });
 }

@@ -5,7 +5,6 @@
 #include <cmath>
 #include <cstdint>
 #include <tuple>
-#include <utility>
 #include <vector>
 
 #include "tensors.h"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -332,10 +333,12 @@ def test_a_loop_by_hand_moves_by_the_coefficients_that_are_not_zero(dtype: torch
     x, w = some("x", particles, D), some("w", particles, 2)
     phi, gain = some("phi", D, D), some("gain", D, 2)
     phi[:, :, 1], phi[:, 3], gain[1] = 0.0, 0.0, 0.0  # a state that nothing sees, one that is noise alone, a run without noise
-    for a, b in ((phi, gain), (phi[:1], gain[:1]), (phi[:1], gain)):
-        moved = torch.einsum("rij,rnj->irn", a.expand(RUNS, -1, -1), x) + torch.einsum("rij,rnj->irn", b.expand(RUNS, -1, -1), w)
-        torch.testing.assert_close(native.affine(a, x, b, w), moved)
-        torch.testing.assert_close(base._dense_affine(a, x, b, w), moved)
+    still, steady = torch.zeros(2, dtype=dtype).expand_as(w), torch.tensor([0.0, 2.0], dtype=dtype).expand_as(w)
+    for (a, b), noise in product(((phi, gain), (phi[:1], gain[:1]), (phi[:1], gain)), (w, still, steady)):
+        parts = ((a, x), (b, noise))
+        moved = sum(torch.einsum("rij,rnj->irn", by.expand(RUNS, -1, -1), of) for by, of in parts)
+        torch.testing.assert_close(native.affine(a, x, b, noise), moved)
+        torch.testing.assert_close(base._dense_affine(a, x, b, noise), moved)
 
 
 @compiler

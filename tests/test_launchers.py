@@ -158,7 +158,7 @@ def workers(home: Path, doing: str) -> list[int]:
     return found
 
 
-def wait(what: Callable[[], Any], sweep: subprocess.Popen[str], seconds: float = 120.0) -> Any:
+def wait(what: Callable[[], Any], sweep: subprocess.Popen[str], seconds: float = 300.0) -> Any:
     """The first true answer."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:

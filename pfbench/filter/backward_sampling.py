@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pfbench.covariance import factor
+from pfbench.covariance import covariance_of, factor
 from pfbench.draws import Draws
 from pfbench.filter.blocks import Stretch
-from pfbench.filter.linearisation import drift, innovation, quiet, sight, spread, times, where_seen
+from pfbench.filter.linearisation import drift, innovation, quiet, sight, times, where_seen
 from pfbench.filter.window import join, transition
 from pfbench.model.base import StateSpaceModel
 
@@ -75,8 +75,8 @@ def _links(model: StateSpaceModel, old: Stretch) -> list[Link]:
         here = x[:, :few]
         slope, law, x = drift(model, here, seen.u), transition(model, here, seen), model.propagate(x, seen.u, quiet(model, x))
         there, ahead = ~torch.isnan(seen.y).unsqueeze(1), x[:, :few]
-        noise = where_seen(spread(model.observation(ahead, seen.u)), there)
-        links.append(Link(x, slope, spread(law), sight(model, ahead, seen), noise, innovation(model, x, seen)))
+        noise = where_seen(covariance_of(model.observation(ahead, seen.u)), there)
+        links.append(Link(x, slope, covariance_of(law), sight(model, ahead, seen), noise, innovation(model, x, seen)))
     return links
 
 

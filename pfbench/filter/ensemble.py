@@ -14,11 +14,11 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from pfbench.covariance import factor
+from pfbench.covariance import common_covariance_of, factor
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, Info
 from pfbench.filter.gaussian import around_first
-from pfbench.filter.linearisation import spread, where_seen
+from pfbench.filter.linearisation import where_seen
 from pfbench.filter.particle import ParticleFilter, bury, summarise
 from pfbench.filter.proposals import Bootstrap
 from pfbench.filter.whitening import LOG_2PI, log_det
@@ -154,7 +154,7 @@ def _look(model: StateSpaceModel, x: Tensor, d: Tensor, seen: Record) -> tuple[F
     there = ~torch.isnan(seen.y)
     r = torch.where(there, model.residual(seen.y.nan_to_num(), y_hat), 0.0)
     s = torch.where(there.unsqueeze(1), model.residual(law.mean, y_hat.unsqueeze(1)), 0.0)
-    root, ok = factor(where_seen(spread(law).mean(1), there))
+    root, ok = factor(where_seen(common_covariance_of(law).mean(1), there))
     white = torch.linalg.solve_triangular(root, torch.cat([s.mT / math.sqrt(n - 1), r.unsqueeze(-1)], -1), upper=False)
     s, r = white[..., :-1].mT, white[..., -1]
     product = torch.where(torch.isfinite(s).all(1).all(-1)[:, None, None], s.mT @ s, torch.nan)

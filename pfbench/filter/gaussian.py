@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pfbench import native
-from pfbench.covariance import factor, squared_length
+from pfbench.covariance import common_covariance_of, covariance_of, factor, squared_length
 from pfbench.draws import Draws
 from pfbench.filter.belief import Gaussian, Info
 from pfbench.filter.rules import Linearised, Rule, Space
@@ -149,11 +149,9 @@ class GaussianFilter:
     ) -> Gaussian:
         """The moments of the initial law."""
         law: Any = initial_law(model, runs, spread)
-        dense = isinstance(law, torch.distributions.MultivariateNormal)
-        covariance = law.covariance_matrix if dense else torch.diag_embed(law.variance)
         origin = model.origin.expand(runs, -1) if start is None else start
         mean = model.chart.add(origin, law.mean)
-        return Gaussian(mean, covariance, torch.zeros(runs, dtype=torch.float64, device=mean.device))
+        return Gaussian(mean, covariance_of(law), torch.zeros(runs, dtype=torch.float64, device=mean.device))
 
     def step(self, model: StateSpaceModel, belief: Gaussian, seen: Record, draws: Draws) -> tuple[Gaussian, Info]:
         """The belief at t-1 and what is seen at t -> the belief at t."""
@@ -212,8 +210,7 @@ class GaussianFilter:
 
         def through(xi: Tensor) -> tuple[Tensor, Tensor]:
             law: Any = model.observation(place(xi), seen.u)
-            dense = isinstance(law, torch.distributions.MultivariateNormal)
-            return law.mean, law.covariance_matrix if dense else torch.diag_embed(law.variance)
+            return law.mean, common_covariance_of(law)
 
         space = Space(model.residual, around_first(model.residual))
         y_hat, m, omega, noise = self.rule(through, like, model.chart.dimension, space)

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.covariance import factor
+from pfbench.covariance import covariance_of, factor
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, weights
 from pfbench.filter.gaussian import GaussianFilter, around_first
 from pfbench.filter.guides import check_widen, log_ratio_of, standard
-from pfbench.filter.linearisation import base, quiet, spread, where_seen
+from pfbench.filter.linearisation import base, quiet, where_seen
 from pfbench.filter.points import Independent, Points
 from pfbench.filter.proposals import Proposed
 from pfbench.filter.rules import Linearised, Space
@@ -103,5 +103,5 @@ def _covariances(law: Distribution, shape: torch.Size) -> Tensor:
     each = base(law)
     if isinstance(each, torch.distributions.Normal) and each.scale.stride(0) == 0 and each.scale.stride(1) == 0:
         return torch.diag_embed(each.scale[:1, :1].square())  # torch has expanded it
-    full = spread(law)
+    full = covariance_of(law)
     return full.reshape(*shape[:2], *full.shape[-2:])

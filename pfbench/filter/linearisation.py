@@ -84,11 +84,6 @@ def is_normal(law: Distribution) -> bool:
     return isinstance(base(law), Normal | MultivariateNormal)
 
 
-def spread(law: Any) -> Tensor:
-    """Covariance [..., k, k] of a law with independent components or a multivariate normal one."""
-    return law.covariance_matrix if isinstance(law, MultivariateNormal) else torch.diag_embed(law.variance)
-
-
 def where_seen(covariance: Tensor, there: Tensor) -> Tensor:
     """A covariance [..., k, k] between the components that are there [..., k]; 1 and uncorrelated where they are not."""
     both = there.unsqueeze(-1) & there.unsqueeze(-2)

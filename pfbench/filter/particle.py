@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pfbench import native
-from pfbench.covariance import squared_length
+from pfbench.covariance import common_covariance_of, covariance_of, squared_length
 from pfbench.draws import Draws
 from pfbench.filter.belief import Cloud, Info, weights
 from pfbench.filter.derived_draws import named
@@ -116,10 +116,8 @@ class ParticleFilter:
         cloud = Cloud(x=x, log_w=log_w, log_z=torch.zeros_like(log_w[:, 0], dtype=torch.float64))
         if self.keeper is None:
             return cloud
-        dense = isinstance(law, torch.distributions.MultivariateNormal)
-        covariance = law.covariance_matrix if dense else torch.diag_embed(law.variance)
         mean = model.chart.add(origin, law.mean)
-        return self.keeper.begin(model, cloud, mean.expand(runs, -1), covariance.expand(runs, -1, -1))
+        return self.keeper.begin(model, cloud, mean.expand(runs, -1), covariance_of(law).expand(runs, -1, -1))
 
     def step(self, model: StateSpaceModel, belief: Cloud, seen: Record, draws: Draws) -> tuple[Cloud, Info]:
         """The cloud at t-1 and what is seen at t -> the weighted cloud at t."""
@@ -196,10 +194,8 @@ def surprise(model: StateSpaceModel, x: Tensor, log_w: Tensor, seen: Record) -> 
     w, there = weights(log_w).unsqueeze(-1), ~torch.isnan(seen.y)
     y_hat = around_first(model.residual)(law.mean, w.squeeze(-1))
     off = torch.where(w > 0.0, model.residual(law.mean, y_hat.unsqueeze(1)), 0.0)
-    if isinstance(law, torch.distributions.MultivariateNormal):
-        noise = (w.unsqueeze(-1) * law.covariance_matrix).sum(1)
-    else:
-        noise = torch.diag_embed((w * law.variance).sum(1))
+    own = common_covariance_of(law)
+    noise = (w.unsqueeze(-1) * own).sum(1) if own.shape[1] > 1 else own[:, 0]
     r = torch.where(there, model.residual(seen.y.nan_to_num(), y_hat), 0.0)
     every = torch.arange(off.shape[-1], device=off.device).unsqueeze(0)
     spread = _spread(off, torch.zeros_like(y_hat), w.squeeze(-1), every).squeeze(1)

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from pfbench.covariance import factor
+from pfbench.covariance import covariance_of, factor
 from pfbench.filter.belief import Cloud, moments, weights
-from pfbench.filter.linearisation import derivative, drift, sight, spread, where_seen
+from pfbench.filter.linearisation import derivative, drift, sight, where_seen
 from pfbench.model.base import AtRest, StateSpaceModel
 from pfbench.record import Record
 
@@ -126,7 +126,7 @@ def fisher(model: StateSpaceModel, x: Tensor, seen: Record) -> Tensor:
     """Information of a measurement about the state, at x [R, 1, D] -> [R, d, d]; of a law that is not normal, by its moments."""
     there, h = ~torch.isnan(seen.y), sight(model, x, seen)[:, 0]
     law: Any = model.observation(x, seen.u)
-    told = h.mT @ torch.linalg.solve_ex(where_seen(spread(law)[:, 0], there), h)[0]
+    told = h.mT @ torch.linalg.solve_ex(where_seen(covariance_of(law)[:, 0], there), h)[0]
     if isinstance(law, torch.distributions.MultivariateNormal):
         return told
 

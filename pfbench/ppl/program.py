@@ -13,6 +13,7 @@ from pyro.distributions.torch_distribution import TorchDistributionMixin
 from torch import Tensor
 from torch.distributions import biject_to
 
+from pfbench.covariance import covariance_of
 from pfbench.draws import MonteCarlo
 from pfbench.filter.belief import Filter
 from pfbench.filter.loop import run_filter
@@ -253,15 +254,13 @@ def gaussian_hmm(model: StateSpaceModel, record: Record) -> GaussianHMM:
     runs, d = len(record.y), model.chart.dimension
     eye = torch.eye(d, dtype=gain.dtype, device=gain.device).expand(runs, -1, -1)
     first: Any = initial_law(model, runs)
-    dense = isinstance(first, torch.distributions.MultivariateNormal)
-    start = MultivariateNormal(first.mean, first.covariance_matrix if dense else torch.diag_embed(first.variance))
+    start = MultivariateNormal(first.mean, covariance_of(first))
     zero = torch.zeros_like(eye)
     carried = model.propagate(eye, (), zero)  # rows: where each state alone would go
     law: Any = model.observation(torch.cat([eye, zero[:, :1]], 1), ())
     seen, offset = law.mean[:, :-1], law.mean[:, -1]
-    noise = law.covariance_matrix if isinstance(law, torch.distributions.MultivariateNormal) else torch.diag_embed(law.variance)
     driven = MultivariateNormal(zero[:, 0].unsqueeze(1), (gain @ gain.mT).expand(runs, d, d).unsqueeze(1))
-    errors = MultivariateNormal(offset.unsqueeze(1), noise[:, -1].unsqueeze(1))
+    errors = MultivariateNormal(offset.unsqueeze(1), covariance_of(law)[:, -1].unsqueeze(1))
     return GaussianHMM(
         start, carried.unsqueeze(1), driven, (seen - offset.unsqueeze(1)).unsqueeze(1), errors, duration=record.y.shape[1]
     )

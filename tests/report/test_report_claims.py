@@ -310,7 +310,7 @@ def test_what_lacks_power_says_the_runs_that_it_takes() -> None:
 def test_so_many_runs_decide_as_often_as_said(middle: float, outcome: str) -> None:
     (few,) = ruled(LESS, **normal(middle, 0.2, 6)).findings[""]
     assert few.outcome == "open"
-    rng, trials = np.random.default_rng(23), 400
+    rng, trials = np.random.default_rng(23), 150
     hits = 0
     for _ in range(trials):
         d = middle + 0.2 * rng.standard_normal(int(few.needed))
