@@ -4,10 +4,13 @@ BIN    := $(VENV)/bin
 
 .PHONY: demo report test test-fast test-slow lint bench clean
 
+# Modules are compiled when they are first imported, and kept so: compiling all that is installed took half of the set-up.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Installs everything once; runs again only when the requirements change.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e ".[dev]"
 	touch $@
 
 demo: $(VENV)/.installed        ## quickstart study: run, compare, report
@@ -17,7 +20,8 @@ demo: $(VENV)/.installed        ## quickstart study: run, compare, report
 report: $(VENV)/.installed      ## every published report again, from results/
 	$(BIN)/pfbench report all
 
-test: test-fast test-slow       ## fast and slow tests
+test: $(VENV)/.installed        ## fast and slow tests
+	$(BIN)/python -m pytest -n 2 -m "slow or not slow"
 
 test-fast: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2
@@ -32,12 +36,12 @@ lint: $(VENV)/.installed
 # The library particles needs numpy below 2 and JAX needs it above, so peers live beside the project's own environment.
 .venv-bench/.installed: benchmarks/requirements.txt
 	$(PYTHON) -m venv .venv-bench
-	.venv-bench/bin/python -m pip install --quiet -r benchmarks/requirements.txt
+	.venv-bench/bin/python -m pip install --quiet --no-compile -r benchmarks/requirements.txt
 	touch $@
 
 .venv-peers/.installed: benchmarks/requirements-peers.txt
 	$(PYTHON) -m venv .venv-peers
-	.venv-peers/bin/python -m pip install --quiet -r benchmarks/requirements-peers.txt
+	.venv-peers/bin/python -m pip install --quiet --no-compile -r benchmarks/requirements-peers.txt
 	touch $@
 
 bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## speed against peers, of all methods, against size: three quarters of an hour on a quiet machine

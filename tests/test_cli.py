@@ -180,7 +180,7 @@ def test_report_with_a_misspelt_key(tmp_path: Path) -> None:
 
 
 def test_check_finds_nothing_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It asks for every file. Here every tenth is composed: test_configs composes each, and so does the installed package's."""
+    """It asks for every file. Here every tenth is composed: test_configs composes each."""
     compose, asked = cli._compose, []
 
     def tenth(words: list[str]) -> dict[str, Any]:

@@ -470,7 +470,7 @@ def test_the_unscented_filter_gives_the_prototype_s_numbers(fixed: Episode, row:
 
 @pytest.mark.slow
 def test_the_filter_that_models_the_biases_is_consistent_and_the_others_are_not() -> None:
-    runs, level = 40, 1e-4
+    runs, level = 24, 1e-4
     flight = job.build(composed("scenario=azimuth").scenario)
     episode = replace(flight, imu_rate=20.0).draw(Nominal(), torch.arange(runs), 21)
 

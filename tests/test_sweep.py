@@ -20,8 +20,8 @@ from pfbench import store
 pytestmark = pytest.mark.slow
 
 FILTERS = ("sir", "rpf", "apf", "ckf")
-# cells of one or two seconds, so that a kill after the first result falls into another cell
-SWEEP = ("run", "-m", "scenario=linear_walk", "scenario.steps=400", "runs=20", "particles=300", f"filter={','.join(FILTERS)}")
+# cells of a second, so that a kill after the first result falls into another cell
+SWEEP = ("run", "-m", "scenario=linear_walk", "scenario.steps=200", "runs=20", "particles=300", f"filter={','.join(FILTERS)}")
 
 
 def files(home: Path) -> list[Path]:

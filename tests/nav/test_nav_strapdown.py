@@ -21,7 +21,7 @@ def closure(flight: Flight, rate: float, per_step: int = 2) -> Tensor:
 
 
 HOUR = ([cruise(3600)], Start(55, 37, 150, heading_deg=77))
-LONG = {"T003 50": (T003, 50), "T003 100": (T003, 100), "T003 200": (T003, 200), "T004 100": (T004, 100), "an hour": (HOUR, 10)}
+LONG = {"T003 50": (T003, 50), "T003 100": (T003, 100), "T004 100": (T004, 100), "an hour": (HOUR, 10)}
 
 
 @cache
@@ -45,9 +45,9 @@ def long_closures() -> dict[str, Tensor]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flight", ["T003 100", "T003 200", "T004 100", "T003 100, one sample a step"])
+@pytest.mark.parametrize("flight", ["T003 100", "T004 100", "T003 20, one sample a step"])
 def test_closes_on_the_generator(flight):
-    error = (long_closures()[flight] if flight in LONG else closure(fly(*T003, 100), 100, per_step=1)).abs()
+    error = (long_closures()[flight] if flight in LONG else closure(fly(*T003, 20), 20, per_step=1)).abs()
     assert error[:3].max() < 1e-8
     assert error[3:6].max() < 1e-4
     assert error[6:].max() < 0.02
