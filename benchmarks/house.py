@@ -57,7 +57,7 @@ class Radar(StateSpaceModel):
 
     def observation(self, x: Tensor, u: Any) -> Distribution:
         east, north = x[..., 0], x[..., 2]
-        return independent_normal(torch.stack([torch.atan2(east, north), torch.hypot(east, north)], -1), self.sd)
+        return independent_normal(torch.stack([torch.atan2(east, north), torch.sqrt(east * east + north * north)], -1), self.sd)
 
 
 MODELS = {"growth": partial(Growth, **GROWTH), "volatility": partial(StochasticVolatility, **VOLATILITY), "radar": Radar}

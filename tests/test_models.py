@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 from pfbench.chart import wrap
-from pfbench.covariance import gaussian_log_density
+from pfbench.covariance import common_covariance_of, covariance_of, gaussian_log_density
 from pfbench.draws import MonteCarlo
-from pfbench.model.base import AtRest, StateSpaceModel, normal_batch
+from pfbench.model.base import AtRest, StateSpaceModel, dense_normal, independent_normal, normal_batch
 from pfbench.model.linear import LinearGaussian, linear_walk, local_level
 from pfbench.model.toys import Benes, Growth, Lorenz63, Pendulum, StochasticVolatility
 from pfbench.record import Record
@@ -302,6 +302,24 @@ def test_a_dense_law_without_a_positive_covariance_has_no_likelihood() -> None:
     value = gaussian_log_density(torch.zeros(2, 2, dtype=torch.float64), covariance, torch.ones(2, 2, dtype=torch.bool))
     assert torch.isnan(value).tolist() == [True, False]
     assert float(value[1]) == pytest.approx(stats.multivariate_normal.logpdf([0, 0], [0, 0], covariance[1].numpy()), rel=1e-14)
+
+
+def test_a_covariance_that_all_particles_share_is_made_once() -> None:
+    x, sd = normal(3, 4, 2), torch.tensor([0.5, 2.0], dtype=torch.float64)
+    root = torch.tensor([[1.0, 0.0], [-3.0, 2.0]], dtype=torch.float64)
+    for law, one in (
+        (independent_normal(x, sd), np.diag([0.25, 4.0])),
+        (dense_normal(x, root.expand(3, 4, 2, 2)), np.array([[1.0, -3.0], [-3.0, 13.0]])),
+        (dense_normal(x, root.expand(3, 1, 2, 2).contiguous().expand(3, 4, 2, 2)), np.array([[1.0, -3.0], [-3.0, 13.0]])),
+    ):
+        assert np.allclose(covariance_of(law), np.broadcast_to(one, (3, 4, 2, 2)), rtol=1e-15)
+        assert np.allclose(common_covariance_of(law), np.broadcast_to(one, (3, 1, 2, 2)), rtol=1e-15)
+        assert common_covariance_of(law).shape == (3, 1, 2, 2)
+    for law, variance in (
+        (independent_normal(x, x.abs()), x.square()),
+        (Independent(Laplace(x, sd.expand_as(x)), 1), (2.0 * sd.square()).expand_as(x)),
+    ):
+        assert torch.allclose(common_covariance_of(law), torch.diag_embed(variance), rtol=1e-14)
 
 
 def test_other_observation_laws() -> None:
