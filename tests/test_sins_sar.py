@@ -103,12 +103,12 @@ def test_the_model_follows_the_mechanisation_through_every_manoeuvre(initial: Al
 
 @pytest.mark.slow
 def test_the_model_follows_the_mechanisation_for_a_thousand_seconds() -> None:
-    """To 0.1 m of a hundred kilometres, with misalignments of degrees; half of it is what the mechanisation itself leaves."""
+    """To 0.15 m of a hundred kilometres, with misalignments of degrees; most of it is what two samples of 0.02 s leave."""
     path = job.build(composed("scenario=sar_flight").scenario).path
-    missed, grown = followed(SimulatedFlight(path, SILENT, Sar(), MISALIGNED, imu_rate=100.0), torch.arange(4))
+    missed, grown = followed(SimulatedFlight(path, SILENT, Sar(), MISALIGNED, imu_rate=50.0), torch.arange(4))
     assert missed[:3].max() < 1e-4 * ARCMIN
     assert missed[3:6].max() < 3e-4
-    assert missed[6:9].max() < 0.1
+    assert missed[6:9].max() < 0.15
     assert grown[6:8].max() > 1e5
 
 
