@@ -44,7 +44,7 @@ lint: $(VENV)/.installed
 	.venv-peers/bin/python -m pip install --quiet --no-compile -r benchmarks/requirements-peers.txt
 	touch $@
 
-bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## speed against peers, of all methods, against size: three quarters of an hour on a quiet machine
+bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## speed against peers, of all methods, against size: two hours of a quiet machine
 	$(BIN)/python benchmarks/compare.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python
 	$(BIN)/python benchmarks/campaigns.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python
 	$(BIN)/python benchmarks/methods.py

@@ -69,7 +69,7 @@ def cut(figure: Figure) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("worlds", [2, 5])
+@pytest.mark.parametrize("worlds", [2, 7])
 def test_letters_of_figures_of_many_filters_can_be_read_and_are_not_cut(worlds: int, tmp_path: Path) -> None:
     table = rows(worlds, (*BASES, *OTHERS))
     of = {(f"passive_{k}", noise, "m"): "position" for k, noise in product(range(worlds), table.noise.unique())}
