@@ -2,12 +2,12 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo report test test-fast test-slow lint bench clean
+.PHONY: demo report test test-fast test-slow mutants format lint bench clean
 
-# Modules are compiled when they are first imported, and kept so: compiling all that is installed took half of the set-up.
+# Python compiles modules at first import. Compiling all installed packages took half of the set-up time.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Installs everything once; runs again only when the requirements change.
+# Installs once, and again if the requirements change.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e ".[dev]"
@@ -17,8 +17,9 @@ demo: $(VENV)/.installed        ## quickstart study: run, compare, report
 	$(BIN)/pfbench run -m +experiment=quickstart
 	$(BIN)/pfbench report study=quickstart
 
-report: $(VENV)/.installed      ## every published report again, from results/
+report: $(VENV)/.installed      ## all reports, from results/
 	$(BIN)/pfbench report all
+	$(BIN)/python docs/publish_reports.py
 
 test: $(VENV)/.installed        ## fast and slow tests
 	$(BIN)/python -m pytest -n 2 -m "slow or not slow"
@@ -29,11 +30,20 @@ test-fast: $(VENV)/.installed
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 -m slow
 
-lint: $(VENV)/.installed
+mutants: $(VENV)/.installed     ## plant each fault of tests/mutants.toml and check that a test fails
+	$(BIN)/python tests/mutants.py
+
+format: $(VENV)/.installed      ## format the code and apply safe fixes of the linter
+	$(BIN)/ruff check --fix-only --quiet .
+	$(BIN)/ruff format .
+
+lint: $(VENV)/.installed        ## format, lint, types and spelling, without changes
+	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/codespell
 
-# The library particles needs numpy below 2 and JAX needs it above, so peers live beside the project's own environment.
+# particles needs numpy below 2, JAX needs numpy 2: the other libraries have separate environments.
 .venv-bench/.installed: benchmarks/requirements.txt
 	$(PYTHON) -m venv .venv-bench
 	.venv-bench/bin/python -m pip install --quiet --no-compile -r benchmarks/requirements.txt
@@ -44,7 +54,7 @@ lint: $(VENV)/.installed
 	.venv-peers/bin/python -m pip install --quiet --no-compile -r benchmarks/requirements-peers.txt
 	touch $@
 
-bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## speed against peers, of all methods, against size: two hours of a quiet machine
+bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## speed of other libraries, all methods and job sizes: two hours on an idle machine
 	$(BIN)/python benchmarks/compare.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python
 	$(BIN)/python benchmarks/campaigns.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python
 	$(BIN)/python benchmarks/methods.py

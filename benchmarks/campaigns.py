@@ -32,7 +32,14 @@ from race import HERE, QUALITIES, THREADS, Contestant, Result, cpu_name
 
 CAMPAIGNS = 6
 PARTICLES = Contestant("particles float32", "numba", ("peer.py", "float32"))
-CONTESTANTS = (FLOAT32, LOOPS, EAGER, PARTICLES, JAX, Contestant("JAX, run by run", "jax", ("peer_jax.py", "loop")))
+CONTESTANTS = (
+    FLOAT32,
+    LOOPS,
+    EAGER,
+    PARTICLES,
+    JAX,
+    Contestant("JAX, run by run", "jax", ("peer_jax.py", "loop")),
+)
 
 
 class Goal(NamedTuple):
@@ -46,7 +53,9 @@ class Goal(NamedTuple):
 GOALS = (Goal("particles", 1.5, 2.5), Goal("JAX", 2.5, 4.0))
 
 
-def one(command: list[str], env: Mapping[str, str], turn: int) -> tuple[float, float, list[dict[str, Any]]] | None:
+def one(
+    command: list[str], env: Mapping[str, str], turn: int
+) -> tuple[float, float, list[dict[str, Any]]] | None:
     """A process from its start to its end: CPU and wall milliseconds, and what it answered; None where it failed.
 
     Args:
@@ -56,7 +65,13 @@ def one(command: list[str], env: Mapping[str, str], turn: int) -> tuple[float, f
     """
     seeds = range(turn * CAMPAIGNS + 1, (turn + 1) * CAMPAIGNS)
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    done = subprocess.run(command, input="".join(f"go {seed}\n" for seed in seeds), env=env, stdout=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        command,
+        input="".join(f"go {seed}\n" for seed in seeds),
+        env=env,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - begun
     if done.returncode:
         return None
@@ -64,7 +79,9 @@ def one(command: list[str], env: Mapping[str, str], turn: int) -> tuple[float, f
     return 1e3 * cpu, 1e3 * wall, [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def race(work: Mapping[str, Any], places: Mapping[str, str], rounds: int) -> dict[Contestant, Result | None]:
+def race(
+    work: Mapping[str, Any], places: Mapping[str, str], rounds: int
+) -> dict[Contestant, Result | None]:
     """One result for each contestant that has a place; None for one that failed, of which standard error has the reason.
 
     Qualities are of the five campaigns of each round that answer, [5 rounds, R].
@@ -72,10 +89,16 @@ def race(work: Mapping[str, Any], places: Mapping[str, str], rounds: int) -> dic
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "work.npz"
         np.savez(path, **work)
-        kept = {"JAX_COMPILATION_CACHE_DIR": f"{folder}/jax", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        kept = {
+            "JAX_COMPILATION_CACHE_DIR": f"{folder}/jax",
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        }
         env = os.environ | dict.fromkeys(THREADS, "1") | kept
         ready = (who for who in CONTESTANTS if who.place in places)
-        there = {who: [places[who.place], str(HERE / who.words[0]), *who.words[1:], str(path)] for who in ready}
+        there = {
+            who: [places[who.place], str(HERE / who.words[0]), *who.words[1:], str(path)]
+            for who in ready
+        }
         found: dict[Contestant, list[Any]] = {who: [] for who in there}
         for turn in range(rounds + 1):
             for who, command in there.items():
@@ -91,7 +114,9 @@ def _result(passes: list[tuple[float, float, list[dict[str, Any]]]]) -> Result:
     (_, first, greeting), *rounds = passes  # the first pass filled the caches
     answers = [answer for _, _, told in rounds for answer in told[1:]]
     cpu, wall = (np.array([taken[clock] for taken in rounds]) for clock in (0, 1))
-    qualities = {name: np.array([answer[name] for answer in answers], dtype=float) for name in QUALITIES}
+    qualities = {
+        name: np.array([answer[name] for answer in answers], dtype=float) for name in QUALITIES
+    }
     return Result(cpu, wall, qualities, greeting[0]["versions"], first)
 
 
@@ -100,23 +125,45 @@ def table(found: Mapping[Contestant, Result], bad: list[str]) -> list[str]:
     ours = fastest(found, own)
     of = {goal: [who for who in found if who.label.startswith(goal.library)] for goal in GOALS}
     peers = {goal: fastest(found, there.__contains__) for goal, there in of.items()}
-    lines = ["| against | pfbench's best | times as fast (quartiles) | must | aim |", "|---|---|---|---|---|"]
+    lines = [
+        "| against | pfbench's best | times as fast (quartiles) | must | aim |",
+        "|---|---|---|---|---|",
+    ]
     for goal, theirs in peers.items():
         if ours is not None and theirs is not None:
             low, middle, high = ratio(found[theirs], found[ours])
-            must, aim = (f"{wanted:g}, {'met' if middle >= wanted else 'missed'}" for wanted in (goal.must, goal.aim))
-            lines.append(f"| {theirs.label} | {ours.label} | {middle:.2f} ({low:.2f}-{high:.2f}) | {must} | {aim} |")
-    heads = [f"times as fast as {theirs.label if theirs else goal.library} (quartiles)" for goal, theirs in peers.items()]
-    lines += ["", f"| | CPU s, median (quartiles) | wall s | {' | '.join(heads)} | log evidence minus exact |", "|---" * 6 + "|"]
+            must, aim = (
+                f"{wanted:g}, {'met' if middle >= wanted else 'missed'}"
+                for wanted in (goal.must, goal.aim)
+            )
+            lines.append(
+                f"| {theirs.label} | {ours.label} | {middle:.2f} ({low:.2f}-{high:.2f}) | {must} | {aim} |"
+            )
+    heads = [
+        f"times as fast as {theirs.label if theirs else goal.library} (quartiles)"
+        for goal, theirs in peers.items()
+    ]
+    lines += [
+        "",
+        f"| | CPU s, median (quartiles) | wall s | {' | '.join(heads)} | log evidence minus exact |",
+        "|---" * 6 + "|",
+    ]
     for who, result in found.items():
         low, middle, high = np.quantile(result.cpu, [0.25, 0.5, 0.75]) / 1e3
-        quick = ["{1:.2f} ({0:.2f}-{2:.2f})".format(*ratio(found[peer], result)) if peer else "-" for peer in peers.values()]
+        quick = [
+            "{1:.2f} ({0:.2f}-{2:.2f})".format(*ratio(found[peer], result)) if peer else "-"
+            for peer in peers.values()
+        ]
         evidence = result.qualities["evidence"].mean(1)
         lines.append(
             f"| {who.label} | {middle:.3g} ({low:.3g}-{high:.3g}) | {np.median(result.wall) / 1e3:.3g} | {' | '.join(quick)} "
             f"| {evidence.mean():.2f} ± {evidence.std(ddof=1) / len(evidence) ** 0.5:.2f} |"
         )
-    return [*lines, "", "**Not the same work:** " + "; ".join(bad) + "." if bad else "All contestants agree."]
+    return [
+        *lines,
+        "",
+        "**Not the same work:** " + "; ".join(bad) + "." if bad else "All contestants agree.",
+    ]
 
 
 def draw(found: Mapping[Contestant, Result], path: Path) -> None:
@@ -128,12 +175,21 @@ def draw(found: Mapping[Contestant, Result], path: Path) -> None:
         colour = COLOURS["pfbench"] if own(who) else "#777777"
         axis.plot([low, high], [place, place], color=colour, lw=1.5)
         axis.plot(middle, place, "o", color=colour, ms=5)
-        axis.annotate(f"{middle:.3g}", (high, place), (6, 0), textcoords="offset points", va="center", fontsize=8)
+        axis.annotate(
+            f"{middle:.3g}",
+            (high, place),
+            (6, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
     axis.set(xlim=(0, None), ylim=(len(found) - 0.4, -0.6))
     axis.set_yticks(range(len(found)), [who.label for who in found], fontsize=8)
     axis.margins(x=0.12)
     axis.set_xlabel("CPU time in s of a whole process, one thread (median, quartiles)", fontsize=8)
-    axis.set_title("six campaigns of W4, with imports, and what was compiled on disk", fontsize=9, loc="left")
+    axis.set_title(
+        "six campaigns of W4, with imports, and what was compiled on disk", fontsize=9, loc="left"
+    )
     axis.tick_params(axis="x", labelsize=8)
     axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=150, metadata={"Software": None})
@@ -141,19 +197,38 @@ def draw(found: Mapping[Contestant, Result], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--numba", default="", help="Python that has the library particles; without, it takes no part")
+    parser.add_argument(
+        "--numba",
+        default="",
+        help="Python that has the library particles; without, it takes no part",
+    )
     parser.add_argument("--jax", default="", help="Python that has jax; likewise")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--scale", type=float, default=1.0, help="below 1: fewer runs and steps, to try it out")
-    parser.add_argument("--out", type=Path, default=HERE, help="folder for campaigns.md and campaigns.png")
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="below 1: fewer runs and steps, to try it out"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=HERE, help="folder for campaigns.md and campaigns.png"
+    )
     chosen = parser.parse_args()
-    places = {name: path for name, path in (("own", sys.executable), ("numba", chosen.numba), ("jax", chosen.jax)) if path}
+    places = {
+        name: path
+        for name, path in (("own", sys.executable), ("numba", chosen.numba), ("jax", chosen.jax))
+        if path
+    }
     runs, steps = max(4, round(100 * chosen.scale)), max(10, round(200 * chosen.scale))
     work = {**workload.make(runs, steps, 500)._asdict(), "kind": np.array("ins")}
     told = race(work, places, chosen.rounds)
     found = {who: result for who, result in told.items() if result is not None}
-    bad = disagreements(found, exact=False) + [f"{who.label}: it did not run" for who, result in told.items() if result is None]
-    versions = {name: value for result in found.values() for name, value in result.versions.items() if name != "numpy"}
+    bad = disagreements(found, exact=False) + [
+        f"{who.label}: it did not run" for who, result in told.items() if result is None
+    ]
+    versions = {
+        name: value
+        for result in found.values()
+        for name, value in result.versions.items()
+        if name != "numpy"
+    }
     page = [
         "# Whole processes: six campaigns of W4", "",
         f"SIR on the 15-state INS error model, {runs} Monte Carlo runs, {steps} steps, 500 particles, six times by six seeds. "

@@ -23,10 +23,12 @@ from matplotlib.figure import Figure
 from race import HERE, Contestant, Result, cpu_name, race
 
 TOLERANCE = 4.5  # standard errors, in some hundred comparisons
-EXACT = 0.05  # of the log evidence, where filters draw nothing: two round differently, or add a jitter
+EXACT = (
+    0.05  # of the log evidence, where filters draw nothing: two round differently, or add a jitter
+)
 
 FLOAT32 = Contestant("pfbench float32, compiled", "own", ("house.py", "float32", "compiled"))
-LOOPS = Contestant("pfbench float32, C++ loops", "own", ("house.py", "float32", "loops"))
+LOOPS = Contestant("pfbench float32, C++ loops", "own", ("house.py", "float32", "kernels"))
 EAGER = Contestant("pfbench float32, eager", "own", ("house.py", "float32", "eager"))
 FLOAT64 = Contestant("pfbench float64, compiled", "own", ("house.py", "float64", "compiled"))
 LIMIT = Contestant("fused C", "own", ("fused.py",))
@@ -45,9 +47,9 @@ BATCH = (
     Contestant("naive torch float32", "own", ("naive.py", "float32")),
 )  # fmt: skip
 GAUSSIAN = (
-    Contestant("pfbench float32, C++ loops", "own", ("house.py", "float32", "loops", "ckf")),
+    Contestant("pfbench float32, C++ loops", "own", ("house.py", "float32", "kernels", "ckf")),
     Contestant("pfbench float32, eager", "own", ("house.py", "float32", "eager", "ckf")),
-    Contestant("pfbench float64, C++ loops", "own", ("house.py", "float64", "loops", "ckf")),
+    Contestant("pfbench float64, C++ loops", "own", ("house.py", "float64", "kernels", "ckf")),
     Contestant("dynamax", "jax", ("peer_dynamax.py",)),
     Contestant("FilterPy", "jax", ("peer_filterpy.py", "ckf")),
     Contestant("Stone Soup", "jax", ("peer_stonesoup.py", "ckf")),
@@ -75,7 +77,17 @@ CASES = (
     Case("W1, N = 1e4", "growth model", "growth", 1, 100, 10_000, SMALL, 2.0, 3.0),
     Case("W1, N = 1e5", "growth model", "growth", 1, 100, 100_000, LARGE, 2.0, 2.6),
     Case("W2, N = 1e4", "stochastic volatility", "volatility", 1, 1000, 10_000, LARGE, 2.5, None),
-    Case("W3, N = 1e4", "constant velocity, bearing and range", "radar", 1, 100, 10_000, SMALL, 4.0, None),
+    Case(
+        "W3, N = 1e4",
+        "constant velocity, bearing and range",
+        "radar",
+        1,
+        100,
+        10_000,
+        SMALL,
+        4.0,
+        None,
+    ),
     Case("W4, N = 500", "15-state INS error model", "ins", 100, 200, 500, BATCH, 5.0, 2.6),
     Case("W5", "cubature filter on W4's model", "ins", 100, 200, 500, GAUSSIAN, 1.6, None),
 )
@@ -90,7 +102,10 @@ def work(case: Case, scale: float) -> Mapping[str, Any]:
     """The workload's arrays; `scale` shortens it for a trial."""
     steps = max(10, round(case.steps * scale))
     if case.kind == "ins":
-        return {**workload.make(max(4, round(case.runs * scale)), steps, case.particles)._asdict(), "kind": np.array("ins")}
+        return {
+            **workload.make(max(4, round(case.runs * scale)), steps, case.particles)._asdict(),
+            "kind": np.array("ins"),
+        }
     return problems.make(case.kind, steps, case.particles)._asdict()
 
 
@@ -98,7 +113,11 @@ def disagreements(found: Mapping[Contestant, Result], exact: bool) -> list[str]:
     """Contestants that did not compute the same: against the mean of all others, in standard errors over rounds and runs."""
     said = []
     for name, what in (("evidence", "log evidence"), ("normalised", "mean square error")):
-        values = {who: result.qualities[name] for who, result in found.items() if not np.isnan(result.qualities[name]).any()}
+        values = {
+            who: result.qualities[name]
+            for who, result in found.items()
+            if not np.isnan(result.qualities[name]).any()
+        }
         for who, own in values.items() if len(values) > 1 else ():
             others = np.concatenate([other for key, other in values.items() if key is not who])
             off = own.mean(0) - others.mean(0)  # of each run
@@ -112,13 +131,19 @@ def disagreements(found: Mapping[Contestant, Result], exact: bool) -> list[str]:
             else:
                 error = np.sqrt(own.var(ddof=1) / len(own) + others.var(ddof=1) / len(others))
             if not abs(off.mean()) < TOLERANCE * error:
-                said.append(f"{who.label}: {what} differs from the others' by {off.mean():.3g} +- {error:.2g}")
+                said.append(
+                    f"{who.label}: {what} differs from the others' by {off.mean():.3g} +- {error:.2g}"
+                )
     return said
 
 
-def fastest(found: Mapping[Contestant, Result], wanted: Callable[[Contestant], bool]) -> Contestant | None:
+def fastest(
+    found: Mapping[Contestant, Result], wanted: Callable[[Contestant], bool]
+) -> Contestant | None:
     """Of those that are wanted, the one with the smallest median."""
-    return min(filter(wanted, found), key=lambda who: float(np.median(found[who].cpu)), default=None)
+    return min(
+        filter(wanted, found), key=lambda who: float(np.median(found[who].cpu)), default=None
+    )
 
 
 def starting(label: str) -> Callable[[Contestant], bool]:
@@ -140,10 +165,15 @@ def own(who: Contestant) -> bool:
     return who.label.startswith("pfbench")
 
 
-def section(case: Case, found: Mapping[Contestant, Result], bad: list[str], scale: float) -> list[str]:
+def section(
+    case: Case, found: Mapping[Contestant, Result], bad: list[str], scale: float
+) -> list[str]:
     """The table of one workload."""
     best, limit = fastest(found, peer), found.get(LIMIT)
-    runs, steps = next(iter(found.values())).qualities["evidence"].shape[1], max(10, round(case.steps * scale))
+    runs, steps = (
+        next(iter(found.values())).qualities["evidence"].shape[1],
+        max(10, round(case.steps * scale)),
+    )
     size = f"{case.said}; R = {runs}, T = {steps}"
     lines = [
         "", f"## {case.name}", "", f"{size[0].upper()}{size[1:]}.", "",
@@ -156,12 +186,19 @@ def section(case: Case, found: Mapping[Contestant, Result], bad: list[str], scal
         quick = "{1:.2f} ({0:.2f}-{2:.2f})".format(*ratio(found[best], result)) if best else "-"
         behind = f"{ratio(result, limit)[1]:.1f}" if limit else "-"
         evidence, error = (result.qualities[name].mean(1) for name in ("evidence", "normalised"))
-        told = "-" if np.isnan(evidence).any() else f"{evidence.mean():.2f} ± {evidence.std(ddof=1) / len(evidence) ** 0.5:.2f}"
+        told = (
+            "-"
+            if np.isnan(evidence).any()
+            else f"{evidence.mean():.2f} ± {evidence.std(ddof=1) / len(evidence) ** 0.5:.2f}"
+        )
         lines.append(
             f"| {who.label} | {middle:.3g} ({low:.3g}-{high:.3g}) | {quick} | {behind} | {told} | {error.mean():.4g} "
             f"| {result.start / 1e3:.1f} |"
         )
-    lines += ["", "**Not the same work:** " + "; ".join(bad) + "." if bad else "All contestants agree."]
+    lines += [
+        "",
+        "**Not the same work:** " + "; ".join(bad) + "." if bad else "All contestants agree.",
+    ]
     return lines
 
 
@@ -188,7 +225,9 @@ def summary(found: Mapping[Case, Mapping[Contestant, Result]]) -> list[str]:
         if ours and theirs:
             low, middle, high = ratio(results[theirs], results[ours])
             quick = f"{middle:.2f} ({low:.2f}-{high:.2f})"
-            lines.append(f"| {name} | {label} | {theirs.label} | {quick} | {_goal(middle, must)} | - | - |")
+            lines.append(
+                f"| {name} | {label} | {theirs.label} | {quick} | {_goal(middle, must)} | - | - |"
+            )
     return lines
 
 
@@ -198,8 +237,13 @@ def _goal(value: float, must: float) -> str:
 
 def draw(found: Mapping[Case, Mapping[Contestant, Result]], path: Path) -> None:
     """One panel for each workload: median CPU time of each contestant on a logarithmic axis, quartiles as bars."""
-    figure = Figure(figsize=(7.5, 0.5 + sum(0.42 + 0.17 * len(results) for results in found.values())), layout="constrained")
-    axes = figure.subplots(len(found), 1, height_ratios=[len(results) for results in found.values()], squeeze=False)[:, 0]
+    figure = Figure(
+        figsize=(7.5, 0.5 + sum(0.42 + 0.17 * len(results) for results in found.values())),
+        layout="constrained",
+    )
+    axes = figure.subplots(
+        len(found), 1, height_ratios=[len(results) for results in found.values()], squeeze=False
+    )[:, 0]
     for axis, (case, results) in zip(axes, found.items(), strict=True):
         for place, (who, result) in enumerate(results.items()):
             low, middle, high = np.quantile(result.cpu, [0.25, 0.5, 0.75])
@@ -207,7 +251,9 @@ def draw(found: Mapping[Case, Mapping[Contestant, Result]], path: Path) -> None:
             axis.plot([low, high], [place, place], color=colour, lw=1.5)
             axis.plot(middle, place, "o", color=colour, ms=4)
             told = f"{middle:,.0f}" if middle >= 100.0 else f"{middle:.3g}"
-            axis.annotate(told, (high, place), (5, 0), textcoords="offset points", va="center", fontsize=7)
+            axis.annotate(
+                told, (high, place), (5, 0), textcoords="offset points", va="center", fontsize=7
+            )
         axis.set(xscale="log", ylim=(len(results) - 0.4, -0.6))
         axis.set_yticks(range(len(results)), [who.label for who in results], fontsize=7)
         axis.set_title(f"{case.name}: {case.said}", fontsize=8, loc="left")
@@ -220,21 +266,43 @@ def draw(found: Mapping[Case, Mapping[Contestant, Result]], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--numba", default="", help="Python that has the library particles; without, it takes no part")
-    parser.add_argument("--jax", default="", help="Python that has jax, cuthbert, dynamax, filterpy and stonesoup; likewise")
+    parser.add_argument(
+        "--numba",
+        default="",
+        help="Python that has the library particles; without, it takes no part",
+    )
+    parser.add_argument(
+        "--jax",
+        default="",
+        help="Python that has jax, cuthbert, dynamax, filterpy and stonesoup; likewise",
+    )
     parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--scale", type=float, default=1.0, help="below 1: shorter and smaller, to try it out")
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="below 1: shorter and smaller, to try it out"
+    )
     parser.add_argument("--only", default="", help="workloads whose names begin so")
-    parser.add_argument("--out", type=Path, default=HERE, help="folder for compare.md and compare.png")
+    parser.add_argument(
+        "--out", type=Path, default=HERE, help="folder for compare.md and compare.png"
+    )
     chosen = parser.parse_args()
-    places = {name: path for name, path in (("own", sys.executable), ("numba", chosen.numba), ("jax", chosen.jax)) if path}
+    places = {
+        name: path
+        for name, path in (("own", sys.executable), ("numba", chosen.numba), ("jax", chosen.jax))
+        if path
+    }
     found: dict[Case, dict[Contestant, Result]] = {}
     lines, wrong, versions = [], [], {}
     for case in (case for case in CASES if case.name.startswith(chosen.only)):
         there = [who for who in case.contestants if who.place in places]
         results = race(work(case, chosen.scale), there, places, chosen.rounds)
-        found[case] = {who: result for who, result in zip(there, results, strict=True) if result is not None}
-        failed = [f"{who.label}: it did not run" for who, result in zip(there, results, strict=True) if result is None]
+        found[case] = {
+            who: result for who, result in zip(there, results, strict=True) if result is not None
+        }
+        failed = [
+            f"{who.label}: it did not run"
+            for who, result in zip(there, results, strict=True)
+            if result is None
+        ]
         bad = disagreements(found[case], exact=case.name == "W5") + failed
         wrong += [f"{case.name}, {text}" for text in bad]
         lines += section(case, found[case], bad, chosen.scale)

@@ -30,17 +30,17 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from pfbench import fusion, native
-from pfbench.draws import MonteCarlo
-from pfbench.filter.compiled import Compiled
-from pfbench.filter.loop import Estimate, run_filter, runs_at_once
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.resamplers import Resample, Systematic
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record, map_inputs
+from pfbench.filter.loop import FilterResult, choose_run_batch, run_filter
+from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.kernels import compilation, cpp
 from pfbench.model.base import StateSpaceModel
-from pfbench.record import Record, map_inputs
 
 HERE = Path(__file__).parent
-ENGINES = ("compiled", "loops", "eager")
+ENGINES = ("compiled", "kernels", "eager")
 SIZES = ((1000, 10_000, 200), (100, 500, 200))  # runs, particles, steps
 TOLERANCE = 4.5  # standard errors
 
@@ -110,11 +110,19 @@ class Traffic(TorchDispatchMode):
         super().__init__()
         self.bytes = 0
 
-    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, operation: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         out = operation(*args, **(kwargs or {}))
-        given, made = ([a for a in tree_leaves(tree) if isinstance(a, Tensor)] for tree in ((args, kwargs), out))
+        given, made = (
+            [a for a in tree_leaves(tree) if isinstance(a, Tensor)]
+            for tree in ((args, kwargs), out)
+        )
         stored = {a.untyped_storage().data_ptr() for a in given}
-        view = any(a.untyped_storage().data_ptr() in stored for a in made) and not operation._schema.is_mutable
+        view = (
+            any(a.untyped_storage().data_ptr() in stored for a in made)
+            and not operation._schema.is_mutable
+        )
         if not view and "empty" not in operation._schema.name:
             self.bytes += sum(map(_bytes, given + made))
         return out
@@ -164,21 +172,23 @@ class Pass:
         block: runs that a step takes together.
     """
 
-    def __init__(self, engine: str, model: StateSpaceModel, record: Record, particles: int, block: int) -> None:
-        method = ParticleFilter(particles, Resample(Systematic(), threshold=1.0))
-        self.method = Compiled(method) if engine == "compiled" else method
+    def __init__(
+        self, engine: str, model: StateSpaceModel, record: Record, particles: int, block: int
+    ) -> None:
+        method = ParticleFilter(particles, EssResampler(Systematic(), ess_threshold=1.0))
+        self.method = CompiledParticleFilter(method) if engine == "compiled" else method
         self.engine, self.model, self.record, self.block = engine, model, record, block
         self.runs = torch.arange(len(record.y), device=record.y.device)
 
-    def __call__(self, seed: int) -> Estimate:
-        draws = MonteCarlo(seed, self.runs, self.record.y.dtype)
-        with fusion.fused(self.engine != "eager"), torch.no_grad():
-            return run_filter(self.method, self.model, self.record, draws, at_once=self.block)
+    def __call__(self, seed: int) -> FilterResult:
+        draws = PhiloxStream(seed, self.runs, self.record.y.dtype)
+        with compilation.use_compiled(self.engine != "eager"), torch.no_grad():
+            return run_filter(self.method, self.model, self.record, draws, run_batch=self.block)
 
     @property
     def ran(self) -> str:
         """The engine, once it has run."""
-        fell_back = isinstance(self.method, Compiled) and not self.method.at_work
+        fell_back = isinstance(self.method, CompiledParticleFilter) and not self.method.is_active
         return "loops (the step did not compile)" if fell_back else self.engine
 
 
@@ -192,7 +202,7 @@ def measure(engine: str, work: workload.Workload, device: torch.device, rounds: 
     model = model.to(device)
     record = record.to(model.anchor)
     (runs, steps, _), particles = record.y.shape, int(work.particles)
-    block = runs if device.type == "cuda" else runs_at_once(runs, particles, model.chart.size)
+    block = runs if device.type == "cuda" else choose_run_batch(runs, particles, model.chart.size)
     filtered, first = None, 0.0
     while filtered is None:
         filtered = Pass(engine, model, record, particles, block)
@@ -214,18 +224,20 @@ def measure(engine: str, work: workload.Workload, device: torch.device, rounds: 
     counted = moved(model, record, particles) if engine == "eager" else None
     if filtered.ran == "compiled" and device.type == "cuda":
         counted = Moved(COMPILED, 0.0)
-    return Measured(filtered.ran, runs, particles, steps, block, first, seconds, peak, counted, evidence)
+    return Measured(
+        filtered.ran, runs, particles, steps, block, first, seconds, peak, counted, evidence
+    )
 
 
 def moved(model: StateSpaceModel, record: Record, particles: int) -> Moved:
     """By the eager engine in a step of a few runs: what three steps move more than two."""
-    few, counts = record.of(slice(0, 4)), []
+    few, counts = record.select_runs(slice(0, 4)), []
     for steps in (2, 3):
         begun = few._replace(y=few.y[:, :steps], u=_begun(few.u, steps))
         with Traffic() as traffic:
             Pass("eager", model, begun, particles, len(few.y))(0)
         counts.append(traffic.bytes)
-    draws = MonteCarlo(0, torch.arange(len(few.y), device=few.y.device), few.y.dtype)
+    draws = PhiloxStream(0, torch.arange(len(few.y), device=few.y.device), few.y.dtype)
     with Traffic() as traffic:
         draws.normal("counted", particles, model.noise_dim)
     each = len(few.y) * particles
@@ -246,7 +258,9 @@ def disagreements(found: Sequence[Measured]) -> list[str]:
         error = off.std(ddof=1) / len(off) ** 0.5
         if not abs(off.mean()) <= TOLERANCE * error + 1e-3:
             far = f"{off.mean():.3g} +- {error:.2g}"
-            said.append(f"{one.size}, {one.engine}: log evidence differs from {other.engine}'s by {far}")
+            said.append(
+                f"{one.size}, {one.engine}: log evidence differs from {other.engine}'s by {far}"
+            )
     return said
 
 
@@ -289,7 +303,9 @@ def goals(found: Sequence[Measured], rate: float) -> list[str]:
     ]  # fmt: skip
 
 
-def page(found: Sequence[Measured], failed: Sequence[str], rate: float, device: torch.device) -> str:
+def page(
+    found: Sequence[Measured], failed: Sequence[str], rate: float, device: torch.device
+) -> str:
     """gpu.md."""
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
     counted = [one.moved for one in found if one.moved and one.engine == "eager"]
@@ -315,9 +331,16 @@ def page(found: Sequence[Measured], failed: Sequence[str], rate: float, device: 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--device", default="cuda", help="cuda, or one of several as cuda:1; cpu to try it out")
+    parser.add_argument(
+        "--device", default="cuda", help="cuda, or one of several as cuda:1; cpu to try it out"
+    )
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--scale", type=float, default=1.0, help="below 1: fewer runs, particles and steps, to try it out")
+    parser.add_argument(
+        "--scale",
+        type=float,
+        default=1.0,
+        help="below 1: fewer runs, particles and steps, to try it out",
+    )
     parser.add_argument("--out", type=Path, default=HERE, help="folder for gpu.md")
     chosen = parser.parse_args()
     device = torch.device(chosen.device)
@@ -328,21 +351,30 @@ def main() -> None:
         )
     if device.type == "cpu":
         torch.set_num_threads(1)
-        native.keep_memory()
+        cpp.keep_freed_memory()
     rate = copy_rate(device)
     found: list[Measured] = []
     failed: list[str] = []
     for runs, particles, steps in SIZES:
-        size = max(4, round(runs * chosen.scale)), max(10, round(steps * chosen.scale)), max(50, round(particles * chosen.scale))
+        size = (
+            max(4, round(runs * chosen.scale)),
+            max(10, round(steps * chosen.scale)),
+            max(50, round(particles * chosen.scale)),
+        )
         work = workload.make(*size)
         for engine in ENGINES:
             try:
                 found.append(measure(engine, work, device, chosen.rounds))
-            except Exception as error:  # a compiler's, or memory: the other engines shall be measured all the same
+            except (
+                Exception
+            ) as error:  # a compiler's, or memory: the other engines shall be measured all the same
                 traceback.print_exc()
                 failed.append(f"{engine}, {size}: {type(error).__name__}")
                 continue
-            print(f"{found[-1].size}, {engine}: {statistics.median(found[-1].seconds):.3g} s", file=sys.stderr)
+            print(
+                f"{found[-1].size}, {engine}: {statistics.median(found[-1].seconds):.3g} s",
+                file=sys.stderr,
+            )
     failed += disagreements(found)
     text = page(found, failed, rate, device)
     (chosen.out / "gpu.md").write_text(text)

@@ -2,7 +2,7 @@
 
 W1 to W3 are single runs, W4 a batch. Of W3 the package has no model; `Radar` is one as a user would write it.
 
-    python house.py float32|float64 eager|loops|compiled [sir|ckf] WORKLOAD
+    python house.py float32|float64 eager|kernels|compiled [sir|ckf] WORKLOAD
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from torch.distributions import Distribution
 from worker import Filter, serve
 from workload import ins_model
 
-from pfbench import fusion, job, native
-from pfbench.draws import MonteCarlo
-from pfbench.filter.compiled import Compiled
-from pfbench.filter.loop import run_filter, runs_at_once
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.resamplers import Resample, Systematic
-from pfbench.model.base import StateSpaceModel, affine, independent_normal, normal_batch
-from pfbench.model.ins_gnss import Step
-from pfbench.model.toys import Growth, StochasticVolatility
-from pfbench.record import Record
+from pfbench import job
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.loop import choose_run_batch, run_filter
+from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.kernels import compilation, cpp
+from pfbench.model.base import StateSpaceModel, affine_map, independent_normal, normal_batch
+from pfbench.model.ins_gnss import LooseStep
+from pfbench.model.textbook import StochasticVolatility, UnivariateGrowth
 
 
 class Radar(StateSpaceModel):
@@ -38,29 +39,46 @@ class Radar(StateSpaceModel):
         super().__init__()
         dt, q = RADAR["interval"], RADAR["acceleration_sd"]
         eye = torch.eye(2, dtype=torch.float64)
-        self.register_buffer("phi", torch.kron(eye, torch.tensor([[1.0, dt], [0.0, 1.0]], dtype=torch.float64)))
-        self.register_buffer("gain", torch.kron(eye, q * torch.tensor([[0.5 * dt**2], [dt]], dtype=torch.float64)))
-        self.register_buffer("sd", torch.tensor([RADAR["bearing_sd"], RADAR["range_sd"]], dtype=torch.float64))
+        self.register_buffer(
+            "phi", torch.kron(eye, torch.tensor([[1.0, dt], [0.0, 1.0]], dtype=torch.float64))
+        )
+        self.register_buffer(
+            "gain", torch.kron(eye, q * torch.tensor([[0.5 * dt**2], [dt]], dtype=torch.float64))
+        )
+        self.register_buffer(
+            "sd", torch.tensor([RADAR["bearing_sd"], RADAR["range_sd"]], dtype=torch.float64)
+        )
         self.register_buffer("start", torch.tensor(RADAR_START, dtype=torch.float64))
         self.register_buffer("spread", torch.tensor(RADAR_SPREAD, dtype=torch.float64))
-        self.names, self.units, self.noise_dim = ("east", "east rate", "north", "north rate"), ("m", "m/s") * 2, 2
+        self.names, self.units, self.noise_dim = (
+            ("east", "east rate", "north", "north rate"),
+            ("m", "m/s") * 2,
+            2,
+        )
         self.groups = {"position": (0, 2), "velocity": (1, 3)}
 
     def initial(self, runs: int) -> Distribution:
         return normal_batch(runs, self.spread, self.start)
 
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        return affine(self.phi[None], x, self.gain[None], w)
+        return affine_map(self.phi[None], x, self.gain[None], w)
 
     def noise_gain(self, u: Any) -> Tensor:
         return self.gain.unsqueeze(0)
 
     def observation(self, x: Tensor, u: Any) -> Distribution:
         east, north = x[..., 0], x[..., 2]
-        return independent_normal(torch.stack([torch.atan2(east, north), torch.sqrt(east * east + north * north)], -1), self.sd)
+        return independent_normal(
+            torch.stack([torch.atan2(east, north), torch.sqrt(east * east + north * north)], -1),
+            self.sd,
+        )
 
 
-MODELS = {"growth": partial(Growth, **GROWTH), "volatility": partial(StochasticVolatility, **VOLATILITY), "radar": Radar}
+MODELS = {
+    "growth": partial(UnivariateGrowth, **GROWTH),
+    "volatility": partial(StochasticVolatility, **VOLATILITY),
+    "radar": Radar,
+}
 
 
 def model_and_record(work: Any, dtype: torch.dtype) -> tuple[StateSpaceModel, Record]:
@@ -70,33 +88,39 @@ def model_and_record(work: Any, dtype: torch.dtype) -> tuple[StateSpaceModel, Re
         return model, Record(torch.from_numpy(work.y)).to(model.anchor)
     model = ins_model().to(dtype)
     step, d = torch.from_numpy(work.step)[None], len(work.p0)
-    inputs = Step(step[..., :d].contiguous(), step[..., d:].contiguous())
+    inputs = LooseStep(step[..., :d].contiguous(), step[..., d:].contiguous())
     return model, Record(torch.from_numpy(work.y), inputs).to(model.anchor)
 
 
 def sir(work: Any, dtype: torch.dtype, engine: str = "eager") -> Filter:
     """The project's SIR filter, resampling at every step; `engine` as in a job."""
-    method = ParticleFilter(int(work.particles), Resample(Systematic(), threshold=1.0))
+    method = ParticleFilter(int(work.particles), EssResampler(Systematic(), ess_threshold=1.0))
     return of(method, method.particles, work, dtype, engine)
 
 
 def ckf(work: Any, dtype: torch.dtype, engine: str = "eager") -> Filter:
     """The project's cubature filter, as it is configured."""
     with initialize_config_module("pfbench.conf", version_base="1.3"):
-        method = job.build(compose("config", ["filter=ckf"])["filter"])
+        method = job.instantiate(compose("config", ["filter=ckf"])["filter"])
     return of(method, 1, work, dtype, engine)
 
 
 def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) -> Filter:
     """A filter in the project's time loop, in blocks of runs as a job makes them."""
     model, record = model_and_record(work, dtype)
-    method = Compiled(method) if engine == "compiled" and isinstance(method, ParticleFilter) else method
+    method = (
+        CompiledParticleFilter(method)
+        if engine == "compiled" and isinstance(method, ParticleFilter)
+        else method
+    )
     runs = torch.arange(len(work.y))
-    block = runs_at_once(len(runs), particles, model.chart.size)
+    block = choose_run_batch(len(runs), particles, model.chart.size)
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        with fusion.fused(engine != "eager"), torch.no_grad():
-            estimate = run_filter(method, model, record, MonteCarlo(seed, runs, dtype), at_once=block)
+        with compilation.use_compiled(engine != "eager"), torch.no_grad():
+            estimate = run_filter(
+                method, model, record, PhiloxStream(seed, runs, dtype), run_batch=block
+            )
         return estimate.log_evidence, estimate.mean
 
     return run
@@ -104,7 +128,7 @@ def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) 
 
 def contestant(work: Any) -> tuple[Filter, dict[str, str]]:
     torch.set_num_threads(1)
-    native.keep_memory()  # as a job does
+    cpp.keep_freed_memory()  # as a job does
     filtered = ckf if "ckf" in sys.argv[3:-1] else sir
     run = filtered(work, getattr(torch, sys.argv[1]), sys.argv[2])
     return run, {"torch": torch.__version__, "numpy": sys.modules["numpy"].__version__}

@@ -22,13 +22,14 @@ from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
 from race import cpu_name
 
-from pfbench import fusion, job, native
-from pfbench.draws import MonteCarlo
-from pfbench.filter.gaussian import GaussianFilter
+from pfbench import job
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record, map_inputs
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Record, map_inputs
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.kernels import compilation, cpp
+from pfbench.noise.white import NominalNoise
 
 HERE = Path(__file__).parent
 FIRST = "sir"
@@ -39,14 +40,22 @@ def methods(particles: int) -> dict[str, Any]:
     names = sorted(path.stem for path in (HERE.parent / "conf" / "filter").glob("*.yaml"))
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         words = (f"particles={particles}", "checkpoint=untrained")
-        return {name: job.build(compose("config", [f"filter={name}", *words])["filter"]) for name in names}
+        return {
+            name: job.instantiate(compose("config", [f"filter={name}", *words])["filter"])
+            for name in names
+        }
 
 
 def flights(runs: int, steps: int) -> tuple[Any, Record]:
     """The first steps of simulated flights and the model of all filters."""
     with initialize_config_module("pfbench.conf", version_base="1.3"):
-        cfg = compose("config", ["scenario=t004", "model=ins_gnss_inflated", "worlds=null"])
-    model, episode = job.build(cfg.model), job.build(cfg.scenario).draw(Nominal(), torch.arange(runs), 1)
+        cfg = compose(
+            "config", ["scenario=flight_500s", "model=ins_gnss_inflated", "episode_cache_dir=null"]
+        )
+    model, episode = (
+        job.instantiate(cfg.model),
+        job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(runs), 1),
+    )
     record = model.prepare(episode.record)
     first = record._replace(y=record.y[:, :steps], u=map_inputs(lambda a: a[:, :steps], record.u))
     return model, first
@@ -59,7 +68,7 @@ def race(found: dict[str, Any], model: Any, record: Record, rounds: int) -> dict
     for turn in range(rounds + 1):
         for name, method in found.items():
             begun = time.process_time()
-            run_filter(method, model, record, MonteCarlo(turn, torch.arange(runs)))
+            run_filter(method, model, record, PhiloxStream(turn, torch.arange(runs)))
             if turn:
                 spent[name].append(1e3 * (time.process_time() - begun) / steps)
             print(f"round {turn} of {rounds}: {name}", file=sys.stderr)
@@ -69,7 +78,7 @@ def race(found: dict[str, Any], model: Any, record: Record, rounds: int) -> dict
 def begins_with(method: Any) -> str:
     """Particles at the start; a method that adapts their number may have its own."""
     if isinstance(method, ParticleFilter):
-        return str(method.size.first(method.particles))
+        return str(method.particle_count.initial_count(method.particles))
     return "none" if isinstance(method, GaussianFilter) else str(method.particles)
 
 
@@ -79,13 +88,16 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=default)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    native.keep_memory()
+    cpp.keep_freed_memory()
     warnings.simplefilter("ignore")  # of methods that say what they cost
     model, record = flights(chosen.runs, chosen.steps)
     found = methods(chosen.particles)
-    with fusion.fused(), torch.no_grad():
+    with compilation.use_compiled(), torch.no_grad():
         spent = race(found, model, record, chosen.rounds)
-    ratios = {name: [a / b for a, b in zip(times, spent[FIRST], strict=True)] for name, times in spent.items()}
+    ratios = {
+        name: [a / b for a, b in zip(times, spent[FIRST], strict=True)]
+        for name, times in spent.items()
+    }
     order = sorted(ratios, key=lambda name: statistics.median(ratios[name]))
     lines = [
         "# What a step costs",
@@ -102,13 +114,22 @@ def main() -> None:
         low, middle, high = min(own), statistics.median(own), max(own)
         cost = f"{statistics.median(spent[name]):.2f} | {middle:.2f} ({low:.2f}-{high:.2f})"
         lines.append(f"| `{name}` | {begins_with(found[name])} | {cost} |")
-    lines += ["", f"{cpu_name()}; Python {platform.python_version()}, torch {torch.__version__}.", ""]
+    lines += [
+        "",
+        f"{cpu_name()}; Python {platform.python_version()}, torch {torch.__version__}.",
+        "",
+    ]
     (HERE / "methods.md").write_text("\n".join(lines))
     draw(order, ratios, found, chosen)
     print("\n".join(lines))
 
 
-def draw(order: list[str], ratios: dict[str, list[float]], found: dict[str, Any], chosen: argparse.Namespace) -> None:
+def draw(
+    order: list[str],
+    ratios: dict[str, list[float]],
+    found: dict[str, Any],
+    chosen: argparse.Namespace,
+) -> None:
     """One bar per method on a logarithmic axis."""
     figure = Figure(figsize=(6.5, 0.6 + 0.19 * len(order)), layout="constrained")
     axis = figure.subplots()
@@ -118,14 +139,26 @@ def draw(order: list[str], ratios: dict[str, list[float]], found: dict[str, Any]
         axis.plot([min(ratios[name]), max(ratios[name])], [place, place], color=colour, lw=1)
         axis.plot(middle, place, "o" if colour == "#0072B2" else "s", color=colour, ms=4)
         said = f"{middle:.2g}" if middle < 9.5 else f"{middle:.0f}"
-        axis.annotate(said, (max(ratios[name]), place), (5, 0), textcoords="offset points", va="center", fontsize=7)
+        axis.annotate(
+            said,
+            (max(ratios[name]), place),
+            (5, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=7,
+        )
     axis.axvline(1.0, color="0.6", lw=0.8, zorder=0)
     axis.set_yticks(range(len(order)), order, fontsize=7)
     axis.set_ylim(len(order) - 0.4, -0.6)
     axis.set(xscale="log")
     axis.margins(x=0.08)
-    axis.set_xlabel("cost of a step, times that of SIR; circles: particles, squares: Gaussian filters", fontsize=8)
-    axis.set_title(f"18-state INS/GNSS, {chosen.runs} runs, {chosen.particles} particles, one core", fontsize=9)
+    axis.set_xlabel(
+        "cost of a step, times that of SIR; circles: particles, squares: Gaussian filters",
+        fontsize=8,
+    )
+    axis.set_title(
+        f"18-state INS/GNSS, {chosen.runs} runs, {chosen.particles} particles, one core", fontsize=9
+    )
     axis.tick_params(axis="x", labelsize=8)
     axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(HERE / "methods.png", dpi=150, metadata={"Software": None})

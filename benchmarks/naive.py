@@ -1,6 +1,6 @@
 """What one writes in an hour: the same filter in plain eager torch.
 
-    python naive.py float32|float64 WORKLOAD
+python naive.py float32|float64 WORKLOAD
 """
 
 from __future__ import annotations

@@ -20,7 +20,16 @@ from race import cpu_name
 
 HERE = Path(__file__).parent
 FILTERS = ("ekf", "ukf", "ckf", "sir", "apf", "rpf", "gpf")
-NOISES = ("nominal", "paper_burst", "outliers", "student", "laplace", "mixture", "bias_step", "gauss_markov")
+NOISES = (
+    "nominal",
+    "paper_bursts",
+    "outliers",
+    "student",
+    "laplace",
+    "mixture",
+    "bias_step",
+    "gauss_markov",
+)
 LIMIT = 60.0  # seconds
 
 
@@ -28,24 +37,42 @@ def command(*words: str) -> float:
     """Runs pfbench on one thread; returns the seconds that it took."""
     begun = time.perf_counter()
     env = {**os.environ, "OMP_NUM_THREADS": "1"}
-    subprocess.run([sys.executable, "-m", "pfbench", *words], check=True, stdout=subprocess.DEVNULL, env=env)
+    subprocess.run(
+        [sys.executable, "-m", "pfbench", *words], check=True, stdout=subprocess.DEVNULL, env=env
+    )
     return time.perf_counter() - begun
 
 
 def measured(folder: Path, runs: int) -> tuple[float, float, int, float]:
     """Seconds of the study and of its report; figures of the page, and its size in MB."""
-    places = f"results={folder}/results", f"worlds={folder}/worlds"
+    places = f"results_dir={folder}/results", f"episode_cache_dir={folder}/worlds"
     sweep = f"filter={','.join(FILTERS)}", f"noise={','.join(NOISES)}"
-    study = command("run", "-m", "study=pages", "scenario=linear_walk", f"runs={runs}", "particles=100", *sweep, *places)
-    report = command("report", "study=pages", places[0], f"reports={folder}/reports")
+    study = command(
+        "run",
+        "-m",
+        "study=pages",
+        "scenario=linear_walk",
+        f"runs={runs}",
+        "particles=100",
+        *sweep,
+        *places,
+    )
+    report = command("report", "study=pages", places[0], f"reports_dir={folder}/reports")
     page = folder / "reports" / "pages" / "index.html"
-    return study, report, len(list((page.parent / "figures").glob("*.svg"))), page.stat().st_size / 1e6
+    return (
+        study,
+        report,
+        len(list((page.parent / "figures").glob("*.svg"))),
+        page.stat().st_size / 1e6,
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--keep", type=Path, help="a folder for results and page, which are otherwise thrown away")
+    parser.add_argument(
+        "--keep", type=Path, help="a folder for results and page, which are otherwise thrown away"
+    )
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         study, report, figures, size = measured(given.keep or Path(scratch), given.runs)

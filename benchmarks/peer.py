@@ -4,7 +4,7 @@
 
 All that can be computed before the loop is (no Cholesky factor and no distribution object at a step); normals come from
 NumPy's ziggurat generator, not from the slow global one; resampling is the library's own numba loop. It has no axis of runs,
-so the runs follow each other. `Moments` collects mean and variance, since pfbench computes them too, by two products rather
+so the runs follow each other. `QuadratureEmitterPrior` collects mean and variance, since pfbench computes them too, by two products rather
 than by the library's slower default; effective sample size, evidence and the resampling flag are collected anyway.
 """
 
@@ -32,12 +32,25 @@ class Bootstrap(particles.FeynmanKac):
 
     isAPF = False  # the library finds out at every step, by dir()
 
-    def __init__(self, work: Any, y: np.ndarray, steps: list[tuple[np.ndarray, np.ndarray]], chance: np.random.Generator) -> None:
+    def __init__(
+        self,
+        work: Any,
+        y: np.ndarray,
+        steps: list[tuple[np.ndarray, np.ndarray]],
+        chance: np.random.Generator,
+    ) -> None:
         super().__init__(len(y))
         self.steps, self.chance = steps, chance
         dtype = steps[0][0].dtype
-        self.y, self.p0, self.scale = y.astype(dtype), work.p0.astype(dtype), (np.sqrt(0.5) / work.r).astype(dtype)
-        first, width = int(work.seen.min()), len(work.seen)  # a slice is faster than a list of columns
+        self.y, self.p0, self.scale = (
+            y.astype(dtype),
+            work.p0.astype(dtype),
+            (np.sqrt(0.5) / work.r).astype(dtype),
+        )
+        first, width = (
+            int(work.seen.min()),
+            len(work.seen),
+        )  # a slice is faster than a list of columns
         self.seen = slice(first, first + width)
         order = np.argsort(work.seen)
         self.y, self.scale = np.ascontiguousarray(self.y[:, order]), self.scale[order]
@@ -62,17 +75,21 @@ class Bootstrap(particles.FeynmanKac):
 def sir(work: Any, dtype: str) -> Filter:
     d = len(work.p0)
     if sorted(work.seen) != list(range(work.seen.min(), work.seen.min() + len(work.seen))):
-        raise ValueError(f"seen={work.seen}: this contestant wants measured states that are neighbours")
+        raise ValueError(
+            f"seen={work.seen}: this contestant wants measured states that are neighbours"
+        )
     transposed = np.ascontiguousarray(work.step.transpose(0, 2, 1).astype(dtype))
     steps = [(a[:d], a[d:]) for a in transposed]
 
     def run(seed: int) -> tuple[list[float], np.ndarray]:
-        np.random.seed(seed)  # noqa: NPY002 (the library draws its resampling uniforms from the global generator)
+        np.random.seed(seed)
         chance = np.random.Generator(np.random.SFC64(seed))
         log_z, means = [], []
         for y in work.y:
             fk, collect = Bootstrap(work, y, steps, chance), [Moments(mom_func=moments)]
-            smc = particles.SMC(fk, int(work.particles), resampling="systematic", ESSrmin=1.0, collect=collect)
+            smc = particles.SMC(
+                fk, int(work.particles), resampling="systematic", ESSrmin=1.0, collect=collect
+            )
             smc.run()
             log_z.append(smc.logLt)
             means.append([mean for mean, _ in smc.summaries.moments])

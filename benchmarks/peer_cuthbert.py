@@ -12,7 +12,9 @@ import os
 from importlib.metadata import version
 from typing import Any
 
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+)
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +52,9 @@ def sir(work: Any) -> Filter:
     every = jax.jit(lambda keys, ys: jax.lax.map(lambda a: one(*a), (keys, ys)))
 
     def run(seed: int) -> tuple[np.ndarray, np.ndarray]:
-        total, mean, _, _ = jax.block_until_ready(every(jax.random.split(jax.random.key(seed), runs), problem.y))
+        total, mean, _, _ = jax.block_until_ready(
+            every(jax.random.split(jax.random.key(seed), runs), problem.y)
+        )
         return np.asarray(total), np.asarray(mean)
 
     return run

@@ -12,7 +12,9 @@ import os
 from importlib.metadata import version
 from typing import Any
 
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+)
 os.environ["JAX_ENABLE_X64"] = "1"
 
 import jax
@@ -27,7 +29,9 @@ def ckf(work: Any) -> Filter:
     phi, gain = work.step[:, :, :d], work.step[:, :, d:]
     noise = gain @ gain.transpose(0, 2, 1)
     first = phi[0] @ np.diag(work.p0**2) @ phi[0].T + noise[0]
-    ahead = jnp.asarray(np.concatenate([phi[1:], phi[-1:]]).reshape(len(phi), -1))  # of the step after this one
+    ahead = jnp.asarray(
+        np.concatenate([phi[1:], phi[-1:]]).reshape(len(phi), -1)
+    )  # of the step after this one
     seen = jnp.asarray(work.seen)
     params = ParamsNLGSSM(
         initial_mean=jnp.zeros(d),
@@ -41,7 +45,11 @@ def ckf(work: Any) -> Filter:
 
     def one(y: Any) -> Any:
         found = unscented_kalman_filter(params, y, rule, inputs=ahead)
-        return found.marginal_loglik, found.filtered_means, jnp.diagonal(found.filtered_covariances, axis1=1, axis2=2)
+        return (
+            found.marginal_loglik,
+            found.filtered_means,
+            jnp.diagonal(found.filtered_covariances, axis1=1, axis2=2),
+        )
 
     every, y = jax.jit(jax.vmap(one)), jnp.asarray(work.y)
 

@@ -11,7 +11,9 @@ import os
 import sys
 from typing import Any
 
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+)
 
 import jax
 import jax.numpy as jnp
@@ -43,14 +45,18 @@ def sir(work: Any) -> Filter:
         first, rest = jax.random.split(key)
         x = problem.initial(jax.random.normal(first, (n, problem.d)))
         start = (x, jnp.full(n, 1.0 / n), jnp.zeros(()))
-        (_, _, total), told = jax.lax.scan(step, start, (jnp.arange(steps), seen, jax.random.split(rest, steps)))
+        (_, _, total), told = jax.lax.scan(
+            step, start, (jnp.arange(steps), seen, jax.random.split(rest, steps))
+        )
         return total, told
 
     in_turn = jax.jit(lambda keys, ys: jax.lax.map(lambda a: one(*a), (keys, ys)))
     every = jax.jit(jax.vmap(one)) if sys.argv[1] == "vmap" else in_turn
 
     def run(seed: int) -> tuple[np.ndarray, np.ndarray]:
-        total, (mean, _, _) = jax.block_until_ready(every(jax.random.split(jax.random.key(seed), runs), y))
+        total, (mean, _, _) = jax.block_until_ready(
+            every(jax.random.split(jax.random.key(seed), runs), y)
+        )
         return np.asarray(total), np.asarray(mean)
 
     return run

@@ -42,10 +42,12 @@ def sir(work: Any) -> Filter:
     problem = Problem(work, np)
 
     def run(seed: int) -> tuple[list[float], np.ndarray]:
-        np.random.seed(seed)  # noqa: NPY002 (the library draws its resampling uniforms from the global generator)
+        np.random.seed(seed)
         chance = np.random.Generator(np.random.SFC64(seed))
         fk, collect = Bootstrap(problem, problem.y[0], chance), [Moments(mom_func=moments)]
-        smc = particles.SMC(fk, int(work.particles), resampling="systematic", ESSrmin=1.0, collect=collect)
+        smc = particles.SMC(
+            fk, int(work.particles), resampling="systematic", ESSrmin=1.0, collect=collect
+        )
         smc.run()
         return [smc.logLt], np.array([[mean for mean, _ in smc.summaries.moments]])
 

@@ -1,6 +1,6 @@
 """Pyro's SMCFilter, in the project's own environment. It has no evidence and no axis of runs.
 
-    python peer_pyro.py WORKLOAD
+python peer_pyro.py WORKLOAD
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ class Model:
 
     def step(self, state: dict[str, torch.Tensor], *given: Any) -> None:
         self.t += 1
-        z = pyro.sample(f"z{self.t + 1}", dist.Normal(0.0, 1.0).expand([self.problem.w]).to_event(1))
+        z = pyro.sample(
+            f"z{self.t + 1}", dist.Normal(0.0, 1.0).expand([self.problem.w]).to_event(1)
+        )
         if self.y is not None:
             state["x"] = self.problem.move(self.t, state["x"], z)
             pyro.factor(f"y{self.t}", self.problem.log_like(self.y[self.t], state["x"]))
@@ -46,7 +48,13 @@ def sir(work: Any) -> Filter:
         means = torch.empty(runs, steps, problem.d)
         for r in range(runs):
             model, guide = Model(problem, problem.y[r]), Model(problem, None)
-            smc = SMCFilter(model, guide, num_particles=int(work.particles), max_plate_nesting=0, ess_threshold=1.0)
+            smc = SMCFilter(
+                model,
+                guide,
+                num_particles=int(work.particles),
+                max_plate_nesting=0,
+                ess_threshold=1.0,
+            )
             smc.init()
             for t in range(steps):
                 smc.step()

@@ -20,7 +20,10 @@ from problems import GROWTH, RADAR, Problem
 from scipy.stats import multivariate_normal
 from stonesoup.base import Property
 from stonesoup.models.measurement.linear import LinearGaussian
-from stonesoup.models.measurement.nonlinear import CartesianToBearingRange, NonLinearGaussianMeasurement
+from stonesoup.models.measurement.nonlinear import (
+    CartesianToBearingRange,
+    NonLinearGaussianMeasurement,
+)
 from stonesoup.models.transition.linear import LinearGaussianTimeInvariantTransitionModel
 from stonesoup.models.transition.nonlinear import GaussianTransitionModel
 from stonesoup.predictor.kalman import UnscentedKalmanPredictor
@@ -78,12 +81,18 @@ def models(problem: Problem) -> tuple[Any, Any]:
     """
     if problem.kind == "growth":
         spread = np.array([[GROWTH["measurement_sd"] ** 2]])
-        return Growth(problem), Square(problem=problem, ndim_state=1, mapping=(0,), noise_covar=spread)
+        return Growth(problem), Square(
+            problem=problem, ndim_state=1, mapping=(0,), noise_covar=spread
+        )
     if problem.kind != "radar":
         raise ValueError(f"kind={problem.kind}: this contestant takes growth and radar")
     gain, spread = problem.gain_t.T, np.diag([RADAR["bearing_sd"] ** 2, RADAR["range_sd"] ** 2])
-    move = LinearGaussianTimeInvariantTransitionModel(transition_matrix=problem.phi_t.T, covariance_matrix=gain @ gain.T)
-    return move, CartesianToBearingRange(ndim_state=4, mapping=(2, 0), noise_covar=spread)  # its bearings count from the first
+    move = LinearGaussianTimeInvariantTransitionModel(
+        transition_matrix=problem.phi_t.T, covariance_matrix=gain @ gain.T
+    )
+    return move, CartesianToBearingRange(
+        ndim_state=4, mapping=(2, 0), noise_covar=spread
+    )  # its bearings count from the first
 
 
 def times(steps: int) -> list[datetime]:
@@ -93,17 +102,23 @@ def times(steps: int) -> list[datetime]:
 def sir(work: Any) -> Filter:
     problem, n = Problem(work, np), int(work.particles)
     move, see = models(problem)
-    predictor, updater, resampler = ParticlePredictor(move), ParticleUpdater(see), SystematicResampler()
+    predictor, updater, resampler = (
+        ParticlePredictor(move),
+        ParticleUpdater(see),
+        SystematicResampler(),
+    )
 
     def run(seed: int) -> tuple[np.ndarray, np.ndarray]:
-        np.random.seed(seed)  # noqa: NPY002 (the library draws from the global generator)
+        np.random.seed(seed)
         chance, means = np.random.default_rng(seed), []
         for y in problem.y:
             x = StateVectors(problem.initial(chance.standard_normal((n, problem.d))).T)
             cloud, path = ParticleState(x, log_weight=np.full(n, -np.log(n)), timestamp=START), []
             for seen, time in zip(y, times(len(y)), strict=True):
                 ahead = predictor.predict(cloud, timestamp=time)
-                found = updater.update(SingleHypothesis(ahead, Detection(StateVector(seen), timestamp=time)))
+                found = updater.update(
+                    SingleHypothesis(ahead, Detection(StateVector(seen), timestamp=time))
+                )
                 path.append(np.asarray(found.mean, float).ravel())
                 _variance, _ess = np.diag(found.covar), 1.0 / np.exp(2.0 * found.log_weight).sum()
                 cloud = resampler.resample(found)
@@ -119,15 +134,23 @@ def ckf(work: Any) -> Filter:
     predictors = []
     for step in work.step:
         phi, gain = step[:, :d], step[:, d:]
-        law = LinearGaussianTimeInvariantTransitionModel(transition_matrix=phi, covariance_matrix=gain @ gain.T)
+        law = LinearGaussianTimeInvariantTransitionModel(
+            transition_matrix=phi, covariance_matrix=gain @ gain.T
+        )
         predictors.append(UnscentedKalmanPredictor(law, **RULE))
-    see = LinearGaussian(ndim_state=d, mapping=tuple(map(int, work.seen)), noise_covar=np.diag(work.r**2))
+    see = LinearGaussian(
+        ndim_state=d, mapping=tuple(map(int, work.seen)), noise_covar=np.diag(work.r**2)
+    )
     updater = UnscentedKalmanUpdater(see, **RULE)
 
     def run(seed: int) -> tuple[list[float], np.ndarray]:
         log_z, means = [], []
         for y in work.y:
-            belief, total, path = GaussianState(np.zeros(d), np.diag(work.p0**2), timestamp=START), 0.0, []
+            belief, total, path = (
+                GaussianState(np.zeros(d), np.diag(work.p0**2), timestamp=START),
+                0.0,
+                [],
+            )
             for predictor, seen, time in zip(predictors, y, times(len(y)), strict=True):
                 ahead = predictor.predict(belief, timestamp=time)
                 both = SingleHypothesis(ahead, Detection(StateVector(seen), timestamp=time))
@@ -143,7 +166,9 @@ def ckf(work: Any) -> Filter:
 
 
 def contestant(work: Any) -> tuple[Filter, dict[str, str]]:
-    return (ckf if sys.argv[1] == "ckf" else sir)(work), {name: version(name) for name in ("stonesoup", "numpy")}
+    return (ckf if sys.argv[1] == "ckf" else sir)(work), {
+        name: version(name) for name in ("stonesoup", "numpy")
+    }
 
 
 if __name__ == "__main__":

@@ -39,7 +39,12 @@ class Workload(NamedTuple):
 def make(kind: str, steps: int, particles: int, seed: int = 1) -> Workload:
     """One world, drawn from the model itself."""
     chance = np.random.default_rng(seed)
-    empty = Workload(np.array(kind), np.zeros((1, steps, 2 if kind == "radar" else 1)), np.zeros((1, steps, 1)), np.array(1))
+    empty = Workload(
+        np.array(kind),
+        np.zeros((1, steps, 2 if kind == "radar" else 1)),
+        np.zeros((1, steps, 1)),
+        np.array(1),
+    )
     problem = Problem(empty, np)
     x = problem.initial(chance.standard_normal((1, problem.d)))
     states, ys = [], []
@@ -67,7 +72,10 @@ class Problem:
         if self.kind == "ins":
             self.d, self.w = work.step.shape[1], work.step.shape[2] - work.step.shape[1]
             transposed = work.step.transpose(0, 2, 1)
-            self.phi, self.gain = array(transposed[:, : self.d].copy()), array(transposed[:, self.d :].copy())
+            self.phi, self.gain = (
+                array(transposed[:, : self.d].copy()),
+                array(transposed[:, self.d :].copy()),
+            )
             self.p0, self.scale = array(work.p0), array(np.sqrt(0.5) / work.r)
             order = np.argsort(work.seen)
             self.y, self.scale = array(work.y[..., order]), array((np.sqrt(0.5) / work.r)[order])

@@ -51,7 +51,10 @@ class Result(NamedTuple):
 
 
 def race(
-    work: Mapping[str, Any], contestants: Sequence[Contestant], places: Mapping[str, str], rounds: int
+    work: Mapping[str, Any],
+    contestants: Sequence[Contestant],
+    places: Mapping[str, str],
+    rounds: int,
 ) -> list[Result | None]:
     """One result for each contestant; None for one whose process ended early, of which standard error has the reason.
 
@@ -70,29 +73,48 @@ def race(
         starts: list[float] = []
         try:
             for contestant in contestants:
-                command = [places.get(contestant.place, sys.executable), str(HERE / contestant.words[0]), *contestant.words[1:]]
+                command = [
+                    places.get(contestant.place, sys.executable),
+                    str(HERE / contestant.words[0]),
+                    *contestant.words[1:],
+                ]
                 pipe, begun = subprocess.PIPE, time.perf_counter()
-                processes.append(subprocess.Popen([*command, str(path)], env=alone, stdin=pipe, stdout=pipe, text=True))
+                processes.append(
+                    subprocess.Popen(
+                        [*command, str(path)], env=alone, stdin=pipe, stdout=pipe, text=True
+                    )
+                )
                 first.append(_answer(processes[-1]))
                 starts.append(1e3 * (time.perf_counter() - begun))
-                print(f"{contestant.label}: {'ready' if first[-1] else 'ended early'}", file=sys.stderr)
+                print(
+                    f"{contestant.label}: {'ready' if first[-1] else 'ended early'}",
+                    file=sys.stderr,
+                )
             answers: list[list[dict[str, Any]]] = [[] for _ in contestants]
             for turn in range(rounds):
                 for i, contestant in enumerate(contestants):
                     if first[i] is None:
                         continue
-                    print(f"go {turn + 1}", file=processes[i].stdin, flush=True)  # a seed of its own for each round
+                    print(
+                        f"go {turn + 1}", file=processes[i].stdin, flush=True
+                    )  # a seed of its own for each round
                     answer = _answer(processes[i])
                     if answer is None:
                         first[i] = None
                         continue
                     answers[i].append(answer)
-                    print(f"round {turn + 1} of {rounds}, {contestant.label}: {1e3 * answer['cpu']:.1f} ms", file=sys.stderr)
+                    print(
+                        f"round {turn + 1} of {rounds}, {contestant.label}: {1e3 * answer['cpu']:.1f} ms",
+                        file=sys.stderr,
+                    )
         finally:
             for process in processes:
                 process.communicate()  # closes its input, at which it ends
     rows = zip(answers, first, starts, strict=True)
-    return [_result(found, greeting["versions"], start) if greeting else None for found, greeting, start in rows]
+    return [
+        _result(found, greeting["versions"], start) if greeting else None
+        for found, greeting, start in rows
+    ]
 
 
 def _answer(process: subprocess.Popen[str]) -> dict[str, Any] | None:
@@ -102,7 +124,9 @@ def _answer(process: subprocess.Popen[str]) -> dict[str, Any] | None:
 
 def _result(answers: list[dict[str, Any]], versions: dict[str, str], start: float) -> Result:
     cpu, wall = (np.array([1e3 * answer[clock] for answer in answers]) for clock in ("cpu", "wall"))
-    qualities = {name: np.array([answer[name] for answer in answers], dtype=float) for name in QUALITIES}
+    qualities = {
+        name: np.array([answer[name] for answer in answers], dtype=float) for name in QUALITIES
+    }
     return Result(cpu, wall, qualities, versions, start)
 
 

@@ -25,15 +25,15 @@ import torch
 from matplotlib.figure import Figure
 from race import cpu_name
 
-from pfbench import fusion, native
-from pfbench.draws import MonteCarlo
-from pfbench.filter.loop import Watch, run_filter, runs_at_once
-from pfbench.filter.particle import ParticleFilter
-from pfbench.judge import Judge
-from pfbench.model.linear import LinearGaussian
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Episode
-from pfbench.scenario.model_world import ModelWorld
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Episode
+from pfbench.filter.loop import Watch, choose_run_batch, run_filter
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.job.scoring import ScoreRecorder
+from pfbench.kernels import compilation, cpp
+from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.noise.white import NominalNoise
+from pfbench.scenario.model_simulation import ModelSimulation
 
 HERE = Path(__file__).parent
 USUAL = {"N": 1000, "D": 6, "R": 10, "T": 20}
@@ -45,22 +45,38 @@ AXES = {
 }
 SAID = {"N": "particles", "D": "states", "R": "runs", "T": "steps"}
 COLOURS = {"N": "#0072B2", "D": "#E69F00", "R": "#009E73", "T": "#CC79A7"}
-SWEEP = ("scenario=linear_walk", "filter=sir", "seed=1,2,3,4,5,6", "particles=1000", "bound=false", "engine=eager")
+SWEEP = (
+    "scenario=linear_walk",
+    "filter=sir",
+    "seed=1,2,3,4,5,6",
+    "particles=1000",
+    "pcrb=false",
+    "engine=eager",
+)
 
 
 def world(d: int, runs: int, steps: int) -> tuple[LinearGaussian, Episode]:
     """Random walks, each of them seen."""
     eye = torch.eye(d, dtype=torch.float64)
     model = LinearGaussian(eye, 0.5 * eye, eye, torch.ones(d), torch.zeros(d), torch.ones(d))
-    return model, ModelWorld(model, steps).draw(Nominal(), torch.arange(runs), 1)
+    return model, ModelSimulation(model, steps).draw(NominalNoise(), torch.arange(runs), 1)
 
 
-def cost(model: LinearGaussian, episode: Episode, particles: int, seed: int, watch: Watch | None = None) -> float:
+def cost(
+    model: LinearGaussian, episode: Episode, particles: int, seed: int, watch: Watch | None = None
+) -> float:
     """CPU milliseconds of one filter over the record."""
     runs = len(episode.record.y)
-    block = runs_at_once(runs, particles, model.chart.size)
+    block = choose_run_batch(runs, particles, model.chart.size)
     begun = time.process_time()
-    run_filter(ParticleFilter(particles), model, episode.record, MonteCarlo(seed, torch.arange(runs)), watch, at_once=block)
+    run_filter(
+        ParticleFilter(particles),
+        model,
+        episode.record,
+        PhiloxStream(seed, torch.arange(runs)),
+        watch,
+        run_batch=block,
+    )
     return 1e3 * (time.process_time() - begun)
 
 
@@ -91,7 +107,9 @@ def slope(points: list[tuple[int, float]]) -> float:
 def batched(rounds: int) -> list[float]:
     """100 runs together, times one run alone; 200 particles of 6 states do not fill the core."""
     (model, one), (_, many) = world(6, 1, 50), world(6, 100, 50)
-    pairs = [(cost(model, many, 200, turn), cost(model, one, 200, turn)) for turn in range(rounds + 1)]
+    pairs = [
+        (cost(model, many, 200, turn), cost(model, one, 200, turn)) for turn in range(rounds + 1)
+    ]
     return [whole / single for whole, single in pairs[1:]]
 
 
@@ -101,7 +119,7 @@ def watched(rounds: int, instants: int, steps: int) -> list[float]:
     truth = model.assemble(episode.truth)
     pairs = []
     for turn in range(rounds + 1):
-        judge = Judge(model, truth, instants)
+        judge = ScoreRecorder(model, truth, instants)
         pairs.append((cost(model, episode, 500, turn, judge), cost(model, episode, 500, turn)))
     return [with_it / without - 1.0 for with_it, without in pairs[1:]]
 
@@ -114,11 +132,26 @@ def sped_up(rounds: int, scale: float) -> list[float]:
         walls = {}
         for workers in (1, 2) if turn % 2 else (2, 1):
             with tempfile.TemporaryDirectory() as home:
-                env = alone | {"PFBENCH_RESULTS": f"{home}/results", "PFBENCH_WORLDS": f"{home}/worlds"}
+                env = alone | {
+                    "PFBENCH_RESULTS": f"{home}/results",
+                    "PFBENCH_EPISODES": f"{home}/worlds",
+                }
                 cells = ["runs=100", f"scenario.steps={steps}"]
-                words = ["run", "-m", *SWEEP, *cells, "hydra/launcher=cores", f"hydra.launcher.n_jobs={workers}"]
+                words = [
+                    "run",
+                    "-m",
+                    *SWEEP,
+                    *cells,
+                    "hydra/launcher=cores",
+                    f"hydra.launcher.n_jobs={workers}",
+                ]
                 begun = time.perf_counter()
-                subprocess.run([sys.executable, "-m", "pfbench", *words], env=env, check=True, capture_output=True)
+                subprocess.run(
+                    [sys.executable, "-m", "pfbench", *words],
+                    env=env,
+                    check=True,
+                    capture_output=True,
+                )
                 walls[workers] = time.perf_counter() - begun
             print(f"{workers} workers: {walls[workers]:.1f} s", file=sys.stderr)
         found.append(walls[1] / walls[2])
@@ -137,7 +170,11 @@ def draw(found: dict[str, list[tuple[int, float]]], path: Path) -> None:
         sizes, times = np.array(points, dtype=float).T
         label = f"{SAID[axis]} {axis}: exponent {slope(points):.2f}"
         axes.loglog(sizes / USUAL[axis], times, "o-", color=COLOURS[axis], ms=4, label=label)
-    axes.set_xlabel("size, the usual one = 1: " + ", ".join(f"{axis} = {value}" for axis, value in USUAL.items()), fontsize=8)
+    axes.set_xlabel(
+        "size, the usual one = 1: "
+        + ", ".join(f"{axis} = {value}" for axis, value in USUAL.items()),
+        fontsize=8,
+    )
     axes.set_ylabel("CPU time in ms, one thread", fontsize=8)
     axes.legend(fontsize=8, frameon=False)
     axes.tick_params(labelsize=8)
@@ -149,11 +186,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--scale", type=float, default=1.0, help="below 1: smaller, to try it out")
-    parser.add_argument("--out", type=Path, default=HERE, help="folder for scaling.md and scaling.png")
+    parser.add_argument(
+        "--out", type=Path, default=HERE, help="folder for scaling.md and scaling.png"
+    )
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    native.keep_memory()
-    with fusion.fused(), torch.no_grad():
+    cpp.keep_freed_memory()
+    with compilation.use_compiled(), torch.no_grad():
         found = against(chosen.rounds, chosen.scale)
         together, steps = batched(chosen.rounds), max(20, round(300 * chosen.scale))
         judged, scored = watched(chosen.rounds, 0, steps), watched(chosen.rounds, 10, steps)

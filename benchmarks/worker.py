@@ -45,7 +45,11 @@ def quality(work: Any, log_evidence: np.ndarray, mean: np.ndarray) -> dict[str, 
     square = (mean.astype(float) - work.truth) ** 2
     if not hasattr(work, "log_evidence"):
         whole, first = square.mean((1, 2)).tolist(), square[..., 0].mean(1).tolist()
-        return {"evidence": np.asarray(log_evidence, float).tolist(), "normalised": whole, "position": first}
+        return {
+            "evidence": np.asarray(log_evidence, float).tolist(),
+            "normalised": whole,
+            "position": first,
+        }
     return {
         "evidence": (log_evidence.astype(float) - work.log_evidence).tolist(),
         "normalised": (square / work.sd**2).mean((1, 2)).tolist(),

@@ -15,19 +15,19 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from pfbench import job
-from pfbench.cli import conf_dir
-from pfbench.draws import MonteCarlo
-from pfbench.model.ins_gnss import InsGnss, Step
-from pfbench.nav.strapdown import Intervals
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.job import conf_dir
+from pfbench.model.ins_gnss import InsGnss, LooseStep
+from pfbench.nav.strapdown import InsIntervals
 
 Array = np.ndarray
 
-# From t003's own coarse alignment every bootstrap filter of 500 particles diverges, whoever wrote it, and evidences that are
+# From flight_300s's own coarse alignment every bootstrap filter of 500 particles diverges, whoever wrote it, and evidences that are
 # wrong by 1e4 cannot be compared. The arithmetic does not depend on these sizes.
 FINE = (
-    "scenario.initial.attitude_arcmin=[1.0, 1.0, 3.0]",
-    "scenario.initial.velocity=[0.1, 0.1, 0.1]",
-    "scenario.initial.position=[1.0, 1.0, 1.0]",
+    "scenario.initial_errors.attitude_arcmin=[1.0, 1.0, 3.0]",
+    "scenario.initial_errors.velocity=[0.1, 0.1, 0.1]",
+    "scenario.initial_errors.position=[1.0, 1.0, 1.0]",
     "scenario.imu.accelerometer_bias_ug=100.0",
 )
 
@@ -62,46 +62,68 @@ class Workload(NamedTuple):
 
 def ins_model() -> InsGnss:
     """The 15-state model of the configuration, with noise added on purpose and after a fine alignment."""
-    return job.build(_configured().model)
+    return job.instantiate(_configured().model)
 
 
 def make(runs: int, steps: int, particles: int, seed: int = 1) -> Workload:
-    """The workload, drawn from the model over the first `steps` seconds of flight t003.
+    """The workload, drawn from the model over the first `steps` seconds of flight flight_300s.
 
     Raises:
         ValueError: more steps than the flight has.
     """
     model = ins_model()
     phi, gain = (a[:, :steps] for a in model.discretise(_nominal(steps, seed)))
-    draws = MonteCarlo(seed, torch.arange(runs))
+    draws = PhiloxStream(seed, torch.arange(runs))
     x = model.p0 * draws.normal("world.state", 1, len(model.p0))
     states = []
     for t in range(steps):
-        x = model.propagate(x, Step(phi[:, t], gain[:, t]), draws.at(t + 1).normal("world.state", 1, model.noise_dim))
+        x = model.propagate(
+            x,
+            LooseStep(phi[:, t], gain[:, t]),
+            draws.at_step(t + 1).normal("world.state", 1, model.noise_dim),
+        )
         states.append(x[:, 0])
     truth = torch.stack(states, 1)
-    error = torch.stack([draws.at(t + 1).normal("world.measurement", 1, len(model.r))[:, 0] for t in range(steps)], 1)
-    y = truth[..., model.seen] + model.r * error
-    step0, p0, r, seen, seen_y = (a.numpy() for a in (torch.cat([phi, gain], -1)[0], model.p0, model.r, model.seen, y))
+    error = torch.stack(
+        [
+            draws.at_step(t + 1).normal("world.measurement", 1, len(model.r))[:, 0]
+            for t in range(steps)
+        ],
+        1,
+    )
+    y = truth[..., model.observed_indices] + model.r * error
+    step0, p0, r, seen, seen_y = (
+        a.numpy()
+        for a in (torch.cat([phi, gain], -1)[0], model.p0, model.r, model.observed_indices, y)
+    )
     log_evidence, mean, sd = kalman(step0, p0, r, seen, seen_y)
-    return Workload(step0, p0, r, seen, seen_y, truth.numpy(), log_evidence, mean, sd, np.array(particles))
+    return Workload(
+        step0, p0, r, seen, seen_y, truth.numpy(), log_evidence, mean, sd, np.array(particles)
+    )
 
 
-def _nominal(steps: int, seed: int) -> Intervals:
+def _nominal(steps: int, seed: int) -> InsIntervals:
     """At least `steps` seconds of the flight, in whole segments: what nobody filters need not be flown."""
     cfg = _configured()
-    flight = job.build(cfg.scenario)
-    segments = [segment for manoeuvre in flight.path.segments for segment in manoeuvre]
-    ends = np.cumsum([segment.duration for segment in segments])
+    flight = job.instantiate(cfg.scenario)
+    segments = [segment for manoeuvre in flight.trajectory.segments for segment in manoeuvre]
+    ends = np.cumsum([segment.duration_s for segment in segments])
     if steps > ends[-1]:
         raise ValueError(f"steps={steps}: the flight lasts {ends[-1]:g} s; give at most that")
     flown = segments[: int(np.searchsorted(ends, steps)) + 1]
-    return replace(flight, path=replace(flight.path, segments=flown)).draw(job.build(cfg.noise), torch.arange(1), seed).record.u
+    return (
+        replace(flight, trajectory=replace(flight.trajectory, segments=flown))
+        .draw(job.instantiate(cfg.noise), torch.arange(1), seed)
+        .record.u
+    )
 
 
 def _configured() -> Any:
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("config", ["scenario=t003", "model=ins_gnss_inflated", "worlds=null", *FINE])
+        return compose(
+            "config",
+            ["scenario=flight_300s", "model=ins_gnss_inflated", "episode_cache_dir=null", *FINE],
+        )
 
 
 def kalman(step: Array, p0: Array, r: Array, seen: Array, y: Array) -> tuple[Array, Array, Array]:
@@ -116,7 +138,9 @@ def kalman(step: Array, p0: Array, r: Array, seen: Array, y: Array) -> tuple[Arr
         s = h @ p @ h.T + np.diag(r**2)
         k = np.linalg.solve(s, h @ p).T
         e = y[:, t] - m @ h.T
-        log_evidence -= 0.5 * ((e * np.linalg.solve(s, e.T).T).sum(1) + np.linalg.slogdet(2.0 * math.pi * s)[1])
+        log_evidence -= 0.5 * (
+            (e * np.linalg.solve(s, e.T).T).sum(1) + np.linalg.slogdet(2.0 * math.pi * s)[1]
+        )
         left = np.eye(d) - k @ h
         m, p = m + e @ k.T, left @ p @ left.T + (k * r**2) @ k.T
         means.append(m)

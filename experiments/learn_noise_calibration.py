@@ -21,19 +21,19 @@ from typing import Any
 import torch
 from pyro.distributions import LogNormal
 
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.rules import Jacobian
+from pfbench.core.record import Record
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
+from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear import local_level
-from pfbench.model.passive_location import PassiveLocation, Platform, level_attitude
-from pfbench.ppl.calibration import Ranks, calibrate, histograms
-from pfbench.ppl.gradients import normal_guide, variational
+from pfbench.model.linear_gaussian import local_level
+from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
+from pfbench.ppl.nuts_svi import normal_guide, svi
+from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.pmmh import pmmh
-from pfbench.ppl.posterior import Posterior
-from pfbench.ppl.program import ExactHMM, Filtered, Unknown, program
-from pfbench.record import Record
-from pfbench.report.canvas import indexed
+from pfbench.ppl.program import FilterLikelihood, GaussianHmmLikelihood, ParameterisedModel, program
+from pfbench.ppl.sbc import SbcRanks, sbc_histograms, simulation_based_calibration
+from pfbench.report.plots.plotting import render_palette_png
 
 WRONG = 1.5
 BINS = 10
@@ -56,36 +56,79 @@ def flight(runs: int, steps: int) -> Record:
     t = 10.0 * torch.arange(1, steps + 1, dtype=torch.float64)
     velocity = torch.tensor([200.0, 0.0, 0.0], dtype=torch.float64)
     place = torch.tensor([0.0, 0.0, 2000.0], dtype=torch.float64) + t[:, None] * velocity
-    attitude = level_attitude(velocity).expand(1, steps, 3, 3)
+    attitude = compute_level_attitude(velocity).expand(1, steps, 3, 3)
     carrier = torch.full((1, steps), 1e10, dtype=torch.float64)
-    platform = Platform(place[None], velocity.expand(1, steps, 3), attitude, carrier)
+    platform = PlatformInputs(place[None], velocity.expand(1, steps, 3), attitude, carrier)
     return Record(torch.zeros(runs, steps, 5, dtype=torch.float64), platform)
 
 
-def by_pmmh(unknown: Unknown, particles: int, draws: int, warmup: int) -> Callable[[Record], Posterior]:
-    return lambda record: pmmh(unknown, ParticleFilter(particles), record, draws, warmup, chains=1, seed=3, apart=True)
+def by_pmmh(
+    unknown: ParameterisedModel, particles: int, draws: int, warmup: int
+) -> Callable[[Record], ParameterPosterior]:
+    return lambda record: pmmh(
+        unknown,
+        ParticleFilter(particles),
+        record,
+        draws,
+        warmup,
+        chains=1,
+        seed=3,
+        separate_parameters=True,
+    )
 
 
-def by_svi(unknown: Unknown, likelihood: Any, steps: int) -> Callable[[Record], Posterior]:
-    def infer(record: Record) -> Posterior:
-        guide = normal_guide(unknown, apart=True)
-        return variational(program(unknown, likelihood, apart=True), record, guide, steps, 100, rate=0.1, seed=3).posterior
+def by_svi(
+    unknown: ParameterisedModel, likelihood: Any, steps: int
+) -> Callable[[Record], ParameterPosterior]:
+    def infer(record: Record) -> ParameterPosterior:
+        guide = normal_guide(unknown, separate_parameters=True)
+        return svi(
+            program(unknown, likelihood, separate_parameters=True),
+            record,
+            guide,
+            steps,
+            100,
+            rate=0.1,
+            seed=3,
+        ).posterior
 
     return infer
 
 
-def studies(runs: int, effort: int = 1) -> dict[str, tuple[Unknown, Record, Callable[[Record], Posterior]]]:
+def studies(
+    runs: int, effort: int = 1
+) -> dict[str, tuple[ParameterisedModel, Record, Callable[[Record], ParameterPosterior]]]:
     """The eight cases: world, shape of its records, algorithm."""
     found = {}
     for name, wrong in (("", 1.0), (", wrong", WRONG)):
-        toy, believed = Unknown(level, LEVELS), Unknown(lambda wrong=wrong, **values: level(**values, wrong=wrong), LEVELS)
+        toy, believed = (
+            ParameterisedModel(level, LEVELS),
+            ParameterisedModel(lambda wrong=wrong, **values: level(**values, wrong=wrong), LEVELS),
+        )
         shape = Record(torch.zeros(runs, 8, 1, dtype=torch.float64))
         found[f"toy, PMMH{name}"] = toy, shape, by_pmmh(believed, 100, 120 * effort, 60 * effort)
-        found[f"toy, SVI{name}"] = toy, shape, by_svi(believed, ExactHMM(), 150 * effort)
-        far, believed = Unknown(location, SIGHTS), Unknown(lambda wrong=wrong, **values: location(**values, wrong=wrong), SIGHTS)
+        found[f"toy, SVI{name}"] = (
+            toy,
+            shape,
+            by_svi(believed, GaussianHmmLikelihood(), 150 * effort),
+        )
+        far, believed = (
+            ParameterisedModel(location, SIGHTS),
+            ParameterisedModel(
+                lambda wrong=wrong, **values: location(**values, wrong=wrong), SIGHTS
+            ),
+        )
         shape = flight(runs, 6)
-        found[f"location, PMMH{name}"] = far, shape, by_pmmh(believed, 1000, 120 * effort, 60 * effort)
-        found[f"location, SVI{name}"] = far, shape, by_svi(believed, Filtered(GaussianFilter(Jacobian())), 80 * effort)
+        found[f"location, PMMH{name}"] = (
+            far,
+            shape,
+            by_pmmh(believed, 1000, 120 * effort, 60 * effort),
+        )
+        found[f"location, SVI{name}"] = (
+            far,
+            shape,
+            by_svi(believed, FilterLikelihood(GaussianFilter(TaylorLinearisation())), 80 * effort),
+        )
     return found
 
 
@@ -96,37 +139,50 @@ def main(folder: Path, runs: int = 200, effort: int = 2, only: str = "") -> None
     told: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     if {name: told.get(name) for name in asked} != asked:  # of another call: from the beginning
         told = dict(asked)
-    drawn: dict[str, dict[str, Ranks]] = {}
+    drawn: dict[str, dict[str, SbcRanks]] = {}
     for name, (unknown, shape, infer) in studies(runs, effort).items():
         if not name.startswith(only):
             continue
         if name not in told:
             began = time.process_time()
-            found = calibrate(unknown, shape, infer, draws=19, seed=7)
-            told[name] = {part: told_of(found, part) for part in unknown.names} | {"seconds": time.process_time() - began}
+            found = simulation_based_calibration(unknown, shape, infer, draws=19, seed=7)
+            told[name] = {part: told_of(found, part) for part in unknown.names} | {
+                "seconds": time.process_time() - began
+            }
             path.write_text(json.dumps(told))
         parts = {part: told[name][part] for part in unknown.names}
         world, label = name.split(", ", 1)
-        drawn.setdefault(world, {})[label] = Ranks({part: torch.tensor(kept["ranks"]) for part, kept in parts.items()}, 19)
+        drawn.setdefault(world, {})[label] = SbcRanks(
+            {part: torch.tensor(kept["ranks"]) for part, kept in parts.items()}, 19
+        )
         values = {part: (f"{kept['p']:.2g}", kept["counts"]) for part, kept in parts.items()}
         print(name, values, f"{told[name]['seconds']:.0f} s", flush=True)
     (folder / "table.md").write_text("\n".join(table(told)) + "\n")
     for world, ranks in drawn.items():
-        (folder / f"calibration_{world}.png").write_bytes(indexed(histograms(ranks)))
+        (folder / f"calibration_{world}.png").write_bytes(render_palette_png(sbc_histograms(ranks)))
 
 
 def table(told: Mapping[str, Any]) -> list[str]:
     """Lines of a table in Markdown: a row for each case that is done and each of its numbers."""
-    lines = ["| case | number | data sets in each tenth of the ranks | p | s of the processor |", "|" + " --- |" * 5]
+    lines = [
+        "| case | number | data sets in each tenth of the ranks | p | s of the processor |",
+        "|" + " --- |" * 5,
+    ]
     for name, case in told.items():
-        parts = {part: kept for part, kept in case.items() if part != "seconds"} if isinstance(case, dict) else {}
+        parts = (
+            {part: kept for part, kept in case.items() if part != "seconds"}
+            if isinstance(case, dict)
+            else {}
+        )
         for part, kept in parts.items():
             counts = " ".join(map(str, kept["counts"]))
-            lines.append(f"| {name} | {part} | {counts} | {kept['p']:.2g} | {case['seconds']:.0f} |")
+            lines.append(
+                f"| {name} | {part} | {counts} | {kept['p']:.2g} | {case['seconds']:.0f} |"
+            )
     return lines
 
 
-def told_of(ranks: Ranks, part: str) -> dict[str, Any]:
+def told_of(ranks: SbcRanks, part: str) -> dict[str, Any]:
     return {
         "p": ranks.p_value(part, BINS), "counts": ranks.counts(part, BINS).tolist(), "ranks": ranks.ranks[part].tolist()
     }  # fmt: skip

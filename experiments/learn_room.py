@@ -27,32 +27,43 @@ import torch
 from hydra import compose, initialize_config_module
 from torch import Tensor
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter.belief import Cloud, weights
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.guided_noise import GuidedNoise
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.proposals import Bootstrap, Proposal
-from pfbench.filter.rules import Cubature, Jacobian, Points
-from pfbench.job import build
-from pfbench.model.base import AtRest, StateSpaceModel
-from pfbench.record import Record, map_inputs
-from pfbench.scenario.told import Witness
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record, map_inputs
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+)
+from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
+from pfbench.job import instantiate
+from pfbench.model.base import StateSpaceModel, StaticModel
+from pfbench.scenario.oracle_noise import RecordingRegime
 
 SCENES = (
     "growth", "stochastic_volatility", "pendulum", "lorenz63", "linear_walk",
     "passive_1", "passive_2", "passive_3", "azimuth", "azimuth_fast", "azimuth,model=sins_gps_azimuth15", "azimuth_small",
-    "t003", "t004", "t004,model=ins_gnss_inflated", "gps_ins", "boreas", "sar_flight_short", "anshun_short", "anshun_nl",
-    "berlin", "berlin,model=urban_gnss_mixture", "walk", "car_drive", "quad_flights", "fixed_wing", "fixed_wing_aided",
+    "flight_300s", "flight_500s", "flight_500s,model=ins_gnss_inflated", "gps_ins", "recorded_boreas", "sar_flight_short", "anshun_short", "anshun_nl",
+    "recorded_berlin", "berlin,model=urban_gnss_mixture", "walk", "recorded_car_drive", "recorded_quad_flights", "recorded_fixed_wing", "recorded_fixed_wing_aided",
 )  # fmt: skip
-TOLD = "noise=outliers,told=true"  # the filter knows that one measurement in twenty is ten times as wrong: no normal law
+TOLD = "noise=outliers,oracle_noise=true"  # the filter knows that one measurement in twenty is ten times as wrong: no normal law
 SCENES += tuple(f"{scene},{TOLD}" for scene in ("azimuth", "anshun_short", "passive_1"))
-RULES = {"own noise": None, "EKF": Jacobian(), "CKF": Points(Cubature())}
+RULES = {
+    "own noise": None,
+    "EKF": TaylorLinearisation(),
+    "CKF": SigmaPointLinearisation(CubaturePoints()),
+}
 PARENTS, CHILDREN, RUNS, LOOKS = 40, 50, 4, 25
 
 
 def proposals() -> dict[str, Proposal]:
-    return {name: Bootstrap() if rule is None else GuidedNoise(GaussianFilter(rule)) for name, rule in RULES.items()}
+    return {
+        name: BootstrapProposal() if rule is None else GuidedNoiseProposal(GaussianFilter(rule))
+        for name, rule in RULES.items()
+    }
 
 
 def world(words: str, runs: int, steps: int | None) -> tuple[StateSpaceModel, Record]:
@@ -64,22 +75,37 @@ def world(words: str, runs: int, steps: int | None) -> tuple[StateSpaceModel, Re
     scene, *choices = words.split(",")
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         cfg = compose("config", [f"scenario={scene}", *choices])
-    model, witness = build(cfg.model), Witness(build(cfg.noise))
-    episode = build(cfg.scenario).draw(witness, torch.arange(runs), cfg.seed)
-    model = witness.tell(model, episode.time) if cfg.told else model
+    model, witness = instantiate(cfg.model), RecordingRegime(instantiate(cfg.noise))
+    episode = instantiate(cfg.scenario).draw(witness, torch.arange(runs), cfg.seed)
+    model = witness.to_oracle_model(model, episode.time) if cfg.oracle_noise else model
     began = episode.record.to(model.anchor)
     record = model.prepare(episode.record).to(model.anchor)
-    return model, Record(record.y[:, :steps], map_inputs(lambda a: a[:, :steps], record.u), began.start, began.spread)
+    return model, Record(
+        record.y[:, :steps], map_inputs(lambda a: a[:, :steps], record.u), began.start, began.spread
+    )
 
 
-def weighed(proposal: Proposal, model: StateSpaceModel, cloud: Cloud, seen: Record, draws: MonteCarlo) -> Tensor:
+def weighed(
+    proposal: Proposal,
+    model: StateSpaceModel,
+    belief: ParticleBelief,
+    record: Record,
+    draws: PhiloxStream,
+) -> Tensor:
     """log v [R, parents, children] of children of a cloud's particles, the same parents for every proposal."""
-    who = torch.multinomial(weights(cloud.log_w), PARENTS, True, generator=torch.Generator().manual_seed(0))
+    who = torch.multinomial(
+        normalise_log_weights(belief.log_w),
+        PARENTS,
+        True,
+        generator=torch.Generator().manual_seed(0),
+    )
     rows = who.repeat_interleave(CHILDREN, 1)
-    x = cloud.x.gather(1, rows.unsqueeze(-1).expand(-1, -1, cloud.x.shape[-1]))
+    x = belief.x.gather(1, rows.unsqueeze(-1).expand(-1, -1, belief.x.shape[-1]))
     log_w = torch.full_like(x[..., 0], -torch.tensor(float(x.shape[1])).log().item())
-    sent = proposal(model, Cloud(x, log_w, cloud.log_z), seen, draws)
-    return (model.log_likelihood(seen.y, sent.x, seen.u) + sent.log_ratio).unflatten(1, (PARENTS, CHILDREN))
+    sent = proposal(model, ParticleBelief(x, log_w, belief.log_evidence), record, draws)
+    return (model.log_likelihood(record.y, sent.x, record.u) + sent.log_ratio).unflatten(
+        1, (PARENTS, CHILDREN)
+    )
 
 
 def share(log_v: Tensor) -> Tensor:
@@ -89,12 +115,14 @@ def share(log_v: Tensor) -> Tensor:
     return ((total.square() - square) / (m - 1)).sum(1) / square.sum(1)
 
 
-def nats(model: StateSpaceModel, cloud: Cloud, seen: Record) -> Tensor:
+def nats(model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
     """What the measurement tells of the step's noise [R], by the linearisation at the cloud's mean."""
-    mean = model.chart.mean(cloud.x, weights(cloud.log_w)).unsqueeze(1)
+    mean = model.chart.mean(belief.x, normalise_log_weights(belief.log_w)).unsqueeze(1)
     z = torch.zeros(*mean.shape[:2], model.noise_dim).to(mean)
-    guide = GuidedNoise(GaussianFilter(Jacobian()))
-    told: Tensor = -guide._posterior(model, cloud._replace(x=mean, log_w=mean.new_zeros(mean.shape[:2])), seen, z)[1]
+    guide = GuidedNoiseProposal(GaussianFilter(TaylorLinearisation()))
+    told: Tensor = -guide._posterior(
+        model, belief._replace(x=mean, log_w=mean.new_zeros(mean.shape[:2])), record, z
+    )[1]
     return told[:, 0]
 
 
@@ -107,24 +135,27 @@ def looked_at(record: Record) -> set[int]:
 
 def room(model: StateSpaceModel, record: Record) -> dict[str, Any]:
     """Means over looks and runs, and standard errors over runs where there are some; the filter on the way is guided by a CKF."""
-    method = ParticleFilter(500, proposal=GuidedNoise(GaussianFilter(RULES["CKF"]), shared=True))
+    method = ParticleFilter(
+        500, proposal=GuidedNoiseProposal(GaussianFilter(RULES["CKF"]), shared_by_particles=True)
+    )
     runs, looks = torch.arange(len(record.y)), looked_at(record)
-    draws, found = MonteCarlo(2, runs), {name: [] for name in ("nats", *RULES, "parents")}
-    belief = method.init(model, len(runs), draws.at(0), record.start, record.spread)
+    draws, found = PhiloxStream(2, runs), {name: [] for name in ("nats", *RULES, "parents")}
+    belief = method.init(model, len(runs), draws.at_step(0), record.start, record.spread)
     for t in range(max(looks) + 1):
-        seen, own = record.at(t), draws.at(t + 1)
+        seen, own = record.at_step(t), draws.at_step(t + 1)
         still = t == 0 and model.observes_initial
         if t in looks and not still:
             found["nats"].append(nats(model, belief, seen))
             for name, proposal in proposals().items():
-                log_v = weighed(proposal, model, belief, seen, MonteCarlo(3, runs).at(t + 1))
+                log_v = weighed(proposal, model, belief, seen, PhiloxStream(3, runs).at_step(t + 1))
                 found[name].append(share(log_v))
             a = torch.softmax(log_v.logsumexp(2), 1)
             found["parents"].append(1.0 / (PARENTS * a.square().sum(1)))
-        belief, _ = method.step(AtRest(model) if still else model, belief, seen, own)
+        belief, _ = method.step(StaticModel(model) if still else model, belief, seen, own)
     each = {name: torch.stack(values).mean(0) for name, values in found.items()}
     return {"noises": model.noise_dim, "looks": len(found["nats"])} | {
-        name: (float(value.mean()), float(value.std() / len(runs) ** 0.5)) for name, value in each.items()
+        name: (float(value.mean()), float(value.std() / len(runs) ** 0.5))
+        for name, value in each.items()
     }
 
 
@@ -133,7 +164,11 @@ def table(told: Mapping[str, Mapping[str, Any]]) -> list[str]:
     names = [*RULES, "parents"]
     lines = [f"| scene | noises | nats | {' | '.join(names)} |", "|" + " --- |" * (3 + len(names))]
     for words, found in told.items():
-        cells = [str(found["noises"]), f"{found['nats'][0]:.2g}", *(f"{found[name][0]:.3f}" for name in names)]
+        cells = [
+            str(found["noises"]),
+            f"{found['nats'][0]:.2g}",
+            *(f"{found[name][0]:.3f}" for name in names),
+        ]
         lines.append(f"| {words.replace(',', ', ')} | " + " | ".join(cells) + " |")
     return lines
 

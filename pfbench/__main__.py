@@ -1,4 +1,4 @@
-"""`python -m pfbench` is `pfbench`."""
+"""Entry point of `python -m pfbench`."""
 
 from pfbench.cli import main
 

@@ -47,7 +47,10 @@ def pfbench(*words: object, home: Path) -> Said:
         except SystemExit as stop:
             code = int(stop.code or 0)
         finally:
-            root.handlers[:], root.level = handlers, level  # Hydra's point at streams that close now
+            root.handlers[:], root.level = (
+                handlers,
+                level,
+            )  # Hydra's point at streams that close now
     return Said(code, out.getvalue(), err.getvalue())
 
 
@@ -61,11 +64,17 @@ def block(code: str, home: Path) -> None:
 
 def process(*words: object, home: Path, cwd: Path, **more: str) -> Said:
     """`python -m pfbench ...` in a folder of its own."""
-    env = {name: value for name, value in os.environ.items() if name != "PFBENCH_DATA"} | environment(home) | more
+    env = (
+        {name: value for name, value in os.environ.items() if name != "PFBENCH_DATA"}
+        | environment(home)
+        | more
+    )
     command = [sys.executable, "-m", "pfbench", *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=env, check=False, timeout=600)
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=cwd, env=env, check=False, timeout=600
+    )
     return Said(done.returncode, done.stdout, done.stderr)
 
 
 def environment(home: Path) -> dict[str, str]:
-    return {"PFBENCH_RESULTS": str(home / "results"), "PFBENCH_WORLDS": str(home / "worlds")}
+    return {"PFBENCH_RESULTS": str(home / "results"), "PFBENCH_EPISODES": str(home / "worlds")}

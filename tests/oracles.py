@@ -1,65 +1,30 @@
-"""Independent answers: plain NumPy, no code shared with pfbench.
+"""Independent answers: plain NumPy, no code shared with the filters.
 
-Kalman filter with evidence (covariance form, one run at a time, seen components picked out), RTS smoother, one-dimensional
-grid filter, and the closed form of the Benes filter.
+One-dimensional grid filter and the closed form of the Benes filter. The Kalman filter and the RTS smoother are those of
+pfbench.testing, which share no code with the filters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
+
+from pfbench.testing import KalmanResult as Filtered
+from pfbench.testing import kalman_filter as kalman
+from pfbench.testing import rts_smoother
+
+__all__ = ["Filtered", "benes", "grid_filter", "kalman", "normal_density", "rts_smoother"]
 
 Array = np.ndarray
 
 
-class Filtered(NamedTuple):
-    """Moments after each measurement, before it, and the log evidence of each step."""
-
-    mean: Array  # [T, D]
-    covariance: Array  # [T, D, D]
-    predicted_mean: Array  # [T, D]
-    predicted_covariance: Array  # [T, D, D]
-    log_evidence: Array  # [T]
-
-
-def kalman(
-    f: Array, q: Array, h: Array, r: Array, m0: Array, p0: Array, y: Array, observes_initial: bool = False
-) -> Filtered:
-    """Kalman filter of one record y [T, Dy], NaN where unseen; q and r are covariances [D, D] and [Dy, Dy]."""
-    m, p = np.array(m0, dtype=float), np.array(p0, dtype=float)
-    rows: list[tuple] = []
-    for t, seen_y in enumerate(y):
-        if t > 0 or not observes_initial:
-            m, p = f @ m, f @ p @ f.T + q
-        before = m, p
-        seen = ~np.isnan(seen_y)
-        log_z = 0.0
-        if seen.any():
-            hs, rs = h[seen], r[np.ix_(seen, seen)]
-            s = hs @ p @ hs.T + rs
-            gain = np.linalg.solve(s, hs @ p).T
-            e = seen_y[seen] - hs @ m
-            left = np.eye(len(m)) - gain @ hs
-            m, p = m + gain @ e, left @ p @ left.T + gain @ rs @ gain.T
-            log_z = -0.5 * (e @ np.linalg.solve(s, e) + np.linalg.slogdet(2 * np.pi * s)[1])
-        rows.append((m, p, *before, log_z))
-    return Filtered(*(np.array(column) for column in zip(*rows, strict=True)))
-
-
-def rts_smoother(f: Array, filtered: Filtered) -> tuple[Array, Array]:
-    """Smoothed means [T, D] and covariances [T, D, D] [Rauch, Tung, Striebel 1965]."""
-    mean, covariance = filtered.mean.copy(), filtered.covariance.copy()
-    for t in range(len(mean) - 2, -1, -1):
-        gain = np.linalg.solve(filtered.predicted_covariance[t + 1], f @ filtered.covariance[t]).T
-        mean[t] += gain @ (mean[t + 1] - filtered.predicted_mean[t + 1])
-        covariance[t] += gain @ (covariance[t + 1] - filtered.predicted_covariance[t + 1]) @ gain.T
-    return mean, covariance
-
-
 def grid_filter(
-    grid: Array, prior: Array, transition: Callable[[int], Array], log_likelihood: Callable[[int], Array], steps: int
+    grid: Array,
+    prior: Array,
+    transition: Callable[[int], Array],
+    log_likelihood: Callable[[int], Array],
+    steps: int,
 ) -> tuple[Array, Array, float]:
     """Filter on an even grid: means [T], variances [T] and log evidence.
 

@@ -6,15 +6,17 @@ import os
 
 import pytest
 
-from pfbench.model.strapdown_total import Believed
+from pfbench.model.strapdown_total import StrapdownTuning
 
 DATA = os.environ.get("PFBENCH_DATA")
-recorded = pytest.mark.skipif(DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets")
+recorded = pytest.mark.skipif(
+    DATA is None, reason="PFBENCH_DATA does not name the folder of the recorded data sets"
+)
 
 
-def believed(position_sd: list[float], velocity_sd: list[float] | None) -> Believed:
+def believed(position_sd: list[float], velocity_sd: list[float] | None) -> StrapdownTuning:
     """Good sensors and a good start; fixes as told."""
-    return Believed(
+    return StrapdownTuning(
         gyro_density=1e-4,
         accelerometer_density=1e-3,
         gyro_bias_walk=1e-6,

@@ -15,7 +15,9 @@ import oracles
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))  # scripts, not a package
+sys.path.insert(
+    0, str(Path(__file__).resolve().parent.parent / "benchmarks")
+)  # scripts, not a package
 import house
 import naive
 import workload
@@ -28,12 +30,18 @@ def tiny() -> Work:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("contestant", [house, naive], ids=lambda module: module.__name__)
-def test_contestants_estimate_the_exact_evidence(contestant: ModuleType, dtype: torch.dtype) -> None:
+def test_contestants_estimate_the_exact_evidence(
+    contestant: ModuleType, dtype: torch.dtype
+) -> None:
     """E[Z_hat] = Z and E[Z_hat m_hat] = Z m for any number of particles [Del Moral 2004]: no bias to allow for."""
     filtered: Callable[[int], tuple[torch.Tensor, torch.Tensor]] = contestant.sir(tiny(), dtype)
     answers = [filtered(seed) for seed in range(60)]
-    ratio = np.exp(np.stack([log_z.numpy() for log_z, _ in answers]) - tiny().log_evidence)  # [seeds, R]
-    off = (np.stack([mean[:, -1].numpy() for _, mean in answers]) - tiny().mean[:, -1]) / tiny().sd[-1]
+    ratio = np.exp(
+        np.stack([log_z.numpy() for log_z, _ in answers]) - tiny().log_evidence
+    )  # [seeds, R]
+    off = (np.stack([mean[:, -1].numpy() for _, mean in answers]) - tiny().mean[:, -1]) / tiny().sd[
+        -1
+    ]
     values = [ratio - 1.0, *np.moveaxis(ratio[..., None] * off, -1, 0)]
     for value in values:
         error = value.std() / math.sqrt(value.size)
@@ -48,7 +56,9 @@ def test_the_exact_answer_is_the_kalman_filters() -> None:
         m, p, log_z = np.zeros(d), np.diag(work.p0**2), 0.0
         for t, y in enumerate(work.y[run]):
             phi, gain = work.step[t, :, :d], work.step[t, :, d:]
-            one = oracles.kalman(phi, gain @ gain.T, np.eye(d)[work.seen], np.diag(work.r**2), m, p, y[None])
+            one = oracles.kalman(
+                phi, gain @ gain.T, np.eye(d)[work.seen], np.diag(work.r**2), m, p, y[None]
+            )
             m, p, log_z = one.mean[0], one.covariance[0], log_z + one.log_evidence[0]
         np.testing.assert_allclose(work.log_evidence[run], log_z, rtol=1e-10)
         np.testing.assert_allclose(work.mean[run, -1] / work.sd[-1], m / work.sd[-1], atol=1e-8)

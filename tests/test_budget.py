@@ -11,17 +11,24 @@ import pytest
 import torch
 from command_line import pfbench
 
-from pfbench import budget, store
-from pfbench.draws import MonteCarlo
+from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.resamplers import Resample, Systematic
-from pfbench.judge import Tally
-from pfbench.model.linear import linear_walk
-from pfbench.noise.regimes import Nominal
-from pfbench.scenario.model_world import ModelWorld
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.job import budget
+from pfbench.job.scoring import LikelihoodCounter
+from pfbench.model.linear_gaussian import linear_walk
+from pfbench.noise.white import NominalNoise
+from pfbench.results import store
+from pfbench.scenario.model_simulation import ModelSimulation
 
-WALK = ("scenario=linear_walk", "scenario.steps=12", "runs=4", "particles=200", "budget=same likelihood evaluations")
+WALK = (
+    "scenario=linear_walk",
+    "scenario.steps=12",
+    "runs=4",
+    "particles=200",
+    "budget=likelihoods",
+)
 
 
 def metas(home: Path, *words: str) -> dict[str, dict[str, Any]]:
@@ -42,9 +49,11 @@ def metas(home: Path, *words: str) -> dict[str, dict[str, Any]]:
         (lambda n: 1e-5 * n ** (2 / 3), 1e-3, 1000),
     ],
 )
-def test_the_number_is_found_that_costs_the_price(cost: Any, price: float, answer: int, first: int) -> None:
+def test_the_number_is_found_that_costs_the_price(
+    cost: Any, price: float, answer: int, first: int
+) -> None:
     asked: list[int] = []
-    n, paid = budget.afforded(lambda n: asked.append(n) or cost(n), price, first)  # type: ignore[func-returns-value]
+    n, paid = budget.solve_particle_count(lambda n: asked.append(n) or cost(n), price, first)  # type: ignore[func-returns-value]
     assert paid == cost(n)
     assert paid == pytest.approx(price, rel=0.03)
     assert n == pytest.approx(answer, rel=0.1)
@@ -52,13 +61,18 @@ def test_the_number_is_found_that_costs_the_price(cost: Any, price: float, answe
 
 
 def test_a_filter_that_costs_more_with_the_fewest_particles_gets_those() -> None:
-    n, paid = budget.afforded(lambda n: 50.0 + n, 20.0, 100)
-    assert (n, paid) == (budget.LEAST, 60.0)
+    n, paid = budget.solve_particle_count(lambda n: 50.0 + n, 20.0, 100)
+    assert (n, paid) == (budget.MIN_PARTICLES, 60.0)
 
 
 def test_a_measurement_that_scatters_leaves_the_best_that_was_seen() -> None:
     rng = np.random.default_rng(3)
-    ends = [budget.afforded(lambda n: (1.0 + 0.01 * n) * np.exp(0.05 * rng.standard_normal()), 6.0, 50) for _ in range(50)]
+    ends = [
+        budget.solve_particle_count(
+            lambda n: (1.0 + 0.01 * n) * np.exp(0.05 * rng.standard_normal()), 6.0, 50
+        )
+        for _ in range(50)
+    ]
     assert all(abs(np.log(paid / 6.0)) < 0.15 for _, paid in ends)
     assert np.median([n for n, _ in ends]) == pytest.approx(500, rel=0.1)
 
@@ -66,36 +80,44 @@ def test_a_measurement_that_scatters_leaves_the_best_that_was_seen() -> None:
 def test_a_trial_counts_what_a_filter_asks_of_the_likelihood() -> None:
     """Bootstrap weighs each particle once in each step; the model's own count in a whole run is the same."""
     model = linear_walk(1.0, 0.3, 1.0)
-    episode = ModelWorld(model, 300).draw(Nominal(), torch.arange(3), 1)
-    tally = Tally(model)
-    trial = budget.Trial(model, episode.record, lambda: 0.0, 1, tally, lambda method: 3)
+    episode = ModelSimulation(model, 300).draw(NominalNoise(), torch.arange(3), 1)
+    tally = LikelihoodCounter(model)
+    trial = budget.CostTrial(model, episode.record, lambda: 0.0, 1, tally, lambda method: 3)
     assert trial.likelihoods(ParticleFilter(70)) == 70.0
     before = tally.count
-    run_filter(ParticleFilter(70), model, episode.record, MonteCarlo(1, torch.arange(3)))
+    run_filter(ParticleFilter(70), model, episode.record, PhiloxStream(1, torch.arange(3)))
     assert tally.count - before == 70 * 3 * 300
     assert trial.seconds(ParticleFilter(70)) == 0.0  # by its clock, which stands still
 
 
 def test_time_is_that_of_a_step_by_the_quicker_of_two_passes() -> None:
     model = linear_walk(1.0, 0.3, 1.0)
-    record = ModelWorld(model, 20).draw(Nominal(), torch.arange(2), 1).record
+    record = ModelSimulation(model, 20).draw(NominalNoise(), torch.arange(2), 1).record
     ticks = iter([0.0, 10.0, 20.0, 25.0])
-    trial = budget.Trial(model, record, lambda: next(ticks), 1, Tally(model), lambda method: 2)
+    trial = budget.CostTrial(
+        model, record, lambda: next(ticks), 1, LikelihoodCounter(model), lambda method: 2
+    )
     assert trial.seconds(ParticleFilter(10)) == 5.0 / 20
 
 
 def test_sir_itself_has_what_was_asked_for_and_a_variant_is_tried() -> None:
     model = linear_walk(1.0, 0.3, 1.0)
-    record = ModelWorld(model, 20).draw(Nominal(), torch.arange(2), 1).record
-    trial = budget.Trial(model, record, lambda: 0.0, 1, Tally(model), lambda method: 2)
-    own = budget.bought(store.SAME_LIKELIHOODS, ParticleFilter(333), 333, trial)
-    assert own == budget.Bought(333, 333.0, 333.0, 333)
-    always = ParticleFilter(333, resampler=Resample(Systematic(), threshold=1.0))
-    assert budget.bought(store.SAME_LIKELIHOODS, always, 333, trial).particles == pytest.approx(333, rel=0.03)
+    record = ModelSimulation(model, 20).draw(NominalNoise(), torch.arange(2), 1).record
+    trial = budget.CostTrial(
+        model, record, lambda: 0.0, 1, LikelihoodCounter(model), lambda method: 2
+    )
+    own = budget.allocate_budget(store.SAME_LIKELIHOODS, ParticleFilter(333), 333, trial)
+    assert own == budget.BudgetAllocation(333, 333.0, 333.0, 333)
+    always = ParticleFilter(333, resampler=EssResampler(Systematic(), ess_threshold=1.0))
+    assert budget.allocate_budget(
+        store.SAME_LIKELIHOODS, always, 333, trial
+    ).particles == pytest.approx(333, rel=0.03)
 
 
 def test_filters_of_a_study_evaluate_the_likelihood_equally_often(tmp_path: Path) -> None:
-    found = metas(tmp_path, "-m", *WALK, "particles=1000", "filter=sir,apf,pso_pf,mcmc_rpf,ekf,cofm_amssrcpf")
+    found = metas(
+        tmp_path, "-m", *WALK, "particles=1000", "filter=sir,apf,pso_pf,mcmc_rpf,ekf,cofm_amssrcpf"
+    )
     for name in ("sir", "apf", "pso_pf", "mcmc_rpf"):
         assert found[name]["likelihoods_per_step"] == pytest.approx(1000, rel=0.15), name
         assert found[name]["bought"]["price"] == 1000.0
@@ -103,7 +125,10 @@ def test_filters_of_a_study_evaluate_the_likelihood_equally_often(tmp_path: Path
     assert found["sir"]["particles"] == 1000
     assert found["pso_pf"]["particles"] < 100  # it looks again in each of its iterations
     assert found["ekf"]["particles"] is None  # nothing to buy
-    assert (found["cofm_amssrcpf"]["particles"], found["cofm_amssrcpf"]["bought"]) == (200, None)  # has a number of its own
+    assert (found["cofm_amssrcpf"]["particles"], found["cofm_amssrcpf"]["bought"]) == (
+        200,
+        None,
+    )  # has a number of its own
     assert (said := pfbench("report", "study=adhoc", home=tmp_path)).code == 0, said.err
 
 
@@ -116,13 +141,15 @@ def test_the_same_number_buys_nothing_and_equal_time_finds_one(tmp_path: Path) -
     walk = [word for word in WALK if not word.startswith("budget")]
     assert metas(tmp_path, *walk, "filter=mcmc_rpf")["mcmc_rpf"]["bought"] is None
     home = tmp_path / "time"
-    found = metas(home, *walk, "filter=mcmc_rpf", "budget=same time per step")["mcmc_rpf"]
-    assert budget.LEAST <= found["particles"] == found["bought"]["particles"] < 200  # dearer than SIR, whatever the machine
+    found = metas(home, *walk, "filter=mcmc_rpf", "budget=time")["mcmc_rpf"]
+    assert (
+        budget.MIN_PARTICLES <= found["particles"] == found["bought"]["particles"] < 200
+    )  # dearer than SIR, whatever the machine
     assert found["bought"]["asked"] == 200
 
 
 def test_a_step_compiled_as_a_whole_has_no_known_price(tmp_path: Path) -> None:
     said = pfbench("run", *WALK, "filter=apf", "engine=compiled", home=tmp_path)
     assert said.code == 1
-    assert "engine=compiled with budget=same likelihood evaluations" in said.err
-    assert "give engine=auto" in said.err
+    assert "with budget=likelihoods, got compiled" in said.err
+    assert "Use engine=auto" in said.err

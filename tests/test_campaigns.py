@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))  # scripts, not a package
+sys.path.insert(
+    0, str(Path(__file__).resolve().parent.parent / "benchmarks")
+)  # scripts, not a package
 import campaigns
 import workload
 from race import Result
@@ -33,15 +35,22 @@ def test_goals_are_judged_by_the_faster_jax_and_the_best_engine(tmp_path: Path) 
     label = campaigns.LOOPS.label
     assert f"| particles float32 | {label} | 2.00 (2.00-2.00) | 1.5, met | 2.5, missed |" in lines
     assert f"| JAX, run by run | {label} | 4.00 (4.00-4.00) | 2.5, met | 4, met |" in lines
-    assert any(line.startswith(f"| {label} | 5 (4.5-5.5) | 5 | 2.00 (2.00-2.00) | 4.00 (4.00-4.00) |") for line in lines)
+    assert any(
+        line.startswith(f"| {label} | 5 (4.5-5.5) | 5 | 2.00 (2.00-2.00) | 4.00 (4.00-4.00) |")
+        for line in lines
+    )
     assert lines[-1] == "All contestants agree."
     campaigns.draw(found, tmp_path / "campaigns.png")
     assert (tmp_path / "campaigns.png").stat().st_size > 1000
 
 
 def test_a_peer_that_took_no_part_leaves_its_column_empty() -> None:
-    lines = campaigns.table({campaigns.EAGER: result([8e3, 8e3, 8e3])}, ["particles float32: it did not run"])
-    assert any(line.startswith(f"| {campaigns.EAGER.label} | 8 (8-8) | 8 | - | - |") for line in lines)
+    lines = campaigns.table(
+        {campaigns.EAGER: result([8e3, 8e3, 8e3])}, ["particles float32: it did not run"]
+    )
+    assert any(
+        line.startswith(f"| {campaigns.EAGER.label} | 8 (8-8) | 8 | - | - |") for line in lines
+    )
     assert lines[-1] == "**Not the same work:** particles float32: it did not run."
 
 
@@ -58,19 +67,30 @@ def test_a_process_is_measured_to_its_end() -> None:
     spent = campaigns.one([sys.executable, "-c", WORKER], os.environ, turn=2)
     assert spent is not None
     cpu, wall, told = spent
-    assert told == [{"versions": {}}, 13, 14, 15, 16, 17]  # the first of six campaigns is the one before it listens
+    assert told == [
+        {"versions": {}},
+        13,
+        14,
+        15,
+        16,
+        17,
+    ]  # the first of six campaigns is the one before it listens
     assert min(cpu, wall) > 20.0  # ms
     assert campaigns.one([sys.executable, "-c", "raise SystemExit(3)"], os.environ, turn=0) is None
 
 
 @pytest.mark.slow
 def test_fresh_processes_compute_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(campaigns, "CONTESTANTS", (campaigns.LOOPS, campaigns.EAGER, campaigns.PARTICLES))
+    monkeypatch.setattr(
+        campaigns, "CONTESTANTS", (campaigns.LOOPS, campaigns.EAGER, campaigns.PARTICLES)
+    )
     work = {**workload.make(4, 10, 100)._asdict(), "kind": np.array("ins")}
     found = campaigns.race(work, {"own": sys.executable}, rounds=1)
     assert list(found) == [campaigns.LOOPS, campaigns.EAGER]
     told = {who: taken for who, taken in found.items() if taken is not None}
     assert len(told) == 2
-    assert all(taken.qualities["evidence"].shape == (5, 4) and taken.cpu > 0.0 for taken in told.values())
+    assert all(
+        taken.qualities["evidence"].shape == (5, 4) and taken.cpu > 0.0 for taken in told.values()
+    )
     first, second = (taken.qualities["evidence"] for taken in told.values())
     assert np.abs(first - second).max() < 0.5  # the same draws

@@ -9,26 +9,28 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pfbench.chart import Angles, Chart, Euclidean, Quaternion, wrap
-from pfbench.draws import MonteCarlo
+from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, QuaternionBlock, wrap_angle
+from pfbench.core.random_stream import PhiloxStream
 
-MIXED = Chart((Euclidean(2), Quaternion(), Angles(1), Euclidean(1)))
+MIXED = Chart((EuclideanBlock(2), QuaternionBlock(), AngleBlock(1), EuclideanBlock(1)))
 
 
 def normal(*shape: int, purpose: str = "x") -> torch.Tensor:
-    return MonteCarlo(5, torch.arange(shape[0])).normal(purpose, shape[1], shape[2])
+    return PhiloxStream(5, torch.arange(shape[0])).normal(purpose, shape[1], shape[2])
 
 
 def states(runs: int, n: int) -> torch.Tensor:
     """Random states of the mixed chart: unit quaternions and angles in range."""
     x = normal(runs, n, 8)
     q = x[..., 2:6]
-    return torch.cat([x[..., :2], q / q.norm(dim=-1, keepdim=True), wrap(3 * x[..., 6:7]), x[..., 7:]], -1)
+    return torch.cat(
+        [x[..., :2], q / q.norm(dim=-1, keepdim=True), wrap_angle(3 * x[..., 6:7]), x[..., 7:]], -1
+    )
 
 
 def test_sizes() -> None:
     assert (MIXED.size, MIXED.dimension, MIXED.flat) == (8, 7, False)
-    assert Chart((Euclidean(2), Euclidean(3))).flat
+    assert Chart((EuclideanBlock(2), EuclideanBlock(3))).flat
 
 
 def test_subtract_undoes_add() -> None:
@@ -42,7 +44,9 @@ def test_add_undoes_subtract_up_to_the_sign_of_a_quaternion() -> None:
     sign = torch.sign((back[..., 2:6] * y[..., 2:6]).sum(-1, keepdim=True))
     assert torch.allclose(back[..., 2:6] * sign, y[..., 2:6], atol=1e-12)
     assert torch.allclose(back[..., [0, 1, 7]], y[..., [0, 1, 7]], atol=1e-12)
-    assert torch.allclose(wrap(back[..., 6] - y[..., 6]), torch.zeros(20, 50, dtype=torch.float64), atol=1e-12)
+    assert torch.allclose(
+        wrap_angle(back[..., 6] - y[..., 6]), torch.zeros(20, 50, dtype=torch.float64), atol=1e-12
+    )
 
 
 def test_differences_take_the_short_way_round() -> None:
@@ -54,7 +58,7 @@ def test_differences_take_the_short_way_round() -> None:
 @given(st.floats(-1e3, 1e3))
 @settings(deadline=None, max_examples=300)
 def test_wrap_keeps_the_angle(angle: float) -> None:
-    wrapped = float(wrap(torch.tensor(angle, dtype=torch.float64)))
+    wrapped = float(wrap_angle(torch.tensor(angle, dtype=torch.float64)))
     assert -math.pi <= wrapped <= math.pi
     assert math.isclose(math.cos(wrapped), math.cos(angle), abs_tol=1e-12)
     assert math.isclose(math.sin(wrapped), math.sin(angle), abs_tol=1e-12)
@@ -64,17 +68,17 @@ def test_wrap_keeps_the_angle(angle: float) -> None:
 def test_small_angles_keep_all_their_digits(dtype: torch.dtype) -> None:
     # arcseconds are 5e-6 rad; shifting by pi and back would leave them two digits in single precision
     angle = torch.tensor([5e-6, -3e-9, 1.0, 0.0], dtype=dtype)
-    assert torch.equal(wrap(angle), angle)
+    assert torch.equal(wrap_angle(angle), angle)
 
 
 def test_angles_average_across_the_cut() -> None:
     x = torch.tensor([[[math.pi - 0.1], [-math.pi + 0.3]]], dtype=torch.float64)
     w = torch.tensor([[0.75, 0.25]], dtype=torch.float64)
-    assert float(Chart((Angles(1),)).mean(x, w).abs()) == pytest.approx(math.pi, abs=1e-12)
+    assert float(Chart((AngleBlock(1),)).mean(x, w).abs()) == pytest.approx(math.pi, abs=1e-12)
 
 
 def test_a_pair_of_opposite_turns_averages_to_its_middle() -> None:
-    chart = Chart((Quaternion(),))
+    chart = Chart((QuaternionBlock(),))
     q = states(1, 1)[..., 2:6]
     d = 0.8 * normal(1, 1, 3, purpose="d")
     pair = torch.cat([chart.add(q, d), -chart.add(q, -d)], 1)  # -q is the same attitude
@@ -89,16 +93,19 @@ def test_residuals_about_the_mean_vanish() -> None:
     w = torch.softmax(normal(6, 40, 1, purpose="w")[..., 0], -1)
     for passes, slack in ((3, 1e-4), (30, 1e-14)):
         mean = MIXED.mean(x, w, passes)
-        assert float((w.unsqueeze(-1) * MIXED.subtract(x, mean.unsqueeze(1))).sum(1).abs().max()) < slack
+        assert (
+            float((w.unsqueeze(-1) * MIXED.subtract(x, mean.unsqueeze(1))).sum(1).abs().max())
+            < slack
+        )
 
 
 def test_plain_numbers_take_the_plain_path() -> None:
-    chart = Chart((Euclidean(2), Euclidean(3)))
+    chart = Chart((EuclideanBlock(2), EuclideanBlock(3)))
     x, d = normal(4, 9, 5), normal(4, 9, 5, purpose="d")
     w = torch.softmax(normal(4, 9, 1, purpose="w")[..., 0], -1)
     assert torch.equal(chart.add(x, d), x + d)
     assert torch.equal(chart.subtract(x, d), x - d)
     assert torch.allclose(chart.mean(x, w), (w.unsqueeze(-1) * x).sum(1), rtol=1e-13)
     # a curved chart without curvature in its data averages like a plain one
-    curved = Chart((Euclidean(4), Angles(1)))
+    curved = Chart((EuclideanBlock(4), AngleBlock(1)))
     assert torch.allclose(curved.mean(0.1 * x, w), (w.unsqueeze(-1) * 0.1 * x).sum(1), atol=1e-14)

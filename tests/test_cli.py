@@ -2,117 +2,265 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import hydra
 import pytest
 import torch
+import yaml
 from command_line import pfbench
 
 import pfbench as package
-from pfbench import cli, job
+from pfbench import job
+from pfbench.cli import check, messages
+from pfbench.job import run_job
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=20")
 no_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
 
+NUMBER = "must be a whole number of at least"
 # words -> what the message must hold: the key with the value that was given, and the remedy
 MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "unknown filter": (
         ("filter=sirr",),
-        ("filter=sirr: there is no such filter", "did you mean sir?", "There are apf, ckf,"),
+        ("filter=sirr does not exist. Similar: sir", "List all: pfbench list filter"),
     ),
-    "no filter like it": (("filter=zzz",), ("filter=zzz: there is no such filter. There are apf, ckf,",)),
-    "unknown scenario": (("scenario=t0003",), ("scenario=t0003: there is no such scenario", "did you mean t003", "linear_walk")),
-    "unknown noise": (("noise=outlier",), ("noise=outlier: there is no such noise", "did you mean outliers?")),
-    "unknown study": (("+experiment=quikstart",), ("experiment=quikstart", "did you mean quickstart?")),
+    "no filter like it": (
+        ("filter=zzz",),
+        ("filter=zzz does not exist. List all: pfbench list filter",),
+    ),
+    "unknown scenario": (
+        ("scenario=flight_30s",),
+        ("scenario=flight_30s does not exist. Similar: flight_300s",),
+    ),
+    "unknown noise": (("noise=outlier",), ("noise=outlier does not exist. Similar: outliers.",)),
+    "unknown study": (
+        ("+experiment=quikstart",),
+        ("experiment=quikstart does not exist. Similar: quickstart.",),
+    ),
+    "unknown launcher": (
+        ("hydra/launcher=basik",),
+        ("hydra/launcher=basik does not exist", "basic"),
+    ),
     "misspelt key": (
         ("filter.partcles=100",),
-        ("filter.partcles=100: there is no key 'filter.partcles'; did you mean filter.particles?",),
+        ("filter.partcles=100: key filter.partcles does not exist. Similar: filter.particles.",),
     ),
-    "misspelt deep key": (("filter.resampler.treshold=0.3",), ("did you mean filter.resampler.threshold?",)),
-    "misspelt group": (("flter=sir",), ("flter=sir: there is no key 'flter'; did you mean filter?",)),
-    "added key": (("+filter.partcles=100",), ("+filter.partcles=100: there is no key", "did you mean filter.particles?")),
-    "nothing like it": (("zzz=1",), ("zzz=1: there is no key 'zzz'; `pfbench run --cfg job` prints all keys",)),
+    "misspelt deep key": (
+        ("filter.resampler.treshold=0.3",),
+        ("Similar: filter.resampler.ess_threshold.",),
+    ),
+    "misspelt group": (("flter=sir",), ("flter=sir: key flter does not exist. Similar: filter.",)),
+    "added key": (
+        ("+filter.partcles=100",),
+        ("+filter.partcles=100: key filter.partcles does not exist. Similar: filter.particles",),
+    ),
+    "nothing like it": (
+        ("zzz=1",),
+        ("zzz=1: key zzz does not exist. List all: pfbench run --cfg job",),
+    ),
     "a key of another filter": (
         ("-m", "filter=ekf,sir", "filter.particles=20"),
-        ("filter.particles=20: not every cell of this sweep has the key", "apart"),
+        ("filter.particles=20: not all jobs of this sweep have the key", "separate sweep"),
     ),
-    "no particles": (("filter.particles=0",), ("filter.particles=0: give at least 2 particles",)),
-    "particles in words": (("filter.particles=many",), ("filter: its values do not fit", "check filter.particles=many")),
-    "negative deviation": (("model.measurement_sd=-1",), ("model.measurement_sd=[-1]: give positive numbers",)),
+    "no particles": (("filter.particles=0",), ("filter.particles must be at least 2, got 0",)),
+    "particles in words": (
+        ("filter.particles=many",),
+        ("filter: a value is not valid", "Check filter.particles=many"),
+    ),
+    "negative deviation": (
+        ("model.measurement_sd=-1",),
+        ("model.measurement_sd", "-1", "positive numbers"),
+    ),
     "negative receiver": (
-        ("scenario=t003", "scenario.receiver.position_sd=[-1,1,1]"),
-        ("scenario.receiver.position_sd=[-1, 1, 1]: give three positive standard deviations",),
+        ("scenario=flight_300s", "scenario.receiver.position_sd=[-1,1,1]"),
+        (
+            "scenario.receiver.position_sd must be three positive standard deviations, got [-1, 1, 1]",
+        ),
     ),
     "negative alignment": (
-        ("scenario=t003", "scenario.initial.velocity=[1,1]"),
-        ("scenario.initial.velocity=[1, 1]: give three positive standard deviations",),
+        ("scenario=flight_300s", "scenario.initial_errors.velocity=[1,1]"),
+        (
+            "scenario.initial_errors.velocity must be three positive standard deviations, got [1, 1]",
+        ),
     ),
     "odd interval": (
-        ("scenario=t003", "scenario.interval=0.03"),
-        ("scenario.interval=0.03: at imu_rate=100.0 that is 3 samples; give an even number",),
+        ("scenario=flight_300s", "scenario.filter_interval_s=0.03"),
+        ("scenario.filter_interval_s", "0.03", "100.0 Hz", "3 samples", "even number"),
     ),
-    "no runs": (("runs=0",), ("runs=0: give a whole number, 1 or more",)),
-    "runs in words": (("runs=few",), ("runs=few: give a whole number, 1 or more",)),
-    "half a run": (("runs=2.5",), ("runs=2.5: give a whole number",)),
-    "runs before the first": (("first_run=-1",), ("first_run=-1: give a whole number, 0 or more",)),
-    "negative seed": (("seed=-1",), ("seed=-1: give a whole number, 0 or more",)),
-    "huge seed": (("seed=4294967296",), ("seed=4294967296: give an integer from 0 to 2**32 - 1",)),
-    "no threads": (("threads=0",), ("threads=0: give a whole number, 1 or more",)),
-    "half precision": (("dtype=float16",), ("dtype=float16: give float64 (the default) or float32",)),
-    "unknown engine": (("engine=steam",), ("engine=steam: give auto, eager, loops or compiled",)),
-    "unknown device": (("device=gpu",), ("device=gpu: give cpu, cuda",)),
-    "regime": (("noise=outliers", "noise.probability=2"), ("noise.probability=2: give a probability between 0 and 1",)),
-    "no such class": (("noise._target_=pfbench.noise.regimes.Louder",), ("noise: its values do not fit", "Louder")),
+    "no runs": (("runs=0",), (f"runs {NUMBER} 1, got 0",)),
+    "runs in words": (("runs=few",), (f"runs {NUMBER} 1, got few",)),
+    "half a run": (("runs=2.5",), (f"runs {NUMBER} 1, got 2.5",)),
+    "runs before the first": (("first_run=-1",), (f"first_run {NUMBER} 0, got -1",)),
+    "negative seed": (("seed=-1",), (f"seed {NUMBER} 0, got -1",)),
+    "huge seed": (("seed=4294967296",), ("seed", "4294967296", "2**32 - 1")),
+    "no threads": (("threads=0",), (f"threads {NUMBER} 1, got 0",)),
+    "no scored steps": (("score_steps=-1",), (f"score_steps {NUMBER} 0, got -1",)),
+    "half precision": (
+        ("dtype=float16",),
+        ("dtype must be float64 (default) or float32, got float16",),
+    ),
+    "unknown engine": (
+        ("engine=steam",),
+        ("engine must be auto, eager, kernels or compiled, got steam",),
+    ),
+    "unknown device": (("device=gpu",), ("device must be cpu, cuda", "got gpu")),
+    "told maybe": (("oracle_noise=maybe",), ("oracle_noise must be true", "or false, got maybe")),
+    "study in a folder": (
+        ("study=a/b",),
+        ("study must be the name of a results folder", "got a/b"),
+    ),
+    "study of claims": (("study=claims",), ("study must not be datasheets or claims, got claims",)),
+    "regime": (
+        ("noise=outliers", "noise.probability=2"),
+        ("noise.probability must be between 0 and 1, got 2",),
+    ),
+    "no such class": (
+        ("noise._target_=pfbench.noise.white.Louder",),
+        ("noise: a value is not valid", "Louder"),
+    ),
     "a model without its scenario": (
         ("model=ins_gnss",),
-        ("model.imu comes from scenario.imu, which is not there: give model.imu=..., or choose a scenario that has it",),
+        (
+            "model.imu must be set, since scenario.imu does not exist",
+            "model.imu=... or choose a scenario that defines imu",
+        ),
     ),
-    "a key through another": (("scenario.model.measurement_sd=2",), ("did you mean model.measurement_sd?",)),
-    "no equals sign": (("ekf",), ("'ekf' is not understood: give key=value",)),
+    "a key through another": (
+        ("scenario.model.measurement_sd=2",),
+        ("Similar: model.measurement_sd.",),
+    ),
+    "no equals sign": (("ekf",), ("'ekf' must be key=value",)),
     "own log without a folder": (
-        ("scenario=own_log",),
-        ("scenario.folder is not set: give scenario.folder=...",),
+        ("scenario=user_log",),
+        ("scenario.folder must be set. Set scenario.folder=...",),
     ),
-    "car without data": (("scenario=car_drive",), ("data.root is not set", "PFBENCH_DATA", "car_rtk_mems")),
-    "quadrotor without data": (("scenario=quad_flights",), ("data.root is not set", "quad_rtk_mimu")),
+    "car without data": (
+        ("scenario=recorded_car_drive",),
+        ("data.root", "PFBENCH_DATA", "car_rtk_mems"),
+    ),
+    "quadrotor without data": (("scenario=recorded_quad_flights",), ("data.root", "quad_rtk_mimu")),
 }
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_told_and_leaves_nothing_behind(tmp_path: Path, mistake: str) -> None:
-    words, told = MISTAKES[mistake]
+def test_a_mistake_is_reported_and_leaves_nothing_behind(tmp_path: Path, mistake: str) -> None:
+    words, parts = MISTAKES[mistake]
     said = pfbench("run", "scenario=linear_walk", "runs=2", "particles=20", *words, home=tmp_path)
     assert said.code == 1
-    assert "pfbench run: " in said.err
-    message = said.err[said.err.index("pfbench run: ") :]
-    for part in told:
+    assert "error run: " in said.err
+    message = said.err[said.err.index("error run: ") :]
+    for part in parts:
         assert part in message
     assert "Traceback" not in said.err + said.out
     assert not [file for file in tmp_path.rglob("*") if file.suffix in (".npz", ".tmp")]
 
 
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("told=true", "told: renamed to oracle_noise"),
+        ("fresh=true", "fresh: renamed to overwrite"),
+        ("+told2=true", ""),
+        ("told.x=true", ""),
+        ("filter.weigh=1", "filter.weigh: renamed to filter.weight_update"),
+        ("filter.size.step=2", "filter.size.step: renamed to filter.particle_count.increment"),
+        ("scenario=t003", "scenario=t003: renamed to scenario=flight_300s"),
+        ("noise=q_only", "noise=q_only: renamed to noise=variance_q"),
+        ("budget=same N", "budget=same N: renamed to budget=particles"),
+        ("scenario.steps=3", ""),
+    ],
+)
+def test_a_renamed_key_names_the_new_one(tmp_path: Path, word: str, message: str) -> None:
+    renamed = messages.find_renamed(word)
+    assert (f"{renamed[0]}: renamed to {renamed[1]}" if renamed else "") == message
+    if message:
+        said = pfbench("run", *WALK, word, home=tmp_path)
+        assert said.code == 1
+        assert message in said.err
+
+
+def test_renamed_keys_in_lists_and_below_renamed_keys() -> None:
+    renamed = messages.find_renamed("filter.moves.0.kernel.depth=3")
+    assert renamed == ("filter.moves.0.kernel.depth", "filter.moves.0.kernel.lag")
+    renamed = messages.find_renamed("filter.proposal.guide.adaptations.1.keep")
+    assert renamed is not None
+    assert renamed[1] == "filter.proposal.guide_filter.noise_adaptations.1.forgetting_factor"
+
+
+def test_a_renamed_class_names_the_new_one() -> None:
+    targets = messages._renamed_keys()["targets"]
+    assert len(targets) > 150
+    assert all(callable(hydra.utils.get_object(new)) for new in targets.values())
+    old = next(old for old, new in targets.items() if new == "pfbench.filter.EssResampler")
+    with pytest.raises(hydra.errors.InstantiationException) as caught:
+        hydra.utils.instantiate({"a": {"_target_": old}})
+    message = messages.format_error(caught.value)
+    assert message == f"a._target_={old}: renamed to pfbench.filter.EssResampler"
+
+
+def test_no_key_or_choice_in_use_is_listed_as_renamed() -> None:
+    conf = Path(messages.__file__).parents[2] / "conf"
+    words = []
+    for file in conf.glob("*/*.yaml"):
+        group = file.parent.name
+        content = yaml.safe_load(file.read_text()) or {}
+        words += [f"{group}={file.stem}"]
+        words += [f"{group}.{key}" for key in messages._dotted_keys(content)]
+    words += list(yaml.safe_load((conf / "config.yaml").read_text()))
+    assert len(words) > 500
+    assert [word for word in words if messages.find_renamed(word)] == []
+
+
+def test_renamed_choices_lead_to_existing_ones() -> None:
+    conf, table = Path(messages.__file__).parents[2] / "conf", messages._renamed_keys()
+    for group in ("scenario", "noise"):
+        assert [
+            n for n in table["choices"][group].values() if not (conf / group / f"{n}.yaml").exists()
+        ] == []
+    assert set(table["config"].values()) <= set(yaml.safe_load((conf / "config.yaml").read_text()))
+
+
 @no_cuda
 @pytest.mark.parametrize("device", ["cuda", "cuda:3"])
-def test_a_device_that_is_not_there_is_told(tmp_path: Path, device: str) -> None:
+def test_a_device_that_does_not_exist_is_reported(tmp_path: Path, device: str) -> None:
     said = pfbench("run", *WALK, f"device={device}", home=tmp_path)
     assert said.code == 1
-    assert f"device={device}: torch finds 0 CUDA devices here; give device=cpu" in said.err
+    assert f"device must be cpu or one of 0 CUDA devices, got {device}. Use device=cpu" in said.err
 
 
-def test_the_trace_is_there_for_who_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PFBENCH_TRACE", "1")
-    with pytest.raises(ValueError, match="runs=0"):
+def test_the_traceback_is_printed_on_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ValueError, match="runs must be"):
+        pfbench("run", *WALK, "runs=0", "--traceback", home=tmp_path)
+    monkeypatch.setenv("PFBENCH_TRACEBACK", "1")
+    with pytest.raises(ValueError, match="runs must be"):
         pfbench("run", *WALK, "runs=0", home=tmp_path)
 
 
-def test_who_stops_a_sweep_is_told_that_it_goes_on(tmp_path: Path) -> None:
-    with mock.patch.object(job, "compute", side_effect=KeyboardInterrupt):
+def test_an_interrupted_sweep_reports_how_to_resume(tmp_path: Path) -> None:
+    with mock.patch.object(run_job, "compute_job", side_effect=KeyboardInterrupt):
         said = pfbench("run", *WALK, home=tmp_path)
     assert said.code == 130
-    assert "finished cells are kept" in said.err
+    assert "Finished jobs are kept. Repeat the command to resume" in said.err
     assert not list(tmp_path.rglob("*.npz"))
+
+
+def test_a_sweep_counts_its_jobs(tmp_path: Path) -> None:
+    assert pfbench("run", *WALK, "filter=ekf", home=tmp_path).code == 0
+    said = pfbench("run", "-m", *WALK, "filter=ekf,ckf", home=tmp_path)
+    assert said.code == 0, said.err
+    first, second, summary = [
+        line for line in said.out.splitlines() if re.match(r"\[\d|sweep", line)
+    ]
+    assert first.startswith("[1/2] skipped   linear_walk / nominal / ekf   result exists: ")
+    assert second.startswith("[2/2] finished  t=")
+    assert summary.startswith("sweep: 1 finished, 1 skipped, 0 failed in ")
+    assert summary.endswith("Next: pfbench report study=adhoc")
 
 
 @pytest.mark.parametrize("place", range(3))
@@ -127,18 +275,33 @@ def test_the_flag_of_a_sweep_may_stand_anywhere(tmp_path: Path, place: int) -> N
 # the other commands
 
 
+COMMANDS = ("run", "report", "claims", "datasheet", "train", "list", "check")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_a_command(tmp_path: Path, command: str) -> None:
+    said = pfbench(command, "--help", home=tmp_path)
+    assert said.code == 0
+    assert said.out.startswith(f"pfbench {command}")
+    assert "\n\n" in said.out
+
+
+def test_version(tmp_path: Path) -> None:
+    assert pfbench("--version", home=tmp_path).out == f"pfbench {package.__version__}\n"
+
+
 @pytest.mark.parametrize("words", [(), ("-h",), ("--help",), ("help",)])
 def test_usage(tmp_path: Path, words: tuple[str, ...]) -> None:
     said = pfbench(*words, home=tmp_path)
     assert said.code == 0
     assert package.__version__ in said.out
-    assert all(f"pfbench {command}" in said.out for command in ("run", "report", "list", "check"))
+    assert all(f"pfbench {command}" in said.out for command in COMMANDS)
 
 
 def test_an_unknown_command(tmp_path: Path) -> None:
     said = pfbench("reprot", "study=x", home=tmp_path)
     assert said.code == 2
-    assert "there is no command 'reprot'; did you mean report?" in said.err
+    assert "command 'reprot' does not exist. Similar: report." in said.err
     assert "pfbench run" in said.err
 
 
@@ -147,64 +310,73 @@ def test_list_names_every_yaml(tmp_path: Path) -> None:
     assert said.code == 0
     lines = {line.split()[0]: line for line in said.out.splitlines() if line}
     for folder in ("filter", "model", "noise", "scenario", "report"):
-        assert all(file.stem in lines[folder] for file in (cli.conf_dir() / folder).glob("*.yaml"))
-    assert all(file.stem in lines["experiment"] for file in cli.experiments_dir().glob("*.yaml"))
+        assert all(file.stem in lines[folder] for file in (job.conf_dir() / folder).glob("*.yaml"))
+    assert all(file.stem in lines["experiment"] for file in job.experiments_dir().glob("*.yaml"))
 
 
 def test_list_of_a_group_says_what_each_one_is(tmp_path: Path) -> None:
     said = pfbench("list", "filter", home=tmp_path)
     assert said.code == 0
     assert "sir                      SIR: bootstrap particle filter" in said.out
-    assert len(said.out.splitlines()) == len(list((cli.conf_dir() / "filter").glob("*.yaml")))
+    assert len(said.out.splitlines()) == len(list((job.conf_dir() / "filter").glob("*.yaml")))
 
 
 def test_list_of_no_group(tmp_path: Path) -> None:
     said = pfbench("list", "filters", home=tmp_path)
     assert said.code == 1
-    assert "pfbench list: there is no group 'filters'; did you mean filter? There are filter, model" in said.err
+    assert "error list: group must be one of filter, model" in said.err
+    assert "got filters. Similar: filter." in said.err
 
 
 def test_report_of_a_study_that_does_not_exist(tmp_path: Path) -> None:
-    said = pfbench("report", "study=nope", f"reports={tmp_path / 'reports'}", home=tmp_path)
+    said = pfbench("report", "study=nope", f"reports_dir={tmp_path / 'reports'}", home=tmp_path)
     assert said.code == 1
-    assert "pfbench report: no results in" in said.err
+    assert "error report: " in said.err
     assert "nope" in said.err
-    assert "Make them with: pfbench run" in said.err
+    assert "pfbench run" in said.err
     assert not (tmp_path / "reports").exists()
 
 
 def test_report_with_a_misspelt_key(tmp_path: Path) -> None:
     said = pfbench("report", "stdy=nope", home=tmp_path)
     assert said.code == 1
-    assert "stdy=nope: there is no key 'stdy'; did you mean study?" in said.err
+    assert "stdy=nope: key stdy does not exist. Similar: study." in said.err
 
 
 def test_check_finds_nothing_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It asks for every file. Here every tenth is composed: test_configs composes each."""
-    compose, asked = cli._compose, []
+    compose, requested, empty = check.compose, [], job.compose([])
 
-    def tenth(words: list[str]) -> dict[str, Any]:
-        asked.append(words[0] if words else "")
-        return compose(words) if len(asked) % 10 == 1 or asked[-1].startswith(("report=", "train=")) else {}
+    def tenth(words: list[str]) -> Any:
+        requested.append(words[0] if words else "")
+        return compose(words) if len(requested) % 10 == 1 else empty
 
-    monkeypatch.setattr(cli, "_compose", tenth)
+    monkeypatch.setattr(check, "compose", tenth)
     said = pfbench("check", home=tmp_path)
     assert said.code == 0, said.err
-    files = [*cli.conf_dir().glob("*/*.yaml"), *cli.experiments_dir().glob("*.yaml")]
-    named = [("+experiment" if file.parent.name == "experiments" else file.parent.name, file.stem) for file in files]
-    assert sorted(asked) == sorted(["", *(f"{group}={name}" for group, name in named)])
-    assert f"composed   {len(files)} of {len(files)} configurations" in said.out
-    for line in (f"pfbench    {package.__version__}", f"torch      {torch.__version__}", "data root  not set"):
-        assert line in said.out
+    files = [*job.conf_dir().glob("*/*.yaml"), *job.experiments_dir().glob("*.yaml")]
+    named = [
+        ("+experiment" if file.parent.name == "experiments" else file.parent.name, file.stem)
+        for file in files
+    ]
+    assert sorted(requested) == sorted(["", *(f"{group}={name}" for group, name in named)])
+    rows = {line.split("  ")[0]: line.split() for line in said.out.splitlines()}
+    assert rows["item"] == ["item", "value", "status"]
+    assert rows["configurations"][1:] == [str(len(files)), "of", str(len(files)), "ok"]
+    assert rows["pfbench"][1:] == [package.__version__, "ok"]
+    assert rows["torch"][1:] == [torch.__version__, "ok"]
+    assert rows["data root"][2:4] == ["not", "set"]
 
 
 def test_check_names_what_does_not_compose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(words: list[str]) -> dict[str, Any]:
+    empty = job.compose([])
+
+    def broken(words: list[str]) -> Any:
         if "filter=ukf" in words:
             raise ValueError("kappa is not there")
-        return {"data": {"root": None}}
+        return empty
 
-    monkeypatch.setattr(cli, "_compose", broken)
+    monkeypatch.setattr(check, "compose", broken)
     said = pfbench("check", home=tmp_path)
     assert said.code == 1
-    assert "these do not compose:\n  filter=ukf: kappa is not there" in said.err
+    assert "configurations must compose, got errors:\n  filter=ukf: kappa is not there" in said.err

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))  # scripts, not a package
+sys.path.insert(
+    0, str(Path(__file__).resolve().parent.parent / "benchmarks")
+)  # scripts, not a package
 import compare
 import fused
 import house
@@ -34,7 +36,9 @@ def test_the_c_loop_and_pfbench_estimate_the_same(kind: str) -> None:
     told = []
     for run in (fused.sir(work(kind)), house.sir(work(kind), torch.float32)):
         answers = [run(seed + 1) for seed in SEEDS]
-        rows = [np.concatenate([np.ravel(log_z), np.ravel(np.asarray(mean))]) for log_z, mean in answers]
+        rows = [
+            np.concatenate([np.ravel(log_z), np.ravel(np.asarray(mean))]) for log_z, mean in answers
+        ]
         told.append(np.stack(rows))
     off = told[0].mean(0) - told[1].mean(0)
     error = np.sqrt(sum(rows.var(0, ddof=1) for rows in told) / len(SEEDS))
@@ -42,7 +46,11 @@ def test_the_c_loop_and_pfbench_estimate_the_same(kind: str) -> None:
 
 
 def result(evidence: np.ndarray, error: float = 1.0) -> Result:
-    qualities = {"evidence": evidence, "normalised": np.full_like(evidence, error), "position": evidence}
+    qualities = {
+        "evidence": evidence,
+        "normalised": np.full_like(evidence, error),
+        "position": evidence,
+    }
     return Result(np.ones(9), np.ones(9), qualities, {}, 0.0)
 
 
@@ -56,13 +64,19 @@ def test_a_contestant_that_computes_something_else_is_found_out(runs: int) -> No
     alike = {who: result(draws(seed, runs)) for seed, who in enumerate(names)}
     assert [text for text in compare.disagreements(alike, exact=False) if "evidence" in text] == []
     off = {**alike, compare.JAX: result(draws(1, runs) + (4.0 if runs == 1 else 1.0))}
-    assert any("JAX" in text and "log evidence" in text for text in compare.disagreements(off, exact=False))
+    assert any(
+        "JAX" in text and "log evidence" in text for text in compare.disagreements(off, exact=False)
+    )
 
 
 def test_who_has_no_evidence_is_compared_by_errors_alone() -> None:
-    found = {who: result(draws(seed, 1)) for seed, who in enumerate((compare.FLOAT32, compare.LIMIT))}
+    found = {
+        who: result(draws(seed, 1)) for seed, who in enumerate((compare.FLOAT32, compare.LIMIT))
+    }
     found[compare.PYRO] = result(np.full((9, 1), np.nan))
-    assert not any("evidence" in text and "Pyro" in text for text in compare.disagreements(found, exact=False))
+    assert not any(
+        "evidence" in text and "Pyro" in text for text in compare.disagreements(found, exact=False)
+    )
 
 
 def test_filters_that_draw_nothing_agree_to_rounding() -> None:

@@ -13,48 +13,57 @@ from command_line import pfbench
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from pfbench import fusion, native, store
-from pfbench.draws import MonteCarlo
-from pfbench.filter import compiled
-from pfbench.filter.belief import Info
-from pfbench.filter.compiled import Compiled
-from pfbench.filter.loop import Estimate, run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.proposals import Proposal
-from pfbench.judge import Tally
-from pfbench.model.base import StateSpaceModel, affine
-from pfbench.model.linear import LinearGaussian, linear_walk
-from pfbench.model.toys import Growth
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Record
-from pfbench.scenario.model_world import ModelWorld
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import StepInfo
+from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.particle import compiled_step
+from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.proposals import Proposal
+from pfbench.job.scoring import LikelihoodCounter
+from pfbench.kernels import compilation, cpp, step_compiler
+from pfbench.model.base import StateSpaceModel, affine_map
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.model.textbook import UnivariateGrowth
+from pfbench.noise.white import NominalNoise
+from pfbench.results import store
+from pfbench.scenario.model_simulation import ModelSimulation
 
 RUNS, STEPS = 4, 12
-compiler = pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no C++ compiler")
+compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no C++ compiler"
+)
 
 
 def record_of(model: StateSpaceModel) -> Record:
     """A record with a component missing at times, in some runs."""
-    record = ModelWorld(model, STEPS).draw(Nominal(), torch.arange(RUNS), 1).record
+    record = ModelSimulation(model, STEPS).draw(NominalNoise(), torch.arange(RUNS), 1).record
     record.y[1, 4] = record.y[3, 7:9] = torch.nan
     return record
 
 
-def run(method: Any, model: StateSpaceModel, record: Record, at_once: int | None = None) -> Estimate:
-    with fusion.fused(), torch.no_grad():
-        return run_filter(method, model, record, MonteCarlo(1, torch.arange(RUNS)), at_once=at_once)
+def run(
+    method: Any, model: StateSpaceModel, record: Record, at_once: int | None = None
+) -> FilterResult:
+    with compilation.use_compiled(), torch.no_grad():
+        return run_filter(
+            method, model, record, PhiloxStream(1, torch.arange(RUNS)), run_batch=at_once
+        )
 
 
-def agree(one: Estimate, other: Estimate) -> None:
+def agree(one: FilterResult, other: FilterResult) -> None:
     """Every number of two estimates, to rounding."""
     for name in ("mean", "variance", "log_evidence"):
-        torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9, equal_nan=True)
+        torch.testing.assert_close(
+            getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9, equal_nan=True
+        )
     assert one.trace.keys() == other.trace.keys()
     for name, value in one.trace.items():
         torch.testing.assert_close(value.double(), other.trace[name].double(), rtol=1e-9, atol=1e-9)
 
 
-class Failing(Growth):
+class Failing(UnivariateGrowth):
     """Particles that run beyond 15 become no number."""
 
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
@@ -68,24 +77,26 @@ class Failing(Growth):
 def test_a_compiled_filter_draws_weighs_and_counts_as_it_does_step_by_step() -> None:
     """Also where particles fail in some steps, and measurements are missing."""
     model, method = Failing(), ParticleFilter(150)
-    record = record_of(Growth())
+    record = record_of(UnivariateGrowth())
     counts = []
     found = []
     for wrapped in (False, True):
         own = Failing()
-        tally = Tally(own)
-        step = Compiled(method, tally) if wrapped else method
+        tally = LikelihoodCounter(own)
+        step = CompiledParticleFilter(method, tally) if wrapped else method
         found.append(run(step, own, record))
         counts.append(tally.count)
-    assert isinstance(step, Compiled)
-    assert step.at_work
+    assert isinstance(step, CompiledParticleFilter)
+    assert step.is_active
     (graph,) = step.graphs.values()
     assert graph is not None
-    assert graph.direct is not None  # no step was called from Python
+    assert graph.entry is not None  # no step was called from Python
     assert step.seconds > 0.0
     agree(*found)
     assert counts[0] == counts[1] == RUNS * 150 * STEPS
-    failed = [bool(torch.isnan(model.propagate(x, u, w)).any()) for x, u, w in some_steps(model, record)]
+    failed = [
+        bool(torch.isnan(model.propagate(x, u, w)).any()) for x, u, w in some_steps(model, record)
+    ]
     assert any(failed)  # else nothing of it was tried
 
 
@@ -95,25 +106,34 @@ def test_a_compiled_filter_draws_weighs_and_counts_as_it_does_step_by_step() -> 
 def test_a_graph_whose_function_is_not_found_is_called_from_python(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(compiled, "_ENTRY", "of another version of torch")
-    model, method, record = Failing(), ParticleFilter(150), record_of(Growth())  # of the test above: torch keeps what it compiled
-    step = Compiled(method, Tally(model))
+    monkeypatch.setattr(step_compiler, "_ENTRY", "of another version of torch")
+    model, method, record = (
+        Failing(),
+        ParticleFilter(150),
+        record_of(UnivariateGrowth()),
+    )  # of the test above: torch keeps what it compiled
+    step = CompiledParticleFilter(method, LikelihoodCounter(model))
     with caplog.at_level("INFO", "pfbench"):
         agree(run(step, model, record), run(method, model, record))
-    assert [graph.direct for graph in step.graphs.values() if graph] == [None]
+    assert [graph.entry for graph in step.graphs.values() if graph] == [None]
     assert "steps are called from Python (AttributeError" in caplog.text
 
 
 def some_steps(model: StateSpaceModel, record: Record) -> list[tuple[Tensor, Any, Tensor]]:
     prepared = model.prepare(record)
-    x, draws = 10.0 * torch.ones(RUNS, 150, 1, dtype=torch.float64), MonteCarlo(1, torch.arange(RUNS))
-    return [(x, prepared.at(t).u, draws.at(t + 1).normal("noise", 150, 1)) for t in range(3)]
+    x, draws = (
+        10.0 * torch.ones(RUNS, 150, 1, dtype=torch.float64),
+        PhiloxStream(1, torch.arange(RUNS)),
+    )
+    return [
+        (x, prepared.at_step(t).u, draws.at_step(t + 1).normal("noise", 150, 1)) for t in range(3)
+    ]
 
 
 class Looking:
     """A proposal that looks at numbers, which nobody can record."""
 
-    exact = True
+    is_exact = True
 
     def __init__(self, inner: Proposal) -> None:
         self.inner = inner
@@ -128,17 +148,19 @@ def walk() -> LinearGaussian:
 
 
 @compiler
-def test_a_step_that_cannot_be_recorded_goes_on_as_it_is_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_step_that_cannot_be_recorded_goes_on_as_it_is_and_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     model = walk()
     method = ParticleFilter(50, proposal=Looking(ParticleFilter(50).proposal))
     record = record_of(model)
-    step = Compiled(method)
+    step = CompiledParticleFilter(method)
     agree(run(step, model, record), run(method, model, record))
     assert list(step.graphs.values()) == [None]
-    assert not step.at_work
+    assert not step.is_active
     (said,) = [entry.getMessage() for entry in caplog.records if entry.name == "pfbench"]
     assert said.startswith("engine=compiled: this step cannot be compiled (RuntimeError: ")
-    assert said.endswith("going on with compiled loops alone")
+    assert said.endswith("Using compiled kernels only")
 
 
 def test_blocks_of_runs_share_a_graph_where_they_are_alike(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,12 +171,12 @@ def test_blocks_of_runs_share_a_graph_where_they_are_alike(monkeypatch: pytest.M
         recorded.append([tuple(a.shape) for a in tensors])
         return lambda given: step(*given), None
 
-    monkeypatch.setattr(compiled, "_compiled", as_it_is)
+    monkeypatch.setattr(compiled_step, "compile_function", as_it_is)
     model = walk()
     method, record = ParticleFilter(50), record_of(model)
-    step = Compiled(method)
+    step = CompiledParticleFilter(method)
     run(step, model, Record(record.y[:, :1]))
-    assert not step.at_work  # a first step alone runs as it is
+    assert not step.is_active  # a first step alone runs as it is
     agree(run(step, model, record, at_once=2), run(method, model, record))
     assert len(recorded) == 1
     agree(run(step, model, record, at_once=3), run(method, model, record))
@@ -177,11 +199,11 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
 
         return call, None
 
-    monkeypatch.setattr(compiled, "_compiled", as_it_is)
+    monkeypatch.setattr(compiled_step, "compile_function", as_it_is)
     return asked
 
 
-class Fragile(Growth):
+class Fragile(UnivariateGrowth):
     """All particles of run 2 become no number at step 7, those of run 0 fit nothing that is seen at step 10."""
 
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
@@ -196,20 +218,24 @@ class Fragile(Growth):
 @compiler
 def test_steps_taken_together_are_the_steps_taken_one_by_one(recorded: list[list[int]]) -> None:
     """With inputs and draws that change at each step, measurements missing, a NaN in the middle and a run lost there."""
-    record = record_of(Growth())
-    tally = Tally(model := Fragile())
+    record = record_of(UnivariateGrowth())
+    tally = LikelihoodCounter(model := Fragile())
     method, ticks = ParticleFilter(40), []
-    step = Compiled(method, tally)
+    step = CompiledParticleFilter(method, tally)
 
-    def watch(t: int, info: Info) -> dict[str, Tensor]:
+    def watch(t: int, info: StepInfo) -> dict[str, Tensor]:
         ticks.append(t)
         assert info.cloud is not None
         assert info.nis is not None
         with tally.paused():
-            return {"nis": info.nis()[0], "covariance": info.covariance(), "farthest": info.cloud()[0].abs().amax((1, 2))}
+            return {
+                "nis": info.nis()[0],
+                "covariance": info.covariance(),
+                "farthest": info.cloud()[0].abs().amax((1, 2)),
+            }
 
-    draws = MonteCarlo(1, torch.arange(RUNS))
-    with fusion.fused(), torch.no_grad():
+    draws = PhiloxStream(1, torch.arange(RUNS))
+    with compilation.use_compiled(), torch.no_grad():
         together, counted = run_filter(step, model, record, draws, watch), tally.count
         apart = run_filter(method, model, record, draws, watch)
     agree(together, apart)
@@ -222,26 +248,28 @@ def test_steps_taken_together_are_the_steps_taken_one_by_one(recorded: list[list
 
 
 @compiler
-def test_a_graph_that_held_its_step_s_number_fast_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_graph_that_held_its_step_s_number_fast_would_be_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The comparison of the test above is worth something: with the number of the first step for ever, it fails."""
 
     def frozen(step: Any, example: list[Tensor]) -> Any:
         place = next(k for k, a in enumerate(example) if a.dim() == 0)
         return lambda given: step(*given[:place], example[place], *given[place + 1 :]), None
 
-    monkeypatch.setattr(compiled, "_compiled", frozen)
+    monkeypatch.setattr(compiled_step, "compile_function", frozen)
     model, method = walk(), ParticleFilter(50)
     record = record_of(model)
     with pytest.raises(AssertionError):
-        agree(run(Compiled(method), model, record), run(method, model, record))
+        agree(run(CompiledParticleFilter(method), model, record), run(method, model, record))
 
 
 def test_inputs_reach_their_steps_whatever_their_shape() -> None:
     """Of all runs or of each one, numbers, vectors and matrices: as a single step would have stored them."""
     for shape in ((3, 5), (1, 5), (3, 5, 2), (3, 5, 2, 4), (1, 5, 4, 4)):
         a = torch.randn(shape)
-        for t, given in enumerate(compiled._by_step(a)):
-            assert torch.equal(given, compiled._stored(a[:, t]))
+        for t, given in enumerate(step_compiler.steps_to_storage(a)):
+            assert torch.equal(given, step_compiler.to_storage(a[:, t]))
             assert given.is_contiguous()
 
 
@@ -255,14 +283,14 @@ def as_graph(model: StateSpaceModel, method: ParticleFilter) -> tuple[Any, list[
         raise RuntimeError("only noted")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled, "_compiled", noted)
-        run(Compiled(method), model, record_of(model))
+        patch.setattr(compiled_step, "compile_function", noted)
+        run(CompiledParticleFilter(method), model, record_of(model))
     return kept[0], kept[1]
 
 
 class Moved(LinearGaussian):
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        return affine(self.f[None], x, self.g[None], w)
+        return affine_map(self.f[None], x, self.g[None], w)
 
 
 class Weary(Moved):
@@ -282,37 +310,61 @@ class Crossed(Moved):
 @compiler
 @pytest.mark.parametrize("particles", [60, 61])  # with and without draws that nobody wants
 @pytest.mark.parametrize(("kind", "joined"), [(Moved, True), (Weary, True), (Crossed, False)])
-def test_copies_noise_and_move_are_joined_where_nothing_comes_between(kind: Any, joined: bool, particles: int) -> None:
+def test_copies_noise_and_move_are_joined_where_nothing_comes_between(
+    kind: Any, joined: bool, particles: int
+) -> None:
     """As for a CUDA device; here `driven` is what it stands for."""
 
     def driven(phi: Tensor, x: Tensor, ancestors: Tensor, gain: Tensor, *key: Any) -> Tensor:
-        noise = native.normals(*key, gain.shape[-1], -(-ancestors.shape[1] // 4))[..., : ancestors.shape[1]]
-        return native.affine(phi, native.copied(x, ancestors).permute(1, 2, 0), gain, noise.permute(1, 2, 0).to(x.dtype))
+        noise = cpp.philox_normals(*key, gain.shape[-1], -(-ancestors.shape[1] // 4))[
+            ..., : ancestors.shape[1]
+        ]
+        return cpp.propagate_affine(
+            phi,
+            cpp.gather_particles(x, ancestors).permute(1, 2, 0),
+            gain,
+            noise.permute(1, 2, 0).to(x.dtype),
+        )
 
-    model = kind([[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.1], [0.2, 0.5]], [[1.0, 0.0]], [0.5], [0.3, -0.2], [1.5, 1.0])
+    model = kind(
+        [[1.0, 0.5], [0.0, 0.9]],
+        [[0.6, 0.1], [0.2, 0.5]],
+        [[1.0, 0.0]],
+        [0.5],
+        [0.3, -0.2],
+        [1.5, 1.0],
+    )
     graph, given = as_graph(model, ParticleFilter(particles))
     wanted = graph(*given)
-    compiled._join(graph.graph)
+    step_compiler._fuse_propagation(graph.graph)
     graph.recompile()
-    assert ("pfbench.driven" in graph.code) == joined
-    assert ("pfbench.normals" in graph.code) == (not joined)
+    assert ("pfbench.gather_propagate" in graph.code) == joined
+    assert ("pfbench.philox_normals" in graph.code) == (not joined)
     with torch.library._scoped_library("pfbench", "IMPL") as library:
-        library.impl("driven", driven, "CPU")
+        library.impl("gather_propagate", driven, "CPU")
         found = graph(*given)
     for one, other in zip(found, wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
-def test_large_steps_go_one_by_one(recorded: list[list[int]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_steps_go_one_by_one(
+    recorded: list[list[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What steps keep together stays small: nothing is computed of the next one before this one has been told."""
-    monkeypatch.setattr(compiled, "_AHEAD", 1)
+    monkeypatch.setattr(compiled_step, "_MAX_NUMBERS", 1)
     model, method, told = walk(), ParticleFilter(50), []
 
-    def watch(t: int, info: Info) -> dict[str, Tensor]:
+    def watch(t: int, info: StepInfo) -> dict[str, Tensor]:
         told.append((t + 1, recorded[0][-1] if recorded else 1))
         return {}
 
-    run_filter(Compiled(method), model, record_of(model), MonteCarlo(1, torch.arange(RUNS)), watch)
+    run_filter(
+        CompiledParticleFilter(method),
+        model,
+        record_of(model),
+        PhiloxStream(1, torch.arange(RUNS)),
+        watch,
+    )
     assert told == [(t, t) for t in range(1, STEPS + 1)]
 
 
@@ -320,15 +372,24 @@ def test_large_steps_go_one_by_one(recorded: list[list[int]], monkeypatch: pytes
 @compiler
 @pytest.mark.filterwarnings("ignore")
 def test_a_job_says_that_its_step_was_compiled(tmp_path: Path) -> None:
-    walk = ("run", "scenario=linear_walk", "scenario.steps=20", "runs=4", "particles=200", "fresh=true")
+    walk = (
+        "run",
+        "scenario=linear_walk",
+        "scenario.steps=20",
+        "runs=4",
+        "particles=200",
+        "overwrite=true",
+    )
     found = {}
-    for engine in ("loops", "compiled"):
+    for engine in ("kernels", "compiled"):
         said = pfbench(*walk, f"engine={engine}", home=tmp_path)
         assert said.code == 0, said.err
-        (file,) = (tmp_path / "results" / "adhoc").glob("*.npz")  # one key: an engine changes no result
-        found[engine] = store.load(file)
+        (file,) = (tmp_path / "results" / "adhoc").glob(
+            "*.npz"
+        )  # one key: an engine changes no result
+        found[engine] = store.read_result(file)
         assert found[engine].meta["engine"] == engine
-    loops, whole = (found[engine] for engine in ("loops", "compiled"))
+    loops, whole = (found[engine] for engine in ("kernels", "compiled"))
     assert whole.meta["seconds"]["compile"] > 0.0
     assert whole.meta["likelihoods_per_step"] == loops.meta["likelihoods_per_step"] == 200.0
     for name in ("error", "sd", "log_evidence", "nees"):

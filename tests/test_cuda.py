@@ -12,29 +12,36 @@ from typing import Any
 import pytest
 import torch
 from command_line import pfbench
-from test_configs import composed, truncated, world
-from test_every_filter import NAMES, method_of, refusal
+from config_cases import composed, truncated, world
+from filter_cases import NAMES, method_of, refusal
 from torch import Tensor
 
-from pfbench import fusion, job, store
-from pfbench.chart import Chart
-from pfbench.draws import MonteCarlo
-from pfbench.filter.compiled import Compiled
-from pfbench.filter.differentiable import Soft
-from pfbench.filter.learned import Learned
-from pfbench.filter.learned_laws import Diagonal
-from pfbench.filter.learned_objectives import Bound, InferenceCompilation, StateError
-from pfbench.filter.loop import Estimate, run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.resamplers import Resample, Systematic
-from pfbench.filter.swarm import Swarm
-from pfbench.lessons import draw_worlds
+from pfbench import job
+from pfbench.core.chart import Chart
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.learned.differentiable_resampling import SoftResampler
+from pfbench.filter.learned.networks import DiagonalNormalHead
+from pfbench.filter.learned.objectives import (
+    EvidenceLowerBound,
+    InferenceCompilation,
+    StateErrorLoss,
+)
+from pfbench.filter.learned.proposal import LearnedProposal
+from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.swarm.swarm_proposal import SwarmProposal
+from pfbench.kernels import compilation
+from pfbench.learn.training_config import Training
+from pfbench.learn.training_data import draw_training_data
+from pfbench.learn.training_job import train
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear import LinearGaussian, local_level
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Record
-from pfbench.scenario.model_world import ModelWorld
-from pfbench.train import Training, train
+from pfbench.model.linear_gaussian import LinearGaussian, local_level
+from pfbench.noise.white import NominalNoise
+from pfbench.results import store
+from pfbench.scenario.model_simulation import ModelSimulation
 
 pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
@@ -42,13 +49,20 @@ pytestmark = [
 ]
 
 RUNS = torch.arange(2)
-WORLDS = ("growth", "t004", "sar_flight_short", "azimuth_small", "passive_1")
-NEURAL = ("neural_ckf", "neural_flow", "neural_lowrank", "neural_mh", "neural_mixture", "neural_sir")
+WORLDS = ("growth", "flight_500s", "sar_flight_short", "azimuth_small", "passive_1")
+NEURAL = (
+    "neural_ckf",
+    "neural_flow",
+    "neural_lowrank",
+    "neural_mh",
+    "neural_mixture",
+    "neural_sir",
+)
 OFF = 0.05  # standard deviations: normals differ by 1e-5, and a particle may fall to a neighbouring slot
 
 
 @dataclass(frozen=True, eq=False)
-class Shaken(MonteCarlo):
+class Shaken(PhiloxStream):
     """Normals that are off by as much as those of a device may be: some filters are that sensitive."""
 
     def normal(self, purpose: str, n: int, w: int) -> Tensor:
@@ -56,14 +70,24 @@ class Shaken(MonteCarlo):
 
 
 def on(
-    device: str, method: Any, model: StateSpaceModel, record: Record, fused: bool = False, draws: type[MonteCarlo] = MonteCarlo
-) -> Estimate:
+    device: str,
+    method: Any,
+    model: StateSpaceModel,
+    record: Record,
+    fused: bool = False,
+    draws: type[PhiloxStream] = PhiloxStream,
+) -> FilterResult:
     model = model.to(device)
-    with torch.no_grad(), fusion.fused(fused):
-        return run_filter(method, model, record, draws(1, torch.arange(len(record.y), device=device), model.anchor.dtype))
+    with torch.no_grad(), compilation.use_compiled(fused):
+        return run_filter(
+            method,
+            model,
+            record,
+            draws(1, torch.arange(len(record.y), device=device), model.anchor.dtype),
+        )
 
 
-def apart(chart: Chart, here: Estimate, there: Estimate) -> float:
+def apart(chart: Chart, here: FilterResult, there: FilterResult) -> float:
     """Greatest difference of two estimates' means, in standard deviations of the first, and of their log evidence."""
     off = chart.subtract(there.mean.cpu(), here.mean).abs() / here.variance.sqrt().clamp(min=1e-12)
     return max(float(off.max()), float((there.log_evidence.cpu() - here.log_evidence).abs().max()))
@@ -75,21 +99,27 @@ def test_a_filter_does_there_what_it_does_here(name: str, scenario: str) -> None
     record = truncated(world(scenario), 3).record
 
     def model() -> StateSpaceModel:
-        found: StateSpaceModel = job.build(composed(f"scenario={scenario}").model)
+        found: StateSpaceModel = job.instantiate(composed(f"scenario={scenario}").model)
         return found
 
     if name in NAMES and refusal(name, model(), record):
         pytest.skip("it refuses this world")
     if name == "thompson_taylor":
-        pytest.skip("which of equally near neighbours comes first is the device's: other numbers, the same law")
+        pytest.skip(
+            "which of equally near neighbours comes first is the device's: other numbers, the same law"
+        )
 
     def method() -> Any:
-        found = method_of.__wrapped__(name) if name in NEURAL else method_of(name)  # a network is made for its first model
-        if isinstance(proposal := getattr(found, "proposal", None), Swarm):
+        found = (
+            method_of.__wrapped__(name) if name in NEURAL else method_of(name)
+        )  # a network is made for its first model
+        if isinstance(proposal := getattr(found, "proposal", None), SwarmProposal):
             found = replace(found, proposal=replace(proposal, iterations=4))
         return found
 
-    here, shaken = (on("cpu", method(), model(), record, draws=kind) for kind in (MonteCarlo, Shaken))
+    here, shaken = (
+        on("cpu", method(), model(), record, draws=kind) for kind in (PhiloxStream, Shaken)
+    )
     there = on("cuda", method(), model(), record)
     assert there.mean.is_cuda
     assert apart(model().chart, here, there) < max(OFF, 3.0 * apart(model().chart, here, shaken))
@@ -97,7 +127,9 @@ def test_a_filter_does_there_what_it_does_here(name: str, scenario: str) -> None
 
 def walk() -> LinearGaussian:
     h = [[1.0, 0.0], [0.3, 1.0]]
-    return LinearGaussian([[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.0], [0.2, 0.5]], h, [1.0, 0.8], [0.3, -0.2], [1.5, 1.0])
+    return LinearGaussian(
+        [[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.0], [0.2, 0.5]], h, [1.0, 0.8], [0.3, -0.2], [1.5, 1.0]
+    )
 
 
 class Failing(LinearGaussian):
@@ -114,50 +146,81 @@ def test_engines_agree(particles: int, threshold: float) -> None:
     """In the first steps number by number; later particles fall to other slots, and estimates differ as two of one law."""
     plain = walk()
     model = Failing(plain.f, plain.g, plain.h, plain.r, plain.m0, plain.l0)
-    record = ModelWorld(plain, 12).draw(Nominal(), torch.arange(5), 1).record
+    record = ModelSimulation(plain, 12).draw(NominalNoise(), torch.arange(5), 1).record
     record.y[1, 4] = record.y[3, 7:9] = math.nan
-    method = ParticleFilter(particles, Resample(Systematic(), threshold))
+    method = ParticleFilter(particles, EssResampler(Systematic(), threshold))
     here = on("cpu", method, model, record)
-    compiled = Compiled(method)
+    compiled = CompiledParticleFilter(method)
     for wrapped, fused in ((method, False), (method, True), (compiled, True)):
         there = on("cuda", wrapped, model, record, fused)
         off = (there.mean.cpu() - here.mean).abs() / here.variance.sqrt()
         assert off[:, :3].max() < OFF
-        apart_by_chance = torch.sqrt(2.0 / torch.minimum(here.trace["ess"], there.trace["ess"].cpu())).unsqueeze(-1)
+        apart_by_chance = torch.sqrt(
+            2.0 / torch.minimum(here.trace["ess"], there.trace["ess"].cpu())
+        ).unsqueeze(-1)
         assert (off < 5.0 * apart_by_chance).all()
-        assert (there.log_evidence.cpu() - here.log_evidence).abs().max() < 5.0 * apart_by_chance.square().sum(1).sqrt().max()
-    assert compiled.at_work
+        assert (
+            there.log_evidence.cpu() - here.log_evidence
+        ).abs().max() < 5.0 * apart_by_chance.square().sum(1).sqrt().max()
+    assert compiled.is_active
     model.to("cpu")
 
 
-@pytest.mark.parametrize("engine", ["eager", "loops", "compiled"])
+@pytest.mark.parametrize("engine", ["eager", "kernels", "compiled"])
 def test_a_job_gives_the_same_numbers(engine: str, tmp_path: Path) -> None:
     arrays = {}
     for device in ("cpu", "cuda"):
         words = f"scenario=growth runs=20 particles=200 study={device} device={device}".split()
-        said = pfbench("run", *words, f"engine={'eager' if device == 'cpu' else engine}", home=tmp_path / device)
+        said = pfbench(
+            "run",
+            *words,
+            f"engine={'eager' if device == 'cpu' else engine}",
+            home=tmp_path / device,
+        )
         assert said.code == 0, said.err
         (path,) = (tmp_path / device / "results").rglob("*.npz")
-        arrays[device] = store.load(path).arrays
-        assert store.describe(path)["engine"] == ("eager" if device == "cpu" else engine)
+        arrays[device] = store.read_result(path).arrays
+        assert store.read_metadata(path)["engine"] == ("eager" if device == "cpu" else engine)
     here, there = (torch.as_tensor(arrays[device]["error"]).double() for device in ("cpu", "cuda"))
     assert (here - there)[:, :2].abs().max() < OFF * here.std()
-    square = (here.square() - there.square()).mean((1, 2))  # later as two of their law: paired by world
+    square = (here.square() - there.square()).mean(
+        (1, 2)
+    )  # later as two of their law: paired by world
     assert square.mean().abs() < 4.0 * square.std() / len(square) ** 0.5 + 1e-9
 
 
-@pytest.mark.parametrize("objective", [Bound(), StateError(), InferenceCompilation()], ids=lambda o: type(o).__name__)
+@pytest.mark.parametrize(
+    "objective",
+    [EvidenceLowerBound(), StateErrorLoss(), InferenceCompilation()],
+    ids=lambda o: type(o).__name__,
+)
 def test_a_training_goes_the_same_way(objective: Any, tmp_path: Path) -> None:
     lines = {}
     for device in ("cpu", "cuda"):
-        world = ModelWorld(local_level(1.0, 0.3, 0.0, 1.0), 10)
+        world = ModelSimulation(local_level(1.0, 0.3, 0.0, 1.0), 10)
         model = local_level(1.0, 0.3, 0.0, 1.0).to(device)
-        worlds = [draw_worlds(world, [Nominal()], model, 16, seed, None) for seed in (1, 2)]
-        method = ParticleFilter(16, proposal=Learned(partial(Diagonal, hidden=(8,))))
-        resampler = Soft() if objective.through else Resample(Systematic(), 1.0)
-        training = Training(objective, resampler, particles=16, worlds=16, validation=16, epochs=3, batch=8)
+        worlds = [
+            draw_training_data(world, [NominalNoise()], model, 16, seed, None) for seed in (1, 2)
+        ]
+        method = ParticleFilter(
+            16, proposal=LearnedProposal(partial(DiagonalNormalHead, hidden=(8,)))
+        )
+        resampler = SoftResampler() if objective.through else EssResampler(Systematic(), 1.0)
+        training = Training(
+            objective,
+            resampler,
+            particles=16,
+            training_runs=16,
+            validation_runs=16,
+            epochs=3,
+            batch_size=8,
+        )
         path = train(training, method, model, *worlds, tmp_path / f"{device}.pt")
         with path.with_suffix(".csv").open() as file:
             table = [*csv.DictReader(file)]
-        lines[device] = [[float(line[name]) for name in ("loss", "validation", "ess")] for line in table]
-    torch.testing.assert_close(torch.tensor(lines["cuda"]), torch.tensor(lines["cpu"]), rtol=0.02, atol=0.02)
+        lines[device] = [
+            [float(line[name]) for name in ("loss", "validation", "ess")] for line in table
+        ]
+    torch.testing.assert_close(
+        torch.tensor(lines["cuda"]), torch.tensor(lines["cpu"]), rtol=0.02, atol=0.02
+    )

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pfbench import derivatives
-from pfbench.derivatives import slopes
+from pfbench.core import jacobian as jacobian_module
+from pfbench.core.jacobian import jacobian
 
 R, D = 3, 4
 AT = torch.linspace(0.3, 1.7, R * D, dtype=torch.float64).view(R, 1, D)
@@ -22,11 +22,14 @@ def bent(xi: Tensor) -> Tensor:
 def written() -> Tensor:
     a, b, c, d = AT[:, 0].unbind(-1)
     zero = torch.zeros_like(a)
-    rows = [[torch.cos(a) * b, torch.sin(a), zero, zero], [zero, zero, 1.0 / (1.0 + d), -c / (1.0 + d) ** 2]]
+    rows = [
+        [torch.cos(a) * b, torch.sin(a), zero, zero],
+        [zero, zero, 1.0 / (1.0 + d), -c / (1.0 + d) ** 2],
+    ]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def at_zero(f: derivatives.Map) -> Tensor:
+def at_zero(f: jacobian_module.Map) -> Tensor:
     return f(torch.zeros(R, 1, D, dtype=torch.float64))
 
 
@@ -36,15 +39,17 @@ def of_no_use(*_: object) -> Tensor:
 
 def test_backward_and_forward_give_what_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     with torch.no_grad(), monkeypatch.context() as patched:
-        patched.setattr(derivatives, "_forward", of_no_use)
-        assert torch.allclose(slopes(bent, at_zero(bent), D), written(), rtol=1e-14)
-    monkeypatch.setattr(derivatives, "_backward", of_no_use)
-    assert torch.allclose(slopes(bent, at_zero(bent), D), written(), rtol=1e-14)  # a gradient may be wanted
+        patched.setattr(jacobian_module, "_forward", of_no_use)
+        assert torch.allclose(jacobian(bent, at_zero(bent), D), written(), rtol=1e-14)
+    monkeypatch.setattr(jacobian_module, "_backward", of_no_use)
+    assert torch.allclose(
+        jacobian(bent, at_zero(bent), D), written(), rtol=1e-14
+    )  # a gradient may be wanted
 
 
 def test_a_gradient_goes_through() -> None:
     by = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
-    found = slopes(lambda xi: by**2 * bent(xi), by**2 * at_zero(bent), D)
+    found = jacobian(lambda xi: by**2 * bent(xi), by**2 * at_zero(bent), D)
     (gradient,) = torch.autograd.grad(found.sum(), by)
     assert torch.allclose(gradient, 2.0 * by * written().sum(), rtol=1e-13)
 
@@ -57,13 +62,13 @@ def test_a_branch_not_taken_spoils_nothing() -> None:
         return torch.where(square > 0.0, torch.sqrt(square), 0.0) + bent(xi)
 
     with torch.no_grad():
-        assert derivatives._backward(guarded, at_zero(guarded), D, torch.subtract) is None
-        assert torch.allclose(slopes(guarded, at_zero(guarded), D), written(), rtol=1e-14)
+        assert jacobian_module._backward(guarded, at_zero(guarded), D, torch.subtract) is None
+        assert torch.allclose(jacobian(guarded, at_zero(guarded), D), written(), rtol=1e-14)
 
         def lost(xi: Tensor) -> Tensor:
             return bent(xi) * torch.tensor([1.0, torch.nan, 1.0], dtype=torch.float64).view(R, 1, 1)
 
-        found = slopes(lost, at_zero(lost), D)
+        found = jacobian(lost, at_zero(lost), D)
     assert torch.allclose(found[[0, 2]], written()[[0, 2]], rtol=1e-14)
     assert not bool(torch.isfinite(found[1].sum()))
 
@@ -77,7 +82,10 @@ def test_values_that_wrap_and_values_that_stand_still() -> None:
 
     for mode in (torch.no_grad, torch.enable_grad):
         with mode():
-            assert torch.allclose(slopes(wrapped, at_zero(wrapped), D, turned)[:, 0, 0], torch.tensor(3.0).double())
+            assert torch.allclose(
+                jacobian(wrapped, at_zero(wrapped), D, turned)[:, 0, 0], torch.tensor(3.0).double()
+            )
             assert torch.equal(
-                slopes(lambda xi: AT[..., :2].expand(-1, xi.shape[1], -1), AT[..., :2], D), torch.zeros(R, 2, D).double()
+                jacobian(lambda xi: AT[..., :2].expand(-1, xi.shape[1], -1), AT[..., :2], D),
+                torch.zeros(R, 2, D).double(),
             )

@@ -13,44 +13,58 @@ import torch
 from command_line import pfbench
 from torch import Tensor
 
-from pfbench import covariance, fusion, job, judge, native, store
-from pfbench.draws import MonteCarlo
-from pfbench.filter import gaussian, particle, resamplers, rules
-from pfbench.filter.belief import Cloud, gather
-from pfbench.filter.loop import Estimate, run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.rules import Cubature, Product, Radial5, Simplex3, Unscented
+from pfbench.core import covariance, density
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.filter.belief import ParticleBelief, gather_ancestors
+from pfbench.filter.gaussian import gaussian_filter, linearisation_rules
+from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, UnscentedPoints
+from pfbench.filter.gaussian.spherical_radial import (
+    RadialDegree5,
+    SimplexDegree3,
+    SphericalRadialPoints,
+)
+from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.particle import particle_filter, resampling
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.job import filter_pass, scoring
+from pfbench.kernels import compilation, cpp
 from pfbench.model import base
-from pfbench.model.linear import linear_walk
-from pfbench.noise.regimes import Nominal
-from pfbench.scenario.model_world import ModelWorld
+from pfbench.model.linear_gaussian import linear_walk
+from pfbench.noise.white import NominalNoise
+from pfbench.results import store
+from pfbench.scenario.model_simulation import ModelSimulation
 
 RUNS, N, D = 3, 200, 5
-DRAWS = MonteCarlo(3, torch.arange(RUNS)).at(1)
-compiler = pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no C++ compiler for torch.compile")
+DRAWS = PhiloxStream(3, torch.arange(RUNS)).at_step(1)
+compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("c++", "g++", "clang++"))),
+    reason="no C++ compiler for torch.compile",
+)
 
 
 def test_what_is_not_fused_runs_the_eager_form() -> None:
     seen: list[str] = []
-    half = fusion.fusible(lambda: seen.append("fused"), eager=lambda: seen.append("eager"))
+    half = compilation.compilable(lambda: seen.append("fused"), eager=lambda: seen.append("eager"))
     half()
-    with fusion.fused(False):
+    with compilation.use_compiled(False):
         half()
     assert seen == ["eager", "eager"]
 
 
 def test_the_switch_is_put_back_after_an_error() -> None:
-    with pytest.raises(RuntimeError), fusion.fused():
+    with pytest.raises(RuntimeError), compilation.use_compiled():
         raise RuntimeError
-    assert not fusion._fused.get()
+    assert not compilation._fused.get()
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (0, 2, 1)])
-def test_a_gather_keeps_memory_order_and_takes_the_right_particles(order: tuple[int, int, int]) -> None:
+def test_a_gather_keeps_memory_order_and_takes_the_right_particles(
+    order: tuple[int, int, int],
+) -> None:
     back = [order.index(k) for k in range(3)]
     x = DRAWS.normal("x", N, D).permute(order).contiguous().permute(back)
     ancestors = (DRAWS.uniform("a", N, 1)[..., 0] * N).long()
-    cloud = gather(Cloud(x, x[..., 0], torch.zeros(RUNS)), ancestors)
+    cloud = gather_ancestors(ParticleBelief(x, x[..., 0], torch.zeros(RUNS)), ancestors)
     for r in range(RUNS):
         assert torch.equal(cloud.x[r], x[r][ancestors[r]])
         assert torch.equal(cloud.log_w[r], x[r, ancestors[r], 0])
@@ -63,12 +77,16 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
     hidden[0] = -torch.inf  # a run of which nothing is left
     seen = torch.ones(RUNS, 1, D, dtype=torch.bool)
     seen[1, 0, 2] = False
-    a, n, u = torch.softmax(3.0 * z, -1), torch.full((RUNS, 1), N), torch.tensor([[0.1], [0.5], [0.9]])
+    a, n, u = (
+        torch.softmax(3.0 * z, -1),
+        torch.full((RUNS, 1), N),
+        torch.tensor([[0.1], [0.5], [0.9]]),
+    )
     return [
-        particle._flat_moments(1e3 + x, torch.softmax(z, 1)),
-        particle._normalise(hidden),
+        particle_filter._flat_moments(1e3 + x, torch.softmax(z, 1)),
+        particle_filter._normalise(hidden),
         base._log_normal(0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen),
-        resamplers._evenly(a, n, u.double()),
+        resampling._evenly(a, n, u.double()),
     ]
 
 
@@ -80,7 +98,7 @@ def test_fused_functions_agree_with_eager_ones(dtype: torch.dtype) -> None:
     # the draws are made once: fused and eager normals differ by roundings of float32 (test below)
     x, z = DRAWS.normal("x", N, D).to(dtype), DRAWS.normal("w", N, 1)[..., 0].to(dtype)
     eager = results(x, z)
-    with fusion.fused():
+    with compilation.use_compiled():
         fused = results(x, z)
     torch.testing.assert_close(fused, eager)
 
@@ -90,13 +108,13 @@ def test_fused_functions_agree_with_eager_ones(dtype: torch.dtype) -> None:
 @pytest.mark.filterwarnings("ignore")
 def test_a_filter_runs_alike_fused_and_eagerly() -> None:
     model = linear_walk(1.0, 0.3, 1.0)
-    record = ModelWorld(model, 30).draw(Nominal(), torch.arange(4), 1).record
+    record = ModelSimulation(model, 30).draw(NominalNoise(), torch.arange(4), 1).record
 
-    def run() -> Estimate:
-        return run_filter(ParticleFilter(300), model, record, MonteCarlo(1, torch.arange(4)))
+    def run() -> FilterResult:
+        return run_filter(ParticleFilter(300), model, record, PhiloxStream(1, torch.arange(4)))
 
     eager = run()
-    with fusion.fused(), torch.no_grad():
+    with compilation.use_compiled(), torch.no_grad():
         fused = run()
     # normals agree to 1e-5 and a slot of a resampling may fall to a neighbour: far below the Monte Carlo error
     assert torch.allclose(fused.log_evidence, eager.log_evidence, rtol=0, atol=2e-2)
@@ -114,8 +132,10 @@ def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
     a[5] = torch.nan
     n = torch.tensor([[N], [N // 3], [2], [N], [N], [N]], dtype=dtype)
     u = torch.linspace(1.0 - 1e-9, 1e-9, 6, dtype=torch.float64)[:, None]
-    assert torch.equal(native.systematic(a, n, u), resamplers._counted_evenly(a, n, u))
-    assert torch.equal(native.systematic(a[:1], n[:1], u[:1]), native.systematic(a, n[:1], u)[:1])
+    assert torch.equal(cpp.resample_systematic(a, n, u), resampling._counted_evenly(a, n, u))
+    assert torch.equal(
+        cpp.resample_systematic(a[:1], n[:1], u[:1]), cpp.resample_systematic(a, n[:1], u)[:1]
+    )
 
 
 @compiler
@@ -124,20 +144,29 @@ def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
 def test_roots_by_hand_exist_where_roots_do(dtype: torch.dtype, d: int) -> None:
     """A A' = covariance, A lower triangular, for scales of 1e-4 to 1e4; what has no root does no harm to its neighbours."""
     runs, eps = 21, torch.finfo(dtype).eps
-    half = DRAWS.normal("half", runs * d * d, 1)[0].to(dtype).view(runs, d, d) * torch.logspace(-4, 4, d, dtype=dtype)[:, None]
+    half = (
+        DRAWS.normal("half", runs * d * d, 1)[0].to(dtype).view(runs, d, d)
+        * torch.logspace(-4, 4, d, dtype=dtype)[:, None]
+    )
     whole = half @ half.mT
     whole[1] = torch.nan
     whole[2, 0, 0] *= -1.0
     whole[3, -1], whole[3, :, -1] = 0.0, 0.0  # no spread, and none in the root
-    whole[4] = torch.outer(half[4, 0], half[4, 0])  # of rank 1: rounding decides, and a little more on the diagonal heals it
-    whole[5, 0, -1] = whole[5, -1, 0] = whole[5].diagonal().max() * 1e3  # correlated above 1, unless there is but one component
-    for found, fine in (native.rooted(whole), covariance._factor(whole)):
+    whole[4] = torch.outer(
+        half[4, 0], half[4, 0]
+    )  # of rank 1: rounding decides, and a little more on the diagonal heals it
+    whole[5, 0, -1] = whole[5, -1, 0] = (
+        whole[5].diagonal().max() * 1e3
+    )  # correlated above 1, unless there is but one component
+    for found, fine in (cpp.cholesky_factor(whole), covariance._factor(whole)):
         assert fine.tolist() == [k not in (1, 2, *([5] if d > 1 else [])) for k in range(runs)]
         sd = whole[fine].diagonal(dim1=-2, dim2=-1).sqrt().clamp(min=1e-15)
         off = (found[fine] @ found[fine].mT - whole[fine]) / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
         jitter = 2e-6 if dtype == torch.float32 else 2e-12
         assert float(off.abs().max()) < max(jitter, 20.0 * d * eps)
-        assert float(off[[0, *range(4, len(off))]].abs().max()) < 20.0 * d * eps  # without those that were healed
+        assert (
+            float(off[[0, *range(4, len(off))]].abs().max()) < 20.0 * d * eps
+        )  # without those that were healed
         assert torch.equal(found[fine].triu(1), torch.zeros_like(found[fine]))
         assert bool((found[3, -1] == 0.0).all())
         assert torch.isfinite(found[fine]).all()
@@ -146,11 +175,18 @@ def test_roots_by_hand_exist_where_roots_do(dtype: torch.dtype, d: int) -> None:
 @compiler
 @pytest.mark.parametrize(("runs", "rows", "d"), [(3, 1, 1), (5, 20, 4), (19, 2, 9), (100, 6, 15)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_an_update_by_hand_solves_the_least_squares(dtype: torch.dtype, runs: int, rows: int, d: int) -> None:
+def test_an_update_by_hand_solves_the_least_squares(
+    dtype: torch.dtype, runs: int, rows: int, d: int
+) -> None:
     """Root^-T root^-1 = I + M' Omega^-1 M, of nothing seen too, of priors 1e4 times as wide as noise; NaN stays alone."""
-    m = DRAWS.normal("m", runs * rows * d, 1)[0].to(dtype).view(runs, rows, d) * torch.logspace(-4, 4, d, dtype=dtype)
+    m = DRAWS.normal("m", runs * rows * d, 1)[0].to(dtype).view(runs, rows, d) * torch.logspace(
+        -4, 4, d, dtype=dtype
+    )
     half = DRAWS.normal("noise", runs * rows * rows, 1)[0].to(dtype).view(runs, rows, rows)
-    omega, r = half @ half.mT + torch.eye(rows, dtype=dtype), DRAWS.normal("r", runs * rows, 1)[0].to(dtype).view(runs, rows)
+    omega, r = (
+        half @ half.mT + torch.eye(rows, dtype=dtype),
+        DRAWS.normal("r", runs * rows, 1)[0].to(dtype).view(runs, rows),
+    )
     m[0], m[1] = 0.0, torch.nan
     omega[2, 0, 0] = -1.0
     fine = torch.tensor([k != 1 for k in range(runs)])
@@ -159,25 +195,41 @@ def test_an_update_by_hand_solves_the_least_squares(dtype: torch.dtype, runs: in
     exact_m, exact_r, noise = m[own].double(), r[own].double().unsqueeze(-1), omega[own].double()
     information = torch.eye(d).double() + exact_m.mT @ torch.linalg.solve(noise, exact_m)
     size = information.diagonal(dim1=-2, dim2=-1).sqrt()
-    for shift, root, least, scales, ok in (native.updated(m, r, omega), gaussian._separate_update(m, r, omega)):
+    for shift, root, least, scales, ok in (
+        cpp.kalman_update(m, r, omega),
+        gaussian_filter._separate_update(m, r, omega),
+    ):
         assert torch.equal(ok, rooted)
-        assert torch.equal(torch.isfinite(shift.sum(1) + root.sum((1, 2)) + least)[rooted], fine[rooted])
+        assert torch.equal(
+            torch.isfinite(shift.sum(1) + root.sum((1, 2)) + least)[rooted], fine[rooted]
+        )
         assert torch.equal(root[own].tril(-1), torch.zeros_like(root[own]))
         back, at = torch.linalg.inv(root[own].double()), shift[own].double().unsqueeze(-1)
         eps = 50.0 * (rows + d) * torch.finfo(dtype).eps * float(torch.linalg.cond(noise).max())
         off = (back.mT @ back - information) / (size.unsqueeze(-1) * size.unsqueeze(-2))
         assert float(off.abs().max()) < eps
-        slope = (information @ at - exact_m.mT @ torch.linalg.solve(noise, exact_r)).squeeze(-1) / size
+        slope = (information @ at - exact_m.mT @ torch.linalg.solve(noise, exact_r)).squeeze(
+            -1
+        ) / size
         assert float(slope.abs().max()) < eps * (1.0 + float((size * at.squeeze(-1)).abs().max()))
         residual = exact_r - exact_m @ at
         distance = (residual.mT @ torch.linalg.solve(noise, residual) + at.mT @ at).flatten()
         assert torch.allclose(least[own].double(), distance, rtol=eps, atol=eps)
         logs = 0.5 * torch.linalg.slogdet(noise + exact_m @ exact_m.mT)[1]
-        assert torch.allclose(scales[own].double().log().sum(1), logs, rtol=0, atol=max(eps, 1e-8))  # the sum has rounded, too
+        assert torch.allclose(
+            scales[own].double().log().sum(1), logs, rtol=0, atol=max(eps, 1e-8)
+        )  # the sum has rounded, too
 
 
 @compiler
-@pytest.mark.parametrize("scheme", [Cubature(), Product(Simplex3(), Radial5()), Unscented(kappa=1.0)])
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        CubaturePoints(),
+        SphericalRadialPoints(SimplexDegree3(), RadialDegree5()),
+        UnscentedPoints(kappa=1.0),
+    ],
+)
 @pytest.mark.parametrize("k", [1, 3, 4, 6, 15])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_fit_by_hand_is_the_weighted_one(dtype: torch.dtype, k: int, scheme: Any) -> None:
@@ -193,7 +245,7 @@ def test_a_fit_by_hand_is_the_weighted_one(dtype: torch.dtype, k: int, scheme: A
     left = off - torch.einsum("rkd,pd->rpk", wanted, xi.double())
     both = torch.einsum("p,rpk,rpl->rkl", w.double(), left, left)
     for lie in (r, r.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
-        for m, omega in (native.fitted(lie, xi, w), rules._separate_fit(lie, xi, w)):
+        for m, omega in (cpp.fit_affine(lie, xi, w), linearisation_rules._separate_fit(lie, xi, w)):
             assert torch.equal(torch.isfinite(m.sum((1, 2)) + omega.sum((1, 2))), fine)
             eps = 100.0 * torch.finfo(dtype).eps
             assert torch.allclose(m[fine].double(), wanted[fine], rtol=eps, atol=eps * 10.0)
@@ -202,40 +254,66 @@ def test_a_fit_by_hand_is_the_weighted_one(dtype: torch.dtype, k: int, scheme: A
 
 @compiler
 def test_a_loop_by_hand_gathers() -> None:
-    x, ancestors = DRAWS.normal("x", N, D).permute(2, 0, 1), (DRAWS.uniform("a", 3 * N, 1)[..., 0] * N).long()
+    x, ancestors = (
+        DRAWS.normal("x", N, D).permute(2, 0, 1),
+        (DRAWS.uniform("a", 3 * N, 1)[..., 0] * N).long(),
+    )
     expected = x.gather(2, ancestors.expand(D, -1, -1))
-    assert torch.equal(native.copied(x, ancestors), expected)
-    assert torch.equal(native.copied(x.contiguous().float(), ancestors), expected.float())
+    assert torch.equal(cpp.gather_particles(x, ancestors), expected)
+    assert torch.equal(cpp.gather_particles(x.contiguous().float(), ancestors), expected.float())
 
 
 @compiler
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (0, 2, 1)])
-def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(order: tuple[int, int, int]) -> None:
+def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(
+    order: tuple[int, int, int],
+) -> None:
     back = [order.index(k) for k in range(3)]
-    x, w = DRAWS.normal("x", N, D).permute(order).contiguous().permute(back), torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1)
+    x, w = (
+        DRAWS.normal("x", N, D).permute(order).contiguous().permute(back),
+        torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1),
+    )
     x[1, 5, 2], x[2, 4, 0] = torch.nan, torch.inf
-    y, scale, constant = x[:, 0], torch.rand(RUNS, D, dtype=torch.float64), torch.rand(RUNS, dtype=torch.float64)
+    y, scale, constant = (
+        x[:, 0],
+        torch.rand(RUNS, D, dtype=torch.float64),
+        torch.rand(RUNS, dtype=torch.float64),
+    )
     scale[1, 1] = 0.0  # not seen
     torch.testing.assert_close(
-        native.log_normal(y, x, scale, constant), base._run_quadratic(y, x, scale, constant), equal_nan=True
+        cpp.log_normal(y, x, scale, constant),
+        density._run_quadratic(y, x, scale, constant),
+        equal_nan=True,
     )
-    torch.testing.assert_close(native.moments(x, w), particle._separate_moments(x, w), equal_nan=True)
+    torch.testing.assert_close(
+        cpp.weighted_moments(x, w), particle_filter._separate_moments(x, w), equal_nan=True
+    )
     w[2, 3] = torch.nan
-    torch.testing.assert_close(native.totals(w), particle._separate_totals(w), equal_nan=True)
+    torch.testing.assert_close(
+        cpp.sum_and_squares(w), particle_filter._separate_totals(w), equal_nan=True
+    )
 
 
 @compiler
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 7, 9])
-def test_a_loop_by_hand_spreads_about_the_mean_in_any_memory_order(dtype: torch.dtype, size: int) -> None:
+def test_a_loop_by_hand_spreads_about_the_mean_in_any_memory_order(
+    dtype: torch.dtype, size: int
+) -> None:
     """One particle, several chunks of them and a rest; a particle that is not finite stays in its run and groups."""
     groups = torch.stack([torch.arange(size), torch.arange(size).flip(0) + 2])
     for particles in (1, 50, 300, 1000):
-        x, w = DRAWS.normal("x", particles, 11).to(dtype), torch.softmax(DRAWS.normal("w", particles, 1)[..., 0].to(dtype), -1)
+        x, w = (
+            DRAWS.normal("x", particles, 11).to(dtype),
+            torch.softmax(DRAWS.normal("w", particles, 1)[..., 0].to(dtype), -1),
+        )
         x[1, particles // 2, 0] = torch.nan
         mean = DRAWS.normal("mean", 1, 11)[:, 0].to(dtype)
         for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
-            found, wanted = native.spread(laid, mean, w, groups), particle._separate_spread(x, mean, w, groups)
+            found, wanted = (
+                cpp.group_covariance(laid, mean, w, groups),
+                particle_filter._separate_spread(x, mean, w, groups),
+            )
             eps = torch.finfo(dtype).eps
             torch.testing.assert_close(found, wanted, equal_nan=True, rtol=1e3 * eps, atol=20 * eps)
 
@@ -246,23 +324,38 @@ def test_a_loop_by_hand_spreads_about_the_mean_in_any_memory_order(dtype: torch.
 def test_a_loop_by_hand_measures_by_a_covariance(dtype: torch.dtype, systems: int, d: int) -> None:
     """Metres beside radians, a rounding below zero, several groups of a run, one covariance for all; a NaN stays in its place."""
     root = DRAWS.normal("root", d * systems * (d + 2), 1)[0].to(dtype).view(systems, d, d + 2)
-    e, unit = DRAWS.normal("e", systems * d, 1)[0].to(dtype).view(systems, d), torch.logspace(-6, 6, d, dtype=dtype)
+    e, unit = (
+        DRAWS.normal("e", systems * d, 1)[0].to(dtype).view(systems, d),
+        torch.logspace(-6, 6, d, dtype=dtype),
+    )
     wide = root.double() @ root.double().mT
     wide[-1, -1, -1] *= -1.0
     given = ((unit[:, None] * unit).double() * wide).to(dtype)
-    found, wanted = native.squared_length(unit * e, given), covariance._solved_length(e.double(), wide).to(dtype)
+    found, wanted = (
+        cpp.squared_mahalanobis(unit * e, given),
+        covariance._solved_length(e.double(), wide).to(dtype),
+    )
     # by the inverse's elements, which two systems of 15 x 17 numbers have up to 1e3 of
     torch.testing.assert_close(found, wanted, rtol=1e5 * torch.finfo(dtype).eps, atol=0.0)
-    grouped = native.squared_length(e.unsqueeze(1).expand(-1, 2, -1), wide.to(dtype).unsqueeze(1).expand(-1, 2, -1, -1))
-    torch.testing.assert_close(grouped, wanted.unsqueeze(1).expand(-1, 2), rtol=1e5 * torch.finfo(dtype).eps, atol=0.0)
+    grouped = cpp.squared_mahalanobis(
+        e.unsqueeze(1).expand(-1, 2, -1), wide.to(dtype).unsqueeze(1).expand(-1, 2, -1, -1)
+    )
+    torch.testing.assert_close(
+        grouped, wanted.unsqueeze(1).expand(-1, 2), rtol=1e5 * torch.finfo(dtype).eps, atol=0.0
+    )
     one = torch.linalg.inv(wide[:1]) * e.double().unsqueeze(1) * e.double().unsqueeze(2)
     torch.testing.assert_close(
-        native.squared_length(e, wide[:1].to(dtype)).double(), one.sum((1, 2)), rtol=1e6 * torch.finfo(dtype).eps, atol=1e-6
+        cpp.squared_mahalanobis(e, wide[:1].to(dtype)).double(),
+        one.sum((1, 2)),
+        rtol=1e6 * torch.finfo(dtype).eps,
+        atol=1e-6,
     )
     e[0], given[:, 0], given[:, :, 0] = torch.nan, 0.0, 0.0
-    assert torch.isnan(native.squared_length(e, wide.to(dtype))).tolist() == [True] + [False] * (systems - 1)
+    assert torch.isnan(cpp.squared_mahalanobis(e, wide.to(dtype))).tolist() == [True] + [False] * (
+        systems - 1
+    )
     for lost in (given, torch.zeros_like(given)):
-        assert not torch.isfinite(native.squared_length(e, lost)).any()
+        assert not torch.isfinite(cpp.squared_mahalanobis(e, lost)).any()
         assert not torch.isfinite(covariance._solved_length(e, lost)).any()
 
 
@@ -286,11 +379,17 @@ def test_a_loop_by_hand_scores_components(dtype: torch.dtype, particles: int) ->
     log_w[1, 1 : particles // 3] = -torch.inf
     log_w[2] = 0.0
     w = torch.softmax(log_w, -1)
-    crps, below = judge._separate_marginals(error.double(), x.double(), w.double())
-    eps, known, far = torch.finfo(dtype).eps, ~torch.isnan(crps), (w.unsqueeze(-1) * (error.unsqueeze(1) + x).abs()).sum(1)
+    crps, below = scoring._separate_marginals(error.double(), x.double(), w.double())
+    eps, known, far = (
+        torch.finfo(dtype).eps,
+        ~torch.isnan(crps),
+        (w.unsqueeze(-1) * (error.unsqueeze(1) + x).abs()).sum(1),
+    )
     for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
-        found = native.marginal_scores(error, laid, w)
-        off = torch.where(torch.isinf(crps) & (found[0] == crps), 0.0, (found[0].double() - crps).abs())
+        found = cpp.marginal_scores(error, laid, w)
+        off = torch.where(
+            torch.isinf(crps) & (found[0] == crps), 0.0, (found[0].double() - crps).abs()
+        )
         assert (off[known] <= 20 * eps * (far[known] + torch.finfo(dtype).tiny)).all()
         torch.testing.assert_close(found[1].double(), below, rtol=0.0, atol=100 * eps)
         assert torch.isnan(found[0]).nonzero().tolist() == [[0, 0], [2, 6]]
@@ -303,11 +402,15 @@ def test_a_loop_by_hand_scores_vectors(dtype: torch.dtype, points: int) -> None:
     x = 3.0 + DRAWS.normal("x", points, 6).to(dtype)
     x[1, 0, 2] = torch.nan
     for parts in ([0], [3, 1, 5], [0, 1, 2, 3, 4, 5]):
-        found, wanted = native.energy_score(x[:, :, parts]), judge._separate_energy(x[:, :, parts])
-        torch.testing.assert_close(found, wanted, rtol=1e2 * torch.finfo(dtype).eps, atol=0.0, equal_nan=True)
+        found, wanted = cpp.energy_score(x[:, :, parts]), scoring._separate_energy(x[:, :, parts])
+        torch.testing.assert_close(
+            found, wanted, rtol=1e2 * torch.finfo(dtype).eps, atol=0.0, equal_nan=True
+        )
 
 
-def test_what_no_compiler_improves_runs_eagerly_where_its_loop_does_not_compile(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_no_compiler_improves_runs_eagerly_where_its_loop_does_not_compile(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     def refused(a: Tensor) -> Tensor:
         raise OSError("no C++ compiler")
 
@@ -317,45 +420,75 @@ def test_what_no_compiler_improves_runs_eagerly_where_its_loop_does_not_compile(
         compiled.append(torch.compiler.is_compiling())
         return 2.0 * a
 
-    with fusion.fused():
-        assert float(fusion.fusible(separate, by_hand=refused, whole=False, compiles=False)(torch.ones(()))) == 2.0
+    with compilation.use_compiled():
+        assert (
+            float(
+                compilation.compilable(
+                    separate, operator=refused, keep_in_graph=False, use_torch_compiler=False
+                )(torch.ones(()))
+            )
+            == 2.0
+        )
     assert compiled == [False]
-    assert "refused does not compile here (OSError); it runs eagerly instead" in caplog.text
+    assert "refused does not compile here (OSError). Using eager mode" in caplog.text
 
 
 @compiler
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("particles", [1, 63, 64, 200])
-def test_a_loop_by_hand_moves_by_the_coefficients_that_are_not_zero(dtype: torch.dtype, particles: int) -> None:
+def test_a_loop_by_hand_moves_by_the_coefficients_that_are_not_zero(
+    dtype: torch.dtype, particles: int
+) -> None:
     def some(purpose: str, n: int, w: int) -> Tensor:
         return DRAWS.normal(purpose, n, w).to(dtype)
 
     x, w = some("x", particles, D), some("w", particles, 2)
     phi, gain = some("phi", D, D), some("gain", D, 2)
-    phi[:, :, 1], phi[:, 3], gain[1] = 0.0, 0.0, 0.0  # a state that nothing sees, one that is noise alone, a run without noise
-    still, steady = torch.zeros(2, dtype=dtype).expand_as(w), torch.tensor([0.0, 2.0], dtype=dtype).expand_as(w)
-    for (a, b), noise in product(((phi, gain), (phi[:1], gain[:1]), (phi[:1], gain)), (w, still, steady)):
+    phi[:, :, 1], phi[:, 3], gain[1] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # a state that nothing sees, one that is noise alone, a run without noise
+    still, steady = (
+        torch.zeros(2, dtype=dtype).expand_as(w),
+        torch.tensor([0.0, 2.0], dtype=dtype).expand_as(w),
+    )
+    for (a, b), noise in product(
+        ((phi, gain), (phi[:1], gain[:1]), (phi[:1], gain)), (w, still, steady)
+    ):
         parts = ((a, x), (b, noise))
         moved = sum(torch.einsum("rij,rnj->irn", by.expand(RUNS, -1, -1), of) for by, of in parts)
-        torch.testing.assert_close(native.affine(a, x, b, noise), moved)
+        torch.testing.assert_close(cpp.propagate_affine(a, x, b, noise), moved)
         torch.testing.assert_close(base._dense_affine(a, x, b, noise), moved)
 
 
 @compiler
 def test_a_gradient_goes_round_the_loops_by_hand() -> None:
-    x, w = DRAWS.normal("x", N, D).requires_grad_(), torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1)
-    with fusion.fused():
-        particle._flat_moments(x, w)[0].sum().backward()
+    x, w = (
+        DRAWS.normal("x", N, D).requires_grad_(),
+        torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1),
+    )
+    with compilation.use_compiled():
+        particle_filter._flat_moments(x, w)[0].sum().backward()
     torch.testing.assert_close(x.grad, w.unsqueeze(-1).expand_as(x))
 
 
 @compiler
 def test_small_numbers_are_still_numbers_after_the_loops_are_loaded() -> None:
-    native.normals(torch.tensor(1), 2, torch.tensor(0), torch.arange(2), 2, 2)
-    assert float(torch.tensor(1e-310, dtype=torch.float64) / 2) > 0.0  # -ffast-math, when linked, would make it 0
+    cpp.philox_normals(torch.tensor(1), 2, torch.tensor(0), torch.arange(2), 2, 2)
+    assert (
+        float(torch.tensor(1e-310, dtype=torch.float64) / 2) > 0.0
+    )  # -ffast-math, when linked, would make it 0
 
 
-WALK = ("run", "scenario=linear_walk", "scenario.steps=20", "runs=4", "particles=200", "fresh=true")
+WALK = (
+    "run",
+    "scenario=linear_walk",
+    "scenario.steps=20",
+    "runs=4",
+    "particles=200",
+    "overwrite=true",
+)
 
 
 @compiler
@@ -363,49 +496,69 @@ WALK = ("run", "scenario=linear_walk", "scenario.steps=20", "runs=4", "particles
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_compiled_job_gives_the_numbers_of_an_eager_one(tmp_path: Path, dtype: str) -> None:
     found = {}
-    for engine in ("eager", "loops"):
+    for engine in ("eager", "kernels"):
         said = pfbench(*WALK, f"engine={engine}", f"dtype={dtype}", home=tmp_path)
         assert said.code == 0, said.err
-        (file,) = (tmp_path / "results" / "adhoc").glob("*.npz")  # one key: an engine changes no result
-        found[engine] = store.load(file)
+        (file,) = (tmp_path / "results" / "adhoc").glob(
+            "*.npz"
+        )  # one key: an engine changes no result
+        found[engine] = store.read_result(file)
         assert found[engine].meta["engine"] == engine
     # the same draws, to 1e-5; a particle in a few thousand falls to a neighbouring slot
-    eager, compiled = (found[engine].arrays for engine in ("eager", "loops"))
+    eager, compiled = (found[engine].arrays for engine in ("eager", "kernels"))
     for name in ("error", "sd", "log_evidence"):
         assert np.allclose(compiled[name], eager[name], rtol=0, atol=2e-2), name
 
 
-def test_where_nothing_compiles_one_line_says_so(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_where_nothing_compiles_one_line_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     model, method = linear_walk(1.0, 0.3, 1.0), ParticleFilter(100)
 
     def refused(*given: Any) -> None:
         raise OSError("no C++ compiler")
 
-    monkeypatch.setattr(job.MonteCarlo, "uniform", refused)
-    assert not job.fuses("compiled", method, model, 10)
+    monkeypatch.setattr(filter_pass.PhiloxStream, "uniform", refused)
+    assert not filter_pass.should_compile("compiled", method, model, 10)
     assert [record.getMessage() for record in caplog.records] == [
-        "engine=compiled: nothing compiles here (OSError); going on eagerly"
+        "engine=compiled: compilation failed (OSError). Using eager mode"
     ]
 
 
 def test_small_jobs_are_not_compiled_unless_asked() -> None:
     model, method = linear_walk(1.0, 0.3, 1.0), ParticleFilter(100)
-    assert not job.fuses("auto", method, model, 1000)
-    assert not job.fuses("eager", method, model, 10**9)
-    assert not job.fuses("auto", gaussian.GaussianFilter(rules.Points(Cubature())), model, 10**6)
+    assert not filter_pass.should_compile("auto", method, model, 1000)
+    assert not filter_pass.should_compile("eager", method, model, 10**9)
+    assert not filter_pass.should_compile(
+        "auto",
+        gaussian_filter.GaussianFilter(
+            linearisation_rules.SigmaPointLinearisation(CubaturePoints())
+        ),
+        model,
+        10**6,
+    )
 
 
 @compiler
 def test_large_jobs_are_compiled_unasked() -> None:
     model = linear_walk(1.0, 0.3, 1.0)
-    for method in (ParticleFilter(100), gaussian.GaussianFilter(rules.Points(Cubature()))):
-        assert job.fuses("auto", method, model, 10**9)
+    for method in (
+        ParticleFilter(100),
+        gaussian_filter.GaussianFilter(
+            linearisation_rules.SigmaPointLinearisation(CubaturePoints())
+        ),
+    ):
+        assert filter_pass.should_compile("auto", method, model, 10**9)
 
 
 @compiler
-def test_a_compilation_is_told_with_its_cost(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_compilation_is_told_with_its_cost(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level("INFO")
     clock = iter((0.0, 3.21))
-    monkeypatch.setattr(job.time, "perf_counter", lambda: next(clock))
-    assert job.fuses("compiled", ParticleFilter(100), linear_walk(1.0, 0.3, 1.0), 10)
-    assert "engine=compiled: inner loops compiled in 3.2 s; later jobs find them ready" in caplog.text
+    monkeypatch.setattr(filter_pass.time, "perf_counter", lambda: next(clock))
+    assert filter_pass.should_compile(
+        "compiled", ParticleFilter(100), linear_walk(1.0, 0.3, 1.0), 10
+    )
+    assert "engine=compiled: inner loops compiled in 3.2 s. Later jobs reuse them" in caplog.text

@@ -11,12 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))  # scripts, not a package
+sys.path.insert(
+    0, str(Path(__file__).resolve().parent.parent / "benchmarks")
+)  # scripts, not a package
 import gpu
 import workload
 
 CPU = torch.device("cpu")
-compiles = pytest.mark.skipif(not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no C++ compiler")
+compiles = pytest.mark.skipif(
+    not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no C++ compiler"
+)
 
 
 def counted(what: Callable[[], object]) -> int:
@@ -45,7 +49,7 @@ def test_a_step_moves_more_than_it_needs() -> None:
 @compiles
 def test_engines_agree_and_are_reported() -> None:
     work = workload.make(6, 10, 60)
-    found = [gpu.measure(engine, work, CPU, rounds=2) for engine in ("loops", "eager")]
+    found = [gpu.measure(engine, work, CPU, rounds=2) for engine in ("kernels", "eager")]
     assert gpu.disagreements(found) == []
     assert [len(one.seconds) for one in found] == [2, 2]
     page = gpu.page(found, [], 1e10, CPU)
@@ -58,7 +62,16 @@ def test_engines_agree_and_are_reported() -> None:
 
 
 def test_goals_are_those_of_the_first_size() -> None:
-    one = gpu.Measured("compiled", *gpu.SIZES[0], 1000, 9.0, [0.3, 0.4, 0.5], 2**30, None, np.linspace(-0.1, 0.1, 1000))
+    one = gpu.Measured(
+        "compiled",
+        *gpu.SIZES[0],
+        1000,
+        9.0,
+        [0.3, 0.4, 0.5],
+        2**30,
+        None,
+        np.linspace(-0.1, 0.1, 1000),
+    )
     rate = 144 * 1000 * 10_000 * 200 / 0.4 / 0.6  # of which 0.6 is put to use
     assert "| seconds | 0.4 | 0.5, met | 0.2, missed |" in gpu.goals([one], rate)
     assert "| bytes needed, share of the copy rate | 0.6 | 0.5, met | - |" in gpu.goals([one], rate)
@@ -75,7 +88,17 @@ def test_a_device_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.slow
 def test_the_whole_of_it_runs_on_the_cpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     # at this scale the two sizes are one, which is compiled once
-    words = ["gpu.py", "--device", "cpu", "--scale", "0.001", "--rounds", "1", "--out", str(tmp_path)]
+    words = [
+        "gpu.py",
+        "--device",
+        "cpu",
+        "--scale",
+        "0.001",
+        "--rounds",
+        "1",
+        "--out",
+        str(tmp_path),
+    ]
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit) as end:
         gpu.main()

@@ -1,56 +1,61 @@
-"""The rules of the house: who may import whom, what is packaged, how files are called. Read from the syntax trees."""
+"""The structure of the package: floors, sizes, single definitions, doors and packaging, from the syntax trees."""
 
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "pfbench"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-# what each part of the house may import; a part may always import itself
-FAST = {"fusion", "native"}
-GROUND = {"record", "draws", "covariance", "derivatives"}
-CHARTED = GROUND | {"nav", "chart"}
-MODELLED = CHARTED | {"model", "noise"}
-PLAIN = {"metrics", "store"}
-MAY_IMPORT: dict[str, set[str]] = {
-    **{part: FAST | {"cuda"} for part in GROUND},
-    **{part: set() for part in PLAIN | {"cuda"}},
-    **{part: {"cuda"} for part in FAST},
-    "nav": GROUND,
-    "chart": GROUND | {"nav"},
-    "model": CHARTED | FAST,
-    "noise": CHARTED,
-    "filter": CHARTED | FAST | {"model.base"},
-    **{part: CHARTED | {"model.base", "filter"} for part in ("bound", "memory")},
-    "judge": CHARTED | FAST | {"model.base", "filter"},
-    "budget": CHARTED | {"model.base", "filter", "judge", "memory", "store"},
-    "scenario": MODELLED,
-    "lessons": MODELLED | {"scenario"},
-    "train": MODELLED | PLAIN | {"filter", "scenario", "lessons"},
-    "job": MODELLED | PLAIN | FAST | {"filter", "bound", "judge", "memory", "budget", "scenario"},
-    "ppl": MODELLED | {"filter", "report.canvas"},
-    "survey": MODELLED | PLAIN | FAST | {"filter", "bound", "judge", "scenario", "job"},
-    "report": PLAIN,
-    "cli": MODELLED | PLAIN | {"filter", "scenario", "job", "survey", "train", "ppl", "report"},
-    "pieces": set(),
-    "__main__": {"cli"},
+# The floors from the ground up. A folder may import the folders of lower floors, and itself.
+FLOORS = (
+    ("core", "kernels"),
+    ("nav",),
+    ("model", "noise"),
+    ("filter", "scenario"),
+    ("results",),
+    ("report", "job", "learn", "ppl", "testing"),
+    ("claims",),
+    ("cli",),
+    ("__main__",),
+)
+FLOOR = {folder: height for height, floor in enumerate(FLOORS) for folder in floor}
+# core and kernels form the ground floor together: draws and covariances call operators, operators use nothing above
+TOGETHER = {("core", "kernels"), ("kernels", "core")}
+ONLY = {  # (importing folder, imported folder): the modules that it may name
+    ("filter", "model"): {"pfbench.model.base"},
+    ("ppl", "report"): {"pfbench.report.plots.plotting"},
 }
-UPSTAIRS = {"job", "train", "cli"}  # may ask the package itself, for its version
+NEVER = {("filter", "noise"), ("scenario", "results"), ("scenario", "filter"), ("nav", "kernels")}
+AT_THE_SAME_FLOOR = {("ppl", "report"), ("learn", "job")}
 FOREIGN = {"hydra": {"cli", "job"}, "omegaconf": {"cli", "job"}}
-NO_ENGINE = ("torch", "pyro", "hydra")  # for a report, files are enough
+NO_ENGINE = ("torch", "pyro", "hydra")  # stored files are enough for these folders
+STORED = {"results", "report", "claims"}
+LONGEST_FILE, LONGEST_FUNCTION = 250, 25
+MODULES_IN_A_FOLDER = 15
+
+
+def module_name(file: Path) -> str:
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@cache
+def tree_of(file: Path) -> ast.Module:
+    return ast.parse(file.read_text())
 
 
 def imported(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
-    """Dotted names of all imports, wherever they stand; `from a import b` gives a.b, since b may be a module."""
+    """Yield the dotted names of all imports; `from a import b` gives a.b, since b may be a module."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -60,82 +65,177 @@ def imported(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
             yield from (f"{stem}.{alias.name}" for alias in node.names)
 
 
-def violations(source: str, module: str) -> list[str]:
-    """Imports that the floors forbid, for a module such as pfbench.filter.loop."""
+def allowed(folder: str, name: str) -> bool:
+    """Return whether a module of a folder may import a dotted name of pfbench."""
+    parts = name.split(".")
+    target = parts[1] if len(parts) > 1 else ""
+    if target not in FLOOR:  # the package itself: its version and `load`
+        return FLOOR[folder] >= FLOOR["job"]
+    pair = (folder, target)
+    if target == folder or pair in TOGETHER:
+        return True
+    if name.startswith("pfbench.core.lazy_import"):
+        return True
+    if pair in NEVER:
+        return False
+    if pair in ONLY and not any(name.startswith(module) for module in ONLY[pair]):
+        return False
+    return FLOOR[target] < FLOOR[folder] or pair in AT_THE_SAME_FLOOR
+
+
+def violations(source: str | ast.AST, module: str) -> list[str]:
+    """Return the imports that the floors forbid, for a module such as pfbench.filter.loop."""
+    tree = ast.parse(source) if isinstance(source, str) else source
     parts = module.split(".")
-    part = parts[1]
-    found = []
-    for name in imported(ast.parse(source), tuple(parts[:-1])):
-        top, *rest = name.split(".")
-        if top == "pfbench":
-            inside = rest[0] if rest else ""
-            allowed = MAY_IMPORT[part] | {part}
-            at_the_door = inside in ("", "__version__", "load") and part in UPSTAIRS
-            if not ({inside, ".".join(rest[:2])} & allowed or at_the_door):
-                found.append(f"{module} imports {name}")
-        elif (top in FOREIGN and part not in FOREIGN[top]) or (top in NO_ENGINE and part in PLAIN | {"report"}):
-            found.append(f"{module} imports {name}")
-    return found
+    folder = parts[1] if len(parts) > 1 else "__main__"
+    forbidden = []
+    for name in imported(tree, tuple(parts[:-1])):
+        top = name.split(".")[0]
+        wrong = (
+            not allowed(folder, name)
+            if top == "pfbench"
+            else (top in FOREIGN and folder not in FOREIGN[top])
+            or (top in NO_ENGINE and folder in STORED)
+        )
+        if wrong:
+            forbidden.append(f"{module} imports {name}")
+    return forbidden
 
 
-def module_name(file: Path) -> str:
-    parts = file.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+def imported_at_import(file: Path) -> list[str]:
+    """Return the imports that run with the module: not inside functions, not for the type checker only."""
+    body = [
+        node for node in tree_of(file).body if not isinstance(node, ast.FunctionDef | ast.ClassDef)
+    ]
+    body = [
+        node
+        for node in body
+        if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))
+    ]
+    return list(imported(ast.Module(body, []), tuple(module_name(file).split(".")[:1])))
 
 
-@pytest.mark.parametrize("file", FILES, ids=module_name)
-def test_floors(file: Path) -> None:
-    if file == PACKAGE / "__init__.py":  # the lazy door
-        assert not [name for name in imported_at_import(file) if name.split(".")[0] in (*NO_ENGINE, "pfbench")]
-        return
-    part = module_name(file).split(".")[1]
-    assert part in MAY_IMPORT, f"{part} has no floor: decide who may import it"
-    assert violations(file.read_text(), module_name(file)) == []
+def test_floors() -> None:
+    inside = [file for file in FILES if file != PACKAGE / "__init__.py"]
+    assert {module_name(file).split(".")[1] for file in inside} <= set(FLOOR)
+    assert [line for file in inside for line in violations(tree_of(file), module_name(file))] == []
+    first = [
+        name
+        for name in imported_at_import(PACKAGE / "__init__.py")
+        if name.split(".")[0] in (*NO_ENGINE, "pfbench")
+    ]
+    assert first == []  # the lazy door
 
 
 BROKEN = {
-    "pfbench.record": "from pfbench.chart import Chart",
-    "pfbench.nav.earth": "import pfbench.chart",
-    "pfbench.chart": "from pfbench import model",
-    "pfbench.model.toys": "from pfbench.noise.regimes import Nominal",
-    "pfbench.filter.loop": "from pfbench.model.toys import Growth",
-    "pfbench.filter.gaussian": "def f():\n    from pfbench.scenario import base",
+    "pfbench.core.record": "from pfbench.nav.earth import radii",
+    "pfbench.nav.earth": "import pfbench.model.base",
+    "pfbench.core.chart": "from pfbench import model",
+    "pfbench.model.textbook": "from pfbench.noise.white import NominalNoise",
+    "pfbench.filter.loop": "from pfbench.model.textbook import UnivariateGrowth",
+    "pfbench.filter.gaussian.gaussian_filter": "def f():\n    from pfbench.scenario import base",
     "pfbench.scenario.base": "from pfbench.filter import loop",
-    "pfbench.filter.rules": "from ..model import linear",
-    "pfbench.job": "from pfbench.report import frame",
-    "pfbench.report.frame": "import torch",
-    "pfbench.metrics": "from pfbench.record import Record",
-    "pfbench.store": "from pyro import distributions",
+    "pfbench.filter.smoothing": "from ..model import linear_gaussian",
+    "pfbench.job.plan": "from pfbench.report import page",
+    "pfbench.report.page": "import torch",
+    "pfbench.results.metrics": "from pfbench.job import plan",
+    "pfbench.results.store": "from pyro import distributions",
     "pfbench.model.base": "from hydra.utils import instantiate",
 }
 
 
-@pytest.mark.parametrize("module", BROKEN)
-def test_the_floors_see_what_breaks_them(module: str) -> None:
-    assert len(violations(BROKEN[module], module)) == 1
+def test_the_floor_test_finds_forbidden_imports() -> None:
+    assert {
+        module: len(violations(source, module)) for module, source in BROKEN.items()
+    } == dict.fromkeys(BROKEN, 1)
+    fine = "from pfbench.model.base import StaticModel\nfrom . import smoothing\nimport torch"
+    assert violations(fine, "pfbench.filter.loop") == []
+    assert violations("from pfbench.results import store\nimport hydra", "pfbench.job.plan") == []
 
 
-def test_the_floors_let_through_what_is_allowed() -> None:
-    assert violations("from pfbench.model.base import AtRest\nfrom . import rules\nimport torch", "pfbench.filter.loop") == []
-    assert violations("from pfbench import store\nimport hydra", "pfbench.job") == []
+def test_nothing_loose_at_the_top_and_folders_are_small() -> None:
+    assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == {
+        "__init__.py",
+        "__main__.py",
+        "py.typed",
+    }
+    sizes = defaultdict(list)
+    for file in FILES:
+        if file.stem != "__init__":
+            sizes[file.parent].append(file.name)
+    assert {
+        folder.name: len(names)
+        for folder, names in sizes.items()
+        if len(names) > MODULES_IN_A_FOLDER
+    } == {}
+    assert [
+        f for f in FILES if f.stem in ("utils", "util", "helpers", "helper", "common", "misc")
+    ] == []
 
 
-def imported_at_import(file: Path) -> list[str]:
-    """Imports that run when the module does: not inside functions, not for the type checker only."""
-    body = [node for node in ast.parse(file.read_text()).body if not isinstance(node, ast.FunctionDef | ast.ClassDef)]
-    body = [node for node in body if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))]
-    return list(imported(ast.Module(body, []), module_name(file).split(".")[:1]))
+def test_a_public_name_is_defined_once() -> None:
+    homes = defaultdict(list)
+    for file in FILES:
+        for node in tree_of(file).body:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+                homes[node.name].append(module_name(file))
+    assert {
+        name: modules for name, modules in homes.items() if len(modules) > 1 and name != "main"
+    } == {}
 
 
-def test_the_command_line_opens_its_rooms_lazily() -> None:
-    names = imported_at_import(PACKAGE / "cli.py")
-    assert not [n for n in names if n.split(".")[0] in ("torch", "pyro") or n.startswith(("pfbench.job", "pfbench.report"))]
+def statements(function: ast.FunctionDef) -> int:
+    """Count the statements of a function without its docstring and nested functions' own."""
+    body = [node for node in ast.walk(function) if isinstance(node, ast.stmt)]
+    return len(body) - 1 - (ast.get_docstring(function) is not None)
+
+
+# Today's counts of files over 250 lines and of functions over 25 statements. They may only fall.
+LIMITS = {"files": 45, "functions": 17}
+
+
+def test_files_and_functions_are_short() -> None:
+    files = {
+        module_name(f): n for f in FILES if (n := len(f.read_text().splitlines())) > LONGEST_FILE
+    }
+    functions = {
+        f"{module_name(file)}.{node.name}": n
+        for file in FILES
+        for node in ast.walk(tree_of(file))
+        if isinstance(node, ast.FunctionDef) and (n := statements(node)) > LONGEST_FUNCTION
+    }
+    assert len(files) <= LIMITS["files"], sorted(files.items(), key=lambda item: -item[1])
+    assert len(functions) <= LIMITS["functions"], sorted(
+        functions.items(), key=lambda item: -item[1]
+    )
+
+
+def test_the_doors_list_what_they_export() -> None:
+    for folder in ("nav", "model", "noise", "scenario", "filter", "learn", "ppl"):
+        door = importlib.import_module(f"pfbench.{folder}")
+        assert sorted(door.__all__) == dir(door)
+        assert all(hasattr(door, name) for name in door.__all__)
+
+
+def test_the_command_line_imports_lazily() -> None:
+    names = [name for file in (PACKAGE / "cli").glob("*.py") for name in imported_at_import(file)]
+    assert not [
+        n for n in names if n.split(".")[0] in ("torch", "pyro") or n.startswith("pfbench.report")
+    ]
 
 
 def test_a_report_needs_no_engine() -> None:
-    modules = [module_name(f) for f in FILES if module_name(f).startswith(("pfbench.report", "pfbench.metrics", "pfbench.store"))]
-    code = f"import sys, {', '.join(modules)}; print([m for m in {NO_ENGINE!r} if m in sys.modules])"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    modules = [
+        module_name(f)
+        for f in FILES
+        if module_name(f).startswith(("pfbench.report", "pfbench.results", "pfbench.claims"))
+    ]
+    code = (
+        f"import sys, {', '.join(modules)}; print([m for m in {NO_ENGINE!r} if m in sys.modules])"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     assert run.stdout.strip() == "[]"
 
 
@@ -145,13 +245,19 @@ def test_the_package_list_is_what_is_on_disk() -> None:
     on_disk = {module_name(f) for f in PACKAGE.rglob("__init__.py")} | set(homes)
     assert set(setuptools["packages"]) == on_disk
     assert all((ROOT / folder / "__init__.py").is_file() for folder in homes.values())
-    assert {f.parent for f in FILES} == {f.parent for f in PACKAGE.rglob("__init__.py")}  # no folder left outside
-
-
-def test_no_module_without_a_subject() -> None:
-    assert [f for f in FILES if f.stem in ("utils", "util", "helpers", "helper", "common", "misc")] == []
+    assert {f.parent for f in FILES} == {
+        f.parent for f in PACKAGE.rglob("__init__.py")
+    }  # no folder left outside
 
 
 def test_test_files_have_names_of_their_own() -> None:
     names = [f.name for f in (ROOT / "tests").rglob("test_*.py")]
-    assert sorted(names) == sorted(set(names))  # without __init__.py, two of one name hide each other
+    assert sorted(names) == sorted(
+        set(names)
+    )  # without __init__.py, two of one name hide each other
+
+
+def test_tests_do_not_import_tests() -> None:
+    for file in (ROOT / "tests").rglob("*.py"):
+        tests = [name for name in imported_at_import(file) if name.startswith("test_")]
+        assert not tests, f"{file.name} imports {tests}: move the shared code to a helper module"

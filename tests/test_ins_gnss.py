@@ -15,30 +15,38 @@ from scipy import stats
 from torch import Tensor
 
 from pfbench import job
-from pfbench.cli import conf_dir
-from pfbench.draws import MonteCarlo
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.loop import Estimate, run_filter
-from pfbench.filter.rules import Cubature, Jacobian, Points, Unscented
-from pfbench.judge import Judge
-from pfbench.model.ins_gnss import InsGnss, Step
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Episode
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+    UnscentedPoints,
+)
+from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.job import conf_dir
+from pfbench.job.scoring import ScoreRecorder
+from pfbench.model.ins_gnss import InsGnss, LooseStep
 from pfbench.nav import attitude, earth, error_dynamics
-from pfbench.nav.aiding import Alignment, Inflation, Receiver
-from pfbench.nav.sensors import ImuErrors
-from pfbench.nav.strapdown import Intervals
-from pfbench.nav.trajectory import Manoeuvres, Start, accelerate, climb, cruise, turn
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Episode
-from pfbench.scenario.flight import SimulatedFlight
+from pfbench.nav.aiding import AlignmentErrors, GnssReceiver, ProcessNoiseInflation
+from pfbench.nav.imu_errors import ImuErrors
+from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, cruise, turn
+from pfbench.nav.strapdown import InsIntervals
+from pfbench.nav.trajectory import TrajectoryStart
+from pfbench.noise.white import NominalNoise
+from pfbench.scenario.simulated_flight import SimulatedFlight
 
 IMU = ImuErrors(0.05, 0.05, 3600.0, 0.01, 100.0, 50.0, 1800.0, 5.0)
-RECEIVER = Receiver((6.87, 7.20, 4.83), (0.21, 0.20, 0.14))
-INITIAL = Alignment((1.0, 1.0, 5.0), (0.2, 0.2, 0.2), (10.0, 10.0, 10.0))
+RECEIVER = GnssReceiver((6.87, 7.20, 4.83), (0.21, 0.20, 0.14))
+INITIAL = AlignmentErrors((1.0, 1.0, 5.0), (0.2, 0.2, 0.2), (10.0, 10.0, 10.0))
 MODELS: dict[str, Callable[[], InsGnss]] = {
     "15 states": lambda: InsGnss(IMU, RECEIVER, INITIAL),
     "18 states": lambda: InsGnss(IMU, RECEIVER, INITIAL, markov=True),
-    "15 inflated": lambda: InsGnss(IMU, RECEIVER, INITIAL, inflation=Inflation()),
-    "18 inflated": lambda: InsGnss(IMU, RECEIVER, INITIAL, markov=True, inflation=Inflation()),
+    "15 inflated": lambda: InsGnss(IMU, RECEIVER, INITIAL, inflation=ProcessNoiseInflation()),
+    "18 inflated": lambda: InsGnss(
+        IMU, RECEIVER, INITIAL, markov=True, inflation=ProcessNoiseInflation()
+    ),
 }
 every_model = pytest.mark.parametrize("name", MODELS)
 RUNS = torch.arange(3)
@@ -48,8 +56,10 @@ MANOEUVRES = (accelerate(5.0, 10.0), climb(8.0, 5.0, 5.0), turn(60.0, 15.0), cru
 @pytest.fixture(scope="module")
 def flight() -> Episode:
     """A minute with every manoeuvre: 3 runs, 50 intervals of 1 s."""
-    start = Start(lat_deg=32.0, lon_deg=118.0, height=200.0, speed=50.0, heading_deg=45.0)
-    return SimulatedFlight(Manoeuvres(MANOEUVRES, start), IMU, RECEIVER, INITIAL, imu_rate=20.0).draw(Nominal(), RUNS, 5)
+    start = TrajectoryStart(lat_deg=32.0, lon_deg=118.0, height=200.0, speed=50.0, heading_deg=45.0)
+    return SimulatedFlight(
+        ManoeuvreTrajectory(MANOEUVRES, start), IMU, RECEIVER, INITIAL, imu_rate_hz=20.0
+    ).draw(NominalNoise(), RUNS, 5)
 
 
 def composed(*words: str) -> Any:
@@ -60,22 +70,25 @@ def composed(*words: str) -> Any:
 # the transition
 
 
-def exact_parts(model: InsGnss, u: Intervals) -> tuple[Tensor, Tensor, Tensor]:
+def exact_parts(model: InsGnss, u: InsIntervals) -> tuple[Tensor, Tensor, Tensor]:
     """F, G and q written out again, 18 states whatever the model has; position in (rad, rad, m)."""
     f, g = u.f.new_zeros(*u.f.shape[:-1], 18, 18), u.f.new_zeros(*u.f.shape[:-1], 18, 12)
     f[..., :9, :9] = error_dynamics.small_angle_matrix(u.pos, u.vel, u.f)
     f[..., 0:3, 9:12] = f[..., 0:3, 12:15] = g[..., 0:3, 0:3] = -u.dcm
     f[..., 3:6, 15:18] = g[..., 3:6, 3:6] = u.dcm
     for k in range(3):
-        f[..., 12 + k, 12 + k], f[..., 15 + k, 15 + k] = -1 / IMU.gyro_markov_time, -1 / IMU.accelerometer_markov_time
+        f[..., 12 + k, 12 + k], f[..., 15 + k, 15 + k] = (
+            -1 / IMU.gyro_markov_time_s,
+            -1 / IMU.accelerometer_markov_time_s,
+        )
         g[..., 12 + k, 6 + k] = g[..., 15 + k, 9 + k] = 1.0
-    gyro = 2 * IMU.gyro_markov**2 / IMU.gyro_markov_time
-    accelerometer = 2 * IMU.accelerometer_markov**2 / IMU.accelerometer_markov_time
+    gyro = 2 * IMU.gyro_markov**2 / IMU.gyro_markov_time_s
+    accelerometer = 2 * IMU.accelerometer_markov**2 / IMU.accelerometer_markov_time_s
     sizes = [IMU.gyro_random_walk**2, IMU.accelerometer_random_walk**2, gyro, accelerometer]
     return f, g, u.f.new_tensor([size for size in sizes for _ in range(3)])
 
 
-def scales(u: Intervals) -> tuple[Tensor, Tensor]:
+def scales(u: InsIntervals) -> tuple[Tensor, Tensor]:
     """Diagonal matrices that turn (rad, rad, m) into metres at the start and at the end of intervals."""
     ones = u.f.new_ones(*u.f.shape[:-1], 18)
     before, after = ones.clone(), ones.clone()
@@ -93,11 +106,15 @@ def test_transition_is_the_matrix_exponential_to_order_four(flight: Episode) -> 
     # what a fourth-order series leaves out is its fifth term, and next to nothing more
     fifth = after @ torch.linalg.matrix_power(ft, 5) @ torch.linalg.inv(before) / 120
     assert (phi - exact).abs().max() <= 1.01 * fifth.abs().max() + 1e-12
-    assert (phi - exact).abs().max() < 1e-6  # metres per rad/s, after a second: w^2 g T^5 / 120, where the fourth term has 1e-4
+    assert (
+        (phi - exact).abs().max() < 1e-6
+    )  # metres per rad/s, after a second: w^2 g T^5 / 120, where the fourth term has 1e-4
 
 
 def test_fifteen_states_are_eighteen_without_a_markov_part(flight: Episode) -> None:
-    phi18, phi15 = (MODELS[name]().discretise(flight.record.u).phi for name in ("18 states", "15 states"))
+    phi18, phi15 = (
+        MODELS[name]().discretise(flight.record.u).phi for name in ("18 states", "15 states")
+    )
     assert torch.allclose(phi15[..., :9, :12], phi18[..., :9, :12], rtol=1e-12, atol=0)
     eye = torch.eye(6, dtype=torch.float64).expand(*phi15.shape[:2], -1, -1)
     assert torch.equal(phi15[..., 9:, 9:15], eye)  # random walks
@@ -120,15 +137,21 @@ def test_noise_over_an_interval_against_van_loan(flight: Episode, source: str) -
     f, g, q = exact_parts(model, u)
     g = g * torch.isin(torch.arange(12), torch.arange(first, first + 3))
     span = u.duration[..., None, None]
-    block = torch.cat([torch.cat([-f, g * q @ g.mT], -1), torch.cat([torch.zeros_like(f), f.mT], -1)], -2)
+    block = torch.cat(
+        [torch.cat([-f, g * q @ g.mT], -1), torch.cat([torch.zeros_like(f), f.mT], -1)], -2
+    )
     power = torch.matrix_exp(block * span)  # [Van Loan 1978]
     after = scales(u)[1]
     exact = after @ power[..., 18:, 18:].mT @ power[..., :18, 18:] @ after
     factor = model.discretise(u).gain[..., first : first + 3]
     ours = factor @ factor.mT
     for start, k in chain:
-        axes = slice(start, start + 2)  # the vertical is driven by the horizontal specific force, which manoeuvres change
-        ratio = ours.diagonal(dim1=-2, dim2=-1)[..., axes] / exact.diagonal(dim1=-2, dim2=-1)[..., axes]
+        axes = slice(
+            start, start + 2
+        )  # the vertical is driven by the horizontal specific force, which manoeuvres change
+        ratio = (
+            ours.diagonal(dim1=-2, dim2=-1)[..., axes] / exact.diagonal(dim1=-2, dim2=-1)[..., axes]
+        )
         # in the air |F| is below 0.01 (rates) beside the chain itself, so a second is short
         assert torch.allclose(ratio, ratio.new_tensor((2 * k + 1) / (k + 1) ** 2), rtol=0.02)
 
@@ -136,32 +159,52 @@ def test_noise_over_an_interval_against_van_loan(flight: Episode, source: str) -
 @every_model
 def test_the_noise_gain_is_what_propagate_does_with_noise(flight: Episode, name: str) -> None:
     model = MODELS[name]()
-    seen = model.prepare(flight.record).at(20)
-    x = MonteCarlo(1, RUNS).normal("x", 4, len(model.names)) * model.p0
-    w = MonteCarlo(1, RUNS).normal("w", 4, model.noise_dim)
+    seen = model.prepare(flight.record).at_step(20)
+    x = PhiloxStream(1, RUNS).normal("x", 4, len(model.names)) * model.p0
+    w = PhiloxStream(1, RUNS).normal("w", 4, model.noise_dim)
     still = model.propagate(x, seen.u, torch.zeros_like(w))
-    assert torch.allclose(model.propagate(x, seen.u, w) - still, w @ model.noise_gain(seen.u).mT, rtol=1e-9, atol=1e-12)
+    assert torch.allclose(
+        model.propagate(x, seen.u, w) - still,
+        w @ model.noise_gain(seen.u).mT,
+        rtol=1e-9,
+        atol=1e-12,
+    )
 
 
 def test_inflation_adds_its_variances_and_nothing_else(flight: Episode) -> None:
-    plain, inflated = (MODELS[name]().discretise(flight.record.u) for name in ("18 states", "18 inflated"))
+    plain, inflated = (
+        MODELS[name]().discretise(flight.record.u) for name in ("18 states", "18 inflated")
+    )
     noise, full = plain.gain, inflated.gain
     extra = full @ full.mT - noise @ noise.mT
-    arcsec, size = math.radians(1 / 3600), Inflation()
-    gyro, accelerometer = [size.gyro_deg_h * math.radians(1) / 3600] * 6, [size.accelerometer_ug * 9.80665e-6] * 3
-    sd = [*(a * arcsec for a in size.attitude_arcsec), *size.velocity, *size.position, *gyro, *accelerometer]
+    arcsec, size = math.radians(1 / 3600), ProcessNoiseInflation()
+    gyro, accelerometer = (
+        [size.gyro_deg_h * math.radians(1) / 3600] * 6,
+        [size.accelerometer_ug * 9.80665e-6] * 3,
+    )
+    sd = [
+        *(a * arcsec for a in size.attitude_arcsec),
+        *size.velocity,
+        *size.position,
+        *gyro,
+        *accelerometer,
+    ]
     wanted = torch.diag(torch.tensor(sd, dtype=torch.float64).square())
     scale = torch.tensor(sd, dtype=torch.float64)
     assert torch.allclose(plain.phi, inflated.phi, rtol=1e-14, atol=0)
-    assert torch.allclose(extra / scale / scale[:, None], (wanted / scale / scale[:, None]).expand_as(extra), atol=1e-9)
+    assert torch.allclose(
+        extra / scale / scale[:, None],
+        (wanted / scale / scale[:, None]).expand_as(extra),
+        atol=1e-9,
+    )
 
 
 @pytest.mark.parametrize("name", ["15 inflated", "18 inflated"])
 def test_the_transition_law_is_the_law_of_propagate(flight: Episode, name: str) -> None:
     model = MODELS[name]()
-    seen = model.prepare(flight.record).at(7)
-    x = MonteCarlo(2, RUNS).normal("x", 5, len(model.names)) * model.p0
-    w = MonteCarlo(2, RUNS).normal("w", 5, model.noise_dim)
+    seen = model.prepare(flight.record).at_step(7)
+    x = PhiloxStream(2, RUNS).normal("x", 5, len(model.names)) * model.p0
+    w = PhiloxStream(2, RUNS).normal("w", 5, model.noise_dim)
     law = model.transition(x, seen.u)
     assert law is not None
     log_p = law.log_prob(model.propagate(x, seen.u, w))
@@ -173,8 +216,10 @@ def test_the_transition_law_is_the_law_of_propagate(flight: Episode, name: str) 
 @pytest.mark.parametrize("name", ["15 states", "18 states"])
 def test_a_singular_transition_is_not_faked(flight: Episode, name: str) -> None:
     model = MODELS[name]()
-    seen = model.prepare(flight.record).at(0)
-    assert model.transition(torch.zeros(3, 2, len(model.names), dtype=torch.float64), seen.u) is None
+    seen = model.prepare(flight.record).at_step(0)
+    assert (
+        model.transition(torch.zeros(3, 2, len(model.names), dtype=torch.float64), seen.u) is None
+    )
 
 
 # what is measured, and what is an error
@@ -183,9 +228,11 @@ def test_a_singular_transition_is_not_faked(flight: Episode, name: str) -> None:
 def test_measurement_order_is_position_then_velocity() -> None:
     model = MODELS["18 states"]()
     x = torch.arange(18.0, dtype=torch.float64).reshape(1, 1, 18)
-    law: Any = model.observation(x, Step(x, x))
+    law: Any = model.observation(x, LooseStep(x, x))
     assert law.mean[0, 0].tolist() == [6.0, 7.0, 8.0, 3.0, 4.0, 5.0]
-    assert torch.allclose(law.stddev[0, 0], torch.tensor([6.87, 7.20, 4.83, 0.21, 0.20, 0.14], dtype=torch.float64))
+    assert torch.allclose(
+        law.stddev[0, 0], torch.tensor([6.87, 7.20, 4.83, 0.21, 0.20, 0.14], dtype=torch.float64)
+    )
 
 
 @every_model
@@ -193,43 +240,59 @@ def test_a_perfect_estimate_leaves_no_error(flight: Episode, name: str) -> None:
     model = MODELS[name]()
     truth = model.assemble(flight.truth)
     assert not torch.isnan(truth).any()
-    assert (model.error(truth, truth) / model.p0).abs().max() < 1e-9  # angles of 1e-3 rad go through a product of matrices
+    assert (
+        model.error(truth, truth) / model.p0
+    ).abs().max() < 1e-9  # angles of 1e-3 rad go through a product of matrices
     nothing = model.error(torch.zeros_like(truth), truth)
-    assert torch.allclose(nothing[..., :9], truth[..., :9], rtol=1e-9, atol=1e-12)  # the INS itself is in error by the truth
+    assert torch.allclose(
+        nothing[..., :9], truth[..., :9], rtol=1e-9, atol=1e-12
+    )  # the INS itself is in error by the truth
     assert torch.equal(nothing[..., 9:], -truth[..., 9:])  # and nothing was said of the sensors
 
 
 def test_error_is_corrected_minus_true(flight: Episode) -> None:
     model = MODELS["15 states"]()
     u, truth = flight.record.u, model.assemble(flight.truth)
-    guess = MonteCarlo(3, RUNS).normal("guess", truth.shape[1], 15) * model.p0
+    guess = PhiloxStream(3, RUNS).normal("guess", truth.shape[1], 15) * model.p0
     error = model.error(guess, truth)
     true_pos = u.pos_end - truth[..., 6:9] / earth.metre_scale(u.pos_end)
     corrected = u.pos_end - guess[..., 6:9] / earth.metre_scale(u.pos_end)
     # a metre of latitude differs from one place to another 100 m away by 1e-5 at most
-    assert torch.allclose((corrected - true_pos) * earth.metre_scale(u.pos_end), error[..., 6:9], rtol=1e-6, atol=1e-4)
-    assert torch.allclose((u.vel_end - guess[..., 3:6]) - (u.vel_end - truth[..., 3:6]), error[..., 3:6], atol=1e-10)
+    assert torch.allclose(
+        (corrected - true_pos) * earth.metre_scale(u.pos_end), error[..., 6:9], rtol=1e-6, atol=1e-4
+    )
+    assert torch.allclose(
+        (u.vel_end - guess[..., 3:6]) - (u.vel_end - truth[..., 3:6]), error[..., 3:6], atol=1e-10
+    )
     dcm = attitude.dcm_from_euler(guess[..., :3]) @ u.dcm_end  # corrected attitude
     true_dcm = attitude.dcm_from_euler(truth[..., :3]) @ u.dcm_end
     assert torch.allclose(attitude.attitude_error(true_dcm, dcm), error[..., :3], atol=1e-12)
     assert torch.allclose(error[..., 9:], guess[..., 9:] - truth[..., 9:])
 
 
-def filtered(rule: Any, model: InsGnss, episode: Episode) -> Estimate:
+def filtered(rule: Any, model: InsGnss, episode: Episode) -> FilterResult:
     runs = torch.arange(episode.record.y.shape[0])
-    watch = Judge(model, model.assemble(episode.truth))
+    watch = ScoreRecorder(model, model.assemble(episode.truth))
     with torch.no_grad():
-        return run_filter(GaussianFilter(rule), model, episode.record, MonteCarlo(1, runs), watch)
+        return run_filter(GaussianFilter(rule), model, episode.record, PhiloxStream(1, runs), watch)
 
 
-RULES = {"ukf": Points(Unscented()), "ckf": Points(Cubature())}
+RULES = {
+    "ukf": SigmaPointLinearisation(UnscentedPoints()),
+    "ckf": SigmaPointLinearisation(CubaturePoints()),
+}
 
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("name", ["15 states", "18 inflated"])
-def test_on_a_linear_model_all_gaussian_filters_are_one(flight: Episode, name: str, rule: str) -> None:
+def test_on_a_linear_model_all_gaussian_filters_are_one(
+    flight: Episode, name: str, rule: str
+) -> None:
     model = MODELS[name]()
-    kalman, other = filtered(Jacobian(), model, flight), filtered(RULES[rule], model, flight)
+    kalman, other = (
+        filtered(TaylorLinearisation(), model, flight),
+        filtered(RULES[rule], model, flight),
+    )
     sd = kalman.variance.sqrt()
     assert ((kalman.mean - other.mean) / sd).abs().max() < 1e-9
     assert torch.allclose(kalman.variance, other.variance, rtol=1e-9, atol=0)
@@ -237,15 +300,21 @@ def test_on_a_linear_model_all_gaussian_filters_are_one(flight: Episode, name: s
 
 
 def test_a_receiver_without_velocity_is_one_whose_velocity_is_never_seen(flight: Episode) -> None:
-    blind = InsGnss(IMU, Receiver(RECEIVER.position_sd), INITIAL)
+    blind = InsGnss(IMU, GnssReceiver(RECEIVER.position_sd), INITIAL)
     y = flight.record.y.clone()
     y[..., 3:] = torch.nan
     position_only = flight.record._replace(y=y[..., :3])
-    a = filtered(Points(Cubature()), blind, replace(flight, record=position_only))
-    b = filtered(Points(Cubature()), MODELS["15 states"](), replace(flight, record=flight.record._replace(y=y)))
+    a = filtered(
+        SigmaPointLinearisation(CubaturePoints()), blind, replace(flight, record=position_only)
+    )
+    b = filtered(
+        SigmaPointLinearisation(CubaturePoints()),
+        MODELS["15 states"](),
+        replace(flight, record=flight.record._replace(y=y)),
+    )
     assert torch.allclose(a.mean, b.mean, rtol=1e-9, atol=1e-12)
     assert torch.allclose(a.log_evidence, b.log_evidence, rtol=1e-9)
-    both = filtered(Points(Cubature()), MODELS["15 states"](), flight)
+    both = filtered(SigmaPointLinearisation(CubaturePoints()), MODELS["15 states"](), flight)
     assert (both.variance[..., 3:6] < a.variance[..., 3:6]).all()  # seeing it would have helped
 
 
@@ -253,7 +322,12 @@ def test_improper_initial_laws_are_refused() -> None:
     with pytest.raises(ValueError, match=r"model\.imu.*positive gyro and accelerometer"):
         InsGnss(ImuErrors(gyro_bias_deg_h=1.0), RECEIVER, INITIAL)
     with pytest.raises(ValueError, match=r"Markov parts \(or markov=false\)"):
-        InsGnss(ImuErrors(gyro_bias_deg_h=1.0, accelerometer_bias_ug=10.0), RECEIVER, INITIAL, markov=True)
+        InsGnss(
+            ImuErrors(gyro_bias_deg_h=1.0, accelerometer_bias_ug=10.0),
+            RECEIVER,
+            INITIAL,
+            markov=True,
+        )
 
 
 # against simulated flights
@@ -263,18 +337,30 @@ def test_improper_initial_laws_are_refused() -> None:
 def test_the_linear_transition_carries_errors_of_constant_biases_over_a_whole_flight() -> None:
     """500 s open loop against the mechanisation: 0.2-0.7 m of 110-400 m, 0.002 m/s, 0.01 arcsec; ten times that is allowed."""
     constant = ["scenario.imu.gyro_markov_deg_h=0", "scenario.imu.accelerometer_markov_ug=0"]
-    flight = job.build(composed("scenario=t004", "scenario.imu_rate=20", "worlds=null", *constant).scenario)
-    episode = flight.draw(Nominal(), torch.arange(10), 3)
-    believed = ImuErrors(0.05, 0.05, 3600.0, accelerometer_bias_ug=100.0)  # no correlation time: the bias does not decay
+    flight = job.instantiate(
+        composed(
+            "scenario=flight_500s", "scenario.imu_rate_hz=20", "episode_cache_dir=null", *constant
+        ).scenario
+    )
+    episode = flight.draw(NominalNoise(), torch.arange(10), 3)
+    believed = ImuErrors(
+        0.05, 0.05, 3600.0, accelerometer_bias_ug=100.0
+    )  # no correlation time: the bias does not decay
     model = InsGnss(believed, RECEIVER, INITIAL, markov=True)
-    constants = {"gyro_constant": episode.truth["gyro_bias"], "gyro_markov": 0 * episode.truth["gyro_bias"]}
+    constants = {
+        "gyro_constant": episode.truth["gyro_bias"],
+        "gyro_markov": 0 * episode.truth["gyro_bias"],
+    }
     truth = model.assemble(episode.truth | constants)
     assert truth[..., :2].abs().max() < math.radians(0.2)  # the model is linear in the tilts
     record = model.prepare(episode.record)
     x = truth[:, :1]
     for t in range(1, truth.shape[1]):
-        x = model.propagate(x, record.at(t).u, x.new_zeros(10, 1, 12))
-    missed, grown = (x[:, 0] - truth[:, -1]).square().mean(0).sqrt(), truth[:, -1].square().mean(0).sqrt()
+        x = model.propagate(x, record.at_step(t).u, x.new_zeros(10, 1, 12))
+    missed, grown = (
+        (x[:, 0] - truth[:, -1]).square().mean(0).sqrt(),
+        truth[:, -1].square().mean(0).sqrt(),
+    )
     assert (grown[6:8] > 100.0).all()  # there was something to carry
     assert (missed[6:9] < 7.0).all()
     assert (missed[3:6] < 0.02).all()
@@ -285,13 +371,13 @@ def test_the_linear_transition_carries_errors_of_constant_biases_over_a_whole_fl
 def test_the_kalman_filter_is_consistent_on_flights_that_its_model_did_not_draw() -> None:
     """Normalised errors at the end, state by state, and NEES of groups; both chi-square where the model is right.
 
-    Of 18 states; scenario/test_consistency.py has the 15 of t003, where the INS is corrected.
+    Of 18 states; scenario/test_consistency.py has the 15 of flight_300s, where the INS is corrected.
     """
     runs, level = 40, 1e-4  # of each of some twenty bands
-    cfg = composed("scenario=t004", "scenario.imu_rate=10", "worlds=null")
-    model = job.build(cfg.model)
-    episode = job.build(cfg.scenario).draw(Nominal(), torch.arange(runs), 12)
-    estimate = filtered(Points(Cubature()), model, episode)
+    cfg = composed("scenario=flight_500s", "scenario.imu_rate_hz=10", "episode_cache_dir=null")
+    model = job.instantiate(cfg.model)
+    episode = job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(runs), 12)
+    estimate = filtered(SigmaPointLinearisation(CubaturePoints()), model, episode)
     assert not estimate.lost.any()
 
     # 18 states: the accelerometer bias is one Markov process of 112 ug; its constant 100 ug should not decay but does in the

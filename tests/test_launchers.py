@@ -18,27 +18,40 @@ import pytest
 from command_line import environment, pfbench
 from hydra import compose, initialize_config_dir
 
-from pfbench import cli, store
+from pfbench import job
+from pfbench.cli.messages import format_error
+from pfbench.cli.run import run_with_retries
+from pfbench.results import store
 
 GONE = (ProcessLookupError, FileNotFoundError, PermissionError)
 FILTERS = ("sir", "rpf", "apf", "gpf")
-SWEEP = ("run", "-m", "scenario=linear_walk", "scenario.steps=150", "runs=10", "particles=200", f"filter={','.join(FILTERS)}")
+SWEEP = (
+    "run",
+    "-m",
+    "scenario=linear_walk",
+    "scenario.steps=150",
+    "runs=10",
+    "particles=200",
+    f"filter={','.join(FILTERS)}",
+)
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "disabled", "PYTHONUNBUFFERED": "1"}
 
 
 def launcher(name: str, *words: str) -> Any:
-    with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
+    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
         composed = compose("config", [f"hydra/launcher={name}", *words], return_hydra_config=True)
     return composed.hydra.launcher
 
 
 def numbers(home: Path) -> dict[str, dict[str, np.ndarray]]:
     """The arrays of all finished cells, by filter."""
-    found = map(store.load, sorted((home / "results" / "adhoc").glob("*.npz")))
+    found = map(store.read_result, sorted((home / "results" / "adhoc").glob("*.npz")))
     return {result.meta["label"]: result.arrays for result in found}
 
 
-def assert_same(ours: dict[str, dict[str, np.ndarray]], theirs: dict[str, dict[str, np.ndarray]]) -> None:
+def assert_same(
+    ours: dict[str, dict[str, np.ndarray]], theirs: dict[str, dict[str, np.ndarray]]
+) -> None:
     assert set(ours) == set(theirs) == set(FILTERS)
     for name in FILTERS:
         assert ours[name].keys() == theirs[name].keys()
@@ -55,18 +68,40 @@ def test_every_core_gets_a_cell_by_joblib() -> None:
 
 
 def test_slurm_gets_what_the_job_needs() -> None:
-    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason='needs submitit: pip install "pfbench[slurm]"')
+    pytest.importorskip(
+        "hydra_plugins.hydra_submitit_launcher",
+        reason='needs submitit: pip install "pfbench[slurm]"',
+    )
     preset = launcher("slurm", "threads=4", "hydra.launcher.partition=short")
-    assert (preset.cpus_per_task, preset.partition, preset.additional_parameters.requeue) == (4, "short", True)
+    assert (preset.cpus_per_task, preset.partition, preset.additional_parameters.requeue) == (
+        4,
+        "short",
+        True,
+    )
 
 
 def test_the_script_for_slurm_is_one_array_that_is_queued_again(tmp_path: Path) -> None:
     """What submitit would hand to sbatch, without a cluster."""
-    slurm = pytest.importorskip("submitit.slurm.slurm", reason='needs submitit: pip install "pfbench[slurm]"')
+    slurm = pytest.importorskip(
+        "submitit.slurm.slurm", reason='needs submitit: pip install "pfbench[slurm]"'
+    )
     preset = launcher("slurm", "threads=2", "hydra.launcher.setup=[module load python]")
-    more = ("partition", "account", "qos", "constraint", "exclude", "gres", "additional_parameters", "array_parallelism", "setup")
+    more = (
+        "partition",
+        "account",
+        "qos",
+        "constraint",
+        "exclude",
+        "gres",
+        "additional_parameters",
+        "array_parallelism",
+        "setup",
+    )
     given = {name: preset[name] for name in more if preset[name] is not None}
-    given |= {"additional_parameters": dict(preset.additional_parameters), "setup": list(preset.setup)}
+    given |= {
+        "additional_parameters": dict(preset.additional_parameters),
+        "setup": list(preset.setup),
+    }
     script = slurm._make_sbatch_string(
         command="run", folder=tmp_path, job_name=preset.name, time=preset.timeout_min, mem=f"{preset.mem_gb}GB",
         cpus_per_task=preset.cpus_per_task, map_count=12, **given,
@@ -79,16 +114,24 @@ def test_the_script_for_slurm_is_one_array_that_is_queued_again(tmp_path: Path) 
 
 
 def test_ray_retries_a_cell_and_never_joins_a_cluster_by_accident() -> None:
-    pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason='needs Ray: pip install "pfbench[ray]"')
+    pytest.importorskip(
+        "hydra_plugins.hydra_ray_launcher", reason='needs Ray: pip install "pfbench[ray]"'
+    )
     local, cluster = (launcher(name, "threads=2").ray for name in ("ray_local", "ray_cluster"))
-    assert (local.init.address, cluster.init.address, cluster.init.object_store_memory) == ("local", "auto", None)
+    assert (local.init.address, cluster.init.address, cluster.init.object_store_memory) == (
+        "local",
+        "auto",
+        None,
+    )
     for preset in (local, cluster):
         assert (preset.remote.max_retries, preset.remote.num_cpus) == (3, 2)
 
 
 def test_a_launcher_that_is_not_installed_is_told_with_the_remedy() -> None:
-    absent = Exception("In 'hydra/launcher/ray_local': Could not find 'hydra/launcher/ray'\n\nAvailable options:\n\tbasic\n")
-    assert 'pip install "pfbench[ray]"' in cli.explain(absent, ["hydra/launcher=ray_local"])
+    absent = Exception(
+        "In 'hydra/launcher/ray_local': Could not find 'hydra/launcher/ray'\n\nAvailable options:\n\tbasic\n"
+    )
+    assert 'pip install "pfbench[ray]"' in format_error(absent, ["hydra/launcher=ray_local"])
 
 
 # a process that joblib lost takes the whole sweep with it
@@ -98,7 +141,9 @@ class TerminatedWorkerError(Exception):
     """Called as joblib's own is."""
 
 
-def test_a_sweep_that_lost_a_process_goes_on_and_gives_up_in_the_end(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sweep_that_lost_a_process_goes_on_and_gives_up_in_the_end(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     answers: list[Exception | None] = [TerminatedWorkerError(), TerminatedWorkerError(), None]
 
     def sweep() -> None:
@@ -106,16 +151,21 @@ def test_a_sweep_that_lost_a_process_goes_on_and_gives_up_in_the_end(capsys: pyt
         if answer is not None:
             raise answer
 
-    cli._again(sweep)
+    run_with_retries(sweep)
     assert answers == []
-    assert capsys.readouterr().err.count("a process of the sweep was killed; going on with the cells that are not done") == 2
+    assert (
+        capsys.readouterr().err.count(
+            "a process of the sweep was killed. Running the remaining jobs"
+        )
+        == 2
+    )
     answers += [TerminatedWorkerError()] * 9
     with pytest.raises(RuntimeError, match=r"killed 4 times.*hydra.launcher.n_jobs=2"):
-        cli._again(sweep)
+        run_with_retries(sweep)
     assert len(answers) == 5
     answers[:] = [ValueError("a bad cell")] * 2
     with pytest.raises(ValueError, match="a bad cell"):
-        cli._again(sweep)
+        run_with_retries(sweep)
     assert len(answers) == 1
 
 
@@ -137,7 +187,9 @@ def started(home: Path, *words: str, **more: str) -> Iterator[subprocess.Popen[s
     env = os.environ | environment(home) | QUIET | more
     command = [sys.executable, "-m", "pfbench", *SWEEP, *words]
     pipe = subprocess.PIPE
-    sweep = subprocess.Popen(command, env=env, cwd=home, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+    sweep = subprocess.Popen(
+        command, env=env, cwd=home, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
     try:
         yield sweep
     finally:
@@ -153,7 +205,11 @@ def workers(home: Path, doing: str) -> list[int]:
     for entry in Path("/proc").iterdir():
         with suppress(*GONE):
             own = entry.name.isdigit() and int(entry.name) != os.getpid()
-            if own and mark in (entry / "environ").read_bytes().split(b"\0") and doing in (entry / "cmdline").read_text():
+            if (
+                own
+                and mark in (entry / "environ").read_bytes().split(b"\0")
+                and doing in (entry / "cmdline").read_text()
+            ):
                 found.append(int(entry.name))
     return found
 
@@ -170,7 +226,9 @@ def wait(what: Callable[[], Any], sweep: subprocess.Popen[str], seconds: float =
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="workers are looked up in /proc")
+@pytest.mark.skipif(
+    not Path("/proc/self/environ").exists(), reason="workers are looked up in /proc"
+)
 def test_a_killed_worker_of_ray_costs_its_own_cell_which_is_done_again(
     tmp_path: Path, alone: dict[str, dict[str, np.ndarray]]
 ) -> None:
@@ -178,7 +236,9 @@ def test_a_killed_worker_of_ray_costs_its_own_cell_which_is_done_again(
     words = ("hydra/launcher=ray_local", "hydra.launcher.ray.init.num_cpus=2")
     with started(tmp_path, *words) as sweep:
         wait(lambda: numbers(tmp_path), sweep)
-        done = {file: file.stat().st_mtime_ns for file in (tmp_path / "results" / "adhoc").glob("*.npz")}
+        done = {
+            file: file.stat().st_mtime_ns for file in (tmp_path / "results" / "adhoc").glob("*.npz")
+        }
         victim = wait(lambda: workers(tmp_path, "ray::_run_job"), sweep)[0]
         os.kill(victim, signal.SIGKILL)
         _, err = sweep.communicate(timeout=120)
@@ -188,7 +248,9 @@ def test_a_killed_worker_of_ray_costs_its_own_cell_which_is_done_again(
 
 
 @pytest.mark.slow
-def test_a_lost_node_costs_its_own_cell_which_is_done_again(tmp_path: Path, alone: dict[str, dict[str, np.ndarray]]) -> None:
+def test_a_lost_node_costs_its_own_cell_which_is_done_again(
+    tmp_path: Path, alone: dict[str, dict[str, np.ndarray]]
+) -> None:
     pytest.importorskip("ray", reason='needs Ray: pip install "pfbench[ray]"')
     from ray.cluster_utils import Cluster
 
@@ -196,7 +258,9 @@ def test_a_lost_node_costs_its_own_cell_which_is_done_again(tmp_path: Path, alon
         cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
         nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
         try:
-            with started(tmp_path, "hydra/launcher=ray_cluster", RAY_ADDRESS=cluster.address) as sweep:
+            with started(
+                tmp_path, "hydra/launcher=ray_cluster", RAY_ADDRESS=cluster.address
+            ) as sweep:
                 wait(lambda: numbers(tmp_path), sweep)
                 time.sleep(0.3)  # well into the next cells
                 cluster.remove_node(nodes[0], allow_graceful=False)

@@ -13,19 +13,25 @@ import torch
 from pfbench.experiments import learn_canyon_noise, learn_quad_noise
 from recorded_data import recorded
 
-from pfbench.model.urban_gnss import Normal, SightOrTail
-from pfbench.ppl.posterior import Posterior
+from pfbench.model.urban_gnss import LosNlosRangeError, NormalRangeError
+from pfbench.ppl.parameter_posterior import ParameterPosterior
 
-LAWS = {"first": SightOrTail(0.32, 3.3, 39.0, 0.55), "second": SightOrTail(0.46, 2.9, 42.0, 0.51)}
+LAWS = {
+    "first": LosNlosRangeError(0.32, 3.3, 39.0, 0.55),
+    "second": LosNlosRangeError(0.46, 2.9, 42.0, 0.51),
+}
 
 
-def chains(middles: dict[str, float], apart: float = 0.0) -> Posterior:
+def chains(middles: dict[str, float], apart: float = 0.0) -> ParameterPosterior:
     """Four chains of independent draws with an sd of a tenth around these numbers, `apart` of them between chains."""
     g = torch.Generator().manual_seed(0)
     noise = torch.randn(len(middles), 4, 200, dtype=torch.float64, generator=g)
     noise = noise + apart * torch.arange(4.0)[:, None]
-    draws = {name: middle * (1.0 + 0.1 * z) for (name, middle), z in zip(middles.items(), noise, strict=True)}
-    return Posterior(draws, torch.full((4,), 0.4, dtype=torch.float64), "PMMH")
+    draws = {
+        name: middle * (1.0 + 0.1 * z)
+        for (name, middle), z in zip(middles.items(), noise, strict=True)
+    }
+    return ParameterPosterior(draws, torch.full((4,), 0.4, dtype=torch.float64), "PMMH")
 
 
 def breaking(at: int, work: Callable[..., Any]) -> tuple[Callable[..., Any], list[tuple[Any, ...]]]:
@@ -41,18 +47,20 @@ def breaking(at: int, work: Callable[..., Any]) -> tuple[Callable[..., Any], lis
     return counted, calls
 
 
-def canyon(monkeypatch: pytest.MonkeyPatch, apart: float = 0.0, at: int = 0) -> dict[str, list[tuple[Any, ...]]]:
+def canyon(
+    monkeypatch: pytest.MonkeyPatch, apart: float = 0.0, at: int = 0
+) -> dict[str, list[tuple[Any, ...]]]:
     """The study without its data: the second stretch's share is 0.5, mixtures are ahead by 1 in evidence, elsewhere by 0.94."""
 
-    def learn(stretch: str, best: SightOrTail, draws: int, warmup: int) -> Posterior:
+    def learn(stretch: str, best: LosNlosRangeError, draws: int, warmup: int) -> ParameterPosterior:
         odds = {"first": -0.8, "second": 1e-9}[stretch]
         return chains({"odds": odds, "sd": best.sd, "tail": best.tail, "slope": best.slope}, apart)
 
     def positions(law: Any, stretch: str) -> list[float]:
-        return [(20.0 if isinstance(law, Normal) else 10.0) + k for k in range(8)]
+        return [(20.0 if isinstance(law, NormalRangeError) else 10.0) + k for k in range(8)]
 
     def evidence(law: Any, stretch: str) -> tuple[float, float]:
-        if isinstance(law, Normal):
+        if isinstance(law, NormalRangeError):
             return -4.8, 0.002
         here = (law.tail < 41.0) == (stretch == "first")
         return (-3.8 if here else -3.86), 0.002
@@ -62,7 +70,9 @@ def canyon(monkeypatch: pytest.MonkeyPatch, apart: float = 0.0, at: int = 0) -> 
     for name, work in parts.items():
         counted, found[name] = breaking(at if name == "positions" else 0, work)
         monkeypatch.setattr(learn_canyon_noise, name, counted)
-    monkeypatch.setattr(learn_canyon_noise, "most_likely", lambda stretch: (Normal(3.35), LAWS[stretch]))
+    monkeypatch.setattr(
+        learn_canyon_noise, "most_likely", lambda stretch: (NormalRangeError(3.35), LAWS[stretch])
+    )
     return found
 
 
@@ -71,13 +81,19 @@ def cells(page: str, start: str) -> list[str]:
     return line.strip("| ").split(" | ")
 
 
-def test_a_study_of_the_canyon_goes_on_from_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_of_the_canyon_goes_on_from_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls = canyon(monkeypatch, at=4)
     with pytest.raises(KeyboardInterrupt):
         learn_canyon_noise.main(tmp_path, 200, 10)
     assert not (tmp_path / "report.md").exists()
     learn_canyon_noise.main(tmp_path, 200, 10)
-    assert {name: len(each) for name, each in calls.items()} == {"learn": 2, "evidence": 10, "positions": 7}  # one normal law
+    assert {name: len(each) for name, each in calls.items()} == {
+        "learn": 2,
+        "evidence": 10,
+        "positions": 7,
+    }  # one normal law
     assert calls["positions"][3] == calls["positions"][4]
     page = (tmp_path / "report.md").read_text()
     learn_canyon_noise.main(tmp_path, 200, 10)
@@ -87,7 +103,9 @@ def test_a_study_of_the_canyon_goes_on_from_where_it_stopped(tmp_path: Path, mon
     assert "What was learned" not in (tmp_path / "report.md").read_text()
 
 
-def test_the_canyon_s_page_says_what_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_canyon_s_page_says_what_was_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     canyon(monkeypatch)
     learn_canyon_noise.main(tmp_path, 200, 10)
     page = (tmp_path / "report.md").read_text()
@@ -113,7 +131,9 @@ def test_the_canyon_s_page_says_what_was_found(tmp_path: Path, monkeypatch: pyte
         assert (tmp_path / name).stat().st_size > 5000
 
 
-def test_the_canyon_s_page_says_that_chains_have_not_met(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_canyon_s_page_says_that_chains_have_not_met(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     canyon(monkeypatch, apart=3.0)
     learn_canyon_noise.main(tmp_path, 200, 10)
     page = (tmp_path / "report.md").read_text()
@@ -121,19 +141,32 @@ def test_the_canyon_s_page_says_that_chains_have_not_met(tmp_path: Path, monkeyp
     assert float(cells(page, "first | sd")[4]) > 1.5
 
 
-MIDDLES = {"gyro_density": 3e-4, "accelerometer_density": 9e-3, "gyro_bias_walk": 3e-5, "accelerometer_bias_walk": 8e-4}
+MIDDLES = {
+    "gyro_density": 3e-4,
+    "accelerometer_density": 9e-3,
+    "gyro_bias_walk": 3e-5,
+    "accelerometer_bias_walk": 8e-4,
+}
 
 
-def quad(monkeypatch: pytest.MonkeyPatch, at: int = 0, equal: bool = False) -> list[tuple[Any, ...]]:
+def quad(
+    monkeypatch: pytest.MonkeyPatch, at: int = 0, equal: bool = False
+) -> list[tuple[Any, ...]]:
     """The study without its data: errors are the gyro's density times a flight's number, evidence falls with it."""
 
     def tried(believed: Any) -> dict[str, list[float]]:
         each = believed.gyro_density * np.arange(1, 16)
         if equal and believed.gyro_density < 1e-3:  # learned or the maker's
-            each = 3e-4 + 1e-5 * np.cos(np.arange(15) * (3.0 if believed.gyro_density < 2e-4 else 5.0))
+            each = 3e-4 + 1e-5 * np.cos(
+                np.arange(15) * (3.0 if believed.gyro_density < 2e-4 else 5.0)
+            )
         sign = {"evidence": -1.0}
         parts = learn_quad_noise.MEASURES
-        return {f"{method} {part}": [*(sign.get(part, 1.0) * each)] for method in ("ekf", "ckf") for part in parts}
+        return {
+            f"{method} {part}": [*(sign.get(part, 1.0) * each)]
+            for method in ("ekf", "ckf")
+            for part in parts
+        }
 
     counted, calls = breaking(at, tried)
     monkeypatch.setattr(learn_quad_noise, "tried", counted)
@@ -141,7 +174,9 @@ def quad(monkeypatch: pytest.MonkeyPatch, at: int = 0, equal: bool = False) -> l
     return calls
 
 
-def test_a_study_of_the_quadrotor_goes_on_from_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_of_the_quadrotor_goes_on_from_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls = quad(monkeypatch, at=3)
     with pytest.raises(KeyboardInterrupt):
         learn_quad_noise.main(tmp_path, 200, 10)
@@ -153,10 +188,14 @@ def test_a_study_of_the_quadrotor_goes_on_from_where_it_stopped(tmp_path: Path, 
     assert len(calls) == 4
 
 
-def test_the_quadrotor_s_page_says_what_was_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_quadrotor_s_page_says_what_was_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls = quad(monkeypatch)
     learn_quad_noise.main(tmp_path, 200, 10)
-    assert [believed.gyro_density for (believed,) in calls] == pytest.approx([1.22e-4, 1e-2, 3e-4], rel=0.02)
+    assert [believed.gyro_density for (believed,) in calls] == pytest.approx(
+        [1.22e-4, 1e-2, 3e-4], rel=0.02
+    )
     page = (tmp_path / "report.md").read_text()
     assert "They have met: " in page
     assert "/tmp/" not in page
@@ -165,7 +204,10 @@ def test_the_quadrotor_s_page_says_what_was_found(tmp_path: Path, monkeypatch: p
     assert float(gyro[3].split()[0]) == pytest.approx(3e-4, rel=0.03)
     assert gyro[4] == "2.9 and 0.1"
     assert gyro[7:] == ["0.01", "0.00012"]
-    position, evidence = ([line for line in page.splitlines() if line.startswith(f"| {what}")] for what in ("position", "log ev"))
+    position, evidence = (
+        [line for line in page.splitlines() if line.startswith(f"| {what}")]
+        for what in ("position", "log ev")
+    )
     assert len(position) == len(evidence) == 2  # of the EKF and the CKF
     row = position[0].strip("| ").split(" | ")
     assert float(row[1]) == pytest.approx(8 * 3e-4, rel=0.02)
@@ -173,27 +215,46 @@ def test_the_quadrotor_s_page_says_what_was_found(tmp_path: Path, monkeypatch: p
     assert float(row[3].split()[0]) == pytest.approx(8 * (3e-4 - 1e-2), rel=0.02)
     assert row[4] == "6e-05, 0.0006"  # the least that fifteen flights give, ten tests
     assert evidence[0].split(" | ")[3].startswith("0.07")
-    every = "position rms, roll and pitch rms, yaw rms, log evidence of a fix, share in 90 % intervals"
+    every = (
+        "position rms, roll and pitch rms, yaw rms, log evidence of a fix, share in 90 % intervals"
+    )
     flat = " ".join(page.split())
     for method in ("EKF", "CKF"):
-        assert f"{method}: against the values set by hand differences are shown in {every} (least corrected p 0.0006); " in flat
+        assert (
+            f"{method}: against the values set by hand differences are shown in {every} (least corrected p 0.0006); "
+            in flat
+        )
     for name in ("posterior.png", "flights.png"):
         assert (tmp_path / name).stat().st_size > 5000
 
 
-def test_the_quadrotor_s_page_says_what_is_not_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_quadrotor_s_page_says_what_is_not_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     quad(monkeypatch, equal=True)
     learn_quad_noise.main(tmp_path, 200, 10)
-    assert (tmp_path / "report.md").read_text().replace("\n", " ").count("against the maker's no difference is shown") == 2
+    assert (tmp_path / "report.md").read_text().replace("\n", " ").count(
+        "against the maker's no difference is shown"
+    ) == 2
 
 
 @pytest.mark.slow
 @recorded
-def test_the_canyon_is_learned_and_scored_on_a_few_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learn_canyon_noise, "STRETCHES", {"first": (0.0, 30.0), "second": (30.0, 60.0)})
+def test_the_canyon_is_learned_and_scored_on_a_few_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        learn_canyon_noise, "STRETCHES", {"first": (0.0, 30.0), "second": (30.0, 60.0)}
+    )
     monkeypatch.setattr(learn_canyon_noise, "PARTICLES", 50)
-    monkeypatch.setattr(learn_canyon_noise, "positions", partial(learn_canyon_noise.positions, runs=2, particles=100))
+    monkeypatch.setattr(
+        learn_canyon_noise,
+        "positions",
+        partial(learn_canyon_noise.positions, runs=2, particles=100),
+    )
     learn_canyon_noise.main(tmp_path, 5, 3)
     page = (tmp_path / "report.md").read_text()
-    normal, mixture = ([float(x) for x in cells(page, f"{name} | ")[1:]] for name in ("normal", "mixture"))
+    normal, mixture = (
+        [float(x) for x in cells(page, f"{name} | ")[1:]] for name in ("normal", "mixture")
+    )
     assert all(a < b - 0.3 for a, b in zip(normal, mixture, strict=True))

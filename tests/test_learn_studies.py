@@ -10,15 +10,15 @@ from matplotlib.figure import Figure
 from pfbench.experiments import learn_data_efficiency, learn_noise_calibration, learn_room
 from pfbench.experiments.learn_data_efficiency import World, against, interval, volatility
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter.belief import Cloud
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.guided_noise import GuidedNoise
-from pfbench.filter.proposals import Bootstrap
-from pfbench.filter.rules import Jacobian
-from pfbench.model.linear import local_level
-from pfbench.ppl.calibration import Ranks
-from pfbench.record import Record
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
+from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
+from pfbench.filter.particle.proposals import BootstrapProposal
+from pfbench.model.linear_gaussian import local_level
+from pfbench.ppl.sbc import SbcRanks
 
 
 def normal(r: torch.Tensor, variance: float) -> torch.Tensor:
@@ -29,20 +29,36 @@ def test_the_room_that_is_left_is_that_of_closed_forms(monkeypatch: pytest.Monke
     """y = x + b w + s e: sum (E v)^2 / sum E v^2 for v = p(y | x, w), one for the optimal law, and its nats."""
     monkeypatch.setattr(learn_room, "CHILDREN", 1000)
     b, s, y = 0.8, 0.6, 1.1
-    model, parents = local_level(b, s, 0.0, 1.0), torch.tensor([-0.5, 0.4, 1.5], dtype=torch.float64)
-    cloud = Cloud(parents[None, :, None], torch.full((1, 3), -math.log(3.0), dtype=torch.float64), torch.zeros(1))
-    seen, draws = Record(torch.tensor([[y]], dtype=torch.float64)), MonteCarlo(1, torch.arange(1))
-    chosen = torch.multinomial(torch.full((3,), 1.0), learn_room.PARENTS, True, generator=torch.Generator().manual_seed(0))
+    model, parents = (
+        local_level(b, s, 0.0, 1.0),
+        torch.tensor([-0.5, 0.4, 1.5], dtype=torch.float64),
+    )
+    cloud = ParticleBelief(
+        parents[None, :, None],
+        torch.full((1, 3), -math.log(3.0), dtype=torch.float64),
+        torch.zeros(1),
+    )
+    seen, draws = Record(torch.tensor([[y]], dtype=torch.float64)), PhiloxStream(1, torch.arange(1))
+    chosen = torch.multinomial(
+        torch.full((3,), 1.0), learn_room.PARENTS, True, generator=torch.Generator().manual_seed(0)
+    )
     r = y - parents[chosen]
     best = normal(r, b * b + s * s).square().sum()
     wanted = {
         "own": best / (normal(r, b * b + 0.5 * s * s) / (2 * s * math.sqrt(math.pi))).sum(),
         "optimal": torch.tensor(1.0, dtype=torch.float64),
     }
-    for name, proposal in (("own", Bootstrap()), ("optimal", GuidedNoise(GaussianFilter(Jacobian())))):
+    for name, proposal in (
+        ("own", BootstrapProposal()),
+        ("optimal", GuidedNoiseProposal(GaussianFilter(TaylorLinearisation()))),
+    ):
         found = learn_room.share(learn_room.weighed(proposal, model, cloud, seen, draws))
-        torch.testing.assert_close(found[0], wanted[name], rtol=0.03 if name == "own" else 1e-3, atol=0.0)
-    torch.testing.assert_close(learn_room.nats(model, cloud, seen)[0].item(), 0.5 * math.log1p((b / s) ** 2))
+        torch.testing.assert_close(
+            found[0], wanted[name], rtol=0.03 if name == "own" else 1e-3, atol=0.0
+        )
+    torch.testing.assert_close(
+        learn_room.nats(model, cloud, seen)[0].item(), 0.5 * math.log1p((b / s) ** 2)
+    )
 
 
 def test_steps_without_a_measurement_are_not_looked_at() -> None:
@@ -62,8 +78,14 @@ def test_an_interval_holds_what_differs_between_worlds_and_between_trainings() -
 
 
 def test_scores_are_told_against_the_own_noise_s() -> None:
-    own, other = ({"ess": [0.4], "evidence": [e], "error": [x]} for e, x in ((-2.0, 4.0), (-1.5, 2.0)))
-    assert [float(against(other, own, name)[0]) for name in ("ess", "evidence", "error")] == [0.4, 0.5, math.log(0.5)]
+    own, other = (
+        {"ess": [0.4], "evidence": [e], "error": [x]} for e, x in ((-2.0, 4.0), (-1.5, 2.0))
+    )
+    assert [float(against(other, own, name)[0]) for name in ("ess", "evidence", "error")] == [
+        0.4,
+        0.5,
+        math.log(0.5),
+    ]
 
 
 def test_verdicts_name_the_better_one_and_tables_count_what_a_step_costs() -> None:
@@ -71,12 +93,21 @@ def test_verdicts_name_the_better_one_and_tables_count_what_a_step_costs() -> No
     scatter = np.exp(0.1 * np.random.default_rng(1).normal(size=40))
 
     def scores(error: float, evidence: float, **more: list[float]) -> dict[str, list[float]]:
-        found = {"ess": [0.25] * 40, "evidence": [*(evidence + scatter)], "error": [*(error * scatter)], "seconds": [0.8]}
+        found = {
+            "ess": [0.25] * 40,
+            "evidence": [*(evidence + scatter)],
+            "error": [*(error * scatter)],
+            "seconds": [0.8],
+        }
         return found | more
 
     each = {"1": scores(1.0, 2.0, training=[3.0]), "2": scores(1.0, 2.0, training=[5.0])}
     by_hand = {learn_data_efficiency.OWN: scores(4.0, 1.0), "as good": scores(1.0, 2.0)}
-    told = {"by hand": by_hand, "dearer": {"as good": scores(0.5, 2.5, particles=[80])}, "inference compilation": {"1": each}}
+    told = {
+        "by hand": by_hand,
+        "dearer": {"as good": scores(0.5, 2.5, particles=[80])},
+        "inference compilation": {"1": each},
+    }
     told["bound"] = {"1": {name: scores(1.1, 2.0, training=[1.0]) for name in each}, "3": each}
     rows = [row.strip("| ").split(" | ") for row in learn_data_efficiency.verdicts(told)[2:]]
     others = ("own noise", "as good", "as good, 80 particles", "bound, 1 world")
@@ -90,13 +121,32 @@ def test_verdicts_name_the_better_one_and_tables_count_what_a_step_costs() -> No
     assert rows[-1][2].startswith("0.909 (0.909 to 0.909)")
 
     world = World(volatility, "state", 10, 0.01, (1,), (1, 2), 40, particles=20)
-    table = {row.split(" | ")[0]: row.strip("| ").split(" | ") for row in learn_data_efficiency.table(told, world)}
-    assert table["| as good, 80 particles"][-2:] == ["80.0", "0.2"]  # 0.8 s in 10 steps, a quarter of 80 particles
+    table = {
+        row.split(" | ")[0]: row.strip("| ").split(" | ")
+        for row in learn_data_efficiency.table(told, world)
+    }
+    assert table["| as good, 80 particles"][-2:] == [
+        "80.0",
+        "0.2",
+    ]  # 0.8 s in 10 steps, a quarter of 80 particles
     assert table["| bound, 3 worlds"][-3:] == ["80.0", "0.1", "4"]
 
 
-def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = World(volatility, "state", 6, 0.01, (1, 2), (1, 2), 8, particles=20, few=4, dearer={"own noise": 60})
+def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = World(
+        volatility,
+        "state",
+        6,
+        0.01,
+        (1, 2),
+        (1, 2),
+        8,
+        particles=20,
+        few=4,
+        dearer={"own noise": 60},
+    )
     monkeypatch.setattr(learn_data_efficiency, "WORLDS", {"small": small})
     learned, taught = [], learn_data_efficiency.taught
 
@@ -120,33 +170,49 @@ def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(tmp_path: Path
     assert (tmp_path / "data_efficiency.png").stat().st_size > 5000
 
 
-def test_few_worlds_come_again_and_no_others_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_worlds_come_again_and_no_others_are_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen = {}
-    monkeypatch.setattr(learn_data_efficiency, "train", lambda plan, method, model, own, few, path: seen.update(own=own, few=few))
+    monkeypatch.setattr(
+        learn_data_efficiency,
+        "train",
+        lambda plan, method, model, own, few, path: seen.update(own=own, few=few),
+    )
     world = World(volatility, "state", 6, 0.01, (2, 40), (1,), 8)
-    learn_data_efficiency.taught(world, 2, 1, learn_data_efficiency.Bound(), tmp_path / "none.pt")
+    learn_data_efficiency.taught(
+        world, 2, 1, learn_data_efficiency.EvidenceLowerBound(), tmp_path / "none.pt"
+    )
     assert len(seen["own"].record.y) == 40
     few = seen["own"].record.y[:2]
     for worlds in seen.values():
-        torch.testing.assert_close(worlds.record.y, few.repeat(len(worlds.record.y) // 2 + 1, 1, 1)[: len(worlds.record.y)])
-    learn_data_efficiency.taught(world, 40, 1, learn_data_efficiency.Bound(), tmp_path / "none.pt")
+        torch.testing.assert_close(
+            worlds.record.y, few.repeat(len(worlds.record.y) // 2 + 1, 1, 1)[: len(worlds.record.y)]
+        )
+    learn_data_efficiency.taught(
+        world, 40, 1, learn_data_efficiency.EvidenceLowerBound(), tmp_path / "none.pt"
+    )
     torch.testing.assert_close(seen["own"].record.y[:2], few)
     assert len(seen["own"].record.y.unique(dim=0)) == 40
 
 
-def test_a_study_of_calibration_goes_on_from_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_of_calibration_goes_on_from_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked = []
 
     def told(unknown, shape, infer, draws, seed):
         asked.append(len(shape.y))
-        return Ranks({name: torch.arange(len(shape.y)) % 20 for name in unknown.names}, draws)
+        return SbcRanks({name: torch.arange(len(shape.y)) % 20 for name in unknown.names}, draws)
 
-    monkeypatch.setattr(learn_noise_calibration, "calibrate", told)
-    monkeypatch.setattr(learn_noise_calibration, "histograms", lambda ranks: Figure())
+    monkeypatch.setattr(learn_noise_calibration, "simulation_based_calibration", told)
+    monkeypatch.setattr(learn_noise_calibration, "sbc_histograms", lambda ranks: Figure())
     learn_noise_calibration.main(tmp_path, 30, 1, "toy")
     learn_noise_calibration.main(tmp_path, 30, 1)
     assert asked == [30] * 8
-    learn_noise_calibration.main(tmp_path, 31, 1, "location, SVI")  # another call, from the beginning
+    learn_noise_calibration.main(
+        tmp_path, 31, 1, "location, SVI"
+    )  # another call, from the beginning
     assert asked[8:] == [31, 31]
     assert (tmp_path / "calibration_toy.png").exists()
     rows = [row.split(" | ") for row in (tmp_path / "table.md").read_text().splitlines()[2:]]

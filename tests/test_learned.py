@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 import torch
-from test_moves import posterior
-from test_particle_filters import CASES, WALK, WALK_Y, check_unbiased, run
+from network_cases import NETWORKS, SMALL, shaken
+from particle_cases import CASES, WALK, WALK_Y
 from torch import Tensor, nn
 from torch.distributions import (
     Beta,
@@ -25,68 +25,78 @@ from torch.distributions import (
     TransformedDistribution,
 )
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter import learned_weights
-from pfbench.filter.belief import Cloud
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.guided_noise import GuidedNoise
-from pfbench.filter.learned import PAST, Learned
-from pfbench.filter.learned_draws import drawn
-from pfbench.filter.learned_inputs import Innovation, Inputs, Parent, Width, scene
-from pfbench.filter.learned_kernel import LearnedWalk
-from pfbench.filter.learned_laws import Diagonal, Flow, LowRank, Mixture, Zuko
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+)
+from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
+from pfbench.filter.learned import checkpoint
+from pfbench.filter.learned.features import (
+    InnovationFeature,
+    InputFeature,
+    ParentFeature,
+    SpreadFeature,
+    make_feature_context,
+)
+from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
+from pfbench.filter.learned.networks import (
+    DiagonalNormalHead,
+    ZukoFlowHead,
+)
+from pfbench.filter.learned.proposal import PAST, LearnedProposal
+from pfbench.filter.learned.reparameterised_sampling import sample_from
 from pfbench.filter.loop import run_filter
-from pfbench.filter.moves import Metropolis
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.proposals import Bootstrap, Proposed
-from pfbench.filter.resamplers import Resample, Systematic
-from pfbench.filter.rules import Cubature, Jacobian, Points
+from pfbench.filter.moves.metropolis import MetropolisHastings
+from pfbench.filter.moves.path_history import StateHistory
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
+from pfbench.filter.particle.resampling import EssResampler, Systematic
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear import LinearGaussian
-from pfbench.record import Record
+from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.testing import check_evidence, filter_record, simulate_path_posterior
+from pfbench.testing.moves import STEPS
 
-ALWAYS = Resample(Systematic(), 1.0)
-EKF, CKF = GaussianFilter(Jacobian()), GaussianFilter(Points(Cubature()))
-SMALL = (8,)
-NETWORKS: dict[str, Callable[[int, int], nn.Module]] = {
-    "diagonal": partial(Diagonal, hidden=SMALL),
-    "low rank": partial(LowRank, hidden=SMALL),
-    "mixture": partial(Mixture, hidden=SMALL),
-    "flow": partial(Flow, hidden=SMALL),
-}
+ALWAYS = EssResampler(Systematic(), 1.0)
+EKF, CKF = (
+    GaussianFilter(TaylorLinearisation()),
+    GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
+)
 
 
-def shaken(make: Callable[[int, int], nn.Module], size: float = 0.3) -> Callable[[int, int], nn.Module]:
-    """The network with weights of no sense: whatever training may have made of it."""
-
-    def made(features: int, noise: int) -> nn.Module:
-        network = make(features, noise)
-        with torch.no_grad():
-            for weight in network.parameters():
-                weight.add_(size * torch.randn_like(weight) / math.sqrt(weight.shape[-1]))
-        return network
-
-    return made
-
-
-def proposal(name: str, random: bool, **options: Any) -> Learned:
-    return Learned(shaken(NETWORKS[name]) if random else NETWORKS[name], **options)
+def proposal(name: str, random: bool, **options: Any) -> LearnedProposal:
+    return LearnedProposal(shaken(NETWORKS[name]) if random else NETWORKS[name], **options)
 
 
 # the target stays
 
 
-@pytest.mark.parametrize("guide", [None, GuidedNoise(CKF)], ids=["prior", "guided"])
+@pytest.mark.parametrize("guide", [None, GuidedNoiseProposal(CKF)], ids=["prior", "guided"])
 @pytest.mark.parametrize("random", [False, True], ids=["untrained", "random"])
 @pytest.mark.parametrize("name", NETWORKS)
-def test_the_ratio_is_one_on_average(name: str, random: bool, guide: GuidedNoise | None) -> None:
+def test_the_ratio_is_one_on_average(
+    name: str, random: bool, guide: GuidedNoiseProposal | None
+) -> None:
     """E_q[p / q] = 1, and E_q[p / q w] = E_p[w] = 0, for each particle with its own parent."""
     model, n = WALK, 20_000
-    method = proposal(name, random, guide=guide)
+    method = proposal(name, random, guide_filter=guide)
     x = torch.tensor([[[0.4, -0.2], [2.0, 1.0]]], dtype=torch.float64).repeat_interleave(n // 2, 1)
-    cloud = Cloud(x, torch.full((1, n), -math.log(n), dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+    cloud = ParticleBelief(
+        x,
+        torch.full((1, n), -math.log(n), dtype=torch.float64),
+        torch.zeros(1, dtype=torch.float64),
+    )
     with torch.no_grad():
-        told = method(model, cloud, Record(torch.tensor([[1.5]], dtype=torch.float64)), MonteCarlo(3, torch.arange(1)))
+        told = method(
+            model,
+            cloud,
+            Record(torch.tensor([[1.5]], dtype=torch.float64)),
+            PhiloxStream(3, torch.arange(1)),
+        )
     ratio = told.log_ratio.exp()[0]
     for value in (ratio - 1.0, *(ratio[:, None] * told.w[0]).T):
         assert abs(value.mean()) < 4.5 * value.std() / math.sqrt(n) + 1e-9
@@ -99,38 +109,51 @@ def test_the_ratio_is_one_on_average(name: str, random: bool, guide: GuidedNoise
 def test_filters_with_random_networks_are_unbiased(name: str, case: str) -> None:
     model, y, exact = CASES[case]()
     method = ParticleFilter(60, ALWAYS, proposal=proposal(name, True))
-    assert method.exact
+    assert method.is_exact
     with torch.no_grad():
-        check_unbiased(method, model, y, exact, runs=600)
+        check_evidence(method, model, y, exact, runs=600)
 
 
 @pytest.mark.parametrize(
     "options",
     [
-        {"guide": GuidedNoise(CKF)},
-        {"guide": GuidedNoise(EKF, shared=True, widen=1.5), "share": 0.3},
+        {"guide_filter": GuidedNoiseProposal(CKF)},
+        {
+            "guide_filter": GuidedNoiseProposal(
+                EKF, shared_by_particles=True, covariance_factor=1.5
+            ),
+            "defensive_fraction": 0.3,
+        },
         {"memory": 3},
-        {"share": 0.0},
+        {"defensive_fraction": 0.0},
     ],
     ids=["corrects the CKF", "corrects a wide EKF", "remembers", "keeps none"],
 )
 def test_they_are_unbiased_whatever_their_options(options: dict[str, Any]) -> None:
     model, y, exact = CASES["growth"]()
     with torch.no_grad():
-        check_unbiased(ParticleFilter(60, ALWAYS, proposal=proposal("diagonal", True, **options)), model, y, exact, runs=500)
+        check_evidence(
+            ParticleFilter(60, ALWAYS, proposal=proposal("diagonal", True, **options)),
+            model,
+            y,
+            exact,
+            runs=500,
+        )
 
 
 class Wrong(nn.Module):
     """A learned proposal with a mistake in its ratio."""
 
-    exact = True
+    is_exact = True
 
-    def __init__(self, inner: Learned, mistake: str) -> None:
+    def __init__(self, inner: LearnedProposal, mistake: str) -> None:
         super().__init__()
         self.inner, self.mistake = inner, mistake
 
-    def forward(self, model: StateSpaceModel, cloud: Cloud, seen: Record, draws: MonteCarlo) -> Proposed:
-        right = self.inner(model, cloud, seen, draws)
+    def forward(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: PhiloxStream
+    ) -> ProposalSample:
+        right = self.inner(model, belief, record, draws)
         log_p = -0.5 * right.w.square().sum(-1)
         wrong = {
             "no ratio": torch.zeros_like(right.log_ratio),
@@ -144,9 +167,11 @@ class Wrong(nn.Module):
 @pytest.mark.parametrize("mistake", ["no ratio", "p alone", "q / p", "another particle's"])
 def test_a_wrong_ratio_is_seen(mistake: str) -> None:
     model, y, exact = CASES["growth"]()
-    method = ParticleFilter(60, ALWAYS, proposal=Wrong(proposal("diagonal", True, share=0.3), mistake))  # type: ignore[arg-type]
+    method = ParticleFilter(
+        60, ALWAYS, proposal=Wrong(proposal("diagonal", True, defensive_fraction=0.3), mistake)
+    )  # type: ignore[arg-type]
     with torch.no_grad(), pytest.raises(AssertionError):
-        check_unbiased(method, model, y, exact, runs=500)
+        check_evidence(method, model, y, exact, runs=500)
 
 
 @pytest.mark.slow
@@ -158,8 +183,8 @@ def test_with_an_untrained_network_the_filter_goes_to_kalman(name: str) -> None:
     for n in (50, 800):
         method = ParticleFilter(n, ALWAYS, proposal=proposal(name, True))
         with torch.no_grad():
-            estimate = run(method, model, y, runs=100)
-        errors.append((estimate.log_evidence - exact.log_z).square().mean().sqrt().item())
+            estimate = filter_record(method, model, y, runs=100)
+        errors.append((estimate.log_evidence - exact.log_evidence).square().mean().sqrt().item())
     assert errors[1] < 0.35
     assert 2.0 < errors[0] / errors[1] < 8.0  # 4, give or take what 100 runs leave open
 
@@ -171,9 +196,16 @@ def test_with_an_untrained_network_the_filter_goes_to_kalman(name: str) -> None:
 def test_an_untrained_proposal_is_the_one_it_corrects(case: str) -> None:
     """To the last digit: same draws, same particles, same weights."""
     model, y, _ = CASES[case]()
-    for guide, plain in ((None, Bootstrap()), (GuidedNoise(CKF), GuidedNoise(CKF)), (GuidedNoise(EKF), GuidedNoise(EKF))):
-        ours = ParticleFilter(50, proposal=Learned(Diagonal, guide=guide))
-        one, other = (run(method, model, y, runs=3) for method in (ours, ParticleFilter(50, proposal=plain)))
+    for guide, plain in (
+        (None, BootstrapProposal()),
+        (GuidedNoiseProposal(CKF), GuidedNoiseProposal(CKF)),
+        (GuidedNoiseProposal(EKF), GuidedNoiseProposal(EKF)),
+    ):
+        ours = ParticleFilter(50, proposal=LearnedProposal(DiagonalNormalHead, guide_filter=guide))
+        one, other = (
+            filter_record(method, model, y, runs=3)
+            for method in (ours, ParticleFilter(50, proposal=plain))
+        )
         torch.testing.assert_close(one.mean, other.mean, rtol=1e-9, atol=1e-9)
         torch.testing.assert_close(one.log_evidence, other.log_evidence, rtol=1e-9, atol=1e-9)
 
@@ -186,17 +218,26 @@ class Narrow(nn.Module):
         self.sd = nn.Parameter(torch.full((noise,), 0.2))
 
     def forward(self, told: Tensor) -> Distribution:
-        return Independent(Normal(torch.zeros_like(self.sd), self.sd).expand((*told.shape[:2], len(self.sd))), 1)
+        return Independent(
+            Normal(torch.zeros_like(self.sd), self.sd).expand((*told.shape[:2], len(self.sd))), 1
+        )
 
 
 def test_the_kept_share_bounds_every_weight() -> None:
     """p / q <= 1 / share, whatever the network says; without it nothing does."""
     x = torch.zeros(1, 4000, 2, dtype=torch.float64)
-    cloud = Cloud(x, torch.full((1, 4000), -math.log(4000), dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
-    seen, draws = Record(torch.tensor([[9.0]], dtype=torch.float64)), MonteCarlo(1, torch.arange(1))
+    cloud = ParticleBelief(
+        x,
+        torch.full((1, 4000), -math.log(4000), dtype=torch.float64),
+        torch.zeros(1, dtype=torch.float64),
+    )
+    seen, draws = (
+        Record(torch.tensor([[9.0]], dtype=torch.float64)),
+        PhiloxStream(1, torch.arange(1)),
+    )
     largest = []
     for share in (0.0, 0.1):
-        method = Learned(Narrow, share=share)
+        method = LearnedProposal(Narrow, defensive_fraction=share)
         with torch.no_grad():
             largest.append(method(WALK, cloud, seen, draws).log_ratio.max().item())
     assert largest[0] > math.log(10.0) + 1.0
@@ -206,8 +247,8 @@ def test_the_kept_share_bounds_every_weight() -> None:
 @pytest.mark.parametrize("name", NETWORKS)
 def test_gradients_reach_every_weight(name: str) -> None:
     method = ParticleFilter(20, ALWAYS, proposal=proposal(name, True, memory=2))
-    run(method, WALK, WALK_Y, runs=4).log_evidence.mean().backward()
-    assert isinstance(method.proposal, Learned)
+    filter_record(method, WALK, WALK_Y, runs=4).log_evidence.mean().backward()
+    assert isinstance(method.proposal, LearnedProposal)
     weights = dict(method.proposal.named_parameters())
     assert len(weights) > 4
     for key, weight in weights.items():
@@ -217,19 +258,25 @@ def test_gradients_reach_every_weight(name: str) -> None:
 
 
 @pytest.mark.parametrize("flow", ["NSF", "MAF", "NICE"])
-def test_flows_of_the_library_zuko_leave_the_target_too(flow: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flows_of_the_library_zuko_leave_the_target_too(
+    flow: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     zuko = pytest.importorskip("zuko", reason="needs the extra zuko")
-    monkeypatch.setitem(NETWORKS, "zuko", partial(Zuko, flow=getattr(zuko.flows, flow), hidden=SMALL))
+    monkeypatch.setitem(
+        NETWORKS, "zuko", partial(ZukoFlowHead, flow=getattr(zuko.flows, flow), hidden=SMALL)
+    )
     test_the_ratio_is_one_on_average("zuko", True, None)
     test_gradients_reach_every_weight("zuko")
 
 
-class Lying(Zuko):
+class Lying(ZukoFlowHead):
     """A flow that says its map is twice as wide as it is."""
 
     def forward(self, told: Tensor) -> Distribution:
         law: Any = super().forward(told)
-        law.transforms[-1].log_abs_det_jacobian = lambda x, y: math.log(2.0) * torch.ones_like(x[..., 0])
+        law.transforms[-1].log_abs_det_jacobian = lambda x, y: (
+            math.log(2.0) * torch.ones_like(x[..., 0])
+        )
         return law  # type: ignore[no-any-return]
 
 
@@ -245,20 +292,26 @@ def test_a_run_cannot_feel_its_neighbours() -> None:
     y = torch.stack([WALK_Y + k for k in range(3)])
     method = ParticleFilter(20, proposal=proposal("mixture", True, memory=2))
     with torch.no_grad():
-        whole = run_filter(method, WALK, Record(y), MonteCarlo(1, torch.arange(3)))
-        alone = run_filter(method, WALK, Record(y[1:2]), MonteCarlo(1, torch.tensor([1])))
-        blocks = run_filter(method, WALK, Record(y), MonteCarlo(1, torch.arange(3)), at_once=2)
+        whole = run_filter(method, WALK, Record(y), PhiloxStream(1, torch.arange(3)))
+        alone = run_filter(method, WALK, Record(y[1:2]), PhiloxStream(1, torch.tensor([1])))
+        blocks = run_filter(method, WALK, Record(y), PhiloxStream(1, torch.arange(3)), run_batch=2)
     torch.testing.assert_close(whole.mean[1:2], alone.mean, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(whole.mean, blocks.mean, rtol=1e-10, atol=1e-10)
 
 
 def test_what_was_seen_before_is_remembered_once_for_each_run() -> None:
     method = ParticleFilter(20, ALWAYS, proposal=proposal("diagonal", True, memory=3))
-    cloud, model, draws = method.init(WALK, 2, MonteCarlo(1, torch.arange(2))), WALK, MonteCarlo(1, torch.arange(2))
+    cloud, model, draws = (
+        method.init(WALK, 2, PhiloxStream(1, torch.arange(2))),
+        WALK,
+        PhiloxStream(1, torch.arange(2)),
+    )
     pasts = []
     with torch.no_grad():
         for t, y in enumerate(WALK_Y[:2]):
-            cloud, _ = method.step(model, cloud, Record(torch.stack([y, y + 1.0])), draws.at(t + 1))
+            cloud, _ = method.step(
+                model, cloud, Record(torch.stack([y, y + 1.0])), draws.at_step(t + 1)
+            )
             pasts.append(cloud.memory[PAST])
     assert pasts[0].shape == (2, 1, 3)
     assert (pasts[0] - pasts[1]).abs().max() > 1e-3
@@ -275,50 +328,72 @@ def test_a_unit_of_measure_changes_nothing() -> None:
         f = torch.tensor([[1.0, 1.0], [0.0, 1.0]], dtype=torch.float64)
         g = unit * torch.diag(torch.tensor([0.3, 0.1]))
         model = LinearGaussian(f, g, [[1.0, 0.0]], [unit], [0.0, 0.0], [2.0 * unit, unit])
-        x = unit * MonteCarlo(1, torch.arange(1)).normal("x", 30, 2)
-        cloud = Cloud(x, torch.full((1, 30), -math.log(30.0), dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
-        step = scene(model, cloud, Record(unit * torch.tensor([[2.5]], dtype=torch.float64)))
-        return torch.cat([part(step).expand(1, 30, -1) for part in (Innovation(), Parent(), Width())], -1)
+        x = unit * PhiloxStream(1, torch.arange(1)).normal("x", 30, 2)
+        cloud = ParticleBelief(
+            x,
+            torch.full((1, 30), -math.log(30.0), dtype=torch.float64),
+            torch.zeros(1, dtype=torch.float64),
+        )
+        step = make_feature_context(
+            model, cloud, Record(unit * torch.tensor([[2.5]], dtype=torch.float64))
+        )
+        return torch.cat(
+            [
+                part(step).expand(1, 30, -1)
+                for part in (InnovationFeature(), ParentFeature(), SpreadFeature())
+            ],
+            -1,
+        )
 
     torch.testing.assert_close(told(1.0), told(1e-6))
     assert told(1.0).abs().max() < 5.0
 
 
 def test_an_input_is_asked_for_by_name() -> None:
-    cloud = ParticleFilter(5).init(WALK, 1, MonteCarlo(1, torch.arange(1)))
-    with pytest.raises(ValueError, match=r"features\.scales\.speed: the inputs have nothing"):
-        Inputs({"speed": 1.0})(scene(WALK, cloud, Record(WALK_Y[:1])))
+    cloud = ParticleFilter(5).init(WALK, 1, PhiloxStream(1, torch.arange(1)))
+    with pytest.raises(
+        ValueError, match=r"features\.input_scales must be names of inputs .*, got speed"
+    ):
+        InputFeature({"speed": 1.0})(make_feature_context(WALK, cloud, Record(WALK_Y[:1])))
 
 
 # draws of any law
 
 
 def laws() -> dict[str, Distribution]:
-    mean, sd = torch.tensor([0.5, -1.0], dtype=torch.float64), torch.tensor([0.3, 2.0], dtype=torch.float64)
+    mean, sd = (
+        torch.tensor([0.5, -1.0], dtype=torch.float64),
+        torch.tensor([0.3, 2.0], dtype=torch.float64),
+    )
     root = torch.tensor([[1.0, 0.0], [-0.7, 0.5]], dtype=torch.float64)
     parts = Independent(Normal(torch.stack([mean, -3.0 * mean]), torch.stack([sd, 0.5 * sd])), 1)
     return {
         "normal": Independent(Normal(mean, sd), 1),
         "full": MultivariateNormal(mean, scale_tril=root),
         "low rank": LowRankMultivariateNormal(mean, root[:, :1], sd.square()),
-        "mixture": MixtureSameFamily(torch.distributions.Categorical(torch.tensor([0.3, 0.7], dtype=torch.float64)), parts),
+        "mixture": MixtureSameFamily(
+            torch.distributions.Categorical(torch.tensor([0.3, 0.7], dtype=torch.float64)), parts
+        ),
         "laplace": Independent(Laplace(mean, sd), 1),
         "transformed": TransformedDistribution(
-            Independent(Normal(mean, sd), 1), [torch.distributions.AffineTransform(mean, 2.0 * sd, event_dim=1)]
+            Independent(Normal(mean, sd), 1),
+            [torch.distributions.AffineTransform(mean, 2.0 * sd, event_dim=1)],
         ),
     }
 
 
 @pytest.mark.parametrize("name", laws())
 def test_draws_have_the_law_s_moments(name: str) -> None:
-    law, n, draws = laws()[name], 100_000, MonteCarlo(1, torch.arange(1))
+    law, n, draws = laws()[name], 100_000, PhiloxStream(1, torch.arange(1))
     if name == "transformed":  # x = m + 2 s (m + s z)
         m, s = torch.tensor([0.5, -1.0]), torch.tensor([0.3, 2.0])
         mean, sd = m + 2.0 * s * m, 2.0 * s * s
     else:
         mean, sd = law.mean, law.variance.sqrt()
-    x = drawn(law.expand((1, n)), draws.normal("z", n, 2), draws)[0]
-    torch.testing.assert_close(x.mean(0), mean.to(x), rtol=0, atol=4.5 * float(sd.max()) / math.sqrt(n))
+    x = sample_from(law.expand((1, n)), draws.normal("z", n, 2), draws)[0]
+    torch.testing.assert_close(
+        x.mean(0), mean.to(x), rtol=0, atol=4.5 * float(sd.max()) / math.sqrt(n)
+    )
     torch.testing.assert_close(x.std(0), sd.to(x), rtol=0.03, atol=0)
 
 
@@ -328,12 +403,16 @@ def test_gradients_of_a_mixture_s_draws_are_those_of_its_expectations() -> None:
     mean = torch.tensor([[0.5, -1.0], [-0.7, 0.4]], dtype=torch.float64, requires_grad=True)
     sd = torch.tensor([[0.6, 0.5], [0.9, 0.3]], dtype=torch.float64, requires_grad=True)
     share = torch.softmax(logits, -1)
-    exact = torch.autograd.grad((share * (mean[:, 0] ** 2 + sd[:, 0] ** 2) * mean[:, 1]).sum(), (logits, mean, sd))
-    n, draws, rows = 10_000, MonteCarlo(2, torch.arange(1)), []
+    exact = torch.autograd.grad(
+        (share * (mean[:, 0] ** 2 + sd[:, 0] ** 2) * mean[:, 1]).sum(), (logits, mean, sd)
+    )
+    n, draws, rows = 10_000, PhiloxStream(2, torch.arange(1)), []
     for k in range(12):
         parts = Independent(Normal(mean, sd), 1).expand((1, n, 2))
-        law = MixtureSameFamily(torch.distributions.Categorical(logits=logits.expand(1, n, 2)), parts)
-        x = drawn(law, draws.at(k).normal("z", n, 2), draws.at(k))
+        law = MixtureSameFamily(
+            torch.distributions.Categorical(logits=logits.expand(1, n, 2)), parts
+        )
+        x = sample_from(law, draws.at_step(k).normal("z", n, 2), draws.at_step(k))
         found = torch.autograd.grad((x[..., 0] ** 2 * x[..., 1]).mean(), (logits, mean, sd))
         rows.append(torch.cat([g.flatten() for g in found]))
     values, wanted = torch.stack(rows), torch.cat([g.flatten() for g in exact])
@@ -343,9 +422,9 @@ def test_gradients_of_a_mixture_s_draws_are_those_of_its_expectations() -> None:
 
 
 def test_a_law_that_cannot_be_drawn_is_named() -> None:
-    one, draws = torch.ones(1, 5, 2, dtype=torch.float64), MonteCarlo(1, torch.arange(1))
-    with pytest.raises(ValueError, match="returned Beta, which cannot be made"):
-        drawn(Independent(Beta(one, one), 1), one, draws)
+    one, draws = torch.ones(1, 5, 2, dtype=torch.float64), PhiloxStream(1, torch.arange(1))
+    with pytest.raises(ValueError, match="standard normals can sample, got Beta"):
+        sample_from(Independent(Beta(one, one), 1), one, draws)
 
 
 class Heavy(nn.Module):
@@ -362,7 +441,9 @@ class Heavy(nn.Module):
 def test_any_law_may_be_proposed_from() -> None:
     model, y, exact = CASES["growth"]()
     with torch.no_grad():
-        check_unbiased(ParticleFilter(60, ALWAYS, proposal=Learned(Heavy)), model, y, exact, runs=500)
+        check_evidence(
+            ParticleFilter(60, ALWAYS, proposal=LearnedProposal(Heavy)), model, y, exact, runs=500
+        )
 
 
 # the learned kernel
@@ -372,40 +453,57 @@ def test_any_law_may_be_proposed_from() -> None:
 class Careless:
     """The kernel with a part of its ratio left out."""
 
-    inner: LearnedWalk
+    inner: LearnedRandomWalk
     mistake: str
-    exact = True
+    is_exact = True
 
-    def propose(self, model: StateSpaceModel, cloud: Cloud, draws: Any) -> tuple[Cloud, Tensor]:
-        moved, log_alpha, step = self.inner.step(model, cloud, draws)
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: Any
+    ) -> tuple[ParticleBelief, Tensor]:
+        moved, log_alpha, step = self.inner.propose_step(model, belief, draws)
         delta = step / (self.inner.scale * step.shape[-1] ** -0.5)
         assert self.inner.network is not None
-        xi, new = (c.window["noise"][:, :, -self.inner.depth :].flatten(2) for c in (cloud, moved))
-        log_q = self.inner._law(model, moved, new).log_prob(-delta) - self.inner._law(model, cloud, xi).log_prob(delta)
+        xi, new = (c.window["noise"][:, :, -self.inner.lag :].flatten(2) for c in (belief, moved))
+        back, forward = (
+            self.inner._step_distribution(model, *pair) for pair in ((moved, new), (belief, xi))
+        )
+        log_q = back.log_prob(-delta) - forward.log_prob(delta)
         prior = 0.5 * (xi.square() - new.square()).sum(-1)
-        return moved, {"no Hastings": log_alpha - log_q, "no prior": log_alpha - prior, "none": log_alpha}[self.mistake]
+        return moved, {
+            "no Hastings": log_alpha - log_q,
+            "no prior": log_alpha - prior,
+            "none": log_alpha,
+        }[self.mistake]
 
 
 def after(mistake: str, size: float, sweeps: int = 4) -> float:
     """p-value of the drift of exact paths under the kernel."""
-    exact = posterior(0.5, 15_000)
-    cloud = exact.cloud()
-    kernel = LearnedWalk(shaken(NETWORKS["diagonal"], size), depth=2)
-    draws = MonteCarlo(5, torch.arange(1))
+    exact = simulate_path_posterior(0.5, 15_000)
+    cloud = exact.belief(StateHistory(STEPS, store_noise=True, store_density=True))
+    kernel = LearnedRandomWalk(shaken(NETWORKS["diagonal"], size), lag=2)
+    draws = PhiloxStream(5, torch.arange(1))
     with torch.no_grad():
-        kernel.begin(exact.model, 1)
+        kernel.build(exact.model, 1)
         for sweep in range(sweeps):
-            proposed, log_alpha = Careless(kernel, mistake).propose(exact.model, cloud, draws.at(sweep))
-            toss = torch.log(draws.at(sweep).uniform("accept", log_alpha.shape[1], 1).squeeze(2))
+            proposed, log_alpha = Careless(kernel, mistake).propose(
+                exact.model, cloud, draws.at_step(sweep)
+            )
+            toss = torch.log(
+                draws.at_step(sweep).uniform("accept", log_alpha.shape[1], 1).squeeze(2)
+            )
             accept = toss < log_alpha
             window = {
-                name: torch.where(accept[..., None, None] if a.dim() == 4 else accept[..., None], proposed.window[name], a)
+                name: torch.where(
+                    accept[..., None, None] if a.dim() == 4 else accept[..., None],
+                    proposed.window[name],
+                    a,
+                )
                 for name, a in cloud.window.items()
                 if a.shape[1] > 1
             }
             cloud = cloud._replace(window=cloud.window | window)
         assert 0.1 < accept.double().mean() < 0.9
-    return exact.drift(cloud.window["states"][0].flatten(1).numpy())
+    return exact.log_density_p_value(exact.paths_after(cloud))
 
 
 @pytest.mark.parametrize("size", [0.0, 0.6], ids=["untrained", "random"])
@@ -420,11 +518,13 @@ def test_the_test_of_invariance_sees_mistakes_of_the_learned_kernel(mistake: str
 
 def test_a_filter_with_the_learned_kernel_is_unbiased_and_moves() -> None:
     model, y, exact = CASES["growth"]()
-    method = ParticleFilter(60, ALWAYS, moves=(Metropolis(LearnedWalk(shaken(Diagonal)), 2),))
-    assert method.exact
+    method = ParticleFilter(
+        60, ALWAYS, moves=(MetropolisHastings(LearnedRandomWalk(shaken(DiagonalNormalHead)), 2),)
+    )
+    assert method.is_exact
     with torch.no_grad():
-        check_unbiased(method, model, y, exact, runs=300)
-        assert run(method, model, y, runs=20).trace["accepted_0"][:, 2:].mean() > 0.1
+        check_evidence(method, model, y, exact, runs=300)
+        assert filter_record(method, model, y, runs=20).trace["accepted_0"][:, 2:].mean() > 0.1
 
 
 # checkpoints are refused in words
@@ -434,31 +534,40 @@ def test_a_filter_with_the_learned_kernel_is_unbiased_and_moves() -> None:
 def kept(tmp_path: Any) -> Any:
     """A checkpoint of a diagonal network of 8 hidden units on the walk."""
     method = proposal("diagonal", True)
-    cloud = ParticleFilter(5).init(WALK, 1, MonteCarlo(1, torch.arange(1)))
-    method.begin(WALK, cloud, Record(WALK_Y[:1]))
+    cloud = ParticleFilter(5).init(WALK, 1, PhiloxStream(1, torch.arange(1)))
+    method.build(WALK, cloud, Record(WALK_Y[:1]))
     content = {
-        "networks": {"proposal": learned_weights.flat(dict(method.named_children()))},
+        "networks": {"proposal": checkpoint.flatten_parameters(dict(method.named_children()))},
         "sizes": {"proposal": list(method.sizes)},
         "frames": {"proposal": method.learnable.frame},
         "model": {"class": "LinearGaussian", "names": list(WALK.names)},
         "choices": {"scenario": "linear_walk", "model": "linear_walk", "filter": "neural_sir"},
-        "split": {"scenario": "linear_walk", "train": {"seed": 7, "runs": 10}, "validation": {"seed": 8, "runs": 4}},
+        "split": {
+            "scenario": "linear_walk",
+            "train": {"seed": 7, "runs": 10},
+            "validation": {"seed": 8, "runs": 4},
+        },
         "cost": {"seconds": 1.0},
     }
-    learned_weights.write(tmp_path / "walk.pt", content)
+    checkpoint.write_checkpoint(tmp_path / "walk.pt", content)
     return tmp_path / "walk.pt", method, content
 
 
 def used(path: Any, model: StateSpaceModel = WALK, y: Tensor = WALK_Y, **options: Any) -> Any:
-    method = ParticleFilter(20, proposal=Learned(options.pop("network", NETWORKS["diagonal"]), checkpoint=path, **options))
+    method = ParticleFilter(
+        20,
+        proposal=LearnedProposal(
+            options.pop("network", NETWORKS["diagonal"]), checkpoint=path, **options
+        ),
+    )
     with torch.no_grad():
-        return run(method, model, y, runs=2)
+        return filter_record(method, model, y, runs=2)
 
 
 def test_a_checkpoint_brings_the_weights_back(kept: Any) -> None:
     path, method, _ = kept
     with torch.no_grad():
-        own = run(ParticleFilter(20, proposal=method), WALK, WALK_Y, runs=2)
+        own = filter_record(ParticleFilter(20, proposal=method), WALK, WALK_Y, runs=2)
     torch.testing.assert_close(used(str(path)).mean, own.mean, rtol=0, atol=0)
     assert (used("untrained").mean - own.mean).abs().max() > 1e-3
 
@@ -468,19 +577,30 @@ def test_a_checkpoint_brings_the_weights_back(kept: Any) -> None:
     [
         (
             {"model": CASES["singular"]()[0], "y": CASES["singular"]()[1]},
-            "a model with 2 states .*position.*train on this.* scenario=linear_walk model=linear_walk$",
+            "got 2 .position, velocity.*Train on this.* scenario=linear_walk model=linear_walk.$",
         ),
-        ({"network": partial(Diagonal, hidden=(9,))}, r"bent.0.bias has shape \(8,\), this filter's network has \(9,\)"),
+        (
+            {"network": partial(DiagonalNormalHead, hidden=(9,))},
+            r"hidden_layers.0.bias of shape \(9,\), got \(8,\)",
+        ),
         ({"network": NETWORKS["mixture"]}, "proposal.network"),
-        ({"memory": 4}, "trained with memory=0 .* here it is 4; give the model"),
-        ({"features": [Innovation()]}, "trained with features=10 .* here it is 4"),
-        ({"guide": GuidedNoise(CKF)}, "corrects the model's own noise, .* what is guided by Cubature; give filter=neural_sir"),
-        ({"path": None}, "checkpoint=null: .*pfbench train.*checkpoint=untrained"),
-        ({"path": "nowhere.pt"}, "checkpoint=nowhere.pt: there is no such file"),
+        ({"memory": 4}, "memory=4 .* got 0 in .* Set the model"),
+        ({"features": [InnovationFeature()]}, "features=4 .* got 10 in"),
+        (
+            {"guide_filter": GuidedNoiseProposal(CKF)},
+            "correct what is guided by CubaturePoints, got the model's own noise .* Set filter=neural_sir",
+        ),
+        (
+            {"path": None},
+            "checkpoint must be a file or `untrained` .*got null.*pfbench train.*checkpoint=FILE",
+        ),
+        ({"path": "nowhere.pt"}, "checkpoint must be an existing file, got nowhere.pt"),
     ],
     ids=["model", "hidden", "network", "memory", "features", "guide", "none", "missing"],
 )
-def test_another_model_s_checkpoint_is_refused_in_words(kept: Any, options: dict[str, Any], said: str) -> None:
+def test_another_model_s_checkpoint_is_refused_in_words(
+    kept: Any, options: dict[str, Any], said: str
+) -> None:
     given = {"path": str(kept[0])} | options
     with pytest.raises(ValueError, match=said):
         used(given.pop("path"), **given)
@@ -491,52 +611,73 @@ def test_what_is_no_file_of_weights_is_never_run(tmp_path: Any) -> None:
         def __reduce__(self) -> Any:
             return print, ("run!",)
 
-    torch.save({"format": learned_weights.FORMAT, "networks": Evil()}, tmp_path / "evil.pt")
+    torch.save({"format": checkpoint.FORMAT, "networks": Evil()}, tmp_path / "evil.pt")
     (tmp_path / "text.pt").write_text("weights?")
     torch.save({"networks": {}}, tmp_path / "old.pt")
-    for name, said in (("evil", "nothing in it was run"), ("text", "not a file of weights"), ("old", "its format is None")):
+    for name, said in (
+        ("evil", "damaged or another file"),
+        ("text", "must be a file of weights"),
+        ("old", "got None"),
+    ):
         with pytest.raises(ValueError, match=said):
-            learned_weights.read(tmp_path / f"{name}.pt")
+            checkpoint.read_checkpoint(tmp_path / f"{name}.pt")
 
 
 def test_a_key_depends_on_weights_not_on_paths(kept: Any, tmp_path: Any) -> None:
     path, _, content = kept
     (tmp_path / "elsewhere").mkdir()
     path.rename(tmp_path / "elsewhere" / "b.pt")
-    learned_weights.write(path, content | {"cost": {"seconds": 2.0}})
+    checkpoint.write_checkpoint(path, content | {"cost": {"seconds": 2.0}})
     changed = {key: a + 1e-12 for key, a in content["networks"]["proposal"].items()}
-    learned_weights.write(tmp_path / "c.pt", content | {"networks": {"proposal": changed}})
+    checkpoint.write_checkpoint(tmp_path / "c.pt", content | {"networks": {"proposal": changed}})
     one, two, three = (
-        learned_weights.by_content({"filter": {"moves": [{"checkpoint": str(name)}]}, "checkpoint": None})
+        checkpoint.replace_checkpoint_by_hash(
+            {"filter": {"moves": [{"checkpoint": str(name)}]}, "checkpoint": None}
+        )
         for name in (path, tmp_path / "elsewhere" / "b.pt", tmp_path / "c.pt")
     )
     assert one == two != three
-    assert learned_weights.by_content({"checkpoint": "untrained"}) == {"checkpoint": "untrained"}
+    assert checkpoint.replace_checkpoint_by_hash({"checkpoint": "untrained"}) == {
+        "checkpoint": "untrained"
+    }
 
 
 def test_worlds_that_were_learned_from_are_not_for_judging(kept: Any) -> None:
     config = {"moves": [{"kernel": {"checkpoint": str(kept[0])}}]}
-    with pytest.raises(ValueError, match=r"seed=7: runs 0 to 9 of linear_walk .* learned from; give another seed"):
-        learned_weights.origin(config, "linear_walk", 7, torch.arange(5, 20))
-    with pytest.raises(ValueError, match="used to stop by"):
-        learned_weights.origin(config, "linear_walk", 8, torch.arange(1))
-    jobs = ("linear_walk", 7, torch.arange(10, 20)), ("t003", 7, torch.arange(3))
-    told, other = (learned_weights.origin(config, *job) for job in jobs)
+    with pytest.raises(
+        ValueError, match=r"training seed .* got 7: runs 0 to 9 of linear_walk .* Set another seed"
+    ):
+        checkpoint.checkpoint_provenance(config, "linear_walk", 7, torch.arange(5, 20))
+    with pytest.raises(ValueError, match="validation seed"):
+        checkpoint.checkpoint_provenance(config, "linear_walk", 8, torch.arange(1))
+    jobs = ("linear_walk", 7, torch.arange(10, 20)), ("flight_300s", 7, torch.arange(3))
+    told, other = (checkpoint.checkpoint_provenance(config, *job) for job in jobs)
     assert told is not None
     assert other is not None
     assert told["cost"] == {"seconds": 1.0}
     assert told["weights"] == other["weights"]
-    assert learned_weights.origin({"proposal": {"checkpoint": "untrained"}}, "linear_walk", 7, torch.arange(3)) is None
+    assert (
+        checkpoint.checkpoint_provenance(
+            {"proposal": {"checkpoint": "untrained"}}, "linear_walk", 7, torch.arange(3)
+        )
+        is None
+    )
 
 
 @pytest.mark.parametrize(
     ("make", "word"),
     [
-        (lambda: Learned(Diagonal, share=1.0), "share=1.0"),
-        (lambda: Learned(Diagonal, share=-0.1), "proposal.share=-0.1"),
-        (lambda: Learned(Diagonal, memory=-1), "memory=-1"),
-        (lambda: LearnedWalk(Diagonal, depth=0), "depth=0"),
-        (lambda: LearnedWalk(Diagonal, scale=0.0), "scale=0.0"),
+        (
+            lambda: LearnedProposal(DiagonalNormalHead, defensive_fraction=1.0),
+            "defensive_fraction=1.0",
+        ),
+        (
+            lambda: LearnedProposal(DiagonalNormalHead, defensive_fraction=-0.1),
+            "proposal.defensive_fraction must be from 0 to 1, got -0.1",
+        ),
+        (lambda: LearnedProposal(DiagonalNormalHead, memory=-1), "memory=-1"),
+        (lambda: LearnedRandomWalk(DiagonalNormalHead, lag=0), "lag=0"),
+        (lambda: LearnedRandomWalk(DiagonalNormalHead, scale=0.0), "scale=0.0"),
     ],
 )
 def test_learned_stages_refuse_values_of_no_use(make: Callable[[], Any], word: str) -> None:
@@ -545,5 +686,5 @@ def test_learned_stages_refuse_values_of_no_use(make: Callable[[], Any], word: s
 
 
 def test_the_stages_of_a_recipe_may_be_replaced() -> None:
-    method = ParticleFilter(20, proposal=Learned(Diagonal))
+    method = ParticleFilter(20, proposal=LearnedProposal(DiagonalNormalHead))
     assert replace(method, particles=5).proposal is method.proposal

@@ -7,27 +7,35 @@ import math
 import pytest
 import torch
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter.belief import Info
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.loop import run_filter, runs_at_once
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.rules import Cubature, Jacobian, Points
-from pfbench.model.linear import linear_walk, local_level
-from pfbench.model.toys import Growth
-from pfbench.record import Record
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import StepInfo
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+)
+from pfbench.filter.loop import choose_run_batch, run_filter
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.model.linear_gaussian import linear_walk, local_level
+from pfbench.model.textbook import UnivariateGrowth
 
 MODEL = linear_walk(1.0, 0.5, 1.0)
-METHODS = [ParticleFilter(30), GaussianFilter(Jacobian()), GaussianFilter(Points(Cubature()))]
+METHODS = [
+    ParticleFilter(30),
+    GaussianFilter(TaylorLinearisation()),
+    GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
+]
 every_method = pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
 
 
-def draws(runs: int = 3) -> MonteCarlo:
-    return MonteCarlo(1, torch.arange(runs))
+def draws(runs: int = 3) -> PhiloxStream:
+    return PhiloxStream(1, torch.arange(runs))
 
 
 def record(steps: int = 7, runs: int = 3) -> Record:
-    return Record(MonteCarlo(2, torch.arange(runs)).normal("y", steps, 1))
+    return Record(PhiloxStream(2, torch.arange(runs)).normal("y", steps, 1))
 
 
 def test_an_empty_record_is_refused() -> None:
@@ -53,16 +61,20 @@ def test_shapes(method: ParticleFilter | GaussianFilter) -> None:
 
 
 @every_method
-def test_watch_and_tick_are_called_at_every_step_and_change_nothing(method: ParticleFilter | GaussianFilter) -> None:
+def test_watch_and_tick_are_called_at_every_step_and_change_nothing(
+    method: ParticleFilter | GaussianFilter,
+) -> None:
     seen: list[int] = []
     ticks: list[None] = []
 
-    def watch(t: int, info: Info) -> dict[str, torch.Tensor]:
+    def watch(t: int, info: StepInfo) -> dict[str, torch.Tensor]:
         seen.append(t)
         return {"corner": info.covariance()[:, 0, 1], "block": info.covariance()}
 
     plain = run_filter(method, MODEL, record(), draws())
-    watched = run_filter(method, MODEL, record(), draws(), watch=watch, tick=lambda: ticks.append(None))
+    watched = run_filter(
+        method, MODEL, record(), draws(), watch=watch, on_step=lambda: ticks.append(None)
+    )
     assert seen == list(range(7))
     assert len(ticks) == 7
     assert torch.equal(plain.mean, watched.mean)
@@ -75,26 +87,31 @@ def test_watch_and_tick_are_called_at_every_step_and_change_nothing(method: Part
 
 @every_method
 @pytest.mark.parametrize("at_once", [1, 2, 5, 9])
-def test_runs_may_be_stepped_in_blocks(method: ParticleFilter | GaussianFilter, at_once: int) -> None:
+def test_runs_may_be_stepped_in_blocks(
+    method: ParticleFilter | GaussianFilter, at_once: int
+) -> None:
     """Starts, spreads and inputs are of each run, one run has no measurement and the worlds are watched: nothing may change."""
     runs = 5
     seen = record(7, runs)._replace(
-        start=MonteCarlo(4, torch.arange(runs)).normal("start", 2, 1)[..., 0],
-        spread=torch.eye(2, dtype=torch.float64) * torch.arange(1.0, 1.0 + runs, dtype=torch.float64)[:, None, None],
+        start=PhiloxStream(4, torch.arange(runs)).normal("start", 2, 1)[..., 0],
+        spread=torch.eye(2, dtype=torch.float64)
+        * torch.arange(1.0, 1.0 + runs, dtype=torch.float64)[:, None, None],
     )
     seen.y[3] = torch.nan
 
-    def watch(t: int, info: Info) -> dict[str, torch.Tensor]:
+    def watch(t: int, info: StepInfo) -> dict[str, torch.Tensor]:
         return {"mean": info.mean, "covariance": info.covariance()}
 
     whole = run_filter(method, MODEL, seen, draws(runs), watch)
-    blocked = run_filter(method, MODEL, seen, draws(runs), watch, at_once=at_once)
-    torch.testing.assert_close(blocked._asdict(), whole._asdict(), rtol=1e-12, atol=1e-12, equal_nan=True)
+    blocked = run_filter(method, MODEL, seen, draws(runs), watch, run_batch=at_once)
+    torch.testing.assert_close(
+        blocked._asdict(), whole._asdict(), rtol=1e-12, atol=1e-12, equal_nan=True
+    )
 
 
 @pytest.mark.parametrize(("runs", "blocks"), [(1, 1), (100, 1), (300, 2), (1000, 8)])
 def test_blocks_of_runs_are_of_about_equal_size(runs: int, blocks: int) -> None:
-    size = runs_at_once(runs, 500, 15)
+    size = choose_run_batch(runs, 500, 15)
     assert -(-runs // size) == blocks
     assert size * blocks - runs < blocks
 
@@ -114,7 +131,7 @@ def test_the_evidence_is_additive(method: ParticleFilter | GaussianFilter) -> No
 def test_the_caller_s_record_is_left_alone(method: ParticleFilter | GaussianFilter) -> None:
     seen = record()
     before = seen.y.clone()
-    run_filter(method, Growth(), seen, draws())
+    run_filter(method, UnivariateGrowth(), seen, draws())
     assert torch.equal(seen.y, before)
     assert seen.u == ()
 
@@ -122,17 +139,23 @@ def test_the_caller_s_record_is_left_alone(method: ParticleFilter | GaussianFilt
 @every_method
 def test_a_model_that_sees_its_initial_state(method: ParticleFilter | GaussianFilter) -> None:
     """With nothing seen, the first estimate is the initial law itself; the second has moved once."""
-    still, moved = (local_level(3.0, 1.0, 5.0, 2.0, observes_initial=flag) for flag in (True, False))
+    still, moved = (
+        local_level(3.0, 1.0, 5.0, 2.0, observes_initial=flag) for flag in (True, False)
+    )
     nothing = Record(torch.full((3, 2, 1), torch.nan, dtype=torch.float64))
     method = ParticleFilter(20_000) if isinstance(method, ParticleFilter) else method
     a, b = (run_filter(method, m, nothing, draws()) for m in (still, moved))
     slack = 5 * math.sqrt(2 / 20_000) if isinstance(method, ParticleFilter) else 1e-12
     for estimate, expected in ((a, (4.0, 13.0)), (b, (13.0, 22.0))):
-        assert torch.allclose(estimate.variance[..., 0], torch.tensor(expected, dtype=torch.float64).expand(3, -1), rtol=slack)
+        assert torch.allclose(
+            estimate.variance[..., 0],
+            torch.tensor(expected, dtype=torch.float64).expand(3, -1),
+            rtol=slack,
+        )
 
 
 @every_method
 def test_the_model_s_precision_decides(method: ParticleFilter | GaussianFilter) -> None:
     model = linear_walk(1.0, 0.5, 1.0).float()
-    estimate = run_filter(method, model, record(), MonteCarlo(1, torch.arange(3), torch.float32))
+    estimate = run_filter(method, model, record(), PhiloxStream(1, torch.arange(3), torch.float32))
     assert estimate.mean.dtype == estimate.variance.dtype == torch.float32

@@ -14,51 +14,60 @@ import pytest
 import torch
 from command_line import environment, pfbench
 
-from pfbench import memory, store
-from pfbench.draws import MonteCarlo
+from pfbench import job
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Episode
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.model.linear import linear_walk
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Episode
-from pfbench.scenario.model_world import ModelWorld
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.job import allocation, instantiate, memory, plan, system_memory
+from pfbench.job.system_memory import GIB, MIB, AllocationCounter
+from pfbench.model.linear_gaussian import linear_walk
+from pfbench.noise.white import NominalNoise
+from pfbench.results import store
+from pfbench.scenario.model_simulation import ModelSimulation
 
+draw = plan.JobPlan.draw_episode
 MODEL = linear_walk(1.0, 0.3, 1.0)
+SEGMENT = "[{_target_:pfbench.nav.manoeuvres.cruise,duration_s:4}]"
 WALK = ("scenario=linear_walk", "scenario.steps=12", "runs=7", "particles=100", "filter=sir")
 
 
 def world(runs: int, steps: int) -> Episode:
-    return ModelWorld(MODEL, steps).draw(Nominal(), torch.arange(runs), 1)
+    return ModelSimulation(MODEL, steps).draw(NominalNoise(), torch.arange(runs), 1)
 
 
 def counted(runs: int, particles: int, steps: int, at_once: int | None = None) -> int:
-    record, draws = world(runs, steps).record, MonteCarlo(1, torch.arange(runs))
-    with torch.no_grad(), memory.Counted() as count:
-        run_filter(ParticleFilter(particles), MODEL, record, draws, at_once=at_once)
-    return count.most
+    record, draws = world(runs, steps).record, PhiloxStream(1, torch.arange(runs))
+    with torch.no_grad(), AllocationCounter() as count:
+        run_filter(ParticleFilter(particles), MODEL, record, draws, run_batch=at_once)
+    return count.peak
 
 
-def needs(runs: float = 1.0, stepped: float = 0.0, base: float = 0.0, left: float = 0.0) -> memory.Needs:
-    return memory.Needs(base, runs, stepped, left, at_once=lambda runs: min(runs, 10))
+def estimate(run: float = 1.0, result: float = 0.0, episode: float = 0.0) -> memory.MemoryEstimate:
+    return memory.MemoryEstimate(
+        0.0, run, 0.0, result, episode, run_batch=lambda runs: min(runs, 10)
+    )
 
 
 # counting
 
 
 def test_live_bytes_are_counted_once_and_no_longer_than_they_live() -> None:
-    with memory.Counted() as count:
+    with AllocationCounter() as count:
         a = torch.zeros(1000, dtype=torch.float64)
         b = a[:500]  # no bytes of its own
         del a
         c = torch.zeros(1000, dtype=torch.float64)
         del b, c
         torch.zeros(500, dtype=torch.float64)
-    assert count.most == 16000
+    assert count.peak == 16000
 
 
 def test_a_filter_holds_no_more_at_later_steps_than_what_each_step_tells() -> None:
     few, many = counted(4, 500, 5), counted(4, 500, 30)
-    told = 8 * 4 * (2 + 2 + 1 + 1)  # of each step: mean and variance of two states, effective size, resampled; in 4 runs
+    told = (
+        8 * 4 * (2 + 2 + 1 + 1)
+    )  # of each step: mean and variance of two states, effective size, resampled; in 4 runs
     assert many - few < 3 * told * 25
     assert many - few < 0.1 * 8 * 4 * 500 * 2 * 25  # the clouds of all steps
 
@@ -73,60 +82,66 @@ def test_a_step_holds_a_block_of_runs_and_the_clouds_of_all() -> None:
 # the estimate
 
 
-def estimated(runs: int, particles: int, steps: int, of: int = 2) -> memory.Needs:
-    return memory.needs(ParticleFilter(particles), MODEL, world(of, steps), lambda runs: runs)
+def estimated(runs: int, particles: int, steps: int, of: int = 2) -> memory.MemoryEstimate:
+    return memory.estimate_memory(
+        ParticleFilter(particles), MODEL, world(of, steps), lambda runs: runs
+    )
 
 
 @pytest.mark.parametrize(("runs", "particles"), [(16, 200), (8, 3000)])
 def test_the_trial_foretells_what_all_particles_and_runs_take(runs: int, particles: int) -> None:
     found = estimated(runs, particles, 10)
-    told = (found.of(runs) - 256 * memory.MIB) / memory._HELD
+    told = (found.peak(runs) - 256 * MIB) / memory._OVERHEAD
     assert 0.8 < told / counted(runs, particles, 10) < 1.3
 
 
 def test_the_trial_of_an_only_run_counts_all_of_it() -> None:
     one, two = estimated(1, 200, 4, of=1), estimated(1, 200, 4)
-    assert one.of(1) == pytest.approx(two.of(1), rel=0.05)
+    assert one.peak(1) == pytest.approx(two.peak(1), rel=0.05)
 
 
 def test_longer_worlds_take_more_for_each_run() -> None:
     short, long = estimated(1, 50, 100, of=1), estimated(1, 50, 1100, of=1)
     # y and two true states while they are drawn, y again for the filter; mean, variance, and two traces told
-    world, told = memory._DRAWN * 3 + 2, memory._KEPT * 6
+    world, told = memory._SIMULATION_FACTOR * 3 + 2, memory._TRACE_COPIES * 6
     assert long.run - short.run == pytest.approx(1000 * 8 * (world + told), rel=0.1)
 
 
 def test_what_bends_upwards_is_followed() -> None:
     sizes = (64, 128, 256)
     square = [3.0 * n + 0.5 * n * n for n in sizes]
-    assert memory._extended(sizes, square, 5000) == pytest.approx(3.0 * 5000 + 0.5 * 5000**2)
-    assert memory._extended(sizes, [10.0 + 2.0 * n for n in sizes], 5000) == pytest.approx(10010.0)
+    assert memory._extrapolate(sizes, square, 5000) == pytest.approx(3.0 * 5000 + 0.5 * 5000**2)
+    assert memory._extrapolate(sizes, [10.0 + 2.0 * n for n in sizes], 5000) == pytest.approx(
+        10010.0
+    )
 
 
 # how many runs fit
 
 
-@pytest.mark.parametrize(("limit", "size"), [(1000.0, 100), (100.0, 100), (99.0, 50), (40.0, 34), (1.0, 1)])
+@pytest.mark.parametrize(
+    ("limit", "size"), [(1000.0, 100), (100.0, 100), (99.0, 50), (40.0, 34), (1.0, 1)]
+)
 def test_as_many_runs_as_fit_in_parts_of_equal_size(limit: float, size: int) -> None:
-    assert memory.fitting(needs(), 100, limit) == size
+    assert memory.runs_within_limit(estimate(), 100, limit) == size
 
 
 def test_what_earlier_parts_leave_counts() -> None:
-    assert memory.fitting(needs(runs=1.0, left=0.1), 100, 19.0) == 10
-    with pytest.raises(ValueError, match=r"what 100 runs leave would take .*first_run=50"):
-        memory.fitting(needs(runs=1.0, left=0.5), 100, 30.0)
+    assert memory.runs_within_limit(estimate(result=0.1), 100, 19.0) == 10
+    with pytest.raises(ValueError, match=r"for the results of 100 runs, got .*first_run=50"):
+        memory.runs_within_limit(estimate(result=0.5), 100, 30.0)
 
 
 def test_one_run_that_does_not_fit_is_told() -> None:
-    told = r"memory: one run alone would take about 3 GiB, and 2 GiB may be taken here; give fewer particles, dtype=float32"
+    told = r"memory must be at least 3 GiB for a single run, got 2 GiB. Use fewer particles or dtype=float32"
     with pytest.raises(ValueError, match=told):
-        memory.fitting(needs(runs=3.0 * memory.GIB), 100, 2.0 * memory.GIB)
+        memory.runs_within_limit(estimate(run=3.0 * GIB), 100, 2.0 * GIB)
 
 
 def test_small_jobs_are_not_tried() -> None:
-    assert not memory.worth_asking(ParticleFilter(500), MODEL, 100, 16.0 * memory.GIB)
-    assert memory.worth_asking(ParticleFilter(500), MODEL, 100000, 16.0 * memory.GIB)
-    assert memory.worth_asking(ParticleFilter(10**8), MODEL, 1, 16.0 * memory.GIB)
+    assert not memory.needs_memory_trial(ParticleFilter(500), MODEL, 100, 16.0 * GIB)
+    assert memory.needs_memory_trial(ParticleFilter(500), MODEL, 100000, 16.0 * GIB)
+    assert memory.needs_memory_trial(ParticleFilter(10**8), MODEL, 1, 16.0 * GIB)
 
 
 # what there is
@@ -147,13 +162,13 @@ def groups(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_the_tightest_group_decides_and_cached_files_are_free(groups: tuple[Path, Path]) -> None:
-    assert list(memory._of_the_groups(*groups)) == [5000.0 - 3000.0 + 400.0]
+    assert list(system_memory._group_memory(*groups)) == [5000.0 - 3000.0 + 400.0]
 
 
 def test_something_is_free_here() -> None:
-    free = memory.available()
+    free = system_memory.available_memory()
     assert free is None or 1e6 < free < 1e14
-    assert memory.limit(2.0, "cpu") == 2.0 * memory.GIB
+    assert system_memory.memory_limit(2.0, "cpu") == 2.0 * GIB
 
 
 # whole jobs
@@ -161,55 +176,145 @@ def test_something_is_free_here() -> None:
 
 def stored(home: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     (file,) = (home / "results" / "adhoc").glob("*.npz")
-    found = store.load(file)
+    found = store.read_result(file)
     return found.meta, found.arrays
 
 
-def test_a_job_in_parts_gives_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_joint", [True, False])
+def test_a_job_in_parts_gives_the_same_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_joint: bool
+) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert pfbench("run", *WALK, "bound=true", home=whole).code == 0
-    monkeypatch.setattr(memory, "fitting", lambda needs, runs, limit: 3)
-    monkeypatch.setattr(memory, "worth_asking", lambda *given: True)
-    said = pfbench("run", *WALK, "bound=true", "memory=4", home=parts)
+    assert pfbench("run", *WALK, "pcrb=true", home=whole).code == 0
+    monkeypatch.setattr(memory, "runs_within_limit", lambda *given, **more: 3)
+    monkeypatch.setattr(memory, "needs_memory_trial", lambda *given: True)
+    if not is_joint:
+        monkeypatch.setattr(memory, "fits_undrawn", lambda *given: False)
+        monkeypatch.setattr(memory, "fits_drawn", lambda *given: False)
+    said = pfbench("run", *WALK, "pcrb=true", "memory_limit_gib=4", home=parts)
     assert said.code == 0, said.err
-    assert re.search(r"memory: 7 runs at once would take about \S+ GiB, and \S+ GiB may be taken here .*: 3 at a time", said.out)
+    assert re.search(
+        r"memory: 7 runs at once need about \S+ GiB, limit 4 GiB .* Running 3 at a time", said.out
+    )
     (ours, a), (theirs, b) = stored(parts), stored(whole)
     assert (ours["key"], ours["runs"], ours["parts"]) == (theirs["key"], 7, 3)
     assert a.keys() == b.keys()
     for name in a:
-        np.testing.assert_allclose(a[name], b[name], rtol=1e-6, err_msg=name)  # blocks of other sizes round differently
+        np.testing.assert_allclose(
+            a[name], b[name], rtol=1e-6, err_msg=name
+        )  # blocks of other sizes round differently
+
+
+@pytest.mark.parametrize("is_joint", [True, False])
+def test_a_job_is_instantiated_once_and_drawn_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_joint: bool
+) -> None:
+    """Under a budget and a memory limit; if the episodes do not fit together, each batch is drawn once, two for the trial."""
+    built, drawn = [], []
+    monkeypatch.setattr(
+        plan, "instantiate", lambda node: built.append(node._target_) or instantiate(node)
+    )
+    monkeypatch.setattr(
+        plan.JobPlan,
+        "draw_episode",
+        lambda self, runs: drawn.append(runs.tolist()) or draw(self, runs),
+    )
+    monkeypatch.setattr(memory, "runs_within_limit", lambda *given, **more: 3)
+    monkeypatch.setattr(memory, "needs_memory_trial", lambda *given: True)
+    if not is_joint:
+        monkeypatch.setattr(memory, "fits_undrawn", lambda *given: False)
+        monkeypatch.setattr(memory, "fits_drawn", lambda *given: False)
+    config = job.compose(
+        [
+            *WALK,
+            "budget=likelihoods",
+            "memory_limit_gib=4",
+            "episode_cache_dir=null",
+            f"results_dir={tmp_path}",
+        ]
+    )
+    meta, arrays = job.compute_job(config, "test")
+    assert sorted(node.rpartition(".")[2] for node in built) == [
+        "ModelSimulation",
+        "NominalNoise",
+        "ParticleFilter",
+        "linear_walk",
+    ]
+    assert drawn[-3:] == ([[0, 1, 2], [3, 4, 5], [6]] if not is_joint else drawn)
+    assert drawn[: None if is_joint else -3] == ([list(range(7))] if is_joint else [[0, 1], [0, 1]])
+    assert (meta["parts"], meta["particles"], arrays["error"].shape) == (3, 100, (7, 12, 2))
+
+
+def test_a_feedback_process_is_drawn_by_batch() -> None:
+    """Its INS belongs to all runs of an episode, so a batch cannot be cut from it."""
+    config = job.compose(
+        [
+            "scenario=flight_300s_closed_loop",
+            "filter=ekf",
+            "runs=3",
+            "episode_cache_dir=null",
+            f"scenario.trajectory.segments={SEGMENT}",
+        ]
+    )
+    source = allocation.EpisodeSource(job.build_plan(config))
+    assert source.joint is not None
+    assert source.joint.record.feedback is not None
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(memory, "runs_within_limit", lambda *given, **more: 2)
+        patch.setattr(memory, "needs_memory_trial", lambda *given: True)
+        assert allocation.max_runs_in_memory(source.plan, source) == 2
+    assert source.joint is None
+    assert len(source.batch(2, 2).record.y) == 1
 
 
 def test_what_does_not_fit_at_all_is_refused_before_it_starts(tmp_path: Path) -> None:
-    said = pfbench("run", *WALK, "memory=0.01", home=tmp_path)
+    said = pfbench("run", *WALK, "memory_limit_gib=0.01", home=tmp_path)
     assert said.code == 1
-    assert "memory: one run alone would take about" in said.err
-    assert "0.01 GiB may be taken here" in said.err
+    assert "memory must be at least" in said.err
+    assert "GiB for a single run, got 0.01 GiB" in said.err
     assert not list((tmp_path / "results").rglob("*.npz"))
 
 
 @pytest.mark.parametrize("value", ["-1", "0", "much"])
 def test_a_limit_that_is_none_is_told(tmp_path: Path, value: str) -> None:
-    said = pfbench("run", *WALK, f"memory={value}", home=tmp_path)
-    assert (said.code, f"memory={value}: give the GiB" in said.err) == (1, True), said.err
+    said = pfbench("run", *WALK, f"memory_limit_gib={value}", home=tmp_path)
+    assert (
+        said.code,
+        f"got {value}." in said.err.partition("memory_limit_gib must be the GiB")[2],
+    ) == (
+        1,
+        True,
+    ), said.err
 
 
 MEASURED = """
 import sys
-from pfbench import cli, native
-cli.main(sys.argv[1:])
-print("kibibytes", native.peak() // 1024)  # not getrusage's: that begins with what the process had that started this one
+from pfbench.cli.main import main
+from pfbench.kernels import cpp
+main(sys.argv[1:])
+print("kibibytes", cpp.peak_memory() // 1024)  # not getrusage's: that begins with what the process had that started this one
 """
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read as Linux tells it")
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="memory is read as Linux tells it"
+)
 def test_a_process_never_holds_the_clouds_of_all_steps(tmp_path: Path) -> None:
     runs, particles, steps = 80, 1000, 600
-    words = ("run", "scenario=linear_walk", f"scenario.steps={steps}", f"runs={runs}", f"particles={particles}", "bound=false")
+    words = (
+        "run",
+        "scenario=linear_walk",
+        f"scenario.steps={steps}",
+        f"runs={runs}",
+        f"particles={particles}",
+        "pcrb=false",
+    )
     env = os.environ | environment(tmp_path)
     command = [sys.executable, "-c", MEASURED, *words, "engine=eager"]
-    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, check=False, timeout=500)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=env, cwd=tmp_path, check=False, timeout=500
+    )
     assert done.returncode == 0, done.stderr
     held = 1024 * int(done.stdout.rpartition("kibibytes")[2])
     clouds = 8 * 2 * runs * particles * steps

@@ -14,35 +14,47 @@ from scipy import integrate, linalg, stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.chart import wrap
-from pfbench.covariance import common_covariance_of, covariance_of, gaussian_log_density
-from pfbench.draws import MonteCarlo
-from pfbench.model.base import AtRest, StateSpaceModel, dense_normal, independent_normal, normal_batch
-from pfbench.model.linear import LinearGaussian, linear_walk, local_level
-from pfbench.model.toys import Benes, Growth, Lorenz63, Pendulum, StochasticVolatility
-from pfbench.record import Record
+from pfbench.core.chart import wrap_angle
+from pfbench.core.covariance import (
+    distribution_covariance,
+    gaussian_log_density,
+    shared_distribution_covariance,
+)
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.model.base import (
+    StateSpaceModel,
+    StaticModel,
+    dense_normal,
+    independent_normal,
+    normal_batch,
+)
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
 
 MODELS: dict[str, Callable[[], StateSpaceModel]] = {
-    "growth": Growth,
+    "growth": UnivariateGrowth,
     "volatility": StochasticVolatility,
     "benes": Benes,
     "pendulum": Pendulum,
     "lorenz": Lorenz63,
     "level": lambda: local_level(10.0, 20.0, 0.0, 30.0),
     "walk": lambda: linear_walk(0.5, 0.3, 1.0),
-    "singular": lambda: LinearGaussian(np.diag([0.9, 0.5, 0.7]), np.ones((3, 1)), np.eye(2, 3), [1, 2], [0, 0, 0], [1, 1, 1]),
+    "singular": lambda: LinearGaussian(
+        np.diag([0.9, 0.5, 0.7]), np.ones((3, 1)), np.eye(2, 3), [1, 2], [0, 0, 0], [1, 1, 1]
+    ),
 }
 every_model = pytest.mark.parametrize("name", MODELS)
 
 
 def normal(runs: int, n: int, w: int, purpose: str = "x") -> Tensor:
-    return MonteCarlo(11, torch.arange(runs)).normal(purpose, n, w)
+    return PhiloxStream(11, torch.arange(runs)).normal(purpose, n, w)
 
 
 def inputs(model: StateSpaceModel, runs: int = 3, steps: int = 4) -> Any:
     x = initial_states(model, runs, 1).to(model.anchor)
     y = x.new_zeros(runs, steps, model.observation(x, None).event_shape[0])
-    return model.prepare(Record(y)).at(0).u
+    return model.prepare(Record(y)).at_step(0).u
 
 
 def initial_states(model: StateSpaceModel, runs: int, n: int) -> Tensor:
@@ -103,13 +115,20 @@ def test_single_precision_goes_through(name: str) -> None:
     x, w = initial_states(model, 3, 5).float(), normal(3, 5, model.noise_dim, "w").float()
     moved = model.propagate(x, u, w)
     assert moved.dtype == torch.float32
-    assert model.log_likelihood(torch.ones(3, *model.observation(moved, u).event_shape), moved, u).dtype == torch.float32
+    assert (
+        model.log_likelihood(
+            torch.ones(3, *model.observation(moved, u).event_shape), moved, u
+        ).dtype
+        == torch.float32
+    )
 
 
 def whitened(law: Distribution, x: Tensor) -> np.ndarray:
     """Standard normals, if x [R, N, D] follows the law."""
     if isinstance(law, torch.distributions.MultivariateNormal):
-        return torch.linalg.solve_triangular(law.scale_tril, (x - law.mean).unsqueeze(-1), upper=False).numpy()
+        return torch.linalg.solve_triangular(
+            law.scale_tril, (x - law.mean).unsqueeze(-1), upper=False
+        ).numpy()
     return ((x - law.mean) / law.stddev).numpy()
 
 
@@ -125,7 +144,9 @@ def test_transition_law_is_that_of_the_propagation(name: str) -> None:
     z = whitened(law, model.propagate(x, u, normal(3, 4000, model.noise_dim, "w")))
     assert stats.kstest(z.ravel(), "norm").pvalue > 1e-3
     z = z.reshape(-1, model.chart.dimension)
-    correlations = np.corrcoef(z.T)[np.triu_indices(z.shape[1], 1)] if z.shape[1] > 1 else np.zeros(1)
+    correlations = (
+        np.corrcoef(z.T)[np.triu_indices(z.shape[1], 1)] if z.shape[1] > 1 else np.zeros(1)
+    )
     assert np.abs(correlations).max() < 4.5 / math.sqrt(len(z))
 
 
@@ -133,14 +154,20 @@ def test_transition_law_is_that_of_the_propagation(name: str) -> None:
 
 
 def test_growth_counts_its_steps_from_one() -> None:
-    model = Growth()
+    model = UnivariateGrowth()
     record = model.prepare(Record(torch.zeros(1, 3, 1, dtype=torch.float64)))
     x = np.array([-7.0, 0.3, 12.0])
     for t in range(3):
-        moved = model.propagate(torch.tensor(x).reshape(1, 3, 1), record.at(t).u, torch.full((1, 3, 1), 0.5, dtype=torch.float64))
+        moved = model.propagate(
+            torch.tensor(x).reshape(1, 3, 1),
+            record.at_step(t).u,
+            torch.full((1, 3, 1), 0.5, dtype=torch.float64),
+        )
         expected = x / 2 + 25 * x / (1 + x**2) + 8 * np.cos(1.2 * (t + 1)) + math.sqrt(10.0) * 0.5
         assert np.allclose(moved.numpy().ravel(), expected, rtol=1e-14)
-    y = model.log_likelihood(torch.tensor([[2.0]], dtype=torch.float64), torch.tensor(x).reshape(1, 3, 1), ())
+    y = model.log_likelihood(
+        torch.tensor([[2.0]], dtype=torch.float64), torch.tensor(x).reshape(1, 3, 1), ()
+    )
     assert np.allclose(y.numpy().ravel(), stats.norm.logpdf(2.0, x**2 / 20, 1.0))
 
 
@@ -176,7 +203,14 @@ def test_stationary_volatility_stays_stationary() -> None:
     model = StochasticVolatility(mu=-1.0, rho=0.95, sigma=0.3)
     law = model.initial(1)
     assert float(law.mean) == -1.0
-    gain = float(model.propagate(law.mean.unsqueeze(1) + 1.0, (), torch.zeros(1, 1, 1, dtype=torch.float64))) + 1.0
+    gain = (
+        float(
+            model.propagate(
+                law.mean.unsqueeze(1) + 1.0, (), torch.zeros(1, 1, 1, dtype=torch.float64)
+            )
+        )
+        + 1.0
+    )
     assert gain**2 * float(law.variance) + 0.3**2 == pytest.approx(float(law.variance), rel=1e-12)
     x = torch.tensor([[[0.7]]], dtype=torch.float64)
     y = model.log_likelihood(torch.tensor([[1.3]], dtype=torch.float64), x, ())
@@ -190,13 +224,27 @@ def test_benes_draws_its_exact_transition(start: float) -> None:
     model = Benes(step=step)
 
     def density(x: float) -> float:
-        return math.cosh(x) / math.cosh(start) * math.exp(-step / 2) * stats.norm.pdf(x, start, math.sqrt(step))
+        return (
+            math.cosh(x)
+            / math.cosh(start)
+            * math.exp(-step / 2)
+            * stats.norm.pdf(x, start, math.sqrt(step))
+        )
 
-    moments = [integrate.quad(lambda x, k=k: x**k * density(x), start - 14, start + 14)[0] for k in range(5)]
+    moments = [
+        integrate.quad(lambda x, k=k: x**k * density(x), start - 14, start + 14)[0]
+        for k in range(5)
+    ]
     assert moments[0] == pytest.approx(1.0, abs=1e-8)
-    x = model.propagate(torch.full((1, n, 1), start, dtype=torch.float64), (), normal(1, n, 2, "w")).numpy().ravel()
+    x = (
+        model.propagate(torch.full((1, n, 1), start, dtype=torch.float64), (), normal(1, n, 2, "w"))
+        .numpy()
+        .ravel()
+    )
     for k in (1, 2):
-        assert abs((x**k).mean() - moments[k]) < 4 * math.sqrt((moments[2 * k] - moments[k] ** 2) / n)
+        assert abs((x**k).mean() - moments[k]) < 4 * math.sqrt(
+            (moments[2 * k] - moments[k] ** 2) / n
+        )
     grid = np.linspace(start - 12, start + 12, 20_001)
     cdf = integrate.cumulative_trapezoid([density(g) for g in grid], grid, initial=0.0)
     assert stats.kstest(x, lambda v: np.interp(v, grid, cdf)).pvalue > 1e-3
@@ -224,7 +272,10 @@ def test_lorenz_is_of_fourth_order() -> None:
 
 def test_unseen_components_weigh_nothing() -> None:
     model = Lorenz63()
-    x, y = initial_states(model, 2, 6), torch.tensor([[1.0, torch.nan, 20.0], [torch.nan] * 3], dtype=torch.float64)
+    x, y = (
+        initial_states(model, 2, 6),
+        torch.tensor([[1.0, torch.nan, 20.0], [torch.nan] * 3], dtype=torch.float64),
+    )
     value = model.log_likelihood(y, x, ()).numpy()
     expected = stats.norm.logpdf(1.0, x[0, :, 0]) + stats.norm.logpdf(20.0, x[0, :, 2])
     assert np.allclose(value[0], expected, rtol=1e-13)
@@ -235,17 +286,27 @@ def test_the_volatility_weighs_as_its_law_does() -> None:
     model = StochasticVolatility()
     x, y = 20.0 * normal(3, 50, 1), torch.tensor([[0.3], [-40.0], [torch.nan]], dtype=torch.float64)
     value = model.log_likelihood(y, x, ()).numpy()
-    assert np.allclose(value[:2], stats.norm.logpdf(y[:2].numpy(), scale=np.exp(0.5 * x[:2, :, 0].numpy())), rtol=1e-12)
+    assert np.allclose(
+        value[:2],
+        stats.norm.logpdf(y[:2].numpy(), scale=np.exp(0.5 * x[:2, :, 0].numpy())),
+        rtol=1e-12,
+    )
     assert np.all(value[2] == 0.0)
 
 
 def test_dropping_a_component_equals_a_model_without_it() -> None:
-    f, g, h = np.array([[0.9, 0.2], [0.0, 0.7]]), np.eye(2), np.array([[1.0, 0.5], [0.2, 1.0], [1.0, -1.0]])
+    f, g, h = (
+        np.array([[0.9, 0.2], [0.0, 0.7]]),
+        np.eye(2),
+        np.array([[1.0, 0.5], [0.2, 1.0], [1.0, -1.0]]),
+    )
     whole = LinearGaussian(f, g, h, [1.0, 2.0, 3.0], [0.0, 0.0], [1.0, 1.0])
     part = LinearGaussian(f, g, h[[0, 2]], [1.0, 3.0], [0.0, 0.0], [1.0, 1.0])
     x, y = normal(3, 7, 2), normal(3, 1, 3, "y")[:, 0]
     y[:, 1] = torch.nan
-    assert torch.allclose(whole.log_likelihood(y, x, ()), part.log_likelihood(y[:, [0, 2]], x, ()), rtol=1e-14)
+    assert torch.allclose(
+        whole.log_likelihood(y, x, ()), part.log_likelihood(y[:, [0, 2]], x, ()), rtol=1e-14
+    )
 
 
 class Correlated(StateSpaceModel):
@@ -253,8 +314,18 @@ class Correlated(StateSpaceModel):
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("c", torch.tensor([[2.0, 0.8, 0.1], [0.8, 1.0, -0.3], [0.1, -0.3, 1.0]], dtype=torch.float64))
-        self.names, self.units, self.groups, self.noise_dim = ("a", "b", "c"), ("",) * 3, {"state": (0, 1, 2)}, 3
+        self.register_buffer(
+            "c",
+            torch.tensor(
+                [[2.0, 0.8, 0.1], [0.8, 1.0, -0.3], [0.1, -0.3, 1.0]], dtype=torch.float64
+            ),
+        )
+        self.names, self.units, self.groups, self.noise_dim = (
+            ("a", "b", "c"),
+            ("",) * 3,
+            {"state": (0, 1, 2)},
+            3,
+        )
 
     @property
     def origin(self) -> Tensor:
@@ -274,7 +345,7 @@ class Correlated(StateSpaceModel):
 
     def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
         d = y - y_hat
-        return torch.cat([d[..., :2], wrap(d[..., 2:])], -1)
+        return torch.cat([d[..., :2], wrap_angle(d[..., 2:])], -1)
 
 
 def test_unseen_components_of_a_dense_law_are_integrated_out() -> None:
@@ -285,23 +356,35 @@ def test_unseen_components_of_a_dense_law_are_integrated_out() -> None:
         value = model.log_likelihood(y, x, ())[0]
         for n in range(5):
             c = model.covariance(x)[0, n].numpy()[np.ix_(seen, seen)]
-            expected = stats.multivariate_normal.logpdf(y[0, seen].numpy(), x[0, n, seen].numpy(), c)
+            expected = stats.multivariate_normal.logpdf(
+                y[0, seen].numpy(), x[0, n, seen].numpy(), c
+            )
             assert float(value[n]) == pytest.approx(expected, rel=1e-12)
-    assert torch.all(model.log_likelihood(torch.full((1, 3), torch.nan, dtype=torch.float64), x, ()) == 0.0)
+    assert torch.all(
+        model.log_likelihood(torch.full((1, 3), torch.nan, dtype=torch.float64), x, ()) == 0.0
+    )
 
 
 def test_measured_angles_go_the_short_way_round() -> None:
     model, x = Correlated(), normal(1, 5, 3)
     y = torch.tensor([[0.1, 0.2, 3.0]], dtype=torch.float64)
     turned = y + torch.tensor([0.0, 0.0, 2 * math.pi], dtype=torch.float64)
-    assert torch.allclose(model.log_likelihood(y, x, ()), model.log_likelihood(turned, x, ()), rtol=1e-12)
+    assert torch.allclose(
+        model.log_likelihood(y, x, ()), model.log_likelihood(turned, x, ()), rtol=1e-12
+    )
 
 
 def test_a_dense_law_without_a_positive_covariance_has_no_likelihood() -> None:
-    covariance = torch.tensor([[[1.0, 2.0], [2.0, 1.0]], [[2.0, 1.0], [1.0, 2.0]]], dtype=torch.float64)
-    value = gaussian_log_density(torch.zeros(2, 2, dtype=torch.float64), covariance, torch.ones(2, 2, dtype=torch.bool))
+    covariance = torch.tensor(
+        [[[1.0, 2.0], [2.0, 1.0]], [[2.0, 1.0], [1.0, 2.0]]], dtype=torch.float64
+    )
+    value = gaussian_log_density(
+        torch.zeros(2, 2, dtype=torch.float64), covariance, torch.ones(2, 2, dtype=torch.bool)
+    )
     assert torch.isnan(value).tolist() == [True, False]
-    assert float(value[1]) == pytest.approx(stats.multivariate_normal.logpdf([0, 0], [0, 0], covariance[1].numpy()), rel=1e-14)
+    assert float(value[1]) == pytest.approx(
+        stats.multivariate_normal.logpdf([0, 0], [0, 0], covariance[1].numpy()), rel=1e-14
+    )
 
 
 def test_a_covariance_that_all_particles_share_is_made_once() -> None:
@@ -310,16 +393,25 @@ def test_a_covariance_that_all_particles_share_is_made_once() -> None:
     for law, one in (
         (independent_normal(x, sd), np.diag([0.25, 4.0])),
         (dense_normal(x, root.expand(3, 4, 2, 2)), np.array([[1.0, -3.0], [-3.0, 13.0]])),
-        (dense_normal(x, root.expand(3, 1, 2, 2).contiguous().expand(3, 4, 2, 2)), np.array([[1.0, -3.0], [-3.0, 13.0]])),
+        (
+            dense_normal(x, root.expand(3, 1, 2, 2).contiguous().expand(3, 4, 2, 2)),
+            np.array([[1.0, -3.0], [-3.0, 13.0]]),
+        ),
     ):
-        assert np.allclose(covariance_of(law), np.broadcast_to(one, (3, 4, 2, 2)), rtol=1e-15)
-        assert np.allclose(common_covariance_of(law), np.broadcast_to(one, (3, 1, 2, 2)), rtol=1e-15)
-        assert common_covariance_of(law).shape == (3, 1, 2, 2)
+        assert np.allclose(
+            distribution_covariance(law), np.broadcast_to(one, (3, 4, 2, 2)), rtol=1e-15
+        )
+        assert np.allclose(
+            shared_distribution_covariance(law), np.broadcast_to(one, (3, 1, 2, 2)), rtol=1e-15
+        )
+        assert shared_distribution_covariance(law).shape == (3, 1, 2, 2)
     for law, variance in (
         (independent_normal(x, x.abs()), x.square()),
         (Independent(Laplace(x, sd.expand_as(x)), 1), (2.0 * sd.square()).expand_as(x)),
     ):
-        assert torch.allclose(common_covariance_of(law), torch.diag_embed(variance), rtol=1e-14)
+        assert torch.allclose(
+            shared_distribution_covariance(law), torch.diag_embed(variance), rtol=1e-14
+        )
 
 
 def test_other_observation_laws() -> None:
@@ -336,7 +428,7 @@ def test_other_observation_laws() -> None:
 @every_model
 def test_a_model_at_rest_only_looks(name: str) -> None:
     model = MODELS[name]()
-    still = AtRest(model)
+    still = StaticModel(model)
     x, u = initial_states(model, 3, 5), inputs(model)
     assert torch.equal(still.propagate(x, u, normal(3, 5, model.noise_dim, "w")), x)
     y = torch.ones(3, *model.observation(x, u).event_shape, dtype=torch.float64)
@@ -346,13 +438,13 @@ def test_a_model_at_rest_only_looks(name: str) -> None:
 
 
 def test_a_model_at_rest_keeps_its_origin() -> None:
-    assert torch.equal(AtRest(Correlated()).origin, Correlated().origin)
+    assert torch.equal(StaticModel(Correlated()).origin, Correlated().origin)
 
 
 BAD = [
-    (lambda: Growth(process_sd=0.0), "process_sd"),
-    (lambda: Growth(measurement_sd=-1.0), "measurement_sd"),
-    (lambda: Growth(initial_sd=math.nan), "initial_sd"),
+    (lambda: UnivariateGrowth(process_sd=0.0), "process_sd"),
+    (lambda: UnivariateGrowth(measurement_sd=-1.0), "measurement_sd"),
+    (lambda: UnivariateGrowth(initial_sd=math.nan), "initial_sd"),
     (lambda: Lorenz63(process_sd=math.inf), "process_sd"),
     (lambda: StochasticVolatility(rho=1.0), "rho"),
     (lambda: Benes(step=0.0), "step"),
@@ -366,6 +458,8 @@ BAD = [
 
 
 @pytest.mark.parametrize(("build", "word"), BAD)
-def test_impossible_models_are_refused_by_name(build: Callable[[], StateSpaceModel], word: str) -> None:
+def test_impossible_models_are_refused_by_name(
+    build: Callable[[], StateSpaceModel], word: str
+) -> None:
     with pytest.raises(ValueError, match=word):
         build()

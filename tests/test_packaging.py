@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from command_line import Said, environment, process
 
-from pfbench import cli
+from pfbench import job
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -29,7 +29,7 @@ STAGES = '''
 from dataclasses import dataclass
 
 from pfbench.model.base import StateSpaceModel
-from pfbench.record import Record
+from pfbench.core.record import Record
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ CAREFUL = """\
 defaults:
   - sir
   - _self_
-weigh:
+weight_update:
   _target_: mylab.stages.Tempered
   power: {power}
 """
@@ -65,18 +65,37 @@ def mylab(tmp_path: Path) -> Path:
 
 def test_a_stage_of_another_project_runs_beside_the_shipped_ones(mylab: Path) -> None:
     walk = ("scenario=linear_walk", "scenario.steps=30", "runs=3", "particles=100")
-    words = ("run", "-m", "hydra.searchpath=[file://conf]", *walk, "filter=sir,careful,bold", "study=mine")
+    words = (
+        "run",
+        "-m",
+        "hydra.searchpath=[file://conf]",
+        *walk,
+        "filter=sir,careful,bold",
+        "study=mine",
+    )
     said = process(*words, home=mylab, cwd=mylab)
     assert said.code == 0, said.err
     found = {}
     for file in (mylab / "results" / "mine").glob("*.npz"):
         with np.load(file, allow_pickle=False) as stored:
             meta = json.loads(str(stored["meta"]))
-            found[meta["choices"]["filter"]] = meta["exact"], stored["error"], meta["config"]["filter"]
+            found[meta["choices"]["filter"]] = (
+                meta["exact"],
+                stored["error"],
+                meta["config"]["filter"],
+            )
     assert found.keys() == {"sir", "careful", "bold"}
-    assert found["careful"][2]["weigh"] == {"_target_": "mylab.stages.Tempered", "power": 0.5}
-    assert (found["sir"][0], found["careful"][0]) == (True, False)  # it says of itself that it is not exact
-    assert np.array_equal(found["bold"][1], found["sir"][1])  # the same draws, the same worlds, the same filter
+    assert found["careful"][2]["weight_update"] == {
+        "_target_": "mylab.stages.Tempered",
+        "power": 0.5,
+    }
+    assert (found["sir"][0], found["careful"][0]) == (
+        True,
+        False,
+    )  # it says of itself that it is not exact
+    assert np.array_equal(
+        found["bold"][1], found["sir"][1]
+    )  # the same draws, the same worlds, the same filter
     assert not np.array_equal(found["careful"][1], found["sir"][1])
 
 
@@ -101,10 +120,21 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / name, source / name, ignore=leave)
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(home / "dist")]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--wheel-dir",
+        str(home / "dist"),
+    ]
     # with a new enough setuptools at hand no network is needed
     apart = [] if setuptools_version() < 77 else ["--no-build-isolation"]
-    build = subprocess.run([*command, *apart, str(source)], capture_output=True, text=True, check=False)
+    build = subprocess.run(
+        [*command, *apart, str(source)], capture_output=True, text=True, check=False
+    )
     assert build.returncode == 0, build.stderr
     (built,) = (home / "dist").glob("pfbench-*.whl")
     return built
@@ -113,7 +143,17 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def installed(wheel: Path) -> Path:
     target = wheel.parents[1] / "site"
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(target), str(wheel)]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--target",
+        str(target),
+        str(wheel),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return target
@@ -128,13 +168,27 @@ def elsewhere(installed: Path, cwd: Path, *words: str) -> Said:
 def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as opened:
         names = set(opened.namelist())
-    wanted = {f"pfbench/{file.relative_to(ROOT / 'pfbench')}" for file in (ROOT / "pfbench").rglob("*.py")}
-    wanted |= {f"pfbench/{file.relative_to(ROOT)}" for top in ("conf", "experiments") for file in (ROOT / top).rglob("*.yaml")}
-    report = [file for ending in ("jinja", "css", "yaml") for file in (ROOT / "pfbench/report").glob(f"*.{ending}")]
+    wanted = {
+        f"pfbench/{file.relative_to(ROOT / 'pfbench')}" for file in (ROOT / "pfbench").rglob("*.py")
+    }
+    wanted |= {
+        f"pfbench/{file.relative_to(ROOT)}"
+        for top in ("conf", "experiments")
+        for file in (ROOT / top).rglob("*.yaml")
+    }
+    report = [
+        file
+        for ending in ("jinja", "css", "yaml")
+        for file in (ROOT / "pfbench/report").glob(f"*.{ending}")
+    ]
     wanted |= {f"pfbench/report/{file.name}" for file in report}
-    loops = [file for ending in ("cpp", "cu", "h") for file in (ROOT / "pfbench").glob(f"*.{ending}")]
+    loops = [
+        file for ending in ("cpp", "cu", "h") for file in (ROOT / "pfbench").glob(f"*.{ending}")
+    ]
     wanted |= {f"pfbench/{file}" for file in ("py.typed", *(file.name for file in loops))}
-    wanted |= {"pfbench/conf/__init__.py"} | {f"pfbench/{file.relative_to(ROOT)}" for file in (ROOT / "experiments").glob("*.py")}
+    wanted |= {"pfbench/conf/__init__.py"} | {
+        f"pfbench/{file.relative_to(ROOT)}" for file in (ROOT / "experiments").glob("*.py")
+    }
     assert wanted <= names
     rest = {name for name in names - wanted if ".dist-info/" not in name}
     assert rest == set()  # no tests, no results, no caches
@@ -144,22 +198,22 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
 ASK = """
 import sys
 import pfbench
-from pfbench import cli
+from pfbench import cli, job
+from pfbench.cli import check
 
-asked, compose = [], cli._compose
+asked, compose, composed = [], check.compose, job.compose([])
 
 
 def some(words):
-    # every fifth of what `check` asks for, and what it looks into; test_configs composes all
+    # every fifth file; test_configs composes all
     asked.append(words)
-    return compose(words) if len(asked) % 5 == 1 or words and words[0].startswith(("report=", "train=")) else {}
+    return compose(words) if len(asked) % 5 == 1 else composed
 
 
-print(pfbench.__file__, cli.conf_dir(), cli.experiments_dir(), sep="\\n")
+check.compose = some
+print(pfbench.__file__, job.conf_dir(), job.experiments_dir(), sep="\\n")
 for words in sys.argv[1:]:
     print("pfbench:", words)
-    if words == "check":
-        cli._compose = some
     cli.main(words.split())
 """
 
@@ -167,24 +221,34 @@ for words in sys.argv[1:]:
 @pytest.mark.slow
 def test_the_installed_package_needs_no_checkout(installed: Path, tmp_path: Path) -> None:
     """A job by the command itself; all else in one process, since each takes seconds to start."""
-    ran = elsewhere(installed, tmp_path, "run", "scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=50")
+    ran = elsewhere(
+        installed,
+        tmp_path,
+        "run",
+        "scenario=linear_walk",
+        "scenario.steps=5",
+        "runs=2",
+        "particles=50",
+    )
     assert ran.code == 0, ran.err
     assert len(list((tmp_path / "results" / "adhoc").glob("*.npz"))) == 1
 
     env = os.environ | environment(tmp_path) | {"PYTHONPATH": str(installed)}
-    words = ("list", "report study=adhoc report.formats=[svg]", "check")
+    words = ("list", "report study=adhoc report.figure_formats=[svg]", "check")
     command = [sys.executable, "-c", ASK, *words]
-    done = subprocess.run(command, env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, env=env, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     where, listed, _, checked = re.split(r"^pfbench: .*\n", done.stdout, flags=re.M)
     module, conf, experiments = map(Path, where.splitlines())
     assert module == installed / "pfbench" / "__init__.py"
     assert conf == installed / "pfbench" / "conf"
     assert experiments == installed / "pfbench" / "experiments"
-    assert all(name in listed for name in ("sir", "t004", "quickstart"))
+    assert all(name in listed for name in ("sir", "flight_500s", "quickstart"))
     assert (tmp_path / "reports" / "adhoc" / "index.html").is_file()
-    files = [*cli.conf_dir().glob("*/*.yaml"), *cli.experiments_dir().glob("*.yaml")]
-    assert f"composed   {len(files)} of {len(files)} configurations" in checked
+    files = [*job.conf_dir().glob("*/*.yaml"), *job.experiments_dir().glob("*.yaml")]
+    assert re.search(rf"configurations +{len(files)} of {len(files)} +ok", checked)
 
 
 PROGRAM = """
@@ -194,7 +258,7 @@ from pfbench import job
 
 @hydra.main(version_base="1.3", config_path="own", config_name="study")
 def main(cfg):
-    model, scenario, noise, method = (job.build(cfg[part]) for part in ("model", "scenario", "noise", "filter"))
+    model, scenario, noise, method = (job.instantiate(cfg[part]) for part in ("model", "scenario", "noise", "filter"))
     print(type(model).__name__, type(scenario).__name__, type(noise).__name__, method.particles, cfg.mine)
 
 
@@ -223,6 +287,8 @@ def test_another_program_composes_from_the_installed_yamls(installed: Path, tmp_
     (tmp_path / "program.py").write_text(PROGRAM)
     env = os.environ | environment(tmp_path) | {"PYTHONPATH": str(installed)}
     command = [sys.executable, "program.py", "filter=apf"]
-    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=tmp_path, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=env, cwd=tmp_path, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["LinearGaussian", "ModelWorld", "Outliers", "70", "42"]

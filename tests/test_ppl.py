@@ -15,27 +15,44 @@ from scipy.stats import kstest, multivariate_t
 from torch import Tensor
 from torch.distributions import Independent
 
-from pfbench.draws import MonteCarlo
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
-from pfbench.filter.gaussian import GaussianFilter
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+    UnscentedPoints,
+)
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.resamplers import Resample, Systematic
-from pfbench.filter.rules import Cubature, Jacobian, Points, Unscented
-from pfbench.model.base import StateSpaceModel, Wrapped
-from pfbench.model.linear import LinearGaussian, linear_walk, local_level
-from pfbench.model.passive_location import PassiveLocation, Platform, level_attitude
-from pfbench.model.toys import Growth, Pendulum, StochasticVolatility
-from pfbench.model.urban_gnss import TailedNormal
-from pfbench.ppl.apiece import Apiece
-from pfbench.ppl.online import online
-from pfbench.ppl.pmmh import Held, Ordered, _Walk, pmmh, tiled
-from pfbench.ppl.posterior import Posterior, picture
-from pfbench.ppl.program import ExactHMM, Filtered, Unknown, latent_program, program, simulate, unrolled
-from pfbench.ppl.switching import Switching, emission
-from pfbench.record import Record
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.model.base import ModelWrapper, StateSpaceModel
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
+from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
+from pfbench.model.textbook import Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model.urban_gnss import NormalExponentialMixture
+from pfbench.ppl.model_batch import ModelBatch
+from pfbench.ppl.parameter_posterior import ParameterPosterior, plot_posterior
+from pfbench.ppl.pmmh import CorrelatedStream, SortedResampler, _Walk, pmmh, repeat_runs
+from pfbench.ppl.program import (
+    FilterLikelihood,
+    GaussianHmmLikelihood,
+    ParameterisedModel,
+    compute_path,
+    latent_program,
+    program,
+    simulate,
+)
+from pfbench.ppl.smc2 import smc2
+from pfbench.ppl.switching import SwitchingNoise, emission_distribution
 
-EKF, CKF, UKF = GaussianFilter(Jacobian()), GaussianFilter(Points(Cubature())), GaussianFilter(Points(Unscented()))
+EKF, CKF, UKF = (
+    GaussianFilter(TaylorLinearisation()),
+    GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
+    GaussianFilter(SigmaPointLinearisation(UnscentedPoints())),
+)
 STEPS = 5
 
 
@@ -49,10 +66,12 @@ def level(level_sd: Any, measurement_sd: Any) -> LinearGaussian:
 
 def located(angle_sd: Any, acceleration_sd: Any) -> PassiveLocation:
     sd = [angle_sd, angle_sd, 1e-4, 1e-4, 1.0]
-    return PassiveLocation(10.0, acceleration_sd, sd, (160e3, 160e3, 0.0, 0.0), (5e3, 5e3, 9.0, 9.0))
+    return PassiveLocation(
+        10.0, acceleration_sd, sd, (160e3, 160e3, 0.0, 0.0), (5e3, 5e3, 9.0, 9.0)
+    )
 
 
-class Tailed(Wrapped):
+class Tailed(ModelWrapper):
     """A walk whose measurements may be delayed: a law that is not normal, with a number of it in a buffer."""
 
     tail: Tensor
@@ -62,13 +81,15 @@ class Tailed(Wrapped):
         self.register_buffer("tail", torch.as_tensor(tail, dtype=torch.float64))
 
     def observation(self, x: Tensor, u: Any) -> Any:
-        return Independent(TailedNormal(x[..., :1], x.new_zeros(()), x.new_tensor(0.7), self.tail), 1)
+        return Independent(
+            NormalExponentialMixture(x[..., :1], x.new_zeros(()), x.new_tensor(0.7), self.tail), 1
+        )
 
 
 MAKE: dict[str, Callable[..., StateSpaceModel]] = {
     "walk": walk,
     "at_rest": level,
-    "growth": lambda a, b: Growth(a, b),
+    "growth": lambda a, b: UnivariateGrowth(a, b),
     "pendulum": lambda a, b: Pendulum(noise=a, measurement_sd=b),
     "volatility": lambda a, b: StochasticVolatility(mu=-a, sigma=b),
     "location": lambda a, b: located(3e-3 * a, 0.3 * b),
@@ -78,15 +99,25 @@ MAKE: dict[str, Callable[..., StateSpaceModel]] = {
 
 def record_for(model: StateSpaceModel, runs: int) -> Record:
     """Arbitrary measurements with a gap; for the location an aircraft's way, and a start for each run."""
-    y = torch.sin(torch.arange(float(runs * STEPS), dtype=torch.float64) * 1.7).view(runs, STEPS, 1) + 0.5
+    y = (
+        torch.sin(torch.arange(float(runs * STEPS), dtype=torch.float64) * 1.7).view(runs, STEPS, 1)
+        + 0.5
+    )
     y[0, 2] = torch.nan
     if not isinstance(model, PassiveLocation):
         return Record(y)
     t = 10.0 * torch.arange(1, STEPS + 1, dtype=torch.float64)
     velocity = torch.tensor([200.0, 0.0, 0.0], dtype=torch.float64)
     place = torch.stack([200.0 * t, torch.zeros_like(t), 2000.0 + torch.zeros_like(t)], -1)
-    u = Platform(place[None], velocity.expand(1, STEPS, 3), level_attitude(velocity).expand(1, STEPS, 3, 3), 1e10 + 0.0 * t[None])
-    start = model.origin + 1e3 * torch.arange(float(4 * runs), dtype=torch.float64).view(runs, 4).sin()
+    u = PlatformInputs(
+        place[None],
+        velocity.expand(1, STEPS, 3),
+        compute_level_attitude(velocity).expand(1, STEPS, 3, 3),
+        1e10 + 0.0 * t[None],
+    )
+    start = (
+        model.origin + 1e3 * torch.arange(float(4 * runs), dtype=torch.float64).view(runs, 4).sin()
+    )
     record, _ = simulate(model, Record(y.expand(-1, -1, 5).clone(), u, start), 3)
     return record
 
@@ -94,25 +125,41 @@ def record_for(model: StateSpaceModel, runs: int) -> Record:
 @pytest.mark.parametrize("method", [EKF, CKF, ParticleFilter(30)], ids=["ekf", "ckf", "sir"])
 @pytest.mark.parametrize("name", MAKE)
 def test_models_of_one_batch_are_each_what_it_is_alone(name: str, method: Filter) -> None:
-    make, sizes = MAKE[name], torch.tensor([[0.6, 0.9], [1.3, 0.5], [0.8, 1.7]], dtype=torch.float64)
+    make, sizes = (
+        MAKE[name],
+        torch.tensor([[0.6, 0.9], [1.3, 0.5], [0.8, 1.7]], dtype=torch.float64),
+    )
     models = [make(*row) for row in sizes]
     record = record_for(models[0], 3)
-    together = run_filter(method, Apiece(models), record, MonteCarlo(1, torch.arange(3)))
+    together = run_filter(method, ModelBatch(models), record, PhiloxStream(1, torch.arange(3)))
     for r, model in enumerate(models):
-        alone = run_filter(method, model, record.of(slice(r, r + 1)), MonteCarlo(1, torch.tensor([r])))
-        torch.testing.assert_close(together.log_evidence[r : r + 1], alone.log_evidence, rtol=1e-10, atol=1e-10)
-        torch.testing.assert_close(together.mean[r : r + 1], alone.mean, rtol=1e-9, atol=1e-9, equal_nan=True)
+        alone = run_filter(
+            method, model, record.select_runs(slice(r, r + 1)), PhiloxStream(1, torch.tensor([r]))
+        )
+        torch.testing.assert_close(
+            together.log_evidence[r : r + 1], alone.log_evidence, rtol=1e-10, atol=1e-10
+        )
+        torch.testing.assert_close(
+            together.mean[r : r + 1], alone.mean, rtol=1e-9, atol=1e-9, equal_nan=True
+        )
 
 
 def test_a_model_serves_consecutive_runs() -> None:
     models = [walk(0.5, 1.0), walk(1.5, 0.3)]
-    record = tiled(record_for(models[0], 2), 2)
-    found = run_filter(EKF, Apiece(models, 2), record, MonteCarlo(0, torch.arange(4))).log_evidence
-    alone = [run_filter(EKF, model, record.of(slice(0, 2)), MonteCarlo(0, torch.arange(2))).log_evidence for model in models]
+    record = repeat_runs(record_for(models[0], 2), 2)
+    found = run_filter(
+        EKF, ModelBatch(models, 2), record, PhiloxStream(0, torch.arange(4))
+    ).log_evidence
+    alone = [
+        run_filter(
+            EKF, model, record.select_runs(slice(0, 2)), PhiloxStream(0, torch.arange(2))
+        ).log_evidence
+        for model in models
+    ]
     torch.testing.assert_close(found, torch.cat(alone))
 
 
-class Plain(Wrapped):
+class Plain(ModelWrapper):
     """Keeps a number outside its buffers."""
 
     def __init__(self, gain: Any) -> None:
@@ -121,56 +168,89 @@ class Plain(Wrapped):
 
 
 def test_what_no_batch_can_hold_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"keeps gain as a plain number.*register_buffer"):
-        Apiece([Plain(1.0), Plain(2.0)])
+    with pytest.raises(ValueError, match=r"must register gain as a buffer.*register_buffer"):
+        ModelBatch([Plain(1.0), Plain(2.0)])
     with pytest.raises(ValueError, match="one origin"):
-        Apiece([PassiveLocation(1.0, 0.1, [1.0] * 5, initial_mean=(x, 0.0, 0.0, 0.0)) for x in (1.0, 2.0)])
+        ModelBatch(
+            [
+                PassiveLocation(1.0, 0.1, [1.0] * 5, initial_mean=(x, 0.0, 0.0, 0.0))
+                for x in (1.0, 2.0)
+            ]
+        )
 
 
-SIZES = {"growth": (1.1, 0.9), "pendulum": (0.4, 0.6), "location": (1.2, 0.7), "at_rest": (0.7, 0.9)}
+SIZES = {
+    "growth": (1.1, 0.9),
+    "pendulum": (0.4, 0.6),
+    "location": (1.2, 0.7),
+    "at_rest": (0.7, 0.9),
+}
 
 
-@pytest.mark.parametrize(("name", "method"), [*((n, EKF) for n in SIZES), ("growth", CKF), ("location", UKF)])
+@pytest.mark.parametrize(
+    ("name", "method"), [*((n, EKF) for n in SIZES), ("growth", CKF), ("location", UKF)]
+)
 def test_gradients_of_the_evidence_are_its_finite_differences(name: str, method: Filter) -> None:
     """From one end of a Gaussian filter to the other, where a measurement is missing too; as one model and one for each run."""
     make, at = MAKE[name], torch.tensor(SIZES[name], dtype=torch.float64)
     record = record_for(make(*at), 2)
 
     def evidence(log_sizes: Tensor) -> Tensor:
-        return Filtered(method)(make(*log_sizes.exp()), record).sum()
+        return FilterLikelihood(method)(make(*log_sizes.exp()), record).sum()
 
     def each(log_sizes: Tensor) -> Tensor:
-        return Filtered(method)(Apiece([make(*log_sizes.exp()) for _ in range(2)]), record).sum()
+        return FilterLikelihood(method)(
+            ModelBatch([make(*log_sizes.exp()) for _ in range(2)]), record
+        ).sum()
 
     log_at, h = at.log(), 1e-5
     with torch.no_grad():
-        slopes = [(evidence(log_at + h * e) - evidence(log_at - h * e)) / (2 * h) for e in torch.eye(2, dtype=torch.float64)]
+        slopes = [
+            (evidence(log_at + h * e) - evidence(log_at - h * e)) / (2 * h)
+            for e in torch.eye(2, dtype=torch.float64)
+        ]
     assert min(abs(float(slope)) for slope in slopes) > 5e-5  # the evidence depends on both
     for f in (evidence, each):
         z = log_at.clone().requires_grad_()
-        torch.testing.assert_close(torch.autograd.grad(f(z), z)[0], torch.stack(slopes), rtol=2e-6, atol=1e-8)
+        torch.testing.assert_close(
+            torch.autograd.grad(f(z), z)[0], torch.stack(slopes), rtol=2e-6, atol=1e-8
+        )
 
 
-LEVELS = Unknown(lambda a, b: walk(a, b), {"a": LogNormal(0.0, 0.5), "b": LogNormal(0.3, 0.4)})
+LEVELS = ParameterisedModel(
+    lambda a, b: walk(a, b), {"a": LogNormal(0.0, 0.5), "b": LogNormal(0.3, 0.4)}
+)
 
 
 def test_a_program_s_density_is_prior_times_evidence() -> None:
     record = Record(record_for(walk(1.0, 1.0), 2).y)
-    values = {"a": torch.tensor(0.8, dtype=torch.float64), "b": torch.tensor(1.4, dtype=torch.float64)}
-    traced = poutine.trace(poutine.condition(program(LEVELS, Filtered(EKF)), values)).get_trace(record)
+    values = {
+        "a": torch.tensor(0.8, dtype=torch.float64),
+        "b": torch.tensor(1.4, dtype=torch.float64),
+    }
+    traced = poutine.trace(
+        poutine.condition(program(LEVELS, FilterLikelihood(EKF)), values)
+    ).get_trace(record)
     prior = LEVELS.prior["a"].log_prob(values["a"]) + LEVELS.prior["b"].log_prob(values["b"])
-    evidence = Filtered(EKF)(walk(0.8, 1.4), record)
+    evidence = FilterLikelihood(EKF)(walk(0.8, 1.4), record)
     assert not traced.stochastic_nodes
     assert set(traced.observation_nodes) == {"a", "b", "evidence"}
     torch.testing.assert_close(traced.log_prob_sum(), prior + evidence.sum())
-    apart = poutine.condition(program(LEVELS, Filtered(EKF), apart=True), {name: v.expand(2) for name, v in values.items()})
-    torch.testing.assert_close(poutine.trace(apart).get_trace(record).log_prob_sum(), 2 * prior + evidence.sum())
+    apart = poutine.condition(
+        program(LEVELS, FilterLikelihood(EKF), separate_parameters=True),
+        {name: v.expand(2) for name, v in values.items()},
+    )
+    torch.testing.assert_close(
+        poutine.trace(apart).get_trace(record).log_prob_sum(), 2 * prior + evidence.sum()
+    )
 
 
 def test_numbers_beyond_all_bounds_are_impossible_and_no_error() -> None:
     far = {"a": torch.tensor(torch.inf), "b": torch.tensor(1.0)}
     record = Record(torch.zeros(1, 3, 1, dtype=torch.float64))
-    traced = poutine.trace(poutine.condition(program(LEVELS, Filtered(EKF)), far)).get_trace(record)
+    traced = poutine.trace(
+        poutine.condition(program(LEVELS, FilterLikelihood(EKF)), far)
+    ).get_trace(record)
     assert traced.nodes["evidence"]["fn"].log_factor == -torch.inf
 
 
@@ -178,46 +258,64 @@ def test_numbers_beyond_all_bounds_are_impossible_and_no_error() -> None:
 def test_the_exact_likelihood_is_kalman_s(apart: bool) -> None:
     record = Record(record_for(walk(1.0, 1.0), 3).y.nan_to_num(0.3))
     sizes = torch.tensor([[0.6, 0.9], [1.3, 0.5], [0.8, 1.7]], dtype=torch.float64)
-    model = Apiece([walk(*row) for row in sizes]) if apart else walk(*sizes[0])
-    torch.testing.assert_close(ExactHMM()(model, record), Filtered(EKF)(model, record), rtol=0, atol=1e-7)
+    model = ModelBatch([walk(*row) for row in sizes]) if apart else walk(*sizes[0])
+    torch.testing.assert_close(
+        GaussianHmmLikelihood()(model, record),
+        FilterLikelihood(EKF)(model, record),
+        rtol=0,
+        atol=1e-7,
+    )
 
 
 def test_the_exact_likelihood_refuses_what_it_cannot_say() -> None:
     y = torch.zeros(1, 3, 1, dtype=torch.float64)
-    singular = LinearGaussian(torch.eye(2), [[0.0], [1.0]], [[1.0, 0.0]], [1.0], [0.0] * 2, [1.0] * 2)
-    for model in (Growth(), level(1.0, 1.0), singular):
-        with pytest.raises(ValueError, match="is no linear model with full noise"):
-            ExactHMM()(model, Record(y))
-    with pytest.raises(ValueError, match="gaps"):
-        ExactHMM()(walk(1.0, 1.0), Record(y + torch.nan))
+    singular = LinearGaussian(
+        torch.eye(2), [[0.0], [1.0]], [[1.0, 0.0]], [1.0], [0.0] * 2, [1.0] * 2
+    )
+    for model in (UnivariateGrowth(), level(1.0, 1.0), singular):
+        with pytest.raises(ValueError, match="needs a linear model with full noise"):
+            GaussianHmmLikelihood()(model, Record(y))
+    with pytest.raises(ValueError, match="missing components"):
+        GaussianHmmLikelihood()(walk(1.0, 1.0), Record(y + torch.nan))
 
 
 @pytest.mark.parametrize("make", [walk, level])
 def test_the_latent_program_integrates_to_the_evidence(make: Callable[..., LinearGaussian]) -> None:
     """In the noise of a linear model its density is normal: mode and curvature give the integral, which is Kalman's evidence."""
     prior = {"a": LogNormal(0.0, 0.5), "b": LogNormal(0.3, 0.4)}
-    unknown = Unknown(lambda a, b: make(a, b), prior)
+    unknown = ParameterisedModel(lambda a, b: make(a, b), prior)
     record = Record(record_for(make(1.0, 1.0), 1).y)
-    values = {"a": torch.tensor(0.8, dtype=torch.float64), "b": torch.tensor(1.4, dtype=torch.float64)}
+    values = {
+        "a": torch.tensor(0.8, dtype=torch.float64),
+        "b": torch.tensor(1.4, dtype=torch.float64),
+    }
     model = unknown.model(values)
     d, w = model.chart.dimension, model.noise_dim
 
     def log_joint(v: Tensor) -> Tensor:
         sites = {"initial_state": v[:d].view(1, d), "driving_noise": v[d:].view(1, STEPS, w)}
-        traced = poutine.trace(poutine.condition(latent_program(unknown), values | sites)).get_trace(record)
-        return traced.log_prob_sum() - sum(law.log_prob(values[name]) for name, law in prior.items())
+        traced = poutine.trace(
+            poutine.condition(latent_program(unknown), values | sites)
+        ).get_trace(record)
+        return traced.log_prob_sum() - sum(
+            law.log_prob(values[name]) for name, law in prior.items()
+        )
 
     zero = torch.zeros(d + STEPS * w, dtype=torch.float64)
     slope = torch.func.grad(log_joint)(zero)
-    bend = torch.stack([torch.func.grad(log_joint)(e) - slope for e in torch.eye(len(zero), dtype=torch.float64)])
+    bend = torch.stack(
+        [torch.func.grad(log_joint)(e) - slope for e in torch.eye(len(zero), dtype=torch.float64)]
+    )
     mode = -torch.linalg.solve(bend, slope)
     integral = log_joint(mode) + 0.5 * len(zero) * math.log(2 * math.pi) - 0.5 * torch.logdet(-bend)
-    torch.testing.assert_close(integral, Filtered(EKF)(model, record)[0], rtol=0, atol=1e-8)
+    torch.testing.assert_close(integral, FilterLikelihood(EKF)(model, record)[0], rtol=0, atol=1e-8)
 
 
 def test_numbers_cannot_have_the_names_of_the_path_s_sites() -> None:
-    with pytest.raises(ValueError, match=r"\['path'\] name sites"):
-        latent_program(Unknown(lambda path: walk(path, 1.0), {"path": LogNormal(0.0, 1.0)}))
+    with pytest.raises(ValueError, match=r"names of path sites, got \['path'\]"):
+        latent_program(
+            ParameterisedModel(lambda path: walk(path, 1.0), {"path": LogNormal(0.0, 1.0)})
+        )
 
 
 def test_simulated_measurements_have_the_model_s_law_start_and_gaps() -> None:
@@ -228,11 +326,18 @@ def test_simulated_measurements_have_the_model_s_law_start_and_gaps() -> None:
     record, states = simulate(model, Record(y, start=start), 2)
     assert torch.isnan(record.y[:, 1]).all()
     assert record.start is start
-    evidence = Filtered(EKF)(model, record)  # twice its mean is minus an entropy, of 2 normal numbers: variance 2/2
+    evidence = FilterLikelihood(EKF)(
+        model, record
+    )  # twice its mean is minus an entropy, of 2 normal numbers: variance 2/2
     f, q = model.f, model.g @ model.g.mT
     p1 = f @ torch.diag(torch.tensor([4.0, 1.0], dtype=torch.float64)) @ f.mT + q
     p3 = f @ f @ p1 @ f.mT @ f.mT + f @ q @ f.mT + q
-    c = torch.stack([torch.stack([p1[0, 0], (p1 @ f.mT @ f.mT)[0, 0]]), torch.stack([(p1 @ f.mT @ f.mT)[0, 0], p3[0, 0]])])
+    c = torch.stack(
+        [
+            torch.stack([p1[0, 0], (p1 @ f.mT @ f.mT)[0, 0]]),
+            torch.stack([(p1 @ f.mT @ f.mT)[0, 0], p3[0, 0]]),
+        ]
+    )
     c = c + 0.36 * torch.eye(2, dtype=torch.float64)
     entropy = 1.0 + math.log(2 * math.pi) + 0.5 * torch.logdet(c)
     assert abs(float(evidence.mean() + entropy)) < 4.5 / runs**0.5
@@ -245,25 +350,34 @@ def test_the_states_of_a_simulation_are_those_that_its_noise_makes() -> None:
     model = located(3e-3, 0.3)
     record = record_for(model, 2)
     z, w = torch.zeros(2, 4, dtype=torch.float64), torch.zeros(2, STEPS, 2, dtype=torch.float64)
-    states, log_like = unrolled(model, record, z, w)
+    states, log_like = compute_path(model, record, z, w)
     assert record.start is not None
-    torch.testing.assert_close(states[:, -1], record.start @ torch.linalg.matrix_power(model.phi, STEPS).mT)
+    torch.testing.assert_close(
+        states[:, -1], record.start @ torch.linalg.matrix_power(model.phi, STEPS).mT
+    )
     assert log_like.shape == (2, STEPS)
 
 
 def test_what_is_unknown_must_matter() -> None:
-    with pytest.raises(ValueError, match=r"prior\[c\]: nothing in LinearGaussian changes"):
-        Unknown(lambda a, c: walk(a, 1.0), {"a": LogNormal(0.0, 1.0), "c": LogNormal(0.0, 1.0)})
-    with pytest.raises(ValueError, match="scalar law"):
-        Unknown(lambda a: walk(a, 1.0), {"a": LogNormal(torch.zeros(2), 1.0)})
+    with pytest.raises(
+        ValueError, match=r"prior\[c\] must change the model, but no buffer of LinearGaussian"
+    ):
+        ParameterisedModel(
+            lambda a, c: walk(a, 1.0), {"a": LogNormal(0.0, 1.0), "c": LogNormal(0.0, 1.0)}
+        )
+    with pytest.raises(ValueError, match="scalar distribution"):
+        ParameterisedModel(lambda a: walk(a, 1.0), {"a": LogNormal(torch.zeros(2), 1.0)})
     with pytest.raises(ValueError, match=r"pyro\.distributions"):
-        Unknown(lambda a: walk(a, 1.0), {"a": torch.distributions.LogNormal(0.0, 1.0)})
-    with pytest.raises(ValueError, match="nothing is unknown"):
-        Unknown(lambda: walk(1.0, 1.0), {})
+        ParameterisedModel(lambda a: walk(a, 1.0), {"a": torch.distributions.LogNormal(0.0, 1.0)})
+    with pytest.raises(ValueError, match="at least one parameter"):
+        ParameterisedModel(lambda: walk(1.0, 1.0), {})
 
 
 def test_the_density_on_the_whole_line_integrates_to_one() -> None:
-    unknown = Unknown(lambda a, b: StochasticVolatility(rho=a, sigma=b), {"a": Beta(4.0, 2.0), "b": LogNormal(-1.0, 0.5)})
+    unknown = ParameterisedModel(
+        lambda a, b: StochasticVolatility(rho=a, sigma=b),
+        {"a": Beta(4.0, 2.0), "b": LogNormal(-1.0, 0.5)},
+    )
     at = torch.linspace(-12.0, 12.0, 801, dtype=torch.float64)
     z = torch.cartesian_prod(at, at)
     values, log_prior = unknown.constrained(z)
@@ -275,10 +389,10 @@ def test_the_density_on_the_whole_line_integrates_to_one() -> None:
 def test_held_draws_are_correlated_normals_that_only_accepted_runs_replace() -> None:
     kept: dict[Any, Tensor] = {}
     runs, rho = torch.arange(400), 0.9
-    first, second = (Held(MonteCarlo(seed, runs), rho, kept) for seed in (1, 2))
-    one = first.at(3).normal("noise", 25, 2)
+    first, second = (CorrelatedStream(PhiloxStream(seed, runs), rho, kept) for seed in (1, 2))
+    one = first.at_step(3).normal("noise", 25, 2)
     first.accept(torch.ones(400, dtype=torch.bool))
-    two = second.at(3).normal("noise", 25, 2)
+    two = second.at_step(3).normal("noise", 25, 2)
     both = torch.corrcoef(torch.stack([one.flatten(), two.flatten()]))[0, 1]
     assert abs(float(both) - rho) < 4.5 * (1 - rho**2) / 2e4**0.5
     assert abs(float(two.std()) - 1.0) < 4.5 / 4e4**0.5
@@ -289,22 +403,26 @@ def test_held_draws_are_correlated_normals_that_only_accepted_runs_replace() -> 
     assert 0.0 < float(u.min()) < 0.01 < 0.99 < float(u.max()) < 1.0
 
 
-def test_correlated_draws_make_the_likelihood_s_ratio_less_noisy_if_particles_are_in_order() -> None:
+def test_correlated_draws_make_the_likelihood_s_ratio_less_noisy_if_particles_are_in_order() -> (
+    None
+):
     model, runs = local_level(0.5, 0.7, 0.0, 1.0), torch.arange(60)
-    record = tiled(Record(record_for(model, 1).y), 60)
-    always = Resample(Systematic(), threshold=1.0)
+    record = repeat_runs(Record(record_for(model, 1).y), 60)
+    always = EssResampler(Systematic(), ess_threshold=1.0)
 
     def spread(rho: float, resampler: Any) -> float:
         kept: dict[Any, Tensor] = {}
         found = []
         for seed in (1, 2):
-            held = Held(MonteCarlo(seed, runs), rho, kept)
-            found.append(run_filter(ParticleFilter(40, resampler), model, record, held).log_evidence)
+            held = CorrelatedStream(PhiloxStream(seed, runs), rho, kept)
+            found.append(
+                run_filter(ParticleFilter(40, resampler), model, record, held).log_evidence
+            )
             held.accept(torch.ones(60, dtype=torch.bool))
         return float((found[1] - found[0]).std())
 
-    ordered = spread(0.99, Ordered(always))
-    assert ordered < 0.5 * spread(0.0, Ordered(always))
+    ordered = spread(0.99, SortedResampler(always))
+    assert ordered < 0.5 * spread(0.0, SortedResampler(always))
     assert ordered < 0.7 * spread(0.99, always)
 
 
@@ -312,17 +430,25 @@ def test_leaps_are_of_a_t_law_and_know_its_density() -> None:
     """Squared lengths under a law of t with 5 degrees of freedom are 3 F(3, 5) in three dimensions; SciPy has its density."""
     root = torch.tensor([[1.0, 0.0, 0.0], [0.4, 0.7, 0.0], [-0.3, 0.2, 2.0]], dtype=torch.float64)
     mean, covariance = torch.tensor([[1.0, -2.0, 0.5]], dtype=torch.float64), (root @ root.mT)[None]
-    z = mean + 2.0 * torch.randn(2000, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    z = mean + 2.0 * torch.randn(
+        2000, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
     walk = _Walk(mean, covariance, torch.zeros(1, dtype=torch.float64))
-    new, log_back = walk.leap(z, MonteCarlo(1, torch.arange(2000)).at(1))
+    new, log_back = walk.leap(z, PhiloxStream(1, torch.arange(2000)).at_step(1))
     law = multivariate_t(mean[0].numpy(), covariance[0].numpy() + 1e-6 * np.eye(3), df=5)
-    np.testing.assert_allclose(log_back[:, 0], law.logpdf(z[:, 0].numpy()) - law.logpdf(new[:, 0].numpy()), atol=1e-9)
-    length = torch.linalg.solve_triangular(root, (new - mean).mT, upper=False).square().sum((1, 2)) / 3.0
+    np.testing.assert_allclose(
+        log_back[:, 0], law.logpdf(z[:, 0].numpy()) - law.logpdf(new[:, 0].numpy()), atol=1e-9
+    )
+    length = (
+        torch.linalg.solve_triangular(root, (new - mean).mT, upper=False).square().sum((1, 2)) / 3.0
+    )
     assert kstest(length.numpy(), f_law(3, 5).cdf).pvalue > 1e-3
 
 
 @pytest.mark.parametrize("leaps", [1, 10**6])
-def test_chains_that_start_elsewhere_come_to_the_posterior_by_steps_and_by_leaps(leaps: int) -> None:
+def test_chains_that_start_elsewhere_come_to_the_posterior_by_steps_and_by_leaps(
+    leaps: int,
+) -> None:
     """Nothing is measured, so that the posterior is the prior; in the second case they only leap."""
     start = {"a": LogNormal(0.6, 0.9), "b": LogNormal(-0.6, 0.9)}
     ticks: list[None] = []
@@ -332,7 +458,7 @@ def test_chains_that_start_elsewhere_come_to_the_posterior_by_steps_and_by_leaps
     )  # fmt: skip
     assert len(ticks) == 36
     for name, law in LEVELS.prior.items():
-        z = (found.flat(name).log() - law.loc) / law.scale
+        z = (found.pooled_draws(name).log() - law.loc) / law.scale
         assert abs(z.mean()) < 0.2
         assert 0.75 < z.square().mean() < 1.3
 
@@ -341,7 +467,7 @@ def test_pmmh_says_what_it_cannot_do() -> None:
     record = Record(torch.zeros(1, 3, 1, dtype=torch.float64))
     with pytest.raises(ValueError, match="leaps=-1"):
         pmmh(LEVELS, EKF, record, 1, 1, leaps=-1)
-    with pytest.raises(ValueError, match=r"start of \['a'\]; give a law for each of \['a', 'b'\]"):
+    with pytest.raises(ValueError, match=r"a distribution for each of \['a', 'b'\], got \['a'\]"):
         pmmh(LEVELS, EKF, record, 1, 1, start={"a": LogNormal(0.0, 1.0)})
     with pytest.raises(ValueError, match="rho=1"):
         pmmh(LEVELS, EKF, record, 1, 1, rho=1.0)
@@ -354,46 +480,62 @@ def test_pmmh_says_what_it_cannot_do() -> None:
 
 def test_online_learning_says_what_it_cannot_do() -> None:
     impossible = Record(torch.tensor([[[0.5], [1e200]]], dtype=torch.float64))
-    with pytest.raises(ValueError, match="step 1 every filter is lost"):
-        online(LEVELS, ParticleFilter(5), impossible, 4)
-    with pytest.raises(ValueError, match="threshold=2"):
-        online(LEVELS, EKF, impossible, 4, threshold=2.0)
+    with pytest.raises(ValueError, match="valid at step 1, got none"):
+        smc2(LEVELS, ParticleFilter(5), impossible, 4)
+    with pytest.raises(ValueError, match="threshold must be from 0 to 1, got 2"):
+        smc2(LEVELS, EKF, impossible, 4, threshold=2.0)
     with pytest.raises(ValueError, match="particles=1"):
-        online(LEVELS, EKF, impossible, 1)
+        smc2(LEVELS, EKF, impossible, 1)
 
 
 def test_a_table_tells_chains_that_have_not_met() -> None:
     torch.manual_seed(0)
     met = torch.randn(4, 500, dtype=torch.float64)
-    posterior = Posterior({"a": met, "b": met + 5.0 * torch.arange(4.0)[:, None]}, torch.full((4,), 0.3))
+    posterior = ParameterPosterior(
+        {"a": met, "b": met + 5.0 * torch.arange(4.0)[:, None]}, torch.full((4,), 0.3)
+    )
     table = posterior.table()
     assert table.r_hat["a"] < 1.02 < 2.0 < table.r_hat["b"]
-    assert not posterior.mixed
+    assert not posterior.has_converged
     assert table.ess["a"] > 1500 > 50 > table.ess["b"]
-    for column, truth in (("mean", 0.0), ("median", 0.0), ("low", -1.645), ("high", 1.645), ("sd", 1.0)):
+    for column, truth in (
+        ("mean", 0.0),
+        ("median", 0.0),
+        ("low", -1.645),
+        ("high", 1.645),
+        ("sd", 1.0),
+    ):
         assert abs(table[column]["a"] - truth) < 0.2
-    figure = picture({"both": posterior}, {"a": Normal(0.0, 2.0), "b": LogNormal(1.0, 1.0)}, {"a": 0.0})
+    figure = plot_posterior(
+        {"both": posterior}, {"a": Normal(0.0, 2.0), "b": LogNormal(1.0, 1.0)}, {"a": 0.0}
+    )
     assert len(figure.axes) == 4
-    named = picture({"both": posterior}, {"a": Normal(0.0, 2.0), "b": LogNormal(1.0, 1.0)}, names={"b": "b, m"})
+    named = plot_posterior(
+        {"both": posterior}, {"a": Normal(0.0, 2.0), "b": LogNormal(1.0, 1.0)}, names={"b": "b, m"}
+    )
     assert [axis.get_ylabel() for axis in named.axes[::2]] == ["a", "b, m"]
-    apart = Posterior({"a": met.view(4, 100, 5)}, torch.full((4, 5), 0.3))
+    apart = ParameterPosterior({"a": met.view(4, 100, 5)}, torch.full((4, 5), 0.3))
     assert apart.run(2).draws["a"].shape == (4, 100)
     with pytest.raises(ValueError, match="run\\(r\\)"):
         apart.table()
-    short = Posterior({"a": met[:, :3]}, torch.full((4,), 0.3))
-    assert not short.mixed
+    short = ParameterPosterior({"a": met[:, :3]}, torch.full((4,), 0.3))
+    assert not short.has_converged
     assert math.isnan(short.table().r_hat["a"])
 
 
-REGIMES = Switching(LogNormal(0.0, 1.0), LogNormal(1.0, 0.5), Beta(9.0, 1.0), Beta(4.0, 1.0))
-VALUES = dict(zip(REGIMES.prior, torch.tensor([0.5, 4.0, 0.9, 0.7], dtype=torch.float64), strict=True))
+REGIMES = SwitchingNoise(LogNormal(0.0, 1.0), LogNormal(1.0, 0.5), Beta(9.0, 1.0), Beta(4.0, 1.0))
+VALUES = dict(
+    zip(REGIMES.prior, torch.tensor([0.5, 4.0, 0.9, 0.7], dtype=torch.float64), strict=True)
+)
 
 
 def test_switching_sums_over_all_paths_of_the_regime() -> None:
     y = torch.tensor([[[0.2], [-1.9], [torch.nan], [2.5], [0.1]]], dtype=torch.float64)
-    table, total, surged = emission(Record(y), VALUES)[0], [], []
+    table, total, surged = emission_distribution(Record(y), VALUES)[0], [], []
     assert float(table[2].abs().max()) == 0.0
-    torch.testing.assert_close(table[1, 1], Normal(0.0, 2.0).log_prob(torch.tensor(-1.9)).double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        table[1, 1], Normal(0.0, 2.0).log_prob(torch.tensor(-1.9)).double(), rtol=1e-6, atol=0
+    )
     steps = torch.tensor([[0.9, 0.1], [0.3, 0.7]], dtype=torch.float64)
     start = torch.tensor([0.75, 0.25], dtype=torch.float64)
     torch.testing.assert_close(start @ steps, start)
@@ -406,11 +548,16 @@ def test_switching_sums_over_all_paths_of_the_regime() -> None:
     each = torch.stack(total)
     torch.testing.assert_close(REGIMES.chain(VALUES, table.unsqueeze(0))[0], each.logsumexp(0))
     weights = torch.softmax(each, 0)
-    torch.testing.assert_close(REGIMES.probability(Record(y), VALUES)[0], weights @ torch.stack(surged))
+    torch.testing.assert_close(
+        REGIMES.probability(Record(y), VALUES)[0], weights @ torch.stack(surged)
+    )
 
 
 def test_the_switching_program_is_prior_times_chain() -> None:
     record = Record(torch.tensor([[[0.2], [-1.9]], [[0.3], [0.1]]], dtype=torch.float64))
     traced = poutine.trace(poutine.condition(REGIMES.program(), VALUES)).get_trace(record)
     prior = sum(law.log_prob(VALUES[name]) for name, law in REGIMES.prior.items())
-    torch.testing.assert_close(traced.log_prob_sum(), prior + REGIMES.chain(VALUES, emission(record, VALUES)).sum())
+    torch.testing.assert_close(
+        traced.log_prob_sum(),
+        prior + REGIMES.chain(VALUES, emission_distribution(record, VALUES)).sum(),
+    )

@@ -8,28 +8,44 @@ import numpy as np
 import pytest
 import torch
 from oracles import kalman
-from pfbench.experiments.learn_noise_calibration import LEVELS, SIGHTS, by_pmmh, by_svi, flight, level, location
+from pfbench.experiments.learn_noise_calibration import (
+    LEVELS,
+    SIGHTS,
+    by_pmmh,
+    by_svi,
+    flight,
+    level,
+    location,
+)
 from pyro.distributions import LogNormal
 from pyro.infer.autoguide import AutoMultivariateNormal
 
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.rules import Jacobian
-from pfbench.model.linear import local_level
-from pfbench.ppl.calibration import Ranks, calibrate, histograms
-from pfbench.ppl.gradients import normal_guide, nuts, variational
-from pfbench.ppl.online import online
+from pfbench.core.record import Record
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.model.linear_gaussian import local_level
+from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
+from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.pmmh import pmmh
-from pfbench.ppl.posterior import Posterior
-from pfbench.ppl.program import ExactHMM, Filtered, Unknown, latent_program, program
-from pfbench.record import Record
+from pfbench.ppl.program import (
+    FilterLikelihood,
+    GaussianHmmLikelihood,
+    ParameterisedModel,
+    latent_program,
+    program,
+)
+from pfbench.ppl.sbc import SbcRanks, sbc_histograms, simulation_based_calibration
+from pfbench.ppl.smc2 import smc2
 
-EKF, YEARS = GaussianFilter(Jacobian()), 12
-NILE = Unknown(
+EKF, YEARS = GaussianFilter(TaylorLinearisation()), 12
+NILE = ParameterisedModel(
     lambda level_sd, measurement_sd: local_level(level_sd, measurement_sd, 1000.0, 1000.0),
     {"level_sd": LogNormal(3.5, 1.0), "measurement_sd": LogNormal(4.8, 0.5)},
 )
-LEVEL = Unknown(lambda noise: local_level(noise, 0.7, 0.0, 1.0), {"noise": LogNormal(0.0, 1.0)})
+LEVEL = ParameterisedModel(
+    lambda noise: local_level(noise, 0.7, 0.0, 1.0), {"noise": LogNormal(0.0, 1.0)}
+)
 
 
 @cache
@@ -46,13 +62,22 @@ def grid(years: int) -> tuple[dict[str, tuple[float, float]], float]:
     one, log_p = np.eye(1), np.zeros((41, 41))
     for i, a in enumerate(at[0]):
         for j, b in enumerate(at[1]):
-            found = kalman(one, one * np.exp(2 * a), one, one * np.exp(2 * b), np.array([1000.0]), one * 1e6, y)
-            log_p[i, j] = found.log_evidence.sum() - 0.5 * ((a - 3.5) / 1.0) ** 2 - 0.5 * ((b - 4.8) / 0.5) ** 2
+            found = kalman(
+                one, one * np.exp(2 * a), one, one * np.exp(2 * b), np.array([1000.0]), one * 1e6, y
+            )
+            log_p[i, j] = (
+                found.log_evidence.sum()
+                - 0.5 * ((a - 3.5) / 1.0) ** 2
+                - 0.5 * ((b - 4.8) / 0.5) ** 2
+            )
     log_p -= np.log(2 * np.pi * 1.0 * 0.5)
     p = np.exp(log_p - log_p.max())
     p /= p.sum()
     found = {}
-    for name, values, own in (("level_sd", np.exp(at[0]), p.sum(1)), ("measurement_sd", np.exp(at[1]), p.sum(0))):
+    for name, values, own in (
+        ("level_sd", np.exp(at[0]), p.sum(1)),
+        ("measurement_sd", np.exp(at[1]), p.sum(0)),
+    ):
         mean = float(own @ values)
         found[name] = mean, float(own @ (values - mean) ** 2) ** 0.5
     cell = (at[0][1] - at[0][0]) * (at[1][1] - at[1][0])
@@ -64,7 +89,13 @@ def agrees(table, years: int, ess: float = 0.0, sds: float = 4.5) -> None:
     for name, (mean, sd) in grid(years)[0].items():
         n = max(ess, float(table.ess[name]))
         assert n > 40, (name, n)
-        assert abs(table["mean"][name] - mean) < sds * sd / n**0.5, (name, table["mean"][name], mean, sd, n)
+        assert abs(table["mean"][name] - mean) < sds * sd / n**0.5, (
+            name,
+            table["mean"][name],
+            mean,
+            sd,
+            n,
+        )
         assert 0.7 < table.sd[name] / sd < 1.4, (name, table.sd[name], sd)
 
 
@@ -75,10 +106,19 @@ def test_what_disagrees_with_the_grid_is_seen() -> None:
         z = torch.randn(4, draws, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
         z = (z - z.mean()) / z.std()
         moments = grid(YEARS)[0].items()
-        return Posterior({name: mean + sd * (shift + scale * z) for name, (mean, sd) in moments}, None, "made").table()
+        return ParameterPosterior(
+            {name: mean + sd * (shift + scale * z) for name, (mean, sd) in moments}, None, "made"
+        ).table()
 
     agrees(told(), YEARS)
-    for wrong in ({"shift": 0.5}, {"shift": -0.5}, {"scale": 0.6}, {"scale": 1.5}, {"draws": 5}, {"shift": torch.nan}):
+    for wrong in (
+        {"shift": 0.5},
+        {"shift": -0.5},
+        {"scale": 0.6},
+        {"scale": 1.5},
+        {"draws": 5},
+        {"shift": torch.nan},
+    ):
         with pytest.raises(AssertionError):
             agrees(told(**wrong), YEARS)
 
@@ -94,18 +134,23 @@ def test_particle_marginal_chains_find_the_grid_s_posterior() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("leaps", [0, 3])
 def test_metropolis_on_a_kalman_likelihood_finds_it_too(leaps: int) -> None:
-    agrees(pmmh(NILE, EKF, nile(YEARS), draws=60, warmup=40, chains=24, seed=2, leaps=leaps).table(), YEARS)
+    agrees(
+        pmmh(NILE, EKF, nile(YEARS), draws=60, warmup=40, chains=24, seed=2, leaps=leaps).table(),
+        YEARS,
+    )
 
 
 @pytest.mark.slow
 def test_no_u_turns_and_variational_laws_find_it() -> None:
     """SVI's law is normal in logarithms, and the posterior nearly so: means to a third of an sd, and the narrower sd."""
-    exact = program(NILE, ExactHMM())
+    exact = program(NILE, GaussianHmmLikelihood())
     agrees(nuts(exact, nile(YEARS), draws=80, warmup=40, chains=1, seed=3).table(), YEARS)
     for guide in (normal_guide(NILE), AutoMultivariateNormal(exact)):
-        found = variational(exact, nile(YEARS), guide, steps=200, draws=300, seed=4)
+        found = svi(exact, nile(YEARS), guide, steps=200, draws=300, seed=4)
         assert np.mean(found.losses[-30:]) < np.mean(found.losses[:10])
-        assert abs(np.mean(found.losses[-60:]) + grid(YEARS)[1]) < 0.5  # the bound is nearly the evidence
+        assert (
+            abs(np.mean(found.losses[-60:]) + grid(YEARS)[1]) < 0.5
+        )  # the bound is nearly the evidence
         for name, (mean, sd) in grid(YEARS)[0].items():
             assert abs(found.posterior.table()["mean"][name] - mean) < 0.35 * sd, name
 
@@ -119,76 +164,100 @@ def test_no_u_turns_through_an_extended_kalman_filter_and_through_the_path() -> 
     """
     record = Record(torch.tensor([0.3, 1.9, 3.2], dtype=torch.float64)[None, :, None])
     at = torch.linspace(-5.0, 4.0, 91, dtype=torch.float64)
-    likelihood = Filtered(EKF)(LEVEL.apiece({"noise": at.exp()}), Record(record.y.expand(91, -1, -1)))
+    likelihood = FilterLikelihood(EKF)(
+        LEVEL.models_per_run({"noise": at.exp()}), Record(record.y.expand(91, -1, -1))
+    )
     p = torch.softmax(likelihood - 0.5 * at**2, 0)
     mean = float(p @ at)
     sd = float(p @ (at - mean) ** 2) ** 0.5
     assert sd < 0.6  # the prior's is 1: a sampler that sees no measurement is seen
     for posterior in (
-        nuts(program(LEVEL, Filtered(EKF)), record, draws=40, warmup=30, chains=1, seed=1),
+        nuts(program(LEVEL, FilterLikelihood(EKF)), record, draws=40, warmup=30, chains=1, seed=1),
         nuts(latent_program(LEVEL), record, draws=60, warmup=30, chains=1, seed=1),
     ):
-        log_noise = posterior.flat("noise").log()
+        log_noise = posterior.pooled_draws("noise").log()
         ess = min(float(posterior.table().ess["noise"]), log_noise.numel())
         assert abs(float(log_noise.mean()) - mean) < 4.5 * sd / ess**0.5
         assert 0.6 < float(log_noise.std()) / sd < 1.5
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "particles"), [(EKF, 400), (ParticleFilter(60), 200)], ids=["ibis", "smc2"])
+@pytest.mark.parametrize(
+    ("method", "particles"), [(EKF, 400), (ParticleFilter(60), 200)], ids=["ibis", "smc2"]
+)
 def test_online_learning_ends_in_the_grid_s_posterior(method, particles) -> None:
-    found = online(NILE, method, nile(YEARS), particles, seed=5)
+    found = smc2(NILE, method, nile(YEARS), particles, seed=5)
     moments, evidence = grid(YEARS)
     for name, (mean, sd) in moments.items():
-        assert abs(float(found.mean[name][-1]) - mean) < 4.5 * sd / (0.2 * particles) ** 0.5, name  # 1 in 5 counts, at least
+        assert abs(float(found.mean[name][-1]) - mean) < 4.5 * sd / (0.2 * particles) ** 0.5, (
+            name
+        )  # 1 in 5 counts, at least
         assert 0.6 < float(found.sd[name][-1]) / sd < 1.5
     assert abs(float(found.log_evidence[-1]) - evidence) < 4.5 / (0.2 * particles) ** 0.5
     assert float(found.ess.min()) < 0.5 * particles  # it was resampled
-    assert float(found.moved[~found.moved.isnan()].mean()) > 0.1
+    assert float(found.acceptance[~found.acceptance.isnan()].mean()) > 0.1
 
 
 RUNS, DRAWS = 40, 19
 
 
-def uniform(ranks: Ranks, names: tuple[str, ...]) -> bool:
+def uniform(ranks: SbcRanks, names: tuple[str, ...]) -> bool:
     """No departure at one in a thousand for each number."""
     return all(ranks.p_value(name, 5) > 1e-3 for name in names)
 
 
 @pytest.mark.slow
 def test_ranks_on_a_toy_are_uniform_and_a_wrong_likelihood_shows() -> None:
-    shape, toy = Record(torch.zeros(RUNS, 8, 1, dtype=torch.float64)), Unknown(level, LEVELS)
-    believed = Unknown(lambda **values: level(**values, wrong=2.0), LEVELS)
+    shape, toy = (
+        Record(torch.zeros(RUNS, 8, 1, dtype=torch.float64)),
+        ParameterisedModel(level, LEVELS),
+    )
+    believed = ParameterisedModel(lambda **values: level(**values, wrong=2.0), LEVELS)
     right = {
-        "PMMH": calibrate(toy, shape, by_pmmh(toy, 40, 57, 30), DRAWS, seed=7),
-        "SVI": calibrate(toy, shape, by_svi(toy, ExactHMM(), 100), DRAWS, seed=7),
+        "PMMH": simulation_based_calibration(toy, shape, by_pmmh(toy, 40, 57, 30), DRAWS, seed=7),
+        "SVI": simulation_based_calibration(
+            toy, shape, by_svi(toy, GaussianHmmLikelihood(), 100), DRAWS, seed=7
+        ),
     }
     wrong = {
-        "PMMH": calibrate(toy, shape, by_pmmh(believed, 40, 57, 30), DRAWS, seed=7),
-        "SVI": calibrate(toy, shape, by_svi(believed, ExactHMM(), 100), DRAWS, seed=7),
+        "PMMH": simulation_based_calibration(
+            toy, shape, by_pmmh(believed, 40, 57, 30), DRAWS, seed=7
+        ),
+        "SVI": simulation_based_calibration(
+            toy, shape, by_svi(believed, GaussianHmmLikelihood(), 100), DRAWS, seed=7
+        ),
     }
     for name, ranks in right.items():
         assert uniform(ranks, toy.names), (name, ranks)
     for name, ranks in wrong.items():
         assert not uniform(ranks, toy.names), (name, ranks)
-    assert len(histograms(right, 5).axes) == 4
+    assert len(sbc_histograms(right, 5).axes) == 4
 
 
 @pytest.mark.slow
 def test_ranks_on_passive_location_are_uniform_and_a_wrong_likelihood_shows() -> None:
-    far, shape = Unknown(location, SIGHTS), flight(RUNS, 5)
-    believed = Unknown(lambda **values: location(**values, wrong=2.0), SIGHTS)
-    assert uniform(calibrate(far, shape, by_pmmh(far, 300, 38, 25), DRAWS, seed=8), far.names)
-    likelihood = Filtered(EKF)
-    assert uniform(calibrate(far, shape, by_svi(far, likelihood, 50), DRAWS, seed=8), far.names)
-    assert not uniform(calibrate(far, shape, by_svi(believed, likelihood, 50), DRAWS, seed=8), far.names)
+    far, shape = ParameterisedModel(location, SIGHTS), flight(RUNS, 5)
+    believed = ParameterisedModel(lambda **values: location(**values, wrong=2.0), SIGHTS)
+    assert uniform(
+        simulation_based_calibration(far, shape, by_pmmh(far, 300, 38, 25), DRAWS, seed=8),
+        far.names,
+    )
+    likelihood = FilterLikelihood(EKF)
+    assert uniform(
+        simulation_based_calibration(far, shape, by_svi(far, likelihood, 50), DRAWS, seed=8),
+        far.names,
+    )
+    assert not uniform(
+        simulation_based_calibration(far, shape, by_svi(believed, likelihood, 50), DRAWS, seed=8),
+        far.names,
+    )
 
 
 def test_ranks_are_told_apart() -> None:
     ramp = torch.arange(100) % 20
-    even, odd = Ranks({"a": ramp}, 19), Ranks({"a": ramp.clamp(max=9)}, 19)
+    even, odd = SbcRanks({"a": ramp}, 19), SbcRanks({"a": ramp.clamp(max=9)}, 19)
     assert even.p_value("a", 10) == 1.0
     assert odd.p_value("a", 10) < 1e-6
     assert even.counts("a", 5).tolist() == [20] * 5
-    with pytest.raises(ValueError, match="20 ranks"):
+    with pytest.raises(ValueError, match="bins must divide 20"):
         even.counts("a", 7)

@@ -12,56 +12,60 @@ import pytest
 import torch
 from scipy import stats
 
-from pfbench.draws import MonteCarlo
-from pfbench.noise.correlated import GaussMarkov, NonLineOfSight
-from pfbench.noise.regimes import (
-    Glint,
-    Laplace,
-    Nominal,
-    Outage,
-    Outliers,
-    Regime,
-    StudentT,
-    step_process,
-    untouched_process,
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import MeasurementChannels
+from pfbench.noise.base import NoiseRegime, check_unit_process, process_variance_factors
+from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
+from pfbench.noise.error_replay import ErrorReplay
+from pfbench.noise.time_varying import BiasStep, VarianceSurge
+from pfbench.noise.white import (
+    GlintNoise,
+    LaplaceNoise,
+    MeasurementOutage,
+    NominalNoise,
+    OutlierNoise,
+    StudentTNoise,
 )
-from pfbench.noise.replay import Replay
-from pfbench.noise.surges import BiasStep, Surge
-from pfbench.record import Channels
 
 SD = torch.tensor([2.0, 0.05, 30.0], dtype=torch.float64)
 TIME = torch.arange(0.0, 300.0, dtype=torch.float64)
 RUNS = 40
 WINDOWS = ((50.0, 150.0), (200.0, 290.0))
-SURGE = Surge(WINDOWS, (9.0, 4.0), (10.0, 100.0))
-REGIMES: list[Regime] = [
-    Nominal(),
-    StudentT(4),
-    Laplace(),
-    Outliers(0.05, 10.0),
-    Outliers(0.05, 10.0, together=False),
-    Glint(),
+SURGE = VarianceSurge(WINDOWS, (9.0, 4.0), (10.0, 100.0))
+REGIMES: list[NoiseRegime] = [
+    NominalNoise(),
+    StudentTNoise(4),
+    LaplaceNoise(),
+    OutlierNoise(0.05, 10.0),
+    OutlierNoise(0.05, 10.0, joint=False),
+    GlintNoise(),
     SURGE,
-    Outage(((100.0, 130.0), (200.0, 201.0))),
-    Outage(((100.0, 130.0),), of=StudentT(4)),
-    GaussMarkov(2.0, 10.0),
-    NonLineOfSight(),
-    NonLineOfSight(dwell=10.0),
-    BiasStep(time=150.0),
+    MeasurementOutage(((100.0, 130.0), (200.0, 201.0))),
+    MeasurementOutage(((100.0, 130.0),), base_regime=StudentTNoise(4)),
+    GaussMarkovNoise(2.0, 10.0),
+    NonLineOfSightNoise(),
+    NonLineOfSightNoise(mean_dwell_s=10.0),
+    BiasStep(onset_s=150.0),
 ]
 every_regime = pytest.mark.parametrize("regime", REGIMES, ids=lambda r: type(r).__name__)
 # positions of one receiver, ranges of four satellites, and rates of two of them
-MIXED = Channels(
-    torch.ones(9, dtype=torch.float64), ("position",) * 3 + ("range",) * 4 + ("rate",) * 2, (0, 0, 0, 3, 5, 7, 9, 3, 5)
+MIXED = MeasurementChannels(
+    torch.ones(9, dtype=torch.float64),
+    ("position",) * 3 + ("range",) * 4 + ("rate",) * 2,
+    (0, 0, 0, 3, 5, 7, 9, 3, 5),
 )
 
 
-def errors(regime: Regime, runs: torch.Tensor | None = None) -> torch.Tensor:
-    return regime.errors(MonteCarlo(2, torch.arange(RUNS) if runs is None else runs), Channels.alike(SD), TIME)
+def errors(regime: NoiseRegime, runs: torch.Tensor | None = None) -> torch.Tensor:
+    return regime.draw_errors(
+        PhiloxStream(2, torch.arange(RUNS) if runs is None else runs),
+        MeasurementChannels.of_one_kind(SD),
+        TIME,
+    )
 
 
 @every_regime
-def test_shape_and_a_run_alone(regime: Regime) -> None:
+def test_shape_and_a_run_alone(regime: NoiseRegime) -> None:
     e = errors(regime)
     assert e.shape == (RUNS, len(TIME), len(SD))
     alone = errors(regime, torch.tensor([17]))
@@ -69,15 +73,17 @@ def test_shape_and_a_run_alone(regime: Regime) -> None:
 
 
 @every_regime
-def test_errors_scale_with_the_nominal_deviation(regime: Regime) -> None:
+def test_errors_scale_with_the_nominal_deviation(regime: NoiseRegime) -> None:
     z = errors(regime)
-    doubled = regime.errors(MonteCarlo(2, torch.arange(RUNS)), Channels.alike(2 * SD), TIME)
+    doubled = regime.draw_errors(
+        PhiloxStream(2, torch.arange(RUNS)), MeasurementChannels.of_one_kind(2 * SD), TIME
+    )
     assert torch.allclose(doubled, 2 * z, equal_nan=True)
 
 
 @pytest.mark.parametrize("component", range(3))
 def test_nominal_errors_are_white_and_normal(component: int) -> None:
-    z = (errors(Nominal()) / SD)[..., component].numpy()
+    z = (errors(NominalNoise()) / SD)[..., component].numpy()
     assert stats.kstest(z.ravel(), "norm").pvalue > 1e-3
     lag = (z[:, 1:] * z[:, :-1]).mean()
     assert abs(lag) < 4 / math.sqrt(z.size)
@@ -85,7 +91,7 @@ def test_nominal_errors_are_white_and_normal(component: int) -> None:
 
 @pytest.mark.parametrize("dof", [3, 4, 10])
 def test_heavy_tails_are_student(dof: int) -> None:
-    z = (errors(StudentT(dof)) / SD).numpy()
+    z = (errors(StudentTNoise(dof)) / SD).numpy()
     assert stats.kstest(z.ravel(), stats.t(dof).cdf).pvalue > 1e-3
     far = (np.abs(z) > 5).mean()  # the tail itself, which a Kolmogorov-Smirnov test hardly sees
     p = 2 * stats.t(dof).sf(5)
@@ -93,33 +99,35 @@ def test_heavy_tails_are_student(dof: int) -> None:
 
 
 def test_outliers_hit_whole_epochs_with_their_probability() -> None:
-    nominal, e = errors(Nominal()), errors(Outliers(0.2, 7.0))
+    nominal, e = errors(NominalNoise()), errors(OutlierNoise(0.2, 7.0))
     ratio = (e / nominal).numpy()
     assert np.allclose(ratio, ratio[..., :1])  # all components at once
     hit = np.isclose(ratio[..., 0], 7.0)
-    assert np.all(hit | np.isclose(ratio[..., 0], 1.0))  # otherwise the nominal error, number for number
+    assert np.all(
+        hit | np.isclose(ratio[..., 0], 1.0)
+    )  # otherwise the nominal error, number for number
     assert abs(hit.mean() - 0.2) < 4 * math.sqrt(0.16 / hit.size)
 
 
 def test_an_outage_is_silent_from_and_not_at_its_end() -> None:
-    e = errors(Outage(((100.0, 130.0), (200.0, 201.0))))
+    e = errors(MeasurementOutage(((100.0, 130.0), (200.0, 201.0))))
     silent = torch.isnan(e)
     expected = ((TIME >= 100) & (TIME < 130)) | (TIME == 200)
     assert torch.equal(silent, expected[None, :, None].expand_as(silent))
-    assert torch.equal(e[:, ~expected], errors(Nominal())[:, ~expected])
+    assert torch.equal(e[:, ~expected], errors(NominalNoise())[:, ~expected])
 
 
 def test_laplace_errors_have_the_nominal_variance_and_order() -> None:
-    z = (errors(Laplace()) / SD).numpy()
+    z = (errors(LaplaceNoise()) / SD).numpy()
     assert stats.kstest(z.ravel(), stats.laplace(scale=1 / math.sqrt(2)).cdf).pvalue > 1e-3
     p = math.exp(-math.sqrt(2) * 4)
     assert abs((np.abs(z) > 4).mean() - p) < 4 * math.sqrt(p / z.size)
-    nominal = (errors(Nominal()) / SD).numpy().ravel()
+    nominal = (errors(NominalNoise()) / SD).numpy().ravel()
     assert (np.diff(z.ravel()[np.argsort(nominal)]) >= 0).all()
 
 
 def test_outliers_of_components_are_independent() -> None:
-    ratio = (errors(Outliers(0.2, 7.0, together=False)) / errors(Nominal())).numpy()
+    ratio = (errors(OutlierNoise(0.2, 7.0, joint=False)) / errors(NominalNoise())).numpy()
     hit = np.isclose(ratio, 7.0)
     assert np.all(hit | np.isclose(ratio, 1.0))
     for p, found in ((0.2, hit), (0.04, hit[..., 0] & hit[..., 1])):
@@ -128,7 +136,9 @@ def test_outliers_of_components_are_independent() -> None:
 
 @pytest.mark.parametrize("together", [True, False])
 def test_glint_is_a_normal_with_laplace_spikes(together: bool) -> None:
-    z, nominal = ((errors(regime) / SD).numpy() for regime in (Glint(0.2, 8.0, together), Nominal()))
+    z, nominal = (
+        (errors(regime) / SD).numpy() for regime in (GlintNoise(0.2, 8.0, together), NominalNoise())
+    )
     hit = z != nominal
     assert (hit == hit[..., :1]).all() == together
     assert abs(hit.mean() - 0.2) < 4 * math.sqrt(0.16 / (hit.size / (3 if together else 1)))
@@ -147,59 +157,86 @@ def test_a_surge_multiplies_the_variance_inside_its_windows_alone() -> None:
     assert within_chi_square(z[:, first], 9.0)
     assert within_chi_square(z[:, second], 4.0)
     calm = ~(first | second)
-    assert torch.equal(z[:, calm], (errors(Nominal()) / SD)[:, calm])
-    assert SURGE.process(TIME).tolist() == [10.0 if a else 100.0 if b else 1.0 for a, b in zip(first, second, strict=True)]
+    assert torch.equal(z[:, calm], (errors(NominalNoise()) / SD)[:, calm])
+    assert SURGE.process_factors(TIME).tolist() == [
+        10.0 if a else 100.0 if b else 1.0 for a, b in zip(first, second, strict=True)
+    ]
 
 
 def test_a_surge_may_last_to_the_end_and_its_windows_stretch_with_the_record() -> None:
-    step = Surge(((500.0, 900.0), (900.0, None)), (4.0, 9.0), (1.0, 1.0), span=1400.0)
+    step = VarianceSurge(
+        ((500.0, 900.0), (900.0, None)), (4.0, 9.0), (1.0, 1.0), reference_duration_s=1400.0
+    )
     k = torch.arange(1401)
     expected = torch.where(k < 500, 1.0, torch.where(k < 900, 2.0, 3.0)).double()
     for end in (1400.0, 100.0, 7.0):
-        time, draws = end * k.double() / 1400.0, MonteCarlo(2, torch.arange(3))
-        ratio = step.errors(draws, Channels.alike(SD), time) / Nominal().errors(draws, Channels.alike(SD), time)
-        exact = torch.ones(1401, dtype=torch.bool) if end == 1400.0 else (k != 500) & (k != 900)  # edges are rounded
+        time, draws = end * k.double() / 1400.0, PhiloxStream(2, torch.arange(3))
+        ratio = step.draw_errors(
+            draws, MeasurementChannels.of_one_kind(SD), time
+        ) / NominalNoise().draw_errors(draws, MeasurementChannels.of_one_kind(SD), time)
+        exact = (
+            torch.ones(1401, dtype=torch.bool) if end == 1400.0 else (k != 500) & (k != 900)
+        )  # edges are rounded
         assert torch.allclose(ratio[:, exact], expected[exact, None].expand(3, -1, 3))
 
 
 def test_surges_multiply() -> None:
-    twice = Surge(((100.0, 200.0),), (4.0,), (3.0,), of=SURGE)
-    assert torch.allclose(twice.process(TIME)[[60, 120, 170, 220]], torch.tensor([10.0, 30.0, 3.0, 100.0]).double())
-    ratio = (errors(twice) / errors(Nominal()))[0, [60, 120, 170, 220], 0]
+    twice = VarianceSurge(((100.0, 200.0),), (4.0,), (3.0,), base_regime=SURGE)
+    assert torch.allclose(
+        twice.process_factors(TIME)[[60, 120, 170, 220]],
+        torch.tensor([10.0, 30.0, 3.0, 100.0]).double(),
+    )
+    ratio = (errors(twice) / errors(NominalNoise()))[0, [60, 120, 170, 220], 0]
     assert torch.allclose(ratio, torch.tensor([3.0, 6.0, 2.0, 2.0]).double())
 
 
 def test_the_process_factor_of_a_step_is_the_mean_over_its_interval() -> None:
     time = torch.arange(10.0, 310.0, 10.0, dtype=torch.float64)  # ends of intervals
-    factors = step_process(Surge(((55.0, 80.0),), (1.0,), (5.0,)), time)
+    factors = process_variance_factors(VarianceSurge(((55.0, 80.0),), (1.0,), (5.0,)), time)
     assert factors[4:9].tolist() == pytest.approx([1.0, 3.0, 5.0, 5.0, 1.0])
-    assert torch.equal(step_process(Nominal(), time[:1]), torch.ones(1, dtype=torch.float64))
-    stretched = Surge(((150.0, 300.0),), (1.0,), (7.0,), span=300.0)
-    assert step_process(stretched, time).tolist() == pytest.approx([1.0] * 15 + [7.0] * 15)
-    assert step_process(Surge(((0.0, 10.0),), (1.0,), (5.0,)), time)[:2].tolist() == pytest.approx([5.0, 1.0])
+    assert torch.equal(
+        process_variance_factors(NominalNoise(), time[:1]), torch.ones(1, dtype=torch.float64)
+    )
+    stretched = VarianceSurge(((150.0, 300.0),), (1.0,), (7.0,), reference_duration_s=300.0)
+    assert process_variance_factors(stretched, time).tolist() == pytest.approx(
+        [1.0] * 15 + [7.0] * 15
+    )
+    assert process_variance_factors(VarianceSurge(((0.0, 10.0),), (1.0,), (5.0,)), time)[
+        :2
+    ].tolist() == pytest.approx([5.0, 1.0])
 
 
 def test_recorded_sensors_cannot_be_swollen() -> None:
-    untouched_process(StudentT(), TIME)
-    untouched_process(Surge(WINDOWS, (9.0, 4.0), (1.0, 1.0)), TIME)
-    with pytest.raises(ValueError, match=r"recorded, and a regime cannot swell.*q_factors"):
-        untouched_process(SURGE, TIME)
+    check_unit_process(StudentTNoise(), TIME)
+    check_unit_process(VarianceSurge(WINDOWS, (9.0, 4.0), (1.0, 1.0)), TIME)
+    with pytest.raises(
+        ValueError, match=r"must not change the process noise .*recorded.*process_variance_factors"
+    ):
+        check_unit_process(SURGE, TIME)
 
 
 def test_an_outage_may_spare_sources() -> None:
-    regime = Outage(((100.0, 130.0),), keep=3, of=StudentT(4))
-    e = regime.errors(MonteCarlo(2, torch.arange(3)), MIXED, TIME)
+    regime = MeasurementOutage(((100.0, 130.0),), visible_sources=3, base_regime=StudentTNoise(4))
+    e = regime.draw_errors(PhiloxStream(2, torch.arange(3)), MIXED, TIME)
     silent = torch.isnan(e)
-    deaf = torch.tensor([source in (7, 9) for source in MIXED.source])  # the sources are 0, 3, 5, 7, 9
+    deaf = torch.tensor(
+        [source in (7, 9) for source in MIXED.source]
+    )  # the sources are 0, 3, 5, 7, 9
     assert torch.equal(silent, (((TIME >= 100) & (TIME < 130))[:, None] & deaf).expand_as(silent))
-    assert torch.equal(e[~silent], StudentT(4).errors(MonteCarlo(2, torch.arange(3)), MIXED, TIME)[~silent])
+    assert torch.equal(
+        e[~silent],
+        StudentTNoise(4).draw_errors(PhiloxStream(2, torch.arange(3)), MIXED, TIME)[~silent],
+    )
 
 
 def test_a_gauss_markov_process_is_stationary_and_forgets_exponentially() -> None:
     time = torch.cumsum(torch.tensor([1.0, 2.0, 1.0, 4.0] * 25, dtype=torch.float64), 0)  # uneven
-    runs, part = torch.arange(2000), Channels.alike(SD[:1])
-    regime, draws = GaussMarkov(2.0, 5.0), MonteCarlo(3, runs)
-    x = ((regime.errors(draws, part, time) - Nominal().errors(draws, part, time)) / SD[0])[..., 0]
+    runs, part = torch.arange(2000), MeasurementChannels.of_one_kind(SD[:1])
+    regime, draws = GaussMarkovNoise(2.0, 5.0), PhiloxStream(3, runs)
+    x = (
+        (regime.draw_errors(draws, part, time) - NominalNoise().draw_errors(draws, part, time))
+        / SD[0]
+    )[..., 0]
     for t in (0, 1, 50, 99):
         assert within_chi_square(x[:, t], 4.0)
         assert stats.kstest(x[:, t] / 2.0, "norm").pvalue > 1e-4
@@ -207,18 +244,24 @@ def test_a_gauss_markov_process_is_stationary_and_forgets_exponentially() -> Non
             rho = math.exp(-abs(float(time[t] - time[s])) / 5.0)
             error = 4 * math.sqrt((1 + rho**2) / len(runs))  # of a sample covariance
             assert abs((x[:, t] * x[:, s]).mean() - 4 * rho) < 4.5 * error
-    white = (Nominal().errors(draws, part, time) / SD[0])[..., 0]
-    assert abs((x * white).mean() / 2) < 4.5 / math.sqrt(x.numel() / 20)  # the white part is another
+    white = (NominalNoise().draw_errors(draws, part, time) / SD[0])[..., 0]
+    assert abs((x * white).mean() / 2) < 4.5 / math.sqrt(
+        x.numel() / 20
+    )  # the white part is another
 
 
-def bias(regime: NonLineOfSight, channels: Channels = MIXED, runs: int = RUNS) -> np.ndarray:
-    draws = MonteCarlo(2, torch.arange(runs))
-    found = regime.errors(draws, channels, TIME) - Nominal().errors(draws, channels, TIME)
+def bias(
+    regime: NonLineOfSightNoise, channels: MeasurementChannels = MIXED, runs: int = RUNS
+) -> np.ndarray:
+    draws = PhiloxStream(2, torch.arange(runs))
+    found = regime.draw_errors(draws, channels, TIME) - NominalNoise().draw_errors(
+        draws, channels, TIME
+    )
     return torch.where(found.abs() < 1e-12, 0.0, found).numpy()
 
 
 def test_reflected_ranges_are_too_long() -> None:
-    b = bias(NonLineOfSight(0.3, 5.0))
+    b = bias(NonLineOfSightNoise(0.3, 5.0))
     assert (b >= 0).all()
     assert (b[..., :3] == 0).all()  # ranges alone
     assert (b[..., 7:] == 0).all()
@@ -230,16 +273,23 @@ def test_reflected_ranges_are_too_long() -> None:
 
 
 def test_without_ranges_the_positions_of_one_receiver_are_reflected_together() -> None:
-    b = bias(NonLineOfSight(0.3, 5.0), Channels(torch.ones(6).double(), ("position",) * 3 + ("velocity",) * 3, (0,) * 6))
+    b = bias(
+        NonLineOfSightNoise(0.3, 5.0),
+        MeasurementChannels(
+            torch.ones(6).double(), ("position",) * 3 + ("velocity",) * 3, (0,) * 6
+        ),
+    )
     hit = b > 0
     assert (hit[..., 3:] == 0).all()
     assert (hit[..., :3] == hit[..., :1]).all()
     assert not np.isclose(b[..., 0][hit[..., 0]], b[..., 1][hit[..., 1]]).any()
-    assert (bias(NonLineOfSight(1.0, 5.0), Channels.alike(SD)) > 0).all()  # kind `other`
+    assert (
+        bias(NonLineOfSightNoise(1.0, 5.0), MeasurementChannels.of_one_kind(SD)) > 0
+    ).all()  # kind `other`
 
 
 def test_a_lasting_reflection_is_a_markov_chain_with_a_constant_bias() -> None:
-    b = bias(NonLineOfSight(0.25, 5.0, dwell=8.0), runs=200)[..., 3:7]
+    b = bias(NonLineOfSightNoise(0.25, 5.0, mean_dwell_s=8.0), runs=200)[..., 3:7]
     hidden = b > 0
     stay, enter = 0.25 + 0.75 * math.exp(-1 / 6.0), 0.25 - 0.25 * math.exp(-1 / 6.0)
     for t in (0, 150, 299):  # stationary
@@ -254,7 +304,7 @@ def test_a_lasting_reflection_is_a_markov_chain_with_a_constant_bias() -> None:
 
 @pytest.mark.parametrize("component", [None, 1])
 def test_a_bias_begins_at_its_time(component: int | None) -> None:
-    step = (errors(BiasStep(-4.0, 150.0, component)) - errors(Nominal())) / SD
+    step = (errors(BiasStep(-4.0, 150.0, component)) - errors(NominalNoise())) / SD
     wrong = torch.ones(3, dtype=torch.bool) if component is None else torch.arange(3) == component
     expected = torch.where((TIME >= 150)[:, None] & wrong, -4.0, 0.0).double()
     assert torch.allclose(step, expected.expand_as(step), atol=1e-9)
@@ -271,19 +321,27 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     second = np.array([s for s in range(400) if not (100 <= s < 105 or s == 230)], dtype=float)
     truth = np.random.default_rng(1).normal(size=(3, len(second)))
     error = [1000 + second, -second, 0.1 * second]
-    columns = dict(zip(("pn", "pe", "pd", "rx_pn", "rx_pe", "rx_pd"), [*truth, *(truth + error)], strict=True))
+    columns = dict(
+        zip(("pn", "pe", "pd", "rx_pn", "rx_pe", "rx_pd"), [*truth, *(truth + error)], strict=True)
+    )
     pd.DataFrame({"utc_s": 8057.0 + second, **columns}).to_parquet(folder / "f9k_vs_span.parquet")
     return folder.parent
 
 
-POSITION = Channels(torch.tensor([5.0, 5.0, 10.0, 1.0]).double(), ("position",) * 3 + ("velocity",), (0,) * 4)
+POSITION = MeasurementChannels(
+    torch.tensor([5.0, 5.0, 10.0, 1.0]).double(), ("position",) * 3 + ("velocity",), (0,) * 4
+)
 
 
 @pytest.mark.parametrize("interval", [1.0, 0.5])
 def test_a_replay_strings_together_whole_blocks_without_gaps(root: Path, interval: float) -> None:
     time = 7.0 + interval * torch.arange(240, dtype=torch.float64)
-    draws = MonteCarlo(2, torch.arange(300))
-    e = Replay(str(root), block=30.0, metres=True).errors(draws, POSITION, time).numpy()
+    draws = PhiloxStream(2, torch.arange(300))
+    e = (
+        ErrorReplay(str(root), block_length_s=30.0, absolute_metres=True)
+        .draw_errors(draws, POSITION, time)
+        .numpy()
+    )
     known = np.array([s for s in range(400) if not (100 <= s < 105 or s == 230)])
     second = e[..., 0] + known.mean()  # the mean is off
     assert np.allclose(-e[..., 1] + known.mean(), second)  # all axes of one place of the record
@@ -297,82 +355,132 @@ def test_a_replay_strings_together_whole_blocks_without_gaps(root: Path, interva
     assert set(starts.ravel()) <= set(valid)
     counts = np.bincount(starts.ravel(), minlength=400)[valid]
     assert stats.chisquare(counts).pvalue > 1e-4  # anywhere, equally
-    velocity = Nominal().errors(draws, POSITION, time)[..., 3].numpy()
+    velocity = NominalNoise().draw_errors(draws, POSITION, time)[..., 3].numpy()
     assert np.array_equal(e[..., 3], velocity)
 
 
 def test_a_replay_is_scaled_to_the_scene(root: Path) -> None:
     time = torch.arange(200.0, dtype=torch.float64)
     metres, scaled = (
-        Replay(str(root), block=50.0, metres=own).errors(MonteCarlo(2, torch.arange(9)), POSITION, time)[..., :3]
+        ErrorReplay(str(root), block_length_s=50.0, absolute_metres=own).draw_errors(
+            PhiloxStream(2, torch.arange(9)), POSITION, time
+        )[..., :3]
         for own in (True, False)
     )
-    sd = np.array([1.0, 1.0, 0.1]) * np.array([s for s in range(400) if not (100 <= s < 105 or s == 230)]).std()
+    sd = (
+        np.array([1.0, 1.0, 0.1])
+        * np.array([s for s in range(400) if not (100 <= s < 105 or s == 230)]).std()
+    )
     assert np.allclose(scaled / metres, [5.0, 5.0, 10.0] / sd)
 
 
 def test_a_replay_takes_another_place_for_each_source_and_run(root: Path) -> None:
-    time, channels = torch.arange(60.0, dtype=torch.float64), Channels(torch.ones(2).double(), ("range",) * 2, (4, 7))
-    e = Replay(str(root), block=20.0).errors(MonteCarlo(2, torch.arange(50)), channels, time)
-    alone = Replay(str(root), block=20.0).errors(MonteCarlo(2, torch.tensor([17])), channels, time)
+    time, channels = (
+        torch.arange(60.0, dtype=torch.float64),
+        MeasurementChannels(torch.ones(2).double(), ("range",) * 2, (4, 7)),
+    )
+    e = ErrorReplay(str(root), block_length_s=20.0).draw_errors(
+        PhiloxStream(2, torch.arange(50)), channels, time
+    )
+    alone = ErrorReplay(str(root), block_length_s=20.0).draw_errors(
+        PhiloxStream(2, torch.tensor([17])), channels, time
+    )
     assert torch.equal(alone[0], e[17])
     assert len(torch.unique(e[:, 0])) > 60
     assert abs(np.corrcoef(e[:, 0].T.numpy())[0, 1]) < 4 / math.sqrt(50)
 
 
 def test_a_replay_that_cannot_be_is_refused(root: Path) -> None:
-    time, draws = TIME, MonteCarlo(2, torch.arange(2))
+    time, draws = TIME, PhiloxStream(2, torch.arange(2))
     bad = [
-        (Replay(None), POSITION, r"data\.root is not set.*PFBENCH_DATA"),
-        (Replay(str(root), file="other.parquet"), POSITION, r"no file .*other\.parquet"),
-        (Replay(str(root), block=200.0), POSITION, r"noise\.block=200\.0: no 201 s"),
-        (Replay(str(root), metres=True), Channels.alike(SD), r"noise\.metres=true: the scenario measures no positions"),
+        (ErrorReplay(None), POSITION, r"data\.root is not set.*PFBENCH_DATA"),
+        (ErrorReplay(str(root), file="other.parquet"), POSITION, r"other\.parquet does not exist"),
+        (
+            ErrorReplay(str(root), block_length_s=200.0),
+            POSITION,
+            r"noise\.block_length_s must .*got 200\.0, which needs 201 s",
+        ),
+        (
+            ErrorReplay(str(root), absolute_metres=True),
+            MeasurementChannels.of_one_kind(SD),
+            r"noise\.absolute_metres must be false in a scenario without positions",
+        ),
     ]
     for regime, channels, words in bad:
         with pytest.raises(ValueError, match=words):
-            regime.errors(draws, channels, time)
+            regime.draw_errors(draws, channels, time)
 
 
 def test_channels_and_records_that_a_regime_cannot_serve_are_refused() -> None:
-    draws, short = MonteCarlo(2, torch.arange(2)), TIME[:100]
-    bad: list[tuple[Regime, Channels, str]] = [
-        (Outage(((10.0, 20.0),), keep=5), MIXED, r"noise\.keep=5: the scenario has 5 sources"),
-        (Outage(((100.0, 130.0),)), MIXED, r"noise\.windows: \[100\.0, 130\.0\] begins after the record's end at 99 s"),
-        (Surge(((10.0, 20.0), (500.0, 550.0)), (2.0, 2.0), (1.0, 1.0)), MIXED, r"\[500\.0, 550\.0\] begins after"),
-        (BiasStep(time=700.0), MIXED, "begins after the record's end"),
-        (BiasStep(time=50.0, component=9), MIXED, r"noise\.component=9: the scenario measures 9 components, 0 to 8"),
+    draws, short = PhiloxStream(2, torch.arange(2)), TIME[:100]
+    bad: list[tuple[NoiseRegime, MeasurementChannels, str]] = [
+        (
+            MeasurementOutage(((10.0, 20.0),), visible_sources=5),
+            MIXED,
+            r"noise\.visible_sources must be less than the 5 sources of the scenario, got 5",
+        ),
+        (
+            MeasurementOutage(((100.0, 130.0),)),
+            MIXED,
+            r"noise\.windows_s must begin before the end of the record at 99 s, got \[100\.0, 130\.0\]",
+        ),
+        (
+            VarianceSurge(((10.0, 20.0), (500.0, 550.0)), (2.0, 2.0), (1.0, 1.0)),
+            MIXED,
+            r"begin before .*got \[500\.0, 550\.0\]",
+        ),
+        (BiasStep(onset_s=700.0), MIXED, "begin before the end of the record"),
+        (
+            BiasStep(onset_s=50.0, component=9),
+            MIXED,
+            r"noise\.component must be between 0 and 8, got 9",
+        ),
     ]
     for regime, channels, words in bad:
         with pytest.raises(ValueError, match=words):
-            regime.errors(draws, channels, short)
+            regime.draw_errors(draws, channels, short)
 
 
-BAD: list[tuple[Callable[[], Regime], str]] = [
-    (lambda: StudentT(2), "dof=2"),
-    (lambda: Outliers(probability=1.5), "probability=1.5"),
-    (lambda: Outliers(probability=math.nan), "probability=nan"),
-    (lambda: Outliers(size=0.5), "size=0.5"),
-    (lambda: Outage(((5.0, 5.0),)), "5.0"),
-    (lambda: Outage(((5.0,),)), "window"),
-    (lambda: Outage(((None, 5.0),)), "window"),
-    (lambda: Outage(((5.0, None), (8.0, 9.0))), "starts before the one above it ends"),
-    (lambda: Outage(((5.0, 9.0), (8.0, 12.0))), "starts before the one above it ends"),
-    (lambda: Outage(keep=-1), "keep=-1"),
-    (lambda: Outage(span=0.0), "span=0.0"),
-    (lambda: Outliers(0.1, math.nan, False), "size=nan"),
-    (lambda: Glint(probability=-0.1), "probability=-0.1"),
-    (lambda: Surge(WINDOWS, (1.0,), (1.0, 1.0)), "r_factors"),
-    (lambda: Surge(WINDOWS, (1.0, 1.0), (1.0, 0.0)), "q_factors"),
-    (lambda: GaussMarkov(ratio=-1.0), "ratio=-1.0"),
-    (lambda: GaussMarkov(correlation_time=0.0), "correlation_time=0.0"),
-    (lambda: NonLineOfSight(probability=1.0, dwell=5.0), "probability=1.0"),
-    (lambda: NonLineOfSight(mean=0.0), "mean=0.0"),
-    (lambda: NonLineOfSight(dwell=0.0), "dwell=0.0"),
-    (lambda: Replay("", block=0.5), "block=0.5"),
+BAD: list[tuple[Callable[[], NoiseRegime], str]] = [
+    (lambda: StudentTNoise(2), "noise.dof must .*got 2"),
+    (lambda: OutlierNoise(probability=1.5), "noise.probability must .*got 1.5"),
+    (lambda: OutlierNoise(probability=math.nan), "noise.probability must .*got nan"),
+    (lambda: OutlierNoise(sd_factor=0.5), "noise.sd_factor must .*got 0.5"),
+    (lambda: MeasurementOutage(((5.0, 5.0),)), "5.0"),
+    (lambda: MeasurementOutage(((5.0,),)), "window"),
+    (lambda: MeasurementOutage(((None, 5.0),)), "window"),
+    (
+        lambda: MeasurementOutage(((5.0, None), (8.0, 9.0))),
+        "starts before the previous window ends",
+    ),
+    (
+        lambda: MeasurementOutage(((5.0, 9.0), (8.0, 12.0))),
+        "starts before the previous window ends",
+    ),
+    (lambda: MeasurementOutage(visible_sources=-1), "noise.visible_sources must .*got -1"),
+    (
+        lambda: MeasurementOutage(reference_duration_s=0.0),
+        "noise.reference_duration_s must .*got 0.0",
+    ),
+    (lambda: OutlierNoise(0.1, math.nan, False), "noise.sd_factor must .*got nan"),
+    (lambda: GlintNoise(probability=-0.1), "noise.probability must .*got -0.1"),
+    (lambda: VarianceSurge(WINDOWS, (1.0,), (1.0, 1.0)), "measurement_variance_factors"),
+    (lambda: VarianceSurge(WINDOWS, (1.0, 1.0), (1.0, 0.0)), "process_variance_factors"),
+    (lambda: GaussMarkovNoise(sd_ratio=-1.0), "noise.sd_ratio must .*got -1.0"),
+    (lambda: GaussMarkovNoise(correlation_time_s=0.0), "noise.correlation_time_s must .*got 0.0"),
+    (
+        lambda: NonLineOfSightNoise(probability=1.0, mean_dwell_s=5.0),
+        "noise.probability must .*got 1.0",
+    ),
+    (lambda: NonLineOfSightNoise(mean_delay_sd=0.0), "noise.mean_delay_sd must .*got 0.0"),
+    (lambda: NonLineOfSightNoise(mean_dwell_s=0.0), "noise.mean_dwell_s must .*got 0.0"),
+    (lambda: ErrorReplay("", block_length_s=0.5), "noise.block_length_s must .*got 0.5"),
 ]
 
 
 @pytest.mark.parametrize(("build", "word"), BAD)
-def test_impossible_regimes_are_refused_by_name(build: Callable[[], Regime], word: str) -> None:
+def test_impossible_regimes_are_refused_by_name(
+    build: Callable[[], NoiseRegime], word: str
+) -> None:
     with pytest.raises(ValueError, match=word):
         build()

@@ -8,37 +8,30 @@ import math
 import numpy as np
 import pytest
 import torch
+from rule_cases import RULES
 from torch import Tensor
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.loop import run_filter
-from pfbench.filter.rules import (
-    Axis3,
-    Axis5,
-    Cubature,
-    Points,
-    Product,
-    Radial3,
-    Radial5,
-    Simplex3,
-    Simplex5,
-    SphereRule,
-    Unscented,
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    UnscentedPoints,
 )
+from pfbench.filter.gaussian.spherical_radial import (
+    AxisDegree3,
+    AxisDegree5,
+    RadialDegree5,
+    SimplexDegree3,
+    SimplexDegree5,
+    SphericalRadialPoints,
+    SphericalRule,
+)
+from pfbench.filter.loop import run_filter
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.toys import Lorenz63
-from pfbench.record import Record
+from pfbench.model.textbook import Lorenz63
 
-RULES: dict[str, Product] = {
-    "ckf3": Product(Axis3(), Radial3()),
-    "hckf5": Product(Axis5(), Radial5()),
-    "ssr3": Product(Simplex3(), Radial3()),
-    "ssr5": Product(Simplex5(), Radial5()),
-    "mssr": Product(Simplex3(), Radial5()),
-    "ssr53": Product(Simplex5(), Radial3()),
-    "mckf": Product(Axis3(), Radial5()),
-}
 COUNTS = {
     "ckf3": lambda n: 2 * n,
     "hckf5": lambda n: 2 * n * n + 1,
@@ -89,14 +82,21 @@ def test_all_monomials_to_third_degree(name: str, n: int) -> None:
     xi, w = points(name, n)
     for degree in range(4):
         for components in itertools.combinations_with_replacement(range(n), degree):
-            assert moment(xi, w, *components) == pytest.approx(normal_moment(*components), abs=1e-12), components
+            assert moment(xi, w, *components) == pytest.approx(
+                normal_moment(*components), abs=1e-12
+            ), components
 
 
 @every_rule
 @every_size
 def test_odd_moments_of_fifth_degree_vanish(name: str, n: int) -> None:
     xi, w = points(name, n)
-    for components in [(0,) * 5, (0, 0, 0, 0, n - 1), (0, 0, n // 2, n // 2, n - 1), (0, 0, 0, n // 2, n - 1)]:
+    for components in [
+        (0,) * 5,
+        (0, 0, 0, 0, n - 1),
+        (0, 0, n // 2, n // 2, n - 1),
+        (0, 0, 0, n // 2, n - 1),
+    ]:
         assert moment(xi, w, *components) == pytest.approx(0.0, abs=1e-12 * (n + 2) ** 2.5)
 
 
@@ -118,7 +118,7 @@ def test_fourth_degree_is_exact_for_the_rules_that_claim_it(name: str, n: int) -
 def test_radial_moments(name: str, n: int) -> None:
     xi, w = points(name, n)
     square = (xi**2).sum(1)
-    fifth = isinstance(RULES[name].radial, Radial5)
+    fifth = isinstance(RULES[name].radial_rule, RadialDegree5)
     assert w @ square == pytest.approx(n, rel=1e-12)
     assert w @ square**2 == pytest.approx(n * (n + 2) if fifth else n**2, rel=1e-12)
     if fifth:  # sixth degree is out of reach: the truth is n (n + 2) (n + 4)
@@ -144,7 +144,7 @@ def test_fourth_moment_averaged_over_rotations(name: str, n: int) -> None:
     u = np.random.default_rng(0).normal(size=(8_000, n))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     values = (u @ xi.T) ** 4 @ w
-    expected = 3.0 if isinstance(RULES[name].radial, Radial5) else 3.0 * n / (n + 2)
+    expected = 3.0 if isinstance(RULES[name].radial_rule, RadialDegree5) else 3.0 * n / (n + 2)
     assert abs(values.mean() - expected) < 4.0 * values.std() / math.sqrt(len(u)) + 1e-11
 
 
@@ -161,23 +161,31 @@ def test_signs_of_weights(name: str, n: int) -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 17])
 def test_corners_of_the_simplex(n: int) -> None:
-    u = Simplex3()(n)[0][: n + 1].numpy()
+    u = SimplexDegree3()(n)[0][: n + 1].numpy()
     gram = u @ u.T
     assert np.allclose(gram, (1 + 1 / n) * np.eye(n + 1) - 1 / n, atol=1e-14)
     assert np.allclose(u.sum(0), 0.0, atol=1e-14)
     assert np.allclose(u.T @ u, (n + 1) / n * np.eye(n), atol=1e-13)
 
 
-@pytest.mark.parametrize("sphere", [Axis3(), Axis5(), Simplex3(), Simplex5()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "sphere",
+    [AxisDegree3(), AxisDegree5(), SimplexDegree3(), SimplexDegree5()],
+    ids=lambda s: type(s).__name__,
+)
 @every_size
-def test_sphere_rules_average_over_the_unit_sphere(sphere: SphereRule, n: int) -> None:
+def test_sphere_rules_average_over_the_unit_sphere(sphere: SphericalRule, n: int) -> None:
     """Unit vectors, weights of sum 1, E u_i u_j = delta_ij / n; of fifth degree also E u_i^4 = 3 / (n (n + 2))."""
     u, a = sphere(n)
     assert torch.allclose(u.norm(dim=1), torch.ones(len(u), dtype=torch.float64), atol=1e-14)
     assert float(a.sum()) == pytest.approx(1.0, abs=1e-13)
-    assert torch.allclose((a[:, None] * u).mT @ u, torch.eye(n, dtype=torch.float64) / n, atol=1e-13)
-    if isinstance(sphere, Axis5 | Simplex5):
-        assert torch.allclose(a @ u**4, torch.full((n,), 3.0 / (n * (n + 2)), dtype=torch.float64), atol=1e-13)
+    assert torch.allclose(
+        (a[:, None] * u).mT @ u, torch.eye(n, dtype=torch.float64) / n, atol=1e-13
+    )
+    if isinstance(sphere, AxisDegree5 | SimplexDegree5):
+        assert torch.allclose(
+            a @ u**4, torch.full((n,), 3.0 / (n * (n + 2)), dtype=torch.float64), atol=1e-13
+        )
 
 
 def test_in_one_dimension_the_mixed_rule_is_gauss_hermite() -> None:
@@ -189,22 +197,35 @@ def test_in_one_dimension_the_mixed_rule_is_gauss_hermite() -> None:
 @every_size
 def test_rules_that_have_another_name(n: int) -> None:
     """CKF's points in the same order, and the UKF of kappa = 2 without an extra weight of the centre."""
-    assert all(torch.equal(a, b) for a, b in zip(RULES["ckf3"](n), Cubature()(n), strict=True))
-    xi, w, w_cov = Unscented(1.0, 0.0, 2.0)(n)
+    assert all(
+        torch.equal(a, b) for a, b in zip(RULES["ckf3"](n), CubaturePoints()(n), strict=True)
+    )
+    xi, w, w_cov = UnscentedPoints(1.0, 0.0, 2.0)(n)
     for a, b in zip(RULES["mckf"](n), (xi, w, w_cov), strict=True):
         assert torch.allclose(a, b, atol=1e-15)
 
 
 def test_the_unscented_filter_of_kappa_two_filters_alike() -> None:
-    y = 10.0 * torch.randn(2, 12, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    one, other = (mean(scheme, Lorenz63(), y) for scheme in (RULES["mckf"], Unscented(1.0, 0.0, 2.0)))
+    y = 10.0 * torch.randn(
+        2, 12, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(3)
+    )
+    one, other = (
+        mean(scheme, Lorenz63(), y) for scheme in (RULES["mckf"], UnscentedPoints(1.0, 0.0, 2.0))
+    )
     assert torch.allclose(one, other, rtol=1e-9)
 
 
-def mean(scheme: Product | Unscented, model: StateSpaceModel, y: Tensor) -> Tensor:
-    return run_filter(GaussianFilter(Points(scheme)), model, Record(y), MonteCarlo(0, torch.arange(len(y)))).mean
+def mean(
+    scheme: SphericalRadialPoints | UnscentedPoints, model: StateSpaceModel, y: Tensor
+) -> Tensor:
+    return run_filter(
+        GaussianFilter(SigmaPointLinearisation(scheme)),
+        model,
+        Record(y),
+        PhiloxStream(0, torch.arange(len(y))),
+    ).mean
 
 
 def test_points_are_built_once() -> None:
-    one, other = (Product(Simplex5(), Radial5())(9) for _ in range(2))
+    one, other = (SphericalRadialPoints(SimplexDegree5(), RadialDegree5())(9) for _ in range(2))
     assert one[0] is other[0]

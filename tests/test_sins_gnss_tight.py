@@ -8,82 +8,63 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from recorded_data import recorded
 from scipy import stats
+from tight_cases import IMU, INITIAL, PATH, RECEIVER, RUNS, composed, flight, kalman, linear
 from torch import Tensor
 
 from pfbench import job
-from pfbench.cli import conf_dir
-from pfbench.draws import MonteCarlo
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.loop import Estimate, run_filter
-from pfbench.filter.rules import Cubature, Jacobian, Points
-from pfbench.model.sins_gnss_tight import NAMES, SinsGnssTight, Step
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Episode, Record, map_inputs
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+)
+from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.model.sins_gnss_tight import NAMES, SinsGnssTight
 from pfbench.model.sins_gnss_tight_nl import SinsGnssTightNl
 from pfbench.nav import attitude, earth, strapdown
-from pfbench.nav.aiding import Alignment, Flown, Inflation, Receiver
-from pfbench.nav.orbits import Walker
-from pfbench.nav.ranging import TightReceiver, Tracked
-from pfbench.nav.sensors import ImuErrors
-from pfbench.nav.trajectory import Cycloid, Flight, Ramps, Start
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Episode, Record, map_inputs
-from pfbench.scenario.flight import SimulatedFlight
+from pfbench.nav.aiding import AlignmentErrors, FlightSolution, GnssReceiver, ProcessNoiseInflation
+from pfbench.nav.gnss.ranging import RangingInputs
+from pfbench.nav.trajectory import TrajectoryData
+from pfbench.noise.white import NominalNoise
+from pfbench.scenario.simulated_flight import SimulatedFlight
 
-IMU = ImuErrors(0.03, 0.0, 0.0, 0.001, 50.0, 0.0, 0.0, 50.0)
-RECEIVER = TightReceiver(Walker(), satellites=["W02", "W05", "W06", "W09", "W12", "W16", "W21", "W22"])
-INITIAL = Alignment((1.2, 1.2, 6.0), (0.1, 0.1, 0.1), (10.0, 10.0, 10.0))
-PATH = Ramps(
-    Start(26.26, 105.89, 320.0, 100.0, 225.0),
-    80.0,
-    speed=(Cycloid(0.0, 30.0, 100.0),),
-    heading_deg=(Cycloid(20.0, 60.0, 60.0),),
-    rise=(Cycloid(30.0, 50.0, 10.0),),
-)
-RUNS = torch.arange(3)
-
-
-def world(receiver: Any = RECEIVER, runs: Tensor = RUNS) -> Episode:
-    return SimulatedFlight(PATH, IMU, receiver, INITIAL, imu_rate=20.0).draw(Nominal(), runs, 5)
-
-
-@pytest.fixture(scope="module")
-def flight() -> Episode:
-    """80 s with a take-off run's acceleration, a turn and a climb; 3 runs."""
-    return world()
-
-
-def linear(inflation: Inflation | None = None, receiver: TightReceiver = RECEIVER) -> SinsGnssTight:
-    return SinsGnssTight(IMU, receiver, INITIAL, inflation)
+__all__ = ["flight"]  # a fixture
 
 
 def exact() -> SinsGnssTightNl:
     return SinsGnssTightNl(IMU, RECEIVER, INITIAL)
 
 
-def composed(*words: str) -> Any:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("config", ["worlds=null", *words])
-
-
-def ckf(model: Any, record: Record) -> Estimate:
+def ckf(model: Any, record: Record) -> FilterResult:
     with torch.no_grad():
-        return run_filter(GaussianFilter(Points(Cubature())), model, record, MonteCarlo(1, RUNS))
+        return run_filter(
+            GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
+            model,
+            record,
+            PhiloxStream(1, RUNS),
+        )
 
 
 # the transition
 
 
-SIZES = torch.tensor([1e-4] * 3 + [0.1] * 3 + [10.0] * 3 + [1e-6] * 3 + [1e-3] * 3, dtype=torch.float64)
+SIZES = torch.tensor(
+    [1e-4] * 3 + [0.1] * 3 + [10.0] * 3 + [1e-6] * 3 + [1e-3] * 3, dtype=torch.float64
+)
 
 
-def mechanised(flown: Flight, begin: int, x: Tensor) -> Tensor:
+def mechanised(flown: TrajectoryData, begin: int, x: Tensor) -> Tensor:
     """Nine errors after a second of flight, for errors x [K, 15] at its start and sensors that are wrong by constants."""
     per, dt = 100, 0.01
     part = slice(begin * per, (begin + 1) * per)
     first, last = begin * per, (begin + 1) * per
-    ins = strapdown.align(flown.dcm[first], flown.vel[first], flown.pos[first], x[:, :3], x[:, 3:6], x[:, 6:9])
+    ins = strapdown.align(
+        flown.dcm[first], flown.vel[first], flown.pos[first], x[:, :3], x[:, 3:6], x[:, 6:9]
+    )
     dtheta, dv = flown.dtheta[part] + x[:, None, 9:12] * dt, flown.dv[part] + x[:, None, 12:15] * dt
     end, _ = strapdown.navigate(ins, dtheta, dv, dt, per)
     turned = attitude.attitude_error(flown.dcm[last], end.dcm)
@@ -91,33 +72,37 @@ def mechanised(flown: Flight, begin: int, x: Tensor) -> Tensor:
     return torch.cat([turned, end.vel - flown.vel[last], moved], -1)
 
 
-def interval(begin: int) -> tuple[Flight, Tracked]:
+def interval(begin: int) -> tuple[TrajectoryData, RangingInputs]:
     """A second of ideal flight, and the inputs that an INS without errors makes of it."""
-    flown = PATH.fly(100.0)
+    flown = PATH.generate(100.0)
     first, zero = begin * 100, torch.zeros(1, 3, dtype=torch.float64)
     ins = strapdown.align(flown.dcm[first], flown.vel[first], flown.pos[first], zero, zero, zero)
     part = slice(first, first + 100)
     _, u = strapdown.navigate(ins, flown.dtheta[None, part], flown.dv[None, part], 0.01, 100)
     satellites = torch.zeros(1, 1, 1, 3, dtype=torch.float64)
-    return flown, Tracked(*u, satellites, satellites)
+    return flown, RangingInputs(*u, satellites, satellites)
 
 
 @pytest.mark.parametrize("begin", [0, 15, 30, 40, 70])
 def test_the_transition_is_the_derivative_of_the_mechanisation(begin: int) -> None:
     flown, u = interval(begin)
     steps = torch.diag(SIZES)
-    wanted = ((mechanised(flown, begin, steps) - mechanised(flown, begin, -steps)) / 2).mT  # [9, 15] by sizes
+    wanted = (
+        (mechanised(flown, begin, steps) - mechanised(flown, begin, -steps)) / 2
+    ).mT  # [9, 15] by sizes
     phi, _ = linear().discretise(u)
     # row-relative: the dropped dR_M/dL makes 2e-5; forces and attitudes change by some per cent within the second, which
     # the mean of both ends meets to second order
     largest = wanted.abs().amax(-1, keepdim=True)
     small = 2e-3 * wanted.abs() * (wanted.abs() < 0.1 * largest)
-    assert ((phi[0, 0] * SIZES - wanted).abs() <= 5e-5 * largest + small + 1e-9 * SIZES[:9, None]).all()
+    assert (
+        (phi[0, 0] * SIZES - wanted).abs() <= 5e-5 * largest + small + 1e-9 * SIZES[:9, None]
+    ).all()
 
 
 def test_the_noise_is_of_rank_eleven_and_exact(flight: Episode) -> None:
     model, u = linear(), flight.record.u
-    step = model.prepare(flight.record).at(20).u
+    step = model.prepare(flight.record).at_step(20).u
     gain = model.noise_gain(step)
     assert gain.shape == (3, 17, 11)
     q = gain @ gain.mT
@@ -127,9 +112,13 @@ def test_the_noise_is_of_rank_eleven_and_exact(flight: Episode) -> None:
     assert not gain[:, 9:15].any()  # the biases are constant
     # Van Loan's block exponential of the same F, G, q
     f, _, density = model.continuous(map_inputs(lambda a: a[:, 20], u))
-    block = torch.cat([torch.cat([-f, density.expand_as(f)], -1), torch.cat([torch.zeros_like(f), f.mT], -1)], -2)
+    block = torch.cat(
+        [torch.cat([-f, density.expand_as(f)], -1), torch.cat([torch.zeros_like(f), f.mT], -1)], -2
+    )
     power = torch.matrix_exp(block)  # one second
-    after = torch.cat([torch.ones(3, 6, dtype=torch.float64), earth.metre_scale(u.pos_end[:, 20])], -1)
+    after = torch.cat(
+        [torch.ones(3, 6, dtype=torch.float64), earth.metre_scale(u.pos_end[:, 20])], -1
+    )
     wanted = power[:, 9:, 9:].mT @ power[:, :9, 9:] * after.unsqueeze(-1) * after.unsqueeze(-2)
     size = wanted.diagonal(dim1=-2, dim2=-1).sqrt()
     found = gain[:, :9, :9] @ gain[:, :9, :9].mT
@@ -141,12 +130,16 @@ def test_the_noise_is_of_rank_eleven_and_exact(flight: Episode) -> None:
     assert torch.allclose(density.diagonal()[:6].sqrt(), walks, rtol=1e-6)
 
 
-@pytest.mark.parametrize("model", [linear(), linear(Inflation()), exact()], ids=["linear", "inflated", "nonlinear"])
+@pytest.mark.parametrize(
+    "model",
+    [linear(), linear(ProcessNoiseInflation()), exact()],
+    ids=["linear", "inflated", "nonlinear"],
+)
 def test_the_noise_gain_is_what_propagate_does_with_noise(flight: Episode, model: Any) -> None:
-    seen = model.prepare(flight.record).at(20)
-    d = MonteCarlo(1, RUNS).normal("x", 4, 17) * model.p0
+    seen = model.prepare(flight.record).at_step(20)
+    d = PhiloxStream(1, RUNS).normal("x", 4, 17) * model.p0
     x = model.chart.add(model.origin.expand(3, 4, -1), d)
-    w = MonteCarlo(1, RUNS).normal("w", 4, model.noise_dim)
+    w = PhiloxStream(1, RUNS).normal("w", 4, model.noise_dim)
     still = model.propagate(x, seen.u, torch.zeros_like(w))
     moved = model.chart.subtract(model.propagate(x, seen.u, w), still)
     assert torch.allclose(moved, w @ model.noise_gain(seen.u).mT, rtol=1e-6, atol=1e-9)
@@ -154,7 +147,7 @@ def test_the_noise_gain_is_what_propagate_does_with_noise(flight: Episode, model
 
 def test_the_clock_goes_on_by_its_drift_and_the_biases_stay(flight: Episode) -> None:
     model = linear()
-    step = model.prepare(flight.record).at(3).u
+    step = model.prepare(flight.record).at_step(3).u
     phi = model.transition_matrix(step)
     wanted = torch.eye(17, dtype=torch.float64).expand(3, -1, -1).clone()
     wanted[:, :9, :15], wanted[:, 15, 16] = phi[:, :9, :15], step.duration
@@ -171,65 +164,38 @@ def test_preparing_in_parts_changes_nothing(flight: Episode) -> None:
 
 def test_the_transition_has_a_density_only_where_it_is_inflated(flight: Episode) -> None:
     x = torch.zeros(3, 2, 17, dtype=torch.float64)
-    plain, inflated = linear(), linear(Inflation())
-    assert plain.transition(x, plain.prepare(flight.record).at(0).u) is None
-    seen = inflated.prepare(flight.record).at(7)
-    w = MonteCarlo(2, RUNS).normal("w", 2, 17)
+    plain, inflated = linear(), linear(ProcessNoiseInflation())
+    assert plain.transition(x, plain.prepare(flight.record).at_step(0).u) is None
+    seen = inflated.prepare(flight.record).at_step(7)
+    w = PhiloxStream(2, RUNS).normal("w", 2, 17)
     law = inflated.transition(x, seen.u)
     assert law is not None
     log_det = torch.linalg.slogdet(inflated.noise_gain(seen.u))[1].unsqueeze(-1)
-    assert torch.allclose(law.log_prob(inflated.propagate(x, seen.u, w)), inflated.noise.log_prob(w) - log_det, atol=1e-6)
-    q = [m.noise_gain(m.prepare(flight.record).at(7).u) for m in (plain, inflated)]
+    assert torch.allclose(
+        law.log_prob(inflated.propagate(x, seen.u, w)),
+        inflated.noise.log_prob(w) - log_det,
+        atol=1e-6,
+    )
+    q = [m.noise_gain(m.prepare(flight.record).at_step(7).u) for m in (plain, inflated)]
     extra = (q[1] @ q[1].mT - q[0] @ q[0].mT).diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    size = Inflation()
-    wanted = torch.cat([size.motion, size.gyro, size.accelerometer, torch.zeros(2, dtype=torch.float64)])
+    size = ProcessNoiseInflation()
+    wanted = torch.cat(
+        [size.motion, size.gyro, size.accelerometer, torch.zeros(2, dtype=torch.float64)]
+    )
     assert torch.allclose(extra[:, :15], wanted[:15].expand(3, -1), rtol=1e-6)
 
 
 # what is measured, and what is an error
 
 
-def kalman(model: SinsGnssTight, record: Record) -> tuple[Tensor, Tensor, Tensor]:
-    """The textbook's filter with the linear form of the ranges: means, variances [R, T, 17], NIS [R, T]."""
-    runs, count = record.y.shape[0], len(model.r) // 2
-    mean, p = torch.zeros(runs, 17, dtype=torch.float64), torch.diag_embed(model.p0.square().expand(runs, -1))
-    eye, means, variances, distances = torch.eye(17, dtype=torch.float64), [], [], []
-    for t in range(record.y.shape[1]):
-        seen = record.at(t)
-        u: Step = seen.u
-        phi, gain = model.transition_matrix(u), model.noise_gain(u)
-        mean, p = (phi @ mean.unsqueeze(-1)).squeeze(-1), phi @ p @ phi.mT + gain @ gain.mT
-        s, c, o = u.sine, u.cosine, torch.zeros_like(u.sine)
-        east, north, up = (torch.stack(axis, -1) for axis in ((o, o + 1, o), (-s, o, c), (c, o, s)))
-        h = torch.zeros(runs, 2 * count, 17, dtype=torch.float64)
-        h[:, :count, 6:9] = u.line @ torch.stack([north, east, up], -1)
-        h[:, count:, 3:6] = u.line @ torch.stack([east, north, up], -1)
-        # the line turns with the place, (w - e (e.w)) / r, and so do the level axes of the velocity
-        turn = (u.closing - u.line * (u.line * u.closing).sum(-1, keepdim=True)) / u.distance.unsqueeze(-1)
-        h[:, count:, 6:9] = turn @ torch.stack([north, east, up], -1)
-        r_m, r_n = earth.radii(torch.asin(s))
-        for axis, tilt in ((6, (-1 / (r_m + u.height), o, o)), (7, (o, 1 / (r_n + u.height), s / c / (r_n + u.height)))):
-            level = torch.linalg.cross(torch.stack(tilt, -1), u.vel)
-            h[:, count:, axis] += (h[:, count:, 3:6] @ level.unsqueeze(-1)).squeeze(-1)
-        h[:, :count, 15] = h[:, count:, 16] = -1.0
-        there = ~seen.y.isnan()
-        r = torch.where(there, seen.y - model.observation(mean.unsqueeze(1), u).mean[:, 0], 0.0)
-        h = torch.where(there.unsqueeze(-1), h, 0.0)
-        spread = h @ p @ h.mT + torch.diag(model.r.square())
-        k = torch.linalg.solve(spread, h @ p).mT
-        distances.append((r * torch.linalg.solve(spread, r.unsqueeze(-1)).squeeze(-1)).sum(-1))
-        mean, p = mean + (k @ r.unsqueeze(-1)).squeeze(-1), (eye - k @ h) @ p
-        means.append(mean)
-        variances.append(p.diagonal(dim1=-2, dim2=-1))
-    return torch.stack(means, 1), torch.stack(variances, 1), torch.stack(distances, 1)
-
-
-@pytest.mark.parametrize("rule", [Jacobian(), Points(Cubature())], ids=["ekf", "ckf"])
+@pytest.mark.parametrize(
+    "rule", [TaylorLinearisation(), SigmaPointLinearisation(CubaturePoints())], ids=["ekf", "ckf"]
+)
 def test_on_this_model_filters_are_the_kalman_filter(flight: Episode, rule: Any) -> None:
     """Nearly: about an INS that is 10 m off, the measurement is linear to 1e-6 of its matrix."""
     model = linear()
     mean, variance, _ = kalman(model, model.prepare(flight.record))
-    estimate = run_filter(GaussianFilter(rule), model, flight.record, MonteCarlo(1, RUNS))
+    estimate = run_filter(GaussianFilter(rule), model, flight.record, PhiloxStream(1, RUNS))
     assert not estimate.lost.any()
     assert ((estimate.mean - mean) / variance.sqrt()).abs().max() < 1e-4
     assert torch.allclose(estimate.variance, variance, rtol=1e-4, atol=0)
@@ -274,7 +240,9 @@ def test_a_perfect_estimate_leaves_no_error(flight: Episode, model: Any) -> None
     # the INS itself is in error by the truth, and nothing was said of sensors and clock
     assert torch.allclose(nothing[..., 3:9], groups[..., 3:9], rtol=1e-9)
     assert torch.equal(nothing[..., 9:], -groups[..., 9:])
-    assert torch.allclose(nothing[..., :3], groups[..., :3], rtol=0, atol=1e-5)  # Euler angles beside a rotation vector
+    assert torch.allclose(
+        nothing[..., :3], groups[..., :3], rtol=0, atol=1e-5
+    )  # Euler angles beside a rotation vector
 
 
 @pytest.mark.parametrize("make", [linear, exact], ids=["linear", "nonlinear"])
@@ -282,14 +250,16 @@ def test_single_precision_weighs_particles_as_double_does(flight: Episode, make:
     values = []
     for dtype in (torch.float64, torch.float32):
         model = make().to(dtype)
-        seen = model.prepare(flight.record).to(model.anchor).at(60)
+        seen = model.prepare(flight.record).to(model.anchor).at_step(60)
         truth = model.assemble(flight.truth)[:, 60]
-        d = (MonteCarlo(1, RUNS).normal("d", 50, 17) * make().p0).to(dtype)
+        d = (PhiloxStream(1, RUNS).normal("d", 50, 17) * make().p0).to(dtype)
         x = model.chart.add(truth.unsqueeze(1).to(dtype), d)
         x = model.propagate(x, seen.u, d[..., :11] * 0)
         values.append(model.log_likelihood(seen.y, x, seen.u).double())
     spread = values[0] - values[0].mean(1, keepdim=True)
-    assert (values[1] - values[0] - (values[1] - values[0]).mean()).abs().max() < 1e-3 * spread.abs().max()
+    assert (
+        values[1] - values[0] - (values[1] - values[0]).mean()
+    ).abs().max() < 1e-3 * spread.abs().max()
     assert spread.abs().max() > 1.0
 
 
@@ -302,9 +272,17 @@ def test_for_small_errors_the_exact_model_is_the_linear_one(flight: Episode) -> 
     d = torch.cat([d, torch.zeros(3, 15, 2, dtype=torch.float64)], -1)
     nothing = torch.zeros(3, 15, 11, dtype=torch.float64)
     for t in (5, 40):
-        u, step = model.prepare(flight.record).at(t).u, tangent.prepare(flight.record).at(t).u
+        u, step = (
+            model.prepare(flight.record).at_step(t).u,
+            tangent.prepare(flight.record).at_step(t).u,
+        )
         flip = torch.tensor([-1.0] * 3 + [1.0] * 14, dtype=torch.float64)  # E turns by -phi
-        ends = [model.propagate(model.chart.add(model.origin.expand(3, 15, -1), s * flip * d), u, nothing) for s in (1.0, -1.0)]
+        ends = [
+            model.propagate(
+                model.chart.add(model.origin.expand(3, 15, -1), s * flip * d), u, nothing
+            )
+            for s in (1.0, -1.0)
+        ]
         found = flip * model.chart.subtract(ends[0], ends[1]) / 2
         wanted = tangent.propagate(d, step, nothing)
         size = wanted.abs().amax(1, keepdim=True).clamp(min=1e-12)
@@ -313,15 +291,19 @@ def test_for_small_errors_the_exact_model_is_the_linear_one(flight: Episode) -> 
 
 def test_the_exact_model_carries_a_heading_error_of_tens_of_degrees() -> None:
     """Take-off with 45 degrees: the INS is wrong by 100 m/s and kilometres, what the model makes of it by next to nothing."""
-    guessed = Alignment((60.0, 60.0, 2700.0), (0.5, 0.5, 0.5), (10.0, 10.0, 10.0), drawn=False)
+    guessed = AlignmentErrors(
+        (60.0, 60.0, 2700.0), (0.5, 0.5, 0.5), (10.0, 10.0, 10.0), randomise=False
+    )
     quiet = replace(IMU, gyro_random_walk_deg_sqrt_h=0.0, accelerometer_random_walk_ug_sqrt_hz=0.0)
-    episode = SimulatedFlight(PATH, quiet, RECEIVER, guessed, imu_rate=50.0).draw(Nominal(), RUNS, 5)
+    episode = SimulatedFlight(PATH, quiet, RECEIVER, guessed, imu_rate_hz=50.0).draw(
+        NominalNoise(), RUNS, 5
+    )
     model = SinsGnssTightNl(IMU, RECEIVER, guessed)
     truth, record = model.assemble(episode.truth), model.prepare(episode.record)
     assert episode.truth["velocity"][:, -1].norm(dim=-1).min() > 100.0
     x = truth[:, :1]
     for t in range(1, truth.shape[1]):
-        x = model.propagate(x, record.at(t).u, torch.zeros(3, 1, 11, dtype=torch.float64))
+        x = model.propagate(x, record.at_step(t).u, torch.zeros(3, 1, 11, dtype=torch.float64))
     error = model.error(x[:, 0], truth[:, -1]).abs()
     assert error[:, :3].max() < 0.1 * math.radians(1 / 3600)
     assert error[:, 3:6].max() < 1e-3
@@ -331,7 +313,7 @@ def test_the_exact_model_carries_a_heading_error_of_tens_of_degrees() -> None:
 def test_the_exact_models_noise_is_the_linear_ones(flight: Episode) -> None:
     q = []
     for model in (linear(), exact()):
-        gain = model.noise_gain(model.prepare(flight.record).at(30).u)
+        gain = model.noise_gain(model.prepare(flight.record).at_step(30).u)
         q.append((gain @ gain.mT).expand(3, -1, -1))
     size = q[0].diagonal(dim1=-2, dim2=-1).sqrt().clamp(min=1e-30)
     # left out: gyro noise within the interval, 1e-2 of the accelerometers'
@@ -343,15 +325,27 @@ def test_the_exact_models_noise_is_the_linear_ones(flight: Episode) -> None:
 
 
 def test_what_does_not_fit_is_refused(flight: Episode) -> None:
-    loose = SimulatedFlight(PATH, IMU, Receiver((10.0, 10.0, 10.0)), INITIAL, imu_rate=20.0)
+    loose = SimulatedFlight(PATH, IMU, GnssReceiver((10.0, 10.0, 10.0)), INITIAL, imu_rate_hz=20.0)
     for model in (linear(), exact()):
-        with pytest.raises(ValueError, match=r"record\.u is Intervals.*TightReceiver"):
-            model.prepare(loose.draw(Nominal(), RUNS[:1], 1).record)
-        with pytest.raises(ValueError, match=r"measures 6 components, model\.receiver expects 16"):
+        with pytest.raises(
+            ValueError, match=r"record\.u must be .*got InsIntervals.*RangingReceiver"
+        ):
+            model.prepare(loose.draw(NominalNoise(), RUNS[:1], 1).record)
+        with pytest.raises(
+            ValueError, match=r"measure the 16 components of model\.receiver, got 6"
+        ):
             model.prepare(flight.record._replace(y=flight.record.y[..., :6]))
-    with pytest.raises(ValueError, match=r"model\.imu: Markov parts of 0\.1 deg/h.*set gyro_markov_deg_h"):
-        SinsGnssTight(replace(IMU, gyro_markov_deg_h=0.1, gyro_markov_time=300.0), RECEIVER, INITIAL)
-    with pytest.raises(ValueError, match=r"model\.imu: biases of 0\.0 deg/h"):
+    with pytest.raises(
+        ValueError,
+        match=r"model\.imu must not have Markov parts, got 0\.1 deg/h.*Set gyro_markov_deg_h",
+    ):
+        SinsGnssTight(
+            replace(IMU, gyro_markov_deg_h=0.1, gyro_markov_time_s=300.0), RECEIVER, INITIAL
+        )
+    with pytest.raises(
+        ValueError,
+        match=r"model\.imu must have positive gyro and accelerometer biases, got 0\.0 deg/h",
+    ):
         SinsGnssTight(replace(IMU, gyro_bias_deg_h=0.0), RECEIVER, INITIAL)
     assert len(NAMES) == 17
 
@@ -360,8 +354,8 @@ def test_what_does_not_fit_is_refused(flight: Episode) -> None:
 
 
 def test_the_flight_ends_where_the_paper_says() -> None:
-    path = job.build(composed("scenario=anshun_fit").scenario.path)
-    flown = path.fly(10.0)
+    path = job.instantiate(composed("scenario=anshun_fit").scenario.trajectory)
+    flown = path.generate(10.0)
     start, end = flown.pos[0], flown.pos[-1]
     given = torch.tensor([math.radians(23.68), math.radians(108.63), 200.0], dtype=torch.float64)
     assert ((end - given) * earth.metre_scale(given)).abs().max() < 5.0
@@ -374,11 +368,13 @@ def test_the_flight_ends_where_the_paper_says() -> None:
 def visible(scenario: str, *words: str) -> Tensor:
     """Satellites seen [T, S] once a second along the path, without an INS."""
     cfg = composed(f"scenario={scenario}", *words).scenario
-    flown, receiver = job.build(cfg.path).fly(1.0), job.build(cfg.receiver)
+    flown, receiver = job.instantiate(cfg.trajectory).generate(1.0), job.instantiate(cfg.receiver)
     time, pos, vel, dcm, *_ = (a[1:] for a in flown)
     fields = (dcm, dcm, pos, pos, pos, vel, vel, vel, vel, torch.ones_like(time))
-    ins = strapdown.Intervals(*(a.unsqueeze(0) for a in fields))
-    y = receiver.aid(Flown(time, pos, vel, dcm, ins), MonteCarlo(1, RUNS[:1]), torch.ones_like(time)).y[0]
+    ins = strapdown.InsIntervals(*(a.unsqueeze(0) for a in fields))
+    y = receiver.measure(
+        FlightSolution(time, pos, vel, dcm, ins), PhiloxStream(1, RUNS[:1]), torch.ones_like(time)
+    ).y[0]
     half = y.shape[1] // 2
     assert torch.equal(y[:, :half].isnan(), y[:, half:].isnan())
     return ~y[:, :half].isnan()
@@ -396,7 +392,11 @@ def test_real_satellites_come_and_go() -> None:
     seen = visible("anshun_real_orbits")
     assert set(seen.sum(1).tolist()) == {9, 10, 11}
     assert int((seen[1:] != seen[:-1]).sum()) == 3
-    everyone = visible("anshun_real_orbits", "scenario.receiver.satellites=null", "scenario.path.duration=1000")
+    everyone = visible(
+        "anshun_real_orbits",
+        "scenario.receiver.satellites=null",
+        "scenario.trajectory.duration_s=1000",
+    )
     assert torch.equal(everyone.sum(1), seen[:1000].sum(1))  # the list leaves nobody out
 
 
@@ -404,9 +404,9 @@ def test_real_satellites_come_and_go() -> None:
 def test_the_flight_gives_the_published_accuracy() -> None:
     """RMSE of 30 runs, NIS and NEES; the prototype's 0.66, 0.58, 1.40 m are good to 10 %, mean NIS 16.0 to 0.4."""
     runs, level = 30, 1e-4
-    cfg = composed("scenario=anshun_fit", "scenario.imu_rate=50")
-    model = job.build(cfg.model)
-    episode = job.build(cfg.scenario).draw(Nominal(), torch.arange(runs), 7)
+    cfg = composed("scenario=anshun_fit", "scenario.imu_rate_hz=50")
+    model = job.instantiate(cfg.model)
+    episode = job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(runs), 7)
     truth = model.assemble(episode.truth)
     assert (truth[:, -1, 6:8].square().mean(0).sqrt() > 1000.0).all()  # open loop
     mean, variance, nis = kalman(model, model.prepare(episode.record))
@@ -424,12 +424,19 @@ def test_the_flight_gives_the_published_accuracy() -> None:
 @pytest.mark.slow
 def test_the_take_off_shows_the_heading() -> None:
     """From 45 degrees the cubature filter comes below 1 degree within 20 s (half the runs) and 60 s (nearly all)."""
-    cfg = composed("scenario=anshun_nl", "scenario.imu_rate=20", "scenario.path.duration=70")
-    model, runs = job.build(cfg.model), torch.arange(40)
-    episode = job.build(cfg.scenario).draw(Nominal(), runs, 3)
+    cfg = composed(
+        "scenario=anshun_nl", "scenario.imu_rate_hz=20", "scenario.trajectory.duration_s=70"
+    )
+    model, runs = job.instantiate(cfg.model), torch.arange(40)
+    episode = job.instantiate(cfg.scenario).draw(NominalNoise(), runs, 3)
     truth = model.assemble(episode.truth)
     with torch.no_grad():
-        estimate = run_filter(GaussianFilter(Points(Cubature())), model, episode.record, MonteCarlo(1, runs))
+        estimate = run_filter(
+            GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
+            model,
+            episode.record,
+            PhiloxStream(1, runs),
+        )
     heading = torch.rad2deg(model.error(estimate.mean, truth)[..., 2].abs())
     assert not estimate.lost.any()
     assert episode.truth["attitude"][:, 0, 2].abs().median() > math.radians(20.0)

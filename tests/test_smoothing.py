@@ -7,21 +7,30 @@ import pytest
 import torch
 from torch import Tensor
 
-from pfbench.chart import Chart, Quaternion
-from pfbench.draws import MonteCarlo
-from pfbench.filter.adaptations import Fading
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.rules import Cubature, Jacobian, Points, Unscented
-from pfbench.filter.smoothing import smooth, trajectories
-from pfbench.model.base import StateSpaceModel, Wrapped, independent_normal, normal_batch
-from pfbench.model.linear import LinearGaussian, linear_walk, local_level
-from pfbench.model.toys import Growth
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Record
-from pfbench.scenario.model_world import ModelWorld
+from pfbench.core.chart import Chart, QuaternionBlock
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+    UnscentedPoints,
+)
+from pfbench.filter.gaussian.noise_adaptation import FadingMemory
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.smoothing import sample_trajectories, smooth
+from pfbench.model.base import ModelWrapper, StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
+from pfbench.model.textbook import UnivariateGrowth
+from pfbench.noise.white import NominalNoise
+from pfbench.scenario.model_simulation import ModelSimulation
 
-RULES = {"jacobian": Jacobian(), "unscented": Points(Unscented()), "cubature": Points(Cubature())}
+RULES = {
+    "jacobian": TaylorLinearisation(),
+    "unscented": SigmaPointLinearisation(UnscentedPoints()),
+    "cubature": SigmaPointLinearisation(CubaturePoints()),
+}
 
 
 def dense(model: LinearGaussian, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -41,17 +50,19 @@ def dense(model: LinearGaussian, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     big, noise = big[seen], np.diag(np.tile(r**2, steps)[seen])
     gain = np.linalg.solve(big @ p @ big.T + noise, big @ p).T
     mean, p = mean + gain @ (y.ravel()[seen] - big @ mean), p - gain @ big @ p
-    return mean.reshape(steps, d), np.stack([p[t * d : (t + 1) * d, t * d : (t + 1) * d] for t in range(steps)])
+    return mean.reshape(steps, d), np.stack(
+        [p[t * d : (t + 1) * d, t * d : (t + 1) * d] for t in range(steps)]
+    )
 
 
 def record_of(model: LinearGaussian, runs: int, steps: int) -> Record:
-    record = ModelWorld(model, steps).draw(Nominal(), torch.arange(runs), 3).record
+    record = ModelSimulation(model, steps).draw(NominalNoise(), torch.arange(runs), 3).record
     record.y[:, 2] = torch.nan  # an instant without measurement, in all runs
     record.y[0, steps - 1] = torch.nan  # and the last of one run
     return record
 
 
-class Driven(Wrapped):
+class Driven(ModelWrapper):
     """The same linear model, which does not tell how its noise enters: it then goes through the filter's rule."""
 
     linear = True
@@ -61,13 +72,20 @@ class Driven(Wrapped):
         return self.model.observes_initial
 
 
-SINGULAR = LinearGaussian([[1.0, 0.7], [0.0, 0.9]], [[0.1], [0.5]], [[1.0, 0.0]], [0.8], [1.0, -1.0], [2.0, 1.0])
+SINGULAR = LinearGaussian(
+    [[1.0, 0.7], [0.0, 0.9]], [[0.1], [0.5]], [[1.0, 0.0]], [0.8], [1.0, -1.0], [2.0, 1.0]
+)
 
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize(
     "model",
-    [linear_walk(0.5, 0.3, 0.7), SINGULAR, local_level(0.4, 1.0, 2.0, 3.0, observes_initial=True), Driven(SINGULAR)],
+    [
+        linear_walk(0.5, 0.3, 0.7),
+        SINGULAR,
+        local_level(0.4, 1.0, 2.0, 3.0, observes_initial=True),
+        Driven(SINGULAR),
+    ],
     ids=["walk", "singular", "at_rest", "driven"],
 )
 def test_smoothed_laws_are_those_of_the_dense_joint_law(model: StateSpaceModel, rule: str) -> None:
@@ -93,20 +111,29 @@ class Pushed(Driven):
 
 def test_each_step_goes_back_by_its_own_inputs() -> None:
     """Known pushes move a linear model's path by what they alone would do, and nothing else."""
-    by, model = torch.tensor([[3.0, -1.0, 0.5, 4.0, -2.0, 1.0, 0.0, 7.0, 5.0]], dtype=torch.float64), linear_walk(0.5, 0.3, 0.7)
+    by, model = (
+        torch.tensor([[3.0, -1.0, 0.5, 4.0, -2.0, 1.0, 0.0, 7.0, 5.0]], dtype=torch.float64),
+        linear_walk(0.5, 0.3, 0.7),
+    )
     record, way = record_of(model, 2, 9), by.cumsum(1)
-    pushed = smooth(GaussianFilter(Jacobian()), Pushed(model), Record(record.y + way[..., None], Push(by)))
-    plain = smooth(GaussianFilter(Jacobian()), model, record)
+    pushed = smooth(
+        GaussianFilter(TaylorLinearisation()),
+        Pushed(model),
+        Record(record.y + way[..., None], Push(by)),
+    )
+    plain = smooth(GaussianFilter(TaylorLinearisation()), model, record)
     torch.testing.assert_close(pushed.mean[..., 0] - way, plain.mean[..., 0])
     torch.testing.assert_close(pushed.mean[..., 1], plain.mean[..., 1])
 
 
 def test_the_last_state_is_the_filter_s_and_no_other_is() -> None:
     model = linear_walk(0.5, 0.3, 0.7)
-    found = smooth(GaussianFilter(Jacobian()), model, record_of(model, 2, 9))
+    found = smooth(GaussianFilter(TaylorLinearisation()), model, record_of(model, 2, 9))
     variance = found.covariance.diagonal(dim1=-2, dim2=-1)
     torch.testing.assert_close(found.mean[:, -1], found.filtered.mean[:, -1])
-    assert bool((variance[1, :-1] < found.filtered.variance[1, :-1]).all())  # of run 0 nothing was seen last
+    assert bool(
+        (variance[1, :-1] < found.filtered.variance[1, :-1]).all()
+    )  # of run 0 nothing was seen last
 
 
 class Tumbler(StateSpaceModel):
@@ -121,7 +148,7 @@ class Tumbler(StateSpaceModel):
 
     @property
     def chart(self) -> Chart:
-        return Chart((Quaternion(),))
+        return Chart((QuaternionBlock(),))
 
     @property
     def origin(self) -> Tensor:
@@ -142,9 +169,14 @@ class Tumbler(StateSpaceModel):
 
 def test_on_a_curved_chart_it_is_the_flat_one_where_angles_are_small() -> None:
     size = 1e-3
-    flat = LinearGaussian(np.eye(3), 0.5 * size * np.eye(3), np.eye(3), [size] * 3, [0.0] * 3, [size] * 3)
+    flat = LinearGaussian(
+        np.eye(3), 0.5 * size * np.eye(3), np.eye(3), [size] * 3, [0.0] * 3, [size] * 3
+    )
     record = record_of(flat, 2, 8)
-    curved, plain = (smooth(GaussianFilter(Jacobian()), model, record) for model in (Tumbler(size), flat))
+    curved, plain = (
+        smooth(GaussianFilter(TaylorLinearisation()), model, record)
+        for model in (Tumbler(size), flat)
+    )
     vectors = Tumbler(size).chart.subtract(curved.mean, Tumbler(size).origin)
     assert plain.mean.abs().max() > size  # angles of the second order are a thousand times smaller
     torch.testing.assert_close(vectors, plain.mean, rtol=0, atol=10 * size**2)
@@ -155,8 +187,12 @@ def test_backward_sampling_agrees_with_the_smoother() -> None:
     """Means and variances over paths at every instant, and the covariance of neighbours, that single states do not show."""
     model, steps, clouds, paths = linear_walk(1.0, 0.5, 0.8), 8, 40, 25
     record = record_of(model, 1, steps)
-    many = record._replace(y=record.y.expand(clouds, -1, -1))  # as many clouds as runs: their scatter is the standard error
-    x = trajectories(ParticleFilter(150), model, many, MonteCarlo(1, torch.arange(clouds)), paths)
+    many = record._replace(
+        y=record.y.expand(clouds, -1, -1)
+    )  # as many clouds as runs: their scatter is the standard error
+    x = sample_trajectories(
+        ParticleFilter(150), model, many, PhiloxStream(1, torch.arange(clouds)), paths
+    )
     assert x.shape == (clouds, paths, steps, 2)
     mean, covariance = dense(model, record.y[0].numpy())
     inside = torch.from_numpy(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
@@ -165,13 +201,17 @@ def test_backward_sampling_agrees_with_the_smoother() -> None:
         means = moment.mean(1)
         off = (means.mean(0) - truth) / (means.std(0) / clouds**0.5)
         assert off.abs().max() < 4.5, off  # of 16 numbers
-    steps_of = x[:, :, 1:, 0] - x[:, :, :-1, 0] - x[:, :, :-1, 1]  # position's own noise: variance q/3 a priori
-    assert steps_of.std() < 0.5 / 3**0.5 * 1.3  # paths of unrelated states would scatter by the posterior spread, 0.6 and more
+    steps_of = (
+        x[:, :, 1:, 0] - x[:, :, :-1, 0] - x[:, :, :-1, 1]
+    )  # position's own noise: variance q/3 a priori
+    assert (
+        steps_of.std() < 0.5 / 3**0.5 * 1.3
+    )  # paths of unrelated states would scatter by the posterior spread, 0.6 and more
 
 
 def test_paths_of_a_bent_model_have_the_law_that_a_grid_gives() -> None:
     """The first of three states of the growth model given all three measurements, by quadrature."""
-    model = Growth(process_sd=4.0, measurement_sd=1.0, initial_sd=3.0)
+    model = UnivariateGrowth(process_sd=4.0, measurement_sd=1.0, initial_sd=3.0)
     y = np.array([4.0, 5.0, 1.0])
     grid = np.linspace(-45.0, 45.0, 901)
     dx = grid[1] - grid[0]
@@ -187,38 +227,50 @@ def test_paths_of_a_bent_model_have_the_law_that_a_grid_gives() -> None:
     exact = np.array([(law * (grid > 0)).sum(), (law * grid).sum()])
     clouds = 60
     record = Record(torch.from_numpy(y)[None, :, None].expand(clouds, -1, -1))
-    x = trajectories(ParticleFilter(400), model, record, MonteCarlo(2, torch.arange(clouds)), 20)[:, :, 0, 0]
+    x = sample_trajectories(
+        ParticleFilter(400), model, record, PhiloxStream(2, torch.arange(clouds)), 20
+    )[:, :, 0, 0]
     shares = torch.stack([(x > 0).double().mean(1), x.mean(1)], 1)
     off = (shares.mean(0) - torch.from_numpy(exact)) / (shares.std(0) / clouds**0.5)
     assert off.abs().max() < 4.0, (off, exact)
-    assert exact[0] > 0.75 > 0.45 > ahead[grid > 0].sum() / ahead.sum()  # what came later told the sign
+    assert (
+        exact[0] > 0.75 > 0.45 > ahead[grid > 0].sum() / ahead.sum()
+    )  # what came later told the sign
 
 
-def test_paths_do_not_depend_on_how_many_are_weighed_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = Growth()
-    record = ModelWorld(model, 4).draw(Nominal(), torch.arange(2), 0).record
-    draws = MonteCarlo(1, torch.arange(2))
-    whole = trajectories(ParticleFilter(20), model, record, draws, 7)
+def test_paths_do_not_depend_on_how_many_are_weighed_at_a_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = UnivariateGrowth()
+    record = ModelSimulation(model, 4).draw(NominalNoise(), torch.arange(2), 0).record
+    draws = PhiloxStream(1, torch.arange(2))
+    whole = sample_trajectories(ParticleFilter(20), model, record, draws, 7)
     monkeypatch.setattr("pfbench.filter.smoothing._PAIRS", 50)
-    torch.testing.assert_close(trajectories(ParticleFilter(20), model, record, draws, 7), whole)
+    torch.testing.assert_close(
+        sample_trajectories(ParticleFilter(20), model, record, draws, 7), whole
+    )
 
 
 def test_what_cannot_be_smoothed_says_why() -> None:
     model = linear_walk(1.0, 0.5, 0.8)
-    record, draws = record_of(model, 1, 4), MonteCarlo(0, torch.arange(1))
-    with pytest.raises(ValueError, match="no transition density"):
-        trajectories(ParticleFilter(20), SINGULAR, record, draws, 2)
-    with pytest.raises(ValueError, match="has no particles"):
-        trajectories(GaussianFilter(Jacobian()), model, record, draws, 2)
+    record, draws = record_of(model, 1, 4), PhiloxStream(0, torch.arange(1))
+    with pytest.raises(ValueError, match="must have a transition density"):
+        sample_trajectories(ParticleFilter(20), SINGULAR, record, draws, 2)
+    with pytest.raises(ValueError, match="must be a particle filter"):
+        sample_trajectories(GaussianFilter(TaylorLinearisation()), model, record, draws, 2)
     with pytest.raises(ValueError, match="at least 1"):
-        trajectories(ParticleFilter(20), model, record, draws, 0)
+        sample_trajectories(ParticleFilter(20), model, record, draws, 0)
     with pytest.raises(ValueError, match="adapts"):
-        smooth(GaussianFilter(Jacobian(), adaptations=[Fading()]), model, record)
+        smooth(
+            GaussianFilter(TaylorLinearisation(), noise_adaptations=[FadingMemory()]), model, record
+        )
 
 
 def test_a_lost_run_has_no_paths_and_no_smoothed_law_and_spoils_no_other() -> None:
-    model = Growth(measurement_sd=1e-3)
+    model = UnivariateGrowth(measurement_sd=1e-3)
     record = Record(torch.tensor([[[1.0], [2.0]], [[1.0], [1e200]]], dtype=torch.float64))
-    paths = trajectories(ParticleFilter(50), model, record, MonteCarlo(0, torch.arange(2)), 3)
+    paths = sample_trajectories(
+        ParticleFilter(50), model, record, PhiloxStream(0, torch.arange(2)), 3
+    )
     assert torch.isfinite(paths[0]).all()
     assert torch.isnan(paths[1]).all()

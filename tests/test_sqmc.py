@@ -11,25 +11,37 @@ import pytest
 import torch
 from torch import Tensor
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter.belief import Cloud
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.points import Halton, Points, Sobol
-from pfbench.filter.preferences import LookAhead
-from pfbench.filter.resamplers import Resample, Systematic
-from pfbench.filter.sqmc import HilbertSorted, PointNoise, Quantiles, hilbert_index, hilbert_order
-from pfbench.model.linear import LinearGaussian, linear_walk
-from pfbench.record import Record
+from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.point_sets import HaltonPoints, PointSet, SobolPoints
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.sqmc import (
+    HilbertSortedResampler,
+    SqmcProposal,
+    SqmcScheme,
+    compute_hilbert_index,
+    compute_hilbert_order,
+)
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 
 WALK = linear_walk(1.0, 0.5, 1.0)
 WALK_Y = torch.tensor([[0.8], [2.9], [1.2], [math.nan], [3.0], [6.5]], dtype=torch.float64)
 
 
-def sqmc(particles: int, points: Points | None = None, threshold: float = 1.0, **more: Any) -> ParticleFilter:
-    p = points or Sobol()
+def sqmc(
+    particles: int, points: PointSet | None = None, threshold: float = 1.0, **more: Any
+) -> ParticleFilter:
+    p = points or SobolPoints()
     return ParticleFilter(
-        particles, HilbertSorted(Resample(Quantiles(p), threshold)), proposal=PointNoise(p), points=p, **more
+        particles,
+        HilbertSortedResampler(EssResampler(SqmcScheme(p), threshold)),
+        proposal=SqmcProposal(p),
+        points=p,
+        **more,
     )
 
 
@@ -42,7 +54,7 @@ def kalman(model: LinearGaussian, y: Tensor) -> oracles.Filtered:
 def test_the_curve_visits_every_cell_once_and_goes_to_a_neighbour(axes: int, bits: int) -> None:
     side = 2**bits
     cells = torch.cartesian_prod(*[torch.arange(side)] * axes).reshape(-1, axes)
-    index = hilbert_index(cells, bits)
+    index = compute_hilbert_index(cells, bits)
     assert index.sort().values.tolist() == list(range(side**axes))
     step = cells[index.argsort()].diff(dim=0).abs().sum(1)
     assert torch.all(step == 1)
@@ -50,25 +62,35 @@ def test_the_curve_visits_every_cell_once_and_goes_to_a_neighbour(axes: int, bit
 
 def test_the_order_brings_neighbours_together() -> None:
     """Steps along the curve are far shorter than steps in the order of any coordinate."""
-    x = MonteCarlo(1, torch.arange(3)).normal("x", 500, 3)
-    cloud = Cloud(x * torch.tensor([1e4, 1.0, 1e-6]), torch.full((3, 500), -math.log(500)).double(), torch.zeros(3).double())
-    order = hilbert_order(LinearGaussian(*[torch.eye(3)] * 3, [1.0] * 3, [0.0] * 3, [1.0] * 3).chart, cloud)
+    x = PhiloxStream(1, torch.arange(3)).normal("x", 500, 3)
+    cloud = ParticleBelief(
+        x * torch.tensor([1e4, 1.0, 1e-6]),
+        torch.full((3, 500), -math.log(500)).double(),
+        torch.zeros(3).double(),
+    )
+    order = compute_hilbert_order(
+        LinearGaussian(*[torch.eye(3)] * 3, [1.0] * 3, [0.0] * 3, [1.0] * 3).chart, cloud
+    )
     assert torch.equal(order.sort(1).values, torch.arange(500).expand(3, -1))
 
     def length(by: Tensor) -> float:
-        return float(x.gather(1, by.unsqueeze(-1).expand(-1, -1, 3)).diff(dim=1).norm(dim=-1).mean())
+        return float(
+            x.gather(1, by.unsqueeze(-1).expand(-1, -1, 3)).diff(dim=1).norm(dim=-1).mean()
+        )
 
     assert length(order) < 0.4 * length(x[..., 0].argsort(1))
 
 
-@pytest.mark.parametrize("points", [Sobol(), Halton()], ids=lambda p: type(p).__name__)
-def test_quantiles_give_each_particle_its_share(points: Points) -> None:
+@pytest.mark.parametrize("points", [SobolPoints(), HaltonPoints()], ids=lambda p: type(p).__name__)
+def test_quantiles_give_each_particle_its_share(points: PointSet) -> None:
     a = np.random.default_rng(0).gamma(0.5, size=24)
     a[[0, 5, -1]] = 0.0
     a /= a.sum()
     runs = 20_000
     n = torch.full((runs, 1), 24.0, dtype=torch.float64)
-    ancestors = Quantiles(points)(torch.tensor(a).expand(runs, -1), n, MonteCarlo(1, torch.arange(runs)))
+    ancestors = SqmcScheme(points)(
+        torch.tensor(a).expand(runs, -1), n, PhiloxStream(1, torch.arange(runs))
+    )
     counts = torch.zeros(runs, 24).scatter_add(1, ancestors, torch.ones(ancestors.shape)).numpy()
     off = counts.mean(0) - 24 * a
     assert np.all(np.abs(off) <= 4.5 * counts.std(0) / math.sqrt(runs) + 1e-9)
@@ -78,15 +100,17 @@ def test_quantiles_give_each_particle_its_share(points: Points) -> None:
 @pytest.mark.parametrize(
     "method",
     [
-        sqmc(25), sqmc(25, Halton()), sqmc(25, threshold=0.5), sqmc(25, preference=LookAhead()),
-        ParticleFilter(25, HilbertSorted(Resample(Systematic(), 1.0))),
+        sqmc(25), sqmc(25, HaltonPoints()), sqmc(25, threshold=0.5), sqmc(25, auxiliary_weights=LookAheadWeights()),
+        ParticleFilter(25, HilbertSortedResampler(EssResampler(Systematic(), 1.0))),
     ],
     ids=["sobol", "halton", "threshold", "look ahead", "systematic in order"],
 )  # fmt: skip
 def test_it_is_exact_and_unbiased(method: ParticleFilter) -> None:
-    assert method.exact
+    assert method.is_exact
     runs, k = 2000, kalman(WALK, WALK_Y)
-    estimate = run_filter(method, WALK, Record(WALK_Y.expand(runs, -1, -1)), MonteCarlo(1, torch.arange(runs)))
+    estimate = run_filter(
+        method, WALK, Record(WALK_Y.expand(runs, -1, -1)), PhiloxStream(1, torch.arange(runs))
+    )
     ratio = torch.exp(estimate.log_evidence - k.log_evidence.sum())
     mean = torch.tensor(k.mean[-1])
     for value in (ratio - 1.0, *(ratio.unsqueeze(-1) * (estimate.mean[:, -1] - mean)).T):
@@ -96,16 +120,25 @@ def test_it_is_exact_and_unbiased(method: ParticleFilter) -> None:
 def test_noise_and_ancestors_are_coordinates_of_one_point() -> None:
     """Of the same axis they would be dependent, and the filter wrong."""
 
-    class Same(PointNoise):
+    class Same(SqmcProposal):
         def __call__(self, *args):  # type: ignore[no-untyped-def]
             model, cloud, seen, draws = args
-            return ParticleFilter(2).proposal(model, cloud, seen, Sobol()(draws))
+            return ParticleFilter(2).proposal(model, cloud, seen, SobolPoints()(draws))
 
     runs, k = 2000, kalman(WALK, WALK_Y)
-    method = ParticleFilter(25, HilbertSorted(Resample(Quantiles(), 1.0)), proposal=Same(), points=Sobol())
-    estimate = run_filter(method, WALK, Record(WALK_Y.expand(runs, -1, -1)), MonteCarlo(1, torch.arange(runs)))
+    method = ParticleFilter(
+        25,
+        HilbertSortedResampler(EssResampler(SqmcScheme(), 1.0)),
+        proposal=Same(),
+        points=SobolPoints(),
+    )
+    estimate = run_filter(
+        method, WALK, Record(WALK_Y.expand(runs, -1, -1)), PhiloxStream(1, torch.arange(runs))
+    )
     variance = float(estimate.log_evidence.var())
-    right = run_filter(sqmc(25), WALK, Record(WALK_Y.expand(runs, -1, -1)), MonteCarlo(1, torch.arange(runs)))
+    right = run_filter(
+        sqmc(25), WALK, Record(WALK_Y.expand(runs, -1, -1)), PhiloxStream(1, torch.arange(runs))
+    )
     assert variance > 1.5 * float(right.log_evidence.var())
     assert abs(float((estimate.mean[:, -1, 0] - k.mean[-1, 0]).mean())) < 1.0
 
@@ -117,14 +150,20 @@ def test_the_error_falls_faster_than_by_chance() -> None:
     k = kalman(WALK, y)
 
     def error(method: ParticleFilter) -> float:
-        found = run_filter(method, WALK, Record(y.expand(30, -1, -1)), MonteCarlo(1, torch.arange(30)))
-        return float((((found.mean.numpy() - k.mean) ** 2) / np.diagonal(k.covariance, axis1=1, axis2=2)).mean())
+        found = run_filter(
+            method, WALK, Record(y.expand(30, -1, -1)), PhiloxStream(1, torch.arange(30))
+        )
+        return float(
+            (
+                ((found.mean.numpy() - k.mean) ** 2) / np.diagonal(k.covariance, axis1=1, axis2=2)
+            ).mean()
+        )
 
     assert error(sqmc(1000)) < error(ParticleFilter(1000)) / 3
 
 
 def test_a_run_alone_is_what_it_is_in_a_batch() -> None:
-    y = MonteCarlo(8, torch.arange(4)).normal("y", 6, 1)
-    whole = run_filter(sqmc(50), WALK, Record(y), MonteCarlo(1, torch.arange(4)))
-    alone = run_filter(sqmc(50), WALK, Record(y[2:3]), MonteCarlo(1, torch.tensor([2])))
+    y = PhiloxStream(8, torch.arange(4)).normal("y", 6, 1)
+    whole = run_filter(sqmc(50), WALK, Record(y), PhiloxStream(1, torch.arange(4)))
+    alone = run_filter(sqmc(50), WALK, Record(y[2:3]), PhiloxStream(1, torch.tensor([2])))
     assert torch.allclose(alone.mean[0], whole.mean[2], rtol=1e-12, atol=1e-12)

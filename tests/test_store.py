@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pfbench import store
+from pfbench.results import store
 
 R, T, D = 3, 5, 2
 STATE = {"names": ["x", "v"], "units": ["m", "m/s"], "groups": {"position": [0], "b_velocity": [1]}}
@@ -45,8 +45,15 @@ def arrays(fill=1.0):
 
 
 CONFIGS = st.recursive(
-    st.none() | st.booleans() | st.integers(-9, 9) | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
-    lambda below: st.lists(below, max_size=3) | st.dictionaries(st.text(min_size=1, max_size=5), below, max_size=4),
+    st.none()
+    | st.booleans()
+    | st.integers(-9, 9)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=5),
+    lambda below: (
+        st.lists(below, max_size=3)
+        | st.dictionaries(st.text(min_size=1, max_size=5), below, max_size=4)
+    ),
     max_leaves=12,
 )
 
@@ -59,40 +66,49 @@ def reversed_deep(config):
 
 @given(st.dictionaries(st.text(min_size=1, max_size=5), CONFIGS, max_size=4))
 def test_key_knows_content_not_order(config):
-    name = store.key(config)
-    assert name == store.key(reversed_deep(config))
+    name = store.config_key(config)
+    assert name == store.config_key(reversed_deep(config))
     assert len(name) == 16
     assert set(name) <= set("0123456789abcdef")
 
 
 def test_key_survives_the_process():
-    code = "from pfbench import store; print(store.key({'b': [1, 2.5, None], 'a': {'c': 'ü'}}))"
+    code = "from pfbench.results import store; print(store.config_key({'b': [1, 2.5, None], 'a': {'c': 'ü'}}))"
     environment = {**os.environ, "PYTHONHASHSEED": "77"}
-    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-    assert other.stdout.strip() == store.key({"a": {"c": "ü"}, "b": [1, 2.5, None]})
+    other = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )
+    assert other.stdout.strip() == store.config_key({"a": {"c": "ü"}, "b": [1, 2.5, None]})
 
 
 def test_ignored_paths_change_nothing_and_others_do():
     here = {"seed": 1, "results": "a", "data": {"root": "x", "name": "log"}, "threads": 1}
     there = {"seed": 1, "results": "b", "data": {"root": "y", "name": "log"}, "threads": 8}
     ignore = ("results", "data.root", "threads", "absent.path")
-    assert store.key(here, ignore) == store.key(there, ignore)
-    assert store.key(here, ignore) != store.key({**here, "seed": 2}, ignore)
-    assert store.key(here, ignore) != store.key({**here, "data": {"root": "x", "name": "other"}}, ignore)
-    assert store.key(here, ("data",)) == store.key({k: v for k, v in here.items() if k != "data"})
+    assert store.config_key(here, ignore) == store.config_key(there, ignore)
+    assert store.config_key(here, ignore) != store.config_key({**here, "seed": 2}, ignore)
+    assert store.config_key(here, ignore) != store.config_key(
+        {**here, "data": {"root": "x", "name": "other"}}, ignore
+    )
+    assert store.config_key(here, ("data",)) == store.config_key(
+        {k: v for k, v in here.items() if k != "data"}
+    )
 
 
 @pytest.mark.parametrize("value", [float("nan"), {1, 2}, np.zeros(2)])
 def test_key_refuses_what_json_cannot_say(value):
-    with pytest.raises(ValueError, match="has no key"):
-        store.key({"filter": {"gain": value}})
+    with pytest.raises(ValueError, match="configuration must be numbers"):
+        store.config_key({"filter": {"gain": value}})
 
 
 def test_what_is_read_is_what_was_written(tmp_path):
-    path = store.save(tmp_path / "new" / "a.npz", meta(), arrays(1 / 3))
-    result = store.load(path)
+    path = store.write_result(tmp_path / "new" / "a.npz", meta(), arrays(1 / 3))
+    result = store.read_result(path)
     assert result.meta == {"format": 1, **meta()}
-    assert list(result.meta["state"]["groups"]) == ["position", "b_velocity"]  # the order of the last axis of nees
+    assert list(result.meta["state"]["groups"]) == [
+        "position",
+        "b_velocity",
+    ]  # the order of the last axis of nees
     assert result.arrays.keys() == arrays().keys()
     for name, value in arrays(1 / 3).items():
         assert result.arrays[name].dtype == value.dtype
@@ -100,14 +116,14 @@ def test_what_is_read_is_what_was_written(tmp_path):
 
 
 def test_numpy_alone_reads_it(tmp_path):
-    path = store.save(tmp_path / "a.npz", meta(), arrays())
+    path = store.write_result(tmp_path / "a.npz", meta(), arrays())
     with np.load(path, allow_pickle=False) as file:
         assert json.loads(str(file["meta"]))["label"] == "sir"
         assert file["error"].shape == (R, T, D)
 
 
 def test_an_exception_in_the_middle_leaves_the_folder_as_it_was(tmp_path, monkeypatch):
-    store.save(tmp_path / "old.npz", meta(), arrays(1.0))
+    store.write_result(tmp_path / "old.npz", meta(), arrays(1.0))
 
     def half(file, **members):
         file.write(b"PK half a file")
@@ -116,9 +132,9 @@ def test_an_exception_in_the_middle_leaves_the_folder_as_it_was(tmp_path, monkey
     monkeypatch.setattr(np, "savez_compressed", half)
     for name in ("new.npz", "old.npz"):
         with pytest.raises(OSError, match="disk full"):
-            store.save(tmp_path / name, meta(), arrays(2.0))
+            store.write_result(tmp_path / name, meta(), arrays(2.0))
     assert [path.name for path in tmp_path.iterdir()] == ["old.npz"]
-    assert store.load(tmp_path / "old.npz").arrays["error"][0, 0, 0] == 1.0
+    assert store.read_result(tmp_path / "old.npz").arrays["error"][0, 0, 0] == 1.0
 
 
 def test_a_kill_in_the_middle_leaves_no_result_and_the_next_save_sweeps_up(tmp_path):
@@ -128,22 +144,22 @@ def test_a_kill_in_the_middle_leaves_no_result_and_the_next_save_sweeps_up(tmp_p
         sys.path.insert(0, {os.path.dirname(__file__)!r})
         import numpy as np
         import test_store as t
-        from pfbench import store
+        from pfbench.results import store
         def half(file, **members):
             file.write(b"PK half a file"); file.flush()
             os.kill(os.getpid(), signal.SIGKILL)
         np.savez_compressed = half
-        store.save({str(tmp_path)!r} + "/a.npz", t.meta(), t.arrays())
+        store.write_result({str(tmp_path)!r} + "/a.npz", t.meta(), t.arrays())
         """
     )
     killed = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
     assert len(list(tmp_path.glob("a.*.tmp"))) == 1
     assert not (tmp_path / "a.npz").exists()
-    assert list(store.results(tmp_path)) == []
-    store.save(tmp_path / "b.npz", meta(), arrays())
+    assert list(store.list_results(tmp_path)) == []
+    store.write_result(tmp_path / "b.npz", meta(), arrays())
     assert len(list(tmp_path.glob("a.*.tmp"))) == 1  # another key is none of its business
-    store.save(tmp_path / "a.npz", meta(), arrays())
+    store.write_result(tmp_path / "a.npz", meta(), arrays())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz"]
 
 
@@ -165,36 +181,44 @@ def _prose(raw):
 
 @pytest.mark.parametrize("damage", [_cut, _flip, _empty, _prose])
 def test_a_damaged_file_is_named(tmp_path, damage):
-    path = store.save(tmp_path / "a.npz", meta(), arrays())
+    path = store.write_result(tmp_path / "a.npz", meta(), arrays())
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ValueError, match=r"a\.npz is damaged"):
-        store.load(path)
+        store.read_result(path)
 
 
 def test_a_foreign_or_other_format_file_is_named(tmp_path):
     np.savez(tmp_path / "foreign.npz", x=np.zeros(3))
-    with pytest.raises(ValueError, match=r"foreign\.npz has no 'meta'"):
-        store.load(tmp_path / "foreign.npz")
+    with pytest.raises(
+        ValueError, match=r"foreign\.npz must be a result of pfbench, got a file without 'meta'"
+    ):
+        store.read_result(tmp_path / "foreign.npz")
     np.savez(tmp_path / "future.npz", meta=np.array(json.dumps({"format": 99})))
-    with pytest.raises(ValueError, match=r"format 99; this pfbench reads format 1"):
-        store.load(tmp_path / "future.npz")
+    with pytest.raises(ValueError, match=r"must have format 1, got 99"):
+        store.read_result(tmp_path / "future.npz")
     np.save(tmp_path / "single.npy", np.zeros(3))
     (tmp_path / "single.npy").rename(tmp_path / "single.npz")
     with pytest.raises(ValueError, match="single array"):
-        store.load(tmp_path / "single.npz")
-    with pytest.raises(FileNotFoundError, match=r"no result at .*absent\.npz"):
-        store.load(tmp_path / "absent.npz")
+        store.read_result(tmp_path / "single.npz")
+    with pytest.raises(FileNotFoundError, match=r"absent\.npz does not exist"):
+        store.read_result(tmp_path / "absent.npz")
 
 
 def test_save_refuses_what_readers_could_not_use(tmp_path):
-    with pytest.raises(ValueError, match="needs the arrays lost"):
-        store.save(tmp_path / "a.npz", meta(), {k: v for k, v in arrays().items() if k != "lost"})
-    with pytest.raises(ValueError, match=r"sd has shape \(3, 5, 1\)"):
-        store.save(tmp_path / "a.npz", meta(), {**arrays(), "sd": np.ones((R, T, 1))})
-    with pytest.raises(ValueError, match="note holds Python objects"):
-        store.save(tmp_path / "a.npz", meta(), {**arrays(), "note": np.array([{}, None])})
-    with pytest.raises(ValueError, match="needs choices"):
-        store.save(tmp_path / "a.npz", {k: v for k, v in meta().items() if k != "choices"}, arrays())
+    with pytest.raises(ValueError, match="must contain the arrays lost"):
+        store.write_result(
+            tmp_path / "a.npz", meta(), {k: v for k, v in arrays().items() if k != "lost"}
+        )
+    with pytest.raises(ValueError, match=r"sd must have shape .* got \(3, 5, 1\)"):
+        store.write_result(tmp_path / "a.npz", meta(), {**arrays(), "sd": np.ones((R, T, 1))})
+    with pytest.raises(
+        ValueError, match="note must be numbers, booleans or texts, got Python objects"
+    ):
+        store.write_result(tmp_path / "a.npz", meta(), {**arrays(), "note": np.array([{}, None])})
+    with pytest.raises(ValueError, match="metadata must contain choices"):
+        store.write_result(
+            tmp_path / "a.npz", {k: v for k, v in meta().items() if k != "choices"}, arrays()
+        )
     assert not list(tmp_path.iterdir())
 
 
@@ -203,30 +227,36 @@ def test_failure_is_noted_until_a_success(tmp_path):
     try:
         raise FloatingPointError("not positive definite")
     except FloatingPointError as error:
-        note = store.failed(path, meta()["choices"], error)
+        note = store.write_failure(path, meta()["choices"], error)
     assert note == tmp_path / "a.failed.json"
-    (found,) = store.failures(tmp_path)
+    (found,) = store.list_failures(tmp_path)
     assert found["key"] == "a"
     assert found["message"] == "FloatingPointError: not positive definite"
     assert "raise FloatingPointError" in found["traceback"]
-    store.save(path, meta(), arrays())
-    assert store.failures(tmp_path) == []
+    store.write_result(path, meta(), arrays())
+    assert store.list_failures(tmp_path) == []
     assert not note.exists()
 
 
 def test_failure_never_touches_a_good_result(tmp_path):
-    path = store.save(tmp_path / "a.npz", meta(), arrays())
+    path = store.write_result(tmp_path / "a.npz", meta(), arrays())
     before = path.read_bytes()
-    assert store.failed(path, meta()["choices"], RuntimeError("later")) is None
+    assert store.write_failure(path, meta()["choices"], RuntimeError("later")) is None
     assert path.read_bytes() == before
-    assert store.failures(tmp_path) == []
+    assert store.list_failures(tmp_path) == []
 
 
 def test_results_come_in_order_of_content(tmp_path):
-    wanted = [("a", "n", "ekf", 1), ("a", "n", "sir", 1), ("a", "n", "sir", 2), ("a", "o", "ekf", 1), ("b", "n", "ekf", 1)]
+    wanted = [
+        ("a", "n", "ekf", 1),
+        ("a", "n", "sir", 1),
+        ("a", "n", "sir", 2),
+        ("a", "o", "ekf", 1),
+        ("b", "n", "ekf", 1),
+    ]
     for place, (scenario, noise, label, seed) in zip([3, 0, 4, 1, 2], wanted, strict=True):
         described = meta(f"{place:016x}", label, scenario, noise, seed)
-        store.save(tmp_path / f"{place:016x}.npz", described, arrays())
+        store.write_result(tmp_path / f"{place:016x}.npz", described, arrays())
     found = [(r.meta["choices"]["scenario"], r.meta["choices"]["noise"], r.meta["label"], r.meta["seed"])
-             for r in store.results(tmp_path)]  # fmt: skip
+             for r in store.list_results(tmp_path)]  # fmt: skip
     assert found == wanted

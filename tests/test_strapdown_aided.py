@@ -10,15 +10,16 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter.gaussian import GaussianFilter
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
-from pfbench.filter.rules import Jacobian
-from pfbench.model.strapdown_aided import BelievedAided, StrapdownAided
-from pfbench.model.strapdown_total import Believed, Increments, preintegrate
-from pfbench.record import Record
+from pfbench.model.strapdown_aided import AidedTuning, StrapdownAided
+from pfbench.model.strapdown_total import StrapdownTuning
+from pfbench.nav.preintegration import PreintegratedImu, preintegrate
 
-MOTION = Believed(
+MOTION = StrapdownTuning(
     gyro_density=2e-3,
     accelerometer_density=2e-2,
     gyro_bias_walk=1e-4,
@@ -31,11 +32,11 @@ MOTION = Believed(
     gyro_bias_sd_deg_s=0.1,
     accelerometer_bias_sd=0.2,
 )
-BELIEVED = BelievedAided(
+BELIEVED = AidedTuning(
     MOTION,
     height_sd=1.5,
     magnetic_sd=[0.01, 0.02, 0.03],
-    field=[0.17, 0.01, 0.52],
+    magnetic_field_gauss=[0.17, 0.01, 0.52],
     height_bias_sd=4.0,
     height_bias_walk=0.5,
     magnetic_bias_sd=0.02,
@@ -48,18 +49,20 @@ def normal(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def inputs(steps: int, duration: float = 0.25, rate: Tensor | None = None) -> Increments:
+def inputs(steps: int, duration: float = 0.25, rate: Tensor | None = None) -> PreintegratedImu:
     """Level flight at constant speed, turning at some rate."""
     spans = torch.full((1, steps, 5), duration / 5, dtype=torch.float64)
     force = torch.tensor([0.0, 0.0, 9.8], dtype=torch.float64).expand(1, steps, 5, 3)
     turn = torch.zeros(3, dtype=torch.float64) if rate is None else rate
     bias = torch.zeros(1, steps, 6, dtype=torch.float64)
     imu = preintegrate(force, turn.expand(1, steps, 5, 3), spans, bias)
-    return Increments(*imu, bias, torch.full((1, steps), 9.8, dtype=torch.float64), spans.sum(-1))
+    return PreintegratedImu(
+        *imu, bias, torch.full((1, steps), 9.8, dtype=torch.float64), spans.sum(-1)
+    )
 
 
-def step(u: Increments, t: int = 0) -> Increments:
-    return Increments(*(leaf[:, t] for leaf in u))
+def step(u: PreintegratedImu, t: int = 0) -> PreintegratedImu:
+    return PreintegratedImu(*(leaf[:, t] for leaf in u))
 
 
 def states(runs: int = 2, particles: int = 5) -> Tensor:
@@ -76,15 +79,25 @@ def test_what_is_seen_is_the_fix_the_biased_height_and_the_field_in_body_axes() 
         field = to_level.inv().apply([0.01, 0.17, -0.52]) + state[17:].numpy()  # East, North, Up
         assert torch.allclose(seen[7:], torch.from_numpy(field), rtol=0, atol=1e-12)
     # right, forward, up of what the yaml says of forward, right, down
-    assert law.stddev[0, 0].tolist() == pytest.approx([1.0, 1.0, 1.0, 0.1, 0.2, 0.3, 1.5, 0.02, 0.01, 0.03])
+    assert law.stddev[0, 0].tolist() == pytest.approx(
+        [1.0, 1.0, 1.0, 0.1, 0.2, 0.3, 1.5, 0.02, 0.01, 0.03]
+    )
 
 
 def test_a_compass_reads_north_ahead_and_down_below() -> None:
     """Level and heading North, the field is ahead and downwards; heading East, it is on the left."""
-    model, turn = StrapdownAided(replace(BELIEVED, field=[0.17, 0.0, 0.52])), math.sqrt(0.5)
-    for q, expected in (([1.0, 0.0, 0.0, 0.0], [0.0, 0.17, -0.52]), ([turn, 0.0, 0.0, -turn], [-0.17, 0.0, -0.52])):
+    model, turn = (
+        StrapdownAided(replace(BELIEVED, magnetic_field_gauss=[0.17, 0.0, 0.52])),
+        math.sqrt(0.5),
+    )
+    for q, expected in (
+        ([1.0, 0.0, 0.0, 0.0], [0.0, 0.17, -0.52]),
+        ([turn, 0.0, 0.0, -turn], [-0.17, 0.0, -0.52]),
+    ):
         x = torch.tensor([*q, *[0.0] * 16], dtype=torch.float64).reshape(1, 1, -1)
-        assert model.observation(x, step(inputs(1))).mean[0, 0, 7:].tolist() == pytest.approx(expected, abs=1e-12)
+        assert model.observation(x, step(inputs(1))).mean[0, 0, 7:].tolist() == pytest.approx(
+            expected, abs=1e-12
+        )
 
 
 def test_the_motion_is_that_of_the_model_inside_and_biases_walk() -> None:
@@ -94,20 +107,27 @@ def test_the_motion_is_that_of_the_model_inside_and_biases_walk() -> None:
     walk = torch.tensor([0.5, 1e-3, 1e-3, 1e-3], dtype=torch.float64) * math.sqrt(0.25)
     assert torch.allclose(moved[..., 16:], x[..., 16:] + walk * w[..., 12:])
     quiet = MODEL.propagate(x, u, torch.zeros_like(w))
-    assert torch.allclose(MODEL.chart.add(quiet, w @ MODEL.noise_gain(u).mT), moved, rtol=0, atol=1e-12)
-    assert torch.allclose(MODEL.initial(1).stddev[0, 15:], torch.tensor([4.0, 0.02, 0.02, 0.02], dtype=torch.float64))
+    assert torch.allclose(
+        MODEL.chart.add(quiet, w @ MODEL.noise_gain(u).mT), moved, rtol=0, atol=1e-12
+    )
+    assert torch.allclose(
+        MODEL.initial(1).stddev[0, 15:], torch.tensor([4.0, 0.02, 0.02, 0.02], dtype=torch.float64)
+    )
 
 
-def flown(steps: int, rate: float) -> tuple[Tensor, Increments, Tensor]:
+def flown(steps: int, rate: float) -> tuple[Tensor, PreintegratedImu, Tensor]:
     """Worlds of the model's own law for 40 runs that circle at a rate: truth [R, T, 20], inputs, measurements."""
     u = inputs(steps, 1.0, torch.tensor([0.0, 0.0, rate], dtype=torch.float64))
-    draws = MonteCarlo(3, torch.arange(40))
+    draws = PhiloxStream(3, torch.arange(40))
     x = MODEL.chart.add(MODEL.origin.expand(40, 1, -1), (MODEL.p0 * draws.normal("start", 1, 19)))
     truth, seen = [], []
     for t in range(steps):
-        x = MODEL.propagate(x, step(u, t), draws.at(t).normal("drive", 1, 16))
+        x = MODEL.propagate(x, step(u, t), draws.at_step(t).normal("drive", 1, 16))
         truth.append(x[:, 0])
-        seen.append(MODEL.observation(x, step(u, t)).mean[:, 0] + MODEL.r * draws.at(t).normal("see", 1, 10)[:, 0])
+        seen.append(
+            MODEL.observation(x, step(u, t)).mean[:, 0]
+            + MODEL.r * draws.at_step(t).normal("see", 1, 10)[:, 0]
+        )
     return torch.stack(truth, 1), u, torch.stack(seen, 1)
 
 
@@ -117,24 +137,39 @@ def test_turns_tell_the_hard_iron_and_the_filter_knows_how_well() -> None:
     for rate in (0.5, 0.0):
         truth, u, y = flown(14, rate)
         with torch.no_grad():
-            found = run_filter(GaussianFilter(Jacobian()), MODEL, Record(y, u), MonteCarlo(1, torch.arange(40)))
+            found = run_filter(
+                GaussianFilter(TaylorLinearisation()),
+                MODEL,
+                Record(y, u),
+                PhiloxStream(1, torch.arange(40)),
+            )
         z = MODEL.error(found.mean, truth)[:, -1].square() / found.variance[:, -1]
         assert (abs(z.mean(0) - 1.0) < 4.5 * math.sqrt(2 / 40) + 0.1).all()
         sd.append(found.variance[:, -1].sqrt().mean(0))
     assert (sd[0][16:18] < 0.4 * BELIEVED.magnetic_bias_sd).all()
-    assert sd[1][16] > 0.65 * BELIEVED.magnetic_bias_sd  # to the right: turned about up, the field moves that way
+    assert (
+        sd[1][16] > 0.65 * BELIEVED.magnetic_bias_sd
+    )  # to the right: turned about up, the field moves that way
 
 
 def test_what_does_not_fit_is_refused() -> None:
     u = inputs(2)
-    with pytest.raises(ValueError, match=r"with 6 measured components: StrapdownAided needs Increments and 10"):
+    with pytest.raises(
+        ValueError,
+        match=r"must be PreintegratedImu with 10 measured components .*got PreintegratedImu with 6",
+    ):
         MODEL.prepare(Record(torch.zeros(1, 2, 6), u))
-    with pytest.raises(ValueError, match=r"record\.u is tuple .*scenario=fixed_wing_aided"):
+    with pytest.raises(
+        ValueError, match=r"record must be .*got tuple .*scenario=recorded_fixed_wing_aided"
+    ):
         MODEL.prepare(Record(torch.zeros(1, 2, 10)))
     for changes, words in (
-        ({"field": [0.0, 0.0, 0.0]}, r"believed\.field=\[0\.0, 0\.0, 0\.0\]"),
+        (
+            {"magnetic_field_gauss": [0.0, 0.0, 0.0]},
+            r"tuning\.magnetic_field_gauss must .*got \[0\.0, 0\.0, 0\.0\]",
+        ),
         ({"height_sd": 0.0}, r"believed\.height_sd"),
-        ({"magnetic_sd": [0.1]}, r"believed\.magnetic_sd=\[0\.1\]: give three"),
+        ({"magnetic_sd": [0.1]}, r"believed\.magnetic_sd must be three numbers, got \[0\.1\]"),
         ({"magnetic_bias_walk": -1.0}, r"believed\.magnetic_bias_walk"),
     ):
         with pytest.raises(ValueError, match=words):
@@ -145,5 +180,10 @@ def test_a_truth_without_biases_leaves_them_unknown() -> None:
     state = MODEL.assemble({"position": torch.ones(2, 3, 3).double()})
     assert state.shape == (2, 3, 20)
     assert torch.isnan(state[..., 10:]).all()
-    known = MODEL.assemble({"height_bias": torch.full((2, 3, 1), 7.0).double(), "position": torch.ones(2, 3, 3).double()})
+    known = MODEL.assemble(
+        {
+            "height_bias": torch.full((2, 3, 1), 7.0).double(),
+            "position": torch.ones(2, 3, 3).double(),
+        }
+    )
     assert (known[..., 16] == 7.0).all()

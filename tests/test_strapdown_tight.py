@@ -9,16 +9,22 @@ import pytest
 import torch
 from torch import Tensor
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter.gaussian import GaussianFilter
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
-from pfbench.filter.rules import Jacobian
-from pfbench.model.strapdown_tight import BelievedTight, Scatter, Sighted, StrapdownTight
-from pfbench.model.strapdown_total import Believed, StrapdownTotal, preintegrate
-from pfbench.nav.ranging import Clock
-from pfbench.record import Record
+from pfbench.model.strapdown_tight import (
+    RangeErrorModel,
+    StrapdownTight,
+    TightMemsInputs,
+    TightTuning,
+)
+from pfbench.model.strapdown_total import StrapdownTotal, StrapdownTuning
+from pfbench.nav.gnss.receiver_clock import ReceiverClock
+from pfbench.nav.preintegration import preintegrate
 
-MOTION = Believed(
+MOTION = StrapdownTuning(
     gyro_density=2e-3,
     accelerometer_density=2e-2,
     gyro_bias_walk=1e-4,
@@ -31,8 +37,15 @@ MOTION = Believed(
     gyro_bias_sd_deg_s=0.1,
     accelerometer_bias_sd=0.2,
 )
-CLOCK = Clock(bias_sd=4.0, drift_sd=0.5, bias_walk=0.3, drift_walk=0.2)
-BELIEVED = BelievedTight(MOTION, CLOCK, Scatter(1.0, 2.0), Scatter(0.05, 1.5, 0.1), inter_system_sd=2.0, inter_system_walk=0.04)
+CLOCK = ReceiverClock(bias_sd=4.0, drift_sd=0.5, bias_walk=0.3, drift_walk=0.2)
+BELIEVED = TightTuning(
+    MOTION,
+    CLOCK,
+    RangeErrorModel(1.0, 2.0),
+    RangeErrorModel(0.05, 1.5, 0.1),
+    inter_system_sd=2.0,
+    inter_system_walk=0.04,
+)
 S = 6
 
 
@@ -50,7 +63,7 @@ def sky(steps: int) -> tuple[Tensor, Tensor]:
     return 2.2e7 * line + velocity * after, velocity.expand(1, steps, S, 3)
 
 
-def inputs(steps: int, duration: float = 0.25) -> Sighted:
+def inputs(steps: int, duration: float = 0.25) -> TightMemsInputs:
     spans = torch.full((1, steps, 10), duration / 10, dtype=torch.float64)
     force = torch.tensor([0.0, 0.0, 9.8], dtype=torch.float64) + normal(3, 1, steps, 10, 3)
     bias = torch.zeros(1, steps, 6, dtype=torch.float64)
@@ -60,17 +73,34 @@ def inputs(steps: int, duration: float = 0.25) -> Sighted:
     other = torch.tensor([0.0, 1.0] * (S // 2), dtype=torch.float64).expand(1, steps, S)
     stated = 0.2 + normal(5, 1, steps, S).abs()
     gravity = torch.full((1, steps), 9.8, dtype=torch.float64)
-    return Sighted(*imu, gravity, spans.sum(-1), place / reach[..., None], reach, velocity, other, stated, 0.1 * stated)
+    return TightMemsInputs(
+        *imu,
+        gravity,
+        spans.sum(-1),
+        place / reach[..., None],
+        reach,
+        velocity,
+        other,
+        stated,
+        0.1 * stated,
+    )
 
 
 def states(model: StrapdownTight, runs: int = 2, particles: int = 5) -> Tensor:
     """Spread states with the receiver some hundred metres from where the ranges refer to."""
-    d = torch.cat([normal(6, runs, particles, 6), 200.0 * normal(7, runs, particles, 3), 0.1 * normal(8, runs, particles, 9)], -1)
+    d = torch.cat(
+        [
+            normal(6, runs, particles, 6),
+            200.0 * normal(7, runs, particles, 3),
+            0.1 * normal(8, runs, particles, 9),
+        ],
+        -1,
+    )
     return model.chart.add(model.origin.expand(runs, particles, -1), d)
 
 
-def step(u: Sighted, t: int = 0) -> Sighted:
-    return Sighted(*(leaf[:, t] for leaf in u))
+def step(u: TightMemsInputs, t: int = 0) -> TightMemsInputs:
+    return TightMemsInputs(*(leaf[:, t] for leaf in u))
 
 
 # what is seen
@@ -80,7 +110,13 @@ def test_ranges_and_rates_are_plain_geometry() -> None:
     model, u = StrapdownTight(BELIEVED), inputs(3)
     x = states(model)
     place, velocity = (part[:, 2:3] for part in sky(3))
-    v, p, bias, drift, other = x[..., 4:7], x[..., 7:10], x[..., 16:17], x[..., 17:18], x[..., 18:19]
+    v, p, bias, drift, other = (
+        x[..., 4:7],
+        x[..., 7:10],
+        x[..., 16:17],
+        x[..., 17:18],
+        x[..., 18:19],
+    )
     sight = place - p.unsqueeze(-2)
     r = sight.norm(dim=-1)
     e = sight / r[..., None]
@@ -99,7 +135,9 @@ def test_single_precision_is_enough() -> None:
     model, u = StrapdownTight(BELIEVED), step(inputs(1))
     x = states(model)
     exact = model.observation(x, u).mean
-    single = model.float().observation(x.float(), Sighted(*(leaf.float() for leaf in u))).mean
+    single = (
+        model.float().observation(x.float(), TightMemsInputs(*(leaf.float() for leaf in u))).mean
+    )
     assert single.dtype == torch.float32
     # 500 m and 2 km/s in 24 bits, some roundings each
     assert (single - exact).abs()[..., :S].max() < 1e-3
@@ -119,7 +157,9 @@ def test_derivatives_of_what_is_seen_agree_with_differences() -> None:
         d[i] = h
         # rounding of 1e-9 m over 2 h
         assert ((seen(d) - seen(-d)) / (2 * h) - columns[..., 0, 0, i]).abs().max() < 1e-5
-    assert torch.allclose(columns[0, 0, :S, 0, 0, 6:9], -u.line[0], atol=5e-5)  # 500 m from the place of the lines
+    assert torch.allclose(
+        columns[0, 0, :S, 0, 0, 6:9], -u.line[0], atol=5e-5
+    )  # 500 m from the place of the lines
 
 
 def test_scatter_is_floor_and_statement_and_addition() -> None:
@@ -169,17 +209,28 @@ def test_clock_noise_is_that_of_a_walking_bias_and_drift(duration: float) -> Non
 
     q_b, q_d = 0.3**2, 0.2**2
     cross = q_d * duration**2 / 2
-    wanted = [[q_b * duration + q_d * duration**3 / 3, cross, 0], [cross, q_d * duration, 0], [0, 0, 0.04**2 * duration]]
-    assert torch.allclose(covariance(duration), torch.tensor(wanted, dtype=torch.float64), rtol=1e-9)
+    wanted = [
+        [q_b * duration + q_d * duration**3 / 3, cross, 0],
+        [cross, q_d * duration, 0],
+        [0, 0, 0.04**2 * duration],
+    ]
+    assert torch.allclose(
+        covariance(duration), torch.tensor(wanted, dtype=torch.float64), rtol=1e-9
+    )
     half = covariance(duration / 2)
     f = torch.tensor([[1, duration / 2, 0], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
-    assert torch.allclose(f @ half @ f.T + half, covariance(duration), rtol=1e-9)  # two steps make one
+    assert torch.allclose(
+        f @ half @ f.T + half, covariance(duration), rtol=1e-9
+    )  # two steps make one
 
 
 def test_the_filter_knows_its_errors_where_the_model_is_true() -> None:
     runs, steps = 40, 24
     model, u = StrapdownTight(BELIEVED), inputs(steps)
-    x = model.chart.add(model.origin.expand(runs, 1, -1), model.initial(runs).base_dist.scale[:, None] * normal(11, runs, 1, 18))
+    x = model.chart.add(
+        model.origin.expand(runs, 1, -1),
+        model.initial(runs).base_dist.scale[:, None] * normal(11, runs, 1, 18),
+    )
     truth, seen = [], []
     for t in range(steps):
         x = model.propagate(x, step(u, t), normal(100 + t, runs, 1, 15))
@@ -187,7 +238,9 @@ def test_the_filter_knows_its_errors_where_the_model_is_true() -> None:
         truth.append(x[:, 0])
         seen.append((law.loc + law.scale * normal(200 + t, runs, 1, 2 * S))[:, 0])
     record = Record(torch.stack(seen, 1), u)
-    estimate = run_filter(GaussianFilter(Jacobian()), model, record, MonteCarlo(1, torch.arange(runs)))
+    estimate = run_filter(
+        GaussianFilter(TaylorLinearisation()), model, record, PhiloxStream(1, torch.arange(runs))
+    )
     error = model.error(estimate.mean, torch.stack(truth, 1))[:, -1]
     assert not estimate.lost.any()
     nees = (error.square() / estimate.variance[:, -1]).mean()
@@ -211,7 +264,10 @@ def test_truth_is_laid_out_and_clocks_without_truth_are_nan() -> None:
 
 def test_records_of_another_kind_are_refused() -> None:
     model, u = StrapdownTight(BELIEVED), inputs(2)
-    with pytest.raises(ValueError, match=r"record\.u is Increments: StrapdownTight needs Sighted"):
+    with pytest.raises(
+        ValueError,
+        match=r"record\.u must be TightMemsInputs for StrapdownTight, got PreintegratedImu",
+    ):
         model.prepare(Record(torch.zeros(1, 2, 12), u.increments))
     assert model.prepare(Record(torch.zeros(1, 2, 12), u)).u is u
 
@@ -219,12 +275,21 @@ def test_records_of_another_kind_are_refused() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Scatter(0.0), r"believed\.floor"),
-        (lambda: Scatter(1.0, -1.0), r"believed\.factor=-1\.0"),
-        (lambda: Scatter(1.0, 1.0, -1.0), r"believed\.added=-1\.0"),
-        (lambda: StrapdownTight(replace(BELIEVED, inter_system_sd=0.0)), r"believed\.inter_system_sd"),
-        (lambda: StrapdownTight(replace(BELIEVED, inter_system_walk=-1.0)), r"believed\.inter_system_walk"),
-        (lambda: StrapdownTight(replace(BELIEVED, motion=replace(MOTION, gyro_density=0.0))), r"believed\.gyro_density"),
+        (lambda: RangeErrorModel(0.0), r"believed\.floor"),
+        (lambda: RangeErrorModel(1.0, -1.0), r"believed\.factor .*got -1\.0 and 0\.0"),
+        (lambda: RangeErrorModel(1.0, 1.0, -1.0), r"believed\.added .*got 1\.0 and -1\.0"),
+        (
+            lambda: StrapdownTight(replace(BELIEVED, inter_system_sd=0.0)),
+            r"believed\.inter_system_sd",
+        ),
+        (
+            lambda: StrapdownTight(replace(BELIEVED, inter_system_walk=-1.0)),
+            r"believed\.inter_system_walk",
+        ),
+        (
+            lambda: StrapdownTight(replace(BELIEVED, motion=replace(MOTION, gyro_density=0.0))),
+            r"believed\.gyro_density",
+        ),
     ],
 )
 def test_impossible_beliefs_name_their_key(make: object, message: str) -> None:

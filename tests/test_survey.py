@@ -11,15 +11,15 @@ import pytest
 import torch
 from command_line import block, pfbench
 
-from pfbench import survey
-from pfbench.model.linear import LinearGaussian, linear_walk
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Episode, Record
+from pfbench.core.record import Episode, Record
+from pfbench.job import datasheet_data
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.noise.white import NominalNoise
 from pfbench.report import datasheet
-from pfbench.scenario.model_world import ModelWorld
+from pfbench.scenario.model_simulation import ModelSimulation
 
 WALK = ("scenario=linear_walk", "scenario.steps=12")
-PAGE = Path(__file__).parents[1] / "docs" / "own_scene.md"
+PAGE = Path(__file__).parents[1] / "docs" / "write_a_scenario.md"
 
 
 def doubles(values: Any) -> torch.Tensor:
@@ -31,9 +31,9 @@ def doubles(values: Any) -> torch.Tensor:
 
 def test_residuals_at_the_truth_are_the_errors_that_were_drawn() -> None:
     model = linear_walk(1.0, 0.5, 2.0)
-    episode = ModelWorld(model, steps=30).draw(Nominal(), torch.arange(40), seed=3)
+    episode = ModelSimulation(model, steps=30).draw(NominalNoise(), torch.arange(40), seed=3)
     truth = model.assemble(episode.truth)
-    z = survey.residuals(model, truth, episode)
+    z = datasheet_data.compute_residuals(model, truth, episode)
     assert torch.allclose(z[..., 0], (episode.record.y[..., 0] - truth[..., 0]) / 2.0)
     assert abs(float(z.var()) - 1.0) < 4 * (2 / z.numel()) ** 0.5
 
@@ -45,7 +45,7 @@ def test_a_residual_that_hangs_on_an_unknown_state_is_unknown_and_no_other() -> 
     model = LinearGaussian(eye, eye, h, [2.0, 1.0, 1.0], np.zeros(3), np.ones(3))
     truth = doubles([[[4.0, np.nan, np.nan]], [[1.0, 2.0, 3.0]]])
     y = doubles([[[6.0, 0.0, 0.0]], [[np.nan, 0.0, 5.0]]])
-    z = survey.residuals(model, truth, Episode(Record(y), doubles([1.0]), {}))[:, 0]
+    z = datasheet_data.compute_residuals(model, truth, Episode(Record(y), doubles([1.0]), {}))[:, 0]
     nan = np.nan
     np.testing.assert_allclose(z.numpy(), [[1.0, nan, nan], [nan, 1.0, -1.0]])
 
@@ -54,16 +54,19 @@ def test_deviations_are_about_the_mean_of_the_runs_that_have_a_truth() -> None:
     model = linear_walk(1.0, 0.5, 2.0)
     truth = doubles([[[1.0, 5.0]], [[3.0, np.nan]], [[8.0, 7.0]]])
     np.testing.assert_allclose(
-        survey.deviations(model, truth)[:, 0].numpy(), [[-3.0, -1.0], [-1.0, np.nan], [4.0, 1.0]]
+        datasheet_data.compute_deviations(model, truth)[:, 0].numpy(),
+        [[-3.0, -1.0], [-1.0, np.nan], [4.0, 1.0]],
     )
 
 
 # the command
 
 
-def test_a_scene_becomes_a_file_and_a_page_and_is_not_drawn_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_becomes_a_file_and_a_page_and_is_not_drawn_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    said = pfbench("report", *WALK, "runs=6", home=tmp_path)
+    said = pfbench("datasheet", *WALK, "runs=6", home=tmp_path)
     assert said.code == 0, said.err
     page = tmp_path / "reports" / "datasheets" / "linear_walk_nominal" / "index.html"
     assert f"datasheet: {page.resolve()}" in said.out
@@ -73,55 +76,85 @@ def test_a_scene_becomes_a_file_and_a_page_and_is_not_drawn_twice(tmp_path: Path
     assert "Posterior Cramer-Rao bound" in text
     (file,) = (tmp_path / "results" / "datasheets").glob("*.npz")
     stamp, drawn = file.stat().st_mtime_ns, page.stat().st_mtime_ns
-    assert pfbench("report", *WALK, "runs=6", "filter=ekf", "particles=7", home=tmp_path).code == 0  # nothing of the scene
+    assert (
+        pfbench("datasheet", *WALK, "runs=6", "filter=ekf", "particles=7", home=tmp_path).code == 0
+    )  # nothing of the scene
     assert file.stat().st_mtime_ns == stamp
     assert page.stat().st_mtime_ns > drawn
-    assert pfbench("report", *WALK, "runs=6", "fresh=true", home=tmp_path).code == 0
+    assert pfbench("datasheet", *WALK, "runs=6", "overwrite=true", home=tmp_path).code == 0
     assert file.stat().st_mtime_ns > stamp
-    assert pfbench("report", *WALK, "noise=student", home=tmp_path).code == 0  # as many runs as it takes by itself
+    assert (
+        pfbench("datasheet", *WALK, "noise=student", home=tmp_path).code == 0
+    )  # as many runs as it takes by itself
     other = (tmp_path / "reports" / "datasheets" / "linear_walk_student" / "index.html").read_text()
-    assert f"{survey.RUNS} runs" in other
-    assert "No bound: its measurement law is" in other
+    assert f"{datasheet_data.RUNS} runs" in other
+    assert "No bound: measurement distribution must be normal" in other
+    assert f"{datasheet_data.RUNS} runs" in other
 
 
 def test_a_page_needs_only_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert pfbench("report", *WALK, "runs=3", home=tmp_path).code == 0
+    assert pfbench("datasheet", *WALK, "runs=3", home=tmp_path).code == 0
     (file,) = (tmp_path / "results" / "datasheets").glob("*.npz")
-    elsewhere = datasheet.write(file, tmp_path / "elsewhere")
-    assert elsewhere.read_bytes() == (tmp_path / "reports" / "datasheets" / "linear_walk_nominal" / "index.html").read_bytes()
+    elsewhere = datasheet.write_datasheet(file, tmp_path / "elsewhere")
+    assert (
+        elsewhere.read_bytes()
+        == (tmp_path / "reports" / "datasheets" / "linear_walk_nominal" / "index.html").read_bytes()
+    )
 
 
 MISTAKES = {
-    "unknown scenario": (("scenario=t0003",), "scenario=t0003: there is no such scenario; did you mean t003"),
-    "no data": (("scenario=berlin",), "data.root"),
-    "no runs": ((*WALK, "runs=0"), "runs=0: give a whole number, 1 or more"),
-    "unknown key": ((*WALK, "scenario.stps=3"), "did you mean scenario.steps?"),
-    "bound": ((*WALK, "bound=maybe"), "bound=maybe: give auto"),
-    "the folder of datasheets": (("study=datasheets",), "give scenario=NAME to see one"),
+    "unknown scenario": (
+        ("scenario=flight_30s",),
+        "scenario=flight_30s does not exist. Similar: flight_300s",
+    ),
+    "no data": (("scenario=recorded_berlin",), "data.root"),
+    "no runs": ((*WALK, "runs=0"), "runs must be a whole number of at least 1, got 0"),
+    "unknown key": ((*WALK, "scenario.stps=3"), "Similar: scenario.steps."),
+    "bound": ((*WALK, "pcrb=maybe"), "pcrb must be auto"),
+    "no scenario": (
+        ("noise=student",),
+        "scenario must be set. Use: pfbench datasheet scenario=NAME",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", MISTAKES)
 def test_mistakes_are_told_as_elsewhere(tmp_path: Path, case: str) -> None:
     words, message = MISTAKES[case]
-    said = pfbench("report", *words, home=tmp_path)
+    said = pfbench("datasheet", *words, home=tmp_path)
     assert said.code == 1
     assert message in said.err
     assert not list(tmp_path.rglob("*.npz"))
 
 
+OLD_COMMANDS = {
+    ("report", "scenario=flight_300s"): "pfbench datasheet scenario=flight_300s",
+    ("report", "study=datasheets"): "pfbench datasheet scenario=NAME",
+    ("report", "study=claims"): "pfbench claims",
+}
+
+
+@pytest.mark.parametrize("words", OLD_COMMANDS)
+def test_an_old_command_names_the_new_one(tmp_path: Path, words: tuple[str, ...]) -> None:
+    said = pfbench(*words, home=tmp_path)
+    assert said.code == 1
+    assert f"se: {OLD_COMMANDS[words]}" in said.err
+
+
 def test_a_study_with_a_scenario_is_still_a_study(tmp_path: Path) -> None:
     said = pfbench("report", "study=none", *WALK, home=tmp_path)
     assert said.code == 1
-    assert "no results in" in said.err
+    assert "No results in" in said.err
 
 
 @pytest.mark.slow
-def test_the_page_on_an_own_scene_runs_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_write_a_scenario_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    for language, code in re.findall(r"^```(python|bash)\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE):
+    for language, code in re.findall(
+        r"^```(python|bash)\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE
+    ):
         if language == "python":
             exec(compile(code, PAGE.name, "exec"), names)
         else:

@@ -18,37 +18,72 @@ from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench import cli, job
-from pfbench.draws import Draws, MonteCarlo
-from pfbench.filter.belief import Cloud
-from pfbench.filter.chaos import Chaotic, Interval, Perturbation, Prior, logistic, seeds, settled, uniform
-from pfbench.filter.coordinates import Everything, Frame, Likelihood, Observed, Posterior, observed
-from pfbench.filter.flock import Flock, Gaussian, Inertia
-from pfbench.filter.loop import Estimate, run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.resamplers import Resample, Systematic
-from pfbench.filter.swarm import ChiSquare, Limits, Swarm
-from pfbench.filter.swarm_weights import Equal, Mixture, Printed
+from pfbench import job
+from pfbench.core.random_stream import PhiloxStream, RandomStream
+from pfbench.core.record import Episode, Record, map_inputs
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.swarm.chaotic_sequences import (
+    ChaoticPerturbation,
+    ChaoticPoints,
+    IntervalStart,
+    PriorStart,
+    arcsine_cdf,
+    iterate_logistic,
+    logistic_map,
+    safe_seeds,
+)
+from pfbench.filter.swarm.swarm_coordinates import (
+    AllComponents,
+    LikelihoodFitness,
+    ObservedComponents,
+    PosteriorFitness,
+    SwarmFrame,
+    observed_components,
+)
+from pfbench.filter.swarm.swarm_limits import ChiSquareStopping, SwarmLimits
+from pfbench.filter.swarm.swarm_proposal import SwarmProposal
+from pfbench.filter.swarm.swarm_weighting import (
+    MixtureWeighting,
+    PrintedWeighting,
+    UnchangedWeighting,
+)
+from pfbench.filter.swarm.velocity_update import GaussianVelocity, InertiaVelocity, SwarmState
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear import LinearGaussian, linear_walk
-from pfbench.model.toys import Benes, Growth, Lorenz63, Pendulum, StochasticVolatility
-from pfbench.noise.regimes import Nominal
-from pfbench.record import Episode, Record, map_inputs
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.noise.white import NominalNoise
 
-ALWAYS = Resample(Systematic(), 1.0)
-ESCAPE = Inertia(escape=0.12)
-PRINTED = Swarm(ESCAPE, Perturbation(), Likelihood(), Everything(), Limits(True, 0.5, None), None, 30, Interval(), Printed())
-CORRECTED = Swarm()
-PSO = dataclasses.replace(PRINTED, velocity=Gaussian(), perturbation=None, start=Prior())
+ALWAYS = EssResampler(Systematic(), 1.0)
+ESCAPE = InertiaVelocity(escape_coefficient=0.12)
+PRINTED = SwarmProposal(
+    ESCAPE,
+    ChaoticPerturbation(),
+    LikelihoodFitness(),
+    AllComponents(),
+    SwarmLimits(True, 0.5, None),
+    None,
+    30,
+    IntervalStart(),
+    PrintedWeighting(),
+)
+CORRECTED = SwarmProposal()
+PSO = dataclasses.replace(
+    PRINTED, velocity=GaussianVelocity(), perturbation=None, swarm_start=PriorStart()
+)
 
 
-def draws(runs: int, seed: int = 1, step: int = 1) -> MonteCarlo:
-    return MonteCarlo(seed, torch.arange(runs), step=step)
+def draws(runs: int, seed: int = 1, step: int = 1) -> PhiloxStream:
+    return PhiloxStream(seed, torch.arange(runs), step=step)
 
 
-def cloud_of(x: Tensor, **parts: Any) -> Cloud:
+def cloud_of(x: Tensor, **parts: Any) -> ParticleBelief:
     flat = torch.full(x.shape[:2], -math.log(x.shape[1]), dtype=x.dtype)
-    return Cloud(x, parts.pop("log_w", flat), torch.zeros(len(x), dtype=torch.float64), **parts)
+    return ParticleBelief(
+        x, parts.pop("log_w", flat), torch.zeros(len(x), dtype=torch.float64), **parts
+    )
 
 
 def chain() -> LinearGaussian:
@@ -63,25 +98,33 @@ def chain() -> LinearGaussian:
 def measured(model: LinearGaussian, runs: int, steps: int) -> Tensor:
     """Worlds of the model's own: y [R, T, Dy]."""
     source = draws(runs, seed=11)
-    x = model.m0 + source.at(0).normal("world.initial", 1, model.f.shape[0]) @ model.l0.mT
+    x = model.m0 + source.at_step(0).normal("world.initial", 1, model.f.shape[0]) @ model.l0.mT
     rows = []
     for t in range(1, steps + 1):
-        x = model.propagate(x, (), source.at(t).normal("world.noise", 1, model.noise_dim))
-        rows.append(x @ model.h.mT + model.r * source.at(t).normal("world.seen", 1, len(model.r)))
+        x = model.propagate(x, (), source.at_step(t).normal("world.noise", 1, model.noise_dim))
+        rows.append(
+            x @ model.h.mT + model.r * source.at_step(t).normal("world.seen", 1, len(model.r))
+        )
     return torch.cat(rows, 1)
 
 
 def kalman(model: LinearGaussian, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Means [R, T, D], variances [T, D] and log evidence [R]."""
     f, g, h, r, m0, root = (getattr(model, k).numpy() for k in ("f", "g", "h", "r", "m0", "l0"))
-    exact = [oracles.kalman(f, g @ g.T, h, np.diag(r**2), m0, root @ root.T, one.numpy()) for one in y]
+    exact = [
+        oracles.kalman(f, g @ g.T, h, np.diag(r**2), m0, root @ root.T, one.numpy()) for one in y
+    ]
     mean = torch.tensor(np.array([k.mean for k in exact]))
     variance = torch.tensor(np.diagonal(exact[0].covariance, axis1=1, axis2=2).copy())
     return mean, variance, torch.tensor(np.array([k.log_evidence.sum() for k in exact]))
 
 
-def run(proposal: Swarm, model: StateSpaceModel, y: Tensor, n: int, seed: int = 5, **parts: Any) -> Estimate:
-    return run_filter(ParticleFilter(n, ALWAYS, proposal=proposal, **parts), model, Record(y), draws(len(y), seed))
+def run(
+    proposal: SwarmProposal, model: StateSpaceModel, y: Tensor, n: int, seed: int = 5, **parts: Any
+) -> FilterResult:
+    return run_filter(
+        ParticleFilter(n, ALWAYS, proposal=proposal, **parts), model, Record(y), draws(len(y), seed)
+    )
 
 
 # chaos
@@ -96,10 +139,14 @@ def test_seeds_that_die_are_not_drawn() -> None:
         return z
 
     assert [ends(z, 3) for z in (0.0, 0.25, 0.5, 0.75, 1.0)] == [0.0, 0.75, 0.0, 0.75, 0.0]
-    for z, limit in ((0.5 - math.sqrt(0.125), 0.0), (0.5 + math.sqrt(0.125), 0.0), (0.5 - math.sqrt(0.1875), 0.75)):
+    for z, limit in (
+        (0.5 - math.sqrt(0.125), 0.0),
+        (0.5 + math.sqrt(0.125), 0.0),
+        (0.5 - math.sqrt(0.1875), 0.75),
+    ):
         assert ends(z, 4) == pytest.approx(limit, abs=1e-6)
     u = torch.linspace(0.0, 1.0, 100_001, dtype=torch.float64)
-    z = seeds(u)
+    z = safe_seeds(u)
     dead = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0], dtype=torch.float64)
     assert (z[:, None] - dead).abs().min() >= 1e-3 - 1e-12
     inside = z[(z > 0.001) & (z < 0.249)]  # uniform on what is left
@@ -108,25 +155,29 @@ def test_seeds_that_die_are_not_drawn() -> None:
 
 def test_the_map_keeps_the_arcsine_law_and_its_sequences_are_independent() -> None:
     """Mean 1/2 and variance 1/8; the error of a time average over L steps of M sequences is about 0.35 / sqrt(L M)."""
-    spare = seeds(draws(1).uniform("spare", 2000, 2))
-    z, values = settled(draws(1).uniform("chaos", 2000, 2)), []
+    spare = safe_seeds(draws(1).uniform("spare", 2000, 2))
+    z, values = iterate_logistic(draws(1).uniform("chaos", 2000, 2)), []
     for _ in range(50):
-        z = logistic(z, spare)
+        z = logistic_map(z, spare)
         values.append(z)
     all_ = torch.stack(values)
     assert all_.dtype == torch.float64
     assert all_.mean().item() == pytest.approx(0.5, abs=0.005)
     assert all_.var().item() == pytest.approx(0.125, abs=0.002)
-    assert stats.kstest(uniform(z).flatten().numpy(), stats.uniform.cdf).pvalue > 1e-3
+    assert stats.kstest(arcsine_cdf(z).flatten().numpy(), stats.uniform.cdf).pvalue > 1e-3
     assert abs(np.corrcoef(z[0, :, 0].numpy(), z[0, :, 1].numpy())[0, 1]) < 4.5 / math.sqrt(2000)
     assert torch.equal(values[1], 4 * values[0] * (1 - values[0]))  # chaos, not a new draw
 
 
 def test_a_sequence_at_a_fixed_point_goes_on_from_its_spare_seed() -> None:
     spare = torch.tensor([0.3, 0.4, 0.6, 0.7], dtype=torch.float64)
-    z = logistic(torch.tensor([0.5, 0.75, 1e-14, 0.3], dtype=torch.float64), spare)
-    assert torch.allclose(z, torch.tensor([0.3, 0.4, 0.6, 0.84], dtype=torch.float64), rtol=0, atol=1e-15)
-    extremes = uniform(logistic(torch.tensor([0.5, 0.5 + 1e-9, 1e-13], dtype=torch.float64), spare[:3]))
+    z = logistic_map(torch.tensor([0.5, 0.75, 1e-14, 0.3], dtype=torch.float64), spare)
+    assert torch.allclose(
+        z, torch.tensor([0.3, 0.4, 0.6, 0.84], dtype=torch.float64), rtol=0, atol=1e-15
+    )
+    extremes = arcsine_cdf(
+        logistic_map(torch.tensor([0.5, 0.5 + 1e-9, 1e-13], dtype=torch.float64), spare[:3])
+    )
     assert torch.isfinite(torch.special.ndtri(extremes)).all()
 
 
@@ -136,7 +187,7 @@ def test_chaotic_points_have_the_initial_law(dimension: int) -> None:
     sd = [[2.0]] if dimension == 1 else [[2.0, 0.0], [-1.0, 0.5]]
     eye = torch.eye(dimension)
     model = LinearGaussian(eye, eye, eye, [1.0] * dimension, [3.0, -1.0][:dimension], sd)
-    x = ParticleFilter(4000, points=Chaotic()).init(model, 2, draws(2)).x
+    x = ParticleFilter(4000, points=ChaoticPoints()).init(model, 2, draws(2)).x
     z = torch.linalg.solve_triangular(model.l0, (x - model.m0).mT, upper=False)
     for component in z.unbind(1):
         assert stats.kstest(component.flatten().numpy(), stats.norm.cdf).pvalue > 1e-3
@@ -147,15 +198,17 @@ def test_chaotic_points_have_the_initial_law(dimension: int) -> None:
 
 def test_the_printed_start_is_not_the_initial_law() -> None:
     """Of 100 normal draws the range is 5.0 sigma, the arcsine law's standard deviation range / sqrt 8: 1.77 sigma."""
-    model = LinearGaussian(torch.eye(2), torch.eye(2), torch.eye(2), [1.0, 1.0], [5.0, 0.0], [2.0, 0.1])
+    model = LinearGaussian(
+        torch.eye(2), torch.eye(2), torch.eye(2), [1.0, 1.0], [5.0, 0.0], [2.0, 0.1]
+    )
     cloud = ParticleFilter(100).init(model, 300, draws(300))
-    x = Interval()(model, cloud, settled(draws(300).uniform("chaos", 100, 2)))
+    x = IntervalStart()(model, cloud, iterate_logistic(draws(300).uniform("chaos", 100, 2)))
     ratio = ((x - model.m0).square().mean((0, 1)).sqrt() / torch.tensor([2.0, 0.1])).numpy()
     assert ratio == pytest.approx([1.76, 1.76], abs=0.1)
     assert (x >= cloud.x.amin(1, keepdim=True) - 1e-12).all()
     assert (x <= cloud.x.amax(1, keepdim=True) + 1e-12).all()
-    assert not Interval().exact
-    assert not PRINTED.exact
+    assert not IntervalStart().is_exact
+    assert not PRINTED.is_exact
 
 
 def test_slots_keep_sequences_of_their_own_when_particles_are_copied() -> None:
@@ -165,7 +218,7 @@ def test_slots_keep_sequences_of_their_own_when_particles_are_copied() -> None:
     source, belief = draws(2), ParticleFilter(40).init(chain(), 2, draws(2, step=0))
     before = None
     for t in range(6):
-        belief, _ = method.step(chain(), belief, Record(y).at(t), source.at(t + 1))
+        belief, _ = method.step(chain(), belief, Record(y).at_step(t), source.at_step(t + 1))
         chaos = belief.memory["swarm.chaos"][:, 0, :, :2]
         assert chaos.shape == (2, 40, 2)
         assert len(chaos.flatten().unique()) == chaos.numel()
@@ -180,16 +233,18 @@ def test_slots_keep_sequences_of_their_own_when_particles_are_copied() -> None:
 
 
 def test_the_escape_factor_rises_from_0_to_twice_its_amplitude() -> None:
-    values = [ESCAPE.escape_factor(i / 150) for i in range(151)]
+    values = [ESCAPE.compute_escape_factor(i / 150) for i in range(151)]
     assert values[0] == 0.0
     assert values[75] == pytest.approx(0.12)
     assert values[-1] == pytest.approx(0.24)
     assert (np.diff(values) > 0).all()
 
 
-def still(flock_q: Tensor, **parts: Tensor) -> Flock:
+def still(flock_q: Tensor, **parts: Tensor) -> SwarmState:
     zero = torch.zeros(flock_q.shape[:2], dtype=flock_q.dtype)
-    base = Flock(flock_q, torch.zeros_like(flock_q), zero, flock_q, zero, flock_q, zero, flock_q)
+    base = SwarmState(
+        flock_q, torch.zeros_like(flock_q), zero, flock_q, zero, flock_q, zero, flock_q
+    )
     return base._replace(**parts)
 
 
@@ -202,18 +257,20 @@ def test_velocities_have_the_mean_and_variance_of_their_formulas() -> None:
     best, worst = x + torch.tensor([1.0, -2.0]), x + torch.tensor([3.0, 0.5])
     best[0, 7], here = torch.tensor([4.0, 5.0]), x.clone()
     here[0, 3] = torch.tensor([-6.0, 2.0])
-    flock = still(here, v=torch.ones_like(x), fitness=fitness, best=best, best_fitness=fitness, worst=worst)
+    flock = still(
+        here, v=torch.ones_like(x), fitness=fitness, best=best, best_fitness=fitness, worst=worst
+    )
     live = torch.ones(1, n, dtype=torch.bool)
     others = torch.arange(n) > 7
     pulls = torch.stack([best[0, 9], best[0, 7], worst[0, 9], here[0, 3]])
 
-    v = Inertia(0.8, 1.1, 1.3, 0.12)(flock, live, 0.7, draws(1), "v")[0, others]
+    v = InertiaVelocity(0.8, 1.1, 1.3, 0.12)(flock, live, 0.7, draws(1), "v")[0, others]
     c = torch.tensor([1.1, 1.3, *[-0.12 * (1 - math.cos(0.7 * math.pi))] * 2], dtype=torch.float64)
     expected, spread = 0.8 + 0.5 * c @ pulls, (c.square() @ pulls.square() / 12).sqrt()
     assert ((v.mean(0) - expected).abs() < 4.5 * spread / math.sqrt(n)).all()
     assert v.std(0).numpy() == pytest.approx(spread.numpy(), rel=0.03)
 
-    v = Gaussian()(flock, live, 0.7, draws(1), "v")[0, others]
+    v = GaussianVelocity()(flock, live, 0.7, draws(1), "v")[0, others]
     expected = math.sqrt(2 / math.pi) * pulls[:2].sum(0)
     spread = ((1 - 2 / math.pi) * pulls[:2].square().sum(0)).sqrt()
     assert ((v.mean(0) - expected).abs() < 4.5 * spread / math.sqrt(n)).all()
@@ -224,25 +281,43 @@ class Spy:
     """Looks at each iteration's swarm before it flies on."""
 
     def __init__(self, inner: Any) -> None:
-        self.inner, self.flocks = inner, list[Flock]()
+        self.inner, self.flocks = inner, list[SwarmState]()
 
-    def __call__(self, flock: Flock, live: Tensor, phase: float, source: Draws, purpose: str) -> Tensor:
+    def __call__(
+        self, flock: SwarmState, live: Tensor, phase: float, source: RandomStream, purpose: str
+    ) -> Tensor:
         self.flocks.append(flock)
         v: Tensor = self.inner(flock, live, phase, source, purpose)
         return v
 
 
-@pytest.mark.parametrize("velocity", [ESCAPE, Gaussian()], ids=["escape", "gaussian"])
-@pytest.mark.parametrize("coordinates", [Everything(), Observed(), Observed(white=True)], ids=["all", "observed", "white"])
+@pytest.mark.parametrize("velocity", [ESCAPE, GaussianVelocity()], ids=["escape", "gaussian"])
+@pytest.mark.parametrize(
+    "coordinates",
+    [AllComponents(), ObservedComponents(), ObservedComponents(whiten=True)],
+    ids=["all", "observed", "white"],
+)
 def test_limits_hold_and_the_best_only_improves(velocity: Any, coordinates: Any) -> None:
     model, spy = chain(), Spy(velocity)
-    x = torch.randn(3, 60, 4, dtype=torch.float64, generator=torch.manual_seed(3)) * torch.tensor([2.0, 1.0, 1.0, 0.5])
+    x = torch.randn(3, 60, 4, dtype=torch.float64, generator=torch.manual_seed(3)) * torch.tensor(
+        [2.0, 1.0, 1.0, 0.5]
+    )
     w = torch.full((3, 60), 1 / 60, dtype=torch.float64)
     frame = coordinates(model, x, w, ())
-    swarm = Swarm(spy, Perturbation(0.1), Likelihood(), coordinates, Limits(False, 0.05, 2.5), None, 12)
-    seen = Record(torch.full((3, 2), 9.0, dtype=torch.float64))  # far away: they would like to leave the box
-    memory = {"swarm.chaos": settled(draws(3).uniform("chaos", 60, 4)).unsqueeze(1)}
-    final, flown = swarm.fly(model, frame, w > 0, memory, seen, draws(3))
+    swarm = SwarmProposal(
+        spy,
+        ChaoticPerturbation(0.1),
+        LikelihoodFitness(),
+        coordinates,
+        SwarmLimits(False, 0.05, 2.5),
+        None,
+        12,
+    )
+    seen = Record(
+        torch.full((3, 2), 9.0, dtype=torch.float64)
+    )  # far away: they would like to leave the box
+    memory = {"swarm.chaos": iterate_logistic(draws(3).uniform("chaos", 60, 4)).unsqueeze(1)}
+    final, flown = swarm.optimise(model, frame, w > 0, memory, seen, draws(3))
     flocks = [*spy.flocks, final]
     sd = frame.covariance.diagonal(dim1=1, dim2=2).sqrt().unsqueeze(1)
     assert len(flocks) == 13
@@ -251,13 +326,25 @@ def test_limits_hold_and_the_best_only_improves(velocity: Any, coordinates: Any)
         assert (after.v.abs() <= 6 * 0.05 * sd * (1 + 1e-12)).all()
         assert (after.q.abs() <= 2.5 * sd * (1 + 1e-12)).all()
         reach = 6 * (0.05 + 0.1) * sd * (1 + 1e-9)
-        assert ((after.q - before.q).abs() <= torch.maximum(reach, before.q.abs() - 2.5 * sd + reach)).all()
+        assert (
+            (after.q - before.q).abs() <= torch.maximum(reach, before.q.abs() - 2.5 * sd + reach)
+        ).all()
         assert (after.best_fitness >= before.best_fitness).all()
         assert (after.worst_fitness <= before.worst_fitness).all()
-        fitness = model.log_likelihood(seen.y, frame.place(after.best), ())
+        fitness = model.log_likelihood(seen.y, frame.origin(after.best), ())
         assert torch.allclose(fitness, after.best_fitness, rtol=0, atol=1e-9)
-        assert torch.allclose(model.log_likelihood(seen.y, frame.place(after.q), ()), after.fitness, rtol=0, atol=1e-9)
-        assert torch.allclose(model.log_likelihood(seen.y, frame.place(after.worst), ()), after.worst_fitness, rtol=0, atol=1e-9)
+        assert torch.allclose(
+            model.log_likelihood(seen.y, frame.origin(after.q), ()),
+            after.fitness,
+            rtol=0,
+            atol=1e-9,
+        )
+        assert torch.allclose(
+            model.log_likelihood(seen.y, frame.origin(after.worst), ()),
+            after.worst_fitness,
+            rtol=0,
+            atol=1e-9,
+        )
     assert (final.best_fitness.amax(1) > flocks[0].best_fitness.amax(1)).all()
     assert (flocks[3].v.abs() == 6 * 0.05 * sd).any()  # the limits were met
     assert (final.q.abs() == 2.5 * sd).any()
@@ -265,12 +352,30 @@ def test_limits_hold_and_the_best_only_improves(velocity: Any, coordinates: Any)
 
 def test_a_perturbation_is_kept_only_where_it_improves() -> None:
     """With velocities of nought the swarm moves by Dx alone: to a fitter place or not at all."""
-    model, swarm = chain(), Swarm(Inertia(0.0, 0.0, 0.0), Perturbation(), Likelihood(), Everything(), Limits(), None, 1)
+    model, swarm = (
+        chain(),
+        SwarmProposal(
+            InertiaVelocity(0.0, 0.0, 0.0),
+            ChaoticPerturbation(),
+            LikelihoodFitness(),
+            AllComponents(),
+            SwarmLimits(),
+            None,
+            1,
+        ),
+    )
     x = torch.randn(2, 50, 4, dtype=torch.float64, generator=torch.manual_seed(4)).clamp(-2, 2)
-    frame = Everything()(model, x, torch.full((2, 50), 0.02, dtype=torch.float64), ())
-    chaos = settled(draws(2).uniform("chaos", 50, 4))
+    frame = AllComponents()(model, x, torch.full((2, 50), 0.02, dtype=torch.float64), ())
+    chaos = iterate_logistic(draws(2).uniform("chaos", 50, 4))
     seen = Record(torch.ones(2, 2, dtype=torch.float64))
-    flock, _ = swarm.fly(model, frame, torch.ones(2, 50, dtype=torch.bool), {"swarm.chaos": chaos.unsqueeze(1)}, seen, draws(2))
+    flock, _ = swarm.optimise(
+        model,
+        frame,
+        torch.ones(2, 50, dtype=torch.bool),
+        {"swarm.chaos": chaos.unsqueeze(1)},
+        seen,
+        draws(2),
+    )
     moved = flock.q - frame.q
     went = moved.abs().amax(-1) > 0
     assert 0.2 < went.double().mean() < 0.8
@@ -284,28 +389,39 @@ def test_a_perturbation_is_kept_only_where_it_improves() -> None:
 def test_a_run_stops_where_its_best_particle_is_close_enough() -> None:
     """Median of chi-square with as many degrees of freedom as components were seen; no run feels another."""
     model = chain()
-    y = torch.tensor([[0.0, 0.0], [7.0, -5.0], [50.0, 50.0], [math.nan, 9.0], [math.nan, math.nan]], dtype=torch.float64)
-    swarm = Swarm(ESCAPE, Perturbation(), Likelihood(), Observed(), Limits(False, 0.05, None), ChiSquare(), 40)
+    y = torch.tensor(
+        [[0.0, 0.0], [7.0, -5.0], [50.0, 50.0], [math.nan, 9.0], [math.nan, math.nan]],
+        dtype=torch.float64,
+    )
+    swarm = SwarmProposal(
+        ESCAPE,
+        ChaoticPerturbation(),
+        LikelihoodFitness(),
+        ObservedComponents(),
+        SwarmLimits(False, 0.05, None),
+        ChiSquareStopping(),
+        40,
+    )
     x = torch.randn(5, 30, 4, dtype=torch.float64, generator=torch.manual_seed(5))
     w = torch.full((5, 30), 1 / 30, dtype=torch.float64)
     frame = swarm.coordinates(model, x, w, ())
-    memory = {"swarm.chaos": settled(draws(5).uniform("chaos", 30, 4)).unsqueeze(1)}
-    flock, flown = swarm.fly(model, frame, w > 0, memory, Record(y), draws(5))
+    memory = {"swarm.chaos": iterate_logistic(draws(5).uniform("chaos", 30, 4)).unsqueeze(1)}
+    flock, flown = swarm.optimise(model, frame, w > 0, memory, Record(y), draws(5))
     assert flown[0] == 1
     assert 1 < flown[1] < 40
     assert flown[3] > 1
     assert flown[4] == 0
-    best = frame.place(flock.leader().expand(-1, 30, -1))[:, 0] @ model.h.mT
+    best = frame.origin(flock.best_position().expand(-1, 30, -1))[:, 0] @ model.h.mT
     distance = ((torch.where(torch.isnan(y), best, y) - best) / model.r).square().sum(-1)
     limits = [stats.chi2.ppf(0.5, k) for k in (2, 2, 2, 1)]
     assert all(d <= c for d, c, n in zip(distance, limits, flown, strict=False) if n < 40)
     assert flown[2] == 40 or distance[2] <= limits[2]
     for r in range(5):
         only = slice(r, r + 1)
-        alone = MonteCarlo(1, torch.tensor([r]), step=1)
+        alone = PhiloxStream(1, torch.tensor([r]), step=1)
         own = swarm.coordinates(model, x[only], w[only], ())
         mine = {k: v[only] for k, v in memory.items()}
-        single, count = swarm.fly(model, own, w[only] > 0, mine, Record(y[only]), alone)
+        single, count = swarm.optimise(model, own, w[only] > 0, mine, Record(y[only]), alone)
         assert count == flown[r]
         assert torch.allclose(single.q, flock.q[only], rtol=0, atol=1e-12)
         assert torch.equal(single.chaos, flock.chaos[only])  # a stopped run's sequences wait too
@@ -315,7 +431,7 @@ def test_the_normal_constant_of_a_spread_that_depends_on_the_state_does_not_stop
     """-2 ln p(y | x) alone would count ln sd: for a volatility of exp(-8 / 2) any measurement would seem near."""
     x = torch.tensor([[[-8.0]], [[2.0]]], dtype=torch.float64)
     seen = Record(torch.tensor([[1.0], [1.0]], dtype=torch.float64))
-    assert ChiSquare()(StochasticVolatility(), x, seen).tolist() == [False, True]
+    assert ChiSquareStopping()(StochasticVolatility(), x, seen).tolist() == [False, True]
 
 
 # coordinates
@@ -327,7 +443,12 @@ class Tied(StateSpaceModel):
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("one", torch.ones(4, dtype=torch.float64))
-        self.names, self.units, self.groups, self.noise_dim = tuple("abcd"), ("",) * 4, {"state": (0, 1, 2, 3)}, 4
+        self.names, self.units, self.groups, self.noise_dim = (
+            tuple("abcd"),
+            ("",) * 4,
+            {"state": (0, 1, 2, 3)},
+            4,
+        )
 
     def initial(self, runs: int) -> Distribution:
         return Normal(torch.zeros(runs, 4), self.one.expand(runs, -1)).to_event(1)
@@ -342,39 +463,50 @@ class Tied(StateSpaceModel):
 @pytest.mark.parametrize(
     ("model", "parts"),
     [
-        (chain(), [0, 1]), (linear_walk(1.0, 1.0, 1.0), [0]), (Growth(), [0]), (StochasticVolatility(), [0]), (Benes(), [0]),
+        (chain(), [0, 1]), (linear_walk(1.0, 1.0, 1.0), [0]), (UnivariateGrowth(), [0]), (StochasticVolatility(), [0]), (Benes(), [0]),
         (Pendulum(), [0]), (Lorenz63(), [0, 1, 2]), (Tied(), [0, 1, 2]),
     ],
     ids=lambda v: type(v).__name__,
 )  # fmt: skip
 def test_what_the_measurement_depends_on_is_found(model: StateSpaceModel, parts: list[int]) -> None:
     mean = torch.full((2, 1, model.chart.size), 0.7, dtype=torch.float64)
-    assert observed(model, mean, ()).tolist() == parts
+    assert observed_components(model, mean, ()).tolist() == parts
 
 
 @pytest.mark.parametrize(
-    "coordinates", [Everything(), Observed(), Observed(white=True), Observed(follow=False), Observed(False, True)],
+    "coordinates", [AllComponents(), ObservedComponents(), ObservedComponents(whiten=True), ObservedComponents(regress_unobserved=False), ObservedComponents(False, True)],
     ids=["all", "regressed", "white", "left", "left, white"],
 )  # fmt: skip
 def test_frames_place_the_cloud_where_it_is_and_move_what_they_should(coordinates: Any) -> None:
     model = chain()
     mix = torch.randn(4, 4, dtype=torch.float64, generator=torch.manual_seed(1))
     x = torch.randn(2, 500, 4, dtype=torch.float64, generator=torch.manual_seed(2)) @ mix + 3.0
-    log_w = torch.log_softmax(torch.randn(2, 500, dtype=torch.float64, generator=torch.manual_seed(6)), 1)
+    log_w = torch.log_softmax(
+        torch.randn(2, 500, dtype=torch.float64, generator=torch.manual_seed(6)), 1
+    )
     w = log_w.exp()
-    frame: Frame = coordinates(model, x, w, ())
-    assert torch.allclose(frame.place(frame.q), x, rtol=0, atol=1e-12)
-    assert torch.allclose((w.unsqueeze(-1) * frame.q).mT @ frame.q, frame.covariance, rtol=0, atol=1e-10)
-    if coordinates.white:
-        assert torch.allclose(frame.covariance, torch.eye(2, dtype=torch.float64).expand(2, -1, -1), rtol=0, atol=1e-12)
-    if isinstance(coordinates, Everything):
+    frame: SwarmFrame = coordinates(model, x, w, ())
+    assert torch.allclose(frame.origin(frame.q), x, rtol=0, atol=1e-12)
+    assert torch.allclose(
+        (w.unsqueeze(-1) * frame.q).mT @ frame.q, frame.covariance, rtol=0, atol=1e-10
+    )
+    if coordinates.whiten:
+        assert torch.allclose(
+            frame.covariance,
+            torch.eye(2, dtype=torch.float64).expand(2, -1, -1),
+            rtol=0,
+            atol=1e-12,
+        )
+    if isinstance(coordinates, AllComponents):
         return
     k = len(frame.components)
-    moved = frame.place(frame.q + torch.tensor([0.5, -1.0], dtype=torch.float64)) - x
+    moved = frame.origin(frame.q + torch.tensor([0.5, -1.0], dtype=torch.float64)) - x
     assert torch.allclose(moved, moved[:, :1].expand_as(moved), rtol=0, atol=1e-12)
-    if not coordinates.white:
-        assert torch.allclose(moved[..., :k], torch.tensor([0.5, -1.0], dtype=torch.float64), rtol=0, atol=1e-12)
-    if not coordinates.follow:
+    if not coordinates.whiten:
+        assert torch.allclose(
+            moved[..., :k], torch.tensor([0.5, -1.0], dtype=torch.float64), rtol=0, atol=1e-12
+        )
+    if not coordinates.regress_unobserved:
         assert torch.allclose(moved[..., k:], torch.zeros(1).double(), rtol=0, atol=1e-12)
         return
     mean = (w.unsqueeze(-1) * x).sum(1, keepdim=True)
@@ -389,13 +521,13 @@ def test_the_posterior_fitness_is_highest_at_the_kalman_mean() -> None:
     model = chain()
     x = torch.randn(1, 400, 4, dtype=torch.float64, generator=torch.manual_seed(2))
     w = torch.full((1, 400), 1 / 400, dtype=torch.float64)
-    frame = Everything()(model, x, w, ())
+    frame = AllComponents()(model, x, w, ())
     y = torch.tensor([[1.5, -2.0]], dtype=torch.float64)
     s, h, r = frame.covariance[0], model.h, torch.diag(model.r**2)
     gain = s @ h.mT @ torch.linalg.inv(h @ s @ h.mT + r)
     mode = (gain @ (y[0] - h @ x.mean(1)[0]))[None, None]
-    penalty = Posterior(shrink=0.0)(frame)
-    value = lambda q: model.log_likelihood(y, frame.place(q), ()) + penalty(q)  # noqa: E731
+    penalty = PosteriorFitness(covariance_shrinkage=0.0)(frame)
+    value = lambda q: model.log_likelihood(y, frame.origin(q), ()) + penalty(q)  # noqa: E731
     steps = 0.1 * torch.eye(4, dtype=torch.float64)
     up, down = (value(mode + sign * steps) for sign in (1, -1))
     assert torch.allclose(up, down, rtol=0, atol=1e-9)
@@ -405,43 +537,60 @@ def test_the_posterior_fitness_is_highest_at_the_kalman_mean() -> None:
 # weights
 
 
-def mixed(runs: int, n: int, shift: float, centres: Callable[[Tensor], Tensor]) -> list[tuple[Tensor, float]]:
+def mixed(
+    runs: int, n: int, shift: float, centres: Callable[[Tensor], Tensor]
+) -> list[tuple[Tensor, float]]:
     """sum w f and E_p f for f = 1, a, a^2, u a: p = N(0, 1) in a, with u tied to it, all drawn `shift` lower and weighed back."""
     source, live = draws(runs), torch.arange(n) < n - 3
     a = source.normal("a", n, 2) - torch.tensor([shift, 0.0], dtype=torch.float64)
     u = 2.0 * a[..., :1] + source.normal("u", n, 1)
     log_w = torch.where(live, shift * a[..., 0], -torch.inf).log_softmax(1)
-    frame = Frame(a, torch.eye(2, dtype=torch.float64).expand(runs, -1, -1), torch.arange(2), lambda q: q)
-    q, log_ratio = Mixture(0.4)(frame, centres(a), torch.zeros_like(log_w), log_w, source)
+    frame = SwarmFrame(
+        a, torch.eye(2, dtype=torch.float64).expand(runs, -1, -1), torch.arange(2), lambda q: q
+    )
+    q, log_ratio = MixtureWeighting(0.4)(frame, centres(a), torch.zeros_like(log_w), log_w, source)
     u = u + 2.0 * (q - a)[..., :1]
     assert (log_ratio[:, live] <= -math.log(round(0.4 * (n - 3)) / (n - 3)) + 1e-12).all()
     w = torch.exp(torch.where(live, log_w + log_ratio, -torch.inf))
-    functions = ((torch.ones_like(w), 1.0), (q[..., 0], 0.0), (q[..., 1] ** 2, 1.0), (u[..., 0] * q[..., 0], 2.0))
+    functions = (
+        (torch.ones_like(w), 1.0),
+        (q[..., 0], 0.0),
+        (q[..., 1] ** 2, 1.0),
+        (u[..., 0] * q[..., 0], 2.0),
+    )
     return [((w * f).sum(1), expected) for f, expected in functions]
 
 
 def test_the_mixture_is_unbiased_about_centres_of_any_kind() -> None:
     fixed = torch.tensor([[1.0, -0.5], [-2.0, 0.3]], dtype=torch.float64).repeat(10, 1)
     for values, expected in mixed(6000, 20, 0.0, lambda a: fixed.expand_as(a)):
-        assert abs(values.mean() - expected) < 4.5 * values.std() / math.sqrt(6000), f"{values.mean()} for {expected}"
+        assert abs(values.mean() - expected) < 4.5 * values.std() / math.sqrt(6000), (
+            f"{values.mean()} for {expected}"
+        )
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.6])
 def test_the_mixture_converges_for_a_swarm_and_for_uneven_weights(shift: float) -> None:
     """Centres that follow from the particles make a bias of 1 / N; weights that differ belong to both parts."""
-    for values, expected in mixed(60, 800, shift, lambda a: 0.5 * a + torch.tensor([1.0, -0.5], dtype=torch.float64)):
-        assert abs(values.mean() - expected) < 4.5 * values.std() / math.sqrt(60) + 0.01, f"{values.mean()} for {expected}"
+    for values, expected in mixed(
+        60, 800, shift, lambda a: 0.5 * a + torch.tensor([1.0, -0.5], dtype=torch.float64)
+    ):
+        assert abs(values.mean() - expected) < 4.5 * values.std() / math.sqrt(60) + 0.01, (
+            f"{values.mean()} for {expected}"
+        )
 
 
 def test_who_is_kept_is_drawn_afresh() -> None:
     """A fixed subset of a resampled cloud is a sorted one: neighbours are siblings."""
     n, runs = 10, 2000
     zero = torch.zeros(runs, n, 1, dtype=torch.float64)
-    frame = Frame(zero, torch.ones(runs, 1, 1, dtype=torch.float64), torch.zeros(1).long(), lambda q: q)
+    frame = SwarmFrame(
+        zero, torch.ones(runs, 1, 1, dtype=torch.float64), torch.zeros(1).long(), lambda q: q
+    )
     flat = torch.full((runs, n), -math.log(n), dtype=torch.float64)
     kept = []
     for step in (1, 2):
-        q, _ = Mixture(0.3)(frame, frame.q + 50.0, flat, flat, draws(runs, step=step))
+        q, _ = MixtureWeighting(0.3)(frame, frame.q + 50.0, flat, flat, draws(runs, step=step))
         kept.append(q[..., 0].abs() < 1e-9)
         assert (kept[-1].sum(1) == 3).all()
         shares = kept[-1].double().mean(0)
@@ -450,23 +599,29 @@ def test_who_is_kept_is_drawn_afresh() -> None:
 
 
 def test_kernels_in_blocks_are_the_sum_over_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pfbench.filter import swarm_weights
+    from pfbench.filter.swarm import swarm_weighting
 
-    a, m = (torch.randn(3, 23, 2, dtype=torch.float64, generator=torch.manual_seed(i)) for i in (1, 2))
-    log_w = torch.log_softmax(torch.randn(3, 23, dtype=torch.float64, generator=torch.manual_seed(3)), 1)
+    a, m = (
+        torch.randn(3, 23, 2, dtype=torch.float64, generator=torch.manual_seed(i)) for i in (1, 2)
+    )
+    log_w = torch.log_softmax(
+        torch.randn(3, 23, dtype=torch.float64, generator=torch.manual_seed(3)), 1
+    )
     log_w[:, 5] = -torch.inf
-    direct = (log_w.unsqueeze(1) - 0.5 * (a.unsqueeze(2) - m.unsqueeze(1)).square().sum(-1)).logsumexp(-1)
+    direct = (
+        log_w.unsqueeze(1) - 0.5 * (a.unsqueeze(2) - m.unsqueeze(1)).square().sum(-1)
+    ).logsumexp(-1)
     for pairs in (2**17, 3 * 23 * 4):
-        monkeypatch.setattr(swarm_weights, "_PAIRS", pairs)
-        assert torch.allclose(swarm_weights._kernels(a, m, log_w), direct, rtol=0, atol=1e-12)
+        monkeypatch.setattr(swarm_weighting, "_PAIRS", pairs)
+        assert torch.allclose(swarm_weighting._kernels(a, m, log_w), direct, rtol=0, atol=1e-12)
 
 
 def test_keeping_all_is_the_bootstrap_filter() -> None:
     model = chain()
     y = measured(model, 3, 8)
-    swarm = dataclasses.replace(CORRECTED, weights=Mixture(1.0))
-    assert swarm.exact
-    assert not CORRECTED.exact
+    swarm = dataclasses.replace(CORRECTED, weighting=MixtureWeighting(1.0))
+    assert swarm.is_exact
+    assert not CORRECTED.is_exact
     plain = run_filter(ParticleFilter(50, ALWAYS), model, Record(y), draws(3, 5))
     same = run(swarm, model, y, 50)
     assert torch.allclose(same.mean, plain.mean, rtol=0, atol=1e-10)
@@ -475,7 +630,7 @@ def test_keeping_all_is_the_bootstrap_filter() -> None:
 
 def test_equal_weights_take_the_likelihood_back() -> None:
     y = measured(chain(), 3, 5)
-    estimate = run(dataclasses.replace(PRINTED, weights=Equal()), chain(), y, 30)
+    estimate = run(dataclasses.replace(PRINTED, weighting=UnchangedWeighting()), chain(), y, 30)
     assert estimate.trace["ess"].numpy() == pytest.approx(30.0)
     assert estimate.log_evidence.numpy() == pytest.approx(0.0, abs=1e-9)
 
@@ -483,17 +638,17 @@ def test_equal_weights_take_the_likelihood_back() -> None:
 # against the Kalman filter
 
 
-def distances(swarm: Swarm, sizes: tuple[int, ...], runs: int = 50) -> list[float]:
+def distances(swarm: SwarmProposal, sizes: tuple[int, ...], runs: int = 50) -> list[float]:
     """Root mean square distance to the Kalman mean, in posterior standard deviations, for numbers of particles."""
     model = chain()
     y = measured(model, runs, 10)
     mean, variance, _ = kalman(model, y)
-    found = [run(swarm, model, y, n, points=Chaotic()).mean for n in sizes]
+    found = [run(swarm, model, y, n, points=ChaoticPoints()).mean for n in sizes]
     return [float(((x - mean)[:, 4:] / variance[4:].sqrt()).square().mean().sqrt()) for x in found]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("velocity", [ESCAPE, Gaussian()], ids=["escape", "gaussian"])
+@pytest.mark.parametrize("velocity", [ESCAPE, GaussianVelocity()], ids=["escape", "gaussian"])
 def test_the_corrected_swarm_converges_at_the_monte_carlo_rate(velocity: Any) -> None:
     """Four times the particles halve the distance to the Kalman filter."""
     few, many = distances(dataclasses.replace(CORRECTED, velocity=velocity), (60, 240))
@@ -502,7 +657,7 @@ def test_the_corrected_swarm_converges_at_the_monte_carlo_rate(velocity: Any) ->
 
 def test_the_printed_weights_do_not_converge() -> None:
     """Their distance to the Kalman filter is there to stay."""
-    few, many = distances(dataclasses.replace(CORRECTED, weights=Printed()), (60, 240))
+    few, many = distances(dataclasses.replace(CORRECTED, weighting=PrintedWeighting()), (60, 240))
     assert many > 0.2
     assert few / many < 1.4
 
@@ -512,14 +667,18 @@ def test_the_corrected_evidence_converges() -> None:
     y = measured(model, 40, 10)
     estimate, exact = run(CORRECTED, model, y, 400), kalman(model, y)
     error = estimate.log_evidence - exact[2]
-    assert abs(error.mean()) < 4.5 * error.std() / math.sqrt(40) + 0.02  # the logarithm is biased by half the variance
+    assert (
+        abs(error.mean()) < 4.5 * error.std() / math.sqrt(40) + 0.02
+    )  # the logarithm is biased by half the variance
     assert error.std() < 0.5
     assert (estimate.variance.mean(0) / exact[1]).numpy() == pytest.approx(1.0, abs=0.12)
 
 
 def test_the_printed_swarm_returns_the_measurement() -> None:
     """Thirty iterations towards the likelihood leave nothing of the prediction: the estimate is the fix."""
-    model = LinearGaussian(torch.eye(2), 0.1 * torch.eye(2), torch.eye(2), [1.0, 2.0], [0.0, 0.0], [3.0, 3.0])
+    model = LinearGaussian(
+        torch.eye(2), 0.1 * torch.eye(2), torch.eye(2), [1.0, 2.0], [0.0, 0.0], [3.0, 3.0]
+    )
     y = measured(model, 20, 15)
     fix = (run(PSO, model, y, 100).mean - y)[:, 3:]
     kf = (kalman(model, y)[0] - y)[:, 3:]
@@ -534,36 +693,58 @@ def test_the_fitness_as_printed_has_no_maximum() -> None:
     class AsPrinted:
         """Cancels the likelihood of the only state, z = q + mean, and puts the printed exponent in its place."""
 
-        def __call__(self, frame: Frame) -> Callable[[Tensor], Tensor]:
+        def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
             return lambda q: -0.5 * (0.0 - q[..., 0]) + 0.5 * q[..., 0].square()
 
     model = LinearGaussian([[1.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0])
     x = draws(1).normal("x", 50, 1)
-    frame = Everything()(model, x - x.mean(1, keepdim=True), torch.full((1, 50), 0.02, dtype=torch.float64), ())
+    frame = AllComponents()(
+        model, x - x.mean(1, keepdim=True), torch.full((1, 50), 0.02, dtype=torch.float64), ()
+    )
     found = []
-    for fitness in (AsPrinted(), Likelihood()):
-        swarm = Swarm(ESCAPE, None, fitness, Everything(), Limits(box=None), None, 60)
-        flock, _ = swarm.fly(model, frame, torch.ones(1, 50, dtype=torch.bool), {}, Record(torch.zeros(1, 1).double()), draws(1))
-        found.append(flock.leader().abs().item())
+    for fitness in (AsPrinted(), LikelihoodFitness()):
+        swarm = SwarmProposal(
+            ESCAPE, None, fitness, AllComponents(), SwarmLimits(max_distance_sd=None), None, 60
+        )
+        flock, _ = swarm.optimise(
+            model,
+            frame,
+            torch.ones(1, 50, dtype=torch.bool),
+            {},
+            Record(torch.zeros(1, 1).double()),
+            draws(1),
+        )
+        found.append(flock.best_position().abs().item())
     assert found[0] > 20.0
     assert found[1] < 1.0
-    fitnesses = [composed("linear_walk", f"filter={name}")["filter"].proposal.fitness._target_ for name in PRESETS]
-    assert set(fitnesses) == {"pfbench.filter.coordinates.Likelihood", "pfbench.filter.coordinates.Posterior"}
+    fitnesses = [
+        composed("linear_walk", f"filter={name}")["filter"].proposal.fitness._target_
+        for name in PRESETS
+    ]
+    assert set(fitnesses) == {
+        "pfbench.filter.LikelihoodFitness",
+        "pfbench.filter.PosteriorFitness",
+    }
 
 
 # anything goes
 
 
-SWARMS = {"printed": PRINTED, "stopped": dataclasses.replace(PRINTED, stop=ChiSquare()), "corrected": CORRECTED, "pso": PSO}
+SWARMS = {
+    "printed": PRINTED,
+    "stopped": dataclasses.replace(PRINTED, stopping=ChiSquareStopping()),
+    "corrected": CORRECTED,
+    "pso": PSO,
+}
 
 
 @pytest.mark.parametrize("name", SWARMS)
 def test_where_nothing_is_seen_particles_are_predicted_and_no_more(name: str) -> None:
     model = chain()
     y = torch.full((2, 3, 2), math.nan, dtype=torch.float64)
-    swarm = dataclasses.replace(SWARMS[name], start=Prior())
+    swarm = dataclasses.replace(SWARMS[name], swarm_start=PriorStart())
     plain, blind = (run_filter(ParticleFilter(200, ALWAYS, proposal=p), model, Record(y), draws(2)) for p in
-                    (dataclasses.replace(swarm, weights=Mixture(1.0)), swarm))  # fmt: skip
+                    (dataclasses.replace(swarm, weighting=MixtureWeighting(1.0)), swarm))  # fmt: skip
     if name == "corrected":  # half of it is drawn anew, from the same law
         assert (blind.variance / plain.variance).numpy() == pytest.approx(1.0, abs=0.7)
     else:
@@ -577,7 +758,12 @@ def test_a_run_does_not_feel_its_neighbours(name: str) -> None:
     y = measured(model, 4, 6)
     y[1, 2:4, 0] = math.nan
     together = run(SWARMS[name], model, y, 25)
-    alone = run_filter(ParticleFilter(25, ALWAYS, proposal=SWARMS[name]), model, Record(y[2:3]), MonteCarlo(5, torch.tensor([2])))
+    alone = run_filter(
+        ParticleFilter(25, ALWAYS, proposal=SWARMS[name]),
+        model,
+        Record(y[2:3]),
+        PhiloxStream(5, torch.tensor([2])),
+    )
     assert torch.allclose(alone.mean, together.mean[2:3], rtol=1e-7, atol=1e-9)
 
 
@@ -591,7 +777,7 @@ class Fragile(Tied):
 @pytest.mark.parametrize("name", SWARMS)
 def test_empty_slots_and_broken_particles_harm_nobody(name: str) -> None:
     """An empty slot stays empty; a particle that is not finite weighs nothing and stays where its parent was."""
-    swarm = dataclasses.replace(SWARMS[name], start=Prior())
+    swarm = dataclasses.replace(SWARMS[name], swarm_start=PriorStart())
     x = torch.randn(2, 40, 4, dtype=torch.float64, generator=torch.manual_seed(8))
     x[:, 12, 0], x[:, 35] = 101.0, 1e6
     log_w = torch.where(torch.arange(40) < 30, -math.log(30), -torch.inf).double().expand(2, -1)
@@ -601,7 +787,9 @@ def test_empty_slots_and_broken_particles_harm_nobody(name: str) -> None:
     assert (sent.log_ratio[:, 12] == -torch.inf).all()
     alive = [i for i in range(30) if i != 12]
     assert torch.isfinite(sent.log_ratio[:, alive]).all()
-    assert sent.x[:, alive].abs().max() < (1e4 if swarm.limits.prior else 12.0)  # the first cloud's scale counts who then broke
+    assert sent.x[:, alive].abs().max() < (
+        1e4 if swarm.limits.scale_by_prior else 12.0
+    )  # the first cloud's scale counts who then broke
 
 
 @pytest.mark.parametrize("name", SWARMS)
@@ -610,23 +798,29 @@ def test_a_measurement_of_nothing_leaves_the_prediction(name: str) -> None:
     eye = torch.eye(2)
     model = LinearGaussian(eye, eye, torch.zeros(1, 2), [1.0], [0.0, 0.0], [1.0, 1.0])
     y = torch.ones(2, 4, 1, dtype=torch.float64)
-    estimate = run(SWARMS[name], model, y, 50, points=Chaotic())
+    estimate = run(SWARMS[name], model, y, 50, points=ChaoticPoints())
     assert not estimate.lost.any()
     if name == "corrected":
-        plain = run_filter(ParticleFilter(50, ALWAYS, points=Chaotic()), model, Record(y), draws(2, 5))
+        plain = run_filter(
+            ParticleFilter(50, ALWAYS, points=ChaoticPoints()), model, Record(y), draws(2, 5)
+        )
         assert torch.allclose(estimate.mean, plain.mean, rtol=0, atol=1e-12)
 
 
-TOYS = [Growth(), StochasticVolatility(), Benes(), Pendulum(), Lorenz63()]
+TOYS = [UnivariateGrowth(), StochasticVolatility(), Benes(), Pendulum(), Lorenz63()]
 
 
 @pytest.mark.parametrize("model", TOYS, ids=lambda v: type(v).__name__)
 @pytest.mark.parametrize("name", ["printed", "corrected"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_swarms_run_on_models_of_all_kinds(model: StateSpaceModel, name: str, dtype: torch.dtype) -> None:
+def test_swarms_run_on_models_of_all_kinds(
+    model: StateSpaceModel, name: str, dtype: torch.dtype
+) -> None:
     y = torch.full((3, 3, 3 if isinstance(model, Lorenz63) else 1), 0.6, dtype=dtype)
-    source = MonteCarlo(1, torch.arange(3), dtype)
-    estimate = run_filter(ParticleFilter(40, ALWAYS, proposal=SWARMS[name]), model.to(dtype), Record(y), source)
+    source = PhiloxStream(1, torch.arange(3), dtype)
+    estimate = run_filter(
+        ParticleFilter(40, ALWAYS, proposal=SWARMS[name]), model.to(dtype), Record(y), source
+    )
     model.to(torch.float64)
     assert estimate.mean.dtype == dtype
     assert not estimate.lost.any()
@@ -635,16 +829,16 @@ def test_swarms_run_on_models_of_all_kinds(model: StateSpaceModel, name: str, dt
 
 def test_bad_choices_are_told() -> None:
     for make, key in (
-        (lambda: Swarm(iterations=0), "iterations"),
-        (lambda: Swarm(limits=Limits(prior=True)), "limits.prior"),
-        (lambda: Mixture(0.0), "keep"),
-        (lambda: ChiSquare(1.0), "quantile"),
-        (lambda: Inertia(inertia=1.0), "inertia"),
-        (lambda: Inertia(escape=-0.1), "escape"),
-        (lambda: Perturbation(0.0), "beta"),
-        (lambda: Limits(speed=0.0), "speed"),
-        (lambda: Limits(box=-1.0), "box"),
-        (lambda: Posterior(2.0), "shrink"),
+        (lambda: SwarmProposal(iterations=0), "iterations"),
+        (lambda: SwarmProposal(limits=SwarmLimits(scale_by_prior=True)), "limits.scale_by_prior"),
+        (lambda: MixtureWeighting(0.0), "weighting.defensive_fraction"),
+        (lambda: ChiSquareStopping(1.0), "quantile"),
+        (lambda: InertiaVelocity(inertia_weight=1.0), "inertia_weight"),
+        (lambda: InertiaVelocity(escape_coefficient=-0.1), "escape_coefficient"),
+        (lambda: ChaoticPerturbation(0.0), "beta"),
+        (lambda: SwarmLimits(max_velocity_sd=0.0), "max_velocity_sd"),
+        (lambda: SwarmLimits(max_distance_sd=-1.0), "max_distance_sd"),
+        (lambda: PosteriorFitness(2.0), "covariance_shrinkage"),
     ):
         with pytest.raises(ValueError, match=key):
             make()
@@ -657,30 +851,38 @@ PRESETS = ("pso_pf", "cpso_pf", "cpso_escape", "cpso_escape_printed", "cpso_esca
 
 
 def composed(scenario: str, *words: str) -> Any:
-    with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
-        return compose("config", [f"scenario={scenario}", "worlds=null", "particles=100", *words])
+    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
+        return compose(
+            "config", [f"scenario={scenario}", "episode_cache_dir=null", "particles=100", *words]
+        )
 
 
 def flown(runs: int, steps: int, model: str) -> tuple[Any, Episode]:
     """The first 80 s of the paper's flight."""
-    cfg = composed("t004", f"model={model}", "model.markov=true")
-    cfg.scenario.path.segments = cfg.scenario.path.segments[:2] + cfg.scenario.path.segments[3:4]
-    cfg.scenario.path.segments[2].duration = 20.0
-    cfg.scenario.imu_rate = 20.0
-    episode: Episode = job.build(cfg.scenario).draw(Nominal(), torch.arange(runs), 1)
+    cfg = composed("flight_500s", f"model={model}", "model.markov=true")
+    cfg.scenario.trajectory.segments = (
+        cfg.scenario.trajectory.segments[:2] + cfg.scenario.trajectory.segments[3:4]
+    )
+    cfg.scenario.trajectory.segments[2].duration = 20.0
+    cfg.scenario.imu_rate_hz = 20.0
+    episode: Episode = job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(runs), 1)
     record = episode.record
-    return cfg, dataclasses.replace(episode, record=Record(record.y[:, :steps], map_inputs(lambda a: a[:, :steps], record.u)))
+    return cfg, dataclasses.replace(
+        episode, record=Record(record.y[:, :steps], map_inputs(lambda a: a[:, :steps], record.u))
+    )
 
 
 @pytest.mark.slow
 def test_in_flight_the_corrected_swarm_converges_and_the_printed_one_returns_the_fix() -> None:
     """Distances in position from 20 s on: to the Kalman filter of the same inflated model, and to the raw fix."""
     cfg, episode = flown(8, 50, "ins_gnss_inflated")
-    model = job.build(cfg.model)
+    model = job.instantiate(cfg.model)
 
     def estimated(name: str, n: int = 100) -> Tensor:
-        words = composed("t004", f"filter={name}", f"particles={n}")["filter"]
-        return run_filter(job.build(words), model, episode.record, draws(8, 9)).mean[:, 20:, 6:9]
+        words = composed("flight_500s", f"filter={name}", f"particles={n}")["filter"]
+        return run_filter(job.instantiate(words), model, episode.record, draws(8, 9)).mean[
+            :, 20:, 6:9
+        ]
 
     def rms(d: Tensor) -> float:
         return float(d.square().mean().sqrt())
@@ -694,19 +896,21 @@ def test_in_flight_the_corrected_swarm_converges_and_the_printed_one_returns_the
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario", ["sar_flight", "anshun_fit", "passive_1", "t003"])
+@pytest.mark.parametrize("scenario", ["sar_flight", "anshun_fit", "passive_1", "flight_300s"])
 def test_swarms_fly_with_quaternions_missing_satellites_and_bearings(scenario: str) -> None:
     cfg = composed(scenario)
-    if "path" in cfg.scenario and "segments" in cfg.scenario.path:
-        cfg.scenario.path.segments = cfg.scenario.path.segments[:1]
-    if "path" in cfg.scenario and "duration" in cfg.scenario.path:
-        cfg.scenario.path.duration = 20.0
+    if "path" in cfg.scenario and "segments" in cfg.scenario.trajectory:
+        cfg.scenario.trajectory.segments = cfg.scenario.trajectory.segments[:1]
+    if "path" in cfg.scenario and "duration" in cfg.scenario.trajectory:
+        cfg.scenario.trajectory.duration_s = 20.0
     if "imu_rate" in cfg.scenario:
-        cfg.scenario.imu_rate = 20.0
-    model = job.build(cfg.model)
-    record = job.build(cfg.scenario).draw(Nominal(), torch.arange(2), 1).record
+        cfg.scenario.imu_rate_hz = 20.0
+    model = job.instantiate(cfg.model)
+    record = job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(2), 1).record
     record = record._replace(y=record.y[:, :8], u=map_inputs(lambda a: a[:, :8], record.u))
     for name in ("cpso_escape", "cpso_escape_printed"):
-        estimate = run_filter(job.build(composed(scenario, f"filter={name}")["filter"]), model, record, draws(2))
+        estimate = run_filter(
+            job.instantiate(composed(scenario, f"filter={name}")["filter"]), model, record, draws(2)
+        )
         assert not estimate.lost.any()
         assert torch.isfinite(estimate.mean).all()

@@ -15,13 +15,21 @@ import pandas as pd
 import pytest
 from command_line import environment, pfbench, process
 
-from pfbench import store
+from pfbench.results import store
 
 pytestmark = pytest.mark.slow
 
 FILTERS = ("sir", "rpf", "apf", "ckf")
 # cells of a second, so that a kill after the first result falls into another cell
-SWEEP = ("run", "-m", "scenario=linear_walk", "scenario.steps=200", "runs=20", "particles=300", f"filter={','.join(FILTERS)}")
+SWEEP = (
+    "run",
+    "-m",
+    "scenario=linear_walk",
+    "scenario.steps=200",
+    "runs=20",
+    "particles=300",
+    f"filter={','.join(FILTERS)}",
+)
 
 
 def files(home: Path) -> list[Path]:
@@ -30,14 +38,16 @@ def files(home: Path) -> list[Path]:
 
 def arrays(home: Path) -> dict[str, dict[str, np.ndarray]]:
     """The arrays of all cells, by filter."""
-    return {found.meta["label"]: found.arrays for found in map(store.load, files(home))}
+    return {found.meta["label"]: found.arrays for found in map(store.read_result, files(home))}
 
 
 def same(a: dict[str, dict[str, np.ndarray]], b: dict[str, dict[str, np.ndarray]]) -> bool:
     def equal(x: np.ndarray, y: np.ndarray) -> bool:
         return np.array_equal(x, y, equal_nan=x.dtype.kind == "f")
 
-    return a.keys() == b.keys() and all(a[f].keys() == b[f].keys() and all(equal(a[f][n], b[f][n]) for n in a[f]) for f in a)
+    return a.keys() == b.keys() and all(
+        a[f].keys() == b[f].keys() and all(equal(a[f][n], b[f][n]) for n in a[f]) for f in a
+    )
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +62,9 @@ def killed_after_the_first_result(home: Path) -> None:
     command = [sys.executable, "-m", "pfbench", *SWEEP]
     env = os.environ | environment(home)
     quiet = subprocess.DEVNULL
-    sweep = subprocess.Popen(command, env=env, cwd=home, stdout=quiet, stderr=quiet, start_new_session=True)
+    sweep = subprocess.Popen(
+        command, env=env, cwd=home, stdout=quiet, stderr=quiet, start_new_session=True
+    )
     try:
         while not files(home):
             assert sweep.poll() is None, "the sweep ended without a result"
@@ -68,10 +80,10 @@ def test_a_killed_sweep_is_finished_by_the_same_command(tmp_path: Path, undistur
     finished = {file: file.stat().st_mtime_ns for file in files(tmp_path)}
     assert 1 <= len(finished) < len(FILTERS)
     for file in finished:
-        store.load(file)  # whole
+        store.read_result(file)  # whole
     again = process(*SWEEP, home=tmp_path, cwd=tmp_path)
     assert again.code == 0, again.err
-    assert again.out.count("done already") == len(finished)
+    assert again.out.count("skipped   ") == len(finished)
     assert {file: file.stat().st_mtime_ns for file in finished} == finished
     assert not list((tmp_path / "results").rglob("*.tmp"))
     assert [file.name for file in files(tmp_path)] == [file.name for file in files(undisturbed)]
@@ -79,7 +91,13 @@ def test_a_killed_sweep_is_finished_by_the_same_command(tmp_path: Path, undistur
 
     pages = []
     for home in (tmp_path, undisturbed):
-        said = pfbench("report", "study=adhoc", f"reports={home / 'reports'}", "report.formats=[svg]", home=home)
+        said = pfbench(
+            "report",
+            "study=adhoc",
+            f"reports_dir={home / 'reports'}",
+            "report.figure_formats=[svg]",
+            home=home,
+        )
         assert said.code == 0, said.err
         pages.append(home / "reports" / "adhoc")
     ours, theirs = ((page / "verdicts.json").read_text() for page in pages)
@@ -89,12 +107,19 @@ def test_a_killed_sweep_is_finished_by_the_same_command(tmp_path: Path, undistur
     assert tables == sorted(table.name for table in (pages[1] / "tables").iterdir())
     assert any(name.endswith("overview.csv") for name in tables)
     for name in tables:
-        if name.endswith(".csv"):  # the computer was not equally busy; all else is the same to the last digit
-            busy = ["time per step in ms", "memory in MiB"]
-            left, right = (pd.read_csv(page / "tables" / name).drop(columns=busy, errors="ignore") for page in pages)
+        if name.endswith(
+            ".csv"
+        ):  # the computer was not equally busy; all else is the same to the last digit
+            busy = ["time per step [ms]", "peak memory above baseline [MiB]"]
+            left, right = (
+                pd.read_csv(page / "tables" / name).drop(columns=busy, errors="ignore")
+                for page in pages
+            )
             pd.testing.assert_frame_equal(left, right, check_exact=True)
         elif "overview" not in name:
-            assert (pages[0] / "tables" / name).read_text() == (pages[1] / "tables" / name).read_text()
+            assert (pages[0] / "tables" / name).read_text() == (
+                pages[1] / "tables" / name
+            ).read_text()
 
 
 def test_a_half_written_file_is_never_taken_for_a_result(tmp_path: Path) -> None:
@@ -107,23 +132,34 @@ def test_a_half_written_file_is_never_taken_for_a_result(tmp_path: Path) -> None
     file.unlink()
     said = pfbench(*words, home=tmp_path)
     assert said.code == 0
-    assert "done already" not in said.out
-    assert store.load(file).meta["runs"] == 2
+    assert "skipped   " not in said.out
+    assert store.read_result(file).meta["runs"] == 2
     assert not half.exists()
 
 
 def test_several_processes_give_the_bits_of_one(tmp_path: Path, undisturbed: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    said = process(*SWEEP, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", home=tmp_path, cwd=tmp_path)
+    said = process(
+        *SWEEP, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", home=tmp_path, cwd=tmp_path
+    )
     assert said.code == 0, said.err
     assert same(arrays(tmp_path), arrays(undisturbed))
 
 
 def test_a_bad_cell_among_several_processes_fails_alone(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    words = ("run", "-m", "scenario=linear_walk", "scenario.steps=5", "runs=2", "filter.particles=0,50,60")
-    said = process(*words, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", home=tmp_path, cwd=tmp_path)
+    words = (
+        "run",
+        "-m",
+        "scenario=linear_walk",
+        "scenario.steps=5",
+        "runs=2",
+        "filter.particles=0,50,60",
+    )
+    said = process(
+        *words, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", home=tmp_path, cwd=tmp_path
+    )
     assert said.code == 1
-    assert "filter.particles=0: give at least 2 particles" in said.err
+    assert "filter.particles must be at least 2, got 0" in said.err
     assert len(files(tmp_path)) == 2
     assert len(list((tmp_path / "results" / "adhoc").glob("*.failed.json"))) == 1

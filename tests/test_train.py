@@ -16,54 +16,79 @@ from typing import Any
 import pytest
 import torch
 from command_line import pfbench
-from test_learned import NETWORKS, shaken
+from network_cases import NETWORKS, shaken
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, Normal
 
-from pfbench import store
-from pfbench.draws import MonteCarlo
-from pfbench.filter import learned_weights
-from pfbench.filter.differentiable import Soft, StopGradient, Transport
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.guided_noise import GuidedNoise
-from pfbench.filter.learned import Learned
-from pfbench.filter.learned_kernel import LearnedWalk
-from pfbench.filter.learned_laws import Diagonal
-from pfbench.filter.learned_objectives import Bound, InferenceCompilation, Jump, StateError, imagine
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
+from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
+from pfbench.filter.learned import checkpoint
+from pfbench.filter.learned.differentiable_resampling import (
+    OptimalTransportResampler,
+    SoftResampler,
+    StopGradientResampler,
+)
+from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
+from pfbench.filter.learned.networks import DiagonalNormalHead
+from pfbench.filter.learned.objectives import (
+    EvidenceLowerBound,
+    ExpectedSquaredJump,
+    InferenceCompilation,
+    StateErrorLoss,
+    simulate_from_model,
+)
+from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.loop import run_filter
-from pfbench.filter.moves import Metropolis
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.proposals import Bootstrap, Proposal
-from pfbench.filter.resamplers import Resample, Systematic
-from pfbench.filter.rules import Jacobian
-from pfbench.lessons import Worlds, draw_worlds
-from pfbench.model.linear import local_level
-from pfbench.noise.regimes import Nominal, Regime
-from pfbench.record import Record
-from pfbench.scenario.model_world import ModelWorld
-from pfbench.train import Progress, Pupil, Training, train
+from pfbench.filter.moves.metropolis import MetropolisHastings
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.learn.trainer import TrainingState
+from pfbench.learn.training_config import Progress, Training
+from pfbench.learn.training_data import TrainingData, draw_training_data
+from pfbench.learn.training_job import train
+from pfbench.model.linear_gaussian import local_level
+from pfbench.noise.base import NoiseRegime
+from pfbench.noise.white import NominalNoise
+from pfbench.results import store
+from pfbench.scenario.model_simulation import ModelSimulation
 
 LEVEL = local_level(1.0, 0.3, 0.0, 1.0)  # what is seen is three times as sure as what is predicted
-SMALL = partial(Diagonal, hidden=(8,))
+SMALL = partial(DiagonalNormalHead, hidden=(8,))
 
 
-def lessons(runs: int, seed: int, steps: int = 10, regimes: Sequence[Regime] = (Nominal(),)) -> Worlds:
-    return draw_worlds(ModelWorld(LEVEL, steps), regimes, LEVEL, runs, seed, None)
+def lessons(
+    runs: int, seed: int, steps: int = 10, regimes: Sequence[NoiseRegime] = (NominalNoise(),)
+) -> TrainingData:
+    return draw_training_data(ModelSimulation(LEVEL, steps), regimes, LEVEL, runs, seed, None)
 
 
-def trained(tmp_path: Path, training: Training, method: ParticleFilter, name: str = "one") -> tuple[Path, dict[str, Any]]:
+def trained(
+    tmp_path: Path, training: Training, method: ParticleFilter, name: str = "one"
+) -> tuple[Path, dict[str, Any]]:
     path = train(
-        training, method, LEVEL, lessons(training.worlds, training.seed), lessons(training.validation, training.seed + 1),
+        training, method, LEVEL, lessons(training.training_runs, training.seed), lessons(training.validation_runs, training.seed + 1),
         tmp_path / f"{name}.pt",
     )  # fmt: skip
-    return path, learned_weights.read(path)
+    return path, checkpoint.read_checkpoint(path)
 
 
 def fresh(make: Callable[[int, int], nn.Module] = SMALL, **options: Any) -> ParticleFilter:
-    return ParticleFilter(20, proposal=Learned(make, checkpoint=None, **options))
+    return ParticleFilter(20, proposal=LearnedProposal(make, checkpoint=None, **options))
 
 
-QUICK = Training(worlds=16, validation=8, epochs=5, batch=8, segment=5, particles=10, learning_rate=0.02)
+QUICK = Training(
+    training_runs=16,
+    validation_runs=8,
+    epochs=5,
+    batch_size=8,
+    gradient_steps=5,
+    particles=10,
+    learning_rate=0.02,
+)
 
 
 # what the objectives are
@@ -84,17 +109,17 @@ class Fixed(nn.Module):
 def test_the_gradient_of_the_bound_is_that_of_its_closed_form() -> None:
     """One particle, one step: E[log Z_hat] = E_q[log p(y | x) p(w) / q(w)], of which all is known."""
     runs, y = 20_000, 0.9
-    proposal = Learned(Fixed, share=0.0)
+    proposal = LearnedProposal(Fixed, defensive_fraction=0.0)
     method = ParticleFilter(2, proposal=proposal)
-    first = method.init(LEVEL, 1, MonteCarlo(1, torch.arange(1)))
-    proposal.begin(LEVEL, first, Record(torch.tensor([[y]], dtype=torch.float64)), True)
+    first = method.init(LEVEL, 1, PhiloxStream(1, torch.arange(1)))
+    proposal.build(LEVEL, first, Record(torch.tensor([[y]], dtype=torch.float64)), True)
     found = []
     for k in range(16):
-        draws = MonteCarlo(2 + k, torch.arange(runs // 16))
-        cloud = method.init(LEVEL, runs // 16, draws.at(0))
+        draws = PhiloxStream(2 + k, torch.arange(runs // 16))
+        cloud = method.init(LEVEL, runs // 16, draws.at_step(0))
         one = cloud._replace(x=cloud.x[:, :1], log_w=torch.zeros_like(cloud.log_w[:, :1]))
         record = Record(torch.full((runs // 16, 1), y, dtype=torch.float64))
-        sent = proposal(LEVEL, one, record, draws.at(1))
+        sent = proposal(LEVEL, one, record, draws.at_step(1))
         value = (LEVEL.log_likelihood(record.y, sent.x, ()) + sent.log_ratio).mean()
         found.append(torch.stack(torch.autograd.grad(value, list(proposal.parameters()))).flatten())
     m, s = 0.3, math.exp(-0.4)
@@ -108,22 +133,30 @@ def test_the_gradient_of_the_bound_is_that_of_its_closed_form() -> None:
 def test_the_bound_of_a_record_is_what_the_filter_says_of_it() -> None:
     """Segment by segment, the losses of all steps sum to minus the log evidence that this filter finds with these draws."""
     worlds = lessons(4, 5)
-    pupil = Pupil(QUICK, fresh(), LEVEL, worlds)
+    pupil = TrainingState(QUICK, fresh(), LEVEL, worlds)
     with torch.no_grad():
-        losses = torch.cat([loss for loss, _ in pupil._walk(worlds, MonteCarlo(3, torch.arange(4)))])
-        estimate = run_filter(pupil.method, LEVEL, worlds.record, MonteCarlo(3, torch.arange(4)))
+        losses = torch.cat(
+            [loss for loss, _ in pupil._segments(worlds, PhiloxStream(3, torch.arange(4)))]
+        )
+        estimate = run_filter(pupil.method, LEVEL, worlds.record, PhiloxStream(3, torch.arange(4)))
     assert losses.shape == (10, 4)
     torch.testing.assert_close(losses.sum(0), -estimate.log_evidence)
 
 
-def test_the_error_is_in_deviations_of_the_initial_law_and_what_is_not_known_does_not_count() -> None:
+def test_the_error_is_in_deviations_of_the_initial_law_and_what_is_not_known_does_not_count() -> (
+    None
+):
     worlds = lessons(4, 5)
     worlds = worlds._replace(states=worlds.states.index_fill(1, torch.tensor([3]), math.nan))
-    pupil = Pupil(replace(QUICK, objective=StateError(), segment=None), fresh(), LEVEL, worlds)
+    pupil = TrainingState(
+        replace(QUICK, objective=StateErrorLoss(), gradient_steps=None), fresh(), LEVEL, worlds
+    )
     with torch.no_grad():
-        (losses,) = [loss for loss, _ in pupil._walk(worlds, MonteCarlo(3, torch.arange(4)))]
-        estimate = run_filter(pupil.method, LEVEL, worlds.record, MonteCarlo(3, torch.arange(4)))
-    wanted = (estimate.mean - worlds.states).square()[..., 0].nan_to_num(0.0)  # the level starts with deviation 1
+        (losses,) = [loss for loss, _ in pupil._segments(worlds, PhiloxStream(3, torch.arange(4)))]
+        estimate = run_filter(pupil.method, LEVEL, worlds.record, PhiloxStream(3, torch.arange(4)))
+    wanted = (
+        (estimate.mean - worlds.states).square()[..., 0].nan_to_num(0.0)
+    )  # the level starts with deviation 1
     torch.testing.assert_close(losses, wanted.T)
 
 
@@ -135,53 +168,72 @@ def optimal(x: Tensor, y: Tensor) -> tuple[Tensor, float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("objective", "way"), [(InferenceCompilation(), 0.75), (Bound(), 0.4)], ids=["compilation", "bound"]
+    ("objective", "way"),
+    [(InferenceCompilation(), 0.75), (EvidenceLowerBound(), 0.4)],
+    ids=["compilation", "bound"],
 )
 def test_a_network_finds_the_optimal_proposal(objective: Any, way: float, tmp_path: Path) -> None:
     """On a linear model the noise's posterior is normal: most of the way from the prior to it is gone in twelve epochs."""
-    plan = replace(QUICK, objective=objective, worlds=48, epochs=12, patience=12, learning_rate=0.03)
+    plan = replace(
+        QUICK, objective=objective, worlds=48, epochs=12, patience_epochs=12, learning_rate=0.03
+    )
     method = fresh()
     path, _ = trained(tmp_path, plan, method)
     test = lessons(20, 77)
     shares = {}
     kinds: dict[str, Proposal] = {
-        "learned": Learned(SMALL, checkpoint=str(path)), "prior": Bootstrap(),
-        "optimal": GuidedNoise(GaussianFilter(Jacobian())),
+        "learned": LearnedProposal(SMALL, checkpoint=str(path)), "prior": BootstrapProposal(),
+        "optimal": GuidedNoiseProposal(GaussianFilter(TaylorLinearisation())),
     }  # fmt: skip
     with torch.no_grad():
         for name, proposal in kinds.items():
-            estimate = run_filter(ParticleFilter(200, proposal=proposal), LEVEL, test.record, MonteCarlo(1, torch.arange(20)))
+            estimate = run_filter(
+                ParticleFilter(200, proposal=proposal),
+                LEVEL,
+                test.record,
+                PhiloxStream(1, torch.arange(20)),
+            )
             shares[name] = estimate.trace["ess"].mean().item() / 200
     assert shares["learned"] > shares["prior"] + way * (shares["optimal"] - shares["prior"]), shares
 
 
 def test_inference_compilation_measures_the_cross_entropy() -> None:
     """At the optimal law the mean of -log q is the posterior's entropy; the guide with an untrained network is that law."""
-    proposal = Learned(Diagonal, guide=GuidedNoise(GaussianFilter(Jacobian())))
+    proposal = LearnedProposal(
+        DiagonalNormalHead, guide_filter=GuidedNoiseProposal(GaussianFilter(TaylorLinearisation()))
+    )
     worlds = lessons(2000, 3, 2)
-    record, states, noises = imagine(LEVEL, worlds.record, MonteCarlo(3, torch.arange(2000)))
-    cloud = ParticleFilter(5).init(LEVEL, 2000, MonteCarlo(1, torch.arange(2000)))
+    record, states, noises = simulate_from_model(
+        LEVEL, worlds.record, PhiloxStream(3, torch.arange(2000))
+    )
+    cloud = ParticleFilter(5).init(LEVEL, 2000, PhiloxStream(1, torch.arange(2000)))
     with torch.no_grad():
-        loss = -proposal.log_density(LEVEL, cloud, record.at(0), states[:, 0], noises[:, 0])
+        loss = -proposal.log_density(LEVEL, cloud, record.at_step(0), states[:, 0], noises[:, 0])
     _, sd = optimal(states[:, 0], record.y[:, 0])
     entropy = 0.5 * math.log(2 * math.pi * math.e * sd**2)
     assert abs(loss.mean() - entropy) < 4.5 * loss.std() / math.sqrt(2000)
-    prior = Learned(Diagonal)
+    prior = LearnedProposal(DiagonalNormalHead)
     with torch.no_grad():
-        plain = -prior.log_density(LEVEL, cloud, record.at(0), states[:, 0], noises[:, 0])
+        plain = -prior.log_density(LEVEL, cloud, record.at_step(0), states[:, 0], noises[:, 0])
     torch.testing.assert_close(plain, 0.5 * noises[:, 0, 0] ** 2 + 0.5 * math.log(2 * math.pi))
 
 
 def test_imagined_worlds_have_the_model_s_law() -> None:
     """And the gaps, inputs and starts of the record that they are like."""
-    record = Record(torch.zeros(4000, 3, 1, dtype=torch.float64).index_fill(1, torch.tensor([1]), math.nan))
-    imagined, states, noises = imagine(LEVEL, record, MonteCarlo(1, torch.arange(4000)))
+    record = Record(
+        torch.zeros(4000, 3, 1, dtype=torch.float64).index_fill(1, torch.tensor([1]), math.nan)
+    )
+    imagined, states, noises = simulate_from_model(
+        LEVEL, record, PhiloxStream(1, torch.arange(4000))
+    )
     assert torch.isnan(imagined.y[:, 1]).all()
     torch.testing.assert_close(states[:, 1:] - states[:, :-1], noises)
     apart = (imagined.y - states[:, 1:])[:, [0, 2], 0]
     assert abs(apart.std() - 0.3) < 0.3 * 4.0 / math.sqrt(16_000)
     assert abs(noises.std() - 1.0) < 4.0 / math.sqrt(24_000)
-    assert abs(torch.corrcoef(torch.stack([apart[:, 0], noises[:, 0, 0]]))[0, 1]) < 4.0 / math.sqrt(4000)
+    assert abs(torch.corrcoef(torch.stack([apart[:, 0], noises[:, 0, 0]]))[0, 1]) < 4.0 / math.sqrt(
+        4000
+    )
 
 
 # what training does
@@ -190,19 +242,23 @@ def test_imagined_worlds_have_the_model_s_law() -> None:
 @pytest.mark.parametrize(
     ("objective", "resampler"),
     [
-        (Bound(), Resample(Systematic(), 1.0)),
-        pytest.param(Bound(), Soft(0.5), marks=pytest.mark.slow),
-        pytest.param(Bound(), StopGradient(), marks=pytest.mark.slow),
-        pytest.param(StateError(), Transport(), marks=pytest.mark.slow),
-        pytest.param(InferenceCompilation(), Resample(Systematic(), 0.5), marks=pytest.mark.slow),
+        (EvidenceLowerBound(), EssResampler(Systematic(), 1.0)),
+        pytest.param(EvidenceLowerBound(), SoftResampler(0.5), marks=pytest.mark.slow),
+        pytest.param(EvidenceLowerBound(), StopGradientResampler(), marks=pytest.mark.slow),
+        pytest.param(StateErrorLoss(), OptimalTransportResampler(), marks=pytest.mark.slow),
+        pytest.param(
+            InferenceCompilation(), EssResampler(Systematic(), 0.5), marks=pytest.mark.slow
+        ),
     ],
     ids=["bound", "soft", "score", "state error", "compilation"],
 )
-def test_each_objective_falls_on_worlds_not_learned_from(objective: Any, resampler: Any, tmp_path: Path) -> None:
+def test_each_objective_falls_on_worlds_not_learned_from(
+    objective: Any, resampler: Any, tmp_path: Path
+) -> None:
     epochs = 4
     plan = replace(QUICK, objective=objective, resampler=resampler, epochs=epochs)
     _, kept = trained(tmp_path, plan, fresh())
-    first = Pupil(plan, fresh(), LEVEL, lessons(1, 1)).validate(lessons(8, 1002))[0]
+    first = TrainingState(plan, fresh(), LEVEL, lessons(1, 1)).validate(lessons(8, 1002))[0]
     assert kept["best"] < first - 0.003
     assert len(kept["losses"]) == epochs
     assert kept["cost"]["updates"] == epochs * 2 * 2  # two batches, two segments
@@ -210,14 +266,18 @@ def test_each_objective_falls_on_worlds_not_learned_from(objective: Any, resampl
 
 @pytest.mark.slow
 def test_a_kernel_learns_to_jump_farther(tmp_path: Path) -> None:
-    method = ParticleFilter(20, moves=(Metropolis(LearnedWalk(SMALL, depth=1, checkpoint=None)),))
-    _, kept = trained(tmp_path, replace(QUICK, objective=Jump(), epochs=5, worlds=32), method)
+    method = ParticleFilter(
+        20, moves=(MetropolisHastings(LearnedRandomWalk(SMALL, lag=1, checkpoint=None)),)
+    )
+    _, kept = trained(
+        tmp_path, replace(QUICK, objective=ExpectedSquaredJump(), epochs=5, worlds=32), method
+    )
     values = [line["validation"] for line in kept["losses"]]
     assert min(values) < 1.1 * values[0] < 0.0  # a tenth farther
     assert set(kept["networks"]) == {"kernel"}
 
 
-class Stop(Exception):
+class Stop(Exception):  # noqa: N818
     pass
 
 
@@ -230,15 +290,19 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Pat
         if line.startswith("epoch 2 "):
             raise Stop
 
-    worlds, others = lessons(plan.worlds, plan.seed), lessons(plan.validation, plan.seed + 1)
+    worlds, others = lessons(plan.training_runs, plan.seed), lessons(plan.validation_runs, plan.seed + 1)
     with pytest.raises(Stop):
         train(plan, fresh(memory=2), LEVEL, worlds, others, tmp_path / "two.pt", tell=stop)
     assert (tmp_path / "two.pt.part").exists()
     assert not (tmp_path / "two.pt").exists()
-    two = learned_weights.read(train(plan, fresh(memory=2), LEVEL, worlds, others, tmp_path / "two.pt"))
-    assert learned_weights.digest(one["networks"]) == learned_weights.digest(two["networks"])
+    two = checkpoint.read_checkpoint(
+        train(plan, fresh(memory=2), LEVEL, worlds, others, tmp_path / "two.pt")
+    )
+    assert checkpoint.hash_weights(one["networks"]) == checkpoint.hash_weights(two["networks"])
     for a, b in zip(one["losses"], two["losses"], strict=True):
-        assert {k: v for k, v in a.items() if k != "seconds"} == {k: v for k, v in b.items() if k != "seconds"}
+        assert {k: v for k, v in a.items() if k != "seconds"} == {
+            k: v for k, v in b.items() if k != "seconds"
+        }
     assert not (tmp_path / "two.pt.part").exists()
     lines = list(csv.DictReader(whole.with_suffix(".csv").read_text().splitlines()))
     assert [float(line["loss"]) for line in lines] == [line["loss"] for line in one["losses"]]
@@ -247,19 +311,27 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Pat
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"learning_rate": 0.5}, "learning_rate=0.02, and this one has learning_rate=0.5"),
-        ({"objective": InferenceCompilation()}, "objective=Bound, and .* objective=InferenceCompilation"),
-        ({"worlds": 17}, "had worlds="),
-        ({"memory": 2}, "had proposal="),
-        ({"guide": GuidedNoise(GaussianFilter(Jacobian()))}, "own noise .*this one has proposal=what is guided by Jacobian"),
+        ({"learning_rate": 0.5}, "learning_rate must be 0.02 .* got 0.5"),
+        (
+            {"objective": InferenceCompilation()},
+            "objective must be EvidenceLowerBound .* got InferenceCompilation",
+        ),
+        ({"training_runs": 17}, "worlds must be"),
+        ({"memory": 2}, "proposal must be"),
+        (
+            {"guide_filter": GuidedNoiseProposal(GaussianFilter(TaylorLinearisation()))},
+            "own noise .* got what is guided by TaylorLinearisation",
+        ),
     ],
     ids=["rate", "objective", "worlds", "memory", "guide"],
 )
-def test_another_training_does_not_go_on_from_there(change: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_another_training_does_not_go_on_from_there(
+    change: dict[str, Any], said: str, tmp_path: Path
+) -> None:
     """Adam would take the stopped one's rate along, and weights of one filter would be finished as another's."""
 
     def run(plan: Training, tell: Callable[[str], object] | None = None, **options: Any) -> None:
-        worlds = lessons(plan.worlds, plan.seed)
+        worlds = lessons(plan.training_runs, plan.seed)
         train(plan, fresh(**options), LEVEL, worlds, worlds, tmp_path / "one.pt", tell=tell)
 
     def stop(line: str) -> None:
@@ -269,14 +341,19 @@ def test_another_training_does_not_go_on_from_there(change: dict[str, Any], said
     plan = replace(QUICK, epochs=2)
     with pytest.raises(Stop):
         run(plan, stop)
-    options = {name: value for name, value in change.items() if name in ("memory", "guide")}
+    options = {name: value for name, value in change.items() if name in ("memory", "guide_filter")}
     with pytest.raises(ValueError, match=said):
-        run(replace(plan, **{name: value for name, value in change.items() if name not in options}), **options)
-    run(replace(plan, epochs=3, patience=5))  # more of the same is the same training
-    assert len(learned_weights.read(tmp_path / "one.pt")["losses"]) == 3
+        run(
+            replace(plan, **{name: value for name, value in change.items() if name not in options}),
+            **options,
+        )
+    run(replace(plan, epochs=3, patience_epochs=5))  # more of the same is the same training
+    assert len(checkpoint.read_checkpoint(tmp_path / "one.pt")["losses"]) == 3
 
 
-def test_where_tensorboard_is_installed_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_tensorboard_is_installed_it_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     told: list[tuple[str, str, int]] = []
 
     class Writer:
@@ -289,8 +366,10 @@ def test_where_tensorboard_is_installed_it_is_told(tmp_path: Path, monkeypatch: 
         def flush(self) -> None: ...
 
     monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
-    trained(tmp_path, replace(QUICK, epochs=1, worlds=4), fresh())
+    monkeypatch.setitem(
+        sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer)
+    )
+    trained(tmp_path, replace(QUICK, epochs=1, training_runs=4), fresh())
     assert ("one", "validation", 1) in told
 
 
@@ -300,27 +379,29 @@ def test_another_seed_is_another_training_and_torch_s_stream_is_left_alone(tmp_p
     for seed in (1, 2):
         method = fresh()
         _, kept = trained(tmp_path, replace(QUICK, epochs=1, seed=seed), method, f"seed{seed}")
-        digests.add(learned_weights.digest(kept["networks"]))
+        digests.add(checkpoint.hash_weights(kept["networks"]))
     assert len(digests) == 2
     assert torch.equal(state, torch.random.get_rng_state())
 
 
 def test_it_stops_early_and_keeps_the_best(tmp_path: Path) -> None:
     """With a learning rate that ruins everything, the first epochs are the best ones, and what is kept is theirs."""
-    plan = replace(QUICK, epochs=30, patience=2, learning_rate=3.0)
+    plan = replace(QUICK, epochs=30, patience_epochs=2, learning_rate=3.0)
     path, kept = trained(tmp_path, plan, fresh())
     values = [line["validation"] for line in kept["losses"]]
     best = values.index(min(values))
     assert len(values) == best + 1 + 2 < 30
-    method = ParticleFilter(20, proposal=Learned(SMALL, checkpoint=str(path)))
-    pupil = Pupil(plan, method, LEVEL, lessons(1, 1))
-    assert pupil.validate(lessons(plan.validation, plan.seed + 1))[0] == pytest.approx(min(values), abs=1e-12)
+    method = ParticleFilter(20, proposal=LearnedProposal(SMALL, checkpoint=str(path)))
+    pupil = TrainingState(plan, method, LEVEL, lessons(1, 1))
+    assert pupil.validate(lessons(plan.validation_runs, plan.seed + 1))[0] == pytest.approx(
+        min(values), abs=1e-12
+    )
 
 
 def test_gradients_are_clipped(tmp_path: Path) -> None:
     """Adam forgets the scale of a gradient, but not of one among others: clipped to nothing, nothing is learned in one update."""
     worlds = lessons(8, 1)
-    pupil = Pupil(replace(QUICK, clip=1e-12), fresh(), LEVEL, worlds)
+    pupil = TrainingState(replace(QUICK, max_grad_norm=1e-12), fresh(), LEVEL, worlds)
     with torch.enable_grad():
         pupil._batch(worlds, torch.arange(8), Progress())
     norm = math.sqrt(sum(float(p.grad.square().sum()) for p in pupil.weights if p.grad is not None))
@@ -329,10 +410,12 @@ def test_gradients_are_clipped(tmp_path: Path) -> None:
 
 def test_a_gradient_that_is_not_finite_is_skipped_and_counted() -> None:
     worlds = lessons(8, 1)
-    broken = worlds._replace(record=worlds.record._replace(y=worlds.record.y.index_fill(1, torch.tensor([2]), 1e200)))
-    pupil = Pupil(QUICK, fresh(), LEVEL, worlds)
+    broken = worlds._replace(
+        record=worlds.record._replace(y=worlds.record.y.index_fill(1, torch.tensor([2]), 1e200))
+    )
+    pupil = TrainingState(QUICK, fresh(), LEVEL, worlds)
     progress = Progress()
-    line = pupil.epoch(progress, broken, worlds)
+    line = pupil.run_epoch(progress, broken, worlds)
     assert all(torch.isfinite(p).all() for p in pupil.weights)
     assert math.isfinite(line["validation"])
 
@@ -340,16 +423,16 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted() -> None:
 def test_a_batch_mixes_regimes() -> None:
     """Worlds of two regimes are drawn with run numbers of their own, and an epoch's batches hold both."""
 
-    class Loud(Nominal):
-        def errors(self, draws: Any, channels: Any, time: Tensor) -> Tensor:
-            return 50.0 + super().errors(draws, channels, time)
+    class Loud(NominalNoise):
+        def draw_errors(self, draws: Any, channels: Any, time: Tensor) -> Tensor:
+            return 50.0 + super().draw_errors(draws, channels, time)
 
-    worlds = lessons(20, 1, regimes=(Nominal(), Loud()))
+    worlds = lessons(20, 1, regimes=(NominalNoise(), Loud()))
     assert worlds.record.y.shape == (40, 10, 1)
     loud = worlds.record.y.mean((1, 2)) > 10.0
     assert loud.tolist() == [False] * 20 + [True] * 20
     assert (worlds.states[:20] - worlds.states[20:]).abs().min() > 1e-6
-    batches = Pupil(QUICK, fresh(), LEVEL, worlds)._batches(40, 0)
+    batches = TrainingState(QUICK, fresh(), LEVEL, worlds)._batches(40, 0)
     assert [len(rows) for rows in batches] == [8] * 5
     assert sum(bool(loud[rows].any() and not loud[rows].all()) for rows in batches) >= 4
     assert sorted(torch.cat(list(batches)).tolist()) == list(range(40))
@@ -358,24 +441,40 @@ def test_a_batch_mixes_regimes() -> None:
 @pytest.mark.slow
 def test_every_network_can_be_trained(tmp_path: Path) -> None:
     for name, make in NETWORKS.items():
-        _, kept = trained(tmp_path, replace(QUICK, epochs=1, worlds=8), fresh(shaken(make)), name)
+        _, kept = trained(
+            tmp_path, replace(QUICK, epochs=1, training_runs=8), fresh(shaken(make)), name
+        )
         assert math.isfinite(kept["best"])
 
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("epochs", 0), ("batch", 2.5), ("particles", 1), ("segment", 0), ("learning_rate", 0.0), ("clip", -1.0), ("seed", -1)],
+    [
+        ("epochs", 0),
+        ("batch_size", 2.5),
+        ("particles", 1),
+        ("gradient_steps", 0),
+        ("learning_rate", 0.0),
+        ("max_grad_norm", -1.0),
+        ("seed", -1),
+    ],
 )
 def test_training_refuses_values_of_no_use(key: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"train.{key}={value}: give"):
+    with pytest.raises(ValueError, match=f"train.{key} must be .*, got {value}"):
         Training(**{key: value})
 
 
 def test_training_refuses_what_it_cannot_do(tmp_path: Path) -> None:
     for method, objective, said in (
-        (ParticleFilter(5), Bound(), "nothing to train in it"),
-        (fresh(), Jump(), "filter.moves has none"),
-        (ParticleFilter(5, moves=(Metropolis(LearnedWalk(SMALL, checkpoint=None)),)), InferenceCompilation(), "trains a Learned"),
+        (ParticleFilter(5), EvidenceLowerBound(), "must have a network to train"),
+        (fresh(), ExpectedSquaredJump(), "filter.moves must have a LearnedRandomWalk"),
+        (
+            ParticleFilter(
+                5, moves=(MetropolisHastings(LearnedRandomWalk(SMALL, checkpoint=None)),)
+            ),
+            InferenceCompilation(),
+            "filter.proposal must be LearnedProposal",
+        ),
     ):
         with pytest.raises(ValueError, match=said):
             trained(tmp_path, replace(QUICK, objective=objective), method)
@@ -383,56 +482,87 @@ def test_training_refuses_what_it_cannot_do(tmp_path: Path) -> None:
 
 # the command line
 
-CHEAP = ("scenario=local_level", "scenario.steps=6", "particles=20", "filter=neural_sir", "filter.proposal.network.hidden=[4]")
-SHORT = ("train.epochs=2", "train.worlds=6", "train.validation=4", "train.batch=3", "train.particles=5")
+CHEAP = (
+    "scenario=local_level",
+    "scenario.steps=6",
+    "particles=20",
+    "filter=neural_sir",
+    "filter.proposal.network.hidden=[4]",
+)
+SHORT = (
+    "train.epochs=2",
+    "train.training_runs=6",
+    "train.validation_runs=4",
+    "train.batch_size=3",
+    "train.particles=5",
+)
 
 
 def test_train_and_run_at_the_command_line(tmp_path: Path) -> None:
-    words = [*CHEAP, f"results={tmp_path / 'results'}", "study=mine"]
-    said = pfbench("train", *words, *SHORT, "train.noises=[nominal,outliers]", home=tmp_path)
+    words = [*CHEAP, f"results_dir={tmp_path / 'results'}", "study=mine"]
+    said = pfbench("train", *words, *SHORT, "train.noise_regimes=[nominal,outliers]", home=tmp_path)
     assert said.code == 0, said.err
     assert "epoch 2 loss" in said.out
     (path,) = (tmp_path / "results" / "mine" / "checkpoints").glob("*.pt")
-    kept = learned_weights.read(path)
+    kept = checkpoint.read_checkpoint(path)
     assert kept["choices"]["noise"] == "nominal+outliers"
     assert kept["config"]["train"]["epochs"] == 2
     assert kept["split"]["train"] == {"seed": 1001, "runs": 12}
     assert kept["split"]["validation"] == {"seed": 1002, "runs": 8}
     assert kept["cost"]["seconds"] > 0.0
-    assert "trained already" in pfbench("train", *words, *SHORT, "train.noises=[nominal,outliers]", home=tmp_path).out
+    assert (
+        "checkpoint exists"
+        in pfbench(
+            "train", *words, *SHORT, "train.noise_regimes=[nominal,outliers]", home=tmp_path
+        ).out
+    )
 
     part = path.with_name(path.name + ".part")
     part.write_text("of something else")
-    again = pfbench("train", *words, *SHORT, "train.noises=[nominal,outliers]", "fresh=true", home=tmp_path)
+    again = pfbench(
+        "train",
+        *words,
+        *SHORT,
+        "train.noise_regimes=[nominal,outliers]",
+        "overwrite=true",
+        home=tmp_path,
+    )
     assert again.code == 0, again.err  # from the beginning: it does not go on from there
     assert not part.exists()
-    assert learned_weights.digest(learned_weights.read(path)["networks"]) == learned_weights.digest(kept["networks"])
+    assert checkpoint.hash_weights(
+        checkpoint.read_checkpoint(path)["networks"]
+    ) == checkpoint.hash_weights(kept["networks"])
 
     run = [*words, "runs=3", f"checkpoint={path}"]
     said = pfbench("run", *run, home=tmp_path)
     assert said.code == 0, said.err
-    (result,) = store.results(tmp_path / "results" / "mine")
+    (result,) = store.list_results(tmp_path / "results" / "mine")
     assert result.meta["exact"]
-    assert result.meta["trained"]["cost"] == learned_weights.read(path)["cost"]
-    assert result.meta["trained"]["weights"] == learned_weights.digest(kept["networks"])
+    assert result.meta["trained"]["cost"] == checkpoint.read_checkpoint(path)["cost"]
+    assert result.meta["trained"]["weights"] == checkpoint.hash_weights(kept["networks"])
     moved = tmp_path / "moved.pt"
     moved.write_bytes(path.read_bytes())
     assert pfbench("run", *words, "runs=3", f"checkpoint={moved}", home=tmp_path).code == 0
-    assert len(list(store.results(tmp_path / "results" / "mine"))) == 1  # the same weights, the same job
+    assert (
+        len(list(store.list_results(tmp_path / "results" / "mine"))) == 1
+    )  # the same weights, the same job
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("run", "runs=2"), "checkpoint=null: .*`pfbench train`"),
-        (("train", "-m"), "one network at a time"),
-        (("train", "train.epoch=3"), "did you mean train.epochs"),
-        (("train", "told=true"), "told=true: a network is trained"),
-        (("train", "train.noises=[nomnal]"), "there is no such noise; did you mean nominal"),
+        (("run", "runs=2"), "checkpoint must be a file .*got null.*`pfbench train`"),
+        (("train", "-m"), "must be run without -m: it trains one network"),
+        (("train", "train.epoch=3"), "Similar: train.epochs"),
+        (("train", "oracle_noise=true"), "oracle_noise must be false for training, got true"),
+        (
+            ("train", "train.noise_regimes=[nomnal]"),
+            "noise=nomnal does not exist. Similar: nominal",
+        ),
     ],
     ids=lambda value: "" if isinstance(value, str) else " ".join(value),
 )
 def test_mistakes_are_told_in_words(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
-    answer = pfbench(words[0], *CHEAP, *words[1:], f"results={tmp_path}", home=tmp_path)
+    answer = pfbench(words[0], *CHEAP, *words[1:], f"results_dir={tmp_path}", home=tmp_path)
     assert answer.code == 1
     assert re.search(said, answer.err), answer.err

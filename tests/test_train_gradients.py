@@ -10,18 +10,24 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from test_particle_filters import CASES, check_unbiased, run
+from particle_cases import CASES
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter.belief import Cloud, moments
-from pfbench.filter.differentiable import Soft, StopGradient, Transport, transport_plan
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
+from pfbench.filter.learned.differentiable_resampling import (
+    OptimalTransportResampler,
+    SoftResampler,
+    StopGradientResampler,
+    compute_transport_plan,
+)
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.resamplers import Multinomial, Resample, Resampler, Systematic
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.resampling import EssResampler, Multinomial, Resampler, Systematic
 from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
-from pfbench.record import Record
+from pfbench.testing import check_evidence, filter_record
 
 Y = torch.tensor([[0.8], [1.9], [-0.4], [2.5], [1.0], [-1.5]], dtype=torch.float64)
 THETA = torch.tensor([0.8, math.log(0.9)], dtype=torch.float64)  # a, log q
@@ -76,19 +82,21 @@ def bias(resampler: Resampler, particles: int, runs: int, of_z: bool) -> Found:
     """Of grad Z_hat / Z (`of_z`), or of grad log Z_hat."""
     theta = THETA.expand(runs, -1).clone().requires_grad_()
     method = ParticleFilter(particles, resampler)
-    estimate = run_filter(method, Walker(theta), Record(Y.expand(runs, -1, -1)), MonteCarlo(4, torch.arange(runs)))
+    estimate = run_filter(
+        method, Walker(theta), Record(Y.expand(runs, -1, -1)), PhiloxStream(4, torch.arange(runs))
+    )
     gradient = torch.autograd.grad(estimate.log_evidence.sum(), theta)[0]
     if of_z:
         gradient = gradient * (estimate.log_evidence.detach() - kalman(THETA)).exp()[:, None]
     return Found(gradient.mean(0) - exact(), gradient.std(0) / math.sqrt(runs))
 
 
-DROPPED = Resample(Systematic(), 1.0)
+DROPPED = EssResampler(Systematic(), 1.0)
 UNBIASED: dict[str, Resampler] = {
-    "score": StopGradient(),
-    "score, multinomial": StopGradient(Resample(Multinomial(), 1.0)),
-    "score, adaptive": StopGradient(Resample(Systematic(), 0.6)),
-    "score, soft": Soft(0.5, StopGradient()),
+    "score": StopGradientResampler(),
+    "score, multinomial": StopGradientResampler(EssResampler(Multinomial(), 1.0)),
+    "score, adaptive": StopGradientResampler(EssResampler(Systematic(), 0.6)),
+    "score, soft": SoftResampler(0.5, StopGradientResampler()),
 }
 
 
@@ -105,18 +113,24 @@ class Slotted:
     """Soft or score weights with the mistake that is often made: of the slot, not of the ancestor."""
 
     soft: bool
-    exact = True
+    is_exact = True
 
-    def __call__(self, model: StateSpaceModel, cloud: Cloud, log_a: Tensor, n: Tensor, draws: Any) -> tuple[Cloud, Tensor]:
-        wanted = torch.logaddexp(log_a + math.log(0.5), torch.full_like(log_a, math.log(0.5 / log_a.shape[1])))
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, log_a: Tensor, n: Tensor, draws: Any
+    ) -> tuple[ParticleBelief, Tensor]:
+        wanted = torch.logaddexp(
+            log_a + math.log(0.5), torch.full_like(log_a, math.log(0.5 / log_a.shape[1]))
+        )
         used = wanted if self.soft else log_a
-        fresh, hit = DROPPED(model, cloud._replace(log_w=used), used, n, draws)
+        fresh, hit = DROPPED(model, belief._replace(log_w=used), used, n, draws)
         correction = log_a - wanted if self.soft else log_a - log_a.detach()
         return fresh._replace(log_w=fresh.log_w + correction), hit
 
 
 @pytest.mark.parametrize(
-    "resampler", [DROPPED, Soft(0.5), Slotted(False)], ids=["dropped", "soft", "wrong score"]
+    "resampler",
+    [DROPPED, SoftResampler(0.5), Slotted(False)],
+    ids=["dropped", "soft", "wrong score"],
 )
 def test_without_it_there_is_a_bias_and_the_test_sees_it(resampler: Resampler) -> None:
     found = bias(resampler, 6, 6000, of_z=True)
@@ -127,10 +141,14 @@ def test_without_it_there_is_a_bias_and_the_test_sees_it(resampler: Resampler) -
 def test_the_bias_that_many_particles_leave() -> None:
     """Of grad log Z_hat: the score's and transport's go, the dropped one stays, and soft weights mend part of it."""
     cases: dict[str, tuple[Resampler, int]] = {
-        "dropped": (DROPPED, 400), "soft": (Soft(0.3), 400), "transport": (Transport(), 100), "score": (StopGradient(), 2000)
+        "dropped": (DROPPED, 400), "soft": (SoftResampler(0.3), 400), "transport": (OptimalTransportResampler(), 100), "score": (StopGradientResampler(), 2000)
     }  # fmt: skip
-    found = {name: bias(resampler, 100, runs, of_z=False) for name, (resampler, runs) in cases.items()}
-    share = {name: (value.bias / exact()).norm().item() for name, value in found.items()}  # of the gradient itself
+    found = {
+        name: bias(resampler, 100, runs, of_z=False) for name, (resampler, runs) in cases.items()
+    }
+    share = {
+        name: (value.bias / exact()).norm().item() for name, value in found.items()
+    }  # of the gradient itself
     noise = {name: (value.error / exact()).norm().item() for name, value in found.items()}
     assert max(noise.values()) < 0.07
     assert share["dropped"] > 0.5
@@ -141,7 +159,10 @@ def test_the_bias_that_many_particles_leave() -> None:
 
 def test_the_score_changes_no_number() -> None:
     model, y, _ = CASES["growth"]()
-    one, other = (run(ParticleFilter(30, resampler), model, y, runs=3) for resampler in (DROPPED, StopGradient()))
+    one, other = (
+        filter_record(ParticleFilter(30, resampler), model, y, runs=3)
+        for resampler in (DROPPED, StopGradientResampler())
+    )
     assert torch.equal(one.mean, other.mean)
     assert torch.equal(one.log_evidence, other.log_evidence)
 
@@ -149,30 +170,32 @@ def test_the_score_changes_no_number() -> None:
 @pytest.mark.parametrize("alpha", [0.2, 0.7, 1.0])
 def test_soft_resampling_targets_what_it_should(alpha: float) -> None:
     model, y, answer = CASES["growth"]()
-    method = ParticleFilter(60, Soft(alpha))
-    assert method.exact
-    check_unbiased(method, model, y, answer, runs=700)
+    method = ParticleFilter(60, SoftResampler(alpha))
+    assert method.is_exact
+    check_evidence(method, model, y, answer, runs=700)
 
 
 def test_soft_weights_of_the_slot_are_seen() -> None:
     model, y, answer = CASES["growth"]()
     with pytest.raises(AssertionError):
-        check_unbiased(ParticleFilter(60, Slotted(True)), model, y, answer, runs=700)
+        check_evidence(ParticleFilter(60, Slotted(True)), model, y, answer, runs=700)
 
 
 # transport
 
 
-def cloud_of(n: int, d: int, runs: int = 3) -> Cloud:
-    draws = MonteCarlo(7, torch.arange(runs))
+def cloud_of(n: int, d: int, runs: int = 3) -> ParticleBelief:
+    draws = PhiloxStream(7, torch.arange(runs))
     log_w = torch.log_softmax(1.5 * draws.normal("w", n, 1)[..., 0], 1)
-    return Cloud(draws.normal("x", n, d), log_w, torch.zeros(runs, dtype=torch.float64))
+    return ParticleBelief(draws.normal("x", n, d), log_w, torch.zeros(runs, dtype=torch.float64))
 
 
 def test_a_plan_has_its_margins() -> None:
     cloud = cloud_of(25, 2)
-    plan = transport_plan(cloud.x, cloud.log_w, 0.3, 100)
-    torch.testing.assert_close(plan.sum(1), torch.full((3, 25), 1 / 25, dtype=torch.float64), rtol=0, atol=1e-4)
+    plan = compute_transport_plan(cloud.x, cloud.log_w, 0.3, 100)
+    torch.testing.assert_close(
+        plan.sum(1), torch.full((3, 25), 1 / 25, dtype=torch.float64), rtol=0, atol=1e-4
+    )
     torch.testing.assert_close(plan.sum(2), cloud.log_w.exp(), rtol=1e-10, atol=1e-14)
     assert (plan >= 0).all()
 
@@ -181,30 +204,41 @@ def test_in_one_dimension_the_plan_goes_to_the_order_s() -> None:
     """With little entropy x' are the means of the weighted cloud's even slices, in order: the exact transport on a line."""
     x = torch.tensor([[[-1.0], [0.0], [1.0], [2.0]]], dtype=torch.float64)
     a = torch.tensor([[0.5, 0.125, 0.125, 0.25]], dtype=torch.float64)
-    plan = transport_plan(x, a.log(), 0.02, 1000)
+    plan = compute_transport_plan(x, a.log(), 0.02, 1000)
     moved = (plan.mT @ x / plan.sum(1, keepdim=True).mT)[0, :, 0]
-    torch.testing.assert_close(moved.sort()[0], torch.tensor([-1.0, -1.0, 0.5, 2.0], dtype=torch.float64), rtol=0, atol=5e-3)
+    torch.testing.assert_close(
+        moved.sort()[0],
+        torch.tensor([-1.0, -1.0, 0.5, 2.0], dtype=torch.float64),
+        rtol=0,
+        atol=5e-3,
+    )
 
 
 def test_transport_keeps_the_mean_and_most_of_the_spread() -> None:
     model = Walker(THETA.expand(3, -1))
     cloud = cloud_of(200, 1)
     n = torch.tensor([[200]])
-    before, variance = moments(model.chart, cloud)
+    before, variance = weighted_mean_cov(model.chart, cloud)
     for epsilon, iterations, least in ((0.05, 40, 0.9), (0.3, 2, 0.5)):
-        fresh, _ = Transport(epsilon, iterations)(model, cloud, cloud.log_w, n, MonteCarlo(1, torch.arange(3)))
-        after, spread = moments(model.chart, fresh)
+        fresh, _ = OptimalTransportResampler(epsilon, iterations)(
+            model, cloud, cloud.log_w, n, PhiloxStream(1, torch.arange(3))
+        )
+        after, spread = weighted_mean_cov(model.chart, fresh)
         torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
-        torch.testing.assert_close(fresh.log_w.logsumexp(1), torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-12)
+        torch.testing.assert_close(
+            fresh.log_w.logsumexp(1), torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-12
+        )
         assert (spread < variance).all()
         assert (spread > least * variance).all()
 
 
 def test_transport_says_that_it_is_not_exact_and_is_near() -> None:
-    method = ParticleFilter(60, Transport())
-    assert not method.exact
+    method = ParticleFilter(60, OptimalTransportResampler())
+    assert not method.is_exact
     runs, model = 40, Walker(THETA.expand(40, -1))
-    estimate = run_filter(method, model, Record(Y.expand(runs, -1, -1)), MonteCarlo(1, torch.arange(runs)))
+    estimate = run_filter(
+        method, model, Record(Y.expand(runs, -1, -1)), PhiloxStream(1, torch.arange(runs))
+    )
     away = estimate.log_evidence - kalman(THETA)
     assert away.mean().abs() < 0.15 + 4.0 * away.std() / math.sqrt(runs)
     assert away.std() < 0.8
@@ -212,9 +246,13 @@ def test_transport_says_that_it_is_not_exact_and_is_near() -> None:
 
 def test_transport_leaves_alone_what_it_need_not_touch() -> None:
     cloud = cloud_of(20, 1)
-    even = cloud._replace(log_w=cloud.log_w.clone().index_fill(0, torch.tensor([1]), -math.log(20.0)))
-    n, draws = torch.tensor([[20]]), MonteCarlo(1, torch.arange(3))
-    fresh, hit = Transport(threshold=0.9)(Walker(THETA.expand(3, -1)), even, even.log_w, n, draws)
+    even = cloud._replace(
+        log_w=cloud.log_w.clone().index_fill(0, torch.tensor([1]), -math.log(20.0))
+    )
+    n, draws = torch.tensor([[20]]), PhiloxStream(1, torch.arange(3))
+    fresh, hit = OptimalTransportResampler(threshold=0.9)(
+        Walker(THETA.expand(3, -1)), even, even.log_w, n, draws
+    )
     assert hit.tolist() == [True, False, True]
     assert torch.equal(fresh.x[1], even.x[1])
     assert not torch.equal(fresh.x[0], even.x[0])
@@ -223,9 +261,20 @@ def test_transport_leaves_alone_what_it_need_not_touch() -> None:
 def test_resampling_with_gradients_refuses_what_it_cannot_do() -> None:
     cloud = cloud_of(20, 1)
     remembers = cloud._replace(memory={"own": cloud.x})
-    with pytest.raises(ValueError, match="have no past"):
-        Transport()(Walker(THETA.expand(3, -1)), remembers, cloud.log_w, torch.tensor([[20]]), MonteCarlo(1, torch.arange(3)))
-    makes: list[Callable[[], Any]] = [partial(Soft, 0.0), partial(Soft, 1.5), partial(Transport, 0.0), partial(Transport, 1.0, 0)]
-    for make in [*makes, partial(Transport, threshold=2.0)]:
-        with pytest.raises(ValueError, match=r"resampler\.\w+="):
+    with pytest.raises(ValueError, match="have a past or memory"):
+        OptimalTransportResampler()(
+            Walker(THETA.expand(3, -1)),
+            remembers,
+            cloud.log_w,
+            torch.tensor([[20]]),
+            PhiloxStream(1, torch.arange(3)),
+        )
+    makes: list[Callable[[], Any]] = [
+        partial(SoftResampler, 0.0),
+        partial(SoftResampler, 1.5),
+        partial(OptimalTransportResampler, 0.0),
+        partial(OptimalTransportResampler, 1.0, 0),
+    ]
+    for make in [*makes, partial(OptimalTransportResampler, threshold=2.0)]:
+        with pytest.raises(ValueError, match=r"resampler\.\w+ must be"):
             make()

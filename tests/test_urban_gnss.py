@@ -14,10 +14,19 @@ from scipy import integrate, stats
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from pfbench.model.urban_gnss import Believed, Normal, RangeLaw, SightOrTail, Sky, TailedNormal, UrbanGnss, range_change
-from pfbench.record import Record
+from pfbench.core.record import Record
+from pfbench.model.urban_gnss import (
+    LosNlosRangeError,
+    NormalExponentialMixture,
+    NormalRangeError,
+    PseudorangeError,
+    UrbanGnss,
+    UrbanInputs,
+    UrbanTuning,
+    range_change,
+)
 
-BELIEVED = Believed(
+BELIEVED = UrbanTuning(
     distance_density=0.2,
     heading_density=0.01,
     height_density=0.1,
@@ -34,32 +43,42 @@ BELIEVED = Believed(
     initial_scale_sd=0.01,
     initial_yaw_bias_sd=0.002,
 )
-MIXED = SightOrTail(share=0.4, sd=3.0, tail=40.0, slope=0.5)
+MIXED = LosNlosRangeError(share=0.4, sd=3.0, tail=40.0, slope=0.5)
 STATE = torch.tensor([40.0, -70.0, 3.0, 2.9, 12.0, -0.4, -5.0, -0.007, 0.001], dtype=torch.float64)
 LAWS = [(-1.0, 3.0, 40.0), (0.5, 6.0, 45.0), (2.0, 5.0, 1.0), (-8.0, 0.5, 100.0)]  # odds, sd, tail
 
 
-def sky(duration: float = 0.2, speed: float = 8.0, yaw_rate: float = 0.3) -> Sky:
+def sky(duration: float = 0.2, speed: float = 8.0, yaw_rate: float = 0.3) -> UrbanInputs:
     """One step's inputs, without the time axis: three satellites, the last one of GLONASS."""
-    line = torch.tensor([[0.6, 0.0, 0.8], [-0.48, 0.6, 0.64], [0.0, -0.96, 0.28]], dtype=torch.float64)
+    line = torch.tensor(
+        [[0.6, 0.0, 0.8], [-0.48, 0.6, 0.64], [0.0, -0.96, 0.28]], dtype=torch.float64
+    )
     reach = torch.tensor([2.02e7, 2.1e7, 2.3e7], dtype=torch.float64)
     row = [torch.tensor([value], dtype=torch.float64) for value in (duration, speed, yaw_rate)]
-    sky_rows = [line, reach, reach.new_tensor([0, 0, 1]), reach.new_tensor([50, 40, 30]), reach.new_tensor([5, 8, 11])]
-    return Sky(*row, *(part.unsqueeze(0) for part in sky_rows))
+    sky_rows = [
+        line,
+        reach,
+        reach.new_tensor([0, 0, 1]),
+        reach.new_tensor([50, 40, 30]),
+        reach.new_tensor([5, 8, 11]),
+    ]
+    return UrbanInputs(*row, *(part.unsqueeze(0) for part in sky_rows))
 
 
-def model(law: RangeLaw = MIXED, **changes: float) -> UrbanGnss:
+def model(law: PseudorangeError = MIXED, **changes: float) -> UrbanGnss:
     return UrbanGnss(replace(BELIEVED, **changes), law)
 
 
-def moved(x: Tensor, u: Sky, w: Tensor | None = None) -> Tensor:
+def moved(x: Tensor, u: UrbanInputs, w: Tensor | None = None) -> Tensor:
     """One step of a single state."""
     noise = torch.zeros(1, 1, 8, dtype=x.dtype) if w is None else w.reshape(1, 1, 8)
     return model().to(x.dtype).propagate(x.reshape(1, 1, 9), u, noise)[0, 0]
 
 
-def tailed(odds: float, sd: float, tail: float, loc: float = 0.0) -> TailedNormal:
-    return TailedNormal(*(torch.tensor(a, dtype=torch.float64) for a in (loc, odds, sd, tail)))
+def tailed(odds: float, sd: float, tail: float, loc: float = 0.0) -> NormalExponentialMixture:
+    return NormalExponentialMixture(
+        *(torch.tensor(a, dtype=torch.float64) for a in (loc, odds, sd, tail))
+    )
 
 
 # motion
@@ -70,17 +89,23 @@ def test_a_steady_turn_is_a_circle(yaw_rate: float) -> None:
     duration, v, x = 1.5, 8.0, STATE.clone()
     end = moved(x, sky(duration, v, yaw_rate))
     rate, speed, h = yaw_rate - x[8], v * (1 + x[7]), x[3]
-    east = x[0] + speed / rate * (torch.cos(h) - torch.cos(h + rate * duration))  # integral of speed sin(heading)
+    east = x[0] + speed / rate * (
+        torch.cos(h) - torch.cos(h + rate * duration)
+    )  # integral of speed sin(heading)
     north = x[1] + speed / rate * (torch.sin(h + rate * duration) - torch.sin(h))
     assert torch.allclose(end[:2], torch.stack([east, north]), rtol=0, atol=1e-9)
     turn = end[3] - h - rate * duration
-    assert float(torch.remainder(turn + math.pi, 2 * math.pi) - math.pi) == pytest.approx(0.0, abs=1e-12)
+    assert float(torch.remainder(turn + math.pi, 2 * math.pi) - math.pi) == pytest.approx(
+        0.0, abs=1e-12
+    )
     assert abs(float(end[3])) <= math.pi
 
 
 def test_a_car_drives_where_it_points_and_turns_clockwise() -> None:
     east = torch.tensor([0.0, 0, 0, math.pi / 2, 0, 0, 0, 0, 0], dtype=torch.float64)
-    assert torch.allclose(moved(east, sky(1.0, 8.0, 0.0))[:2], east.new_tensor([8.0, 0.0]), rtol=0, atol=1e-12)
+    assert torch.allclose(
+        moved(east, sky(1.0, 8.0, 0.0))[:2], east.new_tensor([8.0, 0.0]), rtol=0, atol=1e-12
+    )
     end = moved(torch.zeros_like(east), sky(1.0, 8.0, 0.1))
     assert end[0] > 0  # from North to the East
     assert end[3] == pytest.approx(0.1)
@@ -93,7 +118,9 @@ def test_two_half_steps_are_a_step() -> None:
 
 def test_the_clock_runs_on_its_drift() -> None:
     end = moved(STATE, sky(0.25))
-    assert torch.allclose(end[4:], STATE[4:] + STATE.new_tensor([0.25 * -0.4, 0, 0, 0, 0]), rtol=0, atol=1e-12)
+    assert torch.allclose(
+        end[4:], STATE[4:] + STATE.new_tensor([0.25 * -0.4, 0, 0, 0, 0]), rtol=0, atol=1e-12
+    )
     assert end[2] == STATE[2]
 
 
@@ -118,12 +145,23 @@ def test_the_step_has_the_derivatives_of_finite_differences() -> None:
 def test_the_noise_has_the_densities_it_is_given() -> None:
     """Over one step from a state that faces North, at first order."""
     u, x = sky(0.25, 8.0, 0.0), torch.zeros(9, dtype=torch.float64)
-    columns = torch.stack([(moved(x, u, e) - moved(x, u, -e)) / 2e-4 for e in 1e-4 * torch.eye(8, dtype=torch.float64)], -1)
+    columns = torch.stack(
+        [
+            (moved(x, u, e) - moved(x, u, -e)) / 2e-4
+            for e in 1e-4 * torch.eye(8, dtype=torch.float64)
+        ],
+        -1,
+    )
     root = 0.5
     expected = torch.zeros(9, 8, dtype=torch.float64)
     expected[1, 0] = 0.2 * root
     expected[0, 1], expected[3, 1] = 8.0 * 0.25 / 2 * 0.01 * root, 0.01 * root
-    expected[2, 2], expected[4, 3], expected[5, 4], expected[6, 5] = 0.1 * root, 0.3 * root, 0.04 * root, 0.05 * root
+    expected[2, 2], expected[4, 3], expected[5, 4], expected[6, 5] = (
+        0.1 * root,
+        0.3 * root,
+        0.04 * root,
+        0.05 * root,
+    )
     expected[4, 4] = 0.04 * root * 0.25 / 2
     expected[7, 6], expected[8, 7] = 1e-3 * root, 1e-4 * root
     assert torch.allclose(columns, expected, rtol=0, atol=1e-9)
@@ -134,11 +172,15 @@ def test_the_noise_has_the_densities_it_is_given() -> None:
 
 def test_a_change_of_range_is_the_difference_of_ranges() -> None:
     u = sky()
-    position = 600.0 * torch.randn(1, 200, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    position = 600.0 * torch.randn(
+        1, 200, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     place = u.line * u.reach.unsqueeze(-1)
     exact = (place.unsqueeze(1) - position.unsqueeze(2)).norm(dim=-1) - place.norm(dim=-1)
     found = range_change(position, u.line, u.reach)
-    assert torch.allclose(found, exact, rtol=0, atol=3e-8)  # what the difference of ranges of 2e7 m leaves of its digits
+    assert torch.allclose(
+        found, exact, rtol=0, atol=3e-8
+    )  # what the difference of ranges of 2e7 m leaves of its digits
     single = range_change(position.float(), u.line.float(), u.reach.float())
     assert (single.double() - exact).abs().max() < 1e-3  # 2400 m times some half units of 6e-8
     toward = range_change(10.0 * u.line[:, :1], u.line, u.reach)
@@ -147,29 +189,49 @@ def test_a_change_of_range_is_the_difference_of_ranges() -> None:
 
 def test_what_is_seen_is_range_and_clock_and_for_one_system_its_bias() -> None:
     u, x = sky(), STATE.reshape(1, 1, 9)
-    mean = model(Normal()).observation(x, u).mean
+    mean = model(NormalRangeError()).observation(x, u).mean
     straight = range_change(x[..., :3], u.line, u.reach)
-    assert torch.allclose(mean - straight, x.new_tensor([12.0, 12.0, 12.0 - 5.0]), rtol=0, atol=1e-12)
-    assert torch.allclose(model(Normal(2.0)).observation(x, u).stddev, 2.0 * u.sd.unsqueeze(1), rtol=0, atol=1e-12)
+    assert torch.allclose(
+        mean - straight, x.new_tensor([12.0, 12.0, 12.0 - 5.0]), rtol=0, atol=1e-12
+    )
+    assert torch.allclose(
+        model(NormalRangeError(2.0)).observation(x, u).stddev,
+        2.0 * u.sd.unsqueeze(1),
+        rtol=0,
+        atol=1e-12,
+    )
 
 
 def test_a_satellite_that_was_not_seen_weighs_nothing() -> None:
     u, x = sky(), STATE.repeat(1, 4, 1) + 30.0 * torch.arange(4.0).reshape(1, 4, 1)
     y = torch.tensor([[20.0, torch.nan, 44.0]], dtype=torch.float64)
-    for law in (Normal(3.0), MIXED):
+    for law in (NormalRangeError(3.0), MIXED):
         whole = model(law)
-        seen = Sky(*u[:3], *(leaf[:, [0, 2]] for leaf in u[3:]))
-        assert torch.allclose(whole.log_likelihood(y, x, u), whole.log_likelihood(y[:, [0, 2]], x, seen), rtol=1e-12, atol=0)
-        single = whole.float().log_likelihood(y.float(), x.float(), Sky(*(leaf.float() for leaf in u)))
-        assert torch.allclose(single.double(), whole.double().log_likelihood(y, x, u), rtol=1e-4, atol=0)
+        seen = UrbanInputs(*u[:3], *(leaf[:, [0, 2]] for leaf in u[3:]))
+        assert torch.allclose(
+            whole.log_likelihood(y, x, u),
+            whole.log_likelihood(y[:, [0, 2]], x, seen),
+            rtol=1e-12,
+            atol=0,
+        )
+        single = whole.float().log_likelihood(
+            y.float(), x.float(), UrbanInputs(*(leaf.float() for leaf in u))
+        )
+        assert torch.allclose(
+            single.double(), whole.double().log_likelihood(y, x, u), rtol=1e-4, atol=0
+        )
 
 
 def test_every_satellite_has_its_own_share_by_its_strength() -> None:
     law = MIXED(torch.zeros(1, 1, 3, dtype=torch.float64), sky()).base_dist
     logit = math.log(0.4 / 0.6)
-    assert torch.allclose(law.odds[0, 0], law.odds.new_tensor([logit + 5.0, logit, logit - 5.0]), rtol=0, atol=1e-12)
+    assert torch.allclose(
+        law.odds[0, 0], law.odds.new_tensor([logit + 5.0, logit, logit - 5.0]), rtol=0, atol=1e-12
+    )
     flat = replace(MIXED, slope=0.0)(torch.zeros(1, 1, 3, dtype=torch.float64), sky()).base_dist
-    assert torch.allclose(torch.sigmoid(flat.odds), torch.full_like(flat.odds, 0.4), rtol=0, atol=1e-12)
+    assert torch.allclose(
+        torch.sigmoid(flat.odds), torch.full_like(flat.odds, 0.4), rtol=0, atol=1e-12
+    )
 
 
 # the law of a range that may be reflected
@@ -183,7 +245,9 @@ def mixture(f: str, value: np.ndarray, odds: float, sd: float, tail: float) -> n
 
 
 @pytest.mark.parametrize(("odds", "sd", "tail"), LAWS)
-def test_the_density_is_that_of_scipy_and_integrates_to_one(odds: float, sd: float, tail: float) -> None:
+def test_the_density_is_that_of_scipy_and_integrates_to_one(
+    odds: float, sd: float, tail: float
+) -> None:
     law = tailed(odds, sd, tail, loc=7.0)
     value = np.concatenate([np.linspace(-6 * sd, 6 * sd, 101), np.linspace(0.1, 12, 50) * tail])
     density = law.log_prob(torch.from_numpy(7.0 + value)).exp().numpy()
@@ -191,10 +255,15 @@ def test_the_density_is_that_of_scipy_and_integrates_to_one(odds: float, sd: flo
 
     def moment(k: int) -> float:
         def integrand(v: float) -> float:
-            return (v - 7.0) ** k * math.exp(float(law.log_prob(torch.tensor(v, dtype=torch.float64))))
+            return (v - 7.0) ** k * math.exp(
+                float(law.log_prob(torch.tensor(v, dtype=torch.float64)))
+            )
 
         cuts = [7.0 - 10 * sd, 7.0, 7.0 + 6 * sd, 7.0 + 8 * sd + 45 * tail]
-        return sum(integrate.quad(integrand, a, b, epsabs=1e-11, epsrel=1e-10)[0] for a, b in pairwise(cuts))
+        return sum(
+            integrate.quad(integrand, a, b, epsabs=1e-11, epsrel=1e-10)[0]
+            for a, b in pairwise(cuts)
+        )
 
     assert moment(0) == pytest.approx(1.0, abs=1e-8)
     mean = moment(1)
@@ -211,9 +280,11 @@ def test_draws_have_the_law() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_far_values_have_finite_densities_and_slopes(dtype: torch.dtype) -> None:
-    value = torch.tensor([-2e4, -300.0, -1.0, 0.0, 1.0, 300.0, 2e4], dtype=dtype, requires_grad=True)
+    value = torch.tensor(
+        [-2e4, -300.0, -1.0, 0.0, 1.0, 300.0, 2e4], dtype=dtype, requires_grad=True
+    )
     parts = [torch.tensor(a, dtype=dtype, requires_grad=True) for a in (0.0, 0.5, 3.0, 40.0)]
-    density = TailedNormal(*parts).log_prob(value)
+    density = NormalExponentialMixture(*parts).log_prob(value)
     slopes = torch.autograd.grad(density.sum(), [value, *parts])
     assert torch.isfinite(density).all()
     assert all(torch.isfinite(slope).all() for slope in slopes)
@@ -225,10 +296,13 @@ def test_far_values_have_finite_densities_and_slopes(dtype: torch.dtype) -> None
 def test_slopes_are_those_of_finite_differences() -> None:
     def log_density(*parts: Tensor) -> Tensor:
         value, *rest = parts
-        return TailedNormal(*rest).log_prob(value)
+        return NormalExponentialMixture(*rest).log_prob(value)
 
     value = torch.tensor([-20.0, -3.0, 0.5, 9.0, 150.0], dtype=torch.float64)
-    parts = [a.expand(5).clone().requires_grad_() for a in torch.tensor([1.0, 0.3, 3.0, 40.0], dtype=torch.float64)]
+    parts = [
+        a.expand(5).clone().requires_grad_()
+        for a in torch.tensor([1.0, 0.3, 3.0, 40.0], dtype=torch.float64)
+    ]
     assert torch.autograd.gradcheck(log_density, (value.requires_grad_(), *parts))
 
 
@@ -248,14 +322,23 @@ def test_the_law_broadcasts_expands_and_sums_over_satellites() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: SightOrTail(1.0, 3.0, 40.0), r"law\.share=1\.0: give a probability"),
-        (lambda: SightOrTail(0.5, 0.0, 40.0), r"law\.sd=0\.0"),
-        (lambda: SightOrTail(0.5, 3.0, -1.0), r"law\.tail=-1\.0"),
-        (lambda: SightOrTail(0.5, 3.0, 40.0, math.inf), r"law\.slope=inf"),
-        (lambda: Normal(0.0), r"law\.factor=0\.0"),
-        (lambda: model(drift_density=0.0), r"believed\.drift_density=\[0\.0\]"),
-        (lambda: model(initial_heading_sd_deg=-1.0), r"believed\.initial_heading_sd_deg"),
-        (lambda: UrbanGnss(replace(BELIEVED, initial_position_sd=[1.0]), MIXED), r"initial_position_sd=\[1\.0\]: give three"),
+        (
+            lambda: LosNlosRangeError(1.0, 3.0, 40.0),
+            r"range_error\.share must be between 0 and 1.*got 1\.0",
+        ),
+        (lambda: LosNlosRangeError(0.5, 0.0, 40.0), r"range_error\.sd must be .*got 0\.0"),
+        (lambda: LosNlosRangeError(0.5, 3.0, -1.0), r"range_error\.tail must be .*got -1\.0"),
+        (
+            lambda: LosNlosRangeError(0.5, 3.0, 40.0, math.inf),
+            r"range_error\.slope must be finite, got inf",
+        ),
+        (lambda: NormalRangeError(0.0), r"range_error\.factor must be .*got 0\.0"),
+        (lambda: model(drift_density=0.0), r"tuning\.drift_density must be .*got \[0\.0\]"),
+        (lambda: model(initial_heading_sd_deg=-1.0), r"tuning\.initial_heading_sd_deg"),
+        (
+            lambda: UrbanGnss(replace(BELIEVED, initial_position_sd=[1.0]), MIXED),
+            r"initial_position_sd must have 3 numbers, got \[1\.0\]",
+        ),
     ],
 )
 def test_impossible_settings_name_their_key(make: Callable[[], object], message: str) -> None:
@@ -264,7 +347,9 @@ def test_impossible_settings_name_their_key(make: Callable[[], object], message:
 
 
 def test_inputs_of_another_scenario_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"UrbanGnss needs Sky; choose scenario=berlin"):
+    with pytest.raises(
+        ValueError, match=r"must be UrbanInputs, got tuple. Choose scenario=recorded_berlin"
+    ):
         model().prepare(Record(torch.zeros(1, 1, 3)))
 
 

@@ -10,9 +10,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from pfbench.filter.flock import Inertia
 
 from pfbench.filter import chaos
-from pfbench.filter.flock import Inertia
 
 MOST = 150  # iterations, as in their figure
 BLUE, ORANGE = "#0072B2", "#D55E00"
@@ -23,7 +23,13 @@ def main() -> None:
     figure, (factor, orbit, law) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
     k = np.arange(MOST + 1)
     meant = [Inertia(escape=0.12).escape_factor(i / MOST) for i in k]
-    factor.plot(k, 0.12 - 0.12 * np.cos(k * np.pi) / MOST, color=ORANGE, ls="--", label="as printed [eq. 35]")
+    factor.plot(
+        k,
+        0.12 - 0.12 * np.cos(k * np.pi) / MOST,
+        color=ORANGE,
+        ls="--",
+        label="as printed [eq. 35]",
+    )
     factor.plot(k, meant, color=BLUE, label="as meant, and as their figure rises")
     factor.set(title="escape factor c3 = c4", xlabel="iteration", ylabel="c3", ylim=(0, 0.26))
     factor.legend(fontsize=8, loc="upper left")
@@ -40,7 +46,9 @@ def main() -> None:
 
     generator = torch.Generator().manual_seed(1)
     values = chaos.settled(torch.rand(200_000, dtype=torch.float64, generator=generator))
-    law.hist(values.numpy(), bins=50, range=(0, 1), density=True, color="0.75", label="200 000 sequences")
+    law.hist(
+        values.numpy(), bins=50, range=(0, 1), density=True, color="0.75", label="200 000 sequences"
+    )
     at = np.linspace(0.004, 0.996, 400)
     law.plot(at, 1 / (np.pi * np.sqrt(at * (1 - at))), color=BLUE, label="arcsine law")
     law.set(title="their law after 50 iterations", xlabel="z", ylabel="density")

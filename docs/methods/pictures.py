@@ -15,35 +15,56 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pfbench.draws import MonteCarlo
-from pfbench.filter.adaptations import ConstrainedNoise, Fading, MatrixNoise
-from pfbench.filter.belief import Cloud, Gaussian, moments, weights
-from pfbench.filter.cells import Raw, Whitened, divide
-from pfbench.filter.control import Control
-from pfbench.filter.coordinates import Everything, Likelihood
-from pfbench.filter.corrections import Uncorrected
-from pfbench.filter.ensemble import EnsembleKalmanFilter, SquareRoot
-from pfbench.filter.gains import AdaptiveFactor, RatioBound
-from pfbench.filter.gaussian import Adaptation, Gain, GaussianFilter
-from pfbench.filter.gaussian_particles import GaussianRefresh
-from pfbench.filter.guided import Guided
-from pfbench.filter.guided_noise import GuidedNoise
-from pfbench.filter.kernels import Flow
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import (
+    GaussianBelief,
+    ParticleBelief,
+    normalise_log_weights,
+    weighted_mean_cov,
+)
+from pfbench.filter.gaussian.covariance_matching import MatrixNoiseAdaptation
+from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter, EnsembleTransformUpdate
+from pfbench.filter.gaussian.gain_adaptation import AdaptiveFactorGain, BoundedRatioGain
+from pfbench.filter.gaussian.gaussian_filter import GainAdaptation, GaussianFilter, NoiseAdaptation
+from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation, TaylorLinearisation
+from pfbench.filter.gaussian.noise_adaptation import ConstrainedNoiseAdaptation, FadingMemory
+from pfbench.filter.gaussian.spherical_radial import (
+    AxisDegree3,
+    AxisDegree5,
+    RadialDegree3,
+    RadialDegree5,
+    SimplexDegree3,
+    SphericalRadialPoints,
+)
+from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
+from pfbench.filter.guided.shared_guide import SharedGuideProposal
 from pfbench.filter.loop import run_filter
-from pfbench.filter.marginalised import RaoBlackwellised
-from pfbench.filter.moves import Metropolis
-from pfbench.filter.particle import ParticleFilter
-from pfbench.filter.points import Halton
-from pfbench.filter.polymerisation import Kept, Polymerised, Stretched
-from pfbench.filter.proposals import Bootstrap, Proposal
-from pfbench.filter.reconstruction import Reconstructed
-from pfbench.filter.resamplers import Regularise, Resample, Resampler, Systematic
-from pfbench.filter.rules import Axis3, Axis5, Jacobian, Points, Product, Radial3, Radial5, Simplex3
-from pfbench.filter.swarm import Limits, Swarm
-from pfbench.filter.swarm_weights import Printed
-from pfbench.filter.window import Path as Past
-from pfbench.model.linear import LinearGaussian, linear_walk
-from pfbench.record import Record
+from pfbench.filter.marginal.rao_blackwellised import RaoBlackwellisedFilter
+from pfbench.filter.moves.flow_kernels import NoiseFlowKernel
+from pfbench.filter.moves.metropolis import MetropolisHastings
+from pfbench.filter.moves.path_history import StateHistory as Past
+from pfbench.filter.particle.gaussian_particle_filter import GaussianResampler
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.point_sets import HaltonPoints
+from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
+from pfbench.filter.particle.resampling import (
+    EssResampler,
+    RegularisedResampler,
+    Resampler,
+    Systematic,
+)
+from pfbench.filter.polymerised.partition import AxisAlignedCells, WhitenedCells, divide_cells
+from pfbench.filter.polymerised.placement import ScaledCentrePlacement
+from pfbench.filter.polymerised.resampler import PolymerisedResampler, UnchangedAllocation
+from pfbench.filter.reconstructed.dmc_controller import DmcController
+from pfbench.filter.reconstructed.proposal import ReconstructedProposal
+from pfbench.filter.reconstructed.weight_correction import NoWeightCorrection
+from pfbench.filter.swarm.swarm_coordinates import AllComponents, LikelihoodFitness
+from pfbench.filter.swarm.swarm_limits import SwarmLimits
+from pfbench.filter.swarm.swarm_proposal import SwarmProposal
+from pfbench.filter.swarm.swarm_weighting import PrintedWeighting
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 
 HERE = Path(__file__).parent
 
@@ -54,28 +75,41 @@ def dmc_reconstructed() -> None:
         [[1.0, 0.0], [0.0, 1.0]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0]], [2.0], [0.0, 0.0], [[2.0, 0.0], [0.8, 0.4]],
         names=("position", "velocity"),
     )  # fmt: skip
-    y, draws = torch.tensor([[4.0]], dtype=torch.float64), MonteCarlo(3, torch.arange(1))
+    y, draws = torch.tensor([[4.0]], dtype=torch.float64), PhiloxStream(3, torch.arange(1))
     cloud = ParticleFilter(250).init(model, 1, draws)
-    seen, control = Record(y), Control(control_weight=1.0)  # a gain of a half, so that the shift can be seen
-    plain = Bootstrap()(model, cloud, seen, draws.at(1))
-    exact, _ = GaussianFilter(Jacobian()).step(model, GaussianFilter(Jacobian()).init(model, 1, draws), seen, draws)
+    seen, control = (
+        Record(y),
+        DmcController(control_weight=1.0),
+    )  # a gain of a half, so that the shift can be seen
+    plain = BootstrapProposal()(model, cloud, seen, draws.at_step(1))
+    exact, _ = GaussianFilter(TaylorLinearisation()).step(
+        model, GaussianFilter(TaylorLinearisation()).init(model, 1, draws), seen, draws
+    )
     panels: dict[str, Proposal] = {
-        "predicted (SIR)": Bootstrap(),
-        "as printed: all are shifted": Reconstructed(control=control, correction=Uncorrected()),
-        "marginal: half shifted, weights corrected": Reconstructed(control=control),
+        "predicted (SIR)": BootstrapProposal(),
+        "as printed: all are shifted": ReconstructedProposal(
+            controller=control, weight_correction=NoWeightCorrection()
+        ),
+        "marginal: half shifted, weights corrected": ReconstructedProposal(controller=control),
     }
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(
+        1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained"
+    )
     for axis, (title, proposal) in zip(axes, panels.items(), strict=True):
-        sent = proposal(model, cloud, seen, draws.at(1))
+        sent = proposal(model, cloud, seen, draws.at_step(1))
         log_w = model.log_likelihood(y, sent.x, ()) + sent.log_ratio
-        after = Cloud(sent.x, log_w.log_softmax(1), cloud.log_z)
+        after = ParticleBelief(sent.x, log_w.log_softmax(1), cloud.log_evidence)
         moved = (sent.x != plain.x).any(-1)[0]
-        size = 250 * 12 * weights(after.log_w)[0]
+        size = 250 * 12 * normalise_log_weights(after.log_w)[0]
         for group, colour in ((~moved, "#0072B2"), (moved, "#E69F00")):
             axis.scatter(*sent.x[0, group].T, s=size[group], color=colour, alpha=0.6, linewidths=0)
         for mean, covariance, colour, label in (
             (exact.mean[0], exact.covariance[0], "#009E73", "exact posterior"),
-            (*(part[0] for part in moments(model.chart, after)), "#D55E00", "weighted cloud"),
+            (
+                *(part[0] for part in weighted_mean_cov(model.chart, after)),
+                "#D55E00",
+                "weighted cloud",
+            ),
         ):
             axis.plot(*_ellipse(mean, covariance), color=colour, label=f"{label}, 2 sd")
         axis.axvline(4.0, color="0.6", linewidth=1, linestyle=":")
@@ -89,26 +123,45 @@ def dmc_reconstructed() -> None:
 def mssrckf() -> None:
     """Points of four rules in two dimensions, and what they make of a turn by an uncertain angle."""
     rules = {
-        "CKF": (Product(Axis3(), Radial3()), "#0072B2"),
-        "SSRCKF": (Product(Simplex3(), Radial3()), "#009E73"),
-        "MSSRCKF": (Product(Simplex3(), Radial5()), "#D55E00"),
-        "HCKF": (Product(Axis5(), Radial5()), "#CC79A7"),
+        "CKF": (SphericalRadialPoints(AxisDegree3(), RadialDegree3()), "#0072B2"),
+        "SSRCKF": (SphericalRadialPoints(SimplexDegree3(), RadialDegree3()), "#009E73"),
+        "MSSRCKF": (SphericalRadialPoints(SimplexDegree3(), RadialDegree5()), "#D55E00"),
+        "HCKF": (SphericalRadialPoints(AxisDegree5(), RadialDegree5()), "#CC79A7"),
     }
     spread = torch.diag(torch.tensor([0.12, 0.7], dtype=torch.float64))  # distance, direction
     middle = torch.tensor([2.0, math.pi / 2], dtype=torch.float64)
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.4, 4.0), layout="constrained")
-    polar = middle + torch.randn(4000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) @ spread
-    cloud = torch.stack([polar[:, 0] * torch.cos(polar[:, 1]), polar[:, 0] * torch.sin(polar[:, 1])], -1)
+    polar = (
+        middle
+        + torch.randn(4000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        @ spread
+    )
+    cloud = torch.stack(
+        [polar[:, 0] * torch.cos(polar[:, 1]), polar[:, 0] * torch.sin(polar[:, 1])], -1
+    )
     right.scatter(*cloud.T, s=1.5, color="0.75", rasterized=True)
-    right.plot(*_ellipse(cloud.mean(0), torch.cov(cloud.T)), color="0.35", linestyle="--", label="moments of the cloud")
+    right.plot(
+        *_ellipse(cloud.mean(0), torch.cov(cloud.T)),
+        color="0.35",
+        linestyle="--",
+        label="moments of the cloud",
+    )
     for (name, (rule, colour)), mark in zip(rules.items(), "s^oD", strict=True):
         xi, w, _ = rule(2)
-        left.scatter(*xi.T, s=300 * w.abs(), marker=mark, facecolors="none", edgecolors=colour, label=name)
+        left.scatter(
+            *xi.T, s=300 * w.abs(), marker=mark, facecolors="none", edgecolors=colour, label=name
+        )
         at = middle + xi @ spread
         moved = torch.stack([at[:, 0] * torch.cos(at[:, 1]), at[:, 0] * torch.sin(at[:, 1])], -1)
         mean = w @ moved
-        right.plot(*_ellipse(mean, (w[:, None] * (moved - mean)).T @ (moved - mean)), color=colour, label=name)
-    left.set(aspect="equal", title="points for N(0, I), area: weight", xlim=(-2.9, 2.9), ylim=(-2.5, 3.8))
+        right.plot(
+            *_ellipse(mean, (w[:, None] * (moved - mean)).T @ (moved - mean)),
+            color=colour,
+            label=name,
+        )
+    left.set(
+        aspect="equal", title="points for N(0, I), area: weight", xlim=(-2.9, 2.9), ylim=(-2.5, 3.8)
+    )
     left.set(xlabel="state 1 in sd", ylabel="state 2 in sd")
     right.set(aspect="equal", title="after a turn: ellipses of 2 sd", xlabel="east", ylabel="north")
     left.legend(fontsize=8, loc="upper center", ncols=4, columnspacing=0.7, handletextpad=0.1)
@@ -119,73 +172,158 @@ def mssrckf() -> None:
 def fm_mssrckf() -> None:
     """Errors of 300 runs in the last step of a burst of process noise, and what the filters believe of them."""
     figure = _errors(
-        {"MSSRCKF": ((), ()), "S = 1.05": ((Fading(1.05),), ()), "S and alpha": ((Fading(1.05),), (AdaptiveFactor(),))}, q=400.0
+        {
+            "MSSRCKF": ((), ()),
+            "S = 1.05": ((FadingMemory(1.05),), ()),
+            "S and alpha": ((FadingMemory(1.05),), (AdaptiveFactorGain(),)),
+        },
+        q=400.0,
     )
     figure.savefig(HERE / "fm_mssrckf.png", dpi=80)
 
 
 def fm_mssrckf_step() -> None:
     """One step that surprises in velocity: what the adaptive factor makes of the cloud, as printed and weighted."""
-    model = LinearGaussian([[1.0, 1.0], [0.0, 1.0]], torch.eye(2) * 1e-3, torch.eye(2), [10.0, 0.1], [0.0, 0.0], [6.0, 0.15])
-    start, y = torch.diag(torch.tensor([36.0, 0.0225], dtype=torch.float64)), torch.tensor([[4.0, 1.2]], dtype=torch.float64)
-    belief = Gaussian(torch.zeros(1, 2, dtype=torch.float64), start[None], torch.zeros(1, dtype=torch.float64))
-    ways = {"MSSRCKF": (), "FM, printed: W = I": (AdaptiveFactor(weighted=False),), "FM: W = 1/R": (AdaptiveFactor(),)}
-    figure, axes = plt.subplots(1, 3, figsize=(9.0, 4.0), sharex=True, sharey=True, layout="constrained")
+    model = LinearGaussian(
+        [[1.0, 1.0], [0.0, 1.0]],
+        torch.eye(2) * 1e-3,
+        torch.eye(2),
+        [10.0, 0.1],
+        [0.0, 0.0],
+        [6.0, 0.15],
+    )
+    start, y = (
+        torch.diag(torch.tensor([36.0, 0.0225], dtype=torch.float64)),
+        torch.tensor([[4.0, 1.2]], dtype=torch.float64),
+    )
+    belief = GaussianBelief(
+        torch.zeros(1, 2, dtype=torch.float64), start[None], torch.zeros(1, dtype=torch.float64)
+    )
+    ways = {
+        "MSSRCKF": (),
+        "FM, printed: W = I": (AdaptiveFactorGain(weight_by_noise=False),),
+        "FM: W = 1/R": (AdaptiveFactorGain(),),
+    }
+    figure, axes = plt.subplots(
+        1, 3, figsize=(9.0, 4.0), sharex=True, sharey=True, layout="constrained"
+    )
     e = torch.randn(600, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    for at, (name, gains), colour in zip(axes, ways.items(), ("#0072B2", "#CC79A7", "#E69F00"), strict=True):
-        method = GaussianFilter(Points(Product(Simplex3(), Radial5())), (Fading(1.002),) if gains else (), gains)
+    for at, (name, gains), colour in zip(
+        axes, ways.items(), ("#0072B2", "#CC79A7", "#E69F00"), strict=True
+    ):
+        method = GaussianFilter(
+            SigmaPointLinearisation(SphericalRadialPoints(SimplexDegree3(), RadialDegree5())),
+            (FadingMemory(1.002),) if gains else (),
+            gains,
+        )
         new = method.advance(model, belief, Record(y))
-        wide = new.innovation.spread[0]  # of what is seen, which is the state itself: the prediction, as widened
+        wide = new.innovation.predicted_covariance[
+            0
+        ]  # of what is seen, which is the state itself: the prediction, as widened
         cloud = e @ torch.linalg.cholesky(wide).mT
         at.scatter(*cloud.T, s=3, color="0.75", label="cloud predicted, as widened")
-        at.plot(*_ellipse(new.mean[0], new.root[0] @ new.root[0].mT), color=colour, label="2 sd after the step, in colour")
-        at.errorbar(*y.T, xerr=20.0, yerr=0.2, color="0.2", capsize=2, linewidth=1, label="seen, 2 sd")
+        at.plot(
+            *_ellipse(new.mean[0], new.root[0] @ new.root[0].mT),
+            color=colour,
+            label="2 sd after the step, in colour",
+        )
+        at.errorbar(
+            *y.T, xerr=20.0, yerr=0.2, color="0.2", capsize=2, linewidth=1, label="seen, 2 sd"
+        )
         at.set(title=name, xlabel="position, m", xlim=(-45.0, 45.0), ylim=(-1.6, 1.8))
     axes[0].set_ylabel("velocity, m/s")
-    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(),
+        fontsize=8,
+        loc="outside lower center",
+        ncols=3,
+        frameon=False,
+    )
     figure.savefig(HERE / "fm_mssrckf_step.png", dpi=80)
 
 
 def cofm_mssrckf() -> None:
     """Errors of 300 runs in the last step of a burst of measurement noise, and what the filters believe of them."""
-    both = (Fading(1.002), ConstrainedNoise())
+    both = (FadingMemory(1.002), ConstrainedNoiseAdaptation())
     figure = _errors(
         {
             "MSSRCKF": ((), ()),
-            "FM-MSSRCKF": (both[:1], (AdaptiveFactor(),)),
-            "COFM-MSSRCKF": (both, (AdaptiveFactor(), RatioBound())),
-            "COFM, printed": ((Fading(1.002), MatrixNoise(0.99)), (AdaptiveFactor(weighted=False), RatioBound())),
+            "FM-MSSRCKF": (both[:1], (AdaptiveFactorGain(),)),
+            "COFM-MSSRCKF": (both, (AdaptiveFactorGain(), BoundedRatioGain())),
+            "COFM, printed": (
+                (FadingMemory(1.002), MatrixNoiseAdaptation(0.99)),
+                (AdaptiveFactorGain(weight_by_noise=False), BoundedRatioGain()),
+            ),
         },
         r=9.5,
     )
     figure.savefig(HERE / "cofm_mssrckf.png", dpi=80)
 
 
-def _errors(methods: dict[str, tuple[tuple[Adaptation, ...], tuple[Gain, ...]]], r: float = 1.0, q: float = 1.0) -> Figure:
+def _errors(
+    methods: dict[str, tuple[tuple[NoiseAdaptation, ...], tuple[GainAdaptation, ...]]],
+    r: float = 1.0,
+    q: float = 1.0,
+) -> Figure:
     """A walk in the plane seen by five equal sensors; the last 15 of 40 steps are a burst."""
-    h = torch.tensor([[1.0, 0.0], [0.8, 0.6], [0.5, -0.9], [0.2, 1.0], [-0.7, 0.4]], dtype=torch.float64)
+    h = torch.tensor(
+        [[1.0, 0.0], [0.8, 0.6], [0.5, -0.9], [0.2, 1.0], [-0.7, 0.4]], dtype=torch.float64
+    )
     eye = torch.eye(2, dtype=torch.float64)
     model = LinearGaussian(eye, 0.3 * eye, h, [1.0] * 5, [0.0, 0.0], [1.0, 1.0])
     draws, runs, steps = torch.Generator().manual_seed(3), 300, 40
     burst = torch.arange(steps)[None, :, None] >= steps - 15
-    moved = 0.3 * torch.randn(runs, steps, 2, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(q), 1.0)
+    moved = (
+        0.3
+        * torch.randn(runs, steps, 2, dtype=torch.float64, generator=draws)
+        * torch.where(burst, math.sqrt(q), 1.0)
+    )
     x = torch.randn(runs, 1, 2, dtype=torch.float64, generator=draws) + moved.cumsum(1)
-    noise = torch.randn(runs, steps, 5, dtype=torch.float64, generator=draws) * torch.where(burst, math.sqrt(r), 1.0)
+    noise = torch.randn(runs, steps, 5, dtype=torch.float64, generator=draws) * torch.where(
+        burst, math.sqrt(r), 1.0
+    )
     size, colours = (3.0 * len(methods), 4.3), ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
-    figure, axes = plt.subplots(1, len(methods), figsize=size, sharex=True, sharey=True, layout="constrained")
-    for at, (name, (adaptations, gains)), colour in zip(axes, methods.items(), colours, strict=False):
-        method = GaussianFilter(Points(Product(Simplex3(), Radial5())), adaptations, gains)
+    figure, axes = plt.subplots(
+        1, len(methods), figsize=size, sharex=True, sharey=True, layout="constrained"
+    )
+    for at, (name, (adaptations, gains)), colour in zip(
+        axes, methods.items(), colours, strict=False
+    ):
+        method = GaussianFilter(
+            SigmaPointLinearisation(SphericalRadialPoints(SimplexDegree3(), RadialDegree5())),
+            adaptations,
+            gains,
+        )
         found = run_filter(
-            method, model, Record(x @ h.mT + noise), MonteCarlo(0, torch.arange(runs)), lambda t, i: {"p": i.covariance()}
+            method,
+            model,
+            Record(x @ h.mT + noise),
+            PhiloxStream(0, torch.arange(runs)),
+            lambda t, i: {"p": i.covariance()},
         )
         error = (found.mean - x)[:, -1]
         at.scatter(*error.T, s=5, color="0.6", label="errors")
-        centre, believed = torch.zeros(2, dtype=torch.float64), found.trace["p"][:, -1].median(0).values
-        at.plot(*_ellipse(centre, torch.cov(error.T)), color="0.35", linestyle="--", label="their 2 sd")
+        centre, believed = (
+            torch.zeros(2, dtype=torch.float64),
+            found.trace["p"][:, -1].median(0).values,
+        )
+        at.plot(
+            *_ellipse(centre, torch.cov(error.T)), color="0.35", linestyle="--", label="their 2 sd"
+        )
         at.plot(*_ellipse(centre, believed), color=colour, label="2 sd believed, in colour")
-        at.set(aspect="equal", title=f"{name}: rms {float(error.square().sum(-1).mean().sqrt()):.2f}", xlabel="error of state 1")
+        at.set(
+            aspect="equal",
+            title=f"{name}: rms {float(error.square().sum(-1).mean().sqrt()):.2f}",
+            xlabel="error of state 1",
+        )
     axes[0].set_ylabel("error of state 2")
-    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(),
+        fontsize=8,
+        loc="outside lower center",
+        ncols=3,
+        frameon=False,
+    )
     return figure
 
 
@@ -202,29 +340,45 @@ def cpso_escape() -> None:
         [[1.0, 0.0], [0.0, 1.0]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0]], [2.0], [0.0, 0.0], [[2.0, 0.0], [0.8, 0.4]],
         names=("position", "velocity"),
     )  # fmt: skip
-    y, draws = torch.tensor([[4.0]], dtype=torch.float64), MonteCarlo(3, torch.arange(1))
+    y, draws = torch.tensor([[4.0]], dtype=torch.float64), PhiloxStream(3, torch.arange(1))
     cloud = ParticleFilter(250).init(model, 1, draws)
-    seen, plain = Record(y), Bootstrap()(model, cloud, Record(y), draws.at(1))
-    exact, _ = GaussianFilter(Jacobian()).step(model, GaussianFilter(Jacobian()).init(model, 1, draws), seen, draws)
-    printed = Swarm(
-        fitness=Likelihood(), coordinates=Everything(), limits=Limits(prior=True, box=None), iterations=30, weights=Printed()
+    seen, plain = Record(y), BootstrapProposal()(model, cloud, Record(y), draws.at_step(1))
+    exact, _ = GaussianFilter(TaylorLinearisation()).step(
+        model, GaussianFilter(TaylorLinearisation()).init(model, 1, draws), seen, draws
+    )
+    printed = SwarmProposal(
+        fitness=LikelihoodFitness(),
+        coordinates=AllComponents(),
+        limits=SwarmLimits(scale_by_prior=True, max_distance_sd=None),
+        iterations=30,
+        weighting=PrintedWeighting(),
     )
     panels: dict[str, Proposal] = {
-        "predicted (SIR)": Bootstrap(),
+        "predicted (SIR)": BootstrapProposal(),
         "as printed, 30 iterations": printed,
-        "corrected: half drawn about the swarm": Swarm(),
+        "corrected: half drawn about the swarm": SwarmProposal(),
     }
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(
+        1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained"
+    )
     for axis, (title, proposal) in zip(axes, panels.items(), strict=True):
-        sent = proposal(model, cloud, seen, draws.at(1))
-        after = Cloud(sent.x, (model.log_likelihood(y, sent.x, ()) + sent.log_ratio).log_softmax(1), cloud.log_z)
+        sent = proposal(model, cloud, seen, draws.at_step(1))
+        after = ParticleBelief(
+            sent.x,
+            (model.log_likelihood(y, sent.x, ()) + sent.log_ratio).log_softmax(1),
+            cloud.log_evidence,
+        )
         moved = ((sent.x - plain.x).abs() > 1e-9).any(-1)[0]
-        size = 250 * 12 * weights(after.log_w)[0]
+        size = 250 * 12 * normalise_log_weights(after.log_w)[0]
         for group, colour in ((~moved, "#0072B2"), (moved, "#E69F00")):
             axis.scatter(*sent.x[0, group].T, s=size[group], color=colour, alpha=0.6, linewidths=0)
         for mean, covariance, colour, label in (
             (exact.mean[0], exact.covariance[0], "#009E73", "exact posterior"),
-            (*(part[0] for part in moments(model.chart, after)), "#D55E00", "weighted cloud"),
+            (
+                *(part[0] for part in weighted_mean_cov(model.chart, after)),
+                "#D55E00",
+                "weighted cloud",
+            ),
         ):
             axis.plot(*_ellipse(mean, covariance), color=colour, label=f"{label}, 2 sd")
         axis.axvline(4.0, color="0.6", linewidth=1, linestyle=":")
@@ -241,15 +395,23 @@ def enkf() -> None:
         [[1.0, 0.0], [0.0, 1.0]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0]], [1.0], [0.0, 0.0], [[2.0, 0.0], [0.8, 0.4]],
         names=("position", "velocity"),
     )  # fmt: skip
-    seen, draws = Record(torch.tensor([[2.5]], dtype=torch.float64)), MonteCarlo(5, torch.arange(1))
-    kalman = GaussianFilter(Jacobian())
-    panels = {"perturbed measurements": EnsembleKalmanFilter(60), "square root": EnsembleKalmanFilter(60, SquareRoot())}
+    seen, draws = (
+        Record(torch.tensor([[2.5]], dtype=torch.float64)),
+        PhiloxStream(5, torch.arange(1)),
+    )
+    kalman = GaussianFilter(TaylorLinearisation())
+    panels = {
+        "perturbed measurements": EnsembleKalmanFilter(60),
+        "square root": EnsembleKalmanFilter(60, EnsembleTransformUpdate()),
+    }
     exact, _ = kalman.step(model, kalman.init(model, 1, draws), seen, draws)
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(
+        1, 2, figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained"
+    )
     for axis, (title, method) in zip(axes, panels.items(), strict=True):
         before = method.init(model, 1, draws)
-        after, info = method.step(model, before, seen, draws.at(1))
-        start = Bootstrap()(model, before, seen, draws.at(1)).x[0]
+        after, info = method.step(model, before, seen, draws.at_step(1))
+        start = BootstrapProposal()(model, before, seen, draws.at_step(1)).x[0]
         axis.plot(*torch.stack([start, after.x[0]]).permute(2, 0, 1), color="0.8", linewidth=0.7)
         axis.scatter(*start.T, s=10, color="#0072B2", label="predicted")
         axis.scatter(*after.x[0].T, s=10, color="#E69F00", label="moved")
@@ -271,23 +433,41 @@ def rbpf() -> None:
         [[1.0, 0.5], [0.0, 0.95]], [[0.8, 0.0], [0.0, 0.4]], [[1.0, 0.0]], [0.7], [0.0, 0.0], [1.0, 1.5],
         names=("position", "velocity"),
     )  # fmt: skip
-    y, draws = torch.tensor([[[0.4], [1.6], [2.0]]], dtype=torch.float64), MonteCarlo(4, torch.arange(1))
-    exact = GaussianFilter(Jacobian()).init(model, 1, draws)
+    y, draws = (
+        torch.tensor([[[0.4], [1.6], [2.0]]], dtype=torch.float64),
+        PhiloxStream(4, torch.arange(1)),
+    )
+    exact = GaussianFilter(TaylorLinearisation()).init(model, 1, draws)
     for t in range(y.shape[1]):
-        exact, _ = GaussianFilter(Jacobian()).step(model, exact, Record(y[:, t]), draws)
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained")
+        exact, _ = GaussianFilter(TaylorLinearisation()).step(model, exact, Record(y[:, t]), draws)
+    figure, axes = plt.subplots(
+        1, 2, figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained"
+    )
     panels = {
         "SIR, 40 particles": ParticleFilter(40),
-        "RBPF, 40: position sampled, velocity normal": RaoBlackwellised(40, ["position"]),
+        "RBPF, 40: position sampled, velocity normal": RaoBlackwellisedFilter(40, ["position"]),
     }
     for axis, (title, method) in zip(axes, panels.items(), strict=True):
         cloud = method.init(model, 1, draws)
         for t in range(y.shape[1]):
-            cloud, info = method.step(model, cloud, Record(y[:, t]), draws.at(t + 1))
+            cloud, info = method.step(model, cloud, Record(y[:, t]), draws.at_step(t + 1))
         if cloud.memory:
             sd = 2.0 * cloud.memory["root"][0, 0, 0, 0].abs()
-            axis.errorbar(*cloud.x[0].T, yerr=sd, fmt="none", ecolor="#E69F00", elinewidth=1, label="conditional law, 2 sd")
-        axis.scatter(*cloud.x[0].T, s=40 * 16 * weights(cloud.log_w)[0], color="#0072B2", linewidths=0, zorder=3)
+            axis.errorbar(
+                *cloud.x[0].T,
+                yerr=sd,
+                fmt="none",
+                ecolor="#E69F00",
+                elinewidth=1,
+                label="conditional law, 2 sd",
+            )
+        axis.scatter(
+            *cloud.x[0].T,
+            s=40 * 16 * normalise_log_weights(cloud.log_w)[0],
+            color="#0072B2",
+            linewidths=0,
+            zorder=3,
+        )
         for mean, covariance, colour, label in (
             (exact.mean[0], exact.covariance[0], "#009E73", "Kalman, 2 sd"),
             (info.mean[0], info.covariance()[0], "#D55E00", "told, 2 sd"),
@@ -301,21 +481,30 @@ def rbpf() -> None:
 
 def qmc_polymerised() -> None:
     """A weighted cloud on a ridge across the axes, and what aggregation makes of it: repaired, and in two readings of eq. 18."""
-    model, draws = _plain(2), MonteCarlo(5, torch.arange(1))
+    model, draws = _plain(2), PhiloxStream(5, torch.arange(1))
     z = draws.normal("x", 250, 2)
     x = torch.stack([z[..., 0] + 0.25 * z[..., 1], z[..., 0] - 0.25 * z[..., 1]], -1)
-    cloud = Cloud(x, (-(x[..., 0] - 1.0).square()).log_softmax(1), torch.zeros(1, dtype=torch.float64))
-    panels: dict[str, Polymerised | None] = {
+    cloud = ParticleBelief(
+        x, (-(x[..., 0] - 1.0).square()).log_softmax(1), torch.zeros(1, dtype=torch.float64)
+    )
+    panels: dict[str, PolymerisedResampler | None] = {
         "weighted, whitened cells": None,
-        "repaired: shares, pooled spread": Polymerised(),
-        "eq. 18, counts by weight": Polymerised(displacement=Stretched()),
-        "as printed: boxes, counts kept": Polymerised(Raw(), Kept(), Stretched()),
+        "repaired: shares, pooled spread": PolymerisedResampler(),
+        "eq. 18, counts by weight": PolymerisedResampler(placement=ScaledCentrePlacement()),
+        "as printed: boxes, counts kept": PolymerisedResampler(
+            AxisAlignedCells(), UnchangedAllocation(), ScaledCentrePlacement()
+        ),
     }
-    figure, axes = plt.subplots(1, 4, figsize=(13, 3.6), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(
+        1, 4, figsize=(13, 3.6), sharex=True, sharey=True, layout="constrained"
+    )
     for axis, (title, resampler) in zip(axes, panels.items(), strict=True):
         _scatter_refreshed(axis, model, cloud, resampler, title)
-    w, (mean, covariance) = weights(cloud.log_w), moments(model.chart, cloud)
-    number = divide(Whitened(), x - mean.unsqueeze(1), w > 0, covariance)[0]
+    w, (mean, covariance) = (
+        normalise_log_weights(cloud.log_w),
+        weighted_mean_cov(model.chart, cloud),
+    )
+    number = divide_cells(WhitenedCells(), x - mean.unsqueeze(1), w > 0, covariance)[0]
     shades = ["#0072B2", "#E69F00", "#009E73", "#CC79A7"]
     axes[0].collections[0].set_color([shades[int(k) % 4] for k in number])
     axes[1].legend(loc="lower right", frameon=False, fontsize=9)
@@ -324,16 +513,20 @@ def qmc_polymerised() -> None:
 
 def gpf() -> None:
     """A bent cloud, and the normal law that a Gaussian particle filter makes of it: by chance, and on Halton points."""
-    model, draws = _plain(2), MonteCarlo(5, torch.arange(1))
+    model, draws = _plain(2), PhiloxStream(5, torch.arange(1))
     z = draws.normal("x", 250, 2)
     x = torch.stack([z[..., 0], z[..., 0].square() - 1.0 + 0.3 * z[..., 1]], -1)
-    cloud = Cloud(x, (-0.5 * (x[..., 0] - 0.5).square()).log_softmax(1), torch.zeros(1, dtype=torch.float64))
-    panels: dict[str, GaussianRefresh | None] = {
+    cloud = ParticleBelief(
+        x, (-0.5 * (x[..., 0] - 0.5).square()).log_softmax(1), torch.zeros(1, dtype=torch.float64)
+    )
+    panels: dict[str, GaussianResampler | None] = {
         "weighted": None,
-        "refreshed by chance": GaussianRefresh(),
-        "refreshed on Halton points": GaussianRefresh(Halton()),
+        "refreshed by chance": GaussianResampler(),
+        "refreshed on Halton points": GaussianResampler(HaltonPoints()),
     }
-    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.6), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(
+        1, 3, figsize=(10.5, 3.6), sharex=True, sharey=True, layout="constrained"
+    )
     for axis, (title, resampler) in zip(axes, panels.items(), strict=True):
         _scatter_refreshed(axis, model, cloud, resampler, title)
     axes[1].legend(loc="lower right", frameon=False, fontsize=9)
@@ -346,14 +539,33 @@ def _plain(d: int) -> LinearGaussian:
     return LinearGaussian(eye, eye, eye, [1.0] * d, [0.0] * d, [1.0] * d)
 
 
-def _scatter_refreshed(axis: Axes, model: LinearGaussian, cloud: Cloud, resampler: Resampler | None, title: str) -> None:
+def _scatter_refreshed(
+    axis: Axes,
+    model: LinearGaussian,
+    belief: ParticleBelief,
+    resampler: Resampler | None,
+    title: str,
+) -> None:
     """A cloud [1, N, 2] before or after a resampler, areas by weight, with two-deviation ellipses of then and before."""
-    n = torch.full((1, 1), float(cloud.x.shape[1]), dtype=torch.float64)
-    after = cloud if resampler is None else resampler(model, cloud, cloud.log_w, n, MonteCarlo(6, torch.arange(1)))[0]
-    size = cloud.x.shape[1] * 9 * weights(after.log_w)[0]
-    axis.scatter(*after.x[0].T, s=size, color="#0072B2" if resampler is None else "#E69F00", alpha=0.7, linewidths=0)
-    for shown, colour, label in ((cloud, "#009E73", "before, 2 sd"), (after, "#D55E00", "after, 2 sd")):
-        mean, covariance = (part[0] for part in moments(model.chart, shown))
+    n = torch.full((1, 1), float(belief.x.shape[1]), dtype=torch.float64)
+    after = (
+        belief
+        if resampler is None
+        else resampler(model, belief, belief.log_w, n, PhiloxStream(6, torch.arange(1)))[0]
+    )
+    size = belief.x.shape[1] * 9 * normalise_log_weights(after.log_w)[0]
+    axis.scatter(
+        *after.x[0].T,
+        s=size,
+        color="#0072B2" if resampler is None else "#E69F00",
+        alpha=0.7,
+        linewidths=0,
+    )
+    for shown, colour, label in (
+        (belief, "#009E73", "before, 2 sd"),
+        (after, "#D55E00", "after, 2 sd"),
+    ):
+        mean, covariance = (part[0] for part in weighted_mean_cov(model.chart, shown))
         axis.plot(*_ellipse(mean, covariance), color=colour, label=label)
     axis.set_title(title, fontsize=11)
     axis.set_xlabel("state 1")
@@ -364,34 +576,48 @@ def _scatter_refreshed(axis: Axes, model: LinearGaussian, cloud: Cloud, resample
 def mcmc_rpf() -> None:
     """Constant velocity in little noise, position seen: a cloud of few ancestors, smoothed, and moved; Kalman's law beside it."""
     model, n, steps = linear_walk(1.0, 0.01, 1.0), 200, 12
-    draws, runs = MonteCarlo(4, torch.arange(1)), torch.ones(1, dtype=torch.bool)
-    record = Record(0.3 * torch.arange(1.0, steps + 1).reshape(1, steps, 1).double() + draws.normal("y", steps, 1))
-    kept = Past(steps, driven=True)
-    method, kalman = ParticleFilter(n, Resample(Systematic(), 0.5)), GaussianFilter(Jacobian())
+    draws, runs = PhiloxStream(4, torch.arange(1)), torch.ones(1, dtype=torch.bool)
+    record = Record(
+        0.3 * torch.arange(1.0, steps + 1).reshape(1, steps, 1).double()
+        + draws.normal("y", steps, 1)
+    )
+    kept = Past(steps, store_noise=True)
+    method, kalman = (
+        ParticleFilter(n, EssResampler(Systematic(), 0.5)),
+        GaussianFilter(TaylorLinearisation()),
+    )
     cloud, law = method.init(model, 1, draws), kalman.init(model, 1, draws)
-    cloud = kept.begin(model, cloud, model.m0.expand(1, -1), (model.l0 @ model.l0.mT).expand(1, -1, -1))
-    size = method.size(cloud)
+    cloud = kept.start(
+        model, cloud, model.m0.expand(1, -1), (model.l0 @ model.l0.mT).expand(1, -1, -1)
+    )
+    size = method.particle_count(cloud)
     for t in range(steps):
-        now, seen = draws.at(t + 1), record.at(t)
+        now, seen = draws.at_step(t + 1), record.at_step(t)
         cloud, _ = method.resampler(model, cloud, cloud.log_w, size, now)
         sent = method.proposal(model, cloud, seen, now)
         log_w = (cloud.log_w + model.log_likelihood(seen.y, sent.x, seen.u)).log_softmax(1)
-        cloud = kept.follow(model, cloud, cloud._replace(x=sent.x, log_w=log_w), sent.w, seen)
+        cloud = kept.append(model, cloud, cloud._replace(x=sent.x, log_w=log_w), sent.w, seen)
         law, _ = kalman.step(model, law, seen, now)
-    copies, _ = Resample(Systematic(), 1.0)(model, cloud, cloud.log_w, size, draws)
-    smoothed, _ = Regularise(Resample(Systematic(), 1.0))(model, cloud, cloud.log_w, size, draws)
-    moved, _ = Metropolis(Flow(steps), 20)(model, copies, runs, draws)
+    copies, _ = EssResampler(Systematic(), 1.0)(model, cloud, cloud.log_w, size, draws)
+    smoothed, _ = RegularisedResampler(EssResampler(Systematic(), 1.0))(
+        model, cloud, cloud.log_w, size, draws
+    )
+    moved, _ = MetropolisHastings(NoiseFlowKernel(steps), 20)(model, copies, runs, draws)
     count = len(torch.unique(copies.x[0, :, 0]))
     panels = {
         f"resampled: {count} places": copies,
         "RPF as printed: blurred where it lies": smoothed,
         "20 flow moves: spread, not widened": moved,
     }
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained")
-    for axis, (title, shown), colour in zip(axes, panels.items(), ("#0072B2", "#E69F00", "#CC79A7"), strict=True):
+    figure, axes = plt.subplots(
+        1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained"
+    )
+    for axis, (title, shown), colour in zip(
+        axes, panels.items(), ("#0072B2", "#E69F00", "#CC79A7"), strict=True
+    ):
         axis.scatter(*shown.x[0].T, s=12, color=colour, alpha=0.7, linewidths=0)
         axis.plot(*_ellipse(law.mean[0], law.covariance[0]), color="#009E73", label="Kalman, 2 sd")
-        mean, covariance = (part[0] for part in moments(model.chart, shown))
+        mean, covariance = (part[0] for part in weighted_mean_cov(model.chart, shown))
         axis.plot(*_ellipse(mean, covariance), color="#D55E00", label="cloud, 2 sd")
         axis.set_title(title, fontsize=11)
         axis.set_xlabel("position")
@@ -404,21 +630,27 @@ def mcmc_rpf() -> None:
 def cofm_amssrcpf() -> None:
     """Position and velocity, position seen far from where it was expected: children by three proposals, areas by weight."""
     model = linear_walk(1.0, 0.8, 0.3, (1.0, 1.0))
-    guide, draws = GaussianFilter(Jacobian()), MonteCarlo(3, torch.arange(1))
+    guide, draws = GaussianFilter(TaylorLinearisation()), PhiloxStream(3, torch.arange(1))
     seen = Record(torch.tensor([[2.5]], dtype=torch.float64))
     exact, _ = guide.step(model, guide.init(model, 1, draws), seen, draws)
     panels: dict[str, Proposal] = {
-        "model's noise (SIR)": Bootstrap(),
-        "noise given parent and y": GuidedNoise(guide),
-        "one guide for the cloud": Guided(guide),
+        "model's noise (SIR)": BootstrapProposal(),
+        "noise given parent and y": GuidedNoiseProposal(guide),
+        "one guide for the cloud": SharedGuideProposal(guide),
     }
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained")
-    for axis, (title, proposal), colour in zip(axes, panels.items(), ("#0072B2", "#E69F00", "#CC79A7"), strict=True):
+    figure, axes = plt.subplots(
+        1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained"
+    )
+    for axis, (title, proposal), colour in zip(
+        axes, panels.items(), ("#0072B2", "#E69F00", "#CC79A7"), strict=True
+    ):
         method = ParticleFilter(150, proposal=proposal)
-        after, info = method.step(model, method.init(model, 1, draws), seen, draws.at(1))
-        w = weights(after.log_w)[0]
+        after, info = method.step(model, method.init(model, 1, draws), seen, draws.at_step(1))
+        w = normalise_log_weights(after.log_w)[0]
         axis.scatter(*after.x[0].T, s=8.0 + 1500.0 * w, color=colour, alpha=0.5, linewidths=0)
-        axis.plot(*_ellipse(exact.mean[0], exact.covariance[0]), color="#009E73", label="Kalman, 2 sd")
+        axis.plot(
+            *_ellipse(exact.mean[0], exact.covariance[0]), color="#009E73", label="Kalman, 2 sd"
+        )
         axis.set_title(f"{title}: ESS {float(info.trace['ess'][0]):.0f} of 150", fontsize=11)
         axis.set_xlabel("position")
     axes[0].set_ylabel("velocity")
@@ -428,6 +660,10 @@ def cofm_amssrcpf() -> None:
 
 
 if __name__ == "__main__":
-    pictures = [name for name, value in globals().items() if callable(value) and getattr(value, "__module__", "") == "__main__"]
+    pictures = [
+        name
+        for name, value in globals().items()
+        if callable(value) and getattr(value, "__module__", "") == "__main__"
+    ]
     for name in sys.argv[1:] or [name for name in pictures if not name.startswith("_")]:
         globals()[name]()

@@ -1,4 +1,4 @@
-"""Models linearised at particles: where a step leads and what is seen there, by exact derivatives along the chart."""
+"""Derivatives of a model along its chart, and checks that a Gaussian approximation is possible."""
 
 from __future__ import annotations
 
@@ -10,10 +10,15 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
 
+from pfbench.core.density import has_finite_moments
+from pfbench.core.jacobian import jacobian
+from pfbench.core.record import Record
+from pfbench.kernels.compilation import is_capturing
 from pfbench.model.base import StateSpaceModel
-from pfbench.record import Record
 
 _POINTS = 200_000  # states differentiated at a time
+_PROBES = 4  # states and noises at which additive noise is verified
+_ROUNDING = 1e3 * 2.2e-16  # relative rounding error that `propagate` may have
 
 
 def derivative(
@@ -22,74 +27,192 @@ def derivative(
     d: int,
     subtract: Callable[[Tensor, Tensor], Tensor] = torch.subtract,
 ) -> Tensor:
-    """Derivative in xi, at 0, of f: states [R, P, D], xi [R, P, d] -> [R, P, k]: [R, N, k, d] for states `at` [R, N, D].
+    """Compute the derivative of a map of states and increments at increment zero.
 
-    `subtract` says how values differ, where they may wrap. All directions go in one forward pass, as more particles.
+    All directions are evaluated in one forward pass, as additional particles.
+
+    Args:
+        f: Map of states [R, P, D] and increments xi [R, P, d] to values [R, P, k].
+        at: States, [R, N, D].
+        d: Dimension of the increments.
+        subtract: Difference of two values; it wraps angles.
+
+    Returns:
+        Derivative, [R, N, k, d].
     """
     runs, n = at.shape[:2]
     parts = []
-    for directions in torch.eye(d, dtype=at.dtype, device=at.device).split(max(1, _POINTS // (runs * n))):
+    eye = torch.eye(d, dtype=at.dtype, device=at.device)
+    for directions in eye.split(max(1, _POINTS // (runs * n))):
         xi = directions.repeat(runs, n, 1)
         with forward_ad.dual_level():
-            value = f(at.repeat_interleave(len(directions), 1), forward_ad.make_dual(torch.zeros_like(xi), xi))
-            still = forward_ad.unpack_dual(value)[0].detach()
-            difference, slopes = forward_ad.unpack_dual(subtract(value, still))
-        slopes = torch.zeros_like(difference) if slopes is None else slopes  # it does not depend on xi
-        parts.append(slopes.unflatten(1, (n, len(directions))))
+            dual = forward_ad.make_dual(torch.zeros_like(xi), xi)
+            value = f(at.repeat_interleave(len(directions), 1), dual)
+            primal = forward_ad.unpack_dual(value)[0].detach()
+            difference, tangent = forward_ad.unpack_dual(subtract(value, primal))
+        if tangent is None:  # the map does not depend on xi
+            tangent = torch.zeros_like(difference)
+        parts.append(tangent.unflatten(1, (n, len(directions))))
     return torch.cat(parts, 2).mT
 
 
-def quiet(model: StateSpaceModel, x: Tensor) -> Tensor:
-    """The mean noise for each of x [R, N, ...]: [R, N, W]."""
+def compute_additive_gain(model: StateSpaceModel, x: Tensor, root: Tensor, u: Any) -> Tensor | None:
+    """Return the gain of additive noise, stated by the model or verified numerically.
+
+    If the model does not define `noise_gain`, its derivative in the noise is computed at the mean
+    state. It is the gain if `propagate` agrees with x (+) L w at other states (several standard
+    deviations and units away) and for large noises of both signs. Otherwise the noise is treated as
+    not additive. This is always valid, because the noise then passes through the linearisation
+    rule. It is also treated so in single precision, which cannot verify it, and while a step is
+    recorded for compilation.
+
+    Args:
+        model: State-space model.
+        x: Mean state, [R, D].
+        root: Square root of the covariance, [R, d, d].
+        u: Inputs of the step.
+
+    Returns:
+        Gain, [R or 1, d, W]; None if the noise is not additive.
+    """
+    if model.has_noise_gain or is_capturing() or x.dtype != torch.float64:
+        return model.noise_gain(u)
+    chart, d, distribution = model.chart, model.chart.dimension, model.noise
+    centre, sd = distribution.mean, distribution.stddev
+    at = x.unsqueeze(1)
+
+    def propagate_noise(w: Tensor) -> Tensor:
+        return model.propagate(at.expand(-1, w.shape[1], -1), u, centre + w)
+
+    value = propagate_noise(centre.new_zeros(len(x), 1, len(centre)))
+    gain = jacobian(propagate_noise, value, len(centre), chart.subtract)
+    with torch.no_grad():
+        count = _PROBES * (d + len(centre))
+        angles = torch.arange(1.0, count + 1.0, dtype=x.dtype, device=x.device)
+        waves = 3.0 * torch.sin(angles**2).view(_PROBES, -1)  # fixed and irregular
+        spread = root.diagonal(dim1=-2, dim2=-1).unsqueeze(1)
+        states = chart.add(at, waves[:, :d] @ root.mT + waves[:, :d] * (0.1 * spread + 0.01))
+        w = (sd * waves[:, d:]).expand(len(x), -1, -1)
+        quiet_states = model.propagate(states, u, centre + torch.zeros_like(w))
+        shift = w @ gain.mT
+        off = chart.subtract(model.propagate(states, u, centre + w), chart.add(quiet_states, shift))
+        size = quiet_states.abs().amax(1, keepdim=True)
+        size = size if chart.flat else size.amax(-1, keepdim=True)
+        additive = bool((off.abs() <= _ROUNDING * (size + shift.abs())).all())
+    return gain if additive else None
+
+
+def check_moments(model: StateSpaceModel, name: str, distribution: Any) -> None:
+    """Raise ValueError if a Gaussian filter cannot approximate a distribution of a model.
+
+    Normal distributions cost a type check only.
+
+    Args:
+        model: State-space model, for the message.
+        name: Method or property that returned the distribution.
+        distribution: The distribution.
+
+    Raises:
+        ValueError: if mean or variance are not finite.
+    """
+    if not has_finite_moments(distribution):
+        kind = type(unwrap_independent(distribution)).__name__
+        raise ValueError(
+            f"{type(model).__name__}.{name} must have a finite mean and variance for a Gaussian "
+            f"filter, got {kind}. Use a particle filter, for example filter=sir."
+        )
+
+
+def mean_noise(model: StateSpaceModel, x: Tensor) -> Tensor:
+    """Return the mean noise for each of the states x [R, N, ...]: [R, N, W]."""
     return model.noise.mean.expand(*x.shape[:2], -1)
 
 
-def drift(model: StateSpaceModel, x: Tensor, u: Any) -> Tensor:
-    """Phi [R, N, d, d], slope of the step that x [R, N, D] would take without noise."""
+def transition_jacobian(model: StateSpaceModel, x: Tensor, u: Any) -> Tensor:
+    """Compute the Jacobian of the noise-free step.
+
+    Args:
+        model: State-space model.
+        x: States, [R, N, D].
+        u: Inputs of the step.
+
+    Returns:
+        Jacobian, [R, N, d, d].
+    """
     chart = model.chart
 
-    def moved(a: Tensor, xi: Tensor) -> Tensor:
-        return model.propagate(chart.add(a, xi), u, quiet(model, xi))
+    def propagate_increment(a: Tensor, xi: Tensor) -> Tensor:
+        return model.propagate(chart.add(a, xi), u, mean_noise(model, xi))
 
-    return derivative(moved, x, chart.dimension, chart.subtract)
-
-
-def sight(model: StateSpaceModel, x: Tensor, seen: Record) -> Tensor:
-    """H [R, N, k, d], slope of what is expected to be seen of x [R, N, D]; rows 0 where nothing was seen."""
-
-    def looked(a: Tensor, xi: Tensor) -> Tensor:
-        return mean(model.observation(model.chart.add(a, xi), seen.u))
-
-    h = derivative(looked, x, model.chart.dimension, model.residual)
-    return torch.where(torch.isnan(seen.y)[:, None, :, None], 0.0, h)
+    return derivative(propagate_increment, x, chart.dimension, chart.subtract)
 
 
-def innovation(model: StateSpaceModel, x: Tensor, seen: Record) -> Tensor:
-    """y - y_hat of x [R, N, D] -> [R, N, k]; 0 where nothing was seen."""
-    y = seen.y.unsqueeze(1)
-    return torch.where(torch.isnan(y), 0.0, model.residual(y.nan_to_num(), mean(model.observation(x, seen.u))))
+def measurement_jacobian(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+    """Compute the Jacobian of the measurement mean.
+
+    Args:
+        model: State-space model.
+        x: States, [R, N, D].
+        seen: Measurement and inputs of the step.
+
+    Returns:
+        Jacobian, [R, N, k, d]; rows of missing components are 0.
+    """
+
+    def observe_increment(a: Tensor, xi: Tensor) -> Tensor:
+        return linearised_mean(model.observation(model.chart.add(a, xi), record.u))
+
+    h = derivative(observe_increment, x, model.chart.dimension, model.residual)
+    return torch.where(torch.isnan(record.y)[:, None, :, None], 0.0, h)
 
 
-def mean(law: Any) -> Tensor:
+def linearised_innovation(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+    """Compute y - y_hat of states.
+
+    Args:
+        model: State-space model.
+        x: States, [R, N, D].
+        seen: Measurement and inputs of the step.
+
+    Returns:
+        Innovation, [R, N, k]; 0 for missing components.
+    """
+    y = record.y.unsqueeze(1)
+    r = model.residual(y.nan_to_num(), linearised_mean(model.observation(x, record.u)))
+    return torch.where(torch.isnan(y), 0.0, r)
+
+
+def linearised_mean(law: Any) -> Tensor:
+    """Return the mean of a distribution."""
     value: Tensor = law.mean
     return value
 
 
-def base(law: Distribution) -> Distribution:
-    """Of a law with independent components, the law that holds them; any other itself."""
+def unwrap_independent(law: Distribution) -> Distribution:
+    """Return the univariate distribution of independent components, or the distribution itself."""
     return law.base_dist if isinstance(law, Independent) else law
 
 
 def is_normal(law: Distribution) -> bool:
-    return isinstance(base(law), Normal | MultivariateNormal)
+    """Return whether a distribution is normal."""
+    return isinstance(unwrap_independent(law), Normal | MultivariateNormal)
 
 
-def where_seen(covariance: Tensor, there: Tensor) -> Tensor:
-    """A covariance [..., k, k] between the components that are there [..., k]; 1 and uncorrelated where they are not."""
+def mask_covariance(covariance: Tensor, there: Tensor) -> Tensor:
+    """Replace rows and columns of missing components by those of the unit matrix.
+
+    Args:
+        covariance: Covariance, [..., k, k].
+        there: Observed components, bool [..., k].
+
+    Returns:
+        Covariance, [..., k, k].
+    """
     both = there.unsqueeze(-1) & there.unsqueeze(-2)
-    return torch.where(both, covariance, torch.eye(there.shape[-1], dtype=covariance.dtype, device=covariance.device))
+    eye = torch.eye(there.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    return torch.where(both, covariance, eye)
 
 
-def times(m: Tensor, e: Tensor) -> Tensor:
-    """Matrices [R, 1 or N, k, l] times vectors [R, 1 or N, l] -> [R, N, k]."""
+def batch_product(m: Tensor, e: Tensor) -> Tensor:
+    """Multiply matrices [R, 1 or N, k, l] by vectors [R, 1 or N, l] -> [R, N, k]."""
     return e @ m[:, 0].mT if m.shape[1] == 1 else (m @ e.unsqueeze(-1)).squeeze(-1)

@@ -1,6 +1,7 @@
-"""Smoothing: what the whole record says of every state. Backward passes over what a filter has left.
+"""Smoothing: distributions of all states given the whole record, by a backward pass.
 
-Gaussian filters are smoothed by the recursion of Rauch, Tung and Striebel, particle filters by sampling whole paths backwards.
+Gaussian filters use the recursion of Rauch, Tung and Striebel. Particle filters use
+backward sampling of paths.
 """
 
 from __future__ import annotations
@@ -10,164 +11,204 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pfbench.covariance import factor
-from pfbench.draws import MonteCarlo, Source
-from pfbench.filter.belief import Filter, Gaussian, Info
-from pfbench.filter.derived_draws import named
-from pfbench.filter.gaussian import GaussianFilter
-from pfbench.filter.loop import Estimate, run_filter
-from pfbench.filter.rules import Linearised
+from pfbench.core.covariance import factor
+from pfbench.core.derived_stream import relabel
+from pfbench.core.random_stream import BatchRandomStream, PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import Filter, GaussianBelief, StepInfo
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
+from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.base import StateSpaceModel
-from pfbench.record import Record
 
-_PAIRS = 4_000_000  # numbers of particles beside paths that are weighed at a time
+_PAIRS = 4_000_000  # numbers of pairs of particle and path that are weighted at a time
 
 
-class Smoothed(NamedTuple):
-    """A normal law of each state given the whole record, in the chart about `mean`.
+class SmoothedStates(NamedTuple):
+    """Normal distribution of each state given the whole record, in the chart about `mean`.
 
     Attributes:
-        mean: [R, T, D]; NaN at the instants of a lost run from which on it was lost, and before.
-        covariance: [R, T, d, d].
-        filtered: what the filter alone made of the record.
+        mean: Smoothed means, [R, T, D]. NaN for a lost run.
+        covariance: Smoothed covariances, [R, T, d, d].
+        filtered: Result of the filter.
     """
 
     mean: Tensor
     covariance: Tensor
-    filtered: Estimate
+    filtered: FilterResult
 
 
-def smooth(method: GaussianFilter, model: StateSpaceModel, record: Record) -> Smoothed:
-    """Means and covariances given the whole record [Rauch, Tung and Striebel 1965; Sarkka 2008 for points].
+def smooth(method: GaussianFilter, model: StateSpaceModel, record: Record) -> SmoothedStates:
+    """Compute smoothed means and covariances (Rauch-Tung-Striebel).
 
-    The covariance between a state and the next is what the filter's own rule finds, so that the recursion is the extended, the
-    unscented or the cubature smoother, as the filter is; it is exact on linear-Gaussian models. On a curved chart the law of
-    the next state is taken in the coordinates about its prediction [ours].
+    The covariance between consecutive states comes from the filter's linearisation rule. The result
+    is the extended, unscented or cubature smoother, and exact for linear Gaussian models. On a
+    curved chart the next state is expressed in coordinates about its prediction [ours].
 
     Args:
-        method: a Gaussian filter without adaptations and gains, whose predictions are those of the model.
-        model: what the filter believes.
-        record: measurements [R, T, Dy] and inputs.
+        method: Gaussian filter without noise or gain adaptations.
+        model: State-space model of the filter.
+        record: Measurements [R, T, Dy] and inputs.
+
+    Returns:
+        Smoothed means and covariances, and the result of the filter.
 
     Raises:
-        ValueError: a filter that changes the model's noise; a record whose world the filter would change.
+        ValueError: If the filter adapts noise or gain, or if the record has feedback.
+
+    References:
+        H. Rauch, F. Tung and C. Striebel (1965). S. Sarkka (2008), Unscented
+        Rauch-Tung-Striebel smoother.
     """
     if not method.plain:
-        raise ValueError("smooth: this filter adapts its noise or gain, and its past is no law of the model; choose a plain one")
+        raise ValueError(
+            "smooth: method must use the model's noise and gain, got a filter that adapts them. "
+            "Choose a filter without adaptations."
+        )
     _check_open(record)
-    laws: list[tuple[Tensor, Tensor]] = []
+    filtered_moments: list[tuple[Tensor, Tensor]] = []
 
-    def keep(t: int, info: Info) -> dict[str, Tensor]:
-        laws.append((info.mean, info.covariance()))
+    def store(t: int, info: StepInfo) -> dict[str, Tensor]:
+        filtered_moments.append((info.mean, info.covariance()))
         return {}
 
     runs = torch.arange(len(record.y))
-    filtered = run_filter(method, model, record, MonteCarlo(0, runs), keep)
+    filtered = run_filter(method, model, record, PhiloxStream(0, runs), store)
     inputs, chart = model.prepare(record.to(model.anchor)).to(model.anchor), model.chart
-    mean, covariance = laws[-1]
+    mean, covariance = filtered_moments[-1]
     means, covariances = [mean], [covariance]
-    for t in reversed(range(len(laws) - 1)):
-        before, spread = laws[t]
-        belief = Gaussian(before, spread, torch.zeros_like(before[:, 0]))
-        predicted, rooted = method.predict(model, belief, inputs.at(t + 1).u)
-        gain, left = _backwards(predicted, factor(spread)[0], rooted)
+    for t in reversed(range(len(filtered_moments) - 1)):
+        before, spread = filtered_moments[t]
+        belief = GaussianBelief(before, spread, torch.zeros_like(before[:, 0]))
+        predicted, rooted = method.predict(model, belief, inputs.at_step(t + 1).u)
+        gain, remainder = _backward_gain(predicted, factor(spread)[0], rooted)
         shift = (gain @ chart.subtract(mean, predicted.y).unsqueeze(-1)).squeeze(-1)
-        mean, covariance = chart.add(before, shift), left + gain @ covariance @ gain.mT
+        mean, covariance = chart.add(before, shift), remainder + gain @ covariance @ gain.mT
         means.append(mean)
         covariances.append(covariance)
-    return Smoothed(torch.stack(means[::-1], 1), torch.stack(covariances[::-1], 1), filtered)
+    return SmoothedStates(torch.stack(means[::-1], 1), torch.stack(covariances[::-1], 1), filtered)
 
 
-def _backwards(predicted: Linearised, root: Tensor, rooted: Tensor) -> tuple[Tensor, Tensor]:
-    """The gain [R, d, d] on the next state's correction, and what it would leave of the covariance if that were known.
+def _backward_gain(
+    predicted: AffineApproximation, root: Tensor, rooted: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the smoother gain [R, d, d] and the covariance given the next state.
 
-    In Joseph's form, which stays positive: of x = L xi, next = M xi + e, it is L ((I - K M) (I - K M)' + K Omega K') L'.
+    For x = L xi and next = M xi + e the covariance is L ((I - K M) (I - K M)' + K Omega K') L', in
+    Joseph's form, which stays positive.
     """
     d = root.shape[-1]
     m, covariance = predicted.m[..., :d], predicted.m @ predicted.m.mT + predicted.omega
-    ahead, positive = factor(covariance)
-    half = torch.linalg.solve_triangular(ahead, m, upper=False)
-    k = torch.linalg.solve_triangular(ahead.mT, half, upper=True).mT
+    predicted_root, positive = factor(covariance)
+    half = torch.linalg.solve_triangular(predicted_root, m, upper=False)
+    k = torch.linalg.solve_triangular(predicted_root.mT, half, upper=True).mT
     eye = torch.eye(d, dtype=m.dtype, device=m.device)
-    driven = predicted.m[..., d:]  # columns of noise that went through the rule
-    rest = driven @ driven.mT + predicted.omega
-    left = (eye - k @ m) @ (eye - k @ m).mT + k @ rest @ k.mT
-    sound = (rooted & positive)[:, None, None]
-    return torch.where(sound, root @ k, torch.nan), torch.where(sound, root @ left @ root.mT, torch.nan)
+    noise_columns = predicted.m[..., d:]  # of noise inside the linearisation rule
+    omega = noise_columns @ noise_columns.mT + predicted.omega
+    conditional = (eye - k @ m) @ (eye - k @ m).mT + k @ omega @ k.mT
+    valid = (rooted & positive)[:, None, None]
+    return torch.where(valid, root @ k, torch.nan), torch.where(
+        valid, root @ conditional @ root.mT, torch.nan
+    )
 
 
-def trajectories(method: Filter, model: StateSpaceModel, record: Record, draws: Source, paths: int) -> Tensor:
-    """Whole paths from p(x_1:T | y_1:T), as a particle filter sees it: forward filtering, backward sampling.
+def sample_trajectories(
+    method: Filter, model: StateSpaceModel, record: Record, draws: BatchRandomStream, paths: int
+) -> Tensor:
+    """Sample paths from p(x_1:T | y_1:T) by forward filtering and backward sampling.
 
-    A path takes its last state by the last weights, then each earlier one from the cloud of its time, by the weights there times
-    the density of the step to the state behind it [Godsill, Doucet and West 2004]. The states of a path come from clouds as they
-    were before later resampling thinned them out, and the paths of a run are independent given its clouds.
+    The last state of a path is sampled by the last weights. Each earlier state is sampled from the
+    particles of its step, by their weights times the transition density to the next state. Later
+    resampling does not reduce the diversity of earlier states. The paths of a run are independent
+    given its particles.
 
     Args:
-        method: a particle filter whose clouds are weighted particles of the model's states.
-        model: with a transition that has a density.
-        record: measurements [R, T, Dy] and inputs.
-        draws: the filter's randomness, and that of the paths.
-        paths: for each run.
+        method: Particle filter.
+        model: State-space model with a transition density.
+        record: Measurements [R, T, Dy] and inputs.
+        draws: Random stream of filter and paths.
+        paths: Number of paths of each run.
 
     Returns:
-        [R, paths, T, D]; NaN where a run is lost.
+        Sampled paths, [R, paths, T, D]. NaN where a run is lost.
 
     Raises:
-        ValueError: no paths; a Gaussian filter; a model without transition density; a record whose world the filter would
-            change.
+        ValueError: If paths is below 1, the filter has no particles, the model has no transition
+            density, or the record has feedback.
+
+    References:
+        S. Godsill, A. Doucet and M. West (2004), Monte Carlo smoothing for nonlinear time series.
     """
     if paths < 1:
-        raise ValueError(f"trajectories: paths={paths}; give at least 1")
+        raise ValueError(f"trajectories: paths must be at least 1, got {paths}. Increase it.")
     _check_open(record)
     clouds: list[tuple[Tensor, Tensor]] = []
 
-    def keep(t: int, info: Info) -> dict[str, Tensor]:
+    def store(t: int, info: StepInfo) -> dict[str, Tensor]:
         if info.cloud is None:
-            raise ValueError(f"trajectories: {type(method).__name__} has no particles; smooth() gives its smoothed law")
+            raise ValueError(
+                f"trajectories: method must be a particle filter, got {type(method).__name__}. "
+                "Use smooth() for a Gaussian filter."
+            )
         deviations, log_w = info.cloud()
         clouds.append((model.chart.add(info.mean.unsqueeze(1), deviations), log_w))
         return {}
 
     inputs = model.prepare(record.to(model.anchor)).to(model.anchor)
     _check_dense(model, inputs, record)
-    estimate = run_filter(method, model, record, draws, keep)
+    estimate = run_filter(method, model, record, draws, store)
     x, log_w = clouds[-1]
-    path = [_chosen(x, log_w.unsqueeze(1).expand(-1, paths, -1), named(draws.at(len(clouds)), "path."))]
+    path = [
+        _sample_states(
+            x,
+            log_w.unsqueeze(1).expand(-1, paths, -1),
+            relabel(draws.at_step(len(clouds)), "path."),
+        )
+    ]
     for t in reversed(range(len(clouds) - 1)):
         x, log_w = clouds[t]
-        log_a = log_w.unsqueeze(1) + _log_densities(model, x, path[-1], inputs.at(t + 1).u)
-        path.append(_chosen(x, log_a, named(draws.at(t + 1), "path.")))
-    whole = torch.stack(path[::-1], 2)
-    return torch.where(estimate.lost[:, None, None, None], torch.nan, whole)
+        log_a = log_w.unsqueeze(1) + _log_densities(model, x, path[-1], inputs.at_step(t + 1).u)
+        path.append(_sample_states(x, log_a, relabel(draws.at_step(t + 1), "path.")))
+    samples = torch.stack(path[::-1], 2)
+    return torch.where(estimate.lost[:, None, None, None], torch.nan, samples)
 
 
-def _log_densities(model: StateSpaceModel, x: Tensor, ahead: Tensor, u: Any) -> Tensor:
-    """log p(ahead | x) of each state ahead [R, M, D] from each particle x [R, N, D] -> [R, M, N], some of M at a time."""
+def _log_densities(model: StateSpaceModel, x: Tensor, next_x: Tensor, u: Any) -> Tensor:
+    """Return log p(next | x) [R, M, N] of next states [R, M, D] from particles [R, N, D]."""
     parts, n = [], x.shape[1]
-    for some in ahead.split(max(1, _PAIRS // x.numel()), 1):
-        law: Any = model.transition(x.repeat(1, some.shape[1], 1), u)
-        parts.append(law.log_prob(some.repeat_interleave(n, 1)).unflatten(1, (-1, n)))
+    for block in next_x.split(max(1, _PAIRS // x.numel()), 1):
+        distribution: Any = model.transition(x.repeat(1, block.shape[1], 1), u)
+        parts.append(distribution.log_prob(block.repeat_interleave(n, 1)).unflatten(1, (-1, n)))
     return torch.cat(parts, 1)
 
 
-def _chosen(x: Tensor, log_a: Tensor, draws: Any) -> Tensor:
-    """For each path one of x [R, N, D], by log probabilities log_a [R, M, N] -> [R, M, D]."""
-    heights = torch.softmax(log_a, -1).nan_to_num().cumsum(-1)
-    at = draws.uniform("state", log_a.shape[1], 1).to(heights) * heights[..., -1:]
-    which = torch.searchsorted(heights, at, right=True).clamp(max=x.shape[1] - 1)
-    return x.gather(1, which.expand(-1, -1, x.shape[-1]))
+def _sample_states(x: Tensor, log_a: Tensor, draws: Any) -> Tensor:
+    """Sample a particle for each path [R, M, D], by log probabilities [R, M, N]."""
+    cumulative = torch.softmax(log_a, -1).nan_to_num().cumsum(-1)
+    level = draws.uniform("state", log_a.shape[1], 1).to(cumulative) * cumulative[..., -1:]
+    index = torch.searchsorted(cumulative, level, right=True).clamp(max=x.shape[1] - 1)
+    return x.gather(1, index.expand(-1, -1, x.shape[-1]))
 
 
 def _check_open(record: Record) -> None:
-    if record.loop is not None:
-        raise ValueError("smoothing: what a filter estimates changes this world, and its past with it; set scenario.closed=false")
+    """Raise an error if the record has feedback."""
+    if record.feedback is not None:
+        raise ValueError(
+            "smoothing: record must not depend on the filter, got one with feedback. "
+            "Set scenario.closed_loop=false."
+        )
 
 
 def _check_dense(model: StateSpaceModel, inputs: Record, record: Record) -> None:
-    start = model.origin.expand(len(record.y), 1, -1) if inputs.start is None else inputs.start.unsqueeze(1)
-    if model.transition(start.to(model.anchor), inputs.at(0).u) is None:
+    """Raise an error if the model has no transition density."""
+    start = (
+        model.origin.expand(len(record.y), 1, -1)
+        if inputs.start is None
+        else inputs.start.unsqueeze(1)
+    )
+    if model.transition(start.to(model.anchor), inputs.at_step(0).u) is None:
         raise ValueError(
-            f"trajectories: {type(model).__name__} has no transition density (fewer noises than states): a state is reached from "
-            "its own parent alone, and nothing can be sampled backwards; smooth() with a Gaussian filter needs none"
+            "trajectories: model must have a transition density, got "
+            f"{type(model).__name__} without one (fewer noise than state components). "
+            "Use smooth() with a Gaussian filter."
         )

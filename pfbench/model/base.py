@@ -1,4 +1,4 @@
-"""The one abstract class of the house: a model is a map driven by explicit noise and a law of what is seen."""
+"""State-space models: propagation driven by noise, and a distribution of the measurement."""
 
 from __future__ import annotations
 
@@ -10,36 +10,41 @@ import torch
 from pyro.distributions import Independent, MultivariateNormal, Normal
 from torch import Tensor, nn
 from torch.distributions import Distribution
+from typing_extensions import override
 
-from pfbench import native
-from pfbench.chart import Chart, Euclidean
-from pfbench.covariance import gaussian_log_density
-from pfbench.fusion import fusible
-from pfbench.record import Record
+from pfbench.core.chart import Chart, EuclideanBlock
+from pfbench.core.covariance import gaussian_log_density
+from pfbench.core.density import log_density, log_normal_density
+from pfbench.core.record import Record
+from pfbench.kernels import cpp
+from pfbench.kernels.compilation import compilable
 
 HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
-class Standard(Normal):
-    """Independent standard normal numbers, known by this type, so that nobody need multiply them by one and add zero."""
+class StandardNormal(Normal):
+    """Independent standard normal numbers; code that knows the type skips scale and shift."""
 
 
 class StateSpaceModel(nn.Module, ABC):
-    """x_t = propagate(x_{t-1}, u_t, w_t), y_t ~ observation(x_t, u_t).
+    """A model x_t = propagate(x_{t-1}, u_t, w_t), y_t ~ observation(x_t, u_t).
 
-    Axes everywhere: R runs, N particles (or sigma points, or tangents), D state. By convention the first measurement is of the
-    state after the first propagation; a model that measures its initial state sets `observes_initial`, and the evidence
-    changes with it.
+    Axes: R runs, N particles (or sigma points, or tangents), D state. The first measurement is of
+    the state after the first propagation, unless the model sets `observes_initial`, which changes
+    the evidence.
 
     Attributes:
-        names, units: of the d components of a difference of states, in which errors and spreads are told (SI, rad).
-        groups: components of a difference that a report shows together, by name.
-        noise_dim: W, the dimension of the driving noise.
-        observes_initial: the first measurement is of x_0, nothing is propagated before it.
-        linear: the map is linear and both laws are normal, so that every Gaussian filter is the Kalman filter and exact.
-        linear_given: components of a difference in which, with the noise, map and measurement are linear given all others, and
-            both laws normal: a Kalman filter of each particle can have them. A linear model need not say so.
-        choices: readings of ours that a report must mention.
+        names: Components of a difference of states, in which errors are reported.
+        units: SI unit of each of these d components.
+        groups: Components of a difference that a report shows together, by name.
+        noise_dim: Dimension W of the driving noise.
+        observes_initial: Whether the first measurement is of x_0, before any propagation.
+        linear: Whether the map is linear and both distributions are normal. Every Gaussian filter
+            is then the Kalman filter and exact.
+        linear_given: Components of a difference in which, together with the noise, map and
+            measurement are linear given all others, with normal distributions. A Kalman filter of
+            each particle can estimate them. A linear model need not set it.
+        choices: Modelling choices that a report must list.
     """
 
     names: tuple[str, ...]
@@ -53,183 +58,288 @@ class StateSpaceModel(nn.Module, ABC):
 
     @property
     def chart(self) -> Chart:
-        """How states add, subtract and average; plain numbers unless the model says otherwise."""
-        return Chart((Euclidean(len(self.names)),))
+        """Addition, subtraction and mean of states; Euclidean by default."""
+        return Chart((EuclideanBlock(len(self.names)),))
 
     @property
     def origin(self) -> Tensor:
-        """The state [D] about which `initial` is laid out in the chart; zero unless the model says otherwise."""
+        """State [D] about which `initial` is defined in the chart; zero by default."""
         return self.anchor.new_zeros(self.chart.size)
 
     @property
     def anchor(self) -> Tensor:
-        """Some tensor of the model: tells dtype and device."""
+        """A tensor of the model that has its dtype and device."""
         return next(iter(self.buffers()))
 
     @property
     def noise(self) -> Distribution:
-        """Law of w, event [W], components independent; standard normal unless the model says otherwise."""
+        """Distribution of w, event [W], independent components; standard normal by default."""
         zero = self.anchor.new_zeros(self.noise_dim)
-        return Standard(zero, torch.ones_like(zero), validate_args=False).to_event(1)
+        return StandardNormal(zero, torch.ones_like(zero), validate_args=False).to_event(1)
+
+    @property
+    def has_residual(self) -> bool:
+        """Whether the model defines a residual other than y - y_hat."""
+        return type(self).residual is not StateSpaceModel.residual
+
+    @property
+    def has_noise_gain(self) -> bool:
+        """Whether the model defines `noise_gain`, so that None is a statement."""
+        return type(self).noise_gain is not StateSpaceModel.noise_gain
 
     @abstractmethod
     def initial(self, runs: int) -> Distribution:
-        """Law of x_0 in the chart about `origin`: batch [R], event [d]."""
+        """Return the distribution of x_0 in the chart about `origin`: batch [R], event [d]."""
 
     @abstractmethod
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        """One step, deterministic: [R, N, D], inputs of the step, [R, N, W] -> [R, N, D]."""
+        """Propagate states by one step, a deterministic function of its arguments.
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+            w: Driving noise, [R, N, W].
+
+        Returns:
+            States, [R, N, D].
+        """
 
     @abstractmethod
     def observation(self, x: Tensor, u: Any) -> Distribution:
-        """Law of y given x: batch [R, N], event [Dy]; Independent over components, or a MultivariateNormal."""
+        """Return the distribution of the measurement given states.
+
+        Any distribution with `log_prob` serves particle filters. Gaussian filters need a finite
+        mean and variance. Missing components need Independent, MultivariateNormal or a
+        MixtureSameFamily of them.
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+
+        Returns:
+            Distribution with batch [R, N], event [Dy].
+        """
 
     def transition(self, x: Tensor, u: Any) -> Distribution | None:
-        """Law of x_t given x_{t-1}, batch [R, N], event [D]; None where it is singular, and never faked."""
+        """Return the distribution of x_t given x_{t-1}.
+
+        Args:
+            x: States x_{t-1}, [R, N, D].
+            u: Inputs of the step.
+
+        Returns:
+            Distribution with batch [R, N], event [D]; None where it is singular.
+        """
         return None
 
     def noise_gain(self, u: Any) -> Tensor | None:
-        """L [R or 1, d, W] where the noise enters as x (+) L w in the chart; None where it enters otherwise."""
+        """Return L [R or 1, d, W] if the noise enters as x (+) L w in the chart, else None.
+
+        A model without this method is probed by Gaussian filters at each step. They use the
+        numerical L if the noise is additive. Define the method to avoid this cost.
+        """
         return None
 
     def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
-        """y - y_hat, the short way round where a measurement is an angle."""
+        """Compute y - y_hat; models wrap angles here."""
         return y - y_hat
 
     def prepare(self, record: Record) -> Record:
-        """What can be computed once for all steps and filters' stages: a record whose inputs the model likes better."""
+        """Return the record with inputs that are computed once for all steps."""
         return record
 
-    def assemble(self, truth: dict[str, Tensor]) -> Tensor:
-        """The true state of an Episode's groups, NaN where a group has no truth: {group: [R, T, k]} -> [R, T, D].
+    def at_step(self, t: int) -> StateSpaceModel:
+        """Return the model of step t, t = 0 being the first measurement.
 
-        Here the groups are laid out as the components of a difference; a model whose states are not differences (a
-        quaternion, say) lays them out itself.
+        A model that observes its initial state does not move before its first measurement. This
+        rule is defined only here.
+        """
+        return StaticModel(self) if t == 0 and self.observes_initial else self
+
+    def assemble(self, truth: dict[str, Tensor]) -> Tensor:
+        """Assemble true states from the groups of an episode.
+
+        Groups are placed as components of a difference. A model whose states differ from that
+        layout (a quaternion, for example) overrides this method.
+
+        Args:
+            truth: True values by group, [R, T, k].
+
+        Returns:
+            States, [R, T, D]; NaN where a group has no truth.
 
         Raises:
-            ValueError: no group of this model has a truth.
+            ValueError: if no group of this model has a truth.
         """
-        known = [name for name in self.groups if name in truth]
-        if not known:
-            raise ValueError(f"truth has {sorted(truth)}, the model's groups are {sorted(self.groups)}: none has a truth")
-        some = truth[known[0]]
-        state = some.new_full((*some.shape[:-1], self.chart.size), torch.nan)
-        for name in known:
+        available = [name for name in self.groups if name in truth]
+        if not available:
+            raise ValueError(
+                f"truth must have at least one group of {list(self.groups)}, got {sorted(truth)}. "
+                "Choose a scenario that fits the model."
+            )
+        first = truth[available[0]]
+        state = first.new_full((*first.shape[:-1], self.chart.size), torch.nan)
+        for name in available:
             state[..., list(self.groups[name])] = truth[name]
         return state
 
     def error(self, mean: Tensor, truth: Tensor) -> Tensor:
-        """Error of an estimate as a report shows it, in the chart: [..., D], [..., D] -> [..., d]."""
+        """Compute the error of an estimate in the chart.
+
+        Args:
+            mean: Estimates, [..., D].
+            truth: True states, [..., D].
+
+        Returns:
+            Errors, [..., d].
+        """
         return self.chart.subtract(mean, truth)
 
     def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
-        """log p(y | x) over the components that were seen: y [R, Dy], x [R, N, D] -> [R, N].
+        """Compute log p(y | x) over the observed components.
+
+        The observation distribution is evaluated at y. If the model defines `residual`, it is
+        evaluated at its mean plus the residual of y to that mean, so that angles wrap.
+
+        Args:
+            y: Measurements, [R, Dy]; NaN marks a missing component.
+            x: States, [R, N, D].
+            u: Inputs of the step.
+
+        Returns:
+            Log likelihood, [R, N].
 
         Raises:
-            TypeError: the observation law is neither Independent nor MultivariateNormal.
+            TypeError: if the observation distribution has not one event dimension.
+            ValueError: if a missing component cannot be integrated out, or a distribution
+                without a mean meets a residual.
         """
-        law = self.observation(x, u)
-        seen = ~torch.isnan(y).unsqueeze(1)  # [R, 1, Dy]
-        if isinstance(law, torch.distributions.Independent) and isinstance(law.base_dist, torch.distributions.Normal):
-            sd = law.base_dist.scale
-            if sd.stride(1) == 0:  # one scale for all particles, which torch has expanded
+        distribution: Any = self.observation(x, u)
+        observed_mask = ~torch.isnan(y).unsqueeze(1)  # [R, 1, Dy]
+        base = distribution.base_dist if isinstance(distribution, Independent) else None
+        if isinstance(base, torch.distributions.Normal):
+            sd = base.scale
+            if sd.stride(1) == 0:  # torch has expanded one scale to all particles
                 sd = sd[:, :1] if sd.stride(0) else sd[:1, :1]
-            y, y_hat = y.nan_to_num().unsqueeze(1), law.base_dist.loc
-            if type(self).residual is not StateSpaceModel.residual:  # a plain difference is taken within the fused loop
+            y, y_hat = y.nan_to_num().unsqueeze(1), base.loc
+            if self.has_residual:  # the fused loop computes a plain difference itself
                 y, y_hat = torch.zeros_like(y), -self.residual(y, y_hat)
-            return _log_normal(y, y_hat, sd, seen)
-        y_hat = law.mean
-        r = torch.where(seen, self.residual(y.unsqueeze(1), y_hat), 0.0)
-        if isinstance(law, torch.distributions.Independent):
-            return (law.base_dist.log_prob(y_hat + r) * seen).sum(-1)
-        if isinstance(law, torch.distributions.MultivariateNormal):
-            return gaussian_log_density(r, law.covariance_matrix, seen)
+            return log_normal_density(y, y_hat, sd, observed_mask)
         name = f"{type(self).__name__}.observation"
-        raise TypeError(f"{name} returned {type(law).__name__}: return Independent or MultivariateNormal")
+        if not self.has_residual:
+            return log_density(distribution, y.unsqueeze(1), observed_mask, name)
+        y_hat = _mean_of(distribution, name)
+        r = torch.where(observed_mask, self.residual(y.unsqueeze(1), y_hat), 0.0)
+        if isinstance(distribution, torch.distributions.MultivariateNormal):
+            return gaussian_log_density(r, distribution.covariance_matrix, observed_mask)
+        return log_density(distribution, y_hat + r, observed_mask, name)
 
 
-class Wrapped(StateSpaceModel):
-    """A model around another, of which a subclass changes what it is there for; it says itself what it is then."""
+class ModelWrapper(StateSpaceModel):
+    """A model that delegates to another; subclasses override what they change.
+
+    Attributes:
+        model: The inner model. Its flags (`linear`, `observes_initial`, ...) are not copied.
+    """
 
     def __init__(self, model: StateSpaceModel) -> None:
         super().__init__()
         self.model = model
-        self.names, self.units, self.groups, self.noise_dim = model.names, model.units, model.groups, model.noise_dim
+        self.names, self.units = model.names, model.units
+        self.groups, self.noise_dim = model.groups, model.noise_dim
 
     @property
+    @override
     def chart(self) -> Chart:
         return self.model.chart
 
     @property
+    @override
     def origin(self) -> Tensor:
         return self.model.origin
 
     @property
+    @override
     def anchor(self) -> Tensor:
         return self.model.anchor
 
     @property
+    @override
     def noise(self) -> Distribution:
         return self.model.noise
 
+    @property
+    @override
+    def has_residual(self) -> bool:
+        if type(self).residual is ModelWrapper.residual:
+            return self.model.has_residual
+        return True
+
+    @override
     def initial(self, runs: int) -> Distribution:
         return self.model.initial(runs)
 
+    @override
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
         return self.model.propagate(x, u, w)
 
+    @override
     def observation(self, x: Tensor, u: Any) -> Distribution:
         return self.model.observation(x, u)
 
+    @override
     def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
         return self.model.residual(y, y_hat)
 
 
-class AtRest(Wrapped):
-    """A model whose state does not move in this step: the first one of a model that observes its initial state."""
+class StaticModel(ModelWrapper):
+    """A model whose state does not move: the first step if the initial state is observed."""
 
     def __init__(self, model: StateSpaceModel) -> None:
         super().__init__(model)
         self.linear, self.linear_given = model.linear, model.linear_given
 
+    @override
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
         return x
 
+    @override
+    def noise_gain(self, u: Any) -> None:
+        return None
+
+    @override
     def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
         return self.model.log_likelihood(y, x, u)
 
 
-def _log_normal(y: Tensor, mean: Tensor, sd: Tensor, seen: Tensor) -> Tensor:
-    """Log density at y [R, 1, Dy] of independent normals about `mean` [R, N, Dy] over the components seen [R, 1, Dy] -> [R, N].
-
-    Scales are of a run or, [R, N, Dy], of each particle. Does what torch's log_prob does in one pass over the particles
-    instead of eight: half of a step was spent there.
-    """
-    scale, constant = seen / sd, ((torch.log(sd) + HALF_LOG_2PI) * seen).sum(-1)
-    if scale.shape[1] == 1:
-        return _quadratic(y[:, 0], mean, scale[:, 0], constant[:, 0])
-    return _quadratic_of_each(y, mean, scale) - constant
-
-
-def _run_quadratic(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tensor:
-    """-1/2 sum ((y - mean) scale)^2 - constant [R, N]; y, scale [R, K], mean [R, N, K], constant [R]."""
-    z = (y[:, None] - mean) * scale[:, None]
-    return -0.5 * (z * z).sum(-1) - constant[:, None]
+def _mean_of(distribution: Any, name: str) -> Tensor:
+    """Return the mean, or raise if the distribution has none."""
+    try:
+        mean: Tensor = distribution.mean
+    except NotImplementedError:
+        mean = torch.full((1,), torch.nan)
+    if bool(torch.isnan(mean).all()):
+        raise ValueError(
+            f"{name} must return a distribution with a mean where the model defines residual, got "
+            f"{type(getattr(distribution, 'base_dist', distribution)).__name__}. "
+            "Override log_likelihood as well."
+        )
+    return mean
 
 
-@fusible
-def _quadratic_of_each(y: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
-    z = (y - mean) * scale
-    return -0.5 * (z * z).sum(-1)
+def affine_map(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
+    """Compute phi x + gain w.
 
+    The compiled version skips zero coefficients, which most are in error models of an INS.
 
-_quadratic = fusible(_run_quadratic, by_hand=native.log_normal, whole=False)
+    Args:
+        phi: Transition matrix, [R or 1, D, D].
+        x: States, [R, N, D].
+        gain: Noise gain, [R or 1, D, W].
+        w: Noise, [R, N, W].
 
-
-def affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
-    """phi x + gain w [R, N, D]; x [R, N, D], w [R, N, W], phi [R or 1, D, D], gain [R or 1, D, W].
-
-    Compiled, it leaves out coefficients that are zero, as most are in error models of an INS.
+    Returns:
+        States, [R, N, D].
     """
     return _affine(phi, x, gain, w).permute(1, 2, 0)
 
@@ -237,55 +347,94 @@ def affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
 def _dense_affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
     runs = x.shape[0]
     if len(phi) == len(gain) == 1:  # the same for all runs: one product, components first in memory
-        moved = (gain[0] @ w.permute(2, 0, 1).flatten(1)).addmm_(phi[0], x.permute(2, 0, 1).flatten(1))
-        return moved.unflatten(1, x.shape[:2])
-    return torch.baddbmm(gain.expand(runs, -1, -1) @ w.mT, phi.expand(runs, -1, -1), x.mT).transpose(0, 1)
+        shifted = gain[0] @ w.permute(2, 0, 1).flatten(1)
+        return shifted.addmm_(phi[0], x.permute(2, 0, 1).flatten(1)).unflatten(1, x.shape[:2])
+    noise = gain.expand(runs, -1, -1) @ w.mT
+    return torch.baddbmm(noise, phi.expand(runs, -1, -1), x.mT).transpose(0, 1)
 
 
-_affine = fusible(_dense_affine, by_hand=native.affine)
+_affine = compilable(_dense_affine, operator=cpp.propagate_affine)
 
 
 def independent_normal(mean: Tensor, sd: Tensor) -> Independent:
-    """Independent normal components, event in the last axis; sd broadcasts against mean."""
+    """Build a normal distribution with independent components.
+
+    Args:
+        mean: Means, [..., k].
+        sd: Standard deviations, broadcast against the mean.
+
+    Returns:
+        Distribution with event [k].
+    """
     return Normal(mean, sd.expand_as(mean), validate_args=False).to_event(1)
 
 
 def normal_batch(runs: int, sd: Tensor, mean: Tensor | None = None) -> Independent:
-    """The same independent normal law for each of `runs` runs: batch [R], event [d]."""
+    """Build the same independent normal distribution for each run.
+
+    Args:
+        runs: Number of runs R.
+        sd: Standard deviations, [d].
+        mean: Means, [d]; None is zero.
+
+    Returns:
+        Distribution with batch [R], event [d].
+    """
     centre = torch.zeros_like(sd) if mean is None else mean
     return independent_normal(centre.expand(runs, -1), sd)
 
 
 def dense_normal(mean: Tensor, factor: Tensor) -> MultivariateNormal:
-    """A normal law from its Cholesky factor, which is not checked again."""
+    """Build a normal distribution from its mean and Cholesky factor, without checks."""
     return MultivariateNormal(mean, scale_tril=factor, validate_args=False)
 
 
 def initial_law(model: StateSpaceModel, runs: int, spread: Tensor | None = None) -> Distribution:
-    """The law of x_0 in the chart, batch [R]: the model's, or the normal that a record brings by its factor [R, d, d]."""
+    """Return the distribution of x_0 in the chart.
+
+    Args:
+        model: State-space model.
+        runs: Number of runs R.
+        spread: Cholesky factor of each run's initial covariance, [R, d, d]; None uses the model.
+
+    Returns:
+        Distribution with batch [R], event [d].
+    """
     if spread is None:
         return model.initial(runs)
     return dense_normal(spread.new_zeros(spread.shape[:-1]), spread)
 
 
-def numbers(values: Any) -> Tensor:
-    """A float64 tensor; numbers that are tensors themselves, in lists of lists too, keep their gradient."""
+def as_float64(values: Any) -> Tensor:
+    """Return a float64 tensor; tensors inside nested lists keep their gradient."""
     if _holds_tensors(values):
-        return torch.stack([numbers(value) for value in values])
+        return torch.stack([as_float64(value) for value in values])
     return torch.as_tensor(values, dtype=torch.float64)
 
 
 def _holds_tensors(values: Any) -> bool:
-    return isinstance(values, list | tuple) and any(isinstance(v, Tensor) or _holds_tensors(v) for v in values)
+    if not isinstance(values, list | tuple):
+        return False
+    return any(isinstance(value, Tensor) or _holds_tensors(value) for value in values)
 
 
-def positive(name: str, values: Any) -> Tensor:
-    """A float64 tensor of strictly positive numbers.
+def check_positive(name: str, values: Any) -> Tensor:
+    """Return a float64 tensor of strictly positive numbers.
+
+    Args:
+        name: Configuration key, for the message.
+        values: Numbers.
+
+    Returns:
+        The numbers.
 
     Raises:
-        ValueError: names the key, the value and the remedy.
+        ValueError: if a number is not positive or not finite.
     """
-    tensor = numbers(values)
+    tensor = as_float64(values)
     if not bool(((tensor > 0) & torch.isfinite(tensor)).all()):
-        raise ValueError(f"{name}={values}: give positive numbers (a standard deviation or variance cannot be 0 or negative)")
+        raise ValueError(
+            f"{name} must be finite positive numbers, got {values}. "
+            "A standard deviation or variance cannot be 0 or negative."
+        )
     return tensor

@@ -1,4 +1,4 @@
-"""Loosely coupled INS/GNSS: the linear small-angle error model with 15 or 18 states."""
+"""Loosely coupled INS/GNSS: the linear small-angle error model, 15 or 18 states."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Distribution, MultivariateNormal
+from typing_extensions import override
 
-from pfbench.covariance import factor
-from pfbench.model.base import StateSpaceModel, affine, independent_normal, normal_batch
+from pfbench.core.covariance import factor
+from pfbench.core.record import Record
+from pfbench.model.base import StateSpaceModel, affine_map, independent_normal, normal_batch
 from pfbench.nav import attitude, error_dynamics
-from pfbench.nav.aiding import Alignment, Inflation, Receiver
-from pfbench.nav.sensors import ImuErrors
-from pfbench.nav.strapdown import Intervals
-from pfbench.record import Record
+from pfbench.nav.aiding import AlignmentErrors, GnssReceiver, ProcessNoiseInflation
+from pfbench.nav.imu_errors import ImuErrors
+from pfbench.nav.strapdown import InsIntervals
 
 _AXES = {
     "attitude": (("E", "N", "U"), "rad"),
@@ -25,46 +26,61 @@ _AXES = {
     "gyro_markov": (("x", "y", "z"), "rad/s"),
     "accelerometer_bias": (("x", "y", "z"), "m/s^2"),
 }
-_TAYLOR = 4  # terms of the matrix exponential; at 1 s the fifth is below 1e-6 in any entry, the fourth 1e-4
+_TAYLOR = 4  # terms of exp(F T), at 1 s the fifth is below 1e-6 in any entry
 
 
-class Step(NamedTuple):
-    """Transition [R or 1, T, D, D] and noise gain [R or 1, T, D, W] of each interval."""
+class LooseStep(NamedTuple):
+    """Discrete model of each interval.
+
+    Attributes:
+        phi: Transition, [R or 1, T, D, D].
+        gain: Noise gain, [R or 1, T, D, W].
+    """
 
     phi: Tensor
     gain: Tensor
 
 
 class InsGnss(StateSpaceModel):
-    """Errors of an INS (INS minus truth), driven by the nominal trajectory; the receiver sees position and velocity errors.
+    """INS errors (INS minus truth) about the nominal trajectory, aided by a receiver.
 
     States: attitude phi (E, N, U), velocity (E, N, U), position in metres (N, E, U), then
 
-    - 15 states: gyro bias and accelerometer bias, random walks driven as hard as the sensors' Markov parts are;
-    - 18 states (`markov`): gyro constant drift, gyro Markov drift, accelerometer Markov bias [Qin Yongyuan's 18-state model].
+    - 15 states: gyro bias and accelerometer bias, random walks with the driving noise of the
+      sensors' Gauss-Markov parts,
+    - 18 states (`markov`): gyro constant drift, gyro Markov drift, accelerometer Markov bias
+      [Qin Yongyuan's 18-state model].
 
-    Sensor errors enter attitude with -C and velocity with +C. Phi is the matrix exponential to order 4, the noise over an
-    interval Gamma sqrt(q / T) with Gamma = sum (F T)^(n-1)/n! G T, rank 12. With `inflation` the noise is full rank, the
-    factor of Q + diag(inflation^2), and the transition has a density.
+    The receiver measures position and velocity errors. Sensor errors enter attitude with -C and
+    velocity with +C. Phi is the matrix exponential to order 4. The noise over an interval is
+    Gamma sqrt(q / T) with Gamma = sum (F T)^(n-1)/n! G T, rank 12. With `inflation` the noise has
+    full rank, the factor of Q + diag(inflation^2), and the transition has a density. `prepare`
+    computes all transitions and noise gains once. `error` is corrected navigation minus truth, for
+    sensor states estimate minus truth.
 
     Args:
-        imu: what the model believes of the sensors.
-        receiver: what it believes of the receiver; measurement order position N, E, U, velocity E, N, U.
-        initial: what it believes of the initial errors.
-        markov: 18 states instead of 15.
-        inflation: noise added on purpose, or None.
+        imu: Sensor errors that the model assumes.
+        receiver: Receiver noise that the model assumes, order position N, E, U, velocity E, N, U.
+        initial: Initial errors that the model assumes.
+        markov: Whether to use 18 states instead of 15.
+        inflation: Additional process noise, or None.
 
     Raises:
-        ValueError: a sensor's bias of 0, which would make the initial law improper.
+        ValueError: If a sensor bias is 0, which makes the initial distribution improper.
     """
 
     linear = True
     p0: Tensor
     r: Tensor
-    seen: Tensor
+    observed_indices: Tensor
 
     def __init__(
-        self, imu: ImuErrors, receiver: Receiver, initial: Alignment, markov: bool = False, inflation: Inflation | None = None
+        self,
+        imu: ImuErrors,
+        receiver: GnssReceiver,
+        initial: AlignmentErrors,
+        markov: bool = False,
+        inflation: ProcessNoiseInflation | None = None,
     ) -> None:
         super().__init__()
         drift = ("gyro_constant", "gyro_markov") if markov else ("gyro_bias",)
@@ -73,33 +89,48 @@ class InsGnss(StateSpaceModel):
         self.units = tuple(_AXES[block][1] for block in blocks for _ in range(3))
         self.groups = {block: (3 * i, 3 * i + 1, 3 * i + 2) for i, block in enumerate(blocks)}
         self.imu, self.markov, self.inflation = imu, markov, inflation
-        gyro_parts = (imu.gyro_bias, imu.gyro_markov) if markov else (_hypot(imu.gyro_bias, imu.gyro_markov),)
+        constant, random = imu.gyro_bias, imu.gyro_markov
+        gyro = (constant, random) if markov else (_hypot(constant, random),)
         accelerometer = _hypot(imu.accelerometer_bias, imu.accelerometer_markov)
-        biases = [sd for size in (*gyro_parts, accelerometer) for sd in [size] * 3]
+        biases = [sd for size in (*gyro, accelerometer) for sd in [size] * 3]
         if min(biases) <= 0.0:
             raise ValueError(
-                f"model.imu: initial standard deviations {biases} of the sensor errors; give positive gyro and accelerometer "
-                "biases" + (" and Markov parts (or markov=false)" if markov else "")
+                "model.imu must have positive initial standard deviations of sensor errors, "
+                f"got {biases}. "
+                "Give positive gyro and accelerometer biases"
+                + (" and Markov parts (or markov=false)." if markov else ".")
             )
-        self.register_buffer("p0", torch.cat([initial.sd, torch.tensor(biases, dtype=torch.float64)]))
+        self.register_buffer(
+            "p0", torch.cat([initial.sd, torch.tensor(biases, dtype=torch.float64)])
+        )
         self.register_buffer("r", receiver.sd)
-        self.register_buffer("seen", torch.tensor([6, 7, 8, 3, 4, 5][: len(receiver.sd)]))
+        self.register_buffer(
+            "observed_indices", torch.tensor([6, 7, 8, 3, 4, 5][: len(receiver.sd)])
+        )
         self.noise_dim = len(self.names) if inflation else 12
-        choices = [f"every filter's model is inflated: {inflation}"] if inflation else []
+        choices = [f"process noise is inflated for every filter: {inflation}"] if inflation else []
         if markov and imu.accelerometer_bias > 0 and imu.accelerometer_markov > 0:
-            choices.append("the constant accelerometer bias counts as Markov and decays: its spread becomes too small")
+            choices.append(
+                "the constant accelerometer bias is modelled as Markov and decays: "
+                "its standard deviation becomes too small"
+            )
         self.choices = tuple(choices)
 
     @property
+    @override
     def anchor(self) -> Tensor:
         return self.p0
 
+    @override
     def prepare(self, record: Record) -> Record:
-        """Intervals of the nominal trajectory to transitions and noise gains, once for all steps."""
-        return record if isinstance(record.u, Step) else record._replace(u=self.discretise(record.u))
+        return (
+            record
+            if isinstance(record.u, LooseStep)
+            else record._replace(u=self.discretise(record.u))
+        )
 
-    def discretise(self, u: Intervals) -> Step:
-        """Transition [..., D, D] and noise gain [..., D, W] of intervals with leading axes [...], float64."""
+    def discretise(self, u: InsIntervals) -> LooseStep:
+        """Compute transition [..., D, D] and noise gain [..., D, W] of intervals, float64."""
         d = len(self.names)
         f, g, q = self._continuous(u)
         span = u.duration[..., None, None]
@@ -109,18 +140,31 @@ class InsGnss(StateSpaceModel):
             power = power @ f * (span / n)  # (F T)^n / n!
             phi = phi + power
             gamma = gamma + power / (n + 1)
-        phi = error_dynamics.in_metres(phi, u.pos_start, u.pos_end)
-        noise = error_dynamics.in_metres(gamma, u.pos_start, u.pos_end) @ g * torch.sqrt(q * span)
+        phi = error_dynamics.convert_transition_to_metres(phi, u.pos_start, u.pos_end)
+        noise = (
+            error_dynamics.convert_transition_to_metres(gamma, u.pos_start, u.pos_end)
+            @ g
+            * torch.sqrt(q * span)
+        )
         if self.inflation is None:
-            return Step(phi, noise)
-        extra = torch.cat([self.inflation.motion, *[self.inflation.gyro] * (d // 3 - 4), self.inflation.accelerometer])
+            return LooseStep(phi, noise)
+        extra = torch.cat(
+            [
+                self.inflation.motion,
+                *[self.inflation.gyro] * (d // 3 - 4),
+                self.inflation.accelerometer,
+            ]
+        )
         full, ok = factor(noise @ noise.mT + torch.diag(extra.to(noise).square()))
         if not bool(ok.all()):
-            raise ValueError(f"model.inflation={self.inflation}: no square root of the noise exists; give every state some")
-        return Step(phi, full)
+            raise ValueError(
+                f"model.inflation must be positive for every state, got {self.inflation}. "
+                "The noise covariance has no Cholesky factor."
+            )
+        return LooseStep(phi, full)
 
-    def _continuous(self, u: Intervals) -> tuple[Tensor, Tensor, Tensor]:
-        """F [..., D, D], G [..., D, 12], and spectral densities q [12] of gyro, accelerometer, and their drivers."""
+    def _continuous(self, u: InsIntervals) -> tuple[Tensor, Tensor, Tensor]:
+        """Return F [..., D, D], G [..., D, 12], and spectral densities q [12]."""
         d, imu = len(self.names), self.imu
         f = u.f.new_zeros(*u.f.shape[:-1], d, d)
         g = u.f.new_zeros(*u.f.shape[:-1], d, 12)
@@ -132,43 +176,59 @@ class InsGnss(StateSpaceModel):
         eye = torch.eye(3, dtype=f.dtype, device=f.device)
         g[..., d - 6 : d - 3, 6:9] = eye
         g[..., d - 3 :, 9:12] = eye
-        gyro_driver = _driver(imu.gyro_markov, imu.gyro_markov_time)
-        accelerometer_driver = _driver(imu.accelerometer_markov, imu.accelerometer_markov_time)
+        gyro_driver = _driver_density(imu.gyro_markov, imu.gyro_markov_time_s)
+        accelerometer_driver = _driver_density(
+            imu.accelerometer_markov, imu.accelerometer_markov_time_s
+        )
         if self.markov:
-            f[..., 12:15, 12:15] = -eye / imu.gyro_markov_time
-            f[..., 15:18, 15:18] = -eye / imu.accelerometer_markov_time if imu.accelerometer_markov_time > 0 else 0 * eye
-        q = [imu.gyro_random_walk**2, imu.accelerometer_random_walk**2, gyro_driver, accelerometer_driver]
+            f[..., 12:15, 12:15] = -eye / imu.gyro_markov_time_s
+            time = imu.accelerometer_markov_time_s
+            f[..., 15:18, 15:18] = -eye / time if time > 0 else 0 * eye
+        q = [
+            imu.gyro_random_walk**2,
+            imu.accelerometer_random_walk**2,
+            gyro_driver,
+            accelerometer_driver,
+        ]
         return f, g, f.new_tensor([value for value in q for _ in range(3)])
 
+    @override
     def initial(self, runs: int) -> Distribution:
         return normal_batch(runs, self.p0)
 
-    def propagate(self, x: Tensor, u: Step, w: Tensor) -> Tensor:
-        return affine(u.phi, x, u.gain, w)
+    @override
+    def propagate(self, x: Tensor, u: LooseStep, w: Tensor) -> Tensor:
+        return affine_map(u.phi, x, u.gain, w)
 
-    def noise_gain(self, u: Step) -> Tensor:
+    @override
+    def noise_gain(self, u: LooseStep) -> Tensor:
         return u.gain
 
-    def observation(self, x: Tensor, u: Step) -> Distribution:
-        return independent_normal(x.permute(2, 0, 1).index_select(0, self.seen).permute(1, 2, 0), self.r)
+    @override
+    def observation(self, x: Tensor, u: LooseStep) -> Distribution:
+        return independent_normal(
+            x.permute(2, 0, 1).index_select(0, self.observed_indices).permute(1, 2, 0), self.r
+        )
 
-    def transition(self, x: Tensor, u: Step) -> Distribution | None:
+    @override
+    def transition(self, x: Tensor, u: LooseStep) -> Distribution | None:
         if self.inflation is None:
             return None
         mean = self.propagate(x, u, x.new_zeros(*x.shape[:2], self.noise_dim))
-        law = torch.distributions.MultivariateNormal
-        return law(mean, scale_tril=self.noise_gain(u).unsqueeze(1), validate_args=False)
+        root = self.noise_gain(u).unsqueeze(1)
+        return MultivariateNormal(mean, scale_tril=root, validate_args=False)
 
+    @override
     def error(self, mean: Tensor, truth: Tensor) -> Tensor:
-        """Corrected navigation minus truth; for the sensor states, estimate minus truth."""
-        turned = attitude.residual_error(truth[..., :3], mean[..., :3])
-        return torch.cat([turned, truth[..., 3:9] - mean[..., 3:9], mean[..., 9:] - truth[..., 9:]], -1)
+        rotation = attitude.residual_error(truth[..., :3], mean[..., :3])
+        navigation = truth[..., 3:9] - mean[..., 3:9]
+        return torch.cat([rotation, navigation, mean[..., 9:] - truth[..., 9:]], -1)
 
 
 def _hypot(a: float, b: float) -> float:
     return (a * a + b * b) ** 0.5
 
 
-def _driver(sigma: float, time: float) -> float:
-    """Spectral density that keeps a first-order Markov process at `sigma`."""
+def _driver_density(sigma: float, time: float) -> float:
+    """Return the driving spectral density of a Markov process of stationary `sigma`."""
     return 2.0 * sigma**2 / time if sigma > 0 else 0.0

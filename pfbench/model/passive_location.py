@@ -1,4 +1,4 @@
-"""Airborne passive location: one aircraft hears an emitter on the ground, and its own motion gives the range away."""
+"""Airborne passive location: a moving aircraft locates an emitter on the ground."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
-from pfbench.chart import wrap
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch, positive
+from pfbench.core.chart import wrap_angle
+from pfbench.model.base import StateSpaceModel, check_positive, independent_normal, normal_batch
 
 SPEED_OF_LIGHT = 299792458.0  # m/s
 
 
-class Platform(NamedTuple):
-    """What the aircraft is given of itself and of the signal; leading axes [R or 1, T].
+class PlatformInputs(NamedTuple):
+    """Navigation of the aircraft and emitter frequency, leading axes [R or 1, T].
 
     Attributes:
-        position: of its centroid in the ground frame, Z up [..., 3] m.
-        velocity: [..., 3] m/s.
-        attitude: ground to body [..., 3, 3]; body axes starboard, forward, up.
-        carrier: frequency of the emitter [...] Hz.
+        position: Centroid in the ground frame, Z up, [..., 3], m.
+        velocity: [..., 3], m/s.
+        attitude: Ground to body, [..., 3, 3]. Body axes are starboard, forward, up.
+        carrier: Frequency of the emitter, [...], Hz.
     """
 
     position: Tensor
@@ -32,22 +33,29 @@ class Platform(NamedTuple):
 
 
 class PassiveLocation(StateSpaceModel):
-    """An emitter on the plane Z = 0, its bearing, elevation, their rates and the Doppler rate measured in body axes.
+    """An emitter on the plane Z = 0, measured by direction, its rates, Doppler rate.
 
-    State [x, y, vx, vy] in the ground frame, driven by white acceleration that is constant over a step, so that the noise has
-    rank 2 of 4 and the transition no density [Pu and Qin, "Application of quasi Monte Carlo polymerization re-sampling particle
-    filter algorithm in airborne passive location", eqs 1-7, 10]. The body's own rotation is left out of the rates: A is that of
-    the moment. [ours]
+    State [x, y, vx, vy] in the ground frame, driven by white acceleration that is constant over a
+    step. The noise has rank 2 of 4, so the transition density does not exist. [Pu and Qin,
+    "Application of quasi Monte Carlo polymerization re-sampling particle filter algorithm in
+    airborne passive location", eqs 1-7, 10]. The rates omit the rotation of the body: A is the
+    attitude at the moment of the measurement. [ours]
+
+    Measurements are in body axes. The bearing residual is wrapped. The elevation is within +-90
+    degrees and does not wrap.
 
     Args:
-        interval: s.
-        acceleration_sd: of each component of the acceleration, m/s^2; 0 for an emitter on a straight line. The paper does not
-            give it. [ours]
-        measurement_sd: bearing, elevation rad, their rates rad/s, Doppler rate Hz/s [5].
-        initial_mean, initial_sd: of the state [4]; for records that bring no start and spread of their own. [ours]
+        interval: Length of a step, s.
+        acceleration_sd: Standard deviation of each acceleration component, m/s^2. 0 is an emitter
+            on a straight line. The paper does not give it. [ours]
+        measurement_sd: Bearing, elevation rad, their rates rad/s, Doppler rate Hz/s, [5].
+        initial_mean: Mean of the initial state, [4]. Used if a record contains no initial
+            distribution. [ours]
+        initial_sd: Standard deviation of the initial state, [4].
 
     Raises:
-        ValueError: a size that is not positive (not negative, for the acceleration), or not 5 or 4 numbers.
+        ValueError: If a size is not positive (or negative, for the acceleration), or a list has not
+            the stated length.
     """
 
     phi: Tensor
@@ -66,80 +74,114 @@ class PassiveLocation(StateSpaceModel):
         initial_sd: Sequence[float] = (60e3, 60e3, 30.0, 30.0),
     ) -> None:
         super().__init__()
-        sized = {"measurement_sd": (measurement_sd, 5), "initial_mean": (initial_mean, 4), "initial_sd": (initial_sd, 4)}
-        for name, (values, size) in sized.items():
-            if len(values) != size:
-                raise ValueError(f"model.{name}={list(values)}: give {size} numbers")
+        lengths = {
+            "measurement_sd": (measurement_sd, 5),
+            "initial_mean": (initial_mean, 4),
+            "initial_sd": (initial_sd, 4),
+        }
+        for name, (values, length) in lengths.items():
+            if len(values) != length:
+                raise ValueError(f"model.{name} must be {length} numbers, got {list(values)}.")
         if not 0.0 <= acceleration_sd < float("inf"):
-            raise ValueError(f"model.acceleration_sd={acceleration_sd}: give m/s^2, 0 or more")
-        t = float(positive("model.interval", interval))
+            raise ValueError(
+                f"model.acceleration_sd must be 0 or more, got {acceleration_sd}. Give m/s^2."
+            )
+        t = float(check_positive("model.interval", interval))
         eye = torch.eye(2, dtype=torch.float64)
-        self.register_buffer("phi", torch.kron(torch.tensor([[1.0, t], [0.0, 1.0]], dtype=torch.float64), eye))
+        self.register_buffer(
+            "phi", torch.kron(torch.tensor([[1.0, t], [0.0, 1.0]], dtype=torch.float64), eye)
+        )
         step = torch.tensor([[0.5 * t * t], [t]], dtype=torch.float64)
         self.register_buffer("gain", acceleration_sd * torch.kron(step, eye))
-        self.register_buffer("r", positive("model.measurement_sd", list(measurement_sd)))
+        self.register_buffer("r", check_positive("model.measurement_sd", list(measurement_sd)))
         self.register_buffer("m0", torch.tensor(list(initial_mean), dtype=torch.float64))
-        self.register_buffer("p0", positive("model.initial_sd", list(initial_sd)))
+        self.register_buffer("p0", check_positive("model.initial_sd", list(initial_sd)))
         self.names, self.units = ("x", "y", "vx", "vy"), ("m", "m", "m/s", "m/s")
         self.groups, self.noise_dim = {"position": (0, 1), "velocity": (2, 3)}, 2
 
     @property
+    @override
     def origin(self) -> Tensor:
         return self.m0
 
+    @override
     def initial(self, runs: int) -> Distribution:
         return normal_batch(runs, self.p0)
 
-    def propagate(self, x: Tensor, u: Platform, w: Tensor) -> Tensor:
+    @override
+    def propagate(self, x: Tensor, u: PlatformInputs, w: Tensor) -> Tensor:
         return x @ self.phi.mT + w @ self.gain.mT
 
-    def noise_gain(self, u: Platform) -> Tensor:
+    @override
+    def noise_gain(self, u: PlatformInputs) -> Tensor:
         return self.gain.unsqueeze(0)
 
-    def observation(self, x: Tensor, u: Platform) -> Distribution:
-        return independent_normal(look(*relative(x, u), u.carrier.unsqueeze(-1)), self.r)
+    @override
+    def observation(self, x: Tensor, u: PlatformInputs) -> Distribution:
+        return independent_normal(
+            predict_bearing(*relative_motion(x, u), u.carrier.unsqueeze(-1)), self.r
+        )
 
+    @override
     def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
-        """The bearing the short way round; an elevation lies within a right angle and cannot wrap."""
         r = y - y_hat
-        return torch.cat([wrap(r[..., :1]), r[..., 1:]], -1)
+        return torch.cat([wrap_angle(r[..., :1]), r[..., 1:]], -1)
 
 
-def relative(x: Tensor, u: Platform) -> tuple[Tensor, Tensor]:
-    """Position and velocity of emitters x [R, N, 4] relative to the aircraft, in body axes [R, N, 3] [Pu and Qin, eq. 1]."""
-    up = x.new_zeros(*x.shape[:-1], 1)
-    place = torch.cat([x[..., :2], up], -1) - u.position.unsqueeze(-2)
-    motion = torch.cat([x[..., 2:], up], -1) - u.velocity.unsqueeze(-2)
-    return place @ u.attitude.mT, motion @ u.attitude.mT
+def relative_motion(x: Tensor, u: PlatformInputs) -> tuple[Tensor, Tensor]:
+    """Compute relative position and velocity of emitters in body axes.
 
-
-def look(p: Tensor, v: Tensor, carrier: Tensor, a: Tensor | None = None) -> Tensor:
-    """What is measured without noise: bearing, elevation, their rates, Doppler rate [..., 5].
-
-    The rates are derived anew where the print is damaged [Pu and Qin, eqs 4-7; eq. 10, and eq. 9 with an acceleration].
+    [Pu and Qin, eq. 1]
 
     Args:
-        p, v: position and velocity of the emitter relative to the aircraft, in body axes [..., 3].
-        carrier: Hz [...].
-        a: relative acceleration in body axes [..., 3]; None leaves it out.
+        x: States, [R, N, 4].
+        u: Navigation of the aircraft.
+
+    Returns:
+        Position and velocity, [R, N, 3] each.
+    """
+    up = x.new_zeros(*x.shape[:-1], 1)
+    position = torch.cat([x[..., :2], up], -1) - u.position.unsqueeze(-2)
+    velocity = torch.cat([x[..., 2:], up], -1) - u.velocity.unsqueeze(-2)
+    return position @ u.attitude.mT, velocity @ u.attitude.mT
+
+
+def predict_bearing(p: Tensor, v: Tensor, carrier: Tensor, a: Tensor | None = None) -> Tensor:
+    """Predict noise-free bearing, elevation, their rates, Doppler rate, [..., 5].
+
+    The rates are derived independently, because the print is damaged
+    [Pu and Qin, eqs 4-7, eq. 10, and eq. 9 with an acceleration].
+
+    Args:
+        p: Position of the emitter relative to the aircraft, in body axes, [..., 3].
+        v: Relative velocity in body axes, [..., 3].
+        carrier: Frequency, [...], Hz.
+        a: Relative acceleration in body axes, [..., 3]. None omits it.
     """
     x, y, z = p.unbind(-1)
     vx, vy, vz = v.unbind(-1)
     level2 = x * x + y * y
     level, r2 = torch.sqrt(level2), level2 + z * z
     r = torch.sqrt(r2)
-    turning = (vx * y - x * vy) / level2
-    rising = (vz * level2 - z * (x * vx + y * vy)) / (r2 * level)
-    stretch = (turning * turning * level2 + rising * rising * r2) / r  # r'' but for the acceleration
+    bearing1 = (vx * y - x * vy) / level2
+    elevation1 = (vz * level2 - z * (x * vx + y * vy)) / (r2 * level)
+    range2 = (
+        bearing1 * bearing1 * level2 + elevation1 * elevation1 * r2
+    ) / r  # without acceleration
     if a is not None:
-        stretch = stretch + (a * p).sum(-1) / r
-    return torch.stack([torch.atan2(x, y), torch.atan2(z, level), turning, rising, -carrier / SPEED_OF_LIGHT * stretch], -1)
+        range2 = range2 + (a * p).sum(-1) / r
+    doppler1 = -carrier / SPEED_OF_LIGHT * range2
+    angles = [torch.atan2(x, y), torch.atan2(z, level)]
+    return torch.stack([*angles, bearing1, elevation1, doppler1], -1)
 
 
-def level_attitude(velocity: Tensor) -> Tensor:
-    """Ground to body axes (starboard, forward, up) in level flight along a velocity [..., 3] -> [..., 3, 3]. [ours]"""
-    ahead = velocity[..., :2] / velocity[..., :2].norm(dim=-1, keepdim=True)
-    east, north = ahead.unbind(-1)
-    zero, one = torch.zeros_like(east), torch.ones_like(east)
-    rows = [torch.stack(row, -1) for row in ((north, -east, zero), (east, north, zero), (zero, zero, one))]
-    return torch.stack(rows, -2)
+def compute_level_attitude(velocity: Tensor) -> Tensor:
+    """Compute ground-to-body matrices [..., 3, 3] of level flight along velocities.
+
+    Body axes are starboard, forward, up. [ours]
+    """
+    direction = velocity[..., :2] / velocity[..., :2].norm(dim=-1, keepdim=True)
+    east, north = direction.unbind(-1)
+    zeros, ones = torch.zeros_like(east), torch.ones_like(east)
+    rows = ((north, -east, zeros), (east, north, zeros), (zeros, zeros, ones))
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)

@@ -1,4 +1,4 @@
-"""Tightly coupled SINS/GNSS: 17 linear error states seen through pseudoranges and range rates."""
+"""Tightly coupled SINS/GNSS: 17 linear error states, pseudoranges and range rates."""
 
 from __future__ import annotations
 
@@ -7,39 +7,44 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
+from typing_extensions import override
 
-from pfbench.covariance import factor
-from pfbench.model.base import StateSpaceModel, affine, independent_normal, normal_batch
+from pfbench.core.covariance import factor
+from pfbench.core.record import Record, map_inputs
+from pfbench.model.base import StateSpaceModel, affine_map, independent_normal, normal_batch
+from pfbench.model.tight_coupling import (
+    GROUPS,
+    NAMES,
+    UNITS,
+    check_ranging_inputs,
+    compute_initial_sd,
+    predict_measurement,
+)
 from pfbench.nav import attitude, earth, error_dynamics
-from pfbench.nav.aiding import Alignment, Inflation
-from pfbench.nav.ranging import Clock, Sight, TightReceiver, Tracked
-from pfbench.nav.sensors import ImuErrors
-from pfbench.record import Record, map_inputs
+from pfbench.nav.aiding import AlignmentErrors, ProcessNoiseInflation
+from pfbench.nav.gnss.ranging import RangingInputs, RangingReceiver
+from pfbench.nav.gnss.satellite_geometry import SatelliteGeometry
+from pfbench.nav.imu_errors import ImuErrors
 
-_AXES = {
-    "attitude": (("E", "N", "U"), ("rad",) * 3),
-    "velocity": (("E", "N", "U"), ("m/s",) * 3),
-    "position": (("N", "E", "U"), ("m",) * 3),
-    "gyro_bias": (("x", "y", "z"), ("rad/s",) * 3),
-    "accelerometer_bias": (("x", "y", "z"), ("m/s^2",) * 3),
-    "clock": (("bias", "drift"), ("m", "m/s")),
-}
-NAMES = tuple(f"{block}_{axis}" for block, (axes, _) in _AXES.items() for axis in axes)
-UNITS = tuple(unit for _, units in _AXES.values() for unit in units)
-GROUPS = {block: tuple(i for i, name in enumerate(NAMES) if name.startswith(f"{block}_")) for block in _AXES}
-_TAYLOR = 4  # terms of the matrix exponential; at 1 s the fifth is below 1e-6 in any entry
-_CHAIN = 5  # terms of the noise: gyro noise reaches the position through the velocity as T^5 / 20
-_EPOCHS = 64  # prepared at once: temporaries for 100 runs stay below 50 MB
+_TAYLOR = 4  # terms of exp(F T), at 1 s the fifth is below 1e-6 in any entry
+_CHAIN = 5  # terms of the noise: gyro noise enters position as T^5 / 20
+_EPOCHS = 64  # prepared at once, below 50 MB of temporaries for 100 runs
 
 
-class Step(NamedTuple):
-    """Motion of the first nine errors over each interval, and what is expected at its end.
+class TightStep(NamedTuple):
+    """Discrete model of the first nine errors, and the predicted geometry at the end.
 
     Attributes:
-        phi: their transition from the first fifteen [R, T, 9, 15].
-        gain: lower triangular root of their noise [R, T, 9, 9].
-        duration: [R or 1, T] s.
-        sine, cosine, height, vel, distance, line, closing: see `ranging.Sight`.
+        phi: Transition from the first fifteen errors, [R, T, 9, 15].
+        gain: Lower triangular root of the noise, [R, T, 9, 9].
+        duration: [R or 1, T], s.
+        sine: See `Sight`, as are the fields below.
+        cosine: See `Sight`.
+        height: See `Sight`.
+        vel: See `Sight`.
+        distance: See `Sight`.
+        line: See `Sight`.
+        closing: See `Sight`.
     """
 
     phi: Tensor
@@ -55,24 +60,29 @@ class Step(NamedTuple):
 
 
 class SinsGnssTight(StateSpaceModel):
-    """Errors of an INS (INS minus truth) and a receiver's clock, seen in ranges and rates, INS minus receiver.
+    """Errors of an INS (INS minus truth) and a receiver clock, measured by ranges.
 
-    States [17]: attitude phi (E, N, U), velocity (E, N, U), position in metres (N, E, U), where the paper has radians for
-    latitude and longitude [ours]; constant gyro and accelerometer biases; clock bias and drift in m and m/s. The groups are
-    the paper's [COFM-AMSSRCPF 2024, Measurement and Control, section 2]; order, axes and signs are ours.
+    States [17]: attitude phi (E, N, U), velocity (E, N, U), position in metres (N, E, U), where the
+    paper has radians for latitude and longitude [ours], constant gyro and accelerometer biases,
+    clock bias and drift in m and m/s. The groups are the paper's [COFM-AMSSRCPF 2024, Measurement
+    and Control, section 2]. Order, axes and signs are ours.
 
-    Phi is the matrix exponential to order 4 of the interval's mean F, the noise its exact integral, so of rank 11: attitude,
-    velocity, position, clock. The biases do not move, so the transition has no density. With `inflation` it has rank 17 and
-    one. What is seen is not linearised, but next to linear: 2.5e-6 m of 10 m.
+    Measurements are ranges and rates, INS minus receiver. They are not linearised, but almost
+    linear: 2.5e-6 m for an error of 10 m. Phi is the matrix exponential to order 4 of the mean F of
+    the interval. The noise is its exact integral, of rank 11: attitude, velocity, position, clock.
+    The biases are constant, so the transition has no density. With `inflation` the rank is 17 and
+    the transition has a density. `error` is corrected navigation minus truth, for sensors and clock
+    estimate minus truth.
 
     Args:
-        imu: what the model believes of the sensors.
-        receiver: what it believes of the receiver and its clock.
-        initial: what it believes of the initial errors.
-        inflation: noise added on purpose, or None.
+        imu: Sensor errors that the model assumes.
+        receiver: Receiver noise and clock that the model assumes.
+        initial: Initial errors that the model assumes.
+        inflation: Additional process noise, or None.
 
-    Raises:
-        ValueError: a sensor's bias of 0, which would make the initial law improper, or one with a Markov part.
+    Raises: ValueError: If a sensor bias is 0, which makes the initial distribution improper, or a
+        sensor
+            has a Markov part.
     """
 
     p0: Tensor
@@ -80,35 +90,44 @@ class SinsGnssTight(StateSpaceModel):
     names, units, groups = NAMES, UNITS, GROUPS
 
     def __init__(
-        self, imu: ImuErrors, receiver: TightReceiver, initial: Alignment, inflation: Inflation | None = None
+        self,
+        imu: ImuErrors,
+        receiver: RangingReceiver,
+        initial: AlignmentErrors,
+        inflation: ProcessNoiseInflation | None = None,
     ) -> None:
         super().__init__()
         self.imu, self.clock, self.inflation = imu, receiver.clock, inflation
-        self.register_buffer("p0", initial_sd(imu, receiver.clock, initial))
+        self.register_buffer("p0", compute_initial_sd(imu, receiver.clock, initial))
         self.register_buffer("r", receiver.sd)
         self.noise_dim = 17 if inflation else 11
-        self.choices = (f"every filter's model is inflated: {inflation}",) if inflation else ()
+        self.choices = (
+            (f"process noise is inflated for every filter: {inflation}",) if inflation else ()
+        )
 
     @property
+    @override
     def anchor(self) -> Tensor:
         return self.p0
 
+    @override
     def prepare(self, record: Record) -> Record:
-        """Intervals and satellites to transitions, noise gains and what is expected, once for all steps.
-
-        Raises:
-            ValueError: inputs of another kind, or satellites that are not the receiver's.
-        """
-        if isinstance(record.u, Step):
+        if isinstance(record.u, TightStep):
             return record
-        u = tracked(record, len(self.r))
+        u = check_ranging_inputs(record, len(self.r))
         steps = u.duration.shape[-1]
-        parts = [self.discretise(map_inputs(lambda a, i=i: a[:, i : i + _EPOCHS], u)) for i in range(0, steps, _EPOCHS)]
-        phi, gain = (torch.cat(a, 1) for a in zip(*parts, strict=True))
-        return record._replace(u=Step(phi, gain, u.duration, *u.sight))
+        blocks = [
+            self.discretise(map_inputs(lambda a, i=i: a[:, i : i + _EPOCHS], u))
+            for i in range(0, steps, _EPOCHS)
+        ]
+        phi, gain = (torch.cat(a, 1) for a in zip(*blocks, strict=True))
+        return record._replace(u=TightStep(phi, gain, u.duration, *u.sight))
 
-    def discretise(self, u: Tracked) -> tuple[Tensor, Tensor]:
-        """Transition [..., 9, 15] and noise gain [..., 9, 9] of the first nine errors over intervals, float64."""
+    def discretise(self, u: RangingInputs) -> tuple[Tensor, Tensor]:
+        """Compute transition [..., 9, 15] and noise gain [..., 9, 9] of nine errors.
+
+        Float64, with the leading axes of the intervals.
+        """
         f, b, q = self.continuous(u)
         span = u.duration[..., None, None]
         eye = torch.eye(9, dtype=f.dtype, device=f.device).expand_as(f)
@@ -118,105 +137,86 @@ class SinsGnssTight(StateSpaceModel):
             phi, gamma = phi + power, gamma + power / (n + 1)
         noise, term = q * span, q * span
         for n in range(2, _CHAIN + 1):
-            term = (f @ term + term @ f.mT) * (span / n)  # of the series of the integral of Phi Q Phi'
+            term = (f @ term + term @ f.mT) * (span / n)  # series of the integral of Phi Q Phi'
             noise = noise + term
-        phi, driven = (error_dynamics.in_metres(a, u.pos_start, u.pos_end) for a in (phi, gamma))
-        scale = torch.cat([torch.ones_like(u.vel), torch.ones_like(u.vel), earth.metre_scale(u.pos_end)], -1)
+        phi, driven = (
+            error_dynamics.convert_transition_to_metres(a, u.pos_start, u.pos_end)
+            for a in (phi, gamma)
+        )
+        scale = torch.cat(
+            [torch.ones_like(u.vel), torch.ones_like(u.vel), earth.metre_scale(u.pos_end)], -1
+        )
         noise = noise * scale.unsqueeze(-1) * scale.unsqueeze(-2)
         if self.inflation is not None:
             noise = noise + torch.diag(self.inflation.motion.to(noise).square())
         root, ok = factor(noise)
         if not bool(ok.all()):
-            raise ValueError(f"model.imu={self.imu}: no square root of the noise exists; give both sensors a random walk")
+            raise ValueError(
+                f"model.imu must have random walks of both sensors, got {self.imu}. "
+                "The noise covariance has no Cholesky factor."
+            )
         return torch.cat([phi, driven @ b * span], -1), root
 
     @staticmethod
     def _bias_columns(dcm: Tensor) -> Tensor:
         zero = torch.zeros_like(dcm)
-        return torch.cat([torch.cat([-dcm, zero], -1), torch.cat([zero, dcm], -1), torch.cat([zero, zero], -1)], -2)
+        rows = ([-dcm, zero], [zero, dcm], [zero, zero])
+        return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
-    def continuous(self, u: Tracked) -> tuple[Tensor, Tensor, Tensor]:
-        """F of the first nine errors [..., 9, 9], of the biases [..., 9, 6], and their noise density [9, 9]; radians."""
+    def continuous(self, u: RangingInputs) -> tuple[Tensor, Tensor, Tensor]:
+        """Return continuous-time matrices, position in radians.
+
+        F of the first nine errors [..., 9, 9], columns of the biases [..., 9, 6], and the noise
+        density [9, 9].
+        """
         dcm = error_dynamics.mid_interval(u.intervals).dcm
         f = error_dynamics.small_angle_matrix(u.pos, u.vel, u.f)
-        densities = [self.imu.gyro_random_walk**2] * 3 + [self.imu.accelerometer_random_walk**2] * 3 + [0.0] * 3
-        return f, self._bias_columns(dcm), torch.diag(f.new_tensor(densities))  # isotropic: turning it changes nothing
+        gyro, accelerometer = self.imu.gyro_random_walk**2, self.imu.accelerometer_random_walk**2
+        # isotropic, so it is the same in body and in level axes
+        density = torch.diag(f.new_tensor([gyro] * 3 + [accelerometer] * 3 + [0.0] * 3))
+        return f, self._bias_columns(dcm), density
 
+    @override
     def initial(self, runs: int) -> Distribution:
         return normal_batch(runs, self.p0)
 
-    def propagate(self, x: Tensor, u: Step, w: Tensor) -> Tensor:
-        return affine(self.transition_matrix(u), x, self.noise_gain(u), w)
+    @override
+    def propagate(self, x: Tensor, u: TightStep, w: Tensor) -> Tensor:
+        return affine_map(self.transition_matrix(u), x, self.noise_gain(u), w)
 
-    def transition_matrix(self, u: Step) -> Tensor:
-        """Phi of one step [R or 1, 17, 17]."""
+    def transition_matrix(self, u: TightStep) -> Tensor:
+        """Build Phi of one step, [R or 1, 17, 17]."""
         phi = torch.eye(17, dtype=u.phi.dtype, device=u.phi.device).repeat(u.phi.shape[0], 1, 1)
         phi[:, :9, :15] = u.phi
         phi[:, 15, 16] = u.duration
         return phi
 
-    def noise_gain(self, u: Step) -> Tensor:
+    @override
+    def noise_gain(self, u: TightStep) -> Tensor:
         gain = u.gain.new_zeros(u.gain.shape[0], 17, self.noise_dim)
         gain[:, :9, :9] = u.gain
-        gain[:, 15:, -2:] = self.clock.gain(u.duration)
+        gain[:, 15:, -2:] = self.clock.noise_gain(u.duration)
         if self.inflation is not None:
-            gain[:, 9:15, 9:15] = torch.diag(torch.cat([self.inflation.gyro, self.inflation.accelerometer]).to(gain))
+            extra = torch.cat([self.inflation.gyro, self.inflation.accelerometer])
+            gain[:, 9:15, 9:15] = torch.diag(extra.to(gain))
         return gain
 
-    def observation(self, x: Tensor, u: Step) -> Distribution:
-        return independent_normal(expected(x[..., 6:9], x[..., 3:6], x[..., 15:], Sight(*u[3:])), self.r)
+    @override
+    def observation(self, x: Tensor, u: TightStep) -> Distribution:
+        mean = predict_measurement(x[..., 6:9], x[..., 3:6], x[..., 15:], SatelliteGeometry(*u[3:]))
+        return independent_normal(mean, self.r)
 
-    def transition(self, x: Tensor, u: Step) -> Distribution | None:
+    @override
+    def transition(self, x: Tensor, u: TightStep) -> Distribution | None:
         if self.inflation is None:
             return None
         mean = self.propagate(x, u, x.new_zeros(*x.shape[:2], self.noise_dim))
-        return MultivariateNormal(mean, scale_tril=self.noise_gain(u).unsqueeze(1), validate_args=False)
+        return MultivariateNormal(
+            mean, scale_tril=self.noise_gain(u).unsqueeze(1), validate_args=False
+        )
 
+    @override
     def error(self, mean: Tensor, truth: Tensor) -> Tensor:
-        """Corrected navigation minus truth; for the sensors and the clock, estimate minus truth."""
-        turned = attitude.residual_error(truth[..., :3], mean[..., :3])
-        return torch.cat([turned, truth[..., 3:9] - mean[..., 3:9], mean[..., 9:] - truth[..., 9:]], -1)
-
-
-def expected(position: Tensor, velocity: Tensor, clock: Tensor, sight: Sight) -> Tensor:
-    """INS minus receiver, ranges and then rates [R, N, 2 S], for errors and clocks [R, N, ...] and what one step expects."""
-    ranges, rates = sight.differences(position, velocity)
-    return torch.cat([ranges - clock[..., :1], rates - clock[..., 1:]], -1)
-
-
-def initial_sd(imu: ImuErrors, clock: Clock, initial: Alignment) -> Tensor:
-    """Standard deviations of the initial errors [17].
-
-    Raises:
-        ValueError: a bias that is not constant or of no size.
-    """
-    if imu.gyro_markov > 0.0 or imu.accelerometer_markov > 0.0:
-        raise ValueError(
-            f"model.imu: Markov parts of {imu.gyro_markov_deg_h} deg/h and {imu.accelerometer_markov_ug} ug; this model has "
-            "constant biases only: set gyro_markov_deg_h and accelerometer_markov_ug to 0"
-        )
-    sizes = [imu.gyro_bias] * 3 + [imu.accelerometer_bias] * 3 + [clock.bias_sd, clock.drift_sd]
-    if min(sizes) <= 0.0:
-        raise ValueError(
-            f"model.imu: biases of {imu.gyro_bias_deg_h} deg/h and {imu.accelerometer_bias_ug} ug; give positive gyro and "
-            "accelerometer biases"
-        )
-    return torch.cat([initial.sd, torch.tensor(sizes, dtype=torch.float64)])
-
-
-def tracked(record: Record, components: int) -> Tracked:
-    """The inputs of a tightly coupled model.
-
-    Raises:
-        ValueError: inputs of another kind, or measurements that do not fit the receiver that the model believes in.
-    """
-    if not isinstance(record.u, Tracked):
-        raise ValueError(
-            f"record.u is {type(record.u).__name__}: this model needs ranges; choose a scenario whose receiver is a TightReceiver"
-        )
-    if record.y.shape[-1] != components:
-        raise ValueError(
-            f"the scenario measures {record.y.shape[-1]} components, model.receiver expects {components}: "
-            "give both the same satellites"
-        )
-    return record.u
+        rotation = attitude.residual_error(truth[..., :3], mean[..., :3])
+        navigation = truth[..., 3:9] - mean[..., 3:9]
+        return torch.cat([rotation, navigation, mean[..., 9:] - truth[..., 9:]], -1)

@@ -1,8 +1,9 @@
-"""Total-state INS/GNSS of an aircraft with a barometer and a magnetometer beside the fixes.
+"""Total-state INS/GNSS of an aircraft with barometer and magnetometer.
 
-Motion and sensor biases are those of the loosely coupled model. Pressure tells the height but for a bias that wanders with
-weather, airspeed and temperature; the magnetometer tells the Earth's field in body axes but for what the aircraft adds to it.
-The field is used as three components, not as a heading: that keeps the law normal and needs no attitude to level it.
+Motion and sensor biases are as in the loosely coupled model. Pressure measures the height plus a
+bias that varies with weather, airspeed and temperature. The magnetometer measures the Earth's
+field in body axes plus the field of the aircraft. The three field components are used, and not a
+heading: their errors are normal and need no attitude for levelling.
 """
 
 from __future__ import annotations
@@ -13,34 +14,37 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
-from pfbench.chart import Chart, Euclidean, Quaternion
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch, positive
-from pfbench.model.strapdown_total import Believed, Increments, StrapdownTotal, three, turned
-from pfbench.record import Record
+from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.record import Record
+from pfbench.model.base import StateSpaceModel, check_positive, independent_normal, normal_batch
+from pfbench.model.strapdown_total import StrapdownTotal, StrapdownTuning, check_three_positive
+from pfbench.nav.preintegration import PreintegratedImu, rotate
 
 _MOTION, _BIASES = 16, 4
 _DRIVEN = StrapdownTotal.noise_dim
-_CHART = Chart((Quaternion(), Euclidean(_MOTION - 4 + _BIASES)))
+_CHART = Chart((QuaternionBlock(), EuclideanBlock(_MOTION - 4 + _BIASES)))
 
 
 @dataclass(frozen=True)
-class BelievedAided:
-    """What filters are told.
+class AidedTuning:
+    """Parameters that filters assume.
 
-    Args:
-        motion: of inertial sensors, receiver and start.
-        height_sd: of a pressure height, m.
-        magnetic_sd: of the measured field about the forward, right and down axis, gauss.
-        field: the Earth's, North, East, Down, gauss.
-        height_bias_sd, height_bias_walk: of the barometer, initially about the level that the record takes off, m, m/sqrt(s).
-        magnetic_bias_sd, magnetic_bias_walk: of each axis, about the hard iron that the record takes off, gauss, gauss/sqrt(s).
+    Attributes: motion: Inertial sensors, receiver and start. height_sd: Standard deviation of a
+        pressure height, m. magnetic_sd: Standard deviation of the field about the forward, right
+        and down axis, gauss. field: The Earth's field, North, East, Down, gauss. height_bias_sd:
+        Initial standard deviation about the level that the record subtracts, m. height_bias_walk:
+        Random walk of the barometer bias, m/sqrt(s). magnetic_bias_sd: Initial standard deviation
+        of each axis about the hard iron that the record
+            subtracts, gauss.
+        magnetic_bias_walk: Random walk of each axis, gauss/sqrt(s).
     """
 
-    motion: Believed
+    motion: StrapdownTuning
     height_sd: float
     magnetic_sd: Sequence[float]
-    field: Sequence[float]
+    magnetic_field_gauss: Sequence[float]
     height_bias_sd: float
     height_bias_walk: float
     magnetic_bias_sd: float
@@ -48,112 +52,138 @@ class BelievedAided:
 
     @property
     def bias_sd(self) -> Tensor:
-        """Initial, of the barometer and of the magnetometer about right, forward and up [4].
+        """Initial standard deviation of barometer and magnetometer biases [4].
 
         Raises:
-            ValueError: one that is not positive.
+            ValueError: If one is not positive.
         """
-        height = positive("believed.height_bias_sd", [self.height_bias_sd])
-        return torch.cat([height, positive("believed.magnetic_bias_sd", [self.magnetic_bias_sd] * 3)])
+        height = check_positive("believed.height_bias_sd", [self.height_bias_sd])
+        return torch.cat(
+            [height, check_positive("believed.magnetic_bias_sd", [self.magnetic_bias_sd] * 3)]
+        )
 
     @property
     def measurement_sd(self) -> Tensor:
-        """Of fix, height and field (right, forward, up) [7 or 10]. Raises as `bias_sd`."""
-        height = positive("believed.height_sd", [self.height_sd])
-        magnetic = three("believed.magnetic_sd", self.magnetic_sd)[[1, 0, 2]]
+        """Standard deviation of fix, height and field (right, forward, up) [7 or 10].
+
+        Raises:
+            ValueError: If one is not positive.
+        """
+        height = check_positive("believed.height_sd", [self.height_sd])
+        magnetic = check_three_positive("believed.magnetic_sd", self.magnetic_sd)[[1, 0, 2]]
         return torch.cat([self.motion.measurement_sd, height, magnetic])
 
 
 class StrapdownAided(StateSpaceModel):
-    """State [20]: that of StrapdownTotal, then the barometer's bias m and the magnetometer's, right, forward, up, gauss.
+    """StrapdownTotal with barometer and magnetometer biases.
 
-    What is seen: position, or position and velocity; the height above the start plus the barometer's bias; and C^T B + b, with
-    the Earth's field B in level axes. The biases walk. About a vertical axis the heading and the two level components of b
-    cannot be told apart on a straight flight; turns and fixes part them. Scale and soft iron of the magnetometer are no states:
-    the field's strength is known to 1 per cent, and turns alone tell little of them [ours].
+    State [20]: the state of StrapdownTotal, then the barometer bias m and the magnetometer bias,
+    right, forward, up, gauss. Measurements are position, or position and velocity, the height above
+    the start plus the barometer bias, and C^T B + b with the Earth's field B in level axes. The
+    biases are random walks. On a straight flight, heading and the two level components of b cannot
+    be separated. Turns and fixes separate them. Scale and soft iron of the magnetometer are not
+    states: the field strength is constant to 1 %, and turns give little information on them [ours].
+
+    The origin is level, facing North, at rest, without biases. Recorded scenarios provide the start
+    of each run.
 
     Args:
-        believed: standard deviations, densities and the field.
+        believed: Standard deviations, densities and the field.
 
     Raises:
-        ValueError: a density or standard deviation that is not positive, a field that is not three numbers or is zero.
+        ValueError: If a density or standard deviation is not positive, or the field is not three
+            numbers or is zero.
     """
 
     p0: Tensor
     r: Tensor
-    field: Tensor
+    magnetic_field_gauss: Tensor
     walk: Tensor
     noise_dim = _DRIVEN + _BIASES
 
-    def __init__(self, believed: BelievedAided) -> None:
+    def __init__(self, tuning: AidedTuning) -> None:
         super().__init__()
-        north, east, down = _field(believed.field)
-        self.motion = StrapdownTotal(believed.motion)
-        self.register_buffer("p0", torch.cat([believed.motion.initial_sd, believed.bias_sd]))
-        self.register_buffer("r", believed.measurement_sd)
-        self.register_buffer("field", self.p0.new_tensor([east, north, -down]))
-        height = positive("believed.height_bias_walk", [believed.height_bias_walk])
-        magnetic = positive("believed.magnetic_bias_walk", [believed.magnetic_bias_walk] * 3)
+        north, east, down = _field(tuning.magnetic_field_gauss)
+        self.motion = StrapdownTotal(tuning.motion)
+        self.register_buffer("p0", torch.cat([tuning.motion.initial_sd, tuning.bias_sd]))
+        self.register_buffer("r", tuning.measurement_sd)
+        self.register_buffer("magnetic_field_gauss", self.p0.new_tensor([east, north, -down]))
+        height = check_positive("believed.height_bias_walk", [tuning.height_bias_walk])
+        magnetic = check_positive("believed.magnetic_bias_walk", [tuning.magnetic_bias_walk] * 3)
         self.register_buffer("walk", torch.cat([height, magnetic]))
         first = len(self.motion.names)
-        self.names = (*self.motion.names, "height_bias", *(f"magnetic_bias_{axis}" for axis in ("right", "forward", "up")))
+        self.names = (
+            *self.motion.names,
+            "height_bias",
+            *(f"magnetic_bias_{axis}" for axis in ("right", "forward", "up")),
+        )
         self.units = (*self.motion.units, "m", "gauss", "gauss", "gauss")
-        self.groups = {**self.motion.groups, "height_bias": (first,), "magnetic_bias": (first + 1, first + 2, first + 3)}
+        self.groups = {
+            **self.motion.groups,
+            "height_bias": (first,),
+            "magnetic_bias": (first + 1, first + 2, first + 3),
+        }
         self.choices = (
             *self.motion.choices,
-            "errors of pressure height and magnetic field last for seconds and are taken for white beside a walking bias",
+            "errors of pressure height and magnetic field are correlated over seconds and modelled "
+            "as white noise plus a random-walk bias",
         )
 
     @property
+    @override
     def chart(self) -> Chart:
         return _CHART
 
     @property
+    @override
     def anchor(self) -> Tensor:
         return self.p0
 
     @property
+    @override
     def origin(self) -> Tensor:
-        """Level, facing North, at rest, without biases; a recorded world hands over each run's own start instead."""
         return torch.cat([self.motion.origin, self.p0.new_zeros(_BIASES)])
 
+    @override
     def prepare(self, record: Record) -> Record:
-        """The record as it is.
-
-        Raises:
-            ValueError: inputs of another kind, or measurements that do not fit the believed standard deviations.
-        """
-        if not isinstance(record.u, Increments) or record.y.shape[-1] != len(self.r):
+        if not isinstance(record.u, PreintegratedImu) or record.y.shape[-1] != len(self.r):
             raise ValueError(
-                f"record.u is {type(record.u).__name__} with {record.y.shape[-1]} measured components: StrapdownAided needs "
-                f"Increments and {len(self.r)} (a fix, a height, a field); choose scenario=fixed_wing_aided, and set "
-                "velocity_sd of believed.motion and of the receiver both to three numbers or both to null"
+                f"record must be PreintegratedImu with {len(self.r)} measured components "
+                f"(a fix, a height, a field) for StrapdownAided, got {type(record.u).__name__} with "
+                f"{record.y.shape[-1]}. Choose scenario=recorded_fixed_wing_aided, and set velocity_sd of "
+                "believed.motion and of the receiver both to three numbers or both to null."
             )
         return record
 
+    @override
     def initial(self, runs: int) -> Distribution:
         return normal_batch(runs, self.p0)
 
-    def propagate(self, x: Tensor, u: Increments, w: Tensor) -> Tensor:
-        moved = self.motion.propagate(x[..., :_MOTION], u, w[..., :_DRIVEN])
-        wander = torch.sqrt(u.duration)[:, None, None] * self.walk * w[..., _DRIVEN:]
-        return torch.cat([moved, x[..., _MOTION:] + wander], -1)
+    @override
+    def propagate(self, x: Tensor, u: PreintegratedImu, w: Tensor) -> Tensor:
+        motion = self.motion.propagate(x[..., :_MOTION], u, w[..., :_DRIVEN])
+        change = torch.sqrt(u.duration)[:, None, None] * self.walk * w[..., _DRIVEN:]
+        return torch.cat([motion, x[..., _MOTION:] + change], -1)
 
-    def noise_gain(self, u: Increments) -> Tensor:
-        motion, walk = self.motion.noise_gain(u), torch.diag_embed(torch.sqrt(u.duration)[:, None] * self.walk)
-        beside = motion.new_zeros(motion.shape[0], motion.shape[1], _BIASES)
-        below = motion.new_zeros(motion.shape[0], _BIASES, motion.shape[2])
-        return torch.cat([torch.cat([motion, beside], -1), torch.cat([below, walk], -1)], -2)
+    @override
+    def noise_gain(self, u: PreintegratedImu) -> Tensor:
+        motion = self.motion.noise_gain(u)
+        walk = torch.diag_embed(torch.sqrt(u.duration)[:, None] * self.walk)
+        upper_right = motion.new_zeros(motion.shape[0], motion.shape[1], _BIASES)
+        lower_left = motion.new_zeros(motion.shape[0], _BIASES, motion.shape[2])
+        rows = [[motion, upper_right], [lower_left, walk]]
+        return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
-    def observation(self, x: Tensor, u: Increments) -> Distribution:
+    @override
+    def observation(self, x: Tensor, u: PreintegratedImu) -> Distribution:
         fix = self.motion.observation(x[..., :_MOTION], u).mean
         to_body = torch.cat([x[..., :1], -x[..., 1:4]], -1)
-        magnetic = turned(to_body, self.field) + x[..., _MOTION + 1 :]
+        magnetic = rotate(to_body, self.magnetic_field_gauss) + x[..., _MOTION + 1 :]
         height = x[..., 9:10] + x[..., _MOTION : _MOTION + 1]
         return independent_normal(torch.cat([fix, height, magnetic], -1), self.r)
 
+    @override
     def assemble(self, truth: dict[str, Tensor]) -> Tensor:
-        """True state of an Episode; NaN where a group has no truth. Raises as `StrapdownTotal.assemble`."""
         motion = self.motion.assemble(truth)
         height = truth.get("height_bias", motion.new_full((*motion.shape[:-1], 1), torch.nan))
         magnetic = truth.get("magnetic_bias", motion.new_full((*motion.shape[:-1], 3), torch.nan))
@@ -162,5 +192,8 @@ class StrapdownAided(StateSpaceModel):
 
 def _field(values: Sequence[float]) -> Sequence[float]:
     if len(values) != 3 or not any(values):
-        raise ValueError(f"believed.field={list(values)}: give the Earth's field, North, East, Down, in gauss")
+        raise ValueError(
+            f"tuning.magnetic_field_gauss must be three numbers that are not all zero, got {list(values)}. "
+            "Give the Earth's field, North, East, Down, in gauss."
+        )
     return values

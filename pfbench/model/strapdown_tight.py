@@ -1,8 +1,9 @@
-"""Total-state tightly coupled INS/GNSS for MEMS sensors: motion and sensor biases as in the loosely coupled model, and a clock.
+"""Total-state tightly coupled INS/GNSS for MEMS sensors, with a receiver clock.
 
-What is seen is the pseudorange and the range rate of each satellite. Ranges are 2e7 m and their errors metres, so the record
-hands over ranges less those from a fixed place near the receiver, and the model expands about that place exactly; a filter can
-then work in single precision.
+Motion and sensor biases are as in the loosely coupled model. Measurements are pseudorange and
+range rate of each satellite. Ranges are 2e7 m and their errors metres, so the record contains
+ranges minus the ranges from a fixed position near the receiver. The model expands about that
+position exactly, and filters can use single precision.
 """
 
 from __future__ import annotations
@@ -13,28 +14,39 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
-from pfbench.chart import Chart, Euclidean, Quaternion
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch, positive
-from pfbench.model.strapdown_total import Believed, Increments, StrapdownTotal
-from pfbench.nav.ranging import Clock
-from pfbench.record import Record
+from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.record import Record
+from pfbench.model.base import StateSpaceModel, check_positive, independent_normal, normal_batch
+from pfbench.model.strapdown_total import StrapdownTotal, StrapdownTuning
+from pfbench.nav.gnss.receiver_clock import ReceiverClock
+from pfbench.nav.preintegration import PreintegratedImu
 
 _MOTION, _CLOCK = 16, 3
 _DRIVEN = StrapdownTotal.noise_dim
-_CHART = Chart((Quaternion(), Euclidean(_MOTION - 4 + _CLOCK)))
+_CHART = Chart((QuaternionBlock(), EuclideanBlock(_MOTION - 4 + _CLOCK)))
 
 
-class Sighted(NamedTuple):
-    """Inputs of a step: what the IMU says of it, and the S satellites at its end, seen from a place fixed to the ground.
+class TightMemsInputs(NamedTuple):
+    """Inputs of a step: preintegrated IMU, and S satellites at its end.
+
+    Geometry is relative to a position that is fixed to the ground.
 
     Attributes:
-        turn, push, shift, jacobian, bias, gravity, duration: see `Increments`.
-        line: unit vectors from the place to the satellites, East, North, Up [R or 1, T, S, 3].
-        reach: distances of the satellites from it [R or 1, T, S] m.
-        velocity: of the satellites, East, North, Up [R or 1, T, S, 3] m/s.
-        other: 1 for a satellite of another system than the clock's own, else 0 [R or 1, T, S].
-        range_sd, rate_sd: as the receiver states them [R or 1, T, S] m, m/s.
+        turn: See `Increments`.
+        push: See `Increments`.
+        shift: See `Increments`.
+        jacobian: See `Increments`.
+        bias: See `Increments`.
+        gravity: See `Increments`.
+        duration: See `Increments`.
+        line: Unit vectors to the satellites, East, North, Up, [R or 1, T, S, 3].
+        reach: Distances of the satellites, [R or 1, T, S], m.
+        velocity: Velocities of the satellites, East, North, Up, [R or 1, T, S, 3], m/s.
+        other: 1 for a satellite of a different system than the clock's, else 0, [R or 1, T, S].
+        range_sd: Standard deviation stated by the receiver, [R or 1, T, S], m.
+        rate_sd: Standard deviation stated by the receiver, [R or 1, T, S], m/s.
     """
 
     turn: Tensor
@@ -47,96 +59,111 @@ class Sighted(NamedTuple):
     line: Tensor
     reach: Tensor
     velocity: Tensor
-    other: Tensor
+    other_system: Tensor
     range_sd: Tensor
     rate_sd: Tensor
 
     @property
-    def increments(self) -> Increments:
-        """The IMU's part."""
-        return Increments(*self[: len(Increments._fields)])
+    def increments(self) -> PreintegratedImu:
+        """The preintegrated IMU data."""
+        return PreintegratedImu(*self[: len(PreintegratedImu._fields)])
 
 
 @dataclass(frozen=True)
-class Scatter:
-    """How far measurements of one kind scatter: sd^2 = floor^2 + (factor stated)^2 + added^2. [ours]
+class RangeErrorModel:
+    """Error model of one kind of measurement.
 
-    Args:
-        floor: what the receiver does not know of, multipath and atmosphere; m or m/s.
-        factor: on what it states of each satellite.
-        added: what a regime adds to the recorded measurements.
+    sd^2 = floor^2 + (factor stated)^2 + added^2. [ours]
+
+    Attributes:
+        floor: Errors unknown to the receiver (multipath, atmosphere), m or m/s.
+        factor: Factor on the stated standard deviation of each satellite.
+        added: Noise that a regime adds to the recorded measurements.
 
     Raises:
-        ValueError: a floor that is not positive, or a negative factor or addition.
+        ValueError: If `floor` is not positive, or `factor` or `added` is negative.
     """
 
-    floor: float
-    factor: float = 1.0
-    added: float = 0.0
+    floor_sd: float
+    stated_sd_factor: float = 1.0
+    added_sd: float = 0.0
 
     def __post_init__(self) -> None:
-        positive("believed.floor", [self.floor])
-        if not (self.factor >= 0.0 and self.added >= 0.0):
-            raise ValueError(f"believed.factor={self.factor}, believed.added={self.added}: give numbers that are not negative")
+        check_positive("believed.floor", [self.floor_sd])
+        if not (self.stated_sd_factor >= 0.0 and self.added_sd >= 0.0):
+            raise ValueError(
+                "believed.factor and believed.added must not be negative, "
+                f"got {self.stated_sd_factor} and {self.added_sd}."
+            )
 
     def sd(self, stated: Tensor) -> Tensor:
-        """Of measurements with stated standard deviations [...]."""
-        return torch.sqrt(self.floor**2 + self.added**2 + (self.factor * stated) ** 2)
+        """Compute the standard deviation from stated standard deviations [...]."""
+        return torch.sqrt(
+            self.floor_sd**2 + self.added_sd**2 + (self.stated_sd_factor * stated) ** 2
+        )
 
 
 @dataclass(frozen=True)
-class BelievedTight:
-    """What filters are told.
+class TightTuning:
+    """Parameters that filters assume.
 
-    Args:
-        motion: of sensors and start; what it says of fixes is not used.
-        clock: the receiver's, about its nominal course.
-        range, rate: scatter of the measurements.
-        inter_system_sd: of the other system's clock against the first one's, about its nominal value, initially, m.
-        inter_system_walk: of the same, m/sqrt(s).
+    Attributes: motion: Sensors and start. Its parameters of fixes are not used. clock: Receiver
+        clock, relative to its nominal course. range: Error model of the ranges. rate: Error model
+        of the rates. inter_system_sd: Initial standard deviation of the other system's clock
+        relative to the first
+            one's, about its nominal value, m.
+        inter_system_walk: Random walk of the same, m/sqrt(s).
     """
 
-    motion: Believed
-    clock: Clock
-    range: Scatter
-    rate: Scatter
+    motion: StrapdownTuning
+    clock: ReceiverClock
+    range: RangeErrorModel
+    rate: RangeErrorModel
     inter_system_sd: float = 3.0
     inter_system_walk: float = 0.02
 
     @property
     def clock_sd(self) -> Tensor:
-        """Initial, of bias m, drift m/s and inter-system bias m [3].
+        """Initial standard deviation of bias m, drift m/s and inter-system bias m [3].
 
         Raises:
-            ValueError: one that is not positive.
+            ValueError: If one is not positive.
         """
-        other = positive("believed.inter_system_sd", [self.inter_system_sd])
-        return torch.cat([other.new_tensor([self.clock.bias_sd, self.clock.drift_sd]), other])
+        inter_system = check_positive("believed.inter_system_sd", [self.inter_system_sd])
+        clock = inter_system.new_tensor([self.clock.bias_sd, self.clock.drift_sd])
+        return torch.cat([clock, inter_system])
 
 
 class StrapdownTight(StateSpaceModel):
-    """State [19]: that of StrapdownTotal, then bias m and drift m/s of the receiver's clock, and the inter-system bias m.
+    """StrapdownTotal with a receiver clock, measured by pseudoranges and range rates.
 
-    Clocks are told as differences from a nominal course that the record has taken off. With x from the fixed place and
-    r = |reach line - x|, a range is r - reach + bias, and a rate is e.(V - v) - line.V + drift, where e points to the satellite.
+    State [19]: the state of StrapdownTotal, then bias m and drift m/s of the receiver clock, and
+    the inter-system bias m. Clock states are differences from a nominal course that the record
+    subtracts. With x from the fixed position and r = |reach line - x|, a range is r - reach + bias.
+    A rate is e.(V - v) - line.V + drift, where e points to the satellite.
+
+    The origin is level, facing North, at rest, without biases. Recorded scenarios provide the start
+    of each run.
 
     Args:
-        believed: standard deviations and densities.
+        believed: Standard deviations and densities.
 
     Raises:
-        ValueError: a density or standard deviation that is not positive.
+        ValueError: If a density or standard deviation is not positive.
     """
 
     p0: Tensor
     other_walk: Tensor
     noise_dim = _DRIVEN + _CLOCK
 
-    def __init__(self, believed: BelievedTight) -> None:
+    def __init__(self, tuning: TightTuning) -> None:
         super().__init__()
-        self.motion = StrapdownTotal(believed.motion)
-        self.clock, self.range, self.rate = believed.clock, believed.range, believed.rate
-        self.register_buffer("p0", torch.cat([believed.motion.initial_sd, believed.clock_sd]))
-        self.register_buffer("other_walk", positive("believed.inter_system_walk", [believed.inter_system_walk]))
+        self.motion = StrapdownTotal(tuning.motion)
+        self.clock, self.range, self.rate = tuning.clock, tuning.range, tuning.rate
+        self.register_buffer("p0", torch.cat([tuning.motion.initial_sd, tuning.clock_sd]))
+        self.register_buffer(
+            "other_walk", check_positive("believed.inter_system_walk", [tuning.inter_system_walk])
+        )
         first = len(self.motion.names)
         self.names = (*self.motion.names, "clock_bias", "clock_drift", "inter_system_bias")
         self.units = (*self.motion.units, "m", "m/s", "m")
@@ -144,72 +171,81 @@ class StrapdownTight(StateSpaceModel):
         self.groups = {**self.motion.groups, **clocks}
         self.choices = (
             *self.motion.choices,
-            "errors of code and Doppler are taken for white; multipath is not, so their standard deviations are inflated",
+            "errors of code and Doppler are modelled as white; multipath is correlated, "
+            "so their standard deviations are inflated",
         )
 
     @property
+    @override
     def chart(self) -> Chart:
         return _CHART
 
     @property
+    @override
     def anchor(self) -> Tensor:
         return self.p0
 
     @property
+    @override
     def origin(self) -> Tensor:
-        """Level, facing North, at rest, without biases; a recorded world hands over each run's own start instead."""
         return torch.cat([self.motion.origin, self.p0.new_zeros(_CLOCK)])
 
+    @override
     def prepare(self, record: Record) -> Record:
-        """The record as it is.
-
-        Raises:
-            ValueError: inputs of another kind.
-        """
-        if not isinstance(record.u, Sighted):
+        if not isinstance(record.u, TightMemsInputs):
             kind = type(record.u).__name__
-            raise ValueError(f"record.u is {kind}: StrapdownTight needs Sighted; choose a scenario with raw ranges (walk)")
+            raise ValueError(
+                f"record.u must be TightMemsInputs for StrapdownTight, got {kind}. "
+                "Choose a scenario with raw ranges (walk)."
+            )
         return record
 
+    @override
     def initial(self, runs: int) -> Distribution:
         return normal_batch(runs, self.p0)
 
-    def propagate(self, x: Tensor, u: Sighted, w: Tensor) -> Tensor:
-        motion, bias, drift, other = x.split([_MOTION, 1, 1, 1], -1)
-        moved = self.motion.propagate(motion, u.increments, w[..., :_DRIVEN])
-        clock = torch.cat([bias + drift * u.duration[:, None, None], drift, other], -1)
-        return torch.cat([moved, clock + w[..., _DRIVEN:] @ self._clock_gain(u.duration).mT], -1)
+    @override
+    def propagate(self, x: Tensor, u: TightMemsInputs, w: Tensor) -> Tensor:
+        motion, bias, drift, inter_system = x.split([_MOTION, 1, 1, 1], -1)
+        motion = self.motion.propagate(motion, u.increments, w[..., :_DRIVEN])
+        clock = torch.cat([bias + drift * u.duration[:, None, None], drift, inter_system], -1)
+        return torch.cat([motion, clock + w[..., _DRIVEN:] @ self._clock_gain(u.duration).mT], -1)
 
-    def noise_gain(self, u: Sighted) -> Tensor:
+    @override
+    def noise_gain(self, u: TightMemsInputs) -> Tensor:
         motion, clock = self.motion.noise_gain(u.increments), self._clock_gain(u.duration)
-        beside = motion.new_zeros(motion.shape[0], motion.shape[1], _CLOCK)
-        below = motion.new_zeros(motion.shape[0], _CLOCK, motion.shape[2])
-        return torch.cat([torch.cat([motion, beside], -1), torch.cat([below, clock], -1)], -2)
+        upper_right = motion.new_zeros(motion.shape[0], motion.shape[1], _CLOCK)
+        lower_left = motion.new_zeros(motion.shape[0], _CLOCK, motion.shape[2])
+        rows = [[motion, upper_right], [lower_left, clock]]
+        return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
     def _clock_gain(self, duration: Tensor) -> Tensor:
-        """Of bias, drift and inter-system bias [R or 1, 3, 3]."""
+        """Return the noise gain of bias, drift and inter-system bias [R or 1, 3, 3]."""
         walk = (self.other_walk * torch.sqrt(duration))[:, None, None]
         side = torch.zeros_like(walk).expand(-1, 2, 1)
-        return torch.cat([torch.cat([self.clock.gain(duration), side], -1), torch.cat([side.mT, walk], -1)], -2)
+        rows = [[self.clock.noise_gain(duration), side], [side.mT, walk]]
+        return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
-    def observation(self, x: Tensor, u: Sighted) -> Distribution:
+    @override
+    def observation(self, x: Tensor, u: TightMemsInputs) -> Distribution:
         v, p = x[..., 4:7], x[..., 7:10]
-        bias, drift, other = x[..., _MOTION:].split(1, -1)
+        bias, drift, inter_system = x[..., _MOTION:].split(1, -1)
         reach = u.reach.unsqueeze(1)
-        farther = (p.square().sum(-1, keepdim=True) / reach - 2 * p @ u.line.mT) / reach
-        root = torch.sqrt(1 + farther)
-        longer = reach * farther / (1 + root)  # r - reach, without the cancellation
+        relative = (p.square().sum(-1, keepdim=True) / reach - 2 * p @ u.line.mT) / reach
+        root = torch.sqrt(1 + relative)
+        difference = reach * relative / (1 + root)  # r - reach, without the cancellation
         r = reach * root
         # (e - line).V and e.v, with e = (reach line - x) / r
-        turned = -(longer * (u.line * u.velocity).sum(-1).unsqueeze(1) + p @ u.velocity.mT) / r
+        line_rate = (u.line * u.velocity).sum(-1).unsqueeze(1)
+        satellite_rate = -(difference * line_rate + p @ u.velocity.mT) / r
         approach = (reach * (v @ u.line.mT) - (v * p).sum(-1, keepdim=True)) / r
-        ranges = longer + bias + other * u.other.unsqueeze(1)
-        rates = turned - approach + drift
+        ranges = difference + bias + inter_system * u.other_system.unsqueeze(1)
+        rates = satellite_rate - approach + drift
         sd = torch.cat([self.range.sd(u.range_sd), self.rate.sd(u.rate_sd)], -1)
         return independent_normal(torch.cat([ranges, rates], -1), sd.unsqueeze(1))
 
+    @override
     def assemble(self, truth: dict[str, Tensor]) -> Tensor:
-        """True state of an Episode; NaN where a group has no truth. Raises as `StrapdownTotal.assemble`."""
         motion = self.motion.assemble(truth)
         missing = motion.new_full((*motion.shape[:-1], 1), torch.nan)
         clocks = [truth.get(name, missing) for name in list(self.groups)[len(self.motion.groups) :]]

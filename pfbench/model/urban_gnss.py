@@ -1,7 +1,8 @@
-"""A car in a city: pseudoranges seen directly or by reflection, wheel speed and yaw rate as inputs.
+"""Car in a city, with direct or reflected pseudoranges and odometry.
 
-Ranges enter as differences about the origin of the local frame, to which each satellite has a direction and a distance. They
-keep all digits of a millimetre in single precision, where a range itself (2e7 m) has two metres.
+The model works with range differences relative to the origin of the local frame. Each satellite is
+given by its direction and distance from that origin. Single precision resolves a range difference
+to a millimetre, but a full range of 2e7 m only to two metres.
 """
 
 from __future__ import annotations
@@ -15,28 +16,32 @@ import torch
 from pyro.distributions import Independent, TorchDistribution
 from torch import Tensor
 from torch.distributions import Distribution, constraints
+from typing_extensions import override
 
-from pfbench.chart import Angles, Chart, Euclidean, wrap
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch, positive
-from pfbench.record import Record
+from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
+from pfbench.core.record import Record
+from pfbench.model.base import StateSpaceModel, check_positive, independent_normal, normal_batch
 
-_CHART = Chart((Euclidean(3), Angles(1), Euclidean(5)))
+_CHART = Chart((EuclideanBlock(3), AngleBlock(1), EuclideanBlock(5)))
 _LOG_ROOT_2PI = 0.5 * math.log(2.0 * math.pi)
-CN0_REFERENCE = 40.0  # dB-Hz at which a law's share is told
+CN0_REFERENCE = 40.0  # dB-Hz; carrier-to-noise density at which `share` is defined
 
 
-class Sky(NamedTuple):
-    """Odometry over the step, and the satellites at its end, in S slots of which each belongs to one satellite for good.
+class UrbanInputs(NamedTuple):
+    """Odometry over each step, and the S satellites at its end.
+
+    Each satellite has the same index in all steps.
 
     Attributes:
-        duration: [1, T] s.
-        speed: mean of the wheel speed [1, T] m/s.
-        yaw_rate: mean rate, clockwise seen from above [1, T] rad/s.
-        line: unit vectors from the origin of the local frame to the satellites, East, North, Up [1, T, S, 3].
-        reach: their distances from it [1, T, S] m.
-        glonass: 1 for a satellite whose ranges carry the inter-system bias, 0 for the others [1, T, S].
-        cn0: carrier-to-noise density [1, T, S] dB-Hz.
-        sd: standard deviation of the range as the receiver states it [1, T, S] m.
+        duration: Duration of the step, s, [1, T].
+        speed: Mean wheel speed, m/s, [1, T].
+        yaw_rate: Mean yaw rate, clockwise from above, rad/s, [1, T].
+        line: Unit vectors from the origin of the local frame to the satellites, East, North, Up,
+            [1, T, S, 3].
+        reach: Distances from that origin to the satellites, m, [1, T, S].
+        glonass: 1 for a satellite with the inter-system bias, else 0, [1, T, S].
+        cn0: Carrier-to-noise density, dB-Hz, [1, T, S].
+        sd: Standard deviation of the range reported by the receiver, m, [1, T, S].
     """
 
     duration: Tensor
@@ -49,44 +54,58 @@ class Sky(NamedTuple):
     sd: Tensor
 
 
-class RangeLaw(Protocol):
-    """Law of a pseudorange about the one of a straight path: mean [R, N, S], inputs -> batch [R, N], event [S]."""
+class PseudorangeError(Protocol):
+    """Distribution of a pseudorange about its line-of-sight value."""
 
-    def __call__(self, mean: Tensor, u: Sky) -> Distribution: ...
+    def __call__(self, mean: Tensor, u: UrbanInputs) -> Distribution:
+        """Return the distribution of the pseudoranges.
+
+        Args:
+            mean: Line-of-sight values, m, [R, N, S].
+            u: Inputs of the step.
+
+        Returns:
+            Distribution with batch [R, N] and event [S].
+        """
 
 
 @dataclass(frozen=True)
-class Normal:
-    """Normal, with the receiver's own standard deviation times `factor`.
+class NormalRangeError:
+    """Normal errors.
+
+    Attributes:
+        factor: Factor on the standard deviation reported by the receiver.
 
     Raises:
-        ValueError: a factor that is not positive.
+        ValueError: if the factor is not positive.
     """
 
     factor: float = 1.0
 
     def __post_init__(self) -> None:
-        positive("law.factor", self.factor)
+        check_positive("model.range_error.factor", self.factor)
 
-    def __call__(self, mean: Tensor, u: Sky) -> Distribution:
+    def __call__(self, mean: Tensor, u: UrbanInputs) -> Distribution:
         return independent_normal(mean, (self.factor * u.sd).unsqueeze(1))
 
 
 @dataclass(frozen=True)
-class SightOrTail:
-    """Line of sight with some probability, else delayed by an exponential detour as well.
+class LosNlosRangeError:
+    """Normal errors, with an additional exponential delay without line of sight.
 
-    The odds of a line of sight grow with the carrier-to-noise density C: logit of the probability = logit(share) +
-    slope (C - 40 dB-Hz). [ours: a reflected signal is a weak one; slope 0 gives every satellite the same probability]
+    The probability of a line of sight depends on the carrier-to-noise density C:
+    logit(probability) = logit(share) + slope (C - 40 dB-Hz). [ours: reflected signals are weak.
+    With slope 0 all satellites have the same probability.]
 
-    Args:
-        share: probability of a line of sight at 40 dB-Hz.
-        sd: of the normal error, m.
-        tail: mean of the exponential detour, m.
-        slope: of the logit, per dB-Hz.
+    Attributes:
+        share: Probability of a line of sight at 40 dB-Hz.
+        sd: Standard deviation of the normal error, m.
+        tail: Mean of the exponential delay, m.
+        slope: Slope of the logit, per dB-Hz.
 
     Raises:
-        ValueError: a share outside (0, 1), an sd or tail that is not positive, a slope that is not finite.
+        ValueError: if the share is not in (0, 1), sd or tail is not positive, or the slope is not
+            finite.
     """
 
     share: float
@@ -96,29 +115,40 @@ class SightOrTail:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.share < 1.0:
-            raise ValueError(f"law.share={self.share}: give a probability between 0 and 1, exclusive")
-        positive("law.sd", self.sd)
-        positive("law.tail", self.tail)
+            raise ValueError(
+                "model.range_error.share must be between 0 and 1, exclusive, "
+                f"got {self.share}. Set a probability."
+            )
+        check_positive("model.range_error.sd", self.sd)
+        check_positive("model.range_error.tail", self.tail)
         if not math.isfinite(self.slope):
-            raise ValueError(f"law.slope={self.slope}: give a number (0: the same share at every carrier-to-noise density)")
+            raise ValueError(
+                f"model.range_error.slope must be finite, got {self.slope}. "
+                "Use 0 for the same share at every carrier-to-noise density."
+            )
 
-    def __call__(self, mean: Tensor, u: Sky) -> Distribution:
+    def __call__(self, mean: Tensor, u: UrbanInputs) -> Distribution:
         odds = math.log(self.share / (1.0 - self.share)) + self.slope * (u.cn0 - CN0_REFERENCE)
-        law = TailedNormal(mean, odds.unsqueeze(1), mean.new_tensor(self.sd), mean.new_tensor(self.tail))
-        return Independent(law, 1)
+        distribution = NormalExponentialMixture(
+            mean, odds.unsqueeze(1), mean.new_tensor(self.sd), mean.new_tensor(self.tail)
+        )
+        return Independent(distribution, 1)
 
 
-class TailedNormal(TorchDistribution):
-    """loc + sd n, and with probability 1 - p an exponential of mean `tail` besides; p = sigmoid(odds).
+class NormalExponentialMixture(TorchDistribution):
+    """Mixture of a normal and an exponentially modified normal distribution.
 
-    The second part is the exponentially modified normal law [Grushka 1972, "Characterization of exponentially modified
-    Gaussian peaks in chromatography"], here in the log domain: log f = -log tail + s^2/2 - r/tail + log Phi(r/sd - s),
-    s = sd/tail, r = value - loc.
+    A value is loc + sd n with probability p = sigmoid(odds), and loc + sd n + tail e otherwise.
+    n is standard normal, e is exponential with mean 1. The second component is the exponentially
+    modified normal distribution [Grushka 1972, "Characterization of exponentially modified Gaussian
+    peaks in chromatography"]. Its log density is -log tail + s^2/2 - r/tail + log Phi(r/sd - s),
+    with s = sd/tail and r = value - loc.
 
     Args:
-        loc: the line-of-sight value.
-        odds: logit of the probability of the line of sight.
-        sd, tail: positive.
+        loc: Line-of-sight value.
+        odds: Logit of the probability of a line of sight.
+        sd: Standard deviation of the normal error, positive.
+        tail: Mean of the delay, positive.
     """
 
     arg_constraints: ClassVar[dict[str, Any]] = {
@@ -127,54 +157,76 @@ class TailedNormal(TorchDistribution):
     support = constraints.real
 
     def __init__(self, loc: Tensor, odds: Tensor, sd: Tensor, tail: Tensor) -> None:
-        # only loc takes the whole shape: what is the same for all particles is computed once
+        # only loc has the full shape, so that values shared by all particles are computed once
         shape = torch.broadcast_shapes(loc.shape, odds.shape, sd.shape, tail.shape)
         self.loc, self.odds, self.sd, self.tail = loc.expand(shape), odds, sd, tail
         super().__init__(shape, validate_args=False)
 
-    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> TailedNormal:
-        return TailedNormal(self.loc.expand(batch_shape), self.odds, self.sd, self.tail)
+    @override
+    def expand(
+        self, batch_shape: Sequence[int], _instance: object = None
+    ) -> NormalExponentialMixture:
+        return NormalExponentialMixture(self.loc.expand(batch_shape), self.odds, self.sd, self.tail)
 
     @property
+    @override
     def mean(self) -> Tensor:
         return self.loc + torch.sigmoid(-self.odds) * self.tail
 
     @property
+    @override
     def variance(self) -> Tensor:
         delayed = torch.sigmoid(-self.odds)
-        return (self.sd.square() + delayed * (2.0 - delayed) * self.tail.square()).expand_as(self.loc)
+        return (self.sd.square() + delayed * (2.0 - delayed) * self.tail.square()).expand_as(
+            self.loc
+        )
 
+    @override
     def log_prob(self, value: Tensor) -> Tensor:
-        log_sigmoid, s, z = torch.nn.functional.logsigmoid, self.sd / self.tail, (value - self.loc) / self.sd
-        sight = log_sigmoid(self.odds) - torch.log(self.sd) - _LOG_ROOT_2PI
+        log_sigmoid, s, z = (
+            torch.nn.functional.logsigmoid,
+            self.sd / self.tail,
+            (value - self.loc) / self.sd,
+        )
+        direct = log_sigmoid(self.odds) - torch.log(self.sd) - _LOG_ROOT_2PI
         delayed = log_sigmoid(-self.odds) - torch.log(self.tail) + 0.5 * s.square()
-        return torch.logaddexp(sight - 0.5 * z.square(), delayed - s * z + torch.special.log_ndtr(z - s))
+        return torch.logaddexp(
+            direct - 0.5 * z.square(), delayed - s * z + torch.special.log_ndtr(z - s)
+        )
 
+    @override
     def sample(self, sample_shape: Any = ()) -> Tensor:
         shape = self._extended_shape(torch.Size(sample_shape))
         with torch.no_grad():
-            n, detour = (torch.empty(shape, dtype=self.loc.dtype, device=self.loc.device) for _ in range(2))
+            n, detour = (
+                torch.empty(shape, dtype=self.loc.dtype, device=self.loc.device) for _ in range(2)
+            )
             delayed = torch.rand_like(n) > torch.sigmoid(self.odds)
             return self.loc + self.sd * n.normal_() + self.tail * detour.exponential_() * delayed
 
 
 @dataclass(frozen=True)
-class Believed:
-    """What filters are told about the odometry, the clock and the start.
+class UrbanTuning:
+    """Parameters that the filter assumes for odometry, clock and initial state.
 
-    Args:
-        distance_density: of the wheel's distance, m/sqrt(s).
-        heading_density: of the integrated yaw rate, rad/sqrt(s).
-        height_density: walk of the height, m/sqrt(s).
-        clock_density, drift_density: white frequency and walk of the frequency of the receiver's clock, m/sqrt(s) and
-            m/s/sqrt(s).
-        inter_system_density: walk of the inter-system bias, m/sqrt(s).
-        scale_density, yaw_bias_density: walks of the wheel's scale error and the yaw rate's bias, 1/sqrt(s) and
-            rad/s/sqrt(s). Small, but a particle filter needs some.
-        initial_position_sd: East, North, Up in m.
-        initial_heading_sd_deg: degrees.
-        initial_clock_sd, initial_drift_sd, initial_inter_system_sd: m, m/s, m.
-        initial_scale_sd, initial_yaw_bias_sd: -, rad/s.
+    Attributes:
+        distance_density: Error of the wheel distance, m/sqrt(s).
+        heading_density: Error of the integrated yaw rate, rad/sqrt(s).
+        height_density: Random walk of the height, m/sqrt(s).
+        clock_density: White frequency noise of the receiver clock, m/sqrt(s).
+        drift_density: Random walk of the clock frequency, m/s/sqrt(s).
+        inter_system_density: Random walk of the inter-system bias, m/sqrt(s).
+        scale_density: Random walk of the wheel scale error, 1/sqrt(s). A particle filter needs a
+            small positive value.
+        yaw_bias_density: Random walk of the yaw-rate bias, rad/s/sqrt(s). A particle filter needs a
+            small positive value.
+        initial_position_sd: Initial position, East, North, Up, m, [3].
+        initial_heading_sd_deg: Initial heading, degrees.
+        initial_clock_sd: Initial clock bias, m.
+        initial_drift_sd: Initial clock drift, m/s.
+        initial_inter_system_sd: Initial inter-system bias, m.
+        initial_scale_sd: Initial wheel scale error, dimensionless.
+        initial_yaw_bias_sd: Initial yaw-rate bias, rad/s.
     """
 
     distance_density: float
@@ -195,46 +247,77 @@ class Believed:
 
     @property
     def density(self) -> Tensor:
-        """Root densities in the order of the noise [8], SI.
+        """Root densities in the order of the process noise, SI units, [8].
 
         Raises:
-            ValueError: one that is not positive.
+            ValueError: if a density is not positive.
         """
-        names = ("distance", "heading", "height", "clock", "drift", "inter_system", "scale", "yaw_bias")
-        return torch.cat([positive(f"believed.{name}_density", [getattr(self, f"{name}_density")]) for name in names])
+        names = (
+            "distance",
+            "heading",
+            "height",
+            "clock",
+            "drift",
+            "inter_system",
+            "scale",
+            "yaw_bias",
+        )
+        return torch.cat(
+            [
+                check_positive(
+                    f"scenario.tuning.{name}_density", [getattr(self, f"{name}_density")]
+                )
+                for name in names
+            ]
+        )
 
     @property
     def initial_sd(self) -> Tensor:
-        """Standard deviations of the initial errors in the chart [9], SI.
+        """Initial standard deviations in the chart, SI units, [9].
 
         Raises:
-            ValueError: one that is not positive, or positions that are not three.
+            ValueError: if a standard deviation is not positive, or the position does not have three.
         """
         if len(self.initial_position_sd) != 3:
-            raise ValueError(f"believed.initial_position_sd={list(self.initial_position_sd)}: give three numbers")
-        parts = [positive("believed.initial_position_sd", list(self.initial_position_sd))]
-        parts += [positive("believed.initial_heading_sd_deg", [self.initial_heading_sd_deg]) * (math.pi / 180.0)]
+            raise ValueError(
+                "scenario.tuning.initial_position_sd must have 3 numbers, "
+                f"got {list(self.initial_position_sd)}. Set East, North and Up."
+            )
+        parts = [
+            check_positive("scenario.tuning.initial_position_sd", list(self.initial_position_sd))
+        ]
+        parts += [
+            check_positive("scenario.tuning.initial_heading_sd_deg", [self.initial_heading_sd_deg])
+            * (math.pi / 180.0)
+        ]
         for name in ("clock", "drift", "inter_system", "scale", "yaw_bias"):
             key = f"initial_{name}_sd"
-            parts.append(positive(f"believed.{key}", [getattr(self, key)]))
+            parts.append(check_positive(f"scenario.tuning.{key}", [getattr(self, key)]))
         return torch.cat(parts)
 
 
 class UrbanGnss(StateSpaceModel):
-    """State [9]: position (East, North, Up), heading, clock bias and drift, inter-system bias, wheel scale, yaw-rate bias.
+    """Urban positioning by odometry and pseudoranges, with nine states.
 
-    Over a step T the car follows an arc: distance d = (1 + scale) v T + n and turn a = (rate - bias) T + n', so that
-    p' = p + d sinc(a/2) (sin, cos)(heading + a/2) and heading' = heading + a, clockwise from North. The height walks; clock
-    bias and drift are the usual two-state clock, whose bias gets half the step of the drift's noise (its exact regression).
-    What is seen: the pseudorange of each satellite less its range from the origin and a nominal clock; its line-of-sight
-    value is the difference of ranges + clock bias (+ inter-system bias for GLONASS).
+    The states are position (East, North, Up), heading, clock bias, clock drift, inter-system bias,
+    wheel scale error and yaw-rate bias.
+
+    Over a step T the car follows an arc with distance d = (1 + scale) v T + n and turn
+    a = (rate - bias) T + n'. Then p' = p + d sinc(a/2) (sin, cos)(heading + a/2) and
+    heading' = heading + a, clockwise from North. The height is a random walk. Clock bias and drift
+    form a two-state clock. The bias receives half the step times the noise of the drift, its exact
+    regression on that noise.
+
+    A measurement is the pseudorange of a satellite, reduced by its range from the origin and by a
+    nominal clock. Its line-of-sight value is the difference of ranges plus the clock bias. GLONASS
+    adds the inter-system bias.
 
     Args:
-        believed: densities and standard deviations.
-        law: of a pseudorange about its line-of-sight value.
+        tuning: Noise densities and initial standard deviations.
+        range_error: Distribution of a pseudorange about its line-of-sight value.
 
     Raises:
-        ValueError: a density or standard deviation that is not positive.
+        ValueError: if a density or standard deviation is not positive.
     """
 
     density: Tensor
@@ -246,53 +329,86 @@ class UrbanGnss(StateSpaceModel):
     )  # fmt: skip
     units = ("m", "m", "m", "rad", "m", "m/s", "m", "", "rad/s")
     choices = (
-        "pseudorange errors are taken as independent from epoch to epoch; those of reflections last for seconds",
-        "the clock's bias is driven by half the noise of its drift (its exact regression) and white frequency noise of its own",
+        "pseudorange errors are independent between epochs, although errors of reflections last for seconds",
+        "the clock bias is driven by half the noise of the clock drift (its exact regression) and by white frequency noise",
     )
 
-    def __init__(self, believed: Believed, law: RangeLaw) -> None:
+    def __init__(self, tuning: UrbanTuning, range_error: PseudorangeError) -> None:
         super().__init__()
-        self.register_buffer("density", believed.density)
-        self.register_buffer("p0", believed.initial_sd)
-        self.law = law
-        self.groups = {"position": (0, 1), "height": (2,), "heading": (3,), "clock": (4, 5, 6), "odometry": (7, 8)}
+        self.register_buffer("density", tuning.density)
+        self.register_buffer("p0", tuning.initial_sd)
+        self.range_error = range_error
+        self.groups = {
+            "position": (0, 1),
+            "height": (2,),
+            "heading": (3,),
+            "clock": (4, 5, 6),
+            "odometry": (7, 8),
+        }
 
     @property
+    @override
     def chart(self) -> Chart:
         return _CHART
 
+    @override
     def prepare(self, record: Record) -> Record:
-        """The record as it is.
+        """Return the record after a check of its inputs.
 
         Raises:
-            ValueError: inputs of another kind.
+            ValueError: if the inputs are not `UrbanInputs`.
         """
-        if not isinstance(record.u, Sky):
-            raise ValueError(f"record.u is {type(record.u).__name__}: UrbanGnss needs Sky; choose scenario=berlin")
+        if not isinstance(record.u, UrbanInputs):
+            raise ValueError(
+                "The inputs of UrbanGnss must be UrbanInputs, "
+                f"got {type(record.u).__name__}. Choose scenario=recorded_berlin."
+            )
         return record
 
+    @override
     def initial(self, runs: int) -> Distribution:
         return normal_batch(runs, self.p0)
 
-    def propagate(self, x: Tensor, u: Sky, w: Tensor) -> Tensor:
-        span = u.duration.unsqueeze(-1)  # [R or 1, 1]
-        noise = w * self.density * torch.sqrt(span).unsqueeze(-1)
+    @override
+    def propagate(self, x: Tensor, u: UrbanInputs, w: Tensor) -> Tensor:
+        duration = u.duration.unsqueeze(-1)  # [R or 1, 1]
+        noise = w * self.density * torch.sqrt(duration).unsqueeze(-1)
         east, north, up, heading, clock, drift, inter, scale, bias = x.unbind(-1)
         n_distance, n_heading, n_up, n_clock, n_drift, n_inter, n_scale, n_bias = noise.unbind(-1)
-        distance = (1.0 + scale) * (u.speed.unsqueeze(-1) * span) + n_distance
-        turn = (u.yaw_rate.unsqueeze(-1) - bias) * span + n_heading
+        distance = (1.0 + scale) * (u.speed.unsqueeze(-1) * duration) + n_distance
+        turn = (u.yaw_rate.unsqueeze(-1) - bias) * duration + n_heading
         chord, middle = distance * torch.sinc(turn / (2.0 * torch.pi)), heading + 0.5 * turn
         east, north = east + chord * torch.sin(middle), north + chord * torch.cos(middle)
-        clock = clock + (drift + 0.5 * n_drift) * span + n_clock
-        walked = [up + n_up, wrap(heading + turn), clock, drift + n_drift, inter + n_inter, scale + n_scale, bias + n_bias]
-        return torch.stack([east, north, *walked], -1)
+        clock = clock + (drift + 0.5 * n_drift) * duration + n_clock
+        remaining_states = [
+            up + n_up,
+            wrap_angle(heading + turn),
+            clock,
+            drift + n_drift,
+            inter + n_inter,
+            scale + n_scale,
+            bias + n_bias,
+        ]
+        return torch.stack([east, north, *remaining_states], -1)
 
-    def observation(self, x: Tensor, u: Sky) -> Distribution:
+    @override
+    def observation(self, x: Tensor, u: UrbanInputs) -> Distribution:
         offset = x[..., 4:5] + x[..., 6:7] * u.glonass.unsqueeze(1)
-        return self.law(range_change(x[..., :3], u.line, u.reach) + offset, u)
+        return self.range_error(range_change(x[..., :3], u.line, u.reach) + offset, u)
 
 
 def range_change(position: Tensor, line: Tensor, reach: Tensor) -> Tensor:
-    """|reach line - p| - reach, without the cancellation: position [R, N, 3], line [R or 1, S, 3] -> [R, N, S]."""
-    across = (position.square().sum(-1, keepdim=True) / reach.unsqueeze(1)) - 2.0 * position @ line.mT
-    return across / (1.0 + torch.sqrt(1.0 + across / reach.unsqueeze(1)))
+    """Compute |reach line - position| - reach without cancellation.
+
+    Args:
+        position: Positions, m, [R, N, 3].
+        line: Unit vectors to the satellites, [R or 1, S, 3].
+        reach: Distances of the satellites, m, [R or 1, S].
+
+    Returns:
+        Range differences, m, [R, N, S].
+    """
+    change = (
+        position.square().sum(-1, keepdim=True) / reach.unsqueeze(1)
+    ) - 2.0 * position @ line.mT
+    return change / (1.0 + torch.sqrt(1.0 + change / reach.unsqueeze(1)))

@@ -1,4 +1,4 @@
-"""What surrounds an INS: what aids it, the errors that it starts with, and noise added on purpose."""
+"""Aiding of an INS: sensor protocol, GNSS fixes, initial errors, process noise."""
 
 from __future__ import annotations
 
@@ -9,43 +9,44 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
-from pfbench.draws import Draws
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import MeasurementChannels, fix_channels
 from pfbench.nav import earth
-from pfbench.nav.sensors import DEG_H, UG
-from pfbench.nav.strapdown import Intervals
-from pfbench.record import Channels, fixes
+from pfbench.nav.imu_errors import DEG_H, UG
+from pfbench.nav.strapdown import InsIntervals
 
 ARCMIN = math.pi / 180.0 / 60.0
 
 
-class Flown(NamedTuple):
-    """A flight at the ends of T filter intervals: the truth, and what the INS of each run made of it.
+class FlightSolution(NamedTuple):
+    """The truth and the INS output of each run at the ends of T filter intervals.
 
     Attributes:
-        time: s [T].
-        pos: latitude, longitude, height [T, 3] rad, rad, m.
-        vel: East, North, Up [T, 3] m/s.
-        dcm: body to level [T, 3, 3].
-        ins: the INS's own intervals [R, T, ...].
+        time: [T], s.
+        pos: Latitude, longitude, height, [T, 3], rad, rad, m.
+        vel: East, North, Up, [T, 3], m/s.
+        dcm: Body to level, [T, 3, 3].
+        ins: Intervals of the INS, [R, T, ...].
     """
 
     time: Tensor
     pos: Tensor
     vel: Tensor
     dcm: Tensor
-    ins: Intervals
+    ins: InsIntervals
 
 
 @dataclass(frozen=True, eq=False)
-class Aided:
-    """What instruments make of a flight.
+class AidingData:
+    """Noise-free measurements and filter inputs of a flight.
 
     Attributes:
-        y: measurements without the instruments' noise [R, T, Dy]; NaN where nothing is seen.
-        u: inputs of the filter's model, a NamedTuple of tensors with leading axes [R or 1, T].
-        truth: true states of the instruments by group, each [R, T, k]: a receiver's clock, say.
-        sheet: what a datasheet draws; see Episode.
+        y: Measurements without instrument noise, [R, T, Dy]. NaN marks a missing component.
+        u: Inputs of the filter's model, a NamedTuple of tensors with leading axes [R or 1, T].
+        truth: True states of the instruments by group, [R, T, k] each (for example a clock).
+        sheet: Data that only a datasheet plots, see Episode.
     """
 
     y: Tensor
@@ -54,35 +55,45 @@ class Aided:
     sheet: dict[str, Tensor] = field(default_factory=dict)
 
 
-class Aiding(Protocol):
+class AidingSensor(Protocol):
     """Instruments that aid an INS."""
 
     @property
-    def channels(self) -> Channels:
-        """Nominal noise of the measurement vector [Dy], and which component comes from where."""
+    def channels(self) -> MeasurementChannels:
+        """Nominal noise [Dy], kind and source of each measurement component."""
 
-    def aid(self, flown: Flown, draws: Draws, process: Tensor) -> Aided:
-        """Measurements along a flight; `process` [T] multiplies the variance of whatever drives the instruments' own states."""
+    def measure(self, flown: FlightSolution, draws: RandomStream, process: Tensor) -> AidingData:
+        """Compute the measurements along a flight.
+
+        Args:
+            flown: Truth and INS output.
+            draws: Random stream, which also decides the runs.
+            process: Factor on the variance of the noise that drives instrument states, [T].
+        """
 
 
-def _sizes(key: str, values: Sequence[float], zero: bool = False) -> Tensor:
-    sizes = torch.tensor(list(values), dtype=torch.float64)
-    if sizes.shape != (3,) or not bool(((sizes >= 0) if zero else (sizes > 0)).all()):
-        wanted = "non-negative" if zero else "positive"
-        raise ValueError(f"{key}={list(values)}: give three {wanted} standard deviations, one per axis")
-    return sizes
+def _check_three(key: str, values: Sequence[float], allow_zero: bool = False) -> Tensor:
+    """Return three standard deviations as a float64 tensor."""
+    sd = torch.tensor(list(values), dtype=torch.float64)
+    if sd.shape != (3,) or not bool(((sd >= 0) if allow_zero else (sd > 0)).all()):
+        sign = "non-negative" if allow_zero else "positive"
+        raise ValueError(
+            f"{key} must be three {sign} standard deviations, got {list(values)}. "
+            "Give one per axis."
+        )
+    return sd
 
 
 @dataclass(frozen=True)
-class Receiver:
-    """A GNSS receiver that gives position, and velocity unless `velocity_sd` is None.
+class GnssReceiver(AidingSensor):
+    """A GNSS receiver for position, and for velocity unless `velocity_sd` is None.
 
-    Args:
-        position_sd: standard deviation North, East, Up [3] m.
-        velocity_sd: East, North, Up [3] m/s.
+    Attributes:
+        position_sd: Standard deviation North, East, Up, [3], m.
+        velocity_sd: Standard deviation East, North, Up, [3], m/s.
 
     Raises:
-        ValueError: not three positive numbers.
+        ValueError: If an entry is not three positive numbers.
     """
 
     position_sd: Sequence[float]
@@ -93,69 +104,84 @@ class Receiver:
 
     @property
     def sd(self) -> Tensor:
-        """Of the measurement vector: position N, E, U, then velocity E, N, U [3] or [6]."""
-        position = _sizes("receiver.position_sd", self.position_sd)
+        """Standard deviation of position N, E, U, then velocity E, N, U, [3] or [6]."""
+        position = _check_three("receiver.position_sd", self.position_sd)
         if self.velocity_sd is None:
             return position
-        return torch.cat([position, _sizes("receiver.velocity_sd", self.velocity_sd)])
+        return torch.cat([position, _check_three("receiver.velocity_sd", self.velocity_sd)])
 
     @property
-    def channels(self) -> Channels:
-        return fixes(self.sd)
+    @override
+    def channels(self) -> MeasurementChannels:
+        return fix_channels(self.sd)
 
-    def aid(self, flown: Flown, draws: Draws, process: Tensor) -> Aided:
-        """INS minus receiver."""
+    @override
+    def measure(self, flown: FlightSolution, draws: RandomStream, process: Tensor) -> AidingData:
         ins = flown.ins
-        difference = torch.cat([(ins.pos_end - flown.pos) * earth.metre_scale(flown.pos), ins.vel_end - flown.vel], -1)
-        return Aided(difference[..., : len(self.sd)], ins)
+        difference = torch.cat(
+            [(ins.pos_end - flown.pos) * earth.metre_scale(flown.pos), ins.vel_end - flown.vel], -1
+        )
+        return AidingData(difference[..., : len(self.sd)], ins)
 
 
 @dataclass(frozen=True)
-class Alignment:
+class AlignmentErrors:
     """Initial errors of an INS, one standard deviation.
 
-    Args:
-        attitude_arcmin: East, North, Up [3].
-        velocity: East, North, Up [3] m/s.
-        position: North, East, Up [3] m.
-        drawn: each run draws its errors; else every run has exactly these, the filters believing in the law as before.
+    Attributes:
+        attitude_arcmin: East, North, Up, [3].
+        velocity: East, North, Up, [3], m/s.
+        position: North, East, Up, [3], m.
+        drawn: Whether each run draws its errors. Otherwise every run has exactly one standard
+            deviation, and the filters assume the same distribution as before.
 
     Raises:
-        ValueError: not three positive numbers each.
+        ValueError: If an entry is not three positive numbers.
     """
 
     attitude_arcmin: Sequence[float]
     velocity: Sequence[float]
     position: Sequence[float]
-    drawn: bool = True
+    randomise: bool = True
 
     def __post_init__(self) -> None:
         _ = self.sd
 
-    def errors(self, draws: Draws) -> Tensor:
-        """Attitude, velocity, position errors of these runs [R, 9]."""
+    def draw_errors(self, draws: RandomStream) -> Tensor:
+        """Draw attitude, velocity and position errors of the runs, [R, 9]."""
         z = draws.normal("world.initial", 1, 9)[:, 0]
-        return self.sd * (z if self.drawn else torch.ones_like(z))
+        return self.sd * (z if self.randomise else torch.ones_like(z))
 
     @property
     def sd(self) -> Tensor:
-        """Attitude rad, velocity m/s, position m [9]."""
-        attitude = _sizes("initial.attitude_arcmin", self.attitude_arcmin) * ARCMIN
-        return torch.cat([attitude, _sizes("initial.velocity", self.velocity), _sizes("initial.position", self.position)])
+        """Standard deviation of attitude rad, velocity m/s, position m, [9]."""
+        attitude = _check_three("initial.attitude_arcmin", self.attitude_arcmin) * ARCMIN
+        return torch.cat(
+            [
+                attitude,
+                _check_three("initial.velocity", self.velocity),
+                _check_three("initial.position", self.position),
+            ]
+        )
 
 
 @dataclass(frozen=True)
-class Inflation:
-    """Noise that the model adds to each step beyond what the sensors explain, one standard deviation.
+class ProcessNoiseInflation:
+    """Process noise of the model beyond the sensor noise, one standard deviation.
 
-    An INS error model has next to no process noise, so a particle filter with an honest model impoverishes. Whoever inflates
-    must inflate for every filter in the comparison, the Kalman filters included; the report says so. The defaults are [ours].
+    The process noise of an INS error model is very small, so a particle filter with the exact
+    model impoverishes. If one filter inflates, all filters of the comparison must, Kalman filters
+    included. The report states it. The defaults are [ours].
 
-    Args:
-        attitude_arcsec: East, North, Up [3]; velocity: [3] m/s; position: [3] m; gyro_deg_h, accelerometer_ug: per axis.
+    Attributes:
+        attitude_arcsec: East, North, Up, [3].
+        velocity: East, North, Up, [3], m/s.
+        position: North, East, Up, [3], m.
+        gyro_deg_h: Gyro error per axis, deg/h.
+        accelerometer_ug: Accelerometer error per axis, micro-g.
 
     Raises:
-        ValueError: a negative number.
+        ValueError: If a number is negative.
     """
 
     attitude_arcsec: Sequence[float] = (5.0, 5.0, 15.0)
@@ -169,17 +195,26 @@ class Inflation:
 
     @property
     def motion(self) -> Tensor:
-        """Attitude rad, velocity m/s, position m [9]."""
-        attitude = _sizes("inflation.attitude_arcsec", self.attitude_arcsec, zero=True) * ARCMIN / 60.0
-        velocity = _sizes("inflation.velocity", self.velocity, zero=True)
-        return torch.cat([attitude, velocity, _sizes("inflation.position", self.position, zero=True)])
+        """Attitude rad, velocity m/s, position m, [9]."""
+        attitude = (
+            _check_three("inflation.attitude_arcsec", self.attitude_arcsec, allow_zero=True)
+            * ARCMIN
+            / 60.0
+        )
+        velocity = _check_three("inflation.velocity", self.velocity, allow_zero=True)
+        return torch.cat(
+            [attitude, velocity, _check_three("inflation.position", self.position, allow_zero=True)]
+        )
 
     @property
     def gyro(self) -> Tensor:
-        """rad/s [3]."""
-        return _sizes("inflation.gyro_deg_h", [self.gyro_deg_h] * 3, zero=True) * DEG_H
+        """Gyro error, [3], rad/s."""
+        return _check_three("inflation.gyro_deg_h", [self.gyro_deg_h] * 3, allow_zero=True) * DEG_H
 
     @property
     def accelerometer(self) -> Tensor:
-        """m/s^2 [3]."""
-        return _sizes("inflation.accelerometer_ug", [self.accelerometer_ug] * 3, zero=True) * UG
+        """Accelerometer error, [3], m/s^2."""
+        return (
+            _check_three("inflation.accelerometer_ug", [self.accelerometer_ug] * 3, allow_zero=True)
+            * UG
+        )

@@ -1,7 +1,7 @@
-"""The Earth of WGS-84: radii, normal gravity, rates of the local level frame, metres.
+"""The WGS-84 Earth: radii, normal gravity, rates of the level frame, coordinates.
 
-Positions are pos [..., 3] = (latitude, longitude, height) in rad, rad, m; velocities v [..., 3] = (East, North, Up) in
-m/s. Every function broadcasts over leading axes.
+Positions are pos [..., 3] = (latitude, longitude, height) in rad, rad, m. Velocities are
+v [..., 3] = (East, North, Up) in m/s. Every function broadcasts over leading axes.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ M_RATIO = OMEGA**2 * A**3 * (1 - F_E) / GM  # m of the height formula
 
 
 def radii(lat: Tensor) -> tuple[Tensor, Tensor]:
-    """Radii of curvature of the ellipsoid along the meridian and across it.
+    """Compute the radii of curvature along the meridian and across it.
 
     Args:
-        lat: latitude [...] in rad.
+        lat: Latitude, [...], rad.
 
     Returns:
-        (R_M, R_N) in m, [...] each.
+        (R_M, R_N), [...] each, m.
     """
     w = 1 - E2 * torch.sin(lat) ** 2
     r_n = A / torch.sqrt(w)
@@ -34,27 +34,63 @@ def radii(lat: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def gravity(lat: Tensor, h: Tensor) -> Tensor:
-    """Normal gravity in m/s^2 [...], positive: the vector is (0, 0, -g) in East, North, Up.
+    """Compute the magnitude of normal gravity.
 
-    Somigliana's formula on the ellipsoid, second order in height [WGS-84, NIMA TR8350.2, eqs 4-1 and 4-3].
+    The vector is (0, 0, -g) in East, North, Up. Somigliana's formula on the ellipsoid, second
+    order in height [WGS-84, NIMA TR8350.2, eqs 4-1 and 4-3].
+
+    Args:
+        lat: Latitude, [...], rad.
+        h: Height, [...], m.
+
+    Returns:
+        Gravity, [...], m/s^2.
     """
     s2 = torch.sin(lat) ** 2
     ellipsoid = G_EQUATOR * (1 + G_SOMIGLIANA * s2) / torch.sqrt(1 - E2 * s2)
     return ellipsoid * (1 - 2 * h / A * (1 + F_E + M_RATIO - 2 * F_E * s2) + 3 * (h / A) ** 2)
 
 
+def inverse_radii_and_gravity(s2: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute inverse radii and gravity together from sin^2 of the latitude.
+
+    The terms are shared, and the number of operations is small, for the inner loop of an INS.
+
+    Args:
+        s2: Squared sine of the latitude, [...].
+        h: Height, [...], m.
+
+    Returns:
+        1 / (R_M + h), 1 / (R_N + h), gravity, [...] each.
+    """
+    w = torch.rsub(s2, 1.0, alpha=E2)
+    root = torch.rsqrt(w)
+    r_n = root * A
+    g0 = root * (s2 * (G_EQUATOR * G_SOMIGLIANA) + G_EQUATOR)
+    linear = s2 * (4 * F_E / A) - 2 / A * (1 + F_E + M_RATIO)
+    g = g0 * (1 + h * torch.add(linear, h, alpha=3 / A**2))
+    return (
+        torch.reciprocal(torch.addcdiv(h, r_n, w, value=1 - E2)),
+        torch.reciprocal(r_n + h),
+        g,
+    )
+
+
 def earth_rate(lat: Tensor) -> Tensor:
-    """Rate of the Earth in East, North, Up [..., 3], rad/s."""
+    """Compute the rotation rate of the Earth in East, North, Up, [..., 3], rad/s."""
     return OMEGA * torch.stack([torch.zeros_like(lat), torch.cos(lat), torch.sin(lat)], dim=-1)
 
 
 def transport_rate(lat: Tensor, h: Tensor, v: Tensor) -> Tensor:
-    """Rate of the local level frame against the Earth as the vehicle moves over it [..., 3], rad/s.
+    """Compute the rate of the level frame relative to the Earth due to vehicle motion.
 
     Args:
-        lat: [...] rad.
-        h: [...] m.
-        v: East, North, Up [..., 3] m/s.
+        lat: Latitude, [...], rad.
+        h: Height, [...], m.
+        v: East, North, Up velocity, [..., 3], m/s.
+
+    Returns:
+        Rate in East, North, Up, [..., 3], rad/s.
     """
     r_m, r_n = radii(lat)
     east = v[..., 0] / (r_n + h)
@@ -62,14 +98,22 @@ def transport_rate(lat: Tensor, h: Tensor, v: Tensor) -> Tensor:
 
 
 def position_rate(pos: Tensor, v: Tensor) -> Tensor:
-    """Time derivative of pos [..., 3] in rad/s, rad/s, m/s at velocity v [..., 3]."""
+    """Compute the time derivative of a position.
+
+    Args:
+        pos: Position, [..., 3], rad, rad, m.
+        v: East, North, Up velocity, [..., 3], m/s.
+
+    Returns:
+        Derivative, [..., 3], rad/s, rad/s, m/s.
+    """
     return torch.stack([v[..., 1], v[..., 0], v[..., 2]], dim=-1) / metre_scale(pos)
 
 
 def metre_scale(pos: Tensor) -> Tensor:
-    """Metres per (rad, rad, m) at pos: (R_M + h, (R_N + h) cos L, 1) [..., 3].
+    """Compute metres per (rad, rad, m): (R_M + h, (R_N + h) cos L, 1), [..., 3].
 
-    (dL, dlam, dh) * metre_scale(pos) = (dN, dE, dU): North comes first here, as latitude does.
+    (dL, dlam, dh) * metre_scale(pos) = (dN, dE, dU). North comes first, like latitude.
     """
     lat, h = pos[..., 0], pos[..., 2]
     r_m, r_n = radii(lat)
@@ -77,7 +121,7 @@ def metre_scale(pos: Tensor) -> Tensor:
 
 
 def ecef(pos: Tensor) -> Tensor:
-    """Earth-centred Earth-fixed x, y, z in m [..., 3]."""
+    """Convert a position to Earth-centred Earth-fixed x, y, z, [..., 3], m."""
     lat, lon, h = pos.unbind(-1)
     _, r_n = radii(lat)
     across = (r_n + h) * torch.cos(lat)
@@ -86,10 +130,17 @@ def ecef(pos: Tensor) -> Tensor:
 
 
 def geodetic(xyz: Tensor, passes: int = 6) -> Tensor:
-    """Position of Earth-centred Earth-fixed points [..., 3]; the inverse of `ecef`.
+    """Convert Earth-centred Earth-fixed points to positions (inverse of `ecef`).
 
-    Iterates on the reduced latitude [Bowring 1976]; six passes reach the last digit from 10 km below the ground to
-    1000 km above.
+    Iterates on the reduced latitude [Bowring 1976]. Six passes reach double precision from 10 km
+    below the ground to 1000 km above it.
+
+    Args:
+        xyz: Points, [..., 3], m.
+        passes: Number of iterations.
+
+    Returns:
+        Positions, [..., 3], rad, rad, m.
     """
     x, y, z = xyz.unbind(-1)
     across = torch.hypot(x, y)
@@ -97,16 +148,22 @@ def geodetic(xyz: Tensor, passes: int = 6) -> Tensor:
     reduced = torch.atan2(z, (1 - F_E) * across)
     lat = reduced
     for _ in range(passes):
-        lat = torch.atan2(z + second * b * torch.sin(reduced) ** 3, across - E2 * A * torch.cos(reduced) ** 3)
+        lat = torch.atan2(
+            z + second * b * torch.sin(reduced) ** 3, across - E2 * A * torch.cos(reduced) ** 3
+        )
         reduced = torch.atan2((1 - F_E) * torch.sin(lat), torch.cos(lat))
     _, r_n = radii(lat)
-    # projection on the vertical: well conditioned at every latitude, where dividing by cos L is not at the poles
+    # the projection on the vertical is well conditioned everywhere, division by cos L is not
     h = across * torch.cos(lat) + z * torch.sin(lat) - A**2 / r_n
     return torch.stack([lat, torch.atan2(y, x), h], dim=-1)
 
 
 def local_axes(origin: Tensor) -> Tensor:
-    """Rotation [..., 3, 3] from Earth-fixed axes to East, North, Up at origin [..., 3]."""
+    """Compute rotations [..., 3, 3] from Earth-fixed axes to East, North, Up.
+
+    Args:
+        origin: Latitude, longitude, height, [..., 3], rad, rad, m.
+    """
     sl, cl = torch.sin(origin[..., 0]), torch.cos(origin[..., 0])
     so, co = torch.sin(origin[..., 1]), torch.cos(origin[..., 1])
     rows = [-so, co, torch.zeros_like(so), -sl * co, -sl * so, cl, cl * co, cl * so, sl]
@@ -114,13 +171,31 @@ def local_axes(origin: Tensor) -> Tensor:
 
 
 def local_enu(pos: Tensor, origin: Tensor) -> Tensor:
-    """East, North, Up [..., 3] in m of a track as seen from an origin [..., 3]; broadcasts.
+    """Convert positions to East, North, Up offsets from an origin.
 
-    Exact, through Earth-fixed axes: a level flight sinks below the tangent plane, by 8 m at 10 km.
+    The conversion is exact, through Earth-fixed axes. A level flight therefore sinks below the
+    tangent plane, by 8 m at 10 km.
+
+    Args:
+        pos: Positions, [..., 3], rad, rad, m.
+        origin: Origin, [..., 3], broadcast against `pos`.
+
+    Returns:
+        Offsets, [..., 3], m.
     """
     return (local_axes(origin) @ (ecef(pos) - ecef(origin)).unsqueeze(-1)).squeeze(-1)
 
 
 def from_local_enu(enu: Tensor, origin: Tensor) -> Tensor:
-    """Position [..., 3] of East, North, Up offsets [..., 3] in m from an origin; the inverse of `local_enu`."""
-    return geodetic(ecef(origin) + (local_axes(origin).transpose(-1, -2) @ enu.unsqueeze(-1)).squeeze(-1))
+    """Convert East, North, Up offsets to positions (inverse of `local_enu`).
+
+    Args:
+        enu: Offsets, [..., 3], m.
+        origin: Origin, [..., 3], rad, rad, m.
+
+    Returns:
+        Positions, [..., 3], rad, rad, m.
+    """
+    return geodetic(
+        ecef(origin) + (local_axes(origin).transpose(-1, -2) @ enu.unsqueeze(-1)).squeeze(-1)
+    )

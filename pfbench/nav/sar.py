@@ -1,4 +1,4 @@
-"""Synthetic aperture radar with a barometer as aids of an INS: heading, position, height."""
+"""Synthetic aperture radar and barometer as INS aids: heading, position, height."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
-from pfbench.draws import Draws
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import MeasurementChannels
 from pfbench.nav import earth
-from pfbench.nav.aiding import Aided, Flown
-from pfbench.nav.sensors import DEG_H
-from pfbench.record import Channels
+from pfbench.nav.aiding import AidingData, AidingSensor, FlightSolution
+from pfbench.nav.imu_errors import DEG_H
 
 _DEG = DEG_H * 3600.0
 _KINDS = ("angle", "position", "position", "position")
@@ -20,20 +21,21 @@ _SOURCES = (0, 0, 0, 1)  # the radar with its map gives three components, the ba
 
 
 @dataclass(frozen=True)
-class Sar:
-    """A radar whose images are matched with a map (heading, latitude, longitude), and a barometric altimeter.
+class SarSensor(AidingSensor):
+    """A radar with map matching (heading, position) and a barometric altimeter.
 
-    What is measured is INS minus instrument [Yan et al. 2016, eq. 4]: heading in rad, then North, East, Up in metres where the
-    paper has latitude and longitude in rad; metres are those of the true position [ours]. The paper's table of sizes is lost;
-    the defaults are typical of the class [ours].
+    The measurement is INS minus instrument [Yan et al. 2016, eq. 4]: heading in rad, then North,
+    East, Up in metres, where the paper has latitude and longitude in rad. Metres are taken at the
+    true position [ours]. The paper's table of noise sizes is lost, so the defaults are typical
+    values for such instruments [ours].
 
-    Args:
-        heading_sd_deg: standard deviation of the radar's heading, degrees.
-        position_sd: of its position, North, East [2] m.
-        height_sd: of the barometer, m.
+    Attributes:
+        heading_sd_deg: Standard deviation of the radar heading, deg.
+        position_sd: Standard deviation of the radar position North, East, [2], m.
+        height_sd: Standard deviation of the barometric height, m.
 
     Raises:
-        ValueError: a number that is not positive, or not two of position.
+        ValueError: If a number is not positive, or `position_sd` has not two entries.
     """
 
     heading_sd_deg: float = 0.05
@@ -42,35 +44,54 @@ class Sar:
 
     def __post_init__(self) -> None:
         if len(self.position_sd) != 2:
-            raise ValueError(f"receiver.position_sd={list(self.position_sd)}: give two standard deviations, North and East")
-        sizes = {"heading_sd_deg": [self.heading_sd_deg], "position_sd": self.position_sd, "height_sd": [self.height_sd]}
+            raise ValueError(
+                f"receiver.position_sd must be two standard deviations, "
+                f"got {list(self.position_sd)}. "
+                "Give North and East."
+            )
+        sizes = {
+            "heading_sd_deg": [self.heading_sd_deg],
+            "position_sd": self.position_sd,
+            "height_sd": [self.height_sd],
+        }
         for name, values in sizes.items():
             if not all(value > 0.0 for value in values):
-                raise ValueError(f"receiver.{name}={list(values)}: give positive standard deviations")
+                raise ValueError(
+                    f"receiver.{name} must be positive, got {list(values)}. "
+                    "Give standard deviations."
+                )
 
     @property
     def sd(self) -> Tensor:
-        """Heading rad, position North, East, Up m [4]."""
-        return torch.tensor([self.heading_sd_deg * _DEG, *self.position_sd, self.height_sd], dtype=torch.float64)
+        """Standard deviation of heading rad, position North, East, Up m, [4]."""
+        return torch.tensor(
+            [self.heading_sd_deg * _DEG, *self.position_sd, self.height_sd], dtype=torch.float64
+        )
 
     @property
-    def channels(self) -> Channels:
-        return Channels(self.sd, _KINDS, _SOURCES)
+    @override
+    def channels(self) -> MeasurementChannels:
+        return MeasurementChannels(self.sd, _KINDS, _SOURCES)
 
-    def aid(self, flown: Flown, draws: Draws, process: Tensor) -> Aided:
-        """INS minus instruments."""
+    @override
+    def measure(self, flown: FlightSolution, draws: RandomStream, process: Tensor) -> AidingData:
         ins = flown.ins
-        turned = heading_difference(ins.dcm_end[..., 1], flown.dcm[..., 1])
-        apart = (ins.pos_end - flown.pos) * earth.metre_scale(flown.pos)
-        return Aided(torch.cat([turned.unsqueeze(-1), apart], -1), ins)
+        heading_error = compute_heading_difference(ins.dcm_end[..., 1], flown.dcm[..., 1])
+        position_error = (ins.pos_end - flown.pos) * earth.metre_scale(flown.pos)
+        return AidingData(torch.cat([heading_error.unsqueeze(-1), position_error], -1), ins)
 
 
-def heading_difference(a: Tensor, b: Tensor) -> Tensor:
-    """Heading of a minus heading of b, clockwise from North, the short way round: [..., 3], [..., 3] -> [...] rad.
+def compute_heading_difference(a: Tensor, b: Tensor) -> Tensor:
+    """Compute heading of a minus heading of b, clockwise from North, in [-pi, pi].
 
-    Both point along a body's forward axis in East, North, Up: the second column of a body-to-level matrix.
+    Args:
+        a: Forward axis of a body in East, North, Up (second column of its matrix), [..., 3].
+        b: Forward axis of the other body, [..., 3].
+
+    Returns:
+        Difference, [...], rad.
     """
-    east, north, _ = a.unbind(-1)
-    other_east, other_north, _ = b.unbind(-1)
-    # not atan2 - atan2: that would lose digits of a small difference, and would have to be wrapped
-    return torch.atan2(east * other_north - north * other_east, north * other_north + east * other_east)
+    a_east, a_north, _ = a.unbind(-1)
+    b_east, b_north, _ = b.unbind(-1)
+    # not atan2 - atan2: it loses digits of a small difference and needs wrapping
+    return torch.atan2(a_east * b_north - a_north * b_east, a_north * b_north + a_east * b_east)

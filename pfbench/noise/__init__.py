@@ -1,0 +1,42 @@
+"""Noise regimes: how measurement errors behave in a scenario: the public names of this folder, imported on first use."""
+
+from pfbench.core.lazy_import import lazy_attributes
+
+__all__ = [
+    "BiasStep",
+    "ErrorReplay",
+    "GaussMarkovNoise",
+    "GlintNoise",
+    "LaplaceNoise",
+    "MeasurementOutage",
+    "NoiseRegime",
+    "NominalNoise",
+    "NonLineOfSightNoise",
+    "OutlierNoise",
+    "StudentTNoise",
+    "VarianceSurge",
+]
+
+__getattr__, __dir__ = lazy_attributes(
+    __name__,
+    {
+        "base": ("NoiseRegime",),
+        "correlated": (
+            "GaussMarkovNoise",
+            "NonLineOfSightNoise",
+        ),
+        "error_replay": ("ErrorReplay",),
+        "time_varying": (
+            "VarianceSurge",
+            "BiasStep",
+        ),
+        "white": (
+            "NominalNoise",
+            "StudentTNoise",
+            "LaplaceNoise",
+            "OutlierNoise",
+            "GlintNoise",
+            "MeasurementOutage",
+        ),
+    },
+)

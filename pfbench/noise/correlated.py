@@ -1,4 +1,4 @@
-"""Errors that remember: Gauss-Markov noise, reflected signals, and blocks of a real receiver's record."""
+"""Noise regimes with memory: Gauss-Markov noise and reflected signals."""
 
 from __future__ import annotations
 
@@ -7,126 +7,164 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
-from pfbench.draws import Draws
-from pfbench.noise import laws
-from pfbench.noise.laws import Law
-from pfbench.noise.regimes import Nominal, Regime, untold
-from pfbench.record import Channels
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import MeasurementChannels
+from pfbench.noise import distributions
+from pfbench.noise.base import NoiseRegime, make_no_distribution_error
+from pfbench.noise.distributions import ErrorDistribution
+from pfbench.noise.white import NominalNoise
 
 
 @dataclass(frozen=True)
-class GaussMarkov:
-    """A first-order Gauss-Markov process on top of each component's errors, exact at any spacing of the times.
+class GaussMarkovNoise(NoiseRegime):
+    """First-order Gauss-Markov noise in addition to other errors.
 
-    Args:
-        ratio: its stationary standard deviation in nominal ones.
-        correlation_time: s, after which the correlation is 1/e.
-        of: the errors that it is added to.
+    Exact at any spacing of the times.
+
+    Attributes:
+        ratio: Stationary standard deviation in nominal standard deviations.
+        correlation_time: Time at which the correlation is 1/e, s.
+        of: Errors to which it is added.
 
     Raises:
-        ValueError: a ratio below 0, a correlation time that is not positive; a filter that is to be told.
+        ValueError: If `ratio` is negative, `correlation_time` is not positive, or a filter asks
+            for the distribution.
     """
 
-    ratio: float = 1.0
-    correlation_time: float = 30.0
-    of: Regime = field(default_factory=Nominal)
+    sd_ratio: float = 1.0
+    correlation_time_s: float = 30.0
+    base_regime: NoiseRegime = field(default_factory=NominalNoise)
 
     def __post_init__(self) -> None:
-        if not self.ratio >= 0.0:
-            raise ValueError(f"noise.ratio={self.ratio}: give a size in nominal standard deviations, 0 or more")
-        if not self.correlation_time > 0.0:
-            raise ValueError(f"noise.correlation_time={self.correlation_time}: give a positive number of seconds")
+        if not self.sd_ratio >= 0.0:
+            raise ValueError(
+                f"noise.sd_ratio must be 0 or more, got {self.sd_ratio}. "
+                "Give a size in nominal standard deviations."
+            )
+        if not self.correlation_time_s > 0.0:
+            raise ValueError(
+                f"noise.correlation_time_s must be positive, got {self.correlation_time_s}. "
+                "Give seconds."
+            )
 
-    def errors(self, draws: Draws, channels: Channels, time: Tensor) -> Tensor:
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
         driver = draws.normal("world.correlated", len(time), len(channels.sd))
-        kept = torch.exp(-torch.diff(time) / self.correlation_time).tolist()
+        correlations = torch.exp(-torch.diff(time) / self.correlation_time_s).tolist()
         x = [driver[:, 0]]
-        for t, rho in enumerate(kept, 1):
+        for t, rho in enumerate(correlations, 1):
             x.append(rho * x[-1] + math.sqrt(1.0 - rho * rho) * driver[:, t])
-        return self.of.errors(draws, channels, time) + self.ratio * channels.sd * torch.stack(x, 1)
+        return self.base_regime.draw_errors(
+            draws, channels, time
+        ) + self.sd_ratio * channels.sd * torch.stack(x, 1)
 
-    def process(self, time: Tensor) -> Tensor:
-        return self.of.process(time)
+    @override
+    def process_factors(self, time: Tensor) -> Tensor:
+        return self.base_regime.process_factors(time)
 
-    def law(self, channels: Channels, time: Tensor) -> Law:
-        raise untold("gauss_markov", "its errors remember those before")
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        raise make_no_distribution_error("gauss_markov", "its errors are correlated in time")
 
 
 @dataclass(frozen=True)
-class NonLineOfSight:
-    """Reflected signals: a source is out of sight with `probability`, and its measurement then too long by an exponential bias.
+class NonLineOfSightNoise(NoiseRegime):
+    """Reflected signals: measurements with an exponential bias at random times.
 
-    Which components are concerned: ranges; in a scenario without ranges the positions; without these, all. All of one source
-    are hit together, each with a bias of its own, which is added to the measurement as it is handed out. [ours]
+    The regime acts on ranges, in a scenario without ranges on positions, otherwise on all
+    components. All components of a source are affected together, each with its own bias, which is
+    added to the measurement. [ours]
 
-    Args:
-        probability: of being out of sight, at any time.
-        mean: of the bias, in nominal standard deviations of the component.
-        dwell: mean seconds out of sight. None draws each epoch anew; else a two-state Markov chain in continuous time that
-            starts in its stationary law, and a bias that lasts as long as the source is out of sight. [ours]
-        of: the errors that the bias is added to.
+    Attributes: probability: Probability of a missing line of sight, at any time. mean: Mean of the
+        bias in nominal standard deviations of the component. dwell: Mean duration without line of
+        sight, s. None draws each epoch independently. Otherwise
+            a stationary two-state Markov chain in continuous time, with a constant bias for the
+            duration. [ours]
+        of: Errors to which the bias is added.
 
     Raises:
-        ValueError: a probability that is none (or 1, with `dwell`), a mean or dwell that is not positive; a filter that is to be
-            told of what has no law step by step.
+        ValueError: If `probability` is outside [0, 1] (or 1 with `dwell`), `mean` or `dwell` is not
+            positive, or a filter asks for a distribution per step that does not exist.
     """
 
     probability: float = 0.2
-    mean: float = 5.0
-    dwell: float | None = None
-    of: Regime = field(default_factory=Nominal)
+    mean_delay_sd: float = 5.0
+    mean_dwell_s: float | None = None
+    base_regime: NoiseRegime = field(default_factory=NominalNoise)
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.probability <= 1.0 or (self.dwell is not None and self.probability == 1.0):
-            raise ValueError(f"noise.probability={self.probability}: give a probability, below 1 where noise.dwell is set")
-        for key, value in (("mean", self.mean), ("dwell", self.dwell)):
+        endless = self.mean_dwell_s is not None and self.probability == 1.0
+        if not 0.0 <= self.probability <= 1.0 or endless:
+            raise ValueError(
+                "noise.probability must be between 0 and 1, and below 1 if noise.mean_dwell_s is set, "
+                f"got {self.probability}."
+            )
+        for key, value in (
+            ("mean_delay_sd", self.mean_delay_sd),
+            ("mean_dwell_s", self.mean_dwell_s),
+        ):
             if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(f"noise.{key}={value}: give a positive number")
+                raise ValueError(f"noise.{key} must be positive and finite, got {value}.")
 
-    def errors(self, draws: Draws, channels: Channels, time: Tensor) -> Tensor:
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
         sources, of_source = torch.unique(torch.tensor(channels.source), return_inverse=True)
         u = draws.uniform("world.sight", len(time), len(sources))[..., of_source]
-        lag = -self.mean * torch.log(draws.uniform("world.reflection", len(time), len(channels.sd)))
-        if self.dwell is None:
+        lag = -self.mean_delay_sd * torch.log(
+            draws.uniform("world.reflection", len(time), len(channels.sd))
+        )
+        if self.mean_dwell_s is None:
             bias = torch.where(u < self.probability, lag, 0.0)
         else:
-            bias = self._stays(u, lag, time, self.dwell)
-        concerned = torch.tensor(_concerned(channels)).to(bias)
-        return self.of.errors(draws, channels, time) + bias * concerned * channels.sd
+            bias = self._persistent_bias(u, lag, time, self.mean_dwell_s)
+        affected = torch.tensor(_affected(channels)).to(bias)
+        return self.base_regime.draw_errors(draws, channels, time) + bias * affected * channels.sd
 
-    def _stays(self, u: Tensor, lag: Tensor, time: Tensor, dwell: float) -> Tensor:
-        """Bias [R, T, Dy] of a chain that stays out of sight for `dwell` and is so with `probability`."""
+    def _persistent_bias(self, u: Tensor, lag: Tensor, time: Tensor, dwell: float) -> Tensor:
+        """Compute the bias [R, T, Dy] of a two-state Markov chain with mean stay `dwell`."""
         p = self.probability
-        kept = torch.exp(-torch.diff(time) / (dwell * (1.0 - p))).tolist()  # what is left of where it was
+        correlations = torch.exp(-torch.diff(time) / (dwell * (1.0 - p))).tolist()
         hidden = u[:, 0] < p
-        held = torch.where(hidden, lag[:, 0], 0.0)
-        biases = [held]
-        for t, rho in enumerate(kept, 1):
-            was, hidden = hidden, u[:, t] < p * (1.0 - rho) + rho * hidden
-            held = torch.where(hidden, torch.where(was, held, lag[:, t]), 0.0)
-            biases.append(held)
+        bias = torch.where(hidden, lag[:, 0], 0.0)
+        biases = [bias]
+        for t, rho in enumerate(correlations, 1):
+            previous, hidden = hidden, u[:, t] < p * (1.0 - rho) + rho * hidden
+            bias = torch.where(hidden, torch.where(previous, bias, lag[:, t]), 0.0)
+            biases.append(bias)
         return torch.stack(biases, 1)
 
-    def process(self, time: Tensor) -> Tensor:
-        return self.of.process(time)
+    @override
+    def process_factors(self, time: Tensor) -> Tensor:
+        return self.base_regime.process_factors(time)
 
-    def law(self, channels: Channels, time: Tensor) -> Law:
-        family, shift, scale = self.of.law(channels, time)
-        hit = _concerned(channels)
-        hits = [source for source, wrong in zip(channels.source, hit, strict=True) if wrong]
-        if self.dwell is not None:
-            raise untold("nlos", "its biases last")
-        if len(set(hits)) < len(hits):
-            raise untold("nlos", "it hits several components of one source together")
-        if family is not laws.normal or not bool((scale == 1.0).all()):
-            raise untold("nlos", "the errors below the bias are not nominal")
-        return Law(laws.one_sided(self.probability * torch.tensor(hit).to(scale), self.mean), shift, scale)
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        family, shift, scale = self.base_regime.error_distribution(channels, time)
+        affected = _affected(channels)
+        sources = [source for source, a in zip(channels.source, affected, strict=True) if a]
+        if self.mean_dwell_s is not None:
+            raise make_no_distribution_error("nlos", "its biases persist")
+        if len(set(sources)) < len(sources):
+            raise make_no_distribution_error(
+                "nlos", "it affects several components of one source together"
+            )
+        if family is not distributions.make_normal or not bool((scale == 1.0).all()):
+            raise make_no_distribution_error("nlos", "the errors without bias are not nominal")
+        probability = self.probability * torch.tensor(affected).to(scale)
+        return ErrorDistribution(
+            distributions.normal_plus_exponential(probability, self.mean_delay_sd), shift, scale
+        )
 
 
-def _concerned(channels: Channels) -> list[bool]:
-    """Ranges; where there are none, positions; where there are none either, everything."""
+def _affected(channels: MeasurementChannels) -> list[bool]:
+    """Select ranges, without ranges positions, without both all components."""
     for kind in ("range", "position"):
         if kind in channels.kind:
-            return [kind == own for own in channels.kind]
+            return [kind == k for k in channels.kind]
     return [True] * len(channels.kind)

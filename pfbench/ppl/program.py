@@ -1,4 +1,7 @@
-"""Models as probabilistic programs: priors on what is not known of a model, and its marginal likelihood as one factor."""
+"""Models as probabilistic programs: priors of unknown parameters and the marginal likelihood.
+
+The marginal likelihood enters a Pyro program as one factor.
+"""
 
 from __future__ import annotations
 
@@ -8,54 +11,61 @@ from typing import Any, Protocol, TypeAlias
 
 import pyro
 import torch
-from pyro.distributions import GaussianHMM, MultivariateNormal, Normal
+from pyro.distributions import GaussianHMM, MultivariateNormal, Normal, TorchDistribution
 from pyro.distributions.torch_distribution import TorchDistributionMixin
 from torch import Tensor
-from torch.distributions import biject_to
+from torch.distributions import Distribution, Independent, biject_to
+from typing_extensions import override
 
-from pfbench.covariance import covariance_of
-from pfbench.draws import MonteCarlo
+from pfbench.core.covariance import distribution_covariance
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record, iterate_steps
+from pfbench.core.simulate import draw_initial_state, draw_measurements, draw_values, simulate_steps
 from pfbench.filter.belief import Filter
 from pfbench.filter.loop import run_filter
-from pfbench.model.base import AtRest, StateSpaceModel, initial_law
-from pfbench.ppl.apiece import Apiece, outside_buffers
-from pfbench.record import Record
+from pfbench.model.base import StateSpaceModel, initial_law
+from pfbench.ppl.model_batch import ModelBatch, list_non_buffers
 
 Values: TypeAlias = dict[str, Tensor]
-Law: TypeAlias = Any  # one of pyro.distributions, whose stubs do not say what they have in common
+Law: TypeAlias = Any  # a distribution of pyro.distributions; their stubs share no useful base type
 
 
-class Likelihood(Protocol):
-    """log p(y_1:T) of each run of a record under a model [R], with a gradient where the model has one."""
+class MarginalLikelihood(Protocol):
+    """A function that computes log p(y_1:T) of each run of a record under a model, [R].
+
+    It is differentiable where the model is.
+    """
 
     def __call__(self, model: StateSpaceModel, record: Record) -> Tensor: ...
 
 
 @dataclass(frozen=True)
-class Filtered:
-    """The marginal likelihood as a filter gives it: exact or approximate, as the filter is.
+class FilterLikelihood:
+    """The marginal likelihood computed by a filter, exact or approximate as the filter is.
 
-    Through a Gaussian filter it is differentiable from end to end. A particle filter's is an unbiased estimate with its draws
-    held fixed, of which the gradient is not that of the likelihood: use it in `pmmh`, which needs none.
+    Through a Gaussian filter it is differentiable. A particle filter gives an unbiased estimate
+    with fixed random numbers. Its gradient is not that of the likelihood: use it in `pmmh`, which
+    needs no gradient.
 
-    Args:
-        method: the filter.
-        seed: of its draws, the same at every call.
+    Attributes:
+        method: The filter.
+        seed: Seed of its random numbers, the same at every call.
     """
 
     method: Filter
     seed: int = 0
 
     def __call__(self, model: StateSpaceModel, record: Record) -> Tensor:
-        return run_filter(self.method, model, record, MonteCarlo(self.seed, torch.arange(len(record.y)))).log_evidence
+        stream = PhiloxStream(self.seed, torch.arange(len(record.y)))
+        return run_filter(self.method, model, record, stream).log_evidence
 
 
 @dataclass(frozen=True)
-class ExactHMM:
-    """The marginal likelihood of a linear-Gaussian model by Pyro's GaussianHMM: exact, and parallel over time.
+class GaussianHmmLikelihood:
+    """The marginal likelihood of a linear-Gaussian model by Pyro's GaussianHMM, parallel over time.
 
-    On use it raises ValueError for a model that is not linear, whose noise is singular, which observes its initial state or
-    needs inputs, and for a record with gaps.
+    A call raises ValueError for models that are not linear, have singular noise, observe their
+    initial state or need inputs, and for records with missing measurements.
     """
 
     def __call__(self, model: StateSpaceModel, record: Record) -> Tensor:
@@ -63,16 +73,17 @@ class ExactHMM:
 
 
 @dataclass(frozen=True)
-class Unknown:
-    """A model of which some numbers are not known.
+class ParameterisedModel:
+    """A model with unknown parameters.
 
-    Args:
-        make: numbers by name -> the model: a model's class, or any function around it. It gets tensors without axes, and a
-            gradient reaches them if it does no more than hand them on.
-        prior: law of each number, by the same names: scalar laws of pyro.distributions.
+    Attributes:
+        make: Model constructor with the parameters as keyword arguments, tensors []. A gradient
+            reaches them if the constructor keeps them as tensors.
+        prior: Distribution of each parameter by name, scalar and from pyro.distributions.
 
     Raises:
-        ValueError: no number; a law that is not scalar or not Pyro's; a number on which nothing in the model depends.
+        ValueError: if `prior` is empty, a distribution is not scalar or not from Pyro, or a
+            parameter does not change the model.
     """
 
     make: Callable[..., StateSpaceModel]
@@ -80,109 +91,168 @@ class Unknown:
 
     def __post_init__(self) -> None:
         if not self.prior:
-            raise ValueError("prior: nothing is unknown; name at least one number and its law")
-        for name, law in self.prior.items():
-            if not isinstance(law, TorchDistributionMixin):
-                raise ValueError(f"prior[{name}]={law}: take the law of that name from pyro.distributions")
-            if law.batch_shape or law.event_shape:
-                shape = tuple(law.batch_shape + law.event_shape)
-                raise ValueError(f"prior[{name}]: a law of shape {shape}; give a scalar law, and several numbers several names")
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            one, two = ({name: law.sample() for name, law in self.prior.items()} for _ in range(2))
-        first = self.model(one)
+            raise ValueError(
+                "prior must have at least one parameter, got none. Name a parameter and its "
+                "distribution."
+            )
+        for name, distribution in self.prior.items():
+            _check_prior(name, distribution)
+        samples = self.sample(2, 0)
+        values = {name: sample[0] for name, sample in samples.items()}
+        first = self.model(values)
         for name in self.prior:
-            other = self.model({**one, name: two[name]})
-            if not outside_buffers(first, other) and all(map(torch.equal, first.buffers(), other.buffers())):
-                raise ValueError(f"prior[{name}]: nothing in {type(first).__name__} changes with it; does `make` hand it on?")
+            second = self.model({**values, name: samples[name][1]})
+            same = all(map(torch.equal, first.buffers(), second.buffers()))
+            if same and not list_non_buffers(first, second):
+                raise ValueError(
+                    f"prior[{name}] must change the model, but no buffer of {type(first).__name__} "
+                    f"depends on it. Check that `make` uses `{name}`."
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
         return tuple(self.prior)
 
     def model(self, values: Mapping[str, Tensor]) -> StateSpaceModel:
-        """The model with these numbers []."""
+        """Build the model with these parameters, tensors []."""
         return self.make(**{name: values[name].double() for name in self.prior})
 
-    def apiece(self, values: Mapping[str, Tensor], each: int = 1) -> StateSpaceModel:
-        """A model for every one of the numbers [G], for G `each` runs: consecutive ones have a model in common.
+    def models_per_run(self, values: Mapping[str, Tensor], each: int = 1) -> StateSpaceModel:
+        """Build one model for each parameter value.
+
+        Args:
+            values: Parameters by name, [G].
+            each: Consecutive runs that share a model.
+
+        Returns:
+            Model of G `each` runs.
 
         Raises:
-            ValueError: a model that keeps a number outside its buffers.
+            ValueError: if the model stores a parameter outside its buffers.
         """
         rows = zip(*(values[name].unbind(0) for name in self.prior), strict=True)
-        return Apiece([self.model(dict(zip(self.prior, row, strict=True))) for row in rows], each)
+        models = [self.model(dict(zip(self.prior, row, strict=True))) for row in rows]
+        return ModelBatch(models, each)
 
-    def draw(self, count: int, seed: int) -> Values:
-        """Numbers from the prior {name: [count]}."""
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            return {name: law.sample(torch.Size([count])).double() for name, law in self.prior.items()}
+    def sample(self, count: int, seed: int) -> Values:
+        """Draw parameters from the prior by counters.
 
-    def possible(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Which values are finite numbers within their support; a far step of a sampler may leave it by overflow."""
-        inside = [torch.isfinite(values[name]) & law.support.check(values[name]) for name, law in self.prior.items()]
-        return torch.stack(inside).all(0)
+        Args:
+            count: Number of values; value i does not depend on it.
+            seed: Seed.
+
+        Returns:
+            Values by name, [count].
+
+        Raises:
+            ValueError: if a prior cannot be drawn, see `draw_values`.
+        """
+        stream = PhiloxStream(seed, torch.arange(count))
+        return {
+            name: draw_values(_as_event(distribution), stream, f"prior.{name}", 1)[:, 0, 0].double()
+            for name, distribution in self.prior.items()
+        }
+
+    def in_support(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Return which values are finite and inside their support.
+
+        A long step of a sampler can overflow and leave the support.
+        """
+        valid_masks = [
+            torch.isfinite(values[name]) & distribution.support.check(values[name])
+            for name, distribution in self.prior.items()
+        ]
+        return torch.stack(valid_masks).all(0)
 
     def constrained(self, z: Tensor) -> tuple[Values, Tensor]:
-        """Numbers from the whole real line [..., P] to their support {name: [...]}, and log prior density of z there [...]."""
+        """Map unconstrained numbers to parameters.
+
+        Args:
+            z: Real numbers, [..., P].
+
+        Returns:
+            Parameters by name, [...], and log prior density of z, [...].
+        """
         values, log_prior = {}, torch.zeros_like(z[..., 0])
-        for (name, law), part in zip(self.prior.items(), z.unbind(-1), strict=True):
-            to = biject_to(law.support)
-            values[name] = to(part)
-            log_prior = log_prior + law.log_prob(values[name]) + to.log_abs_det_jacobian(part, values[name])
+        for (name, distribution), part in zip(self.prior.items(), z.unbind(-1), strict=True):
+            to_support = biject_to(distribution.support)
+            values[name] = to_support(part)
+            log_det = to_support.log_abs_det_jacobian(part, values[name])
+            log_prior = log_prior + distribution.log_prob(values[name]) + log_det
         return values, log_prior
 
     def unconstrained(self, values: Mapping[str, Tensor]) -> Tensor:
-        """The other way round, [..., P]."""
-        return torch.stack([biject_to(law.support).inv(values[name]) for name, law in self.prior.items()], -1)
+        """Map parameters to unconstrained numbers [..., P]; the inverse of `constrained`."""
+        parts = [biject_to(d.support).inv(values[name]) for name, d in self.prior.items()]
+        return torch.stack(parts, -1)
 
 
-def program(unknown: Unknown, likelihood: Likelihood, apart: bool = False) -> Callable[[Record], Values]:
-    """A Pyro program of one argument, the record: a sample site for every unknown number, and the factor `evidence`.
+def program(
+    unknown: ParameterisedModel, likelihood: MarginalLikelihood, separate_parameters: bool = False
+) -> Callable[[Record], Values]:
+    """Build a Pyro program of a record: a site per parameter and the factor `evidence`.
 
     Args:
-        unknown: the model.
-        likelihood: of its numbers; differentiable for NUTS and SVI.
-        apart: every run of the record has numbers of its own, in the plate `runs`; else all have the same.
+        unknown: Model and prior.
+        likelihood: Marginal likelihood; differentiable for NUTS and SVI.
+        apart: If true, each run has its own parameters, in the plate `runs`. Otherwise all runs
+            share them.
+
+    Returns:
+        Program that takes a record and returns the parameters.
     """
 
-    def together(record: Record) -> Values:
+    def sample_shared(record: Record) -> Values:
         values = {name: pyro.sample(name, law) for name, law in unknown.prior.items()}
-        known = likelihood(unknown.model(values), record).sum() if bool(unknown.possible(values)) else torch.tensor(-torch.inf)
-        pyro.factor("evidence", known)
+        log_evidence = torch.tensor(-torch.inf)
+        if bool(unknown.in_support(values)):
+            log_evidence = likelihood(unknown.model(values), record).sum()
+        pyro.factor("evidence", log_evidence)
         return values
 
-    def each(record: Record) -> Values:
+    def sample_by_run(record: Record) -> Values:
         with pyro.plate("runs", len(record.y)):
             values = {name: pyro.sample(name, law) for name, law in unknown.prior.items()}
-            pyro.factor("evidence", likelihood(unknown.apiece(values), record))
+            pyro.factor("evidence", likelihood(unknown.models_per_run(values), record))
         return values
 
-    return each if apart else together
+    return sample_by_run if separate_parameters else sample_shared
 
 
-def latent_program(unknown: Unknown) -> Callable[[Record], Values]:
-    """The same posterior with the path in it: standard normal sites `initial_state` [R, d] and `driving_noise` [R, T, W].
+def latent_program(unknown: ParameterisedModel) -> Callable[[Record], Values]:
+    """Build a Pyro program that samples the path of the states as well.
 
-    No filter, and so no approximation, but R (d + T W) dimensions more: for short records. The path is a deterministic site
-    `path` [R, T, D]; in the noise it has a density even where the model's transition is singular.
+    It uses no filter and no approximation, but has R (d + T W) more dimensions: use it for short
+    records. The sites are `initial_state` [R, d] and `driving_noise` [R, T, W]. They are standard
+    normal where the model's distribution is normal, and have the model's distribution otherwise.
+    The deterministic site `path` [R, T, D] holds the states. The noise has a density even where
+    the transition is singular.
+
+    Args:
+        unknown: Model and prior.
+
+    Returns:
+        Program that takes a record and returns the parameters.
 
     Raises:
-        ValueError: a number that has the name of a site.
+        ValueError: if a parameter has the name of a site.
     """
-    taken = {"initial_state", "driving_noise", "path", "seen"} & set(unknown.prior)
-    if taken:
-        raise ValueError(f"latent_program: {sorted(taken)} name sites of the path; give these numbers other names")
+    reserved = {"initial_state", "driving_noise", "path", "seen"} & set(unknown.prior)
+    if reserved:
+        raise ValueError(
+            f"prior must not use the names of path sites, got {sorted(reserved)}. Rename these "
+            "parameters."
+        )
 
     def run(record: Record) -> Values:
         values = {name: pyro.sample(name, law) for name, law in unknown.prior.items()}
         model = unknown.model(values)
         runs, steps = record.y.shape[:2]
-        zero = model.anchor.new_zeros(())
-        z = pyro.sample("initial_state", Normal(zero, 1.0).expand([runs, model.chart.dimension]).to_event(2))
-        w = pyro.sample("driving_noise", Normal(zero, 1.0).expand([runs, steps, model.noise_dim]).to_event(3))
-        states, log_like = unrolled(model, record, z, w)
+        initial = initial_law(model, runs, record.to(model.anchor).spread)
+        shift = _sample_site("initial_state", initial, (runs,))
+        w = _sample_site("driving_noise", model.noise, (runs, steps))
+        states, log_like = compute_path(model, record, shift, w)
         pyro.deterministic("path", states)
         pyro.factor("seen", log_like.sum())
         return values
@@ -190,77 +260,160 @@ def latent_program(unknown: Unknown) -> Callable[[Record], Values]:
     return run
 
 
-def unrolled(model: StateSpaceModel, record: Record, z: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-    """States [R, T, D] by standard normals z [R, d] of the initial law and w [R, T, W], and log p(y_t | x_t) [R, T]."""
-    start = record.to(model.anchor).start
-    inputs, law = model.prepare(record.to(model.anchor)).to(model.anchor), model.noise
-    x, path, log_like = begun(model, record, z), [], []
-    for t in range(record.y.shape[1]):
-        seen = inputs.at(t)._replace(start=start)
-        stage = AtRest(model) if t == 0 and model.observes_initial else model
-        x = stage.propagate(x, seen.u, law.mean + law.stddev * w[:, t].unsqueeze(1))
+def compute_path(
+    model: StateSpaceModel, record: Record, shift: Tensor, w: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Compute states and log likelihoods from initial state and noise.
+
+    Args:
+        model: State-space model.
+        record: Measurements and inputs.
+        shift: Initial states in the chart about the start, [R, d].
+        w: Driving noise, [R, T, W].
+
+    Returns:
+        States, [R, T, D], and log p(y_t | x_t), [R, T].
+    """
+    record = record.to(model.anchor)
+    inputs = model.prepare(record).to(model.anchor)
+    origin = model.origin.expand(len(shift), -1) if record.start is None else record.start
+    x, path, log_like = model.chart.add(origin, shift).unsqueeze(1), [], []
+    for t, step_model, step in iterate_steps(model, inputs):
+        x = step_model.propagate(x, step.u, w[:, t].unsqueeze(1))
         path.append(x[:, 0])
-        log_like.append(model.log_likelihood(seen.y, x, seen.u)[:, 0])
+        log_like.append(model.log_likelihood(step.y, x, step.u)[:, 0])
     return torch.stack(path, 1), torch.stack(log_like, 1)
 
 
-def begun(model: StateSpaceModel, record: Record, z: Tensor) -> Tensor:
-    """x_0 [R, 1, D] by standard normals z [R, d]."""
-    record = record.to(model.anchor)
-    law: Any = initial_law(model, len(z), record.spread)
-    dense = isinstance(law, torch.distributions.MultivariateNormal)
-    shift = law.mean + ((law.scale_tril @ z.unsqueeze(-1)).squeeze(-1) if dense else law.stddev * z)
-    origin = model.origin.expand(len(z), -1) if record.start is None else record.start
-    return model.chart.add(origin, shift).unsqueeze(1)
-
-
 def simulate(model: StateSpaceModel, record: Record, seed: int) -> tuple[Record, Tensor]:
-    """Measurements that the model itself would make of a record's runs and inputs, and the states behind them [R, T, D].
+    """Simulate measurements of a model with the runs and inputs of a record.
 
-    Of the record it takes shape, inputs, start and spread, and what is NaN stays so: draws from the prior predictive law, if the
-    model is one drawn from a prior.
+    With a model drawn from a prior these are draws from the prior predictive distribution. The
+    random numbers are those of the scenario `ModelSimulation`; run i does not depend on the number of
+    runs.
+
+    Args:
+        model: State-space model.
+        record: Template: shape, inputs, start, spread and missing components are kept.
+        seed: Seed.
+
+    Returns:
+        Record with simulated measurements, and the states, [R, T, D].
     """
-    draws = MonteCarlo(seed, torch.arange(len(record.y)))
-    steps = record.y.shape[1]
-    z = draws.normal("world.state", 1, model.chart.dimension)[:, 0]
-    w = torch.cat([draws.at(t + 1).normal("world.state", 1, model.noise_dim) for t in range(steps)], 1)
+    stream = PhiloxStream(seed, torch.arange(len(record.y)), model.anchor.dtype)
+    own = record.to(model.anchor)
     with torch.no_grad():
-        states, _ = unrolled(model, record, z.to(model.anchor), w.to(model.anchor))
-        inputs, values = model.prepare(record.to(model.anchor)), []
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            for t in range(steps):
-                law = model.observation(states[:, t : t + 1], inputs.at(t).u)
-                values.append(law.sample()[:, 0])
-    y = torch.where(torch.isnan(record.y), torch.nan, torch.stack(values, 1).to(record.y))
-    return record._replace(y=y), states
+        inputs = model.prepare(own).to(model.anchor)
+        initial = initial_law(model, len(record.y), own.spread)
+        x = draw_initial_state(model, initial, stream, "world.state", start=own.start)
+        steps = list(simulate_steps(model, inputs, stream, x, "world.state"))
+        y = draw_measurements([s.distribution for s in steps], stream, "world.receiver")
+    y = torch.where(torch.isnan(record.y), torch.nan, y.to(record.y))
+    return record._replace(y=y), torch.cat([step.x for step in steps], 1)
 
 
 def gaussian_hmm(model: StateSpaceModel, record: Record) -> GaussianHMM:
-    """The linear-Gaussian model, or those of `Apiece`, as one of Pyro's distributions over measurements [T, Dy].
+    """Build Pyro's GaussianHMM of a linear-Gaussian model over measurements [T, Dy].
+
+    Args:
+        model: Model, or models of `ModelBatch`.
+        record: Measurements; its shape is used.
+
+    Returns:
+        Distribution with batch [R].
 
     Raises:
-        ValueError: see `ExactHMM`.
+        ValueError: if the model or the record is not supported, see `GaussianHmmLikelihood`.
     """
-    kind = type(model.model if isinstance(model, Apiece) else model).__name__
+    kind = type(model.model if isinstance(model, ModelBatch) else model).__name__
     gain = model.noise_gain(()) if model.linear else None
-    if gain is None or model.noise_dim < model.chart.dimension or model.observes_initial or record.u or record.start is not None:
+    singular = model.noise_dim < model.chart.dimension
+    has_inputs = bool(record.u) or record.start is not None
+    if gain is None or singular or model.observes_initial or has_inputs:
         raise ValueError(
-            f"ExactHMM: {kind} is no linear model with full noise, no inputs and a step before the first measurement; take "
-            "Filtered(GaussianFilter(Jacobian())), which is exact on any linear model"
+            "GaussianHmmLikelihood needs a linear model with full noise, without inputs, with a step "
+            f"before the first measurement, got {kind}. Use "
+            "FilterLikelihood(GaussianFilter(TaylorLinearisation())), which is exact on every "
+            "linear model."
         )
     if bool(torch.isnan(record.y).any()):
-        raise ValueError("ExactHMM: the record has gaps (NaN), for which GaussianHMM has no place; take Filtered")
+        raise ValueError(
+            "GaussianHmmLikelihood needs complete measurements, got missing components (NaN). "
+            "Use FilterLikelihood."
+        )
     runs, d = len(record.y), model.chart.dimension
     eye = torch.eye(d, dtype=gain.dtype, device=gain.device).expand(runs, -1, -1)
-    first: Any = initial_law(model, runs)
-    start = MultivariateNormal(first.mean, covariance_of(first))
+    initial: Any = initial_law(model, runs)
+    start = MultivariateNormal(initial.mean, distribution_covariance(initial))
     zero = torch.zeros_like(eye)
-    carried = model.propagate(eye, (), zero)  # rows: where each state alone would go
+    phi = model.propagate(eye, (), zero)  # transposed: row i is where unit state i goes
     law: Any = model.observation(torch.cat([eye, zero[:, :1]], 1), ())
-    seen, offset = law.mean[:, :-1], law.mean[:, -1]
-    driven = MultivariateNormal(zero[:, 0].unsqueeze(1), (gain @ gain.mT).expand(runs, d, d).unsqueeze(1))
-    errors = MultivariateNormal(offset.unsqueeze(1), covariance_of(law)[:, -1].unsqueeze(1))
+    y_hat, offset = law.mean[:, :-1], law.mean[:, -1]
+    q = (gain @ gain.mT).expand(runs, d, d)
+    transition_noise = MultivariateNormal(zero[:, 0].unsqueeze(1), q.unsqueeze(1))
+    r = distribution_covariance(law)[:, -1].unsqueeze(1)
+    observation_noise = MultivariateNormal(offset.unsqueeze(1), r)
+    h = (y_hat - offset.unsqueeze(1)).unsqueeze(1)
+    steps = record.y.shape[1]
     return GaussianHMM(
-        start, carried.unsqueeze(1), driven, (seen - offset.unsqueeze(1)).unsqueeze(1), errors, duration=record.y.shape[1]
+        start, phi.unsqueeze(1), transition_noise, h, observation_noise, duration=steps
     )
+
+
+class _PyroDistribution(TorchDistribution):
+    """A torch distribution as a Pyro site of batch shape []."""
+
+    def __init__(self, inner: Distribution) -> None:
+        self.inner = inner
+        self.has_rsample = inner.has_rsample
+        super().__init__(torch.Size(), inner.batch_shape + inner.event_shape, validate_args=False)
+
+    @property
+    @override
+    def support(self) -> Any:
+        return self.inner.support
+
+    @override
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:  # noqa: B008
+        return self.inner.sample(sample_shape)
+
+    @override
+    def rsample(self, sample_shape: Any = torch.Size()) -> Tensor:  # noqa: B008
+        return self.inner.rsample(sample_shape)
+
+    @override
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.inner.log_prob(value).sum()
+
+
+def _sample_site(name: str, distribution: Any, shape: tuple[int, ...]) -> Tensor:
+    """Sample a site [*shape, k]; normal distributions scale a standard normal site."""
+    base = distribution.base_dist if isinstance(distribution, Independent) else distribution
+    size = [*shape, distribution.event_shape[0]]
+    if not isinstance(base, torch.distributions.Normal | torch.distributions.MultivariateNormal):
+        return pyro.sample(name, _PyroDistribution(distribution.expand(torch.Size(shape))))
+    standard = Normal(base.loc.new_zeros(()), 1.0).expand(size).to_event(len(size))
+    z: Tensor = pyro.sample(name, standard)
+    if isinstance(base, torch.distributions.Normal):
+        return base.loc + base.scale * z
+    return base.loc + (base.scale_tril @ z.unsqueeze(-1)).squeeze(-1)
+
+
+def _check_prior(name: str, distribution: Law) -> None:
+    """Raise ValueError if a prior is not a scalar distribution of Pyro."""
+    if not isinstance(distribution, TorchDistributionMixin):
+        raise ValueError(
+            f"prior[{name}] must be a distribution of pyro.distributions, got {distribution}. "
+            "Import the distribution of that name from pyro.distributions."
+        )
+    if distribution.batch_shape or distribution.event_shape:
+        shape = tuple(distribution.batch_shape + distribution.event_shape)
+        raise ValueError(
+            f"prior[{name}] must be a scalar distribution, got shape {shape}. Give several "
+            "parameters several names."
+        )
+
+
+def _as_event(distribution: Law) -> Distribution:
+    """Return a scalar distribution as one with event [1]."""
+    return Independent(distribution.expand(torch.Size((1,))), 1)

@@ -1,4 +1,4 @@
-"""Regimes that switch: which of several laws a series of errors obeyed, and when. Exact, by Pyro's DiscreteHMM."""
+"""Noise levels that switch by a Markov chain, inferred exactly with Pyro's DiscreteHMM."""
 
 from __future__ import annotations
 
@@ -10,21 +10,24 @@ import torch
 from pyro.distributions import DiscreteHMM, Normal, Unit
 from torch import Tensor
 
+from pfbench.core.record import Record
 from pfbench.ppl.program import Law, Values
-from pfbench.record import Record
 
 
 @dataclass(frozen=True)
-class Switching:
-    """Independent normal errors of two sizes, nominal and surge, with a Markov chain that says which.
+class SwitchingNoise:
+    """Independent normal errors of two sizes, nominal and surge, switched by a Markov chain.
 
-    Fits where what is seen is independent from instant to instant given the regime: errors of a sensor at rest or against a
-    reference, or the innovations of a filter. The chain is summed over exactly, so that the program is differentiable.
+    It fits errors that are independent from step to step given the regime: errors of a sensor at
+    rest or against a reference, or innovations of a filter. The sum over the chain is exact, so
+    the program is differentiable.
 
-    Args:
-        sd: law of the nominal standard deviation.
-        ratio: law of the surge's to it; above 1, or the two could change names.
-        stay, surge_stay: laws of the probabilities to stay in the nominal regime, and in the surge.
+    Attributes:
+        sd: Distribution of the nominal standard deviation.
+        ratio: Distribution of the ratio of the surge's standard deviation to the nominal one.
+            Values must exceed 1, or the regimes could exchange their meaning.
+        stay: Distribution of the probability to stay in the nominal regime.
+        surge_stay: Distribution of the probability to stay in the surge.
     """
 
     sd: Law
@@ -34,42 +37,78 @@ class Switching:
 
     @property
     def prior(self) -> dict[str, Law]:
-        return {"sd": self.sd, "ratio": self.ratio, "stay": self.stay, "surge_stay": self.surge_stay}
+        """Distributions of the parameters by name."""
+        return {
+            "sd": self.sd,
+            "ratio": self.ratio,
+            "stay": self.stay,
+            "surge_stay": self.surge_stay,
+        }
 
     def program(self) -> Callable[[Record], Values]:
-        """A Pyro program of the record whose y [R, T, Dy] are the errors, NaN where none is known; regimes hold for all Dy."""
+        """Build a Pyro program of a record whose y [R, T, Dy] are the errors.
+
+        NaN marks a missing error. A regime applies to all Dy components.
+        """
 
         def run(record: Record) -> Values:
             values = {name: pyro.sample(name, law) for name, law in self.prior.items()}
-            pyro.factor("evidence", self.chain(values, emission(record, values)).sum())
+            pyro.factor("evidence", self.chain(values, emission_distribution(record, values)).sum())
             return values
 
         return run
 
     def chain(self, values: Values, table: Tensor) -> Tensor:
-        """log p(y_1:T) [R] by log densities of every instant under each regime [R, T, 2]."""
-        stay, surge = values["stay"].double(), values["surge_stay"].double()
-        steps = torch.stack([torch.stack([stay, 1.0 - stay]), torch.stack([1.0 - surge, surge])]).log()
-        leave, come_back = 1.0 - stay, 1.0 - surge
-        begin = torch.stack([come_back, leave]).log() - (leave + come_back).log()  # the chain's stationary law
-        hmm = DiscreteHMM(begin, steps, Unit(table, validate_args=False), duration=table.shape[1])
-        found: Tensor = hmm.log_prob(table.new_empty(*table.shape[:2], 0))
-        return found
+        """Compute log p(y_1:T).
+
+        Args:
+            values: Parameters, [].
+            table: Log densities of each step under each regime, [R, T, 2].
+
+        Returns:
+            Log evidence, [R].
+        """
+        stay, surge_stay = values["stay"].double(), values["surge_stay"].double()
+        rows = [torch.stack([stay, 1.0 - stay]), torch.stack([1.0 - surge_stay, surge_stay])]
+        log_transition = torch.stack(rows).log()
+        to_surge, to_nominal = 1.0 - stay, 1.0 - surge_stay
+        log_total = (to_surge + to_nominal).log()
+        log_initial = torch.stack([to_nominal, to_surge]).log() - log_total  # stationary
+        observation = Unit(table, validate_args=False)
+        hmm = DiscreteHMM(log_initial, log_transition, observation, duration=table.shape[1])
+        log_evidence: Tensor = hmm.log_prob(table.new_empty(*table.shape[:2], 0))
+        return log_evidence
 
     def probability(self, record: Record, values: Values) -> Tensor:
-        """Of the surge at each instant, given the whole record and these numbers [R, T].
+        """Compute the probability of the surge at each step, given the whole record.
 
-        It is the derivative of log p(y_1:T) by the log density of that instant under that regime.
+        It is the derivative of log p(y_1:T) by the log density of that step under that regime.
+
+        Args:
+            record: Errors, y [R, T, Dy].
+            values: Parameters, [].
+
+        Returns:
+            Probabilities, [R, T].
         """
         with torch.enable_grad():
-            table = emission(record, values).detach().requires_grad_()
-            (slope,) = torch.autograd.grad(self.chain(values, table).sum(), table)
-        return slope[..., 1].detach()
+            table = emission_distribution(record, values).detach().requires_grad_()
+            (gradient,) = torch.autograd.grad(self.chain(values, table).sum(), table)
+        return gradient[..., 1].detach()
 
 
-def emission(record: Record, values: Values) -> Tensor:
-    """Log densities of the errors under each regime [R, T, 2]; 0 where nothing is known."""
-    seen = ~torch.isnan(record.y)
-    sds = values["sd"].double() * torch.stack([torch.ones_like(values["ratio"]), values["ratio"]]).double()
-    each = Normal(0.0, sds).log_prob(torch.where(seen, record.y, 0.0).unsqueeze(-1))
-    return (each * seen.unsqueeze(-1)).sum(2)
+def emission_distribution(record: Record, values: Values) -> Tensor:
+    """Compute log densities of the errors under each regime.
+
+    Args:
+        record: Errors, y [R, T, Dy].
+        values: Parameters, [].
+
+    Returns:
+        Log densities, [R, T, 2]; 0 where all components are missing.
+    """
+    observed_mask = ~torch.isnan(record.y)
+    ratios = torch.stack([torch.ones_like(values["ratio"]), values["ratio"]])
+    sds = values["sd"].double() * ratios.double()
+    y = torch.where(observed_mask, record.y, 0.0).unsqueeze(-1)
+    return (Normal(0.0, sds).log_prob(y) * observed_mask.unsqueeze(-1)).sum(2)

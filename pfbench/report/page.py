@@ -1,4 +1,4 @@
-"""The report of a study: a page that works offline, the same in Markdown, figures, tables and verdicts beside them."""
+"""The report of a study: an offline HTML page, Markdown, figures, tables and decisions."""
 
 from __future__ import annotations
 
@@ -10,72 +10,95 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from pfbench import store
-from pfbench.report import (
-    across,
-    budget,
-    files,
-    headline,
-    headline_figures,
-    paper_figures,
-    provenance,
-    ranking_figures,
-    tables,
+from pfbench.report import cost, provenance, summary, tables, writers
+from pfbench.report.condition_section import PAIRS, write_condition_section
+from pfbench.report.options import (
+    ReportContext,
+    ReportOptions,
+    is_brief,
+    order_by_highlight,
+    select_line_styles,
 )
-from pfbench.report.across import Across
-from pfbench.report.canvas import looks, slug
-from pfbench.report.frame import Cell, blocks, cells, natural
-from pfbench.report.section import PAIRS, section_of
-from pfbench.report.significance import LOST_RULES, NO_DIFFERENCE, Verdict, over_page, sensitivity
-from pfbench.report.view import Options, View, colours_first, is_brief, looks_of
+from pfbench.report.plots import comparison_figures, paper_figures, summary_figures
+from pfbench.report.plots.plotting import format_slug, line_styles
+from pfbench.results import condition_blocks, rankings, store
+from pfbench.results.frame import Condition, load_conditions, natural_sort_key
+from pfbench.results.metrics import metric_definitions
+from pfbench.results.pairwise_tests import (
+    INCONCLUSIVE,
+    LOST_RUN_RULES,
+    PairwiseTest,
+    correct_over_report,
+    lost_rule_sensitivity,
+)
+from pfbench.results.rankings import RankingResult
+from pfbench.results.state_groups import component_groups
 
-_ROWS = 2000  # of the table of all comparisons
+_ROWS = 2000  # rows of the table of all comparisons at most
 
 
-def write(
-    study: str, results: str | Path = "results", out: str | Path = "reports", options: Options | None = None
+def write_report(
+    study: str,
+    results: str | Path = "results",
+    out: str | Path = "reports",
+    options: ReportOptions | None = None,
 ) -> Path:
-    """Writes `<out>/<study>/`: index.html, report.md, verdicts.json, across.json, pfbench.bib, figures/, tables/.
+    """Write the report of a study to `<out>/<study>/`.
 
-    The same results give the same bytes. Figures and tables of an earlier report in that folder are removed.
+    The folder contains index.html, report.md, verdicts.json, across.json, pfbench.bib, figures/ and
+    tables/. Equal results give equal bytes. Figures and tables of an earlier report are removed.
 
     Args:
-        study: name of the folder in `results`.
-        results: folder of all studies.
-        out: folder of all reports.
-        options: what is shown.
+        study: Name of the folder in `results`.
+        results: Folder of all studies.
+        out: Folder of all reports.
+        options: Options of the report.
 
     Returns:
-        The page, index.html.
+        Path of index.html.
 
     Raises:
-        FileNotFoundError: the study has no results.
-        ValueError: results that do not belong together; a group, a filter or a figure that no result has.
+        FileNotFoundError: If the study has no results.
+        ValueError: If results do not belong together, or no result has a selected group, filter or figure.
     """
-    options = options or Options()
-    found = cells(study, results, mixed=options.mixed)
+    options = options or ReportOptions()
+    found = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
     groups = _groups(found, options.groups)
-    _check_converged(found, options.converged)
+    _check_converged(found, options.convergence_threshold)
     folder = Path(out) / study
-    labels = sorted({job.label for cell in found for job in cell.jobs}, key=natural)
-    view = View(groups, looks(colours_first(labels, options.highlight)), folder, options, is_brief(found, options))
-    redrawn = paper_figures.drawings(study, found, view.style, options.figures, options.from_time)
-    files.clear(folder)  # after all that may be refused
+    labels = sorted({job.label for cell in found for job in cell.jobs}, key=natural_sort_key)
+    view = ReportContext(
+        groups,
+        line_styles(order_by_highlight(labels, options.highlight_filters)),
+        folder,
+        options,
+        is_brief(found, options),
+    )
+    redrawn = paper_figures.paper_figures(
+        study, found, view.style, options.paper_figures, options.start_time_s
+    )
+    writers.remove_old_files(folder)  # after all checks
     sections, decided, runs = [], [], []
     for cell in tqdm(found, desc=f"report {study}", disable=None, delay=2):
-        section, own, rows = section_of(cell, view)
+        section, own, rows = write_condition_section(cell, view)
         sections.append(section)
         decided += own
         runs.append(rows)
-    decided = over_page(decided)
+    decided = correct_over_report(decided)
     table = pd.concat(runs, ignore_index=True)
-    mains = {(cell.scenario, cell.noise, cell.model): section["main"] for cell, section in zip(found, sections, strict=True)}
-    rows, of_mains, name = headline.joined(table, decided, mains)
-    if view.brief and name == headline.MAIN:
+    mains = {
+        (cell.scenario, cell.noise, cell.model): section["main"]
+        for cell, section in zip(found, sections, strict=True)
+    }
+    rows, of_mains, name = summary.merge(table, decided, mains)
+    if view.brief and name == summary.MAIN:
         table = pd.concat([rows, table], ignore_index=True)
     scored = [group for group in (name, *groups) if (table.group == group).any()]
-    over_cells = [across.across(table, group, options.alpha, options.margin) for group in dict.fromkeys(scored)]
-    note = budget.stated([job.meta for cell in found for job in cell.jobs])
+    over_cells = [
+        rankings.rank_filters(table, group, options.alpha, options.equivalence_margin)
+        for group in dict.fromkeys(scored)
+    ]
+    note = cost.format_budget([job.meta for cell in found for job in cell.jobs])
     listed = _listed(decided, sections)
     context = {
         "study": study,
@@ -84,53 +107,91 @@ def write(
         "brief": view.brief,
         "cells": sections,
         "verdicts": decided,
-        "everything": tables.everything(listed),
-        "paper": [files.drawn(drawing, "paper", folder, options.formats) for drawing in redrawn],
+        "everything": tables.all_comparisons_table(listed),
+        "paper": [
+            writers.render_figure(drawing, "paper", folder, options.figure_formats)
+            for drawing in redrawn
+        ],
         "page_shown": sum(v.p_page <= options.alpha for v in decided),
-        "shown": sum(v.winner != NO_DIFFERENCE for v in decided),
+        "shown": sum(v.winner != INCONCLUSIVE for v in decided),
         "family_sizes": sorted({v.family for v in decided}),
         "budget": note,
-        "across": _across(table, over_cells, [*of_mains, *decided] if scored[0] == headline.MAIN else decided, view, note),
-        "headline": _headline(table, over_cells[0], of_mains, mains, sections, view, note) if view.brief and over_cells else None,
-        "lost_rules": [rule.name for rule in LOST_RULES],
-        "bibtex": (bibtex := provenance.bibtex(found)),
-        "shared": [*provenance.shared(found), *provenance.spent(found, options.planned), *provenance.trained(found)],
-        "choices": provenance.choices(found),
-        "failures": store.failures(Path(results) / study),
+        "across": _across(
+            table,
+            over_cells,
+            [*of_mains, *decided] if scored[0] == summary.MAIN else decided,
+            view,
+            note,
+        ),
+        "headline": _headline(table, over_cells[0], of_mains, mains, sections, view, note)
+        if view.brief and over_cells
+        else None,
+        "metric_definitions": metric_definitions(),
+        "lost_rules": [rule.name for rule in LOST_RUN_RULES],
+        "bibtex": (bibtex := provenance.format_bibtex(found)),
+        "shared": [
+            *provenance.list_shared_settings(found),
+            *provenance.compute_cost(found, options.planned),
+            *provenance.training_cost(found),
+        ],
+        "choices": provenance.modelling_choices(found),
+        "failures": store.list_failures(Path(results) / study),
     }
     (folder / "pfbench.bib").write_text(bibtex, encoding="utf-8")
-    context["verdict_file"] = files.save_typed(folder, "verdicts", decided)
-    files.save_typed(folder, "across", over_cells)
-    return files.render("page", folder, context)
+    context["verdict_file"] = writers.write_json(folder, "verdicts", decided)
+    writers.write_json(folder, "across", over_cells)
+    return writers.render_template("page", folder, context)
 
 
 def _across(
-    table: pd.DataFrame, found: Sequence[Across], decided: Sequence[Verdict], view: View, note: str
+    table: pd.DataFrame,
+    found: Sequence[RankingResult],
+    decided: Sequence[PairwiseTest],
+    view: ReportContext,
+    note: str,
 ) -> dict[str, Any]:
-    """What the templates need of all cells together; writes its figures and tables."""
+    """Write the figures and tables across conditions and return their template variables."""
     folder, options = view.folder, view.options
-    sources = [across.blocks(table, one.group) for one in found]
-    own = table[table.group != headline.MAIN]
-    ranked, changed = tables.ranked(found), tables.sensitive(sensitivity(own, options.alpha))
+    sources = [condition_blocks.ranking_blocks(table, one.group) for one in found]
+    own = table[table.group != summary.MAIN]
+    ranked, changed = (
+        tables.rank_table(found),
+        tables.lost_rule_table(lost_rule_sensitivity(own, options.alpha)),
+    )
     for name, one_table in (("ranks", ranked), ("lost_rules", changed)):
         if len(one_table):
-            files.save_table(folder, f"across_{name}", one_table, note)
+            writers.write_table(folder, f"across_{name}", one_table, note)
     parts = []
     for one in found:
-        pairs = tables.across_pairs(one)
+        pairs = tables.ranking_pair_table(one)
         if len(pairs):
-            files.save_table(folder, f"across_{slug(one.group)}", pairs, note)
+            writers.write_table(folder, f"across_{format_slug(one.group)}", pairs, note)
         best = min(zip(one.ranks, one.filters, strict=True))[1] if one.ranks else ""
         few = pairs[(pairs.a == best) | (pairs.b == best)] if len(pairs) > PAIRS else pairs
-        others = {rule.name: across.winners(table, one.group, options.alpha, rule) for rule in LOST_RULES[1:]}
-        parts.append({"one": one, "pairs": few, "n": len(pairs), "best": best, "changed": _changed(one, others)})
+        others = {
+            rule.name: rankings.winners_by_rule(table, one.group, options.alpha, rule)
+            for rule in LOST_RUN_RULES[1:]
+        }
+        parts.append(
+            {
+                "one": one,
+                "pairs": few,
+                "n": len(pairs),
+                "best": best,
+                "changed": _changed(one, others),
+            }
+        )
     drawings = []
     for one, source in zip(found, sources, strict=True):
         by = one.ranks or tuple(map(float, np.median(source.values, axis=0)))
         best_first = [label for _, label in sorted(zip(by, one.filters, strict=True))]
-        what = f"the best mean ranks of {one.group}" if one.ranks else f"the smallest median RMSE of {one.group}"
-        look, who = looks_of(view, one.filters, best_first, what)
-        drawings += ranking_figures.of_study([(one, source)], decided, look, who)
+        criterion = (
+            f"the best mean ranks of {one.group}"
+            if one.ranks
+            else f"the smallest median RMSE of {one.group}"
+        )
+        look, who = select_line_styles(view, one.filters, best_first, criterion)
+        drawings += comparison_figures.study_figures([(one, source)], decided, look, who)
     refused: dict[str, list[str]] = {}
     for one in found:
         if one.refused:
@@ -141,69 +202,108 @@ def _across(
         "ranked": ranked,
         "sensitive": changed,
         "lost": bool(table.lost.any()),
-        "drawings": [files.drawn(drawing, "across", folder, options.formats) for drawing in drawings],
+        "drawings": [
+            writers.render_figure(drawing, "across", folder, options.figure_formats)
+            for drawing in drawings
+        ],
     }
 
 
 def _headline(
-    table: pd.DataFrame, one: Across, decided: Sequence[Verdict], mains: Mapping[headline.CellName, str],
-    sections: Sequence[Mapping[str, Any]], view: View, note: str,
+    table: pd.DataFrame,
+    one: RankingResult,
+    decided: Sequence[PairwiseTest],
+    mains: Mapping[summary.CellName, str],
+    sections: Sequence[Mapping[str, Any]],
+    view: ReportContext,
+    note: str,
 ) -> dict[str, Any]:
-    """What a page of many cells says first; writes its figures and its table."""
+    """Write the figures and the table of the summary and return its template variables."""
     folder, options = view.folder, view.options
-    source = across.blocks(table, one.group)
-    pairs = headline.planned(source, decided, options.alpha)
-    planned = tables.planned(pairs)
+    source = condition_blocks.ranking_blocks(table, one.group)
+    pairs = summary.compare_with_baselines(source, decided, options.alpha)
+    planned = tables.baseline_table(pairs)
     if pairs:
-        files.save_table(folder, "proposed", planned, note)
-        files.save_typed(folder, "proposed", pairs)
+        writers.write_table(folder, "proposed", planned, note)
+        writers.write_json(folder, "proposed", pairs)
     fates = [fate for section in sections for fate in section["fates"]]
-    said = headline.summary(one, decided, pairs, table[table.group == one.group], mains, fates)
-    drawings = headline_figures.drawings(one, source, pairs, options.alpha, said.group)
+    said = summary.summarise_study(
+        one, decided, pairs, table[table.group == one.group], mains, fates
+    )
+    drawings = summary_figures.summary_figures(one, source, pairs, options.alpha, said.group)
     return {
         "said": said,
         "planned": planned,
-        "drawings": [files.drawn(drawing, "all", folder, options.formats) for drawing in drawings],
-        "critical": f"across_critical_difference_{slug(one.group)}",
+        "drawings": [
+            writers.render_figure(drawing, "all", folder, options.figure_formats)
+            for drawing in drawings
+        ],
+        "critical": f"across_critical_difference_{format_slug(one.group)}",
     }
 
 
-def _listed(decided: Sequence[Verdict], sections: Sequence[Mapping[str, Any]]) -> list[Verdict]:
-    """What the table of all comparisons holds: all, or where they are too many those with the best filter, of the main groups."""
+def _listed(
+    decided: Sequence[PairwiseTest], sections: Sequence[Mapping[str, Any]]
+) -> list[PairwiseTest]:
+    """Select all comparisons, or those of main groups with the best filter if there are too many."""
     if len(decided) <= _ROWS:
         return list(decided)
-    kept = {_of(v) for section in sections for part in section["parts"] if part["main"] for v in part["chosen"]}
+    kept = {
+        _of(v)
+        for section in sections
+        for part in section["parts"]
+        if part["main"]
+        for v in part["chosen"]
+    }
     return [v for v in decided if _of(v) in kept]
 
 
-def _of(v: Verdict) -> tuple[str, ...]:
+def _of(v: PairwiseTest) -> tuple[str, ...]:
+    """Return the key of a comparison."""
     return v.scenario, v.noise, v.model, v.group, v.a, v.b
 
 
-def _changed(one: Across, others: Mapping[str, dict[tuple[str, str], str] | str]) -> list[str]:
-    """How many decisions across cells change under each other rule for lost runs."""
+def _changed(
+    one: RankingResult, others: Mapping[str, dict[tuple[str, str], str] | str]
+) -> list[str]:
+    """Format the number of decisions across conditions that change under other lost-run rules."""
     if one.refused:
         return []
-    said = []
+    texts = []
     for rule, winners in others.items():
         if isinstance(winners, str):
-            said.append(f"{rule}: {winners}")
+            texts.append(f"{rule}: {winners}")
         else:
             n = sum(winners.get((p.a, p.b)) != p.winner for p in one.pairs)
-            said.append(f"{rule}: {n} of {len(one.pairs)}")
-    return said
+            texts.append(f"{rule}: {n} of {len(one.pairs)}")
+    return texts
 
 
-def _groups(found: Sequence[Cell], wanted: tuple[str, ...] | None) -> list[str]:
+def _groups(found: Sequence[Condition], wanted: tuple[str, ...] | None) -> list[str]:
+    """Return the selected groups, checked against the results."""
     states = [job.meta["state"] for cell in found for job in cell.jobs]
-    there = list(dict.fromkeys(block.group for state in states for block in blocks(state)))
-    unknown = sorted(set(wanted or ()) - set(there))
+    groups = list(
+        dict.fromkeys(block.group for state in states for block in component_groups(state))
+    )
+    unknown = sorted(set(wanted or ()) - set(groups))
     if unknown:
-        raise ValueError(f"groups: no result has {', '.join(unknown)}; choose from {', '.join(there)}")
-    return there if wanted is None else list(wanted)
+        names = ", ".join(groups)
+        raise ValueError(
+            f"report.groups must be groups of the results, got {', '.join(unknown)}. Choose from {names}."
+        )
+    return groups if wanted is None else list(wanted)
 
 
-def _check_converged(found: Sequence[Cell], converged: Mapping[str, float]) -> None:
-    there = {block.group for cell in found for job in cell.jobs for block in blocks(job.meta["state"])}
-    if unknown := sorted(set(converged) - there):
-        raise ValueError(f"report.converged: no result has {', '.join(unknown)}; choose from {', '.join(sorted(there))}")
+def _check_converged(found: Sequence[Condition], converged: Mapping[str, float]) -> None:
+    """Check the groups of the convergence limits."""
+    groups = {
+        block.group
+        for cell in found
+        for job in cell.jobs
+        for block in component_groups(job.meta["state"])
+    }
+    if unknown := sorted(set(converged) - groups):
+        names = ", ".join(sorted(groups))
+        raise ValueError(
+            f"report.convergence_threshold must name groups of the results, got {', '.join(unknown)}. Choose from {names}."
+        )

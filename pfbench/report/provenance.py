@@ -1,4 +1,4 @@
-"""What made the results of a report: versions, seeds, jobs and what they took, training, readings chosen; and how to cite it."""
+"""Provenance of a report: versions, seeds, time of the jobs, training, choices and citation."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from pfbench.report.frame import Cell, natural
+from pfbench.results.frame import Condition, natural_sort_key
 
 _SHARED = (
     ("pfbench", "versions.pfbench"),
@@ -24,57 +24,85 @@ _SHARED = (
     ("steps per run", "steps"),
 )
 
-_TAKEN = {"filter": "filters", "scores": "scores", "world": "worlds", "bound": "bounds", "compile": "compilation"}
+_PHASES = {
+    "filter": "filters",
+    "scores": "scores",
+    "world": "data",
+    "bound": "PCRB",
+    "compile": "compilation",
+}
 
 
-def shared(found: Sequence[Cell]) -> list[tuple[str, str]]:
-    """What all jobs ran with; several values are listed, as they are in a mixed report."""
+def list_shared_settings(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
+    """List the settings of all jobs; a mixed report has several values."""
     rows = []
     for name, path in _SHARED:
-        values = [_at(job.meta, path) for cell in found for job in cell.jobs]
-        rows.append((name, ", ".join(distinct(str(value) for value in values if value is not None)) or "not stated"))
+        values = [_at(job.meta, path) for cell in conditions for job in cell.jobs]
+        rows.append(
+            (
+                name,
+                ", ".join(distinct_values(str(value) for value in values if value is not None))
+                or "not recorded",
+            )
+        )
     return rows
 
 
-def spent(found: Sequence[Cell], planned: int | None) -> list[tuple[str, str]]:
-    """How many jobs there are, and what they took, from the drawing of worlds to the scores."""
+def compute_cost(conditions: Sequence[Condition], planned: int | None) -> list[tuple[str, str]]:
+    """Count the jobs and sum their time by phase.
+
+    Args:
+        found: Conditions of the study.
+        planned: Number of jobs of the experiment, if known.
+    """
     parts: Counter[str] = Counter()
-    jobs = [job for cell in found for job in cell.jobs]
+    jobs = [job for cell in conditions for job in cell.jobs]
     for job in jobs:
-        parts.update({name: job.meta["seconds"].get(name, 0.0) for name in _TAKEN})
-    shares = ", ".join(f"{what} {100 * parts[name] / parts.total():.0f} %" for name, what in _TAKEN.items() if parts[name])
-    of = f" of {planned} that the experiment asks for" if planned else ""
-    took = f"{_duration(parts.total())} ({shares})" if shares else "not stated"
-    return [("jobs", f"{len(jobs)}{of}"), ("time of all jobs", took)]
+        parts.update({name: job.meta["seconds"].get(name, 0.0) for name in _PHASES})
+    shares = ", ".join(
+        f"{phase} {100 * parts[name] / parts.total():.0f} %"
+        for name, phase in _PHASES.items()
+        if parts[name]
+    )
+    target = f" of {planned} in the experiment" if planned else ""
+    elapsed = f"{_duration(parts.total())} ({shares})" if shares else "not recorded"
+    return [("jobs", f"{len(jobs)}{target}"), ("time of all jobs", elapsed)]
 
 
-def trained(found: Sequence[Cell]) -> list[tuple[str, str]]:
-    """What networks were trained on, and what that cost, filter by filter."""
+def training_cost(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
+    """List the training data and the training cost of each learned filter."""
     rows = []
-    for job in (job for cell in found for job in cell.jobs if job.meta.get("trained")):
+    for job in (job for cell in conditions for job in cell.jobs if job.meta.get("trained")):
         split, cost = job.meta["trained"]["split"], job.meta["trained"]["cost"]
-        worlds = f"{split['train']['runs']} worlds of {split['scenario']}, " if split else ""
-        spent = f"{cost['updates']} updates, {cost['seconds']:.0f} s on {cost['device']} ({cost['threads']} threads)"
-        rows.append((f"training of {job.label}", worlds + spent))
+        data = f"{split['train']['runs']} episodes of {split['scenario']}, " if split else ""
+        effort = f"{cost['updates']} updates, {cost['seconds']:.0f} s on {cost['device']} ({cost['threads']} threads)"
+        rows.append((f"training of {job.label}", data + effort))
     return list(dict.fromkeys(rows))
 
 
-def choices(found: Sequence[Cell]) -> list[tuple[str, str]]:
-    """Each reading or choice that a job made, with the filters that made it."""
-    made: dict[str, list[str]] = {}
-    for cell in found:
+def modelling_choices(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
+    """List the modelling choices of the jobs, each with its filters."""
+    labels_by_choice: dict[str, list[str]] = {}
+    for cell in conditions:
         for job in cell.jobs:
             for text in job.meta.get("choices_made", ()):
-                made.setdefault(text, []).append(job.label)
-    everyone = {job.label for cell in found for job in cell.jobs}
-    return [(text, "all" if set(who) == everyone else ", ".join(distinct(who))) for text, who in sorted(made.items())]
+                labels_by_choice.setdefault(text, []).append(job.label)
+    all_labels = {job.label for cell in conditions for job in cell.jobs}
+    return [
+        (text, "all" if set(labels) == all_labels else ", ".join(distinct_values(labels)))
+        for text, labels in sorted(labels_by_choice.items())
+    ]
 
 
-def bibtex(found: Sequence[Cell]) -> str:
-    """An entry that a user can paste: the versions that made the results, and the year they were made in."""
-    metas = [job.meta for cell in found for job in cell.jobs]
-    version = ", ".join(distinct(str(_at(meta, "versions.pfbench")) for meta in metas))
-    commit = ", ".join(distinct(str(_at(meta, "versions.commit")) for meta in metas if _at(meta, "versions.commit")))
+def format_bibtex(conditions: Sequence[Condition]) -> str:
+    """Format a BibTeX entry with the versions and the year of the results."""
+    metas = [job.meta for cell in conditions for job in cell.jobs]
+    version = ", ".join(distinct_values(str(_at(meta, "versions.pfbench")) for meta in metas))
+    commit = ", ".join(
+        distinct_values(
+            str(_at(meta, "versions.commit")) for meta in metas if _at(meta, "versions.commit")
+        )
+    )
     years = [str(meta["created"])[:4] for meta in metas if meta.get("created")]
     note = f"  note    = {{Commit {commit}}},\n" if commit else ""
     return (
@@ -88,17 +116,19 @@ def bibtex(found: Sequence[Cell]) -> str:
 
 
 def _duration(seconds: float) -> str:
+    """Format a duration in s, min or h."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
-def distinct(values: Iterable[str]) -> list[str]:
-    """Each value once, in the order of names."""
-    return sorted(set(values), key=natural)
+def distinct_values(values: Iterable[str]) -> list[str]:
+    """Return the distinct values in natural order."""
+    return sorted(set(values), key=natural_sort_key)
 
 
 def _at(meta: Any, path: str) -> Any:
+    """Return the value at a dotted path, or None."""
     for name in path.split("."):
         meta = meta.get(name) if isinstance(meta, Mapping) else None
     return meta

@@ -1,0 +1,81 @@
+"""Scenarios: simulated and recorded episodes.
+
+The public names of this folder are imported on first use.
+"""
+
+from pfbench.core.lazy_import import lazy_attributes
+
+__all__ = [
+    "BaroMagSensors",
+    "EmitterPrior",
+    "FixHoldout",
+    "FixReceiver",
+    "LogFiles",
+    "ModelSimulation",
+    "PassiveLocationScenario",
+    "PseudorangeReceiver",
+    "QuadratureEmitterPrior",
+    "RawGnssReceiver",
+    "RecordedAidedFlight",
+    "RecordedDrive",
+    "RecordedFlights",
+    "RecordedTrajectory",
+    "RecordedWalk",
+    "RecordingRegime",
+    "Scenario",
+    "SimulatedFlight",
+    "UrbanDrive",
+    "estimate_mixture",
+    "estimate_normal",
+    "find_dataset",
+    "range_residuals",
+    "read_drive",
+    "read_log",
+    "select_stretch",
+]
+
+__getattr__, __dir__ = lazy_attributes(
+    __name__,
+    {
+        "base": ("Scenario",),
+        "emitter_prior": (
+            "EmitterPrior",
+            "QuadratureEmitterPrior",
+        ),
+        "model_simulation": ("ModelSimulation",),
+        "oracle_noise": ("RecordingRegime",),
+        "passive_location": ("PassiveLocationScenario",),
+        "recorded.aided_flight": (
+            "BaroMagSensors",
+            "RecordedAidedFlight",
+        ),
+        "recorded.drive": (
+            "FixReceiver",
+            "RecordedDrive",
+            "RecordedFlights",
+            "find_dataset",
+        ),
+        "recorded.fix_holdout": ("FixHoldout",),
+        "recorded.log_reader": (
+            "LogFiles",
+            "read_log",
+        ),
+        "recorded.raw_gnss_walk": (
+            "RawGnssReceiver",
+            "RecordedWalk",
+        ),
+        "recorded.trajectory_file": ("RecordedTrajectory",),
+        "recorded.urban_drive": (
+            "read_drive",
+            "PseudorangeReceiver",
+            "UrbanDrive",
+            "select_stretch",
+        ),
+        "recorded.urban_error_fit": (
+            "range_residuals",
+            "estimate_normal",
+            "estimate_mixture",
+        ),
+        "simulated_flight": ("SimulatedFlight",),
+    },
+)

@@ -1,17 +1,43 @@
-"""What a scenario is: a law of worlds, from which runs are drawn."""
+"""Interface of scenarios: generators of episodes."""
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 from torch import Tensor
 
-from pfbench.noise.regimes import Regime
-from pfbench.record import Episode
+from pfbench.core.record import Episode
+from pfbench.noise.base import NoiseRegime
 
 
 class Scenario(Protocol):
-    """Draws worlds. It never knows which filters will run."""
+    """Generator of episodes, independent of the filters."""
 
-    def draw(self, noise: Regime, runs: Tensor, seed: int) -> Episode:
-        """The worlds of these run numbers (int64 [R]); a run's world depends on its number and the seed alone."""
+    def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
+        """Draw the episode of some runs.
+
+        Args:
+            noise: Noise regime.
+            runs: Run numbers, int64, [R].
+            seed: Seed. With the run number it fixes all random numbers of a run.
+
+        Returns:
+            Episode with R runs.
+        """
+
+
+def check_divergence_threshold(threshold: float | None) -> None:
+    """Check the position error beyond which a run counts as diverged.
+
+    Args:
+        threshold: Position error, m. None if the scenario does not define divergence.
+
+    Raises:
+        ValueError: if the threshold is not finite and positive.
+    """
+    if threshold is not None and not (math.isfinite(threshold) and threshold > 0.0):
+        raise ValueError(
+            f"scenario.divergence_threshold_m must be finite and positive, got {threshold}. "
+            "Use null for a scenario without this limit."
+        )

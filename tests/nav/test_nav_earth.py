@@ -14,7 +14,8 @@ from pfbench.nav import attitude, earth
 B = earth.A * (1 - earth.F_E)
 LAT = torch.linspace(-1.5, 1.5, 13, dtype=torch.float64)
 PLACES = torch.tensor(
-    [[0.0, 0.0, 0.0], [0.6, 1.9, 400.0], [-1.2, -3.0, 9000.0], [1.5, 2.0, -50.0], [0.9, -0.1, 3e5]], dtype=torch.float64
+    [[0.0, 0.0, 0.0], [0.6, 1.9, 400.0], [-1.2, -3.0, 9000.0], [1.5, 2.0, -50.0], [0.9, -0.1, 3e5]],
+    dtype=torch.float64,
 )
 
 
@@ -36,9 +37,13 @@ def test_radii_agree_with_pymap3d():
 
 
 def test_gravity_at_equator_and_pole():
-    g = earth.gravity(torch.tensor([0.0, torch.pi / 2], dtype=torch.float64), torch.zeros(2, dtype=torch.float64))
+    g = earth.gravity(
+        torch.tensor([0.0, torch.pi / 2], dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    )
     assert g[0] == pytest.approx(9.7803253359, abs=1e-12)
-    assert g[1] == pytest.approx(9.8321849379, abs=1e-9)  # the defining value, independent of Somigliana's constant
+    assert g[1] == pytest.approx(
+        9.8321849379, abs=1e-9
+    )  # the defining value, independent of Somigliana's constant
 
 
 @pytest.mark.parametrize("h", [0.0, 1000.0, 12000.0])
@@ -46,7 +51,9 @@ def test_gravity_agrees_with_ahrs(h):
     wgs = ahrs.utils.WGS()
     theirs = [wgs.normal_gravity(float(lat), h) for lat in np.degrees(LAT.numpy())]
     # they use another value of the Earth's rate in m = w^2 a^2 b / GM, beyond the eighth digit
-    np.testing.assert_allclose(earth.gravity(LAT, torch.full_like(LAT, h)).numpy(), theirs, rtol=1e-8)
+    np.testing.assert_allclose(
+        earth.gravity(LAT, torch.full_like(LAT, h)).numpy(), theirs, rtol=1e-8
+    )
 
 
 def test_metre_scale_agrees_with_geodesics():
@@ -60,14 +67,18 @@ def test_metre_scale_agrees_with_geodesics():
 
 def test_ecef_agrees_with_pymap3d_and_pyproj():
     ours = earth.ecef(PLACES).numpy()
-    np.testing.assert_allclose(ours, np.stack(pymap3d.geodetic2ecef(*degrees(PLACES)), -1), atol=2e-9, rtol=0)
+    np.testing.assert_allclose(
+        ours, np.stack(pymap3d.geodetic2ecef(*degrees(PLACES)), -1), atol=2e-9, rtol=0
+    )
     lat, lon, h = degrees(PLACES)
     proj = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978")
     np.testing.assert_allclose(ours, np.stack(proj.transform(lat, lon, h), -1), atol=2e-9, rtol=0)
 
 
 def test_geodetic_inverts_ecef():
-    more = torch.tensor([[torch.pi / 2, 0.0, 100.0], [-1e-9, 0.5, 1e6], [0.7, 1.0, -1e4]], dtype=torch.float64)
+    more = torch.tensor(
+        [[torch.pi / 2, 0.0, 100.0], [-1e-9, 0.5, 1e6], [0.7, 1.0, -1e4]], dtype=torch.float64
+    )
     pos = torch.cat([PLACES, more])
     metres = (earth.geodetic(earth.ecef(pos)) - pos) * torch.tensor([earth.A, earth.A, 1.0])
     metres[5, 1] = 0.0  # longitude has no meaning at a pole
@@ -75,7 +86,9 @@ def test_geodetic_inverts_ecef():
 
 
 def test_local_enu_agrees_with_pymap3d_and_inverts():
-    track = PLACES[1] + torch.tensor([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [-2e-3, 3e-3, 500.0], [0.05, 0.1, 9000.0]])
+    track = PLACES[1] + torch.tensor(
+        [[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [-2e-3, 3e-3, 500.0], [0.05, 0.1, 9000.0]]
+    )
     ours = earth.local_enu(track, PLACES[1])
     theirs = np.stack(pymap3d.geodetic2enu(*degrees(track), *degrees(PLACES[1])), -1)
     np.testing.assert_allclose(ours.numpy(), theirs, atol=1e-8)
@@ -85,7 +98,9 @@ def test_local_enu_agrees_with_pymap3d_and_inverts():
 
 def test_earth_rate_is_the_polar_axis_seen_from_the_level_frame():
     axis = torch.tensor([0.0, 0.0, earth.OMEGA], dtype=torch.float64)
-    torch.testing.assert_close(earth.earth_rate(PLACES[:, 0]), earth.local_axes(PLACES) @ axis, atol=1e-19, rtol=1e-14)
+    torch.testing.assert_close(
+        earth.earth_rate(PLACES[:, 0]), earth.local_axes(PLACES) @ axis, atol=1e-19, rtol=1e-14
+    )
 
 
 def test_transport_rate_is_how_the_level_axes_turn():

@@ -7,38 +7,49 @@ import torch
 from nav_reference import ARCMIN, SHORT, T003, errors, vector
 from torch import Tensor
 
+from pfbench.core.record import map_inputs
 from pfbench.nav import earth, error_dynamics
-from pfbench.nav.error_dynamics import Nominal
-from pfbench.nav.sensors import DEG_H, UG
-from pfbench.nav.strapdown import Intervals, align, navigate
-from pfbench.nav.trajectory import Flight, fly
-from pfbench.record import map_inputs
+from pfbench.nav.error_dynamics import NominalState
+from pfbench.nav.imu_errors import DEG_H, UG
+from pfbench.nav.manoeuvres import generate_manoeuvres
+from pfbench.nav.strapdown import InsIntervals, align, navigate
+from pfbench.nav.trajectory import TrajectoryData
 
 NONE = vector(0, 0, 0)
-LARGE = torch.cat([vector(*(math.radians(a) for a in (0.1, 0.1, 20))), vector(1, 1, 1), vector(10, 10, 10)], -1)
+LARGE = torch.cat(
+    [vector(*(math.radians(a) for a in (0.1, 0.1, 20))), vector(1, 1, 1), vector(10, 10, 10)], -1
+)
 
 
-def differenced(flight: Flight, dt: float, x: Tensor, gyro: Tensor, acc: Tensor, each: int) -> tuple[Tensor, Intervals]:
+def differenced(
+    flight: TrajectoryData, dt: float, x: Tensor, gyro: Tensor, acc: Tensor, each: int
+) -> tuple[Tensor, InsIntervals]:
     """True error at the end [1, 9] of a mechanisation that starts with error x and has constant sensor errors."""
     ins = align(flight.dcm[0], flight.vel[0], flight.pos[0], *x.split(3, -1))
-    end, intervals = navigate(ins, flight.dtheta[None] + gyro * dt, flight.dv[None] + acc * dt, dt, each)
+    end, intervals = navigate(
+        ins, flight.dtheta[None] + gyro * dt, flight.dv[None] + acc * dt, dt, each
+    )
     return errors(end, flight), intervals
 
 
-def integrated(x: Tensor, intervals: Intervals, gyro: Tensor, acc: Tensor) -> Tensor:
+def integrated(x: Tensor, intervals: InsIntervals, gyro: Tensor, acc: Tensor) -> Tensor:
     for t in range(intervals.f.shape[1]):
-        x = error_dynamics.propagate(x, map_inputs(lambda a, t=t: a[:, t], intervals), gyro, acc)
+        x = error_dynamics.propagate_error(
+            x, map_inputs(lambda a, t=t: a[:, t], intervals), gyro, acc
+        )
     return x
 
 
-def transported(x: Tensor, u: Intervals, gyro: Tensor, acc: Tensor) -> Tensor:
+def transported(x: Tensor, u: InsIntervals, gyro: Tensor, acc: Tensor) -> Tensor:
     """The linear model with constant sensor errors, each interval by the matrix exponential."""
     dcm = (u.dcm + u.dcm_end) / 2
     driven = torch.zeros(*u.duration.shape, 10, 10, dtype=torch.float64)
     driven[..., :9, :9] = error_dynamics.small_angle_matrix(u.pos, u.vel, u.f)
     driven[..., :3, 9] = -(dcm @ gyro[..., None]).squeeze(-1)
     driven[..., 3:6, 9] = (dcm @ acc[..., None]).squeeze(-1)
-    steps = error_dynamics.in_metres(torch.matrix_exp(driven * u.duration[..., None, None]), u.pos_start, u.pos_end)
+    steps = error_dynamics.convert_transition_to_metres(
+        torch.matrix_exp(driven * u.duration[..., None, None]), u.pos_start, u.pos_end
+    )
     x = torch.cat([x, torch.ones(1, 1, dtype=torch.float64)], -1)
     for step in steps.unbind(1):
         x = (step @ x[..., None]).squeeze(-1)
@@ -47,7 +58,7 @@ def transported(x: Tensor, u: Intervals, gyro: Tensor, acc: Tensor) -> Tensor:
 
 @pytest.mark.slow
 def test_exact_equations_over_the_reference_flight():
-    flight = fly(*T003, rate=100)
+    flight = generate_manoeuvres(*T003, rate=100)
     true, intervals = differenced(flight, 0.01, LARGE, NONE, NONE, each=100)
     apart = (integrated(LARGE, intervals, NONE, NONE) - true).abs()
     assert true[0, 6:8].norm() > 1000  # nothing small about these errors
@@ -61,9 +72,11 @@ BIASED = (vector(100, -50, 80) * DEG_H, vector(3000, -2000, 1000) * UG)
 
 @pytest.mark.parametrize(("gyro", "acc"), [(NONE, NONE), BIASED], ids=["ideal", "biased"])
 def test_exact_equations_with_large_errors(gyro, acc):
-    flight = fly(*SHORT, rate=40)
+    flight = generate_manoeuvres(*SHORT, rate=40)
     true, intervals = differenced(flight, 1 / 40, LARGE, gyro, acc, each=10)
-    own, _ = differenced(flight, 1 / 40, 0 * LARGE, NONE, NONE, each=10)  # the mechanisation's, 0.07 m at this rate
+    own, _ = differenced(
+        flight, 1 / 40, 0 * LARGE, NONE, NONE, each=10
+    )  # the mechanisation's, 0.07 m at this rate
     apart = (integrated(LARGE, intervals, gyro, acc) - (true - own)).abs()
     # what freezing the attitude of mid-interval does to a bias: 0.03 m/s^2 (turn of a quarter second)^2 / 24, in turns
     assert apart[0, :3].max() < 0.0005 * ARCMIN
@@ -72,12 +85,12 @@ def test_exact_equations_with_large_errors(gyro, acc):
 
 
 def test_exact_equations_broadcast_over_particles():
-    flight = fly(*SHORT, rate=20)
+    flight = generate_manoeuvres(*SHORT, rate=20)
     _, intervals = differenced(flight, 0.05, LARGE, NONE, NONE, each=20)
     scales = torch.tensor([0.0, 0.5, 1.0]).double()
     swarm = scales[:, None] * LARGE[:, None]
-    together = error_dynamics.propagate(swarm, map_inputs(lambda a: a[:, 3, None], intervals))
-    alone = error_dynamics.propagate(0.5 * LARGE, map_inputs(lambda a: a[:, 3], intervals))
+    together = error_dynamics.propagate_error(swarm, map_inputs(lambda a: a[:, 3, None], intervals))
+    alone = error_dynamics.propagate_error(0.5 * LARGE, map_inputs(lambda a: a[:, 3], intervals))
     assert together.shape == (1, 3, 9)
     torch.testing.assert_close(together[:, 1], alone, rtol=1e-13, atol=1e-15)
     assert (together[:, 0].abs() < 1e-15).all()  # no error, no sensor error: none arises
@@ -86,8 +99,10 @@ def test_exact_equations_broadcast_over_particles():
 def test_linear_blocks_are_derivatives_of_the_exact_equations():
     # at 3 km/s the smallest terms kept (Coriolis with latitude, 7e-8 per metre) stand out from those left out
     pos, vel, f = vector(0.7, 0.3, 5000.0), vector(2000, -2500, 300), vector(3, -2, 9)
-    nominal = Nominal(torch.eye(3).double()[None], vel, pos, f)
-    exact = torch.autograd.functional.jacobian(lambda x: error_dynamics.rate(x, nominal)[0], torch.zeros(1, 9).double())
+    nominal = NominalState(torch.eye(3).double()[None], vel, pos, f)
+    exact = torch.autograd.functional.jacobian(
+        lambda x: error_dynamics.error_rate(x, nominal)[0], torch.zeros(1, 9).double()
+    )
     exact, linear = exact[:, 0], error_dynamics.small_angle_matrix(pos, vel, f)[0]
     first = slice(0, 6)
     torch.testing.assert_close(linear[first, first], exact[first, first], rtol=1e-12, atol=1e-18)
@@ -104,16 +119,23 @@ def test_linear_blocks_are_derivatives_of_the_exact_equations():
 
 def test_coupling_matrix_is_the_rest_of_the_small_angle_matrix():
     pos, vel, f = vector(0.7, 0.3, 5000.0), vector(200, -250, 30), vector(3, -2, 9)
-    rest, whole = error_dynamics.coupling_matrix(pos, vel), error_dynamics.small_angle_matrix(pos, vel, f)
+    rest, whole = (
+        error_dynamics.coupling_matrix(pos, vel),
+        error_dynamics.small_angle_matrix(pos, vel, f),
+    )
     assert (rest[..., :3] == 0).all()
     assert torch.equal(rest[..., 3:], whole[..., 3:])
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 0.2])
 def test_linear_model_with_constant_sensor_errors(tilt_deg):
-    gyro, acc, tilt = vector(0.5, -1.0, 0.8) * DEG_H, vector(100, -50, 80) * UG, math.radians(tilt_deg)
+    gyro, acc, tilt = (
+        vector(0.5, -1.0, 0.8) * DEG_H,
+        vector(100, -50, 80) * UG,
+        math.radians(tilt_deg),
+    )
     x = torch.cat([vector(tilt, -tilt, tilt), vector(0.2, 0.2, -0.1), vector(10, -5, 5)], -1)
-    flight, seconds, dt = fly(*SHORT, rate=40), 80, 1 / 40
+    flight, seconds, dt = generate_manoeuvres(*SHORT, rate=40), 80, 1 / 40
     true, intervals = differenced(flight, dt, x, gyro, acc, each=40)
     ideal, _ = differenced(flight, dt, x * 0, NONE, NONE, each=40)
     apart = (transported(x, intervals, gyro, acc) - (true - ideal)).abs()
@@ -131,10 +153,16 @@ def test_linear_model_with_constant_sensor_errors(tilt_deg):
 def test_in_metres_scales_each_side_at_its_own_end():
     start, end = vector(0.5, 0, 0), vector(0.9, 0, 1e5)
     unit = torch.eye(12).double()[None]
-    made = error_dynamics.in_metres(unit, start, end)
+    made = error_dynamics.convert_transition_to_metres(unit, start, end)
     ratio = earth.metre_scale(end) / earth.metre_scale(start)
     expected = torch.cat([torch.ones(1, 6).double(), ratio, vector(1, 1, 1)], -1)
     torch.testing.assert_close(made, torch.diag_embed(expected))
     full = torch.ones(1, 9, 9).double()
-    assert error_dynamics.in_metres(full, start, end)[0, 6, 0] == earth.metre_scale(end)[0, 0]
-    assert error_dynamics.in_metres(full, start, end)[0, 0, 7] == 1 / earth.metre_scale(start)[0, 1]
+    assert (
+        error_dynamics.convert_transition_to_metres(full, start, end)[0, 6, 0]
+        == earth.metre_scale(end)[0, 0]
+    )
+    assert (
+        error_dynamics.convert_transition_to_metres(full, start, end)[0, 0, 7]
+        == 1 / earth.metre_scale(start)[0, 1]
+    )

@@ -15,17 +15,17 @@ from recorded_data import DATA, recorded
 from torch import Tensor
 
 from pfbench.nav import earth
-from pfbench.nav.broadcast import Broadcast
-from pfbench.nav.ephemeris import GM_GPS, WEEK, read_rinex
-from pfbench.nav.orbits import (
+from pfbench.nav.gnss.broadcast_orbits import BroadcastConstellation
+from pfbench.nav.gnss.ephemeris import GM_GPS, WEEK, read_rinex
+from pfbench.nav.gnss.orbits import (
     GPS_OMEGA,
     LIGHT,
     Constellation,
-    Walker,
+    WalkerConstellation,
     azimuth_elevation,
     eccentric_anomaly,
+    receive_signals,
     sagnac,
-    transmit,
 )
 
 TIMES = torch.arange(0.0, 7200.0, 240.0, dtype=torch.float64) + 13.0
@@ -50,9 +50,11 @@ def exact(x: object) -> Tensor:
     return torch.tensor(x, dtype=torch.float64)
 
 
-def written(folder: Path, table: pd.DataFrame = EPHEMERIDES, begin: str | float = "2016-06-06T12:00:00") -> Broadcast:
+def written(
+    folder: Path, table: pd.DataFrame = EPHEMERIDES, begin: str | float = "2016-06-06T12:00:00"
+) -> BroadcastConstellation:
     table.to_parquet(folder / "eph.parquet")
-    return Broadcast(str(folder), "eph.parquet", begin)
+    return BroadcastConstellation(str(folder), "eph.parquet", begin)
 
 
 def inertial(constellation: Constellation, time: Tensor, rate: float) -> tuple[Tensor, Tensor]:
@@ -73,14 +75,16 @@ def quotient(constellation: Constellation, time: Tensor, h: float = 0.5) -> Tens
 
 
 def test_a_nominal_constellation_obeys_kepler() -> None:
-    w = Walker()
+    w = WalkerConstellation()
     place, velocity = inertial(w, TIMES, earth.OMEGA)
     a = w.semi_major_axis
     assert torch.allclose(place.norm(dim=-1), exact(a), rtol=1e-14, atol=0)
     energy = 0.5 * velocity.square().sum(-1) - earth.GM / place.norm(dim=-1)
     assert torch.allclose(energy, exact(-earth.GM / (2 * a)), rtol=1e-12, atol=0)
     spin = torch.linalg.cross(place, velocity)
-    assert torch.allclose(spin, spin[:1].expand_as(spin), rtol=0, atol=1e-12 * math.sqrt(earth.GM * a))
+    assert torch.allclose(
+        spin, spin[:1].expand_as(spin), rtol=0, atol=1e-12 * math.sqrt(earth.GM * a)
+    )
     tilt = torch.rad2deg(torch.acos(spin[0, :, 2] / spin[0].norm(dim=-1)))
     assert torch.allclose(tilt, exact(55.0), atol=1e-9)
     period = 2 * math.pi / w.motion
@@ -90,7 +94,7 @@ def test_a_nominal_constellation_obeys_kepler() -> None:
 
 
 def test_a_nominal_constellation_is_spread_as_its_name_says() -> None:
-    w = Walker()
+    w = WalkerConstellation()
     place, velocity = (a[0] for a in inertial(w, torch.zeros(1, dtype=torch.float64), earth.OMEGA))
     spin = torch.linalg.cross(place, velocity)
     node = torch.rad2deg(torch.atan2(spin[:, 0], -spin[:, 1])).reshape(6, 4)
@@ -98,7 +102,9 @@ def test_a_nominal_constellation_is_spread_as_its_name_says() -> None:
     assert ((node + 40.0 - planes + 180.0) % 360.0 - 180.0).abs().max() < 1e-9
     ascending = torch.stack([-spin[:, 1], spin[:, 0], 0 * spin[:, 0]], -1)
     along = (place * ascending).sum(-1) / ascending.norm(dim=-1)
-    across = (place * torch.linalg.cross(spin, ascending)).sum(-1) / (spin.norm(dim=-1) * ascending.norm(dim=-1))
+    across = (place * torch.linalg.cross(spin, ascending)).sum(-1) / (
+        spin.norm(dim=-1) * ascending.norm(dim=-1)
+    )
     ahead = torch.rad2deg(torch.atan2(across, along)).reshape(6, 4)
     wanted = 40.0 + 90.0 * torch.arange(4) + 15.0 * torch.arange(6)[:, None]
     assert ((ahead - wanted + 180.0) % 360.0 - 180.0).abs().max() < 1e-9
@@ -109,12 +115,14 @@ def test_eight_satellites_of_the_nominal_constellation_stay_above_ten_degrees() 
     # from 26.26 N 105.89 E to 23.68 N 108.63 E in 1400 s, evenly
     way = torch.tensor([[26.26, 105.89], [24.97, 107.26], [23.68, 108.63]], dtype=torch.float64)
     receiver = torch.cat([torch.deg2rad(way), torch.full((3, 1), 300.0)], -1)
-    _, elevation = azimuth_elevation(receiver, Walker().at(torch.tensor([0.0, 700.0, 1400.0]))[0])
+    _, elevation = azimuth_elevation(
+        receiver, WalkerConstellation().at(torch.tensor([0.0, 700.0, 1400.0]))[0]
+    )
     assert int((torch.rad2deg(elevation) > 10.0).all(0).sum()) == 8
 
 
 def test_velocities_are_the_derivatives_of_positions(tmp_path: Path) -> None:
-    for constellation in (Walker(), written(tmp_path)):
+    for constellation in (WalkerConstellation(), written(tmp_path)):
         _, velocity = constellation.at(TIMES)
         # h^2 / 6 of the third derivative, 1e-4 m/s^3, and rounding of 4e-9 m
         assert (velocity - quotient(constellation, TIMES)).abs().max() < 1e-4
@@ -143,8 +151,15 @@ def test_an_ephemeris_without_harmonics_is_an_ellipse(tmp_path: Path) -> None:
     energy = 0.5 * velocity.square().sum(-1) - gm / radius
     assert torch.allclose(energy, (-gm / (2 * size**2)).expand_as(energy), rtol=1e-11, atol=0)
     spin = torch.linalg.cross(place, velocity)
-    assert torch.allclose(spin.norm(dim=-1), (torch.sqrt(gm * (1 - e**2)) * size).expand_as(radius), rtol=1e-11, atol=0)
-    towards = torch.linalg.cross(velocity, spin) / gm[:, None] - place / radius[..., None]  # to the perigee, length e
+    assert torch.allclose(
+        spin.norm(dim=-1),
+        (torch.sqrt(gm * (1 - e**2)) * size).expand_as(radius),
+        rtol=1e-11,
+        atol=0,
+    )
+    towards = (
+        torch.linalg.cross(velocity, spin) / gm[:, None] - place / radius[..., None]
+    )  # to the perigee, length e
     assert torch.allclose(towards.norm(dim=-1), e.expand_as(radius), rtol=0, atol=1e-10)
     assert torch.allclose(towards, towards[:1].expand_as(towards), rtol=0, atol=1e-10)
     tilt = torch.acos(spin[..., 2] / spin.norm(dim=-1))
@@ -153,14 +168,28 @@ def test_an_ephemeris_without_harmonics_is_an_ellipse(tmp_path: Path) -> None:
 
 def test_at_its_time_of_ephemeris_an_orbit_is_where_its_angles_say(tmp_path: Path) -> None:
     plain = written(tmp_path, KEPLER.assign(M0=0.0))
-    place = plain.at(torch.zeros(1, dtype=torch.float64))[0][0]  # noon is the time of ephemeris: at perigee
+    place = plain.at(torch.zeros(1, dtype=torch.float64))[0][
+        0
+    ]  # noon is the time of ephemeris: at perigee
     for i, name in enumerate(("E", "G")):
         row = EPHEMERIDES[EPHEMERIDES["sys"] == name].iloc[0]
         node = row.Omega0 - GPS_OMEGA * row.toe
-        turn = [[math.cos(node), -math.sin(node), 0], [math.sin(node), math.cos(node), 0], [0, 0, 1]]
-        tilt = [[1, 0, 0], [0, math.cos(row.i0), -math.sin(row.i0)], [0, math.sin(row.i0), math.cos(row.i0)]]
-        in_plane = row.sqrtA**2 * (1 - row.e) * np.array([math.cos(row.omega), math.sin(row.omega), 0.0])
-        assert np.allclose(place[i].numpy(), np.array(turn) @ np.array(tilt) @ in_plane, rtol=0, atol=1e-6)
+        turn = [
+            [math.cos(node), -math.sin(node), 0],
+            [math.sin(node), math.cos(node), 0],
+            [0, 0, 1],
+        ]
+        tilt = [
+            [1, 0, 0],
+            [0, math.cos(row.i0), -math.sin(row.i0)],
+            [0, math.sin(row.i0), math.cos(row.i0)],
+        ]
+        in_plane = (
+            row.sqrtA**2 * (1 - row.e) * np.array([math.cos(row.omega), math.sin(row.omega), 0.0])
+        )
+        assert np.allclose(
+            place[i].numpy(), np.array(turn) @ np.array(tilt) @ in_plane, rtol=0, atol=1e-6
+        )
 
 
 def test_harmonic_corrections_move_along_across_and_out(tmp_path: Path) -> None:
@@ -174,21 +203,36 @@ def test_harmonic_corrections_move_along_across_and_out(tmp_path: Path) -> None:
     size, along = base[0].norm(dim=-1), torch.linalg.cross(normal, radial)
     for name in HARMONICS:
         value = torch.tensor(EPHEMERIDES.set_index("sys").loc[["E", "G"], name].to_numpy())
-        moved = inertial(written(tmp_path, KEPLER.assign(**{name: EPHEMERIDES[name]})), TIMES, GPS_OMEGA)[0] - base[0]
+        moved = (
+            inertial(
+                written(tmp_path, KEPLER.assign(**{name: EPHEMERIDES[name]})), TIMES, GPS_OMEGA
+            )[0]
+            - base[0]
+        )
         wave = value * (torch.cos(2 * u) if name.endswith("c") else torch.sin(2 * u))
-        direction = {"u": along * size[..., None], "r": radial, "i": normal * (size * torch.sin(u))[..., None]}[name[1]]
+        direction = {
+            "u": along * size[..., None],
+            "r": radial,
+            "i": normal * (size * torch.sin(u))[..., None],
+        }[name[1]]
         # second order in the correction: 2.7e7 m times the square of 1e-5
         assert (moved - wave[..., None] * direction).norm(dim=-1).max() < 5e-3, name
 
 
 def test_the_nearest_ephemeris_is_used_and_none_beyond_its_validity(tmp_path: Path) -> None:
-    later = EPHEMERIDES.assign(toe=EPHEMERIDES["toe"] + 7200.0, toc=EPHEMERIDES["toc"] + 7200.0, af0=1.0)
+    later = EPHEMERIDES.assign(
+        toe=EPHEMERIDES["toe"] + 7200.0, toc=EPHEMERIDES["toc"] + 7200.0, af0=1.0
+    )
     both = written(tmp_path, pd.concat([later, EPHEMERIDES.iloc[[0]]]))
     assert both.names == ("E14", "G07")
     times = torch.tensor([-7201.0, -7199.0, 3599.0, 3601.0, 14399.0, 14401.0], dtype=torch.float64)
     offset, _ = both.clock(times)
-    late = torch.tensor([[False, False], [False, False], [True, False], [True, True], [True, True], [False, False]])
-    known = torch.tensor([[False, False], [False, True], [True, True], [True, True], [True, True], [False, False]])
+    late = torch.tensor(
+        [[False, False], [False, False], [True, False], [True, True], [True, True], [False, False]]
+    )
+    known = torch.tensor(
+        [[False, False], [False, True], [True, True], [True, True], [True, True], [False, False]]
+    )
     assert torch.equal(offset > 0.5, late)
     assert torch.equal(~torch.isnan(offset), known)
     for field in (*both.at(times), both.relativity(times), both.group_delay(times)):
@@ -209,11 +253,18 @@ def test_weeks_roll_over_and_may_be_unknown(tmp_path: Path) -> None:
         other = written(tmp_path, EPHEMERIDES.assign(week=week)).at(TIMES)[0]
         assert torch.allclose(other, plain, rtol=0, atol=1e-6)
     assert written(tmp_path, begin=NOON).epoch == written(tmp_path).epoch == 1900 * WEEK + 129600.0
-    saturday = EPHEMERIDES.assign(toe=WEEK - 3600.0, toc=WEEK - 3600.0)  # the week ends while the ephemeris is in force
+    saturday = EPHEMERIDES.assign(
+        toe=WEEK - 3600.0, toc=WEEK - 3600.0
+    )  # the week ends while the ephemeris is in force
     week_end = written(tmp_path, saturday, 1901 * WEEK - 60.0)
-    step = (week_end.at(torch.tensor([59.5, 60.5]))[0].diff(dim=0)[0] - week_end.at(torch.tensor([60.0]))[1][0]).abs()
+    step = (
+        week_end.at(torch.tensor([59.5, 60.5]))[0].diff(dim=0)[0]
+        - week_end.at(torch.tensor([60.0]))[1][0]
+    ).abs()
     assert step.max() < 1e-3
-    sunday = EPHEMERIDES.assign(toe=0.0, toc=WEEK - 16.0, week=1901)  # the clock's time lies in the week before
+    sunday = EPHEMERIDES.assign(
+        toe=0.0, toc=WEEK - 16.0, week=1901
+    )  # the clock's time lies in the week before
     offset, _ = written(tmp_path, sunday, 1901 * WEEK).clock(torch.zeros(1, dtype=torch.float64))
     assert torch.allclose(offset[0, 1], exact(2.3e-5 + 1.3e-12 * 16.0), rtol=0, atol=1e-15)
 
@@ -224,10 +275,14 @@ def test_clocks_follow_their_polynomial_and_relativity(tmp_path: Path) -> None:
     t = TIMES + 16.0  # the GPS clock refers to 16 s before
     assert torch.allclose(offset[:, 1], 2.3e-5 + 1.3e-12 * t + 1e-18 * t**2, rtol=0, atol=1e-16)
     assert torch.allclose(drift[:, 1], 1.3e-12 + 2e-18 * t, rtol=1e-9)
-    assert torch.equal(b.group_delay(TIMES)[0], torch.tensor([-3.0e-9, 5.1e-9], dtype=torch.float64))
+    assert torch.equal(
+        b.group_delay(TIMES)[0], torch.tensor([-3.0e-9, 5.1e-9], dtype=torch.float64)
+    )
     plain = written(tmp_path, KEPLER)
     place, velocity = plain.at(TIMES)
-    term = -2 * (place * velocity).sum(-1) / LIGHT**2  # the same term by another way [IS-GPS-200, 20.3.3.3.3.1]
+    term = (
+        -2 * (place * velocity).sum(-1) / LIGHT**2
+    )  # the same term by another way [IS-GPS-200, 20.3.3.3.3.1]
     assert (plain.relativity(TIMES) - term).abs().max() < 1e-15
     assert term.abs().max() > 1e-7
 
@@ -241,7 +296,9 @@ def test_the_earth_turns_thirty_metres_while_a_signal_flies() -> None:
     flight = (at_horizon - receiver).norm() / LIGHT
     turned = sagnac(at_horizon, flight)
     assert turned.norm() == pytest.approx(26.56e6, abs=1e-6)
-    assert turned[0] == pytest.approx(26.56e6 * math.sin(GPS_OMEGA * flight), rel=1e-12)  # to the East of reception's axes
+    assert turned[0] == pytest.approx(
+        26.56e6 * math.sin(GPS_OMEGA * flight), rel=1e-12
+    )  # to the East of reception's axes
     # the well-known closed form: omega (x_r y_s - y_r x_s) / c is what the range grows by, up to 30 m at the equator
     change = (turned - receiver).norm() - (at_horizon - receiver).norm()
     assert -change == pytest.approx(GPS_OMEGA * earth.A * 26.56e6 / LIGHT, rel=0.01)
@@ -251,20 +308,26 @@ def test_the_earth_turns_thirty_metres_while_a_signal_flies() -> None:
 
 
 def test_azimuth_and_elevation_agree_with_pymap3d() -> None:
-    places = torch.tensor([[0.45, 1.85, 400.0], [-1.1, -2.9, 9000.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
-    satellites = Walker().at(torch.zeros(3, dtype=torch.float64))[0]
+    places = torch.tensor(
+        [[0.45, 1.85, 400.0], [-1.1, -2.9, 9000.0], [0.0, 0.0, 0.0]], dtype=torch.float64
+    )
+    satellites = WalkerConstellation().at(torch.zeros(3, dtype=torch.float64))[0]
     azimuth, elevation = azimuth_elevation(places, satellites)
     for i, (lat, lon, h) in enumerate(places.tolist()):
-        az, el, _ = pymap3d.ecef2aer(*satellites[i].T.numpy(), math.degrees(lat), math.degrees(lon), h)
+        az, el, _ = pymap3d.ecef2aer(
+            *satellites[i].T.numpy(), math.degrees(lat), math.degrees(lon), h
+        )
         assert np.allclose(np.degrees(azimuth[i].numpy()), az, rtol=0, atol=1e-8)
         assert np.allclose(np.degrees(elevation[i].numpy()), el, rtol=0, atol=1e-8)
 
 
 def test_light_time_is_solved_in_the_frame_that_does_not_turn() -> None:
     """|satellite at transmission - receiver at reception|, both in inertial axes, is c times the time between them."""
-    w, time = Walker(), torch.tensor([100.0, 900.0], dtype=torch.float64)
-    receivers = earth.ecef(torch.tensor([[0.45, 1.85, 400.0], [0.46, 1.86, 500.0]], dtype=torch.float64))
-    signal = transmit(w, time, receivers)
+    w, time = WalkerConstellation(), torch.tensor([100.0, 900.0], dtype=torch.float64)
+    receivers = earth.ecef(
+        torch.tensor([[0.45, 1.85, 400.0], [0.46, 1.86, 500.0]], dtype=torch.float64)
+    )
+    signal = receive_signals(w, time, receivers)
     assert signal.pos.shape == signal.vel.shape == (2, 24, 3)
     for t in range(2):
         angle = earth.OMEGA * time[t]
@@ -274,18 +337,20 @@ def test_light_time_is_solved_in_the_frame_that_does_not_turn() -> None:
         there = torch.stack([inertial(w, sent[i : i + 1], earth.OMEGA)[0][0, i] for i in range(24)])
         # 0.01 mm for the last digits of the Earth's rate, and rounding
         assert ((there - here).norm(dim=-1) - signal.range[t]).abs().max() < 2e-5
-    batch = transmit(w, time, receivers.expand(3, 2, 3))
+    batch = receive_signals(w, time, receivers.expand(3, 2, 3))
     assert torch.equal(batch.range[1], signal.range)
 
 
 def test_the_range_changes_as_position_and_velocity_say() -> None:
     h, receiver = 0.5, earth.ecef(torch.tensor([0.45, 1.85, 400.0], dtype=torch.float64))
     times = torch.tensor([100.0 - h, 100.0, 100.0 + h], dtype=torch.float64)
-    signal = transmit(Walker(), times, receiver.expand(3, 3))
+    signal = receive_signals(WalkerConstellation(), times, receiver.expand(3, 3))
     sight = (signal.pos[1] - receiver) / signal.range[1, :, None]
     rate = (sight * signal.vel[1]).sum(-1)
     true = (signal.range[2] - signal.range[0]) / (2 * h)
-    inertial_velocity = signal.vel[1] + torch.linalg.cross(exact([0.0, 0.0, earth.OMEGA]).expand(24, 3), signal.pos[1])
+    inertial_velocity = signal.vel[1] + torch.linalg.cross(
+        exact([0.0, 0.0, earth.OMEGA]).expand(24, 3), signal.pos[1]
+    )
     slower = 1 + (sight * inertial_velocity).sum(-1) / LIGHT
     assert (true - rate / slower).abs().max() < 1e-4
     assert (true - rate).abs().max() < 3e-3  # what the docstring calls a millionth
@@ -295,27 +360,50 @@ def test_the_range_changes_as_position_and_velocity_say() -> None:
 
 
 def test_faulty_settings_and_files_say_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"validity=0"):
-        Broadcast("x", "y", 0.0, validity=0)
-    with pytest.raises(ValueError, match=r"begin=noon: give seconds of GPS time"):
-        Broadcast("x", "y", "noon")
-    with pytest.raises(ValueError, match=r"begin=.*without a zone"):
-        Broadcast("x", "y", "2016-06-06T12:00:00+01:00")
-    with pytest.raises(ValueError, match=r"satellites=25, planes=6"):
-        Walker(satellites=25)
-    with pytest.raises(ValueError, match=r"semi_major_axis=26559\.7: give metres"):
-        Walker(semi_major_axis=26559.7)
-    with pytest.raises(ValueError, match=r"data\.root is not set.*PFBENCH_DATA.*holds a/b\.16n"):
-        _ = Broadcast(None, "a/b.16n", 0.0).names
-    with pytest.raises(ValueError, match=r"no file .*b\.16n; set the environment variable"):
-        _ = Broadcast(str(tmp_path), "b.16n", 0.0).names
-    with pytest.raises(ValueError, match=r"begin=2020-01-01.*give a begin near them"):
+    with pytest.raises(ValueError, match=r"validity must be positive, got 0"):
+        BroadcastConstellation("x", "y", 0.0, validity=0)
+    with pytest.raises(ValueError, match=r"begin must be seconds of GPS time .*, got noon"):
+        BroadcastConstellation("x", "y", "noon")
+    with pytest.raises(ValueError, match=r"begin must .*without a zone"):
+        BroadcastConstellation("x", "y", "2016-06-06T12:00:00+01:00")
+    with pytest.raises(
+        ValueError, match=r"satellites must be a positive multiple of planes=6, got 25"
+    ):
+        WalkerConstellation(satellites=25)
+    with pytest.raises(ValueError, match=r"semi_major_axis must .*, got 26559\.7. Give metres"):
+        WalkerConstellation(semi_major_axis=26559.7)
+    with pytest.raises(
+        ValueError, match=r"data\.root is not set.*PFBENCH_DATA.*folder of a/b\.16n"
+    ):
+        _ = BroadcastConstellation(None, "a/b.16n", 0.0).names
+    with pytest.raises(ValueError, match=r"without .*b\.16n. Set the environment variable"):
+        _ = BroadcastConstellation(str(tmp_path), "b.16n", 0.0).names
+    with pytest.raises(
+        ValueError, match=r"begin must be within .*got 2020-01-01.*Give a time near them"
+    ):
         _ = written(tmp_path, begin="2020-01-01").names
-    with pytest.raises(ValueError, match=r"have no sqrtA, cic"):
+    with pytest.raises(ValueError, match=r"must include sqrtA, cic"):
         _ = written(tmp_path, EPHEMERIDES.drop(columns=["sqrtA", "cic"])).names
 
 
-FIRST = ("af0", "af1", "af2", "iode", "crs", "deltan", "M0", "cuc", "e", "cus", "sqrtA", "toe", "cic", "Omega0", "cis", "i0")
+FIRST = (
+    "af0",
+    "af1",
+    "af2",
+    "iode",
+    "crs",
+    "deltan",
+    "M0",
+    "cuc",
+    "e",
+    "cus",
+    "sqrtA",
+    "toe",
+    "cic",
+    "Omega0",
+    "cis",
+    "i0",
+)
 ORDER = (*FIRST, "crc", "omega", "Omegadot", "idot", "codes", "week", "l2p", "ura", "health")
 
 
@@ -324,14 +412,26 @@ def rinex(version: int) -> str:
     indent = version + 1
     kind = "N: GNSS NAV DATA    M: MIXED" if version == 3 else "N: GPS NAV DATA"
     lines = [f"{version:6d}.00           {kind:<40}RINEX VERSION / TYPE", f"{'':60}END OF HEADER"]
-    for row in EPHEMERIDES.assign(iode=1.0, codes=5.0, l2p=0.0, ura=2.0, health=0.0).to_dict("records"):
+    for row in EPHEMERIDES.assign(iode=1.0, codes=5.0, l2p=0.0, ura=2.0, health=0.0).to_dict(
+        "records"
+    ):
         if version == 2 and row["sys"] == "E":
             continue
         last = [row["tgd"], 3.0] if row["sys"] == "G" else [9e-9, row["tgd"]]
         for codes in (5.0, 258.0) if row["sys"] == "E" else (1.0,):
             row = {**row, "codes": codes, "af0": row["af0"] + (codes == 258.0)}
-            head = f"{row['sys']}{row['prn']:02d} 2016 06 06" if version == 3 else f"{row['prn']:2d} 16  6  6"
-            date = "11 59 44" if row["sys"] == "G" and version == 3 else "12 00 00" if version == 3 else "11 59 44.0"
+            head = (
+                f"{row['sys']}{row['prn']:02d} 2016 06 06"
+                if version == 3
+                else f"{row['prn']:2d} 16  6  6"
+            )
+            date = (
+                "11 59 44"
+                if row["sys"] == "G" and version == 3
+                else "12 00 00"
+                if version == 3
+                else "11 59 44.0"
+            )
             numbers = [*(row[name] for name in ORDER), *last, row["ttx"], 4.0]
             text = [f"{value:19.12E}".replace("E", "D") for value in numbers]
             lines.append(f"{head} {date}" + "".join(text[:3]))
@@ -342,11 +442,13 @@ def rinex(version: int) -> str:
 @pytest.mark.parametrize("version", [2, 3])
 def test_rinex_files_are_read(tmp_path: Path, version: int) -> None:
     (tmp_path / "nav.rnx").write_text(rinex(version))
-    read = Broadcast(str(tmp_path), "nav.rnx", NOON)
+    read = BroadcastConstellation(str(tmp_path), "nav.rnx", NOON)
     plain = written(tmp_path)
     some = slice(0, 2) if version == 3 else slice(1, 2)
     assert read.names == plain.names[some]
-    for ours, theirs in zip((*read.at(TIMES), *read.clock(TIMES)), (*plain.at(TIMES), *plain.clock(TIMES)), strict=True):
+    for ours, theirs in zip(
+        (*read.at(TIMES), *read.clock(TIMES)), (*plain.at(TIMES), *plain.clock(TIMES)), strict=True
+    ):
         assert torch.allclose(ours, theirs[:, some], rtol=1e-11, atol=1e-3)
     assert torch.allclose(read.group_delay(TIMES), plain.group_delay(TIMES)[:, some], rtol=1e-11)
 
@@ -354,11 +456,14 @@ def test_rinex_files_are_read(tmp_path: Path, version: int) -> None:
 def test_rinex_files_that_are_none_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "nav.rnx"
     for text, message in (
-        ("", "no RINEX 2 or 3"),
-        (rinex(2).replace("N: GPS", "O: GPS"), "no RINEX 2 or 3"),
-        (rinex(2).replace("9.600000000000D-01", "9.6x000000000D-01"), r"line 3, .*could not convert"),
-        ("\n".join(rinex(3).splitlines()[:8]), r"line 3, .*cut short"),
-        ("\n".join(rinex(2).splitlines()[:2]), "no ephemeris of GPS or Galileo"),
+        ("", "must be a RINEX 2 or 3"),
+        (rinex(2).replace("N: GPS", "O: GPS"), "must be a RINEX 2 or 3"),
+        (
+            rinex(2).replace("9.600000000000D-01", "9.6x000000000D-01"),
+            r"line 3, .*could not convert",
+        ),
+        ("\n".join(rinex(3).splitlines()[:8]), r"line 3, .*not a complete record"),
+        ("\n".join(rinex(2).splitlines()[:2]), "must contain ephemerides of GPS or Galileo"),
     ):
         file.write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -368,8 +473,8 @@ def test_rinex_files_that_are_none_are_refused(tmp_path: Path) -> None:
 # recorded ephemerides
 
 
-def day(name: str) -> Broadcast:
-    return Broadcast(DATA, f"gnss_orbits/{name}", "2016-06-06T00:00:00")
+def day(name: str) -> BroadcastConstellation:
+    return BroadcastConstellation(DATA, f"gnss_orbits/{name}", "2016-06-06T00:00:00")
 
 
 @recorded
@@ -381,7 +486,9 @@ def test_the_two_files_of_one_day_are_one() -> None:
     assert torch.allclose(text.at(times)[0], table.at(times)[0], rtol=0, atol=1e-6)
     radius = text.at(times)[0].norm(dim=-1)
     assert 25.9e6 < float(radius.min()) < float(radius.max()) < 27.3e6  # NaN would fail
-    assert [note[:45] for note in text.notes] == ["gnss_orbits/brdc1580.16n: an ephemeris of G14"]  # 42 159 km, for two hours
+    assert [note[:45] for note in text.notes] == [
+        "gnss_orbits/brdc1580.16n: an ephemeris of G14"
+    ]  # 42 159 km, for two hours
 
 
 @recorded
@@ -389,7 +496,9 @@ def test_orbits_join_where_ephemerides_change() -> None:
     b = day("brdc1580.16n")
     table = read_rinex(Path(DATA or "") / "gnss_orbits" / "brdc1580.16n")
     toes = [np.unique(part) for name, part in table.groupby("prn")["toe"]]
-    changes = exact(np.unique(np.concatenate([(part[1:] + part[:-1]) / 2 for part in toes])) - 86400.0)
+    changes = exact(
+        np.unique(np.concatenate([(part[1:] + part[:-1]) / 2 for part in toes])) - 86400.0
+    )
     before, after = (b.at(changes + h)[0] for h in (-0.5, 0.5))
     jump = (after - before - b.at(changes + 0.5)[1] + 0.0).norm(dim=-1)
     real = jump > 0.5
@@ -402,9 +511,11 @@ def test_satellites_and_clocks_agree_with_an_independent_program() -> None:
     """The walk's satellites as its own decoder computed them, turned by pr / c into the axes of reception."""
     table = pd.read_parquet(Path(DATA or "") / "walk_tc_mems" / "pseudorange.parquet")
     begin = 2381 * WEEK + 408641.0
-    b = Broadcast(DATA, "walk_tc_mems/ephemeris.parquet", begin)
+    b = BroadcastConstellation(DATA, "walk_tc_mems/ephemeris.parquet", begin)
     row = torch.arange(len(table))
-    which = torch.tensor([b.names.index(f"{s}{n:02d}") for s, n in zip(table["sys"], table["svid"], strict=True)])
+    which = torch.tensor(
+        [b.names.index(f"{s}{n:02d}") for s, n in zip(table["sys"], table["svid"], strict=True)]
+    )
     flight = torch.tensor(table["pr"].to_numpy()) / LIGHT
     sent = torch.tensor(table["tow"].to_numpy()) - 408641.0 - flight
     sent = sent - b.clock(sent)[0][row, which]
@@ -417,7 +528,10 @@ def test_satellites_and_clocks_agree_with_an_independent_program() -> None:
     clock = b.clock(sent)[0] + b.relativity(sent) - b.group_delay(sent)
     # theirs differs by a microsecond in the time of the eccentric satellite's relativistic term
     assert np.abs(LIGHT * clock[row, which].numpy() - table["sclk"].to_numpy()).max() < 1e-5
-    receiver = torch.tensor([math.radians(40.0967388700055), math.radians(-105.14708736222939), 1577.4], dtype=torch.float64)
+    receiver = torch.tensor(
+        [math.radians(40.0967388700055), math.radians(-105.14708736222939), 1577.4],
+        dtype=torch.float64,
+    )
     azimuth, elevation = azimuth_elevation(receiver, torch.from_numpy(place))
     assert np.allclose(np.degrees(elevation.numpy()), table["el"], atol=0.01)
     assert np.allclose((np.degrees(azimuth.numpy()) - table["az"] + 180) % 360 - 180, 0, atol=0.01)

@@ -12,15 +12,18 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from pfbench.draws import MonteCarlo
+from pfbench.core.random_stream import PhiloxStream
 from pfbench.nav import earth
-from pfbench.nav.aiding import Aided, Alignment, Flown
-from pfbench.nav.orbits import LIGHT, Walker
-from pfbench.nav.ranging import Clock, Sight, TightReceiver, Tracked, look
-from pfbench.nav.sensors import ImuErrors
-from pfbench.nav.trajectory import Manoeuvres, Start, cruise, turn
-from pfbench.noise.regimes import Nominal
-from pfbench.scenario.flight import SimulatedFlight
+from pfbench.nav.aiding import AidingData, AlignmentErrors, FlightSolution
+from pfbench.nav.gnss.orbits import LIGHT, WalkerConstellation
+from pfbench.nav.gnss.ranging import RangingInputs, RangingReceiver
+from pfbench.nav.gnss.receiver_clock import ReceiverClock
+from pfbench.nav.gnss.satellite_geometry import SatelliteGeometry, predict_ranges
+from pfbench.nav.imu_errors import ImuErrors
+from pfbench.nav.manoeuvres import ManoeuvreTrajectory, cruise, turn
+from pfbench.nav.trajectory import TrajectoryStart
+from pfbench.noise.white import NominalNoise
+from pfbench.scenario.simulated_flight import SimulatedFlight
 
 DEG, SATELLITES = math.pi / 180, 6
 
@@ -42,12 +45,12 @@ class Scene:
         return dp.unsqueeze(1), (self.ins_vel - self.vel).unsqueeze(1)
 
     @property
-    def sight(self) -> Sight:
-        return look(self.ins_pos, self.ins_vel, self.satellite, self.satellite_vel)
+    def sight(self) -> SatelliteGeometry:
+        return predict_ranges(self.ins_pos, self.ins_vel, self.satellite, self.satellite_vel)
 
 
 def scene(size: float, speed: float, runs: int = 40) -> Scene:
-    draws = MonteCarlo(3, torch.arange(runs))
+    draws = PhiloxStream(3, torch.arange(runs))
     a, b = draws.uniform("place", 1, 3)[:, 0], draws.normal("sky", SATELLITES, 6)
     pos = torch.stack([(140 * a[:, 0] - 70) * DEG, (360 * a[:, 1] - 180) * DEG, 5000 * a[:, 2]], -1)
     vel = 200 * draws.normal("vel", 1, 3)[:, 0]
@@ -66,7 +69,9 @@ def distances(pos: Tensor, vel: Tensor, at: Scene, t: float) -> np.ndarray:
     """Ranges [R, S] after t seconds of uniform motion."""
     u, v, w = pymap3d.enu2uvw(*vel.numpy().T, *pos.numpy().T[:2], deg=False)
     place = geocentric(pos) + t * np.stack([u, v, w], -1)
-    return np.linalg.norm(place[:, None] - at.satellite.numpy() - t * at.satellite_vel.numpy(), axis=-1)
+    return np.linalg.norm(
+        place[:, None] - at.satellite.numpy() - t * at.satellite_vel.numpy(), axis=-1
+    )
 
 
 # what the INS expects
@@ -75,23 +80,32 @@ def distances(pos: Tensor, vel: Tensor, at: Scene, t: float) -> np.ndarray:
 @pytest.mark.parametrize(("size", "speed"), [(10.0, 0.1), (5e3, 10.0), (2e5, 300.0)])
 def test_differences_are_those_of_plain_geometry(size: float, speed: float) -> None:
     at = scene(size, speed)
-    ranges, rates = at.sight.differences(*at.errors)
+    ranges, rates = at.sight.range_differences(*at.errors)
     wanted = distances(at.ins_pos, at.ins_vel, at, 0.0) - distances(at.pos, at.vel, at, 0.0)
     # 2e7 m hold 4e-9 m each; the meridian's radius changes by 1 % per radian at most, and the truth's is found in two passes
     far = 4 * size
-    np.testing.assert_allclose(ranges[:, 0].numpy(), wanted, rtol=0, atol=1e-7 + far * (0.01 * far / 6.4e6) ** 2)
+    np.testing.assert_allclose(
+        ranges[:, 0].numpy(), wanted, rtol=0, atol=1e-7 + far * (0.01 * far / 6.4e6) ** 2
+    )
     dt = 1.0
-    later, sooner = (distances(at.ins_pos, at.ins_vel, at, t) - distances(at.pos, at.vel, at, t) for t in (dt, -dt))
+    later, sooner = (
+        distances(at.ins_pos, at.ins_vel, at, t) - distances(at.pos, at.vel, at, t)
+        for t in (dt, -dt)
+    )
     # the quotient's own error is the third derivative's, (4e3 m/s)^2 / (2e7 m)^2 of the rate
     bound = 1e-7 + 1e-6 * speed + 1e-12 * size
     np.testing.assert_allclose(rates[:, 0].numpy(), (later - sooner) / (2 * dt), rtol=0, atol=bound)
 
 
 @pytest.mark.parametrize("size", [10.0, 1e3, 1e5])
-def test_single_precision_loses_single_precision_of_the_errors_not_of_the_ranges(size: float) -> None:
+def test_single_precision_loses_single_precision_of_the_errors_not_of_the_ranges(
+    size: float,
+) -> None:
     at = scene(size, 0.01 * size)
-    exact = at.sight.differences(*at.errors)
-    rough = Sight(*(a.float() for a in at.sight)).differences(*(a.float() for a in at.errors))
+    exact = at.sight.range_differences(*at.errors)
+    rough = SatelliteGeometry(*(a.float() for a in at.sight)).range_differences(
+        *(a.float() for a in at.errors)
+    )
     for a, b, scale in zip(exact, rough, (size, 0.01 * size + 3e3 * size / 2e7), strict=True):
         assert b.dtype == torch.float32
         assert (a - b).abs().max() < 2e-6 * 3 * scale  # a range of 2e7 m would be known to 1 m
@@ -102,21 +116,30 @@ def test_the_linear_form_is_good_to_a_tenth_of_a_millimetre_at_ten_metres(axis: 
     at = scene(0.0, 0.0)
     dp, dv = (torch.zeros(len(at.pos), 1, 3, dtype=torch.float64) for _ in range(2))
     dp[..., axis], dv[..., axis] = 10.0, 1.0
-    ranges, rates = at.sight.differences(dp, dv)
+    ranges, rates = at.sight.range_differences(dp, dv)
     towards = earth.ecef(at.pos).unsqueeze(1) - at.satellite
-    line = towards / towards.norm(dim=-1, keepdim=True) @ earth.local_axes(at.pos).mT  # East, North, Up
+    line = (
+        towards / towards.norm(dim=-1, keepdim=True) @ earth.local_axes(at.pos).mT
+    )  # East, North, Up
     assert torch.allclose(ranges[:, 0], 10.0 * line[..., [1, 0, 2]][..., axis], rtol=0, atol=1e-4)
-    assert torch.allclose(rates[:, 0], line[..., axis], rtol=0, atol=1e-2)  # turning with the place: 3 km/s, 10 m of 2e7 m
+    assert torch.allclose(
+        rates[:, 0], line[..., axis], rtol=0, atol=1e-2
+    )  # turning with the place: 3 km/s, 10 m of 2e7 m
 
 
 def test_forward_differentiation_agrees_with_differences() -> None:
     at = scene(1e3, 5.0, runs=5)
     dp, dv = at.errors
-    ways = MonteCarlo(4, torch.arange(5)).normal("way", 1, 6)
+    ways = PhiloxStream(4, torch.arange(5)).normal("way", 1, 6)
     with forward_ad.dual_level():
-        moved = (forward_ad.make_dual(a, way) for a, way in zip((dp, dv), ways.split(3, -1), strict=True))
-        slopes = [forward_ad.unpack_dual(a).tangent for a in at.sight.differences(*moved)]
-    plus, minus = (at.sight.differences(dp + s * ways[..., :3], dv + s * ways[..., 3:]) for s in (1.0, -1.0))
+        moved = (
+            forward_ad.make_dual(a, way) for a, way in zip((dp, dv), ways.split(3, -1), strict=True)
+        )
+        slopes = [forward_ad.unpack_dual(a).tangent for a in at.sight.range_differences(*moved)]
+    plus, minus = (
+        at.sight.range_differences(dp + s * ways[..., :3], dv + s * ways[..., 3:])
+        for s in (1.0, -1.0)
+    )
     for slope, a, b in zip(slopes, plus, minus, strict=True):
         assert torch.allclose(slope, (a - b) / 2, rtol=1e-6, atol=1e-8)
 
@@ -125,20 +148,22 @@ def test_forward_differentiation_agrees_with_differences() -> None:
 
 
 def test_a_clock_over_two_intervals_is_the_clock_over_their_sum() -> None:
-    clock = Clock(bias_walk=0.3, drift_walk=0.2)
-    gain = clock.gain(torch.tensor([2.0, 3.0, 5.0], dtype=torch.float64))
+    clock = ReceiverClock(bias_walk=0.3, drift_walk=0.2)
+    gain = clock.noise_gain(torch.tensor([2.0, 3.0, 5.0], dtype=torch.float64))
     q = gain @ gain.mT
     drifting = torch.tensor([[1.0, 3.0], [0.0, 1.0]], dtype=torch.float64)
     assert torch.allclose(drifting @ q[0] @ drifting.T + q[1], q[2], rtol=1e-12)
     assert not gain[:, 0, 1].any()
-    assert not clock.gain(torch.zeros(1)).any()
+    assert not clock.noise_gain(torch.zeros(1)).any()
 
 
 def test_clocks_spread_as_their_covariance_says() -> None:
     """P(t) = Phi P0 Phi' + Q(t) after 20 s in unequal intervals; the noise's variance doubled by the process."""
-    runs, clock = 20000, Clock(2.0, 0.3, 0.5, 0.1)
+    runs, clock = 20000, ReceiverClock(2.0, 0.3, 0.5, 0.1)
     durations = torch.tensor([5.0, 1.0, 4.0, 10.0], dtype=torch.float64)
-    x = clock.run(durations, torch.full((4,), 2.0, dtype=torch.float64), MonteCarlo(1, torch.arange(runs)))
+    x = clock.simulate(
+        durations, torch.full((4,), 2.0, dtype=torch.float64), PhiloxStream(1, torch.arange(runs))
+    )
     assert x.shape == (runs, 4, 2)
     t = 20.0
     bias = 2.0**2 + t**2 * 0.3**2 + 2 * (0.5**2 * t + 0.1**2 * t**3 / 3)
@@ -153,89 +178,110 @@ def test_clocks_spread_as_their_covariance_says() -> None:
 # the receiver
 
 FLIGHT = SimulatedFlight(
-    path=Manoeuvres((cruise(20.0), turn(60.0, 40.0)), Start(26.26, 105.89, 320.0, 250.0, 225.0)),
+    trajectory=ManoeuvreTrajectory(
+        (cruise(20.0), turn(60.0, 40.0)), TrajectoryStart(26.26, 105.89, 320.0, 250.0, 225.0)
+    ),
     imu=ImuErrors(3.0, 0.0, 0.0, 0.1, 500.0, 0.0, 0.0, 50.0),
-    receiver=TightReceiver(Walker(), clock=Clock(30.0, 1.0)),
-    initial=Alignment((1.2, 1.2, 6.0), (5.0, 5.0, 5.0), (100.0, 100.0, 100.0)),
-    imu_rate=20.0,
+    receiver=RangingReceiver(WalkerConstellation(), clock=ReceiverClock(30.0, 1.0)),
+    initial_errors=AlignmentErrors((1.2, 1.2, 6.0), (5.0, 5.0, 5.0), (100.0, 100.0, 100.0)),
+    imu_rate_hz=20.0,
 )
 RUNS = torch.arange(3)
 
 
 @pytest.fixture(scope="module")
-def flown() -> Flown:
-    return FLIGHT.fly(Nominal(), RUNS, 1)[0]
+def flown() -> FlightSolution:
+    return FLIGHT.fly(NominalNoise(), RUNS, 1)[0]
 
 
-def aided(receiver: TightReceiver, flown: Flown) -> Aided:
-    return receiver.aid(flown, MonteCarlo(1, RUNS), torch.ones(len(flown.time), dtype=torch.float64))
+def aided(receiver: RangingReceiver, flown: FlightSolution) -> AidingData:
+    return receiver.measure(
+        flown, PhiloxStream(1, RUNS), torch.ones(len(flown.time), dtype=torch.float64)
+    )
 
 
-def above(flown: Flown) -> np.ndarray:
+def above(flown: FlightSolution) -> np.ndarray:
     """Elevation of all satellites, degrees [T, S]."""
-    places, _ = Walker().at(flown.time)
+    places, _ = WalkerConstellation().at(flown.time)
     lat, lon, h = (flown.pos.numpy() * [1 / DEG, 1 / DEG, 1]).T[..., None]
     return pymap3d.ecef2aer(*places.numpy().transpose(2, 0, 1), lat, lon, h)[1]
 
 
-def test_satellites_below_the_mask_are_not_seen(flown: Flown) -> None:
+def test_satellites_below_the_mask_are_not_seen(flown: FlightSolution) -> None:
     elevation = above(flown)
     mask = float(np.median(elevation[:, elevation[0] > 0]))  # one that satellites cross
-    seen = ~aided(TightReceiver(Walker(), mask_deg=mask), flown).y.isnan().numpy()
+    seen = ~aided(RangingReceiver(WalkerConstellation(), mask_deg=mask), flown).y.isnan().numpy()
     assert (seen == np.tile(elevation >= mask, (1, 2))).all()
     assert 0 < seen[0].any(0).sum() < 48
     # its own sky shows all above the horizon
-    sky = aided(TightReceiver(Walker()), flown).sheet
+    sky = aided(RangingReceiver(WalkerConstellation()), flown).sheet
     assert (~sky["elevation"].isnan().numpy() == (elevation >= 0)).all()
-    np.testing.assert_allclose(np.nan_to_num(sky["elevation"].numpy() / DEG), np.maximum(elevation, 0), atol=1e-9)
+    np.testing.assert_allclose(
+        np.nan_to_num(sky["elevation"].numpy() / DEG), np.maximum(elevation, 0), atol=1e-9
+    )
     assert (sky["azimuth"].isnan() == sky["elevation"].isnan()).all()
 
 
-def test_a_satellite_sets_during_a_flight(flown: Flown) -> None:
+def test_a_satellite_sets_during_a_flight(flown: FlightSolution) -> None:
     elevation = above(flown)
     mask = float(elevation[30, 1])  # W02, at mid-flight
-    seen = ~aided(TightReceiver(Walker(), mask_deg=mask, satellites=["W02"]), flown).y[0, :, 0].isnan()
+    seen = (
+        ~aided(RangingReceiver(WalkerConstellation(), mask_deg=mask, satellites=["W02"]), flown)
+        .y[0, :, 0]
+        .isnan()
+    )
     assert 25 <= int(seen.sum()) <= 35
     assert int((seen[1:] != seen[:-1]).sum()) == 1
 
 
 @pytest.mark.parametrize("sagnac", [False, True])
-def test_without_noise_the_measurement_is_what_is_expected_at_the_truth(flown: Flown, sagnac: bool) -> None:
-    told = aided(TightReceiver(Walker(), mask_deg=-90.0, sagnac=sagnac), flown)
-    assert isinstance(told.u, Tracked)
+def test_without_noise_the_measurement_is_what_is_expected_at_the_truth(
+    flown: FlightSolution, sagnac: bool
+) -> None:
+    told = aided(RangingReceiver(WalkerConstellation(), mask_deg=-90.0, sagnac=sagnac), flown)
+    assert isinstance(told.u, RangingInputs)
     dp = (flown.ins.pos_end - flown.pos) * earth.metre_scale(flown.pos)
     dv = flown.ins.vel_end - flown.vel
     sight = told.u.sight
     for t in (0, 59):
-        at = Sight(*(a[:, t] for a in sight))
-        ranges, rates = at.differences(dp[:, t, None], dv[:, t, None])
+        at = SatelliteGeometry(*(a[:, t] for a in sight))
+        ranges, rates = at.range_differences(dp[:, t, None], dv[:, t, None])
         clock = told.truth["clock"][:, t]
         assert torch.allclose(told.y[:, t, :24], ranges[:, 0] - clock[:, :1], rtol=0, atol=1e-6)
         assert torch.allclose(told.y[:, t, 24:], rates[:, 0] - clock[:, 1:], rtol=0, atol=1e-9)
         assert (dp[:, t].abs().amax(-1) > 20.0).all()
 
 
-def test_signals_take_their_time(flown: Flown) -> None:
+def test_signals_take_their_time(flown: FlightSolution) -> None:
     """Light time and the Earth's turn meanwhile, by the usual correction of the range [Ashby 2003, eq. 26]."""
-    told = aided(TightReceiver(Walker(), mask_deg=-90.0, sagnac=True), flown).u
+    told = aided(RangingReceiver(WalkerConstellation(), mask_deg=-90.0, sagnac=True), flown).u
     place = earth.ecef(flown.pos).unsqueeze(1)
     seen = (told.satellite[0] - place).norm(dim=-1)
     for satellite in (4, 11, 21):
         flight = seen[:, satellite] / LIGHT
-        sent = torch.stack([Walker().at(t[None])[0][0, satellite] for t in flown.time - flight])
+        sent = torch.stack(
+            [WalkerConstellation().at(t[None])[0][0, satellite] for t in flown.time - flight]
+        )
         turned = earth.OMEGA / LIGHT * (sent[:, 0] * place[:, 0, 1] - sent[:, 1] * place[:, 0, 0])
         assert turned.abs().max() > 1.0
         # second order in the Earth's turn of 5e-6 rad: 2e7 m times its square
-        assert torch.allclose(seen[:, satellite], (sent - place[:, 0]).norm(dim=-1) + turned, rtol=0, atol=2e-3)
+        assert torch.allclose(
+            seen[:, satellite], (sent - place[:, 0]).norm(dim=-1) + turned, rtol=0, atol=2e-3
+        )
 
 
-def test_the_order_of_satellites_orders_the_measurements_and_nothing_else(flown: Flown) -> None:
+def test_the_order_of_satellites_orders_the_measurements_and_nothing_else(
+    flown: FlightSolution,
+) -> None:
     names = ["W09", "W02", "W05"]
-    some, other = TightReceiver(Walker(), satellites=names), TightReceiver(Walker(), satellites=names[::-1])
+    some, other = (
+        RangingReceiver(WalkerConstellation(), satellites=names),
+        RangingReceiver(WalkerConstellation(), satellites=names[::-1]),
+    )
     a, b = aided(some, flown), aided(other, flown)
     assert torch.equal(a.y, b.y[..., [2, 1, 0, 5, 4, 3]])
     assert torch.equal(a.truth["clock"], b.truth["clock"])
-    everyone = aided(TightReceiver(Walker()), flown).y
+    everyone = aided(RangingReceiver(WalkerConstellation()), flown).y
     assert torch.equal(a.y, everyone[..., [8, 1, 4, 32, 25, 28]])
     channels = some.channels
     assert channels.kind == ("range",) * 3 + ("rate",) * 3
@@ -243,10 +289,13 @@ def test_the_order_of_satellites_orders_the_measurements_and_nothing_else(flown:
     assert channels.sd.tolist() == [10.0, 10.0, 10.0, 0.1, 0.1, 0.1]
 
 
-def test_a_regime_that_swells_the_process_swells_the_clock(flown: Flown) -> None:
-    receiver, draws = TightReceiver(Walker()), MonteCarlo(1, RUNS)
-    calm, swollen = (receiver.aid(flown, draws, torch.full((60,), f, dtype=torch.float64)).truth["clock"] for f in (1.0, 4.0))
-    free = receiver.aid(flown, draws, torch.zeros(60, dtype=torch.float64)).truth["clock"]
+def test_a_regime_that_swells_the_process_swells_the_clock(flown: FlightSolution) -> None:
+    receiver, draws = RangingReceiver(WalkerConstellation()), PhiloxStream(1, RUNS)
+    calm, swollen = (
+        receiver.measure(flown, draws, torch.full((60,), f, dtype=torch.float64)).truth["clock"]
+        for f in (1.0, 4.0)
+    )
+    free = receiver.measure(flown, draws, torch.zeros(60, dtype=torch.float64)).truth["clock"]
     assert torch.allclose(swollen - free, 2 * (calm - free), atol=1e-9)
     assert torch.allclose(free[..., 1], free[:, :1, 1])  # without noise the drift stays
 
@@ -254,23 +303,26 @@ def test_a_regime_that_swells_the_process_swells_the_clock(flown: Flown) -> None
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"pseudorange_sd": 0.0}, r"receiver\.pseudorange_sd=0\.0: give a positive"),
-        ({"rate_sd": -1.0}, r"receiver\.rate_sd=-1\.0"),
-        ({"mask_deg": 91.0}, r"receiver\.mask_deg=91\.0.*between -90 and 90"),
-        ({"satellites": ["W01", "W01"]}, r"receiver\.satellites=\['W01', 'W01'\]: give each satellite once"),
-        ({"satellites": []}, r"receiver\.satellites=\[\]"),
+        ({"pseudorange_sd": 0.0}, r"receiver\.pseudorange_sd must be positive, got 0\.0"),
+        ({"rate_sd": -1.0}, r"receiver\.rate_sd must be positive, got -1\.0"),
+        ({"mask_deg": 91.0}, r"receiver\.mask_deg must be between -90 and 90 .*got 91\.0"),
+        (
+            {"satellites": ["W01", "W01"]},
+            r"receiver\.satellites must .*got \['W01', 'W01'\]. Give each satellite once",
+        ),
+        ({"satellites": []}, r"receiver\.satellites must .*got \[\]"),
     ],
 )
 def test_receivers_that_cannot_be_are_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        replace(TightReceiver(Walker()), **change)  # type: ignore[arg-type]
+        replace(RangingReceiver(WalkerConstellation()), **change)  # type: ignore[arg-type]
 
 
-def test_an_unknown_satellite_is_named(flown: Flown) -> None:
-    with pytest.raises(ValueError, match=r"receiver\.satellites: no G05 among W01, "):
-        aided(TightReceiver(Walker(), satellites=["W01", "G05"]), flown)
+def test_an_unknown_satellite_is_named(flown: FlightSolution) -> None:
+    with pytest.raises(ValueError, match=r"receiver\.satellites must .*got G05. Choose from W01, "):
+        aided(RangingReceiver(WalkerConstellation(), satellites=["W01", "G05"]), flown)
 
 
 def test_a_clock_without_noise_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"receiver\.clock\.drift_walk=0\.0: give a positive number"):
-        Clock(drift_walk=0.0)
+    with pytest.raises(ValueError, match=r"receiver\.clock\.drift_walk must be positive, got 0\.0"):
+        ReceiverClock(drift_walk=0.0)

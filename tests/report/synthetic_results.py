@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from pfbench import store
+from pfbench.results import store
 
 STATE: dict[str, Any] = {
-    "names": [f"{group}_{axis}" for group in ("attitude", "velocity", "position") for axis in "ENU"],
+    "names": [
+        f"{group}_{axis}" for group in ("attitude", "velocity", "position") for axis in "ENU"
+    ],
     "units": ["rad"] * 3 + ["m/s"] * 3 + ["m"] * 3,
     "groups": {"attitude": [0, 1, 2], "velocity": [3, 4, 5], "position": [6, 7, 8]},
 }
@@ -36,15 +38,27 @@ METHODS = (
     Method("sir", 1.3, 0.8, 200, 4.0, (7,)),
     Method("cofm_amssrcpf", 1.0, 1.0, 200, 9.0),
 )
-VERSIONS = {"pfbench": "0.1.0", "commit": "0123abc", "python": "3.11.7", "torch": "2.13.0", "numpy": "2.4.6"}
+VERSIONS = {
+    "pfbench": "0.1.0",
+    "commit": "0123abc",
+    "python": "3.11.7",
+    "torch": "2.13.0",
+    "numpy": "2.4.6",
+}
 
 
-def study(folder: Path, *, runs: int = 40, steps: int = 120, methods: tuple[Method, ...] = METHODS) -> Path:
+def study(
+    folder: Path, *, runs: int = 40, steps: int = 120, methods: tuple[Method, ...] = METHODS
+) -> Path:
     """Writes one cell with all `methods` and one failed job; returns the folder of the study."""
     for method in methods:
         write(folder, method, runs=runs, steps=steps)
     broken = {"scenario": "flight", "noise": "surge", "filter": "dmc_pf", "model": "ins_gnss"}
-    store.failed(folder / "00000000deadbeef.npz", broken, FloatingPointError("covariance lost its positive eigenvalues"))
+    store.write_failure(
+        folder / "00000000deadbeef.npz",
+        broken,
+        FloatingPointError("covariance lost its positive eigenvalues"),
+    )
     return folder
 
 
@@ -60,13 +74,23 @@ def write(
     config: dict[str, Any] | None = None,
 ) -> Path:
     """Writes the result of one filter; the worlds depend on noise and seed alone, so that runs are paired."""
-    settings = {"filter": {"name": method.name, "particles": method.particles, **(config or {})}, "noise": noise}
-    name = store.key({**settings, "seed": seed, "runs": runs, "steps": steps, "versions": versions["commit"]})
+    settings = {
+        "filter": {"name": method.name, "particles": method.particles, **(config or {})},
+        "noise": noise,
+    }
+    name = store.config_key(
+        {**settings, "seed": seed, "runs": runs, "steps": steps, "versions": versions["commit"]}
+    )
     arrays = _arrays(method, noise, runs, steps, seed, name)
     meta = {
         "key": name,
         "study": folder.name,
-        "choices": {"scenario": "flight", "noise": noise, "filter": method.name, "model": "ins_gnss"},
+        "choices": {
+            "scenario": "flight",
+            "noise": noise,
+            "filter": method.name,
+            "model": "ins_gnss",
+        },
         "config": settings,
         "label": method.name,
         "seed": seed,
@@ -83,13 +107,19 @@ def write(
         "versions": versions,
         "host": "bench",
         "created": "2026-01-01T00:00:00+00:00",
-        "seconds": {"world": 1.0, "filter": 1e-3 * method.milliseconds * steps, "per_step": 1e-3 * method.milliseconds},
+        "seconds": {
+            "world": 1.0,
+            "filter": 1e-3 * method.milliseconds * steps,
+            "per_step": 1e-3 * method.milliseconds,
+        },
         "state": STATE,
     }
-    return store.save(folder / f"{name}.npz", meta, arrays)
+    return store.write_result(folder / f"{name}.npz", meta, arrays)
 
 
-def _arrays(method: Method, noise: str, runs: int, steps: int, seed: int, name: str) -> dict[str, np.ndarray]:
+def _arrays(
+    method: Method, noise: str, runs: int, steps: int, seed: int, name: str
+) -> dict[str, np.ndarray]:
     world = np.random.default_rng([seed, *noise.encode()])
     own = np.random.default_rng(int(name, 16))
     time = np.arange(1.0, steps + 1.0)
@@ -97,7 +127,10 @@ def _arrays(method: Method, noise: str, runs: int, steps: int, seed: int, name: 
     shared, alone = _smooth(world, runs, steps), _smooth(own, runs, steps)
     error = method.size * scale * (0.6 * shared + 0.8 * alone)
     sd = np.broadcast_to(method.honesty * method.size * scale, error.shape).copy()
-    nees = np.stack([np.sum((error / sd)[..., index] ** 2, axis=-1) for index in STATE["groups"].values()], axis=-1)
+    nees = np.stack(
+        [np.sum((error / sd)[..., index] ** 2, axis=-1) for index in STATE["groups"].values()],
+        axis=-1,
+    )
     lost = np.isin(np.arange(runs), method.lost)
     for row in np.flatnonzero(lost):
         error[row, steps // 2 :] = sd[row, steps // 2 :] = nees[row, steps // 2 :] = np.nan
@@ -112,7 +145,9 @@ def _arrays(method: Method, noise: str, runs: int, steps: int, seed: int, name: 
     }
     arrays |= _scores(error, sd)
     if method.particles is not None:
-        share = np.clip(0.45 / method.size + 0.25 * np.sin(time / 3) * own.random((runs, 1)), 0.02, 1)
+        share = np.clip(
+            0.45 / method.size + 0.25 * np.sin(time / 3) * own.random((runs, 1)), 0.02, 1
+        )
         arrays["ess"] = (method.particles * share).astype(np.float32)
         arrays["resampled"] = share < 0.3
     return arrays
@@ -123,9 +158,16 @@ def _scores(error: np.ndarray, sd: np.ndarray, instants: int = 4) -> dict[str, n
     scored = (np.arange(1, instants + 1) * error.shape[1]) // instants - 1
     error, sd = error[:, scored], sd[:, scored]
     z = error / sd
-    crps = sd * (z * (2 * ndtr(z) - 1) + 2 * np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) - 1 / np.sqrt(np.pi))
-    energy = np.stack([np.linalg.norm(error[..., index], axis=-1) for index in STATE["groups"].values()], axis=-1)
-    found = {name: value.astype(np.float32) for name, value in (("crps", crps), ("pit", ndtr(-z)), ("energy", energy))}
+    crps = sd * (
+        z * (2 * ndtr(z) - 1) + 2 * np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) - 1 / np.sqrt(np.pi)
+    )
+    energy = np.stack(
+        [np.linalg.norm(error[..., index], axis=-1) for index in STATE["groups"].values()], axis=-1
+    )
+    found = {
+        name: value.astype(np.float32)
+        for name, value in (("crps", crps), ("pit", ndtr(-z)), ("energy", energy))
+    }
     return {"scored": scored, **found}
 
 

@@ -15,14 +15,18 @@ import pytest
 import synthetic_results as synthetic
 from PIL import Image
 
-from pfbench import cli
-from pfbench.report import ledger, page
+from pfbench import job
+from pfbench.claims import page as claims_page
+from pfbench.report import page
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 BROWSER = next(filter(None, map(shutil.which, NAMES)), None)
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(BROWSER is None, reason=f"there is none of {', '.join(NAMES)} on the path; apt-get install chromium"),
+    pytest.mark.skipif(
+        BROWSER is None,
+        reason=f"there is none of {', '.join(NAMES)} on the path; apt-get install chromium",
+    ),
 ]
 # Whatever the page would fetch is refused and noted; what goes wrong in its script is noted too.
 RECORDER = """
@@ -70,7 +74,7 @@ STUDY = """(facts) => {
   facts.said = document.querySelector(".bar output").textContent;
   put(group, "all");
   facts.again = rows().length;
-  const head = [...document.querySelectorAll(".sift th")].find((one) => one.textContent.startsWith("RMSE a to b"));
+  const head = [...document.querySelectorAll(".sift th")].find((one) => one.textContent.startsWith("RMSE change"));
   head.click();
   facts.sorted = [...document.querySelectorAll(".sift tbody tr")].map((row) => Number(row.cells[head.cellIndex].textContent));
 }"""
@@ -89,9 +93,27 @@ CLAIMS = """(facts) => {
 
 
 def browse(*words: str) -> subprocess.CompletedProcess[str]:
-    quiet = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--enable-logging=stderr", "--v=0")
-    alone = ("--no-first-run", "--disable-background-networking", "--disable-extensions", "--disable-dev-shm-usage")
-    done = subprocess.run([str(BROWSER), *quiet, *alone, *words], capture_output=True, text=True, timeout=120, check=False)
+    quiet = (
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--hide-scrollbars",
+        "--enable-logging=stderr",
+        "--v=0",
+    )
+    alone = (
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-extensions",
+        "--disable-dev-shm-usage",
+    )
+    done = subprocess.run(
+        [str(BROWSER), *quiet, *alone, *words],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done
 
@@ -105,8 +127,16 @@ def facts(made: Path, action: str, dark: bool, width: int = 1280) -> dict[str, A
     text = made.read_text()
     assert text.count("<head>") == text.count("</body>") == 1
     seen = made.with_name(f"seen_{dark}_{width}.html")
-    seen.write_text(text.replace("<head>", "<head>" + RECORDER).replace("</body>", FACTS % action + "</body>"))
-    done = browse("--dump-dom", "--virtual-time-budget=10000", scheme(dark), f"--window-size={width},900", seen.as_uri())
+    seen.write_text(
+        text.replace("<head>", "<head>" + RECORDER).replace("</body>", FACTS % action + "</body>")
+    )
+    done = browse(
+        "--dump-dom",
+        "--virtual-time-budget=10000",
+        scheme(dark),
+        f"--window-size={width},900",
+        seen.as_uri(),
+    )
     assert "CONSOLE" not in done.stderr
     said = re.search(r'<pre id="facts">(.*?)</pre>', done.stdout, re.S)
     assert said, done.stdout[-2000:]
@@ -119,8 +149,8 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for noise in ("nominal", "surge"):
         for method in synthetic.METHODS[1:]:
             synthetic.write(root / "results" / "demo", method, noise=noise, runs=12, steps=30)
-    options = page.Options(formats=("png",), groups=("velocity", "position"))
-    return page.write("demo", root / "results", root / "reports", options)
+    options = page.ReportOptions(figure_formats=("png",), groups=("velocity", "position"))
+    return page.write_report("demo", root / "results", root / "reports", options)
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
@@ -146,29 +176,39 @@ def test_a_report_opens_whole_and_its_filter_filters(report: Path, dark: bool) -
 
 
 def test_a_brief_report_in_its_usual_formats_opens_whole(tmp_path: Path) -> None:
-    """As a large study has it: figures of one group, those of many lines as PNG and the others as SVG within the page."""
+    """A large study shows figures of one group, each embedded in the smaller of its formats."""
     for noise in ("nominal", "surge", "heavy"):
         for method in synthetic.METHODS:
             synthetic.write(tmp_path / "results" / "demo", method, noise=noise, runs=8, steps=12)
-    options = page.Options(groups=("velocity", "position"), full=False)
-    made = page.write("demo", tmp_path / "results", tmp_path / "reports", options)
+    options = page.ReportOptions(groups=("velocity", "position"), show_all=False)
+    made = page.write_report("demo", tmp_path / "results", tmp_path / "reports", options)
     text = made.read_text()
-    assert 'src="data:image/svg+xml,' in text
+    assert re.search(r'src="data:image/(svg\+xml|png);base64,', text)
     found = facts(made, "(facts) => {}", dark=False, width=420)
     assert found["noted"] == found["resources"] == []
     assert found["anchors"] == 0
     names = {path.stem for path in (made.parent / "figures").iterdir()}
     assert {path.suffix for path in (made.parent / "figures").iterdir()} == {".svg", ".png"}
-    assert "all_map_main_group" in names or "all_map_position" in names  # what only the brief form has
+    assert (
+        "all_map_main_group" in names or "all_map_position" in names
+    )  # what only the brief form has
     assert len(found["images"]) == len(found["captions"]) == len(names)
-    assert all(size > 100 for image in found["images"] for size in image)  # an SVG that is not well formed has no size
+    assert all(
+        size > 100 for image in found["images"] for size in image
+    )  # an SVG that is not well formed has no size
     assert found["broad"] <= 0
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 def test_a_picture_of_a_report_is_not_blank(report: Path, dark: bool, tmp_path: Path) -> None:
     file = tmp_path / "page.png"
-    browse(f"--screenshot={file}", "--window-size=1280,2400", "--virtual-time-budget=10000", scheme(dark), report.as_uri())
+    browse(
+        f"--screenshot={file}",
+        "--window-size=1280,2400",
+        "--virtual-time-budget=10000",
+        scheme(dark),
+        report.as_uri(),
+    )
     seen = np.asarray(Image.open(file).convert("RGB")).astype(int)
     assert seen.shape == (2400, 1280, 3)
     paper = np.array([20, 24, 28] if dark else [255, 255, 255])
@@ -180,7 +220,8 @@ def test_a_picture_of_a_report_is_not_blank(report: Path, dark: bool, tmp_path: 
 
 
 def test_the_ledger_opens_and_its_filters_filter(tmp_path: Path) -> None:
-    made = ledger.write(tmp_path / "none", tmp_path / "reports", 0.05, cli.conf_dir(), cli.experiments_dir(), formats=("png",))
+    places = tmp_path / "none", tmp_path / "reports", 0.05, job.conf_dir(), job.experiments_dir()
+    made = claims_page.write_claims(*places, formats=("png",))
     found = facts(made, CLAIMS, dark=False)
     assert found["noted"] == found["resources"] == []
     assert found["anchors"] == 0

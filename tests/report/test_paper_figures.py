@@ -1,4 +1,4 @@
-"""The papers' figures drawn anew: what they show is what the results hold, and captions say which runs."""
+"""Figures of the papers: the curves match the results, and the captions state the runs."""
 
 from __future__ import annotations
 
@@ -14,27 +14,33 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from pfbench import cli, metrics, store
-from pfbench.report import figures, page, paper_figures, paper_plots, section
-from pfbench.report.canvas import dimmed, indexed, looks, told
-from pfbench.report.frame import cells, frame
-from pfbench.report.paper_figures import FIGURES
+from pfbench import job
+from pfbench.report import condition_section, page
+from pfbench.report.plots import filter_plots, paper_figures, paper_plots
+from pfbench.report.plots.axis_ticks import format_ticks
+from pfbench.report.plots.paper_figures import FIGURES
+from pfbench.report.plots.plotting import line_styles, mute_others, render_palette_png
+from pfbench.results import error_measures, store
+from pfbench.results.frame import load_conditions, load_frame
 
 SIR = synthetic.Method("sir", 1.3, 0.8, 200, 4.0, (7,))
 SWARM = synthetic.Method("cpso_escape", 1.0, 1.0, 200, 9.0)
 
 
 def rewrite(path: Path, **more: np.ndarray) -> None:
-    meta, arrays = store.load(path)
-    store.save(path, meta, {**arrays, **more})
+    meta, arrays = store.read_result(path)
+    store.write_result(path, meta, {**arrays, **more})
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("results")
-    others = (synthetic.Method("cpf", 1.0, particles=200), synthetic.Method("cofm_amssrcpf", 0.7, particles=200))
+    others = (
+        synthetic.Method("cpf", 1.0, particles=200),
+        synthetic.Method("cofm_amssrcpf", 0.7, particles=200),
+    )
     for method in (SIR, SWARM, *others):
-        for noise in ("nominal", "paper_burst"):
+        for noise in ("nominal", "paper_bursts"):
             path = synthetic.write(root / "paper_004", method, noise=noise, runs=20, steps=30)
             number = 100.0 + np.arange(20)[:, None] + np.arange(30)
             rewrite(path, iterations=number / 10, particles=number, range=np.full(30, 1000.0))
@@ -42,14 +48,14 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def drawn(results: Path, *wanted: str) -> dict[str, tuple[str, Figure]]:
-    found = cells("paper_004", results)
-    style = looks(sorted({job.label for cell in found for job in cell.jobs}))
-    made = paper_figures.drawings("paper_004", found, style, wanted or None, from_time=10.0)
+    found = load_conditions("paper_004", results)
+    style = line_styles(sorted({job.label for cell in found for job in cell.jobs}))
+    made = paper_figures.paper_figures("paper_004", found, style, wanted or None, start_time_s=10.0)
     return {drawing.name: (drawing.caption, drawing.make()) for drawing in made}
 
 
-def loaded(results: Path, label: str, noise: str = "nominal") -> store.Result:
-    every = store.results(results / "paper_004")
+def loaded(results: Path, label: str, noise: str = "nominal") -> store.JobResult:
+    every = store.list_results(results / "paper_004")
     return next(r for r in every if (r.meta["label"], r.meta["choices"]["noise"]) == (label, noise))
 
 
@@ -59,29 +65,42 @@ def line(figure: Figure, panel: int, label: str) -> tuple[np.ndarray, np.ndarray
 
 
 def test_every_figure_is_of_filters_and_studies_that_there_are() -> None:
-    conf, studies = cli.conf_dir(), cli.experiments_dir()
+    conf, studies = job.conf_dir(), job.experiments_dir()
     for name, figure in FIGURES.items():
-        assert all((conf / "filter" / f"{label.partition('[')[0]}.yaml").exists() for label in figure.filters), name
+        assert all(
+            (conf / "filter" / f"{label.partition('[')[0]}.yaml").exists()
+            for label in figure.filters
+        ), name
         assert figure.noise == "" or (conf / "noise" / f"{figure.noise}.yaml").exists(), name
         ran = [yaml.safe_load(path.read_text()) for path in studies.glob(f"paper_{name[:3]}*.yaml")]
-        swept = [set(str(one["hydra"]["sweeper"]["params"].get("filter", "")).split(",")) for one in ran]
+        swept = [
+            set(str(one["hydra"]["sweeper"]["params"].get("filter", "")).split(",")) for one in ran
+        ]
         assert any(set(figure.filters) & filters for filters in swept), name
         assert any(char.isdigit() for char in figure.said) or "section" in figure.said
 
 
 def test_a_study_shows_the_figures_of_its_own_paper(results: Path) -> None:
     found = drawn(results)
-    assert {name.split("_")[0] for name in found} == {"004-3", "004-4", "004-5", "004-iterations"} - {"004-3"}
-    assert set(drawn(results, "002-12")) == {"002-12_flight_paper_burst_ins_gnss_position"}
+    assert {name.split("_")[0] for name in found} == {
+        "004-3",
+        "004-4",
+        "004-5",
+        "004-iterations",
+    } - {"004-3"}
+    assert set(drawn(results, "002-12")) == {"002-12_flight_paper_bursts_ins_gnss_position"}
     for caption, figure in found.values():
         assert caption.startswith("Tian et al., ")
         assert figure.get_figwidth() <= 3.5  # a column
-        assert all(text.get_fontsize() >= 5.5 for text in figure.findobj(lambda part: hasattr(part, "get_fontsize")))
+        assert all(
+            text.get_fontsize() >= 5.5
+            for text in figure.findobj(lambda part: hasattr(part, "get_fontsize"))
+        )
 
 
 def test_bands_are_the_quantiles_of_the_runs_that_were_not_lost(results: Path) -> None:
     caption, figure = drawn(results)["004-4_flight_nominal_ins_gnss_position"]
-    assert "of 20 runs, of which lost and left out: sir 1" in caption
+    assert "of 20 runs (lost runs excluded: sir 1)" in caption
     for label, component in product(("sir", "cpso_escape"), range(3)):
         kept = loaded(results, label).arrays
         values = kept["error"][~kept["lost"]][..., 6 + component].astype(float)
@@ -90,33 +109,43 @@ def test_bands_are_the_quantiles_of_the_runs_that_were_not_lost(results: Path) -
         np.testing.assert_allclose(middle, np.median(values, axis=0), rtol=1e-6)
         for q in (0.05, 0.95):
             edge = np.quantile(values, q, axis=0)
-            assert any(np.allclose(one.get_ydata(), edge) for one in figure.axes[component].lines if len(one.get_ydata()) == 30)
+            assert any(
+                np.allclose(one.get_ydata(), edge)
+                for one in figure.axes[component].lines
+                if len(one.get_ydata()) == 30
+            )
 
 
 def test_nothing_lies_beyond_the_axes(results: Path) -> None:
     result = loaded(results, "cpso_escape")
     wild = result.arrays["error"].copy()
     wild[..., 6] *= 1 + 1e4 * np.exp(-np.arange(30) / 2)
-    block = next(b for b in paper_figures.blocks(result.meta["state"]) if b.group == "position")
-    own = {"cpso_escape": (store.Result(result.meta, {**result.arrays, "error": wild}), block)}
-    panel = paper_plots.errors(own, looks(["cpso_escape"])).axes[0]
+    block = next(
+        b for b in paper_figures.component_groups(result.meta["state"]) if b.group == "position"
+    )
+    own = {"cpso_escape": (store.JobResult(result.meta, {**result.arrays, "error": wild}), block)}
+    panel = paper_plots.plot_errors(own, line_styles(["cpso_escape"])).axes[0]
     assert panel.get_yscale() == "symlog"
     assert panel.get_ylim()[1] >= np.quantile(wild[:, 0, 6], 0.95)
     ticks = list(panel.get_yticks())
     assert 0.0 in ticks
     assert max(ticks) >= 100 * min(abs(tick) for tick in ticks if tick)
-    assert [text.get_text() for text in panel.get_yticklabels()] == told(ticks)
+    assert [text.get_text() for text in panel.get_yticklabels()] == format_ticks(ticks)
 
 
 @pytest.mark.parametrize("wild", [1e3, 1e7])
 def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float) -> None:
     """The axis is linear for the good ones, in no small part of it, and its few ticks have one style."""
-    block = next(b for b in paper_figures.blocks(loaded(results, "sir").meta["state"]) if b.group == "attitude")
+    block = next(
+        b
+        for b in paper_figures.component_groups(loaded(results, "sir").meta["state"])
+        if b.group == "attitude"
+    )
     good = {label: loaded(results, label) for label in ("cpf", "cpso_escape")}
     bad = loaded(results, "cofm_amssrcpf")
-    bad = store.Result(bad.meta, {**bad.arrays, "error": wild * bad.arrays["error"]})
+    bad = store.JobResult(bad.meta, {**bad.arrays, "error": wild * bad.arrays["error"]})
     own = {label: (result, block) for label, result in (*good.items(), ("cofm_amssrcpf", bad))}
-    figure = paper_plots.errors(own, looks(list(own)))
+    figure = paper_plots.plot_errors(own, line_styles(list(own)))
     figure.draw_without_rendering()
     for component, axis in enumerate(figure.axes):
         assert axis.get_yscale() == "symlog"
@@ -129,17 +158,25 @@ def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float)
         ticks = [text.get_text() for text in axis.get_yticklabels()]
         assert 3 <= len(ticks) <= 7
         assert not any("e" in text for text in ticks)
-        assert axis.get_ylim()[1] >= np.quantile(block.scale * bad.arrays["error"][:, 0, component], 0.95)
+        assert axis.get_ylim()[1] >= np.quantile(
+            block.scale * bad.arrays["error"][:, 0, component], 0.95
+        )
 
 
 def test_a_bias_stands_beside_itself_before_correction(results: Path) -> None:
     result = loaded(results, "cpso_escape")
-    block = next(b for b in paper_figures.blocks(result.meta["state"]) if b.group == "attitude")
-    figure = paper_plots.errors({"cpso_escape": (result, block)}, looks(["cpso_escape"]), before=True)
+    block = next(
+        b for b in paper_figures.component_groups(result.meta["state"]) if b.group == "attitude"
+    )
+    figure = paper_plots.plot_errors(
+        {"cpso_escape": (result, block)}, line_styles(["cpso_escape"]), before=True
+    )
     first = np.quantile(block.scale * result.arrays["error"][:, 0, 0].astype(float), [0.05, 0.95])
     levels = [one.get_ydata()[0] for one in figure.axes[0].lines if len(one.get_xdata()) == 2]
     np.testing.assert_allclose(sorted(levels), first, rtol=1e-6)
-    assert "before correction" in FIGURES["004-3"].draw.keywords or FIGURES["004-3"].draw.keywords == {"before": True}
+    assert "before correction" in FIGURES["004-3"].draw.keywords or FIGURES[
+        "004-3"
+    ].draw.keywords == {"before": True}
 
 
 def test_traces_are_drawn_with_what_is_printed_of_them(results: Path) -> None:
@@ -147,28 +184,39 @@ def test_traces_are_drawn_with_what_is_printed_of_them(results: Path) -> None:
     caption, figure = found["004-iterations_flight_nominal_ins_gnss_iterations"]
     _, middle = line(figure, 0, "cpso_escape")
     np.testing.assert_allclose(middle, (109.5 + np.arange(30)) / 10)
-    caption, figure = found["002-neff_flight_paper_burst_ins_gnss_ess"]
+    caption, figure = found["002-neff_flight_paper_bursts_ins_gnss_ess"]
     assert "Grey: 110 to 180, as printed" in caption
     (span,) = [patch for patch in figure.axes[0].patches if patch.get_extents().height > 0]
     assert span.get_y() == 110
     assert span.get_height() == 70
-    assert "Grey" not in found["002-number_flight_paper_burst_ins_gnss_particles"][0]
+    assert "Grey" not in found["002-number_flight_paper_bursts_ins_gnss_particles"][0]
 
 
 def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
     for label in ("sir", "cpso_escape"):
         result = loaded(results, label)
-        each = paper_plots.relative(result)
+        each = paper_plots.relative_axes(result)
         assert each.size == (~result.arrays["lost"]).sum()
         error = result.arrays["error"][..., [6, 7]]
-        mean = metrics.relative_error(error, result.arrays["lost"], result.arrays["range"])
+        mean = error_measures.relative_error(error, result.arrays["lost"], result.arrays["range"])
         assert each.mean() == pytest.approx(100 * float(mean.value), rel=1e-5)
-    values = {"first": {"sir": np.arange(101.0), "gpf": np.array([5.0])}, "second": {"sir": np.full(3, 7.0)}}
-    axis = paper_plots.against(values, looks(["gpf", "sir"]), "Err").axes[0]
+    values = {
+        "first": {"sir": np.arange(101.0), "gpf": np.array([5.0])},
+        "second": {"sir": np.full(3, 7.0)},
+    }
+    axis = paper_plots.plot_against(values, line_styles(["gpf", "sir"]), "Err").axes[0]
     lines = [(np.asarray(one.get_xdata()), np.asarray(one.get_ydata())) for one in axis.lines]
-    assert sorted((round(x[0]), y[0]) for x, y in lines if len(y) == 1) == [(0, 5.0), (0, 50.0), (1, 7.0)]
+    assert sorted((round(x[0]), y[0]) for x, y in lines if len(y) == 1) == [
+        (0, 5.0),
+        (0, 50.0),
+        (1, 7.0),
+    ]
     assert [tuple(y) for _, y in lines if len(y) == 2 and y[1] > y[0]] == [(5.0, 95.0)]
-    wide = paper_plots.against({"first": {"sir": np.array([0.1]), "gpf": np.array([90.0])}}, looks(["gpf", "sir"]), "").axes[0]
+    wide = paper_plots.plot_against(
+        {"first": {"sir": np.array([0.1]), "gpf": np.array([90.0])}},
+        line_styles(["gpf", "sir"]),
+        "",
+    ).axes[0]
     assert 0.02 < wide.get_ylim()[0] < 0.1  # on a logarithmic scale, all of it there
 
 
@@ -176,11 +224,17 @@ def test_the_escape_factor_is_that_of_the_settings_that_ran(results: Path, tmp_p
     for label, escape, most in (("cpso_escape", 0.12, 5), ("cpso_escape_printed", 0.3, 30)):
         method = synthetic.Method(label, 1.0, particles=100)
         settings = {"proposal": {"velocity": {"escape": escape}, "iterations": most}}
-        synthetic.write(tmp_path / "paper_004", method, noise="nominal", runs=6, steps=8, config=settings)
+        synthetic.write(
+            tmp_path / "paper_004", method, noise="nominal", runs=6, steps=8, config=settings
+        )
     silent = synthetic.Method("cpso_escape_stopped", 1.0, particles=9)
     synthetic.write(tmp_path / "paper_004", silent, noise="nominal", runs=6, steps=8)
     ((_, figure),) = drawn(tmp_path, "004-1").values()
-    lines = {str(one.get_label()): one for one in figure.axes[0].lines if not str(one.get_label()).startswith("_")}
+    lines = {
+        str(one.get_label()): one
+        for one in figure.axes[0].lines
+        if not str(one.get_label()).startswith("_")
+    }
     assert set(lines) == {"cpso_escape", "cpso_escape_printed"}
     y = np.asarray(lines["cpso_escape_printed"].get_ydata())
     assert (y[0], y[15], y[30]) == pytest.approx((0.0, 0.3, 0.6))  # from none to twice its size
@@ -190,23 +244,39 @@ def test_the_escape_factor_is_that_of_the_settings_that_ran(results: Path, tmp_p
 
 
 def test_largest_errors_stand_beside_the_printed_ones(results: Path) -> None:
-    caption, figure = drawn(results, "002-maxima")["002-maxima_flight_paper_burst_ins_gnss_position"]
-    assert "largest error of position after 10 s" in caption
-    assert "Crosses: largest errors as printed." in caption
+    caption, figure = drawn(results, "002-maxima")[
+        "002-maxima_flight_paper_bursts_ins_gnss_position"
+    ]
+    assert "maximum error of position after 10 s" in caption
+    assert "Crosses: maximum errors as printed." in caption
     axis = figure.axes[0]
-    assert [text.get_text() for text in axis.get_xticklabels()] == ["position_N", "position_E", "position_U"]
+    assert [text.get_text() for text in axis.get_xticklabels()] == [
+        "position_N",
+        "position_E",
+        "position_U",
+    ]
     crosses = [tuple(one.get_ydata()) for one in axis.lines if one.get_marker() == "x"]
     assert crosses == [(8.9, 7.4, 16.4), (4.02, 4.4, 5.2)]
-    arrays = loaded(results, "cpf", "paper_burst").arrays
+    arrays = loaded(results, "cpf", "paper_bursts").arrays
     north = np.abs(arrays["error"][:, arrays["time"] >= 10, 7]).max(1)
-    assert any(np.allclose(one.get_ydata(), [np.median(north)]) for one in axis.lines if len(one.get_ydata()) == 1)
+    assert any(
+        np.allclose(one.get_ydata(), [np.median(north)])
+        for one in axis.lines
+        if len(one.get_ydata()) == 1
+    )
 
 
 @pytest.mark.parametrize(
     ("wanted", "message"),
-    [("999-1", "there is no 999-1; choose from 000-2"), ("001-3", None), ("003-5", "003-5 .* needs filters of ukf")],
+    [
+        ("999-1", "got 999-1. Choose from 000-2"),
+        ("001-3", None),
+        ("003-5", "got 003-5 .* requires results of ukf"),
+    ],
 )
-def test_a_figure_that_cannot_be_drawn_is_told(results: Path, wanted: str, message: str | None) -> None:
+def test_a_figure_that_cannot_be_drawn_is_told(
+    results: Path, wanted: str, message: str | None
+) -> None:
     if message is None:
         assert drawn(results, wanted)
     else:
@@ -215,41 +285,53 @@ def test_a_figure_that_cannot_be_drawn_is_told(results: Path, wanted: str, messa
 
 
 def test_the_page_links_to_each_of_them(results: Path, tmp_path: Path) -> None:
-    options = page.Options(formats=("png",), groups=("position",), figures=("004-iterations",))
+    options = page.ReportOptions(
+        figure_formats=("png",), groups=("position",), paper_figures=("004-iterations",)
+    )
     with pytest.MonkeyPatch.context() as patch:  # what else is on a page is tested elsewhere
-        patch.setattr(figures, "drawings", lambda *_, **__: [])
-        patch.setattr(section.calibration, "drawings", lambda *_: [])
-        patch.setattr(page.ranking_figures, "of_cell", lambda *_: [])
-        patch.setattr(page.ranking_figures, "of_study", lambda *_: [])
-        made = page.write("paper_004", results, tmp_path, options)
+        patch.setattr(condition_section.condition_figures, "condition_figures", lambda *_, **__: [])
+        patch.setattr(condition_section.calibration, "calibration_figures", lambda *_: [])
+        patch.setattr(
+            condition_section.comparison_figures, "comparison_figures_of_condition", lambda *_: []
+        )
+        patch.setattr(page.comparison_figures, "study_figures", lambda *_: [])
+        made = page.write_report("paper_004", results, tmp_path, options)
     text = made.read_text()
     assert '<figure id="paper_004_iterations_flight_nominal_ins_gnss_iterations">' in text
     assert "004-iterations_flight" in (made.parent / "report.md").read_text()
-    assert (made.parent / "figures" / "paper_004-iterations_flight_nominal_ins_gnss_iterations.png").exists()
-    with pytest.raises(ValueError, match=r"report\.highlight: no result is of ekf"):
-        page.write("paper_004", results, tmp_path, page.Options(highlight=("ekf",)))
+    assert (
+        made.parent / "figures" / "paper_004-iterations_flight_nominal_ins_gnss_iterations.png"
+    ).exists()
+    with pytest.raises(
+        ValueError, match=r"report\.highlight_filters must be filters with results, got ekf"
+    ):
+        page.write_report(
+            "paper_004", results, tmp_path, page.ReportOptions(highlight_filters=("ekf",))
+        )
 
 
 # how all figures are drawn
 
 
 def test_lines_are_told_apart_without_colour() -> None:
-    style = list(looks([f"filter {k}" for k in range(40)]).values())
+    style = list(line_styles([f"filter {k}" for k in range(40)]).values())
     assert len({(look.dash, look.marker) for look in style}) == 40
     for a, b in combinations(style[:8], 2):  # as many as a figure names
-        grey = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in map(to_rgb, (a.colour, b.colour))]
+        grey = [
+            0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in map(to_rgb, (a.colour, b.colour))
+        ]
         assert a.dash != b.dash or abs(grey[0] - grey[1]) > 0.1
 
 
 def test_of_many_filters_a_few_are_named() -> None:
-    style = dimmed(looks(["a", "b", "c"]), ["b"])
+    style = mute_others(line_styles(["a", "b", "c"]), ["b"])
     assert [look.quiet for look in style.values()] == [True, False, True]
     assert "label" in style["b"].line("b")
     assert "label" not in style["a"].line("a")
 
 
 def test_pictures_keep_the_colours_of_the_filters() -> None:
-    style = looks([f"filter {k}" for k in range(7)])
+    style = line_styles([f"filter {k}" for k in range(7)])
     figure = Figure(figsize=(2, 2))
     axis = figure.subplots()
     for k, (label, look) in enumerate(style.items()):
@@ -257,20 +339,27 @@ def test_pictures_keep_the_colours_of_the_filters() -> None:
         axis.plot([0, 1], [k, k + 1], label=label)
     plain = io.BytesIO()
     figure.savefig(plain, format="png")
-    small = indexed(figure)
+    small = render_palette_png(figure)
     assert len(small) < 0.6 * len(plain.getvalue())
     seen = {colour for _, colour in Image.open(io.BytesIO(small)).convert("RGB").getcolors(2**16)}
-    assert {tuple(round(255 * part) for part in to_rgb(look.colour)) for look in style.values()} <= seen
-    assert small == indexed(figure)
+    assert {
+        tuple(round(255 * part) for part in to_rgb(look.colour)) for look in style.values()
+    } <= seen
+    assert small == render_palette_png(figure)
 
 
 def test_rows_of_many_filters_are_in_the_order_of_their_medians(tmp_path: Path) -> None:
     size = {f"f{k}": 1.0 + (5 * k) % 14 for k in range(14)}
     for label, large in size.items():
-        synthetic.write(tmp_path / "many", synthetic.Method(label, large, lost=(1,) if label == "f3" else ()), runs=9, steps=60)
-    runs = frame("many", tmp_path)
-    style = looks(list(size))
-    axis = figures.rmse(runs, ["position"], dimmed(style, ["f0"])).axes[0]
+        synthetic.write(
+            tmp_path / "many",
+            synthetic.Method(label, large, lost=(1,) if label == "f3" else ()),
+            runs=9,
+            steps=60,
+        )
+    runs = load_frame("many", tmp_path)
+    style = line_styles(list(size))
+    axis = filter_plots.plot_rmse(runs, ["position"], mute_others(style, ["f0"])).axes[0]
     order = [text.get_text() for text in axis.get_yticklabels()]
     assert order == sorted(order, key=lambda label: size[label])
     assert [text.get_text() for text in axis.texts] == ["1 lost"]

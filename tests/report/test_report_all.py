@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 from command_line import pfbench
 
-from pfbench.report import claims, ledger, page
+from pfbench.claims import page as claims_page
+from pfbench.claims import schema
+from pfbench.report import page
 
 
 @pytest.fixture
@@ -16,7 +18,7 @@ def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
     """Options of each report that was asked for; none is drawn."""
     asked: dict[str, Any] = {}
 
-    def write(study: str, results: str, out: str, options: page.Options) -> Path:
+    def write(study: str, results: str, out: str, options: page.ReportOptions) -> Path:
         if study == "broken":
             raise ValueError("the cell holds results that differ")
         asked[study] = options
@@ -26,8 +28,8 @@ def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
         asked["claims"] = None
         return Path(out) / "claims" / "index.html"
 
-    monkeypatch.setattr(page, "write", write)
-    monkeypatch.setattr(ledger, "write", of_claims)
+    monkeypatch.setattr(page, "write_report", write)
+    monkeypatch.setattr(claims_page, "write_claims", of_claims)
     monkeypatch.chdir(tmp_path)
     return asked
 
@@ -39,20 +41,41 @@ def there(home: Path, *files: str) -> None:
 
 
 @pytest.mark.slow
-def test_what_has_results_is_made_again_and_what_has_none_stays(made: dict[str, Any], tmp_path: Path) -> None:
-    there(tmp_path, "results/mine/a.npz", "results/recorded_car/a.npz", "results/datasheets/t004.npz", "results/empty/note.txt")
-    there(tmp_path, "reports/recorded_car/report.md", "reports/paper_001/report.md", "reports/claims/report.md")
+def test_what_has_results_is_made_again_and_what_has_none_stays(
+    made: dict[str, Any], tmp_path: Path
+) -> None:
+    there(
+        tmp_path,
+        "results/mine/a.npz",
+        "results/recorded_car/a.npz",
+        "results/datasheets/t004.npz",
+        "results/empty/note.txt",
+    )
+    there(
+        tmp_path,
+        "reports/recorded_car/report.md",
+        "reports/paper_001/report.md",
+        "reports/claims/report.md",
+    )
     said = pfbench("report", "all", "report.alpha=0.01", home=tmp_path)
     assert said.code == 0
     assert list(made) == ["mine", "recorded_car"]
-    assert (made["mine"].from_time, made["recorded_car"].from_time) == (0.0, 98.0)  # as its experiment says
+    assert (made["mine"].start_time_s, made["recorded_car"].start_time_s) == (
+        0.0,
+        98.0,
+    )  # as its experiment says
     assert {options.alpha for options in made.values()} == {0.01}
-    assert "paper_001: its report is published and stays as it is" in said.out
+    assert "paper_001: the published report is unchanged" in said.out
     assert "pfbench run -m +experiment=paper_001" in said.out
-    studies = sorted({study for claim in claims.load() for study in claim.studies})
-    assert f"claims: the ledger stays as it is, for it needs the results of {', '.join(studies)} too" in said.out
+    studies = sorted({study for claim in schema.read_claims() for study in claim.studies})
+    assert (
+        f"claims: the page is unchanged, since results of {', '.join(studies)} are missing"
+        in said.out
+    )
     there(tmp_path, *(f"results/{study}/a.npz" for study in studies[1:]))
-    assert f"it needs the results of {studies[0]} too" in pfbench("report", "all", home=tmp_path).out
+    assert (
+        f"since results of {studies[0]} are missing" in pfbench("report", "all", home=tmp_path).out
+    )
     there(tmp_path, f"results/{studies[0]}/a.npz")
     assert pfbench("report", "all", home=tmp_path).code == 0
     assert list(made)[-1] == "claims"  # after the pages that it links to
@@ -63,17 +86,19 @@ def test_a_page_alone_is_published_too_and_a_first_ledger_is_written_of_what_the
 ) -> None:
     there(tmp_path, "results/paper_001/a.npz", "reports/all_seven/index.html")
     said = pfbench("report", "all", home=tmp_path)
-    assert "all_seven: its report is published and stays as it is" in said.out
+    assert "all_seven: the published report is unchanged" in said.out
     assert list(made) == ["paper_001", "claims"]
 
 
 def test_a_study_is_shown_as_its_experiment_says(made: dict[str, Any], tmp_path: Path) -> None:
     assert pfbench("report", "study=recorded_car", home=tmp_path).code == 0
-    assert made["recorded_car"].from_time == 98.0
-    assert pfbench("report", "study=recorded_car", "report.from_time=1.0", home=tmp_path).code == 0
+    assert made["recorded_car"].start_time_s == 98.0
+    assert (
+        pfbench("report", "study=recorded_car", "report.start_time_s=1.0", home=tmp_path).code == 0
+    )
     assert pfbench("report", "study=my_own", home=tmp_path).code == 0
-    assert made["my_own"].from_time == 0.0
-    assert made["recorded_car"].from_time == 1.0  # the words come last
+    assert made["my_own"].start_time_s == 0.0
+    assert made["recorded_car"].start_time_s == 1.0  # the words come last
 
 
 def test_one_report_that_fails_stops_no_other(made: dict[str, Any], tmp_path: Path) -> None:
@@ -90,4 +115,4 @@ def test_without_any_results_everything_stays(made: dict[str, Any], tmp_path: Pa
     said = pfbench("report", "all", home=tmp_path)
     assert said.code == 0
     assert made == {}
-    assert said.out.count("stays as it is") == 2
+    assert said.out.count("is unchanged") == 2

@@ -6,9 +6,10 @@ import pytest
 import synthetic_results as synthetic
 from scipy import stats
 
-from pfbench import metrics, store
-from pfbench.report import calibration, figures, frame, tables
-from pfbench.report.canvas import looks
+from pfbench.report import calibration, tables
+from pfbench.report.plots import condition_figures
+from pfbench.report.plots.plotting import line_styles
+from pfbench.results import consistency, coverage, frame, intervals, store
 
 ARCMIN = 180 * 60 / np.pi
 METHODS = (
@@ -29,24 +30,32 @@ def study(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def loaded(study):
-    (cell,) = frame.cells("demo", study)
+    (cell,) = frame.load_conditions("demo", study)
     return {job.label: job.load() for job in cell.jobs}
 
 
 def test_scores_in_units_by_hand(study, loaded):
-    rows = frame.frame("demo", study, from_time=15.0)
-    own = rows[(rows.label == "lossy") & (rows.run == 5)].set_index(["metric", "group", "component"])
+    rows = frame.load_frame("demo", study, start_time_s=15.0)
+    own = rows[(rows.label == "lossy") & (rows.run == 5)].set_index(
+        ["metric", "group", "component"]
+    )
     arrays = loaded["lossy"].arrays
     kept = arrays["time"][arrays["scored"]] >= 15.0
     assert kept.tolist() == [False, True, True, True]
     crps = arrays["crps"][5, kept].astype(float)
-    assert own.loc[("crps", "attitude", "attitude_N"), "value"] == pytest.approx(crps[:, 1].mean() * ARCMIN)
-    assert own.loc[("crps", "attitude", "mean"), "value"] == pytest.approx(crps[:, :3].mean() * ARCMIN)
+    assert own.loc[("crps", "attitude", "attitude_N"), "value"] == pytest.approx(
+        crps[:, 1].mean() * ARCMIN
+    )
+    assert own.loc[("crps", "attitude", "mean"), "value"] == pytest.approx(
+        crps[:, :3].mean() * ARCMIN
+    )
     assert own.loc[("crps", "attitude", "mean"), "unit"] == "arcmin"
     energy = arrays["energy"][5, kept, 2].astype(float)
     assert own.loc[("energy", "position", "norm"), "value"] == pytest.approx(energy.mean())
     pit = arrays["pit"][5, kept, 6:].astype(float)
-    assert own.loc[("coverage_50", "position", "mean"), "value"] == pytest.approx(((pit > 0.25) & (pit < 0.75)).mean())
+    assert own.loc[("coverage_50", "position", "mean"), "value"] == pytest.approx(
+        ((pit > 0.25) & (pit < 0.75)).mean()
+    )
     lost = rows[(rows.label == "lossy") & rows.lost]
     assert np.isinf(lost.value[lost.metric.isin(["crps", "energy"])]).all()
     assert lost.value[lost.metric.str.startswith("coverage")].isna().all()
@@ -54,28 +63,31 @@ def test_scores_in_units_by_hand(study, loaded):
 
 def test_scores_are_cut_with_the_instants(loaded):
     whole = loaded["honest"]
-    late = frame.later(whole, 15.0)
+    late = frame.drop_before(whole, 15.0)
     np.testing.assert_array_equal(late.arrays["time"][late.arrays["scored"]], [20.0, 30.0, 40.0])
     np.testing.assert_array_equal(late.arrays["pit"], whole.arrays["pit"][:, 1:])
-    assert frame.later(whole, 40.0).arrays["scored"].tolist() == [0]
-    early = frame.at_instants(whole, whole.arrays["time"] < 10.0)
+    assert frame.drop_before(whole, 40.0).arrays["scored"].tolist() == [0]
+    early = frame.select_steps(whole, whole.arrays["time"] < 10.0)
     assert not {"scored", "crps", "pit", "energy"} & early.arrays.keys()
-    assert calibration.drawings({"honest": early}, ["position"], looks(["honest"])) == []
+    assert (
+        calibration.calibration_figures({"honest": early}, ["position"], line_styles(["honest"]))
+        == []
+    )
 
 
 def test_narrow_and_wide_are_told_and_lost_runs_are_not_counted(study):
-    rows = frame.frame("demo", study)
-    found = calibration.calibrated(rows[rows.group == "position"])
+    rows = frame.load_frame("demo", study)
+    found = coverage.compute_coverage(rows[rows.group == "position"])
     assert {one.label: one.seen for one in found} == {
-        "honest": calibration.UNDECIDED, "lossy": calibration.UNDECIDED,
-        "narrow": calibration.NARROW, "wide": calibration.WIDE,
+        "honest": coverage.CONSISTENT, "lossy": coverage.CONSISTENT,
+        "narrow": coverage.UNDER_COVERAGE, "wide": coverage.OVER_COVERAGE,
     }  # fmt: skip
     assert {one.label: one.runs for one in found}["lossy"] == 57
-    text = calibration.said(found, "position")
-    assert "too narrow for narrow (" in text
-    assert "too wide for wide (" in text
-    assert text.endswith("no departure shown for honest, lossy.")
-    assert calibration.said(found, "velocity") == ""
+    text = coverage.format_coverage(found, "position")
+    assert "under-coverage for narrow (" in text
+    assert "over-coverage for wide (" in text
+    assert text.endswith("consistent with 90 % for honest, lossy.")
+    assert coverage.format_coverage(found, "velocity") == ""
     shares = {one.label: one.share for one in found}
     assert shares["narrow"] == pytest.approx(2 * stats.norm.cdf(0.4 * 1.6449) - 1, abs=0.06)
 
@@ -85,65 +97,77 @@ def test_a_calibrated_filter_is_rarely_called_otherwise():
     false, studies, runs = 0, 150, 40
     for _ in range(studies):  # six numbers of a run that hang together
         z = np.sqrt(0.5) * (rng.standard_normal((runs, 1, 1)) + rng.standard_normal((runs, 3, 2)))
-        value = metrics.coverage_per_run(stats.norm.cdf(z), np.zeros(runs, bool), 0.9)
-        false += calibration._judged(("s", "n", "m", "g", "f"), value, 0.05, 1).seen != calibration.UNDECIDED
+        value = consistency.coverage_per_run(stats.norm.cdf(z), np.zeros(runs, bool), 0.9)
+        false += (
+            coverage._judge(("s", "n", "m", "g", "f"), value, 0.05, 1).seen != coverage.CONSISTENT
+        )
     assert false <= stats.binom.ppf(0.999, studies, 0.08)
 
 
 def test_rank_histograms_are_flat_for_a_uniform_law_and_weigh_runs_alike():
     rng = np.random.default_rng(2)
     pit, lost = rng.random((500, 4, 2)), np.zeros(500, bool)
-    flat = metrics.rank_histogram(pit, lost)
+    flat = consistency.rank_histogram(pit, lost)
     assert flat.value.sum() == pytest.approx(1)
-    low, high = metrics.share_band(0.1, 500, 0.001)
+    low, high = intervals.binomial_interval(0.1, 500, 0.001)
     assert ((flat.value > low) & (flat.value < high)).all()
     few = np.full((2, 3, 1), np.nan)
     few[0], few[1, 0] = 0.05, 0.95  # three numbers of one run, one of the other
-    assert metrics.rank_histogram(few, lost[:2]).value[[0, 9]].tolist() == [0.5, 0.5]
-    assert metrics.rank_histogram(few, np.array([True, False])).value[9] == 1
-    assert metrics.rank_histogram(np.ones((1, 1, 1)), lost[:1]).value[9] == 1
+    assert consistency.rank_histogram(few, lost[:2]).value[[0, 9]].tolist() == [0.5, 0.5]
+    assert consistency.rank_histogram(few, np.array([True, False])).value[9] == 1
+    assert consistency.rank_histogram(np.ones((1, 1, 1)), lost[:1]).value[9] == 1
 
 
 def test_the_band_holds_for_numbers_that_hang_together():
     rng = np.random.default_rng(3)
-    low, high = metrics.share_band(0.1, 50, 0.05)
+    low, high = intervals.binomial_interval(0.1, 50, 0.05)
     out = [
-        metrics.rank_histogram(np.repeat(rng.random((50, 1, 1)), 5, axis=1), np.zeros(50, bool)).value for _ in range(200)
+        consistency.rank_histogram(
+            np.repeat(rng.random((50, 1, 1)), 5, axis=1), np.zeros(50, bool)
+        ).value
+        for _ in range(200)
     ]
     assert ((np.array(out) < low) | (np.array(out) > high)).mean() < 0.06
 
 
 def test_columns_and_lines(loaded):
-    table = tables.accuracy(loaded, "attitude").set_index("filter")
+    table = tables.accuracy_table(loaded, "attitude").set_index("filter")
     arrays = loaded["lossy"].arrays
     kept = ~arrays["lost"]
-    assert table.loc["lossy", "CRPS in arcmin"] == pytest.approx(arrays["crps"][kept][..., :3].astype(float).mean() * ARCMIN)
+    assert table.loc["lossy", "CRPS [arcmin]"] == pytest.approx(
+        arrays["crps"][kept][..., :3].astype(float).mean() * ARCMIN
+    )
     energy = arrays["energy"][kept][..., 0].astype(float).mean() * ARCMIN
-    assert table.loc["lossy", "energy score in arcmin"] == pytest.approx(energy)
-    assert table.loc["narrow", "in 90 % region in %"] < 70 < table.loc["honest", "in 90 % region in %"]
-    figure = calibration.histograms(loaded, ["position"], looks(list(loaded)))
+    assert table.loc["lossy", "energy score [arcmin]"] == pytest.approx(energy)
+    coverage = table["coverage of the 90 % interval [%]"]
+    assert coverage["narrow"] < 70 < coverage["honest"]
+    figure = calibration.plot_rank_histograms(loaded, ["position"], line_styles(list(loaded)))
     lines = {line.get_label(): np.asarray(line.get_ydata()) for line in figure.axes[0].lines}
     assert lines["narrow"][[0, -1]].min() > 15 > 7 > lines["wide"][[0, -1]].max()
     assert lines["honest"].sum() == pytest.approx(100)
 
 
 def test_of_many_filters_the_best_and_the_least_believable_are_drawn(study, loaded):
-    rows = frame.frame("demo", study)
+    rows = frame.load_frame("demo", study)
     groups = ["velocity", "position"]
-    assert list(figures.worth_a_spread(loaded, rows, groups)) == list(loaded)
+    assert list(condition_figures.has_spread(loaded, rows, groups)) == list(loaded)
     more = {**loaded, "twin": loaded["honest"]}
     again = rows[rows.label == "honest"].assign(label="twin")
     again.loc[again.metric == "rmse", "value"] *= 0.5
-    chosen = figures.worth_a_spread(more, pd.concat([rows, again]), groups)
+    chosen = condition_figures.has_spread(more, pd.concat([rows, again]), groups)
     assert set(chosen) == {"twin", "narrow"}
     assert "of 5 filters the one with the smallest median RMSE of position" in chosen["twin"]
-    assert "NEES farthest" in chosen["narrow"]
+    assert "largest distance of NEES" in chosen["narrow"]
 
 
 def test_scores_of_wrong_shape_are_refused(study, tmp_path):
     path = next((study / "demo").glob("*.npz"))
-    meta, arrays = store.load(path)
-    with pytest.raises(ValueError, match=r"pit has shape \(60, 3, 9\), expected \['R', 'S', 'D'\]"):
-        store.save(tmp_path / path.name, meta, {**arrays, "pit": arrays["pit"][:, :3]})
-    with pytest.raises(ValueError, match=r"crps has shape .*expected \['R', 'S', 'D'\] = \(60, 0, 9\)"):
-        store.save(tmp_path / path.name, meta, {name: a for name, a in arrays.items() if name != "scored"})
+    meta, arrays = store.read_result(path)
+    with pytest.raises(
+        ValueError, match=r"pit must have shape \['R', 'S', 'D'\].* got \(60, 3, 9\)"
+    ):
+        store.write_result(tmp_path / path.name, meta, {**arrays, "pit": arrays["pit"][:, :3]})
+    with pytest.raises(ValueError, match=r"crps must have shape \['R', 'S', 'D'\] = \(60, 0, 9\)"):
+        store.write_result(
+            tmp_path / path.name, meta, {name: a for name, a in arrays.items() if name != "scored"}
+        )

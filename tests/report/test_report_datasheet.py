@@ -11,9 +11,10 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
-from pfbench import metrics, store
-from pfbench.report import datasheet, figures, scene, scene_figures
-from pfbench.report.canvas import RC
+from pfbench.report import datasheet, scenario_data
+from pfbench.report.plots import condition_figures, error_plots, filter_plots, scenario_figures
+from pfbench.report.plots.plotting import RC, LineStyle
+from pfbench.results import consistency, error_measures, store
 
 STEPS, RUNS, SLOTS = 30, 6, 4
 META: dict[str, Any] = {
@@ -39,7 +40,9 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
         "lost": np.zeros(RUNS, bool),
         "residual": rng.standard_normal((RUNS, STEPS, SLOTS + 1)).astype(np.float32),
         "seen": np.column_stack([np.ones((STEPS, SLOTS)), time > 5]).astype(np.float32),
-        "track": np.broadcast_to(np.column_stack([3 * time, 4 * time, 0 * time]), (RUNS, STEPS, 3)).astype(np.float32),
+        "track": np.broadcast_to(
+            np.column_stack([3 * time, 4 * time, 0 * time]), (RUNS, STEPS, 3)
+        ).astype(np.float32),
         "force": rng.standard_normal((STEPS, 3)).astype(np.float32),
         "rate": rng.standard_normal((STEPS, 3)).astype(np.float32),
         "azimuth": np.where(np.isnan(up), np.nan, np.arange(SLOTS) * 1.5 + 0.001 * time[:, None]),
@@ -49,109 +52,143 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture
-def whole() -> store.Result:
-    return store.Result(META, arrays(np.random.default_rng(4)))
+def whole() -> store.JobResult:
+    return store.JobResult(META, arrays(np.random.default_rng(4)))
 
 
-def without(sheet: store.Result, *names: str, **more: Any) -> store.Result:
-    return store.Result({**sheet.meta, **more}, {k: v for k, v in sheet.arrays.items() if k not in names})
+def without(sheet: store.JobResult, *names: str, **more: Any) -> store.JobResult:
+    return store.JobResult(
+        {**sheet.meta, **more}, {k: v for k, v in sheet.arrays.items() if k not in names}
+    )
 
 
-def names(sheet: store.Result) -> list[str]:
-    return [drawing.name for drawing in datasheet.drawings(sheet)]
+def names(sheet: store.JobResult) -> list[str]:
+    return [drawing.name for drawing in datasheet.datasheet_figures(sheet)]
 
 
-def test_every_figure_is_drawn_where_there_are_data(whole: store.Result, tmp_path: Path) -> None:
-    file = store.save(tmp_path / "results" / "0123456789abcdef.npz", whole.meta, whole.arrays)
-    page = datasheet.write(file, tmp_path / "reports")
+def test_every_figure_is_drawn_where_there_are_data(whole: store.JobResult, tmp_path: Path) -> None:
+    file = store.write_result(
+        tmp_path / "results" / "0123456789abcdef.npz", whole.meta, whole.arrays
+    )
+    page = datasheet.write_datasheet(file, tmp_path / "reports")
     assert page == tmp_path / "reports" / "datasheets" / "flight_nominal" / "index.html"
     drawn = {path.name for path in (page.parent / "figures").iterdir()}
     wanted = ("track", "sensors", "sky", "seen", "residuals", "residuals_time", "spread")
-    assert drawn == {f"flight_nominal_{name}.{ending}" for name in wanted for ending in ("svg", "png")}
+    assert drawn == {
+        f"flight_nominal_{name}.{ending}" for name in wanted for ending in ("svg", "png")
+    }
     text = page.read_text()
     assert "<b>made up" not in text  # a stranger's text is no markup
-    assert "Cramer-Rao bound" in text
+    assert "Cramér-Rao bound" in text
     assert text.count("<img ") == len(wanted)
-    assert "What is not shown" not in text
+    assert "Missing figures" not in text
     assert "Track of the first run: 0.145 km" in text  # 29 steps of 5 m
     assert "Satellites above the horizon: 3 to 4 of 4." in text
     first = {path: path.read_bytes() for path in page.parent.rglob("*") if path.is_file()}
-    datasheet.write(file, tmp_path / "reports")
+    datasheet.write_datasheet(file, tmp_path / "reports")
     assert {path: path.read_bytes() for path in page.parent.rglob("*") if path.is_file()} == first
 
 
-def test_what_is_missing_is_said_and_not_drawn(whole: store.Result) -> None:
-    none = without(whole, "track", "force", "rate", "azimuth", "elevation", "bound", bound="no bound: recorded")
+def test_what_is_missing_is_said_and_not_drawn(whole: store.JobResult) -> None:
+    none = without(
+        whole, "track", "force", "rate", "azimuth", "elevation", "bound", bound="no bound: recorded"
+    )
     assert names(none) == ["seen", "residuals", "residuals_time", "spread"]
-    said = " ".join(datasheet.missing(none))
-    for part in ("No track", "No specific force", "No sky"):
+    said = " ".join(datasheet.list_missing_figures(none))
+    for part in ("Track:", "Specific force", "Satellites:"):
         assert part in said
-    assert any(fact == "No bound: recorded." for fact in datasheet.facts(none))
+    assert any(fact == "No bound: recorded." for fact in datasheet.list_facts(none))
     still = none.arrays | {"error": 0 * none.arrays["error"], "seen": np.ones((STEPS, SLOTS + 1))}
-    assert names(store.Result(none.meta, still)) == ["residuals", "residuals_time"]
-    assert "No spread of attitude, velocity, position: the same in all runs." in datasheet.missing(store.Result(none.meta, still))
-    blind = none.arrays | {"error": none.arrays["error"] * np.nan, "residual": none.arrays["residual"].copy()}
+    assert names(store.JobResult(none.meta, still)) == ["residuals", "residuals_time"]
+    assert (
+        "Spread of attitude, velocity, position: equal in all runs."
+        in datasheet.list_missing_figures(store.JobResult(none.meta, still))
+    )
+    blind = none.arrays | {
+        "error": none.arrays["error"] * np.nan,
+        "residual": none.arrays["residual"].copy(),
+    }
     blind["residual"][..., :3] = np.nan
-    said = " ".join(datasheet.missing(store.Result(none.meta, blind)))
-    assert "No residuals of range (3 of 4)" in said
-    assert "No spread of attitude, velocity, position: the truth is not known." in said
+    said = " ".join(datasheet.list_missing_figures(store.JobResult(none.meta, blind)))
+    assert "Residuals of range (3 of 4)" in said
+    assert "Spread of attitude, velocity, position: the truth is not available." in said
 
 
 def test_old_or_other_files_are_refused(tmp_path: Path) -> None:
     file = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=3, steps=5)
-    with pytest.raises(ValueError, match="holds a job and no datasheet"):
-        datasheet.write(file, tmp_path)
+    with pytest.raises(ValueError, match="file must be a datasheet, got the job"):
+        datasheet.write_datasheet(file, tmp_path)
 
 
-def test_the_spread_is_the_deviation_over_runs_beside_the_bound(whole: store.Result) -> None:
+def test_the_spread_is_the_deviation_over_runs_beside_the_bound(whole: store.JobResult) -> None:
     whole.arrays["error"][:, 7] = np.nan  # an instant without truth is no gap
-    panels = scene_figures.spread(whole).axes
+    panels = scenario_figures.plot_error_spread(whole).axes
     error = np.delete(whole.arrays["error"].astype(float), 7, axis=1)
     assert [axis.get_title() for axis in panels] == ["attitude", "velocity", "position"]
     for axis, first, scale in zip(panels, (0, 3, 6), (60 * np.degrees(1), 1.0, 1.0), strict=True):
         value, bound = axis.lines
         square = (error[..., first : first + 3] ** 2).sum(-1).sum(0) / (RUNS - 1)
         np.testing.assert_allclose(value.get_ydata(), np.sqrt(square) * scale, rtol=1e-5)
-        np.testing.assert_allclose(bound.get_ydata(), np.full(STEPS - 1, np.sqrt(0.75) * scale), rtol=1e-5)
+        np.testing.assert_allclose(
+            bound.get_ydata(), np.full(STEPS - 1, np.sqrt(0.75) * scale), rtol=1e-5
+        )
 
 
-def test_the_sky_has_north_up_and_east_to_the_right_and_names(whole: store.Result) -> None:
+def test_the_sky_has_north_up_and_east_to_the_right_and_names(whole: store.JobResult) -> None:
     with matplotlib.rc_context(RC):
-        figure = scene_figures.sky(whole)
+        figure = scenario_figures.plot_sky(whole)
         figure.canvas.draw()
     (axis,) = figure.axes
-    centre, north, east = (axis.transData.transform(point) for point in ((0.0, 0.0), (0.0, 45.0), (np.pi / 2, 45.0)))
+    centre, north, east = (
+        axis.transData.transform(point) for point in ((0.0, 0.0), (0.0, 45.0), (np.pi / 2, 45.0))
+    )
     assert north[1] - centre[1] > 10 > abs(north[0] - centre[0])
     assert east[0] - centre[0] > 10 > abs(east[1] - centre[1])
     assert {text.get_text() for text in axis.texts} >= {"G01", "G02", "G07", "G30"}
     lines = [line for line in axis.lines if len(np.asarray(line.get_xdata())) > 2]
-    np.testing.assert_allclose(lines[0].get_ydata(), 90 - np.degrees(whole.arrays["elevation"][:, 0]))
-    assert [len(np.asarray(line.get_xdata())) for line in lines] == [STEPS, STEPS, STEPS - 10, STEPS]
-    visible = scene_figures.seen(whole).axes[0].lines[0].get_ydata()
+    np.testing.assert_allclose(
+        lines[0].get_ydata(), 90 - np.degrees(whole.arrays["elevation"][:, 0])
+    )
+    assert [len(np.asarray(line.get_xdata())) for line in lines] == [
+        STEPS,
+        STEPS,
+        STEPS - 10,
+        STEPS,
+    ]
+    visible = scenario_figures.plot_measurements(whole).axes[0].lines[0].get_ydata()
     np.testing.assert_array_equal(visible, [3] * 10 + [4] * (STEPS - 10))
 
 
-def test_a_scene_may_spell_its_satellites_and_show_them_at_some_steps_alone(whole: store.Result) -> None:
-    assert scene.satellites(whole) == ["G01", "G02", "G07", "G30"]
+def test_a_scene_may_spell_its_satellites_and_show_them_at_some_steps_alone(
+    whole: store.JobResult,
+) -> None:
+    assert scenario_data.count_satellites(whole) == ["G01", "G02", "G07", "G30"]
     codes = [[ord(letter) for letter in name] for name in ("E1 ", "R24", "G05", "C06")]
     spelled = whole.arrays | {"satellites": np.array(codes, np.float32)}
     for name in ("azimuth", "elevation"):
         spelled[name] = np.where(np.arange(STEPS)[:, None] % 3 == 0, spelled[name], np.nan)
-    sheet = store.Result(whole.meta, spelled)
-    assert scene.satellites(sheet) == ["E1", "R24", "G05", "C06"]
-    assert any(fact == "Satellites above the horizon: 3 to 4 of 4." for fact in datasheet.facts(sheet))
-    line = scene_figures.seen(sheet).axes[0].lines[0]
+    sheet = store.JobResult(whole.meta, spelled)
+    assert scenario_data.count_satellites(sheet) == ["E1", "R24", "G05", "C06"]
+    assert any(
+        fact == "Satellites above the horizon: 3 to 4 of 4." for fact in datasheet.list_facts(sheet)
+    )
+    line = scenario_figures.plot_measurements(sheet).axes[0].lines[0]
     assert line.get_linestyle() == "None"
     np.testing.assert_array_equal(line.get_xdata(), np.arange(1.0, STEPS + 1, 3))
-    assert {text.get_text() for text in scene_figures.sky(sheet).axes[0].texts} >= {"E1", "R24", "G05", "C06"}
+    assert {text.get_text() for text in scenario_figures.plot_sky(sheet).axes[0].texts} >= {
+        "E1",
+        "R24",
+        "G05",
+        "C06",
+    }
 
 
-def test_runs_with_the_same_residuals_count_once(whole: store.Result) -> None:
-    table = datasheet.whiteness(whole)
-    assert table["numbers"].tolist() == [RUNS * STEPS * SLOTS, RUNS * STEPS]
+def test_runs_with_the_same_residuals_count_once(whole: store.JobResult) -> None:
+    table = datasheet.whiteness_table(whole)
+    assert table["residuals"].tolist() == [RUNS * STEPS * SLOTS, RUNS * STEPS]
     whole.arrays["residual"][:] = whole.arrays["residual"][:1]
-    assert datasheet.whiteness(whole)["numbers"].tolist() == [STEPS * SLOTS, STEPS]
-    assert any("counted once" in fact for fact in datasheet.facts(whole))
+    assert datasheet.whiteness_table(whole)["residuals"].tolist() == [STEPS * SLOTS, STEPS]
+    assert any("counted once" in fact for fact in datasheet.list_facts(whole))
 
 
 # the measures
@@ -160,7 +197,7 @@ def test_runs_with_the_same_residuals_count_once(whole: store.Result) -> None:
 def test_white_normal_numbers_lie_in_their_bands_and_others_do_not() -> None:
     rng = np.random.default_rng(2)
     white = rng.standard_normal((20, 200, 3))
-    law = metrics.whiteness(white)
+    law = consistency.compute_whiteness(white)
     # bands are of 1.96 standard errors: three of them allow 5.9
     assert abs(law.mean) < 3 * law.mean_band
     assert abs(law.variance - 1) < 3 * law.variance_band
@@ -168,83 +205,105 @@ def test_white_normal_numbers_lie_in_their_bands_and_others_do_not() -> None:
     assert law.numbers == 12000
     assert law.variance_band == pytest.approx(1.96 * np.sqrt(2 / 12000))
     assert law.lag_band == pytest.approx(1.96 / np.sqrt(20 * 199 * 3))
-    assert metrics.whiteness(white + 0.2).mean > 5 * law.mean_band
-    assert metrics.whiteness(1.1 * white).variance > 1 + 5 * law.variance_band
+    assert consistency.compute_whiteness(white + 0.2).mean > 5 * law.mean_band
+    assert consistency.compute_whiteness(1.1 * white).variance > 1 + 5 * law.variance_band
     slow = white.copy()
     for t in range(1, 200):
         slow[:, t] = 0.5 * slow[:, t - 1] + np.sqrt(0.75) * white[:, t]
-    assert metrics.whiteness(slow).lag == pytest.approx(0.5, abs=0.05)
+    assert consistency.compute_whiteness(slow).lag == pytest.approx(0.5, abs=0.05)
 
 
 def test_neighbours_are_the_measurements_next_to_each_other() -> None:
     z = np.full((1, 9, 1), np.nan)
     z[0, ::2, 0] = [1.0, -1.0, 1.0, -1.0, 1.0]
-    law = metrics.whiteness(z)
+    law = consistency.compute_whiteness(z)
     assert law.lag == -1.0
     assert law.lag_band == pytest.approx(1.96 / 2)
     assert law.variance == 1.0
-    empty = metrics.whiteness(z * np.nan)
+    empty = consistency.compute_whiteness(z * np.nan)
     assert empty.numbers == 0
     assert np.isnan(empty.variance)
 
 
 def test_the_error_over_the_bound_is_over_the_same_runs_and_instants() -> None:
     bound = np.array([[3.0, 4.0], [30.0, 40.0]])  # 5 and 50
-    error = np.array([[[10.0, 0.0], [np.nan, 0.0]], [[10.0, 0.0], [0.0, 100.0]], [[1e9, 0.0], [0.0, 0.0]]])
+    error = np.array(
+        [[[10.0, 0.0], [np.nan, 0.0]], [[10.0, 0.0], [0.0, 100.0]], [[1e9, 0.0], [0.0, 0.0]]]
+    )
     lost = np.array([False, False, True])
-    assert metrics.over_bound(error, lost, bound) == pytest.approx(np.sqrt((100 + 100 + 10000) / (25 + 25 + 2500)))
-    assert np.isnan(metrics.over_bound(error, np.ones(3, bool), bound))
+    assert error_measures.rmse_to_pcrb(error, lost, bound) == pytest.approx(
+        np.sqrt((100 + 100 + 10000) / (25 + 25 + 2500))
+    )
+    assert np.isnan(error_measures.rmse_to_pcrb(error, np.ones(3, bool), bound))
 
 
 def test_the_relative_error_is_a_mean_of_shares() -> None:
     error = np.array([[[3.0, 4.0], [6.0, 8.0]], [[0.0, 5.0], [0.0, 0.0]]])
     distance = np.array([100.0, 50.0])
     none = np.zeros(2, bool)
-    assert metrics.relative_error(error, none, distance).value == pytest.approx((0.05 + 0.2 + 0.05 + 0.0) / 4)
-    assert metrics.relative_error(error, none, distance, 1).value == pytest.approx(0.1)
+    assert error_measures.relative_error(error, none, distance).value == pytest.approx(
+        (0.05 + 0.2 + 0.05 + 0.0) / 4
+    )
+    assert error_measures.relative_error(error, none, distance, 1).value == pytest.approx(0.1)
 
 
 # what a report of a study makes of rare truth and of the bound
 
 
-def changed(file: Path, **more: Any) -> store.Result:
+def changed(file: Path, **more: Any) -> store.JobResult:
     """A job with other arrays, saved and read."""
-    found = store.load(file)
-    store.save(file, {**found.meta, "bound": "posterior Cramer-Rao bound of the model"}, {**found.arrays, **more})
-    return store.load(file)
+    found = store.read_result(file)
+    store.write_result(
+        file,
+        {**found.meta, "bound": "posterior Cramer-Rao bound of the model"},
+        {**found.arrays, **more},
+    )
+    return store.read_result(file)
 
 
 def test_steps_with_rare_truth_are_not_thinned_away(tmp_path: Path) -> None:
     file = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=4, steps=1000)
-    found = store.load(file)
+    found = store.read_result(file)
     error, nees = (found.arrays[name].copy() for name in ("error", "nees"))
     rare = np.zeros(1000, bool)
     rare[[101, 355, 612, 990]] = True  # none of which a stride of three or so meets
     error[:, ~rare, 6:] = nees[:, ~rare, 2] = np.nan
     result = changed(file, error=error, nees=nees)
-    style = {"ekf": figures.Look("black", "-", "o", 1.0)}
-    block = next(b for b in figures.blocks(result.meta["state"]) if b.group == "position")
-    for line in figures.error({"ekf": result}, block, style).axes[0].lines:
+    style = {"ekf": LineStyle("black", "-", "o", 1.0)}
+    block = next(
+        b for b in condition_figures.component_groups(result.meta["state"]) if b.group == "position"
+    )
+    for line in error_plots.plot_error({"ekf": result}, block, style).axes[0].lines:
         np.testing.assert_array_equal(line.get_xdata(), result.arrays["time"][rare])
         assert np.isfinite(np.asarray(line.get_ydata())).all()
     middle = np.median(np.abs(error[:, rare, 6].astype(float)), axis=0)
-    np.testing.assert_allclose(figures.error({"ekf": result}, block, style).axes[0].lines[0].get_ydata(), middle, rtol=1e-6)
-    line = figures.nees({"ekf": result}, ["position"], style).axes[0].lines[0]
+    line = error_plots.plot_error({"ekf": result}, block, style).axes[0].lines[0]
+    np.testing.assert_allclose(line.get_ydata(), middle, rtol=1e-6)
+    line = filter_plots.plot_nees({"ekf": result}, ["position"], style).axes[0].lines[0]
     np.testing.assert_array_equal(line.get_xdata(), result.arrays["time"][rare])
-    panels = {axis.get_title(): axis for axis in figures.spread(result, ["attitude", "position"], style["ekf"]).axes}
+    panels = {
+        axis.get_title(): axis
+        for axis in error_plots.plot_spread(result, ["attitude", "position"], style["ekf"]).axes
+    }
     assert len(panels["position_E"].lines[0].get_xdata()) == 4
-    assert len(panels["attitude_E"].lines[0].get_xdata()) == 120  # where all is known, as many as ever
-    plan = figures.track({"ekf": result}, 0, style).axes[0]
+    assert (
+        len(panels["attitude_E"].lines[0].get_xdata()) == 120
+    )  # where all is known, as many as ever
+    plan = error_plots.plot_track({"ekf": result}, 0, style).axes[0]
     assert len(next(line for line in plan.lines if line.get_label() == "ekf").get_xdata()) == 4
 
 
 def test_one_instant_with_truth_is_a_dot(tmp_path: Path) -> None:
     file = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=4, steps=50)
-    error = store.load(file).arrays["error"].copy()
+    error = store.read_result(file).arrays["error"].copy()
     error[:, np.arange(50) != 17] = np.nan
     result = changed(file, error=error)
-    block = figures.blocks(result.meta["state"])[0]
-    (line,) = figures.error({"ekf": result}, block, {"ekf": figures.Look("black", "-", "o", 1.0)}).axes[0].lines
+    block = condition_figures.component_groups(result.meta["state"])[0]
+    (line,) = (
+        error_plots.plot_error({"ekf": result}, block, {"ekf": LineStyle("black", "-", "o", 1.0)})
+        .axes[0]
+        .lines
+    )
     assert line.get_marker() == "."
     assert len(line.get_xdata()) == 1
 
@@ -253,24 +312,35 @@ def test_the_bound_and_the_range_are_drawn_and_tabled_where_there_are_any(tmp_pa
     from pfbench.report import page, tables
 
     file = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=8, steps=40)
-    plain = tables.accuracy({"ekf": store.load(file)}, "position")
-    assert not [name for name in plain if "bound" in name or "range" in name]
+    plain = tables.accuracy_table({"ekf": store.read_result(file)}, "position")
+    assert not [name for name in plain if "PCRB" in name or "range" in name]
     bound = np.linspace(1.0, 2.0, 40)[:, None] * np.ones(9)
     result = changed(file, bound=bound, range=np.linspace(1000.0, 2000.0, 40))
-    style = {"ekf": figures.Look("blue", "-", "o", 1.0)}
-    block = next(b for b in figures.blocks(result.meta["state"]) if b.group == "position")
-    line = figures.error({"ekf": result}, block, style).axes[0].lines[-1]
-    assert (line.get_label(), line.get_color()) == ("Cramer-Rao bound", "black")
-    np.testing.assert_allclose(line.get_ydata(), 0.6745 * bound[:, 6])  # the median of a normal error's absolute value
-    spread = {axis.get_title(): axis for axis in figures.spread(result, ["position"], style["ekf"]).axes}["position_E"]
-    np.testing.assert_allclose(sorted(float(np.asarray(line.get_ydata())[0]) for line in spread.lines[-2:]), [-3.0, 3.0])
-    options = page.Options(formats=("svg",), groups=("position",), from_time=21.0)
-    made = page.write("demo", tmp_path, tmp_path / "reports", options)
+    style = {"ekf": LineStyle("blue", "-", "o", 1.0)}
+    block = next(
+        b for b in condition_figures.component_groups(result.meta["state"]) if b.group == "position"
+    )
+    line = error_plots.plot_error({"ekf": result}, block, style).axes[0].lines[-1]
+    assert (line.get_label(), line.get_color()) == ("PCRB", "black")
+    np.testing.assert_allclose(
+        line.get_ydata(), 0.6745 * bound[:, 6]
+    )  # the median of a normal error's absolute value
+    spread = {
+        axis.get_title(): axis
+        for axis in error_plots.plot_spread(result, ["position"], style["ekf"]).axes
+    }["position_E"]
+    np.testing.assert_allclose(
+        sorted(float(np.asarray(line.get_ydata())[0]) for line in spread.lines[-2:]), [-3.0, 3.0]
+    )
+    options = page.ReportOptions(figure_formats=("svg",), groups=("position",), start_time_s=21.0)
+    made = page.write_report("demo", tmp_path, tmp_path / "reports", options)
     (table,) = (pd.read_csv(path) for path in (made.parent / "tables").glob("*_position.csv"))
     error = result.arrays["error"][:, 20:, 6:].astype(float)
     share = np.sqrt((error**2).sum(-1).mean() / (3 * (bound[20:, 0] ** 2).mean()))
-    assert table["RMSE norm to Cramer-Rao bound"][0] == pytest.approx(share)
+    assert table["RMSE / PCRB"][0] == pytest.approx(share)
     flat = np.hypot(error[..., 0], error[..., 1]) / result.arrays["range"][20:]
-    assert table["error in % of range, mean"][0] == pytest.approx(100 * flat.mean())
-    assert table["error in % of range, last 20 steps"][0] == pytest.approx(100 * flat[:, -20:].mean())
+    assert table["horizontal error [% of range]"][0] == pytest.approx(100 * flat.mean())
+    assert table["horizontal error [% of range], last 20 steps"][0] == pytest.approx(
+        100 * flat[:, -20:].mean()
+    )
     assert "flight / surge / ins_gnss: posterior Cramer-Rao bound of the model." in made.read_text()

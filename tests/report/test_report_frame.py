@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import synthetic_results as synthetic
 
-from pfbench import store
-from pfbench.report import frame
+from pfbench.results import frame, state_groups, store
 
 SMALL = {"runs": 6, "steps": 20}
 
@@ -21,7 +20,7 @@ def results(tmp_path_factory):
 
 
 def test_one_row_per_run_and_figure(results):
-    table = frame.frame("demo", results)
+    table = frame.load_frame("demo", results)
     assert list(table.columns) == [
         "study", "key", "scenario", "noise", "model", "filter", "label", "particles", "seed", "run", "lost",
         "group", "component", "unit", "metric", "value",
@@ -34,16 +33,20 @@ def test_one_row_per_run_and_figure(results):
 
 
 def test_numbers_and_units_by_hand(results):
-    table = frame.frame("demo", results, from_time=10.0)
-    (raw,) = [r for r in store.results(results / "demo") if r.meta["label"] == "ekf"]
+    table = frame.load_frame("demo", results, start_time_s=10.0)
+    (raw,) = [r for r in store.list_results(results / "demo") if r.meta["label"] == "ekf"]
     late = raw.arrays["time"] >= 10.0
     error = raw.arrays["error"][3, late].astype(float)
-    rows = table[(table.label == "ekf") & (table.run == 3)].set_index(["metric", "group", "component"])
+    rows = table[(table.label == "ekf") & (table.run == 3)].set_index(
+        ["metric", "group", "component"]
+    )
     # One radian is 180 * 60 / pi minutes of arc.
     expected = np.sqrt(np.mean(np.sum(error[:, :3] ** 2, axis=1))) * 180 * 60 / np.pi
     assert rows.loc[("rmse", "attitude", "norm"), "value"] == pytest.approx(expected)
     assert rows.loc[("rmse", "attitude", "norm"), "unit"] == "arcmin"
-    assert rows.loc[("rmse", "position", "position_U"), "value"] == pytest.approx(np.sqrt(np.mean(error[:, 8] ** 2)))
+    assert rows.loc[("rmse", "position", "position_U"), "value"] == pytest.approx(
+        np.sqrt(np.mean(error[:, 8] ** 2))
+    )
     assert rows.loc[("rmse", "position", "position_U"), "unit"] == "m"
     assert rows.loc[("max_error", "velocity", "norm"), "value"] == pytest.approx(
         np.linalg.norm(error[:, 3:6], axis=1).max()
@@ -55,7 +58,7 @@ def test_numbers_and_units_by_hand(results):
 
 
 def test_a_lost_run_stays_with_an_infinite_error(results):
-    table = frame.frame("demo", results)
+    table = frame.load_frame("demo", results)
     lost = table[table.lost]
     assert set(zip(lost.label, lost.run, strict=True)) == {("sir", 7)}
     assert np.isinf(lost.value[lost.metric.isin(["rmse", "max_error"])]).all()
@@ -67,9 +70,18 @@ def test_units_shown():
     state = {
         "names": ["b_g", "b_a", "attitude_E", "clock", "clock_rate", "scale"],
         "units": ["rad/s", "m/s^2", "rad", "m", "m/s", ""],
-        "groups": {"gyro": [0], "accelerometer": [1], "attitude": [2], "clock": [3, 4], "scale": [5]},
+        "groups": {
+            "gyro": [0],
+            "accelerometer": [1],
+            "attitude": [2],
+            "clock": [3, 4],
+            "scale": [5],
+        },
     }
-    shown = {block.group: (block.unit, block.scale, block.whole) for block in frame.blocks(state)}
+    shown = {
+        block.group: (block.unit, block.scale, block.whole)
+        for block in state_groups.component_groups(state)
+    }
     assert shown["gyro"] == ("deg/h", pytest.approx(206264.806), "gyro")
     assert shown["accelerometer"] == ("mg", pytest.approx(101.9716), "accelerometer")
     assert shown["attitude"] == ("arcmin", pytest.approx(3437.7468), "attitude")
@@ -80,10 +92,12 @@ def test_units_shown():
 
 
 def test_convergence_by_bound(results):
-    table = frame.frame("demo", results, converged={"attitude": 1e6})
+    table = frame.load_frame("demo", results, convergence_threshold={"attitude": 1e6})
     found = table[table.metric == "converged"]
     assert set(found.group) == {"attitude"}
-    assert (found.value[~found.lost] == 1.0).all()  # under so wide a bound from the first instant on
+    assert (
+        found.value[~found.lost] == 1.0
+    ).all()  # under so wide a bound from the first instant on
     assert np.isinf(found.value[found.lost]).all()
 
 
@@ -91,7 +105,7 @@ def test_labels_tell_configurations_of_one_filter_apart(tmp_path):
     for particles in (400, 100, 1600):
         synthetic.write(tmp_path / "demo", synthetic.Method("sir", 1.0, 1.0, particles), **SMALL)
     synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), **SMALL)
-    (cell,) = frame.cells("demo", tmp_path)
+    (cell,) = frame.load_conditions("demo", tmp_path)
     assert [job.label for job in cell.jobs] == [
         "ekf", "sir[particles=100]", "sir[particles=400]", "sir[particles=1600]",
     ]  # fmt: skip
@@ -102,15 +116,21 @@ def test_labels_name_only_what_differs(tmp_path):
     for threshold in (0.5, 1.0):
         config = {"resampler": {"threshold": threshold, "kind": "systematic"}}
         synthetic.write(tmp_path / "demo", method, config=config, **SMALL)
-    (cell,) = frame.cells("demo", tmp_path)
-    assert [job.label for job in cell.jobs] == ["sir[resampler.threshold=0.5]", "sir[resampler.threshold=1.0]"]
+    (cell,) = frame.load_conditions("demo", tmp_path)
+    assert [job.label for job in cell.jobs] == [
+        "sir[resampler.threshold=0.5]",
+        "sir[resampler.threshold=1.0]",
+    ]
 
 
 def test_noise_regimes_are_cells(tmp_path):
     for noise in ("surge", "nominal"):
         synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), noise=noise, **SMALL)
-    found = frame.cells("demo", tmp_path)
-    assert [(cell.noise, [job.label for job in cell.jobs]) for cell in found] == [("nominal", ["ekf"]), ("surge", ["ekf"])]
+    found = frame.load_conditions("demo", tmp_path)
+    assert [(cell.noise, [job.label for job in cell.jobs]) for cell in found] == [
+        ("nominal", ["ekf"]),
+        ("surge", ["ekf"]),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -127,14 +147,17 @@ def test_what_does_not_belong_together_is_refused_by_name(tmp_path, change, name
     synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), **SMALL)
     odd = synthetic.write(tmp_path / "demo", synthetic.Method("ukf", 1.0), **{**SMALL, **change})
     with pytest.raises(ValueError, match=rf"differ in {named} .*mixed=True") as refusal:
-        frame.frame("demo", tmp_path)
+        frame.load_frame("demo", tmp_path)
     assert odd.name in str(refusal.value)
-    assert set(frame.frame("demo", tmp_path, mixed=True).label) == {"ekf", "ukf"}
+    assert set(frame.load_frame("demo", tmp_path, allow_mixed_versions=True).label) == {
+        "ekf",
+        "ukf",
+    }
 
 
 def other_world(path: Path, **settings: Any) -> None:
-    meta, arrays = store.load(path)
-    store.save(path, {**meta, "config": {**meta["config"], **settings}}, arrays)
+    meta, arrays = store.read_result(path)
+    store.write_result(path, {**meta, "config": {**meta["config"], **settings}}, arrays)
 
 
 @pytest.mark.parametrize(
@@ -147,45 +170,56 @@ def other_world(path: Path, **settings: Any) -> None:
 )
 def test_filters_of_one_cell_met_the_same_worlds(tmp_path, first, second, named):
     for name, settings in (("ekf", first), ("ukf", second)):
-        other_world(synthetic.write(tmp_path / "demo", synthetic.Method(name, 1.0), **SMALL), **settings)
+        other_world(
+            synthetic.write(tmp_path / "demo", synthetic.Method(name, 1.0), **SMALL), **settings
+        )
     with pytest.raises(ValueError, match=rf"differ in {named} "):
-        frame.cells("demo", tmp_path)
-    assert len(frame.cells("demo", tmp_path, mixed=True)) == 1
+        frame.load_conditions("demo", tmp_path)
+    assert len(frame.load_conditions("demo", tmp_path, allow_mixed_versions=True)) == 1
 
 
 def test_worlds_may_differ_where_every_label_tells_in_what(tmp_path):
     for k, sd in enumerate((1.0, 10.0)):
         for name in ("ekf", "ukf"):
-            path = synthetic.write(tmp_path / "demo", synthetic.Method(name, 1.0, 1.0, 100 + k), **SMALL)
-            meta, arrays = store.load(path)
-            settings = {"filter": {"name": name}, "scenario": {"gps_sd": sd, "cache": f"place{k}"}}
-            store.save(path, {**meta, "config": settings}, arrays)
-    (cell,) = frame.cells("demo", tmp_path)
+            path = synthetic.write(
+                tmp_path / "demo", synthetic.Method(name, 1.0, 1.0, 100 + k), **SMALL
+            )
+            meta, arrays = store.read_result(path)
+            settings = {
+                "filter": {"name": name},
+                "scenario": {"gps_sd": sd, "cache_dir": f"place{k}"},
+            }
+            store.write_result(path, {**meta, "config": settings}, arrays)
+    (cell,) = frame.load_conditions("demo", tmp_path)
     assert [job.label for job in cell.jobs] == [
         "ekf[scenario.gps_sd=1.0]", "ekf[scenario.gps_sd=10.0]", "ukf[scenario.gps_sd=1.0]", "ukf[scenario.gps_sd=10.0]",
     ]  # fmt: skip
-    assert frame.differing(cell.jobs) == ["scenario.gps_sd"]
+    assert frame.differing_settings(cell.jobs) == ["scenario.gps_sd"]
 
 
 def test_shares_are_of_the_particles_in_use(tmp_path):
     """A filter that uses half of its slots and weighs them alike has an effective size of all, not of half."""
-    path = synthetic.write(tmp_path / "demo", synthetic.Method("cofm_amssrcpf", 1.0, 1.0, 200), **SMALL)
-    meta, arrays = store.load(path)
+    path = synthetic.write(
+        tmp_path / "demo", synthetic.Method("cofm_amssrcpf", 1.0, 1.0, 200), **SMALL
+    )
+    meta, arrays = store.read_result(path)
     number = np.full_like(arrays["ess"], 100.0)
-    store.save(path, meta, {**arrays, "particles": number, "ess": number})
-    table = frame.frame("demo", tmp_path)
+    store.write_result(path, meta, {**arrays, "particles": number, "ess": number})
+    table = frame.load_frame("demo", tmp_path)
     assert (table[table.metric == "ess"].value.dropna() == 1.0).all()
 
 
 def test_a_run_may_converge_before_the_time_from_which_errors_count(results):
-    table = frame.frame("demo", results, converged={"attitude": 1e6}, from_time=10.0)
+    table = frame.load_frame(
+        "demo", results, convergence_threshold={"attitude": 1e6}, start_time_s=10.0
+    )
     found = table[(table.metric == "converged") & ~table.lost]
     assert (found.value == 1.0).all()
 
 
 def test_an_empty_study_says_where_to_go(results):
     with pytest.raises(FileNotFoundError) as refusal:
-        frame.frame("nothing", results)
+        frame.load_frame("nothing", results)
     message = str(refusal.value)
     assert str(results / "nothing") in message
     assert "demo" in message
@@ -193,11 +227,15 @@ def test_an_empty_study_says_where_to_go(results):
 
 
 def test_a_study_that_only_failed_says_so(tmp_path):
-    store.failed(tmp_path / "bad" / "00.npz", {"filter": "sir"}, RuntimeError("no particles left"))
-    with pytest.raises(FileNotFoundError, match="1 jobs failed, the first with RuntimeError: no particles left"):
-        frame.frame("bad", tmp_path)
+    store.write_failure(
+        tmp_path / "bad" / "00.npz", {"filter": "sir"}, RuntimeError("no particles left")
+    )
+    with pytest.raises(
+        FileNotFoundError, match="1 jobs failed, the first with RuntimeError: no particles left"
+    ):
+        frame.load_frame("bad", tmp_path)
 
 
-def test_nothing_left_after_from_time_is_an_error(results):
-    with pytest.raises(ValueError, match="from_time=1000"):
-        frame.frame("demo", results, from_time=1000.0)
+def test_nothing_left_after_start_time_is_an_error(results):
+    with pytest.raises(ValueError, match=r"report\.start_time_s must be at most .*, got 1000\.0 s"):
+        frame.load_frame("demo", results, start_time_s=1000.0)

@@ -7,8 +7,12 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from pfbench.report import across, canvas, files, frame, headline, headline_figures, page, ranking_figures
-from pfbench.report.significance import NO_DIFFERENCE, holm, verdicts
+from pfbench.report import page, summary, writers
+from pfbench.report.plots import comparison_figures, plotting, summary_figures
+from pfbench.results import condition_blocks, frame, rankings
+from pfbench.results.pairwise_tests import INCONCLUSIVE, compare_pairs
+from pfbench.results.statistics import holm
+from pfbench.results.status import StatusCounts
 
 WORLDS, REGIMES = ("plain", "hill", "lake"), ("nominal", "outliers")
 SIZES = {"sir": 1.5, "rpf": 1.2, "mcmc_rpf": 1.0, "mssrckf": 1.0, "fm_mssrckf": 1.1}
@@ -39,17 +43,25 @@ def mains(group_of=lambda world: "position"):
 
 
 def found(table, of=None):
-    own, decided, name = headline.joined(table, verdicts(table[table.group != "velocity"]), of or mains())
-    source = across.blocks(own, name)
-    return own, decided, name, source, headline.planned(source, decided, 0.05)
+    own, decided, name = summary.merge(
+        table, compare_pairs(table[table.group != "velocity"]), of or mains()
+    )
+    source = condition_blocks.ranking_blocks(own, name)
+    return own, decided, name, source, summary.compare_with_baselines(source, decided, 0.05)
 
 
 def test_planned_pairs_are_tested_as_scipy_does_and_corrected_over_themselves():
     _, decided, _, source, pairs = found(rows())
-    assert [(p.method, p.baseline) for p in pairs] == [("mcmc_rpf", "sir"), ("mcmc_rpf", "rpf"), ("fm_mssrckf", "mssrckf")]
+    assert [(p.method, p.baseline) for p in pairs] == [
+        ("mcmc_rpf", "sir"),
+        ("mcmc_rpf", "rpf"),
+        ("fm_mssrckf", "mssrckf"),
+    ]
     p = []
     for pair in pairs:
-        a, b = (source.values[:, source.filters.index(label)] for label in (pair.method, pair.baseline))
+        a, b = (
+            source.values[:, source.filters.index(label)] for label in (pair.method, pair.baseline)
+        )
         assert pair.p == pytest.approx(stats.wilcoxon(a - b).pvalue)
         assert pair.ratio == pytest.approx(np.median(np.exp(a - b)))
         own = [v.winner for v in decided if {v.a, v.b} == {pair.method, pair.baseline}]
@@ -65,44 +77,59 @@ def test_planned_pairs_are_tested_as_scipy_does_and_corrected_over_themselves():
 def test_a_winner_needs_the_corrected_p_and_is_the_one_whose_errors_are_smaller():
     table = rows()
     _, _, _, _, pairs = found(table)
-    assert [pair.winner for pair in pairs] == [NO_DIFFERENCE] * 3  # six cells give p = 2 / 2^6 at best, three times that here
+    assert [pair.winner for pair in pairs] == [
+        INCONCLUSIVE
+    ] * 3  # six cells give p = 2 / 2^6 at best, three times that here
     more = pd.concat([table, rows(seed=1).assign(model="n")], ignore_index=True)
     of = mains() | {(world, noise, "n"): group for (world, noise, _), group in mains().items()}
     assert [pair.winner for pair in found(more, of)[4]] == ["mcmc_rpf", "mcmc_rpf", "mssrckf"]
 
 
 def words():
-    return files._environment(False).get_template("text.jinja").make_module({"options": page.Options()})
+    return (
+        writers._environment(False)
+        .get_template("text.jinja")
+        .make_module({"options": page.ReportOptions()})
+    )
 
 
 def test_what_cannot_be_shown_is_not_called_no_difference():
     table = rows()
     pairs = found(table)[4]
     assert min(pair.p for pair in pairs) == 2 / 2**6  # all signs alike
-    assert {(pair.least, pair.possible, pair.decided) for pair in pairs} == {(7, False, "cannot be shown with 6 cells")}
-    text = words().told(pairs)
-    assert "over 6 cells of 3 worlds, which are no independent blocks: a difference cannot be shown with 6 cells" in text
-    assert "takes 7 cells at least to show anything" in text
-    assert "no difference shown" not in text
+    assert {(pair.least, pair.possible, pair.decided) for pair in pairs} == {
+        (7, False, "inconclusive: 6 conditions are too few")
+    }
+    text = words().baselines(pairs)
+    assert (
+        "over 6 conditions of 3 scenarios (dependent blocks): inconclusive: 6 conditions are too few"
+        in text
+    )
+    assert "requires 7 conditions" in text
+    assert "inconclusive in" not in text
     more = pd.concat([table, rows(seed=1).assign(model="n")], ignore_index=True)
     of = mains() | {(world, noise, "n"): group for (world, noise, _), group in mains().items()}
     pairs = found(more, of)[4]
-    assert [pair.decided for pair in pairs] == [pair.winner for pair in pairs] == ["mcmc_rpf", "mcmc_rpf", "mssrckf"]
-    assert "better in 2 (mcmc_rpf / sir, mcmc_rpf / rpf), worse in 1" in words().told(pairs)
+    assert (
+        [pair.decided for pair in pairs]
+        == [pair.winner for pair in pairs]
+        == ["mcmc_rpf", "mcmc_rpf", "mssrckf"]
+    )
+    assert "better in 2 (mcmc_rpf / sir, mcmc_rpf / rpf), worse in 1" in words().baselines(pairs)
 
 
 def test_filters_that_tie_with_the_sixth_are_named_and_the_others_counted():
     table = rows()
     own, decided, _, _, pairs = found(table)
-    one = across.across(own, "position")
-    said = headline.summary(one, decided, pairs, own, mains(), [])
+    one = rankings.rank_filters(own, "position")
+    said = summary.summarise_study(one, decided, pairs, own, mains(), [])
     often = tuple((f"f{k}", 6 if k < 8 else 2) for k in range(11))
-    tied = headline.replace(said, often=often)
+    tied = summary.replace(said, often=often)
     assert [label for label, _ in tied.foremost] == [f"f{k}" for k in range(8)]
     text = words().summary(tied, one)
-    assert "f5 in 6, f6 in 6, f7 in 6 of 6 cells; 3 other filters are so in fewer." in text
-    assert "of 6 cells; " not in words().summary(headline.replace(said, often=often[:8]), one)
-    assert headline.replace(said, often=()).foremost == ()
+    assert "f5 6, f6 6, f7 6. 3 other filters have fewer." in text
+    assert "have fewer" not in words().summary(summary.replace(said, often=often[:8]), one)
+    assert summary.replace(said, often=()).foremost == ()
 
 
 def test_what_runs_are_lost_decides_and_is_said():
@@ -110,13 +137,17 @@ def test_what_runs_are_lost_decides_and_is_said():
     own, decided, _, source, pairs = found(rows(lost=gone))
     assert pairs[0].ratios == (0.0,) * 6
     assert pairs[0].better == 6
-    one = across.across(own, "position")
-    fates = [(label, 16 * (label == "sir"), int(label == "rpf"), 16) for label in SIZES for _ in range(6)]
-    said = headline.summary(one, decided, pairs, own, mains(), fates)
+    one = rankings.rank_filters(own, "position")
+    fates = [
+        (label, StatusCounts(16 * (label == "sir"), int(label == "rpf"), 2 * (label == "rpf"), 16))
+        for label in SIZES for _ in range(6)
+    ]  # fmt: skip
+    said = summary.summarise_study(one, decided, pairs, own, mains(), fates)
     assert said.lost == (("sir", 96, 96),)
     assert said.diverged == (("rpf", 6, 96),)
+    assert said.overconfident == (("rpf", 12, 96),)
     assert said.runs == 5 * 6 * 16
-    for figure in headline_figures.drawings(one, source, pairs, 0.05, said.group):
+    for figure in summary_figures.summary_figures(one, source, pairs, 0.05, said.group):
         assert figure.make().get_figwidth() <= 3.6
 
 
@@ -126,14 +157,16 @@ def test_worlds_without_a_position_are_ranked_by_what_they_have():
 
     table = rows(group_of)
     own, decided, name, source, _ = found(table, mains(group_of))
-    assert name == headline.MAIN
+    assert name == summary.MAIN
     assert len(source.cells) == 6
     assert len(decided) == 6 * 10
-    np.testing.assert_allclose(source.values, found(rows())[3].values)  # the same numbers under one name
-    one = across.across(own, name)
+    np.testing.assert_allclose(
+        source.values, found(rows())[3].values
+    )  # the same numbers under one name
+    one = rankings.rank_filters(own, name)
     assert one.ranks[one.filters.index("sir")] == 5
-    said = headline.summary(one, decided, [], own, mains(group_of), [])
-    assert said.group == "position, and state of lake"
+    said = summary.summarise_study(one, decided, [], own, mains(group_of), [])
+    assert said.group == "position, and state in lake"
     assert [label for label, _ in said.ranked[-2:]] == ["rpf", "sir"]
     assert dict(said.often)["mcmc_rpf"] == said.compared == 6
     assert "sir" not in dict(said.often)
@@ -143,7 +176,9 @@ def test_worlds_without_a_position_are_ranked_by_what_they_have():
 def test_a_cell_that_lacks_filters_is_named():
     table = rows(skipped=[("lake", "outliers", "sir"), ("lake", "outliers", "rpf")])
     own, decided, name, source, pairs = found(table)
-    said = headline.summary(across.across(own, name), decided, pairs, own, mains(), [])
+    said = summary.summarise_study(
+        rankings.rank_filters(own, name), decided, pairs, own, mains(), []
+    )
     assert said.incomplete == (("lake / outliers / m", 2),)
     assert len(source.cells) == 5
     assert len(pairs) == 3
@@ -156,23 +191,31 @@ def test_the_order_of_rows_is_of_no_importance():
 
 
 def test_the_main_group_is_the_position_or_the_first():
-    assert headline.main_group(["attitude", "position"]) == "position"
-    assert headline.main_group(["state [m]", "state [m/s]"]) == "state [m]"
-    assert headline.main_group([]) == ""
+    assert summary.select_main_group(["attitude", "position"]) == "position"
+    assert summary.select_main_group(["state [m]", "state [m/s]"]) == "state [m]"
+    assert summary.select_main_group([]) == ""
 
 
 def test_many_filters_of_which_none_has_a_colour_have_no_legend_and_an_order():
     table = rows()
     few = table[table.scenario != "lake"]
-    decided = [v for v in verdicts(few) if v.group == "position"]
-    one, source = across.across(few, "position"), across.blocks(few, "position")
+    decided = [v for v in compare_pairs(few) if v.group == "position"]
+    one, source = (
+        rankings.rank_filters(few, "position"),
+        condition_blocks.ranking_blocks(few, "position"),
+    )
     assert one.refused
     assert not one.ranks
-    style = canvas.dimmed(canvas.looks(list(SIZES)), [])
-    drawn = {d.name: d.make() for d in ranking_figures.of_study([(one, source)], decided, style)}
+    style = plotting.mute_others(plotting.line_styles(list(SIZES)), [])
+    drawn = {
+        d.name: d.make() for d in comparison_figures.study_figures([(one, source)], decided, style)
+    }
     order = [tick.get_text() for tick in drawn["matrix_position"].axes[0].get_yticklabels()]
     assert order[-2:] == ["rpf", "sir"]
     assert not drawn["profile_position"].legends
     labels = [f"{k}" for k in range(12)]
-    assert frame.natural("2") < frame.natural("10")
-    assert canvas.dimmed(canvas.looks(labels), ["3"])["4"].instants < canvas.looks(labels)["4"].instants
+    assert frame.natural_sort_key("2") < frame.natural_sort_key("10")
+    assert (
+        plotting.mute_others(plotting.line_styles(labels), ["3"])["4"].instants
+        < plotting.line_styles(labels)["4"].instants
+    )

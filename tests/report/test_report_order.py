@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
-from pfbench import store
-from pfbench.report import across, files, frame, page, significance
+from pfbench.report import page, writers
+from pfbench.results import frame, pairwise_tests, rankings, store
 
 NOISES = ("nominal", "surge", "heavy", "outage", "jam")
 METHODS = synthetic.METHODS[1:]
@@ -25,9 +25,13 @@ def study(folder: Path, turn: int = 0) -> Path:
     for k, (noise, method) in enumerate(jobs[turn:] + jobs[:turn]):
         path = synthetic.write(folder, method, noise=noise, runs=16, steps=8)
         if turn:
-            meta, arrays = store.load(path)
-            meta |= {"host": f"worker {k % 5}", "threads": 1 + k % 3, "created": f"2027-01-{1 + k:02}T00:00:00+00:00"}
-            store.save(path, meta, arrays)
+            meta, arrays = store.read_result(path)
+            meta |= {
+                "host": f"worker {k % 5}",
+                "threads": 1 + k % 3,
+                "created": f"2027-01-{1 + k:02}T00:00:00+00:00",
+            }
+            store.write_result(path, meta, arrays)
             os.utime(path, (10**9 - k, 10**9 - k))
     return folder
 
@@ -35,7 +39,7 @@ def study(folder: Path, turn: int = 0) -> Path:
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
     folder = study(tmp_path_factory.mktemp("results") / "demo")
-    full = frame.frame("demo", folder.parent)
+    full = frame.load_frame("demo", folder.parent)
     return full[(full.metric == "rmse") & (full.component == "norm")]
 
 
@@ -45,22 +49,30 @@ def decided(table: pd.DataFrame) -> dict[Any, tuple[Any, ...]]:
         (v.scenario, v.noise, v.model, v.group, frozenset((v.a, v.b))): (
             v.winner, v.pairs, v.p, v.p_holm, abs(v.effect), v.p_equivalent, v.equivalent, v.needed,
         )
-        for v in significance.over_page(significance.verdicts(table))
+        for v in pairwise_tests.correct_over_report(pairwise_tests.compare_pairs(table))
     }  # fmt: skip
 
 
 def between(table: pd.DataFrame) -> dict[Any, tuple[Any, ...]]:
-    one = across.across(table, "position")
-    pairs = {frozenset((p.a, p.b)): (p.winner, p.p_nemenyi, p.p_conover, p.p_wilcoxon, p.bayes_equal) for p in one.pairs}
+    one = rankings.rank_filters(table, "position")
+    pairs = {
+        frozenset((p.a, p.b)): (p.winner, p.p_nemenyi, p.p_conover, p.p_wilcoxon, p.bayes_equal)
+        for p in one.pairs
+    }
     return {**pairs, "all": (one.filters, one.cells, one.p_f, one.ranks)}
 
 
 def alike(first: dict[Any, tuple[Any, ...]], second: dict[Any, tuple[Any, ...]]) -> bool:
     """The same words, and the same numbers but for the order in which they were summed."""
+
     def same(a: Any, b: Any) -> bool:
         if isinstance(a, tuple):
             return len(a) == len(b) and all(map(same, a, b))
-        return a == b if isinstance(a, str) else bool(np.isclose(a, b, rtol=1e-9, atol=0, equal_nan=True))
+        return (
+            a == b
+            if isinstance(a, str)
+            else bool(np.isclose(a, b, rtol=1e-9, atol=0, equal_nan=True))
+        )
 
     return first.keys() == second.keys() and all(same(first[key], second[key]) for key in first)
 
@@ -69,8 +81,14 @@ def test_the_order_of_rows_changes_no_verdict(table: pd.DataFrame) -> None:
     mixed = table.sample(frac=1, random_state=1)
     assert alike(decided(table), decided(mixed))
     assert alike(between(table), between(mixed))
-    known = {(s.cell, s.group, frozenset((s.a, s.b))): s.winners for s in significance.sensitivity(table)}
-    assert known == {(s.cell, s.group, frozenset((s.a, s.b))): s.winners for s in significance.sensitivity(mixed)}
+    known = {
+        (s.cell, s.group, frozenset((s.a, s.b))): s.winners
+        for s in pairwise_tests.lost_rule_sensitivity(table)
+    }
+    assert known == {
+        (s.cell, s.group, frozenset((s.a, s.b))): s.winners
+        for s in pairwise_tests.lost_rule_sensitivity(mixed)
+    }
 
 
 def test_the_numbers_of_the_runs_change_no_verdict(table: pd.DataFrame) -> None:
@@ -79,22 +97,29 @@ def test_the_numbers_of_the_runs_change_no_verdict(table: pd.DataFrame) -> None:
     renamed = table.assign(run=number[table.run.to_numpy()])
     assert alike(decided(table), decided(renamed))
     assert alike(between(table), between(renamed))
-    apart = table.assign(run=np.where(table.label == "ukf", number[table.run.to_numpy()], table.run))
+    apart = table.assign(
+        run=np.where(table.label == "ukf", number[table.run.to_numpy()], table.run)
+    )
     assert not alike(decided(table), decided(apart))  # they are paired by it
 
 
 @pytest.mark.slow
 def test_order_of_files_and_workers_change_no_verdict(tmp_path: Path) -> None:
-    options = page.Options(formats=("png",), groups=("position",), full=False)
+    options = page.ReportOptions(figure_formats=("png",), groups=("position",), show_all=False)
     said = []
     for turn in (0, 7):
         folder = study(tmp_path / f"results{turn}" / "demo", turn)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(files, "drawn", lambda drawing, *_: {
+            patch.setattr(writers, "render_figure", lambda drawing, *_: {
                 "file": "", "caption": drawing.caption, "source": "data:,", "name": drawing.name, "broad": False, "anchor": "x",
             })  # fmt: skip
-            made = page.write("demo", folder.parent, tmp_path / f"reports{turn}", options)
-        said.append([json.loads((made.parent / f"{name}.json").read_text()) for name in ("verdicts", "across")])
+            made = page.write_report("demo", folder.parent, tmp_path / f"reports{turn}", options)
+        said.append(
+            [
+                json.loads((made.parent / f"{name}.json").read_text())
+                for name in ("verdicts", "across")
+            ]
+        )
         assert ("worker 3" in made.read_text()) is bool(turn)
     assert said[0] == said[1]
     assert len(said[0][0]) == 15

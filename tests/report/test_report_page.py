@@ -7,7 +7,6 @@ import shutil
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
@@ -15,16 +14,22 @@ import pytest
 import synthetic_results as synthetic
 from matplotlib.figure import Figure
 
-from pfbench import store
-from pfbench.report import figures, page, tables
-from pfbench.report.canvas import looks, zoom
-from pfbench.report.frame import cells
+from pfbench.report import page, table_formats
+from pfbench.report.plots import error_plots
+from pfbench.report.plots.axis_ticks import limit_to_late_values
+from pfbench.report.plots.plotting import line_styles
+from pfbench.results import store
+from pfbench.results.frame import load_conditions
 
-QUICK = page.Options(formats=("svg",), groups=("position",))
+QUICK = page.ReportOptions(figure_formats=("svg",), groups=("position",))
 
 
 def everything(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +41,12 @@ def results(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def report(results, tmp_path_factory):
-    return page.write("demo", results, tmp_path_factory.mktemp("reports"), page.Options(formats=("svg", "png"))).parent
+    return page.write_report(
+        "demo",
+        results,
+        tmp_path_factory.mktemp("reports"),
+        page.ReportOptions(figure_formats=("svg", "png")),
+    ).parent
 
 
 def test_every_figure_and_table_is_there_and_on_the_page(report):
@@ -49,18 +59,27 @@ def test_every_figure_and_table_is_there_and_on_the_page(report):
         "spread_ekf", "spread_ukf", "spread_sir", "spread_cofm_amssrcpf",
     }  # fmt: skip
     assert {path.suffix for path in (report / "figures").iterdir()} == {".svg", ".png"}
-    bitmaps = [base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', html)]
-    vectors = [re.sub(r"='([^']*)'", r'="\1"', unquote(data)) for data in re.findall(r'src="data:image/svg\+xml,([^"]+)"', html)]
+    bitmaps = [
+        base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', html)
+    ]
+    vectors = [
+        base64.b64decode(data)
+        for data in re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', html)
+    ]
     carried = [*bitmaps, *vectors]
     assert len(carried) == len(names)
-    for path in (report / "figures").glob("*.svg"):  # each of the two files is whole, the page has the smaller, and the text one
+    for path in (report / "figures").glob(
+        "*.svg"
+    ):  # each of the two files is whole, the page has the smaller, and the text one
         assert f"](figures/{path.name})" in text
-        assert path.with_suffix(".png").read_bytes() in bitmaps or path.read_text() in vectors
+        assert path.with_suffix(".png").read_bytes() in bitmaps or path.read_bytes() in vectors
     for path in (report / "tables").glob("*.csv"):
         table = pd.read_csv(path, keep_default_na=False)
         assert path.with_suffix(".tex").read_text().startswith(r"\begin{tabular}")
         assert f"| {table.columns[1]}" in text
-    own = [path for path in (report / "tables").glob("*.csv") if not path.name.startswith("across_")]
+    own = [
+        path for path in (report / "tables").glob("*.csv") if not path.name.startswith("across_")
+    ]
     assert len(own) == 10  # overview, and three for each of three groups
 
 
@@ -81,7 +100,7 @@ def test_the_text_says_what_ran_what_failed_and_what_was_lost(report, name):
         "00000000deadbeef",
         "covariance lost its positive eigenvalues",
         "initial heading error drawn from the filter",
-        "p Holm (6)",
+        "adjusted p (Holm, 6 tests)",
         "18 comparisons",
     ):
         assert said in text, said
@@ -92,25 +111,35 @@ def test_text_tables_and_json_render_the_same_verdicts(report):
     assert len(decided) == 18
     printed = pd.read_csv(report / "tables" / "flight_surge_ins_gnss_position_pairs.csv")
     own = [v for v in decided if v["group"] == "position"]
-    assert list(printed["better"]) == [v["winner"] for v in own]
-    np.testing.assert_allclose(printed["p Holm (6)"], [v["p_holm"] for v in own])
-    accuracy = pd.read_csv(report / "tables" / "flight_surge_ins_gnss_position.csv").set_index("filter")
+    decisions = [f"{v['winner']} better" if v["winner"] in (v["a"], v["b"]) else None for v in own]
+    assert [d if d.endswith("better") else None for d in printed["decision"]] == decisions
+    np.testing.assert_allclose(printed["adjusted p (Holm, 6 tests)"], [v["p_holm"] for v in own])
+    accuracy = pd.read_csv(report / "tables" / "flight_surge_ins_gnss_position.csv").set_index(
+        "filter"
+    )
     for label in accuracy.index:
-        assert accuracy.loc[label, "beats"] == sum(v["winner"] == label for v in own)
-    unbeaten = [label for label in accuracy.index if accuracy.loc[label, "beaten by"] == 0]
-    line = next(row for row in (report / "report.md").read_text().splitlines() if "position: beaten by no other" in row)
+        assert accuracy.loc[label, "better than [filters]"] == sum(
+            v["winner"] == label for v in own
+        )
+    unbeaten = [
+        label for label in accuracy.index if accuracy.loc[label, "worse than [filters]"] == 0
+    ]
+    lines = (report / "report.md").read_text().splitlines()
+    line = next(
+        row for row in lines if row.startswith("- Top group in") and "RMSE of position" in row
+    )
     assert all(label in line for label in unbeaten)
 
 
 def test_same_results_same_bytes_whatever_the_order_of_files(results, tmp_path, monkeypatch):
-    first = page.write("demo", results, tmp_path / "one", QUICK).parent
+    first = page.write_report("demo", results, tmp_path / "one", QUICK).parent
     copy = tmp_path / "copy" / "demo"
     copy.mkdir(parents=True)
     for path in sorted((results / "demo").iterdir(), reverse=True):
         shutil.copy(path, copy)
     real = Path.glob
     monkeypatch.setattr(Path, "glob", lambda self, pattern: reversed(sorted(real(self, pattern))))
-    second = page.write("demo", copy.parent, tmp_path / "two", QUICK).parent
+    second = page.write_report("demo", copy.parent, tmp_path / "two", QUICK).parent
     assert everything(first) == everything(second)
 
 
@@ -118,7 +147,7 @@ def test_a_new_report_leaves_no_figure_of_the_old_one(results, tmp_path):
     (tmp_path / "demo" / "figures").mkdir(parents=True)
     (tmp_path / "demo" / "figures" / "gone_cell.svg").write_text("old")
     (tmp_path / "demo" / "notes.txt").write_text("mine")
-    page.write("demo", results, tmp_path, QUICK)
+    page.write_report("demo", results, tmp_path, QUICK)
     assert not (tmp_path / "demo" / "figures" / "gone_cell.svg").exists()
     assert (tmp_path / "demo" / "notes.txt").read_text() == "mine"
 
@@ -126,27 +155,39 @@ def test_a_new_report_leaves_no_figure_of_the_old_one(results, tmp_path):
 def test_mixed_versions_are_refused_and_named_when_allowed(tmp_path):
     folder = tmp_path / "demo"
     synthetic.write(folder, synthetic.METHODS[0], runs=6, steps=20)
-    synthetic.write(folder, synthetic.METHODS[1], runs=6, steps=20, versions={**synthetic.VERSIONS, "commit": "fff9999"})
+    synthetic.write(
+        folder,
+        synthetic.METHODS[1],
+        runs=6,
+        steps=20,
+        versions={**synthetic.VERSIONS, "commit": "fff9999"},
+    )
     with pytest.raises(ValueError, match=r"versions\.commit"):
-        page.write("demo", tmp_path, tmp_path / "reports", QUICK)
+        page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     assert not (tmp_path / "reports").exists()
-    mixed = page.Options(formats=("svg",), groups=("position",), mixed=True)
-    path = page.write("demo", tmp_path, tmp_path / "reports", mixed)
+    mixed = page.ReportOptions(
+        figure_formats=("svg",), groups=("position",), allow_mixed_versions=True
+    )
+    path = page.write_report("demo", tmp_path, tmp_path / "reports", mixed)
     assert "0123abc, fff9999" in path.read_text()
 
 
 def test_a_toy_without_map_particles_or_rival(tmp_path):
     method = synthetic.Method("kalman", 1.0)
     path = synthetic.write(tmp_path / "demo", method, runs=5, steps=20)
-    meta, arrays = store.load(path)
+    meta, arrays = store.read_result(path)
     state = {"names": ["x"], "units": [""], "groups": {"state": [0]}}
     toy = {name: arrays[name] for name in ("time", "log_evidence", "lost")}
     toy |= {name: arrays[name][..., :1] for name in ("error", "sd", "nees")}
-    store.save(path, {**meta, "state": state}, toy)
-    made = page.write("demo", tmp_path, tmp_path / "reports", page.Options(formats=("svg",)))
-    kinds = {p.stem.removeprefix("flight_surge_ins_gnss_") for p in (made.parent / "figures").iterdir()}
+    store.write_result(path, {**meta, "state": state}, toy)
+    made = page.write_report(
+        "demo", tmp_path, tmp_path / "reports", page.ReportOptions(figure_formats=("svg",))
+    )
+    kinds = {
+        p.stem.removeprefix("flight_surge_ins_gnss_") for p in (made.parent / "figures").iterdir()
+    }
     assert kinds == {"error_state", "rmse", "front", "nees", "spread_kalman"}
-    assert "one filter, nothing to compare" in made.read_text()
+    assert "has one filter. Required: 2; available: 1." in made.read_text()
     assert json.loads((made.parent / "verdicts.json").read_text()) == []
 
 
@@ -154,7 +195,7 @@ def test_a_filter_that_lost_every_run_is_reported(tmp_path):
     folder = tmp_path / "demo"
     synthetic.write(folder, synthetic.METHODS[0], runs=8, steps=20)
     synthetic.write(folder, synthetic.Method("doomed", 1.0, lost=tuple(range(8))), runs=8, steps=20)
-    made = page.write("demo", tmp_path, tmp_path / "reports", QUICK)
+    made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     (verdict,) = json.loads((made.parent / "verdicts.json").read_text())
     assert (verdict["winner"], verdict["lost_a"], verdict["ratio"]) == ("ekf", 8, "inf")
     assert "doomed lost 8 of 8 runs" in made.read_text()
@@ -163,56 +204,82 @@ def test_a_filter_that_lost_every_run_is_reported(tmp_path):
 
 
 def test_the_page_says_what_its_jobs_took_and_how_many_were_asked_for(results, tmp_path):
-    page.write("demo", results, tmp_path, replace(QUICK, planned=6))
+    page.write_report("demo", results, tmp_path, replace(QUICK, planned=6))
     text = (tmp_path / "demo" / "report.md").read_text()
-    seconds = sum(1.0 + 1e-3 * method.milliseconds * 40 for method in synthetic.METHODS)  # a world each, and 40 steps
-    assert "jobs: 4 of 6 that the experiment asks for" in text
-    assert f"time of all jobs: {seconds:.0f} s (filters {100 * (1 - 4 / seconds):.0f} %, worlds" in text
+    seconds = sum(
+        1.0 + 1e-3 * method.milliseconds * 40 for method in synthetic.METHODS
+    )  # a world each, and 40 steps
+    assert "jobs: 4 of 6 in the experiment" in text
+    assert (
+        f"time of all jobs: {seconds:.0f} s (filters {100 * (1 - 4 / seconds):.0f} %, data" in text
+    )
 
 
 def test_the_time_to_converge_is_a_column_of_groups_that_have_a_bound(results, tmp_path):
-    page.write("demo", results, tmp_path, replace(QUICK, converged={"position": 1e9}, from_time=20.0))
+    page.write_report(
+        "demo",
+        results,
+        tmp_path,
+        replace(QUICK, convergence_threshold={"position": 1e9}, start_time_s=20.0),
+    )
     text = (tmp_path / "demo" / "report.md").read_text()
-    assert "median time to 1e+09 m in s" in text
-    with pytest.raises(ValueError, match=r"report\.converged: no result has height"):
-        page.write("demo", results, tmp_path, replace(QUICK, converged={"height": 1.0}))
+    assert "median time to 1e+09 m [s]" in text
+    with pytest.raises(
+        ValueError,
+        match=r"report\.convergence_threshold must name groups of the results, got height",
+    ):
+        page.write_report(
+            "demo", results, tmp_path, replace(QUICK, convergence_threshold={"height": 1.0})
+        )
 
 
 def test_cells_whose_worlds_differ_by_name_say_so(tmp_path):
     for k, sd in enumerate((1.0, 10.0)):
-        path = synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0, 1.0, 100 + k), runs=6, steps=20)
-        meta, arrays = store.load(path)
-        store.save(path, {**meta, "config": {"filter": {"name": "ekf"}, "scenario": {"gps_sd": sd}}}, arrays)
-    page.write("demo", tmp_path, tmp_path / "reports", QUICK)
+        path = synthetic.write(
+            tmp_path / "demo", synthetic.Method("ekf", 1.0, 1.0, 100 + k), runs=6, steps=20
+        )
+        meta, arrays = store.read_result(path)
+        store.write_result(
+            path,
+            {**meta, "config": {"filter": {"name": "ekf"}, "scenario": {"gps_sd": sd}}},
+            arrays,
+        )
+    page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     text = (tmp_path / "reports" / "demo" / "report.md").read_text()
-    assert "Jobs of this cell differ in scenario.gps_sd: runs share their draws there, not their worlds." in text
+    assert (
+        "Jobs of this condition differ in scenario.gps_sd: their runs share random numbers, but not the data."
+        in text
+    )
 
 
 def test_options_are_checked():
-    with pytest.raises(ValueError, match="alpha=5"):
-        page.Options(alpha=5)
-    with pytest.raises(ValueError, match="choose from svg, png"):
-        page.Options(formats=("gif",))
+    with pytest.raises(ValueError, match="alpha must be between 0 and 1, got 5"):
+        page.ReportOptions(alpha=5)
+    with pytest.raises(ValueError, match=r"formats must be a subset of svg, png, got .'gif'"):
+        page.ReportOptions(figure_formats=("gif",))
 
 
 def test_why_no_test_across_cells_is_made_is_said_once(report):
-    why = "No test across cells is made for "
+    start = "Not tested across conditions: "
     for name in ("report.md", "index.html"):
-        (line,) = (line for line in (report / name).read_text().splitlines() if why in line)
-        said = line.partition(why)[2].partition(":")[0]
+        (line,) = (line for line in (report / name).read_text().splitlines() if start in line)
+        said = line.partition(start)[2].partition(". Reason:")[0]
         assert sorted(said.split(", ")) == ["attitude", "position", "velocity"]
-        assert "have 1 cell in common" in line
+        assert "share 1 condition" in line
 
 
 def test_unknown_group_is_refused(results, tmp_path):
-    with pytest.raises(ValueError, match="no result has height; choose from attitude, velocity, position"):
-        page.write("demo", results, tmp_path, page.Options(groups=("height",)))
+    message = (
+        r"report\.groups must be groups .* got height\. Choose from attitude, velocity, position"
+    )
+    with pytest.raises(ValueError, match=message):
+        page.write_report("demo", results, tmp_path, page.ReportOptions(groups=("height",)))
 
 
 def test_text_of_a_stranger_is_not_markup(tmp_path):
     for size, name in enumerate(("<b>sir</b>|x", "<b>sir</b>|y", "<b>sir</b>|z"), 1):
         synthetic.write(tmp_path / "demo", synthetic.Method(name, float(size)), runs=20, steps=20)
-    made = page.write("demo", tmp_path, tmp_path / "reports", QUICK)
+    made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     assert "<b>sir" not in made.read_text()
     assert r"<b>sir</b>\|x" in (made.parent / "report.md").read_text()
 
@@ -226,23 +293,32 @@ def test_text_of_a_stranger_is_not_markup(tmp_path):
     ],
 )  # fmt: skip
 def test_numbers_have_three_digits(value, text):
-    assert tables.number(value) == text
+    assert table_formats.format_number(value) == text
 
 
 def test_markdown_columns_line_up():
-    text = tables.markdown(pd.DataFrame({"a|b": ["x", "yy"], "n": [1.0, 20.0]}))
-    assert text.splitlines() == ["| a\\|b |    n |", "|------|-----:|", "| x    | 1.00 |", "| yy   | 20.0 |"]
+    text = table_formats.format_markdown(pd.DataFrame({"a|b": ["x", "yy"], "n": [1.0, 20.0]}))
+    assert text.splitlines() == [
+        "| a\\|b |    n |",
+        "|------|-----:|",
+        "| x    | 1.00 |",
+        "| yy   | 20.0 |",
+    ]
 
 
 def test_estimated_track_is_truth_plus_error(results):
-    (cell,) = cells("demo", results)
+    (cell,) = load_conditions("demo", results)
     loaded = {job.label: job.load() for job in cell.jobs}
-    style = looks(list(loaded))
-    plan, height = figures.track(loaded, 2, style).axes
+    style = line_styles(list(loaded))
+    plan, height = error_plots.plot_track(loaded, 2, style).axes
     line = next(line for line in plan.lines if line.get_label() == "ekf")
     arrays = loaded["ekf"].arrays
-    np.testing.assert_allclose(line.get_xdata(), arrays["track"][2, :, 0] + arrays["error"][2, :, 6], rtol=1e-5)
-    np.testing.assert_allclose(line.get_ydata(), arrays["track"][2, :, 1] + arrays["error"][2, :, 7], rtol=1e-5)
+    np.testing.assert_allclose(
+        line.get_xdata(), arrays["track"][2, :, 0] + arrays["error"][2, :, 6], rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        line.get_ydata(), arrays["track"][2, :, 1] + arrays["error"][2, :, 7], rtol=1e-5
+    )
     up = arrays["track"][2, :, 2] + arrays["error"][2, :, 8]
     assert any(np.allclose(line.get_ydata(), up, rtol=1e-5) for line in height.lines)
 
@@ -252,15 +328,17 @@ def test_a_late_divergence_is_never_cut_off():
     curve = np.ones(100)
     curve[0], curve[-1] = 1000.0, 500.0
     axis.plot(curve)
-    zoom(axis, [curve])
+    limit_to_late_values(axis, [curve])
     assert axis.get_ylim()[1] >= 500
     curve[-1] = 1.0
-    zoom(axis, [curve])
+    limit_to_late_values(axis, [curve])
     assert axis.get_ylim()[1] < 10
 
 
 def test_templates_are_packaged():
     here = Path(page.__file__).parent
-    patterns = tomllib.loads((here.parents[1] / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    patterns = tomllib.loads((here.parents[1] / "pyproject.toml").read_text())["tool"][
+        "setuptools"
+    ]["package-data"]
     shipped = {path.name for pattern in patterns["pfbench.report"] for path in here.glob(pattern)}
     assert {"page.html.jinja", "page.md.jinja", "text.jinja", "style.css"} <= shipped

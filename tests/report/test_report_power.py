@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from statsmodels.stats.power import TTestPower
 
-from pfbench.report import power, significance
+from pfbench.results import intervals, power, statistics
 
 
 def _p(d):
@@ -13,41 +13,59 @@ def _p(d):
     rank = stats.rankdata(np.abs(d), axis=1)
     n = d.shape[1]
     plus = (rank * (d > 0)).sum(1)
-    return 2 * stats.norm.sf(np.abs(plus - n * (n + 1) / 4) / np.sqrt(n * (n + 1) * (2 * n + 1) / 24))
+    return 2 * stats.norm.sf(
+        np.abs(plus - n * (n + 1) / 4) / np.sqrt(n * (n + 1) * (2 * n + 1) / 24)
+    )
 
 
-@pytest.mark.parametrize(("effect", "alpha"), [(0.3, 0.05), (0.5, 0.05), (0.5, 0.05 / 21), (0.8, 0.05)])
+@pytest.mark.parametrize(
+    ("effect", "alpha"), [(0.3, 0.05), (0.5, 0.05), (0.5, 0.05 / 21), (0.8, 0.05)]
+)
 def test_the_runs_of_a_t_test_are_those_of_statsmodels(effect, alpha):
     exact = TTestPower().solve_power(effect, alpha=alpha, power=0.8, alternative="two-sided")
-    assert power.needed(effect, alpha, efficiency=1.0) == pytest.approx(np.ceil(exact), abs=1)
+    assert power.required_runs(effect, alpha, efficiency=1.0) == pytest.approx(
+        np.ceil(exact), abs=1
+    )
     n = int(np.ceil(exact))
     theirs = TTestPower().power(effect, n, alpha)
-    assert power.power(effect, n, alpha, efficiency=1.0) == pytest.approx(theirs, abs=0.01)
+    assert power.compute_power(effect, n, alpha, efficiency=1.0) == pytest.approx(theirs, abs=0.01)
 
 
 @pytest.mark.parametrize("effect", [0.35, 0.6])
 def test_the_runs_needed_find_the_effect_as_often_as_said(effect):
-    n = int(power.needed(effect, 0.05))
+    n = int(power.required_runs(effect, 0.05))
     trials = 4000
     found = np.mean(_p(effect + np.random.default_rng(1).standard_normal((trials, n))) <= 0.05)
     # The asymptotic efficiency is within two per cent of power at these sizes.
     assert found == pytest.approx(0.8, abs=4 * np.sqrt(0.16 / trials) + 0.02)
-    assert power.power(effect, n, 0.05) == pytest.approx(found, abs=0.05)
+    assert power.compute_power(effect, n, 0.05) == pytest.approx(found, abs=0.05)
 
 
 def test_needed_runs_smallest_effect_and_power_are_one_relation():
     for sd, alpha in ((0.2, 0.05), (1.5, 0.01)):
-        n = power.needed(0.3 / sd, alpha)
-        assert power.detectable(sd, int(n), alpha) <= 0.3 < power.detectable(sd, int(n) - 1, alpha)
-        assert power.power(0.3 / sd, int(n), alpha) >= 0.8 > power.power(0.3 / sd, int(n) - 1, alpha)
-    assert power.needed(0.0) == np.inf
-    assert power.needed(1e9, 0.05) == power.least(0.05) == 6
-    assert stats.wilcoxon(np.arange(1.0, 7)).pvalue <= 0.05 < stats.wilcoxon(np.arange(1.0, 6)).pvalue
-    assert power.detectable(1.0, 5) == np.inf
-    assert power.power(9.0, 5) == 0.0
+        n = power.required_runs(0.3 / sd, alpha)
+        assert (
+            power.detectable_effect(sd, int(n), alpha)
+            <= 0.3
+            < power.detectable_effect(sd, int(n) - 1, alpha)
+        )
+        assert (
+            power.compute_power(0.3 / sd, int(n), alpha)
+            >= 0.8
+            > power.compute_power(0.3 / sd, int(n) - 1, alpha)
+        )
+    assert power.required_runs(0.0) == np.inf
+    assert power.required_runs(1e9, 0.05) == power.min_pairs(0.05) == 6
+    assert (
+        stats.wilcoxon(np.arange(1.0, 7)).pvalue <= 0.05 < stats.wilcoxon(np.arange(1.0, 6)).pvalue
+    )
+    assert power.detectable_effect(1.0, 5) == np.inf
+    assert power.compute_power(9.0, 5) == 0.0
 
 
-@pytest.mark.parametrize(("share", "limit", "alpha"), [(0.15, 0.05, 0.05), (0.7, 0.5, 0.01), (0.3, 0.5, 0.025)])
+@pytest.mark.parametrize(
+    ("share", "limit", "alpha"), [(0.15, 0.05, 0.05), (0.7, 0.5, 0.01), (0.3, 0.5, 0.025)]
+)
 def test_the_runs_of_a_share_find_it_as_often_as_said(share, limit, alpha):
     def exact(n):
         """Power of the exact binomial test."""
@@ -55,28 +73,35 @@ def test_the_runs_of_a_share_find_it_as_often_as_said(share, limit, alpha):
             return stats.binom.sf(stats.binom.isf(alpha, n, limit), n, share)
         return stats.binom.cdf(stats.binom.ppf(alpha, n, limit) - 1, n, share)
 
-    n = int(power.needed_share(share, limit, alpha))
+    n = int(power.required_runs_proportion(share, limit, alpha))
     # the exact test is cautious, and its power goes up and down with n
     assert np.mean([exact(k) for k in range(n - 5, n + 6)]) == pytest.approx(0.8, abs=0.06)
-    assert power.needed_share(limit, limit) == np.inf
+    assert power.required_runs_proportion(limit, limit) == np.inf
 
 
 def test_equivalence_is_shown_within_the_margin_only():
     d = np.linspace(-0.02, 0.02, 21)
-    assert power.equivalence(d, 0.05) < 1e-4
-    assert power.equivalence(d + 0.1, 0.05) > 0.99
-    assert power.equivalence(d, 0.05) == power.equivalence(-d, 0.05)
-    assert power.equivalence(np.zeros(20), 0.05) < 0.001
-    assert power.equivalence(d[:3], 0.05) > 0.05  # no difference shown is not equality shown
-    with pytest.raises(ValueError, match="positive margin"):
-        power.equivalence(d, 0.0)
+    assert statistics.equivalence_p_value(d, 0.05) < 1e-4
+    assert statistics.equivalence_p_value(d + 0.1, 0.05) > 0.99
+    assert statistics.equivalence_p_value(d, 0.05) == statistics.equivalence_p_value(-d, 0.05)
+    assert statistics.equivalence_p_value(np.zeros(20), 0.05) < 0.001
+    assert (
+        statistics.equivalence_p_value(d[:3], 0.05) > 0.05
+    )  # an inconclusive test shows no equivalence
+    with pytest.raises(ValueError, match="margin must be positive"):
+        statistics.equivalence_p_value(d, 0.0)
 
 
 def test_equivalence_is_claimed_wrongly_as_rarely_as_alpha():
     rng, n, alpha = np.random.default_rng(2), 600, 0.05
     for side in (-1, 1):
-        p = [power.equivalence(0.1 * side + 0.05 * rng.standard_normal(20), 0.1) for _ in range(n // 2)]
-        assert np.mean(np.array(p) <= alpha) == pytest.approx(alpha, abs=4 * np.sqrt(alpha * (1 - alpha) / (n // 2)))
+        p = [
+            statistics.equivalence_p_value(0.1 * side + 0.05 * rng.standard_normal(20), 0.1)
+            for _ in range(n // 2)
+        ]
+        assert np.mean(np.array(p) <= alpha) == pytest.approx(
+            alpha, abs=4 * np.sqrt(alpha * (1 - alpha) / (n // 2))
+        )
 
 
 def test_intervals_of_the_effects_hold_the_truth():
@@ -89,9 +114,14 @@ def test_intervals_of_the_effects_hold_the_truth():
     for _ in range(n):
         a, b = np.exp(0.3 * rng.standard_normal(runs) + 0.2 * rng.standard_normal((2, runs)))
         b = b * np.exp(shift)
-        shares = significance.improvement(a, b), significance.effect_share(significance.log_ratio(a, b))
+        shares = (
+            statistics.probability_of_improvement(a, b),
+            statistics.rank_biserial_proportion(statistics.log_ratio(a, b)),
+        )
         for k, (share, truth) in enumerate(zip(shares, (better, smaller), strict=True)):
-            low, high, _ = significance.share_interval(share.value, np.var(share.parts, ddof=1) / runs, runs, 0.9)
+            low, high, _ = intervals.proportion_interval(
+                share.value, np.var(share.parts, ddof=1) / runs, runs, 0.9
+            )
             hits[k] += low <= truth <= high
     # First-order intervals of 30 runs are within a few per cent of their level.
     np.testing.assert_allclose(hits / n, 0.9, atol=4 * np.sqrt(0.09 / n))
@@ -100,15 +130,15 @@ def test_intervals_of_the_effects_hold_the_truth():
 def test_probability_of_improvement_by_counting():
     a, b = np.array([1.0, 2.0, np.inf, 4.0]), np.array([2.0, 2.0, 3.0, np.inf])
     won = [(x < y) + 0.5 * (x == y) for x in a for y in b]
-    assert significance.improvement(a, b).value == np.mean(won)
-    assert significance.improvement(b, a).value == 1 - np.mean(won)
-    assert significance.improvement(a, a).value == 0.5
-    share = significance.improvement(a, b)
+    assert statistics.probability_of_improvement(a, b).value == np.mean(won)
+    assert statistics.probability_of_improvement(b, a).value == 1 - np.mean(won)
+    assert statistics.probability_of_improvement(a, a).value == 0.5
+    share = statistics.probability_of_improvement(a, b)
     assert share.parts.mean() == pytest.approx(share.value)
-    d = significance.log_ratio(a, b)
-    effect = significance.effect_share(d)
-    assert 2 * effect.value - 1 == pytest.approx(significance.rank_biserial(d))
-    low, high, how = significance.share_interval(1.0, 0.0, 20, 0.95)
+    d = statistics.log_ratio(a, b)
+    effect = statistics.rank_biserial_proportion(d)
+    assert 2 * effect.value - 1 == pytest.approx(statistics.rank_biserial(d))
+    low, high, how = intervals.proportion_interval(1.0, 0.0, 20, 0.95)
     assert (how, high) == ("exact", 1.0)
     assert low == pytest.approx(stats.beta.ppf(0.025, 20, 1))  # Clopper and Pearson
 
@@ -119,7 +149,9 @@ def test_the_signed_rank_test_is_scipys(n, digits):
     d = np.round(np.random.default_rng(n).normal(0.3, 1, n), digits)
     for side in ("two-sided", "greater"):
         expected = stats.wilcoxon(d, alternative=side, zero_method="zsplit")
-        assert power.signed_rank(d, side) == pytest.approx((expected.statistic, expected.pvalue), rel=1e-11)
-    ranks, ties = power.ranks_of(d)
+        assert statistics.wilcoxon_signed_rank(d, side) == pytest.approx(
+            (expected.statistic, expected.pvalue), rel=1e-11
+        )
+    ranks, ties = statistics.rank_with_ties(d)
     np.testing.assert_array_equal(ranks, stats.rankdata(d))
     assert ties.sum() == n

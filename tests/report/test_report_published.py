@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from pfbench.draws import MonteCarlo
+from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import ParticleFilter
-from pfbench.model.linear import linear_walk
-from pfbench.noise.regimes import Nominal
-from pfbench.report import across, significance
-from pfbench.scenario.model_world import ModelWorld
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.model.linear_gaussian import linear_walk
+from pfbench.noise.white import NominalNoise
+from pfbench.results import rank_tests, statistics
+from pfbench.scenario.model_simulation import ModelSimulation
 
 # R 4, ?friedman.test: 22 players round first base in three ways [Hollander, Wolfe 1973, p. 140]
 ROUNDING = np.array([
@@ -28,14 +28,14 @@ SECOND = np.array([0.878, 0.647, 0.598, 2.05, 1.06, 1.29, 1.06, 3.14, 1.29])
 
 def test_friedmans_test_is_that_of_r() -> None:
     """friedman.test(RoundingTimes): Friedman chi-squared = 11.143, df = 2, p-value = 0.003805. There are ties."""
-    found = across.friedman(across.ranks(ROUNDING))
+    found = rank_tests.friedman(rank_tests.rank_within_blocks(ROUNDING))
     assert found.chi2 == pytest.approx(11.143, abs=5e-4)
     assert found.p == pytest.approx(0.003805, abs=5e-7)
 
 
 def test_wilcoxons_test_is_that_of_r() -> None:
     """wilcox.test(x, y, paired = TRUE, alternative = "greater"): V = 40, p-value = 0.01953, which is exact."""
-    statistic, p = significance.wilcoxon(FIRST - SECOND)
+    statistic, p = statistics.wilcoxon_signed_rank(FIRST - SECOND)
     assert statistic in (40.0, 45.0 - 40.0)
     assert p / 2 == pytest.approx(0.01953, abs=5e-6)
 
@@ -46,15 +46,23 @@ def test_a_filter_under_two_names_beats_itself_as_seldom_as_alpha() -> None:
     studies, size, steps, alpha = 2000, 15, 10, 0.05
     runs = torch.arange(studies * size)
     model = linear_walk(1.0, 0.3, 1.0)
-    episode = ModelWorld(model, steps).draw(Nominal(), runs, 1)
+    episode = ModelSimulation(model, steps).draw(NominalNoise(), runs, 1)
     truth = model.assemble(episode.truth)
 
     def loss(seed: int, particles: int) -> np.ndarray:
-        estimate = run_filter(ParticleFilter(particles), model, episode.record, MonteCarlo(seed, runs))
-        return (estimate.mean - truth)[..., 0].square().mean(1).sqrt().numpy().reshape(studies, size)
+        estimate = run_filter(
+            ParticleFilter(particles), model, episode.record, PhiloxStream(seed, runs)
+        )
+        return (
+            (estimate.mean - truth)[..., 0].square().mean(1).sqrt().numpy().reshape(studies, size)
+        )
 
     def share_of_wins(a: np.ndarray, b: np.ndarray) -> float:
-        return float(np.mean([significance.wilcoxon(d)[1] <= alpha for d in significance.log_ratio(a, b)]))
+        return float(
+            np.mean(
+                [statistics.wilcoxon_signed_rank(d)[1] <= alpha for d in statistics.log_ratio(a, b)]
+            )
+        )
 
     one, other, poor = loss(1, 20), loss(2, 20), loss(3, 4)
     error = 4 * np.sqrt(alpha * (1 - alpha) / studies)

@@ -10,9 +10,11 @@ import pytest
 import synthetic_results as synthetic
 from matplotlib.figure import Figure
 
-from pfbench import store
-from pfbench.report import across, budget, files, frame, page, ranking_figures, section, significance, tables, view
-from pfbench.report.canvas import looks
+from pfbench.report import condition_section, cost, options, page, writers
+from pfbench.report.plots import comparison_figures
+from pfbench.report.plots.plotting import line_styles
+from pfbench.report.table_formats import format_number
+from pfbench.results import condition_blocks, frame, pairwise_tests, rankings, store
 
 METHODS = (
     synthetic.Method("ekf", 2.0, 0.7, None, 0.4),
@@ -37,12 +39,23 @@ def report(results, tmp_path_factory):
 
     def stub(drawing, prefix, folder, formats):
         drawn.append(f"{prefix}_{drawing.name}")
-        return {"file": drawing.name, "caption": drawing.caption, "source": "data:,", "name": drawing.name, "broad": False,
-                "anchor": drawing.name}
+        return {
+            "file": drawing.name,
+            "caption": drawing.caption,
+            "source": "data:,",
+            "name": drawing.name,
+            "broad": False,
+            "anchor": drawing.name,
+        }
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(files, "drawn", stub)
-        folder = page.write("many", results, tmp_path_factory.mktemp("reports"), page.Options(groups=("position",))).parent
+        patch.setattr(writers, "render_figure", stub)
+        folder = page.write_report(
+            "many",
+            results,
+            tmp_path_factory.mktemp("reports"),
+            page.ReportOptions(groups=("position",)),
+        ).parent
     (folder / "drawn.json").write_text(json.dumps(drawn))
     return folder
 
@@ -53,37 +66,47 @@ def test_the_text_is_that_of_the_verdicts(report, name):
     (one,) = json.loads((report / "across.json").read_text())
     assert len(one["cells"]) == 6
     assert one["filters"] == ["apf", "ekf", "sir"]
-    assert f"Iman-Davenport F {tables.number(float(one['f']))} (p {tables.number(one['p_f'])})" in text
-    shown = [p for p in one["pairs"] if p["winner"] != significance.NO_DIFFERENCE]
-    assert f"A difference is shown in {len(shown)} of 3 pairs" in text
+    assert (
+        f"Iman-Davenport F {format_number(float(one['f']))}, p = {format_number(one['p_f'])}"
+        in text
+    )
+    shown = [p for p in one["pairs"] if p["winner"] != pairwise_tests.INCONCLUSIVE]
+    assert f"{len(shown)} of 3 pairs differ significantly" in text
     beaten = {p["a"] if p["winner"] == p["b"] else p["b"] for p in shown}
-    assert f"beaten by no other: {', '.join(f for f in one['filters'] if f not in beaten)}." in text
+    assert f"Top group: {', '.join(f for f in one['filters'] if f not in beaten)}." in text
     decided = json.loads((report / "verdicts.json").read_text())
     assert {v["page"] for v in decided} == {18}
     many = sum(v["p_page"] <= 0.05 for v in decided)
-    assert f"Corrected over all 18 of this page together, {many} do." in text
-    assert "With another rule (pairs with a lost run left out; largest finite error of the cell)" in text
+    assert f"With correction over all 18 comparisons of the report, {many} are." in text
+    assert (
+        "under another rule (pairs with a lost run left out or largest finite error of the condition)"
+        in text
+    )
     assert "@software{pfbench," in text
     assert "year    = {2026}" in text
     runs = sorted(int(v["needed"]) for v in decided if v["noise"] == "surge")
-    assert f"with a power of 0.8, {runs[0]} to {runs[-1]} runs are needed" in text
+    assert f"with power 0.8: {runs[0]} to {runs[-1]}, depending on the pair" in text
 
 
 def test_every_table_names_its_budget(report):
-    said = "Budget: same N (N = 200 of each particle filter)."
+    said = "Budget: particles (N = 200 in each particle filter)."
     for path in (report / "tables").glob("*.csv"):
         assert set(pd.read_csv(path).note) == {said}
         latex = path.with_suffix(".tex").read_text()
         assert said in latex
         assert latex.rstrip().endswith("\\end{tabular}")
     html = (report / "index.html").read_text()
-    noted = re.findall(r"</table></div>(?:\n</div>)?\n<p class=\"note\">Budget: same N", html)
+    noted = re.findall(r"</table></div>(?:\n</div>)?\n<p class=\"note\">Budget: particles", html)
     assert html.count('<table class="plain">') == len(noted)
 
 
 def test_the_page_carries_its_figures_and_its_filter(report):
     drawn = json.loads((report / "drawn.json").read_text())
-    assert {"across_critical_difference_position", "across_matrix_position", "across_profile_position"} <= set(drawn)
+    assert {
+        "across_critical_difference_position",
+        "across_matrix_position",
+        "across_profile_position",
+    } <= set(drawn)
     assert sum(name.endswith("_front") for name in drawn) == 6
     html = (report / "index.html").read_text()
     sift = html[html.index('<div class="sift">') :]
@@ -93,12 +116,19 @@ def test_the_page_carries_its_figures_and_its_filter(report):
 
 
 def test_pictures_across_cells_show_what_was_decided(results):
-    table = frame.frame("many", results)
-    decided = significance.verdicts(table[table.group == "position"])
-    one, sources = across.across(table, "position"), across.blocks(table, "position")
-    style = looks(sorted(set(table.label)))
-    found = {d.name: d.make() for d in ranking_figures.of_study([(one, sources)], decided, style)}
-    assert all(isinstance(figure, Figure) and figure.get_figwidth() <= 3.6 for figure in found.values())
+    table = frame.load_frame("many", results)
+    decided = pairwise_tests.compare_pairs(table[table.group == "position"])
+    one, sources = (
+        rankings.rank_filters(table, "position"),
+        condition_blocks.ranking_blocks(table, "position"),
+    )
+    style = line_styles(sorted(set(table.label)))
+    found = {
+        d.name: d.make() for d in comparison_figures.study_figures([(one, sources)], decided, style)
+    }
+    assert all(
+        isinstance(figure, Figure) and figure.get_figwidth() <= 3.6 for figure in found.values()
+    )
     ranks = {text.get_text() for text in found["critical_difference_position"].axes[0].texts}
     assert all(any(f"{rank:.2f}" in text for text in ranks) for rank in one.ranks)
     axis = found["matrix_position"].axes[0]
@@ -108,50 +138,71 @@ def test_pictures_across_cells_show_what_was_decided(results):
         row, column = order[round(y)], order[round(x)]
         won = sum(v.winner == row for v in decided if {v.a, v.b} == {row, column})
         assert text.get_text().startswith(f"{won}–")
-    lines = {line.get_label(): line.get_ydata()[-1] for line in found["profile_position"].axes[0].lines}
-    assert lines["sir"] == pytest.approx(100 * 11 / 15)  # four of fifteen runs are lost in each cell
+    lines = {
+        line.get_label(): line.get_ydata()[-1] for line in found["profile_position"].axes[0].lines
+    }
+    assert lines["sir"] == pytest.approx(
+        100 * 11 / 15
+    )  # four of fifteen runs are lost in each cell
 
 
 def test_the_front_is_who_is_not_dominated():
-    cost = np.array([1.0, 2.0, 3.0, 3.0, 4.0, 0.5])
+    seconds = np.array([1.0, 2.0, 3.0, 3.0, 4.0, 0.5])
     loss = np.array([5.0, 3.0, 3.5, 2.0, np.inf, np.inf])
-    assert budget.undominated(cost, loss).tolist() == [True, True, False, True, False, False]
-    assert budget.undominated(np.ones(3), np.ones(3)).all()
+    assert cost.pareto_mask(seconds, loss).tolist() == [True, True, False, True, False, False]
+    assert cost.pareto_mask(np.ones(3), np.ones(3)).all()
     rng = np.random.default_rng(1)
-    cost, loss = rng.random((2, 40))
-    best = [not any(c <= x and l <= y and (c < x or l < y) for c, l in zip(cost, loss, strict=True))
-            for x, y in zip(cost, loss, strict=True)]  # fmt: skip
-    assert budget.undominated(cost, loss).tolist() == best
+    seconds, loss = rng.random((2, 40))
+    best = [not any(c <= x and l <= y and (c < x or l < y) for c, l in zip(seconds, loss, strict=True))
+            for x, y in zip(seconds, loss, strict=True)]  # fmt: skip
+    assert cost.pareto_mask(seconds, loss).tolist() == best
 
 
 def test_a_budget_that_was_not_kept_is_not_claimed():
     def job(particles, per_step=1e-3, **config):
-        return {"key": "k", "particles": particles, "seconds": {"per_step": per_step}, "config": config}
+        return {
+            "key": "k",
+            "particles": particles,
+            "seconds": {"per_step": per_step},
+            "config": config,
+        }
 
-    assert budget.stated([job(100), job(None)]) == "Budget: same N (N = 100 of each particle filter)."
-    assert "was not kept (N = 100, 400)" in budget.stated([job(100), job(400)])
+    assert (
+        cost.format_budget([job(100), job(None)])
+        == "Budget: particles (N = 100 in each particle filter)."
+    )
+    assert "not met (N = 100, 400)" in cost.format_budget([job(100), job(400)])
     used = [{"least": low, "mean": mean, "most": 200} for low, mean in ((100, 120.0), (110, 140.0))]
     changing = [{**job(200), "label": "grows", "particles_used": one} for one in used]
-    said = budget.stated([job(100), job(100), *changing, job(100)])
-    assert "N = 100, 200 of grows; grows had 100 to 200, 130 on average" in said
-    kind = "same time per step"
+    said = cost.format_budget([job(100), job(100), *changing, job(100)])
+    assert "N = 100, 200 of grows, grows used 100 to 200, 130 on average" in said
+    kind = "time"
     alike = [job(100, budget=kind), job(100, 1.05e-3, budget=kind), job(9, 1.1e-3, budget=kind)]
-    said = budget.stated([*alike, job(None, 1e-5, budget=kind)])  # a filter without particles has no number to keep it by
-    assert said == f"Budget: {kind} (1 to 1.1 ms per step, particle filters alone; N = 100, 9)."
+    said = cost.format_budget(
+        [*alike, job(None, 1e-5, budget=kind)]
+    )  # a filter without particles has no number to keep it by
+    assert said == f"Budget: {kind} (1 to 1.1 ms per step, particle filters only, N = 100, 9)."
     dear = job(9, 5e-3, budget=kind) | {"label": "dear"}
-    assert f"{kind} was not kept by dear (4.7 of the price) (1 to 5 ms" in budget.stated([*alike, dear])
+    assert f"{kind} not met by dear (4.7 times the target) (1 to 5 ms" in cost.format_budget(
+        [*alike, dear]
+    )
     priced = [{**one, "bought": {"price": 1e-3}} for one in alike]
-    slow = [{**job(9, k * 1e-2, budget=kind), "bought": {"price": 1e-2}} for k in (1, 1.1)]  # a cell where SIR takes longer
-    assert "was not kept" not in budget.stated([*priced, *slow])
+    slow = [
+        {**job(9, k * 1e-2, budget=kind), "bought": {"price": 1e-2}} for k in (1, 1.1)
+    ]  # a cell where SIR takes longer
+    assert "not met" not in cost.format_budget([*priced, *slow])
     twice = [{**dear, "bought": {"price": price}} for price in (1e-3, 2e-3)]
-    assert "was not kept by dear (2.5 to 5 of the price)" in budget.stated([*priced, *twice])
-    counted = [{**job(n, budget=store.BUDGETS[2]), "likelihoods_per_step": n * k} for n, k in ((100, 1.0), (10, 11.0))]
-    said = "(100 to 110 per step, particle filters alone; N = 10, 100)."
-    assert budget.stated(counted) == f"Budget: same likelihood evaluations {said}"
-    assert "do not count them" in budget.stated([*counted, job(1, budget=store.BUDGETS[2])])
-    assert "not the same for all" in budget.stated([job(100), job(100, budget=kind)])
-    with pytest.raises(ValueError, match="budget=fair"):
-        budget.stated([job(1, budget="fair")])
+    assert "not met by dear (2.5 to 5 times the target)" in cost.format_budget([*priced, *twice])
+    counted = [
+        {**job(n, budget=store.BUDGETS[2]), "likelihoods_per_step": n * k}
+        for n, k in ((100, 1.0), (10, 11.0))
+    ]
+    said = "(100 to 110 per step, particle filters only, N = 10, 100)."
+    assert cost.format_budget(counted) == f"Budget: likelihoods {said}"
+    assert "do not count them" in cost.format_budget([*counted, job(1, budget=store.BUDGETS[2])])
+    assert "differs between jobs" in cost.format_budget([job(100), job(100, budget=kind)])
+    with pytest.raises(ValueError, match=r"budget must be one of .* got fair"):
+        cost.format_budget([job(1, budget="fair")])
 
 
 def test_rules_for_lost_runs_that_decide_otherwise_are_listed():
@@ -162,11 +213,20 @@ def test_rules_for_lost_runs_that_decide_otherwise_are_listed():
         pd.DataFrame({"label": label, "run": runs, "value": value, "lost": np.isinf(value)})
         for label, value in (("a", a), ("b", b))
     ])  # fmt: skip
-    rows = rows.assign(scenario="s", noise="n", model="m", seed=1, group="position", component="norm", metric="rmse", unit="m")
-    (found,) = significance.sensitivity(rows)
-    assert found.winners == ("b", "a", significance.NO_DIFFERENCE)
-    assert significance.sensitivity(rows[~rows.lost]) == []
-    (verdict,) = significance.verdicts(rows)
+    rows = rows.assign(
+        scenario="s",
+        noise="n",
+        model="m",
+        seed=1,
+        group="position",
+        component="norm",
+        metric="rmse",
+        unit="m",
+    )
+    (found,) = pairwise_tests.lost_rule_sensitivity(rows)
+    assert found.winners == ("b", "a", pairwise_tests.INCONCLUSIVE)
+    assert pairwise_tests.lost_rule_sensitivity(rows[~rows.lost]) == []
+    (verdict,) = pairwise_tests.compare_pairs(rows)
     assert verdict.winner == "b"
 
 
@@ -176,38 +236,52 @@ def test_a_study_too_large_to_show_all_says_what_it_shows(results, tmp_path):
 
     def stub(drawing, prefix, folder, formats):
         drawn.append(f"{prefix}_{drawing.name}")
-        return {"file": "", "caption": drawing.caption, "source": "data:,", "name": "", "broad": False, "anchor": "x"}
+        return {
+            "file": "",
+            "caption": drawing.caption,
+            "source": "data:,",
+            "name": "",
+            "broad": False,
+            "anchor": "x",
+        }
 
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
-            (files, "drawn", stub), (page, "PAIRS", 2), (section, "PAIRS", 2),
-            (page, "_ROWS", 30), (files, "_MANY", 30), (view, "_NAMED", 1), (view, "_PLENTY", 17),
+            (writers, "render_figure", stub), (page, "PAIRS", 2), (condition_section, "PAIRS", 2),
+            (page, "_ROWS", 30), (writers, "_MANY", 30), (options, "_NAMED", 1), (options, "_PLENTY", 17),
         ):  # fmt: skip
             patch.setattr(module, name, value)
-        made = page.write("many", results, tmp_path)
+        made = page.write_report("many", results, tmp_path)
     html = made.read_text()
     decided = json.loads(gzip.decompress((made.parent / "verdicts.json.gz").read_bytes()))
     assert len(decided) == 6 * 3 * 3
     assert not (made.parent / "verdicts.json").exists()
-    assert "All 54 verdicts are in verdicts.json.gz" in html
+    assert "All 54 comparisons are in verdicts.json.gz" in html
     sift = html[html.index('<div class="sift">') :]
     rows = re.findall(r"<tr>" + 4 * r"<td class=t>(.*?)" + "<td>", sift[: sift.index("</table>")])
     assert len(rows) == 6 * 2
     assert {group for _, group, _, _ in rows} == {"position"}
     assert all("apf" in (a, b) for _, _, a, b in rows)  # the best
-    assert f"The table holds {len(rows)} of the 54 comparisons" in html
-    assert "2 of 3 comparisons of position, those with apf, whose median RMSE is the smallest" in html
+    assert f"The table contains {len(rows)} of the 54 comparisons" in html
+    assert (
+        "2 of 3 comparisons of position: those with apf, the filter with the smallest median RMSE"
+        in html
+    )
     pairs = pd.read_csv(made.parent / "tables" / "flight_surge_ins_gnss_position_pairs.csv")
     assert len(pairs) == 2
     assert not (made.parent / "tables" / "flight_surge_ins_gnss_velocity_pairs.csv").exists()
     assert (made.parent / "tables" / "flight_surge_ins_gnss_velocity.csv").exists()
-    own = {name.removeprefix("flight_surge_ins_gnss_") for name in drawn if name.startswith("flight_surge")}
+    own = {
+        name.removeprefix("flight_surge_ins_gnss_")
+        for name in drawn
+        if name.startswith("flight_surge")
+    }
     assert own == {"error_position", "rmse", "nees", "calibration", "front", "forest_position"}
     captions = re.findall(r"<figcaption>(.*?)</figcaption>", html)
-    assert sum("In colour: the 1 with" in text for text in captions) >= 6 * 3
+    assert sum("Coloured: the 1 filters with" in text for text in captions) >= 6 * 3
     assert "sir lost 4 of 15 runs" in html  # said in the section of each cell
-    first = html.index('<h2>In short</h2>')
+    first = html.index("<h2>Summary</h2>")
     short = html[first : html.index('<section id="across">')]
-    assert "position: beaten by no other" not in short
-    assert "3 filters in 6 cells (" in short
-    assert "Lost: 24 of 270 runs, by 1 of 3 filters; most by sir (24 of 90)." in short
+    assert "Top group in" not in short
+    assert "3 filters in 6 conditions (" in short
+    assert "Lost runs: 24 of 270, by 1 of 3 filters. Most: sir (24 of 90)." in short

@@ -21,7 +21,9 @@ def drive(t: np.ndarray) -> dict[str, np.ndarray]:
     fine = np.arange(0.0, t[-1] + 0.002, 0.002)
     fast, where = velocity(fine)
     v = fast * np.stack([np.cos(where), np.sin(where)])
-    p = np.concatenate([np.zeros((2, 1)), np.cumsum(0.5 * (v[:, 1:] + v[:, :-1]) * 0.002, axis=1)], axis=1)
+    p = np.concatenate(
+        [np.zeros((2, 1)), np.cumsum(0.5 * (v[:, 1:] + v[:, :-1]) * 0.002, axis=1)], axis=1
+    )
     (speed, heading), turn, zero = velocity(t), 0.24 * np.cos(0.4 * t), np.zeros_like(t)
     return {
         "t": t, "fx": np.cos(0.5 * t), "fy": speed * turn, "fz": zero - GRAVITY, "wx": zero, "wy": zero, "wz": turn,
@@ -44,8 +46,12 @@ def _tables(seconds: float) -> dict[str, pd.DataFrame]:
         "reference": ["t", "pn", "pe", "pd", "vn", "ve", "vd", "roll", "pitch", "yaw"],
     }
     rates = {"imu": 100, "gnss": 5, "reference": 20}
-    whole = {name: drive(np.arange(round(seconds * rate) + 1) / rate) for name, rate in rates.items()}
-    return {name: pd.DataFrame({c: whole[name][c] for c in wanted}) for name, wanted in columns.items()}
+    whole = {
+        name: drive(np.arange(round(seconds * rate) + 1) / rate) for name, rate in rates.items()
+    }
+    return {
+        name: pd.DataFrame({c: whole[name][c] for c in wanted}) for name, wanted in columns.items()
+    }
 
 
 def write(folder: Path, log: dict[str, pd.DataFrame], suffix: str = ".csv") -> Path:

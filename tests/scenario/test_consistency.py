@@ -16,23 +16,23 @@ from hydra import compose, initialize_config_dir
 from numpy.typing import NDArray
 from scipy import stats
 
-from pfbench import cli, job
-from pfbench.draws import MonteCarlo
+from pfbench import job
+from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.loop import run_filter
-from pfbench.judge import Judge
-from pfbench.noise.regimes import Nominal
+from pfbench.job.scoring import ScoreRecorder
+from pfbench.noise.white import NominalNoise
 
 RUNS = 100
 FALSE_ALARM = 1e-2
 
 # Words beside each scene. The IMU is read less often than in the scenes, which is cheap and changes no law.
 CONSISTENT: dict[str, tuple[str, ...]] = {
-    "t003_closed": ("scenario.imu_rate=10",),
-    "gps_ins_markov": ("scenario.imu_rate=10",),
-    "azimuth_small": ("scenario.imu_rate=10",),
-    "anshun_nl_small": ("scenario.imu_rate=10", "scenario.path.duration=100"),
-    "passive_1_drawn": (),
-    "passive_3_drawn": (),
+    "flight_300s_closed_loop": ("scenario.imu_rate_hz=10",),
+    "gps_ins_markov": ("scenario.imu_rate_hz=10",),
+    "azimuth_small": ("scenario.imu_rate_hz=10",),
+    "anshun_nl_small": ("scenario.imu_rate_hz=10", "scenario.trajectory.duration_s=100"),
+    "passive_1_random": (),
+    "passive_3_random": (),
 }
 TESTS = 2 * 6 * len(CONSISTENT)  # two statistics of at most six groups
 
@@ -54,20 +54,26 @@ class Consistency(NamedTuple):
 
 def measured(scenario: str, *words: str, seed: int = 21) -> dict[str, Consistency]:
     """The scene's own model and the extended Kalman filter, which is the Kalman filter where all is linear."""
-    with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
-        cfg: Any = compose("config", [f"scenario={scenario}", "filter=ekf", "worlds=null", *words])
-    model, runs = job.build(cfg.model), torch.arange(RUNS)
+    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
+        cfg: Any = compose(
+            "config", [f"scenario={scenario}", "filter=ekf", "episode_cache_dir=null", *words]
+        )
+    model, runs = job.instantiate(cfg.model), torch.arange(RUNS)
     with torch.no_grad():
-        episode = job.build(cfg.scenario).draw(Nominal(), runs, seed)
-        watch = Judge(model, model.assemble(episode.truth))
-        estimate = run_filter(job.build(cfg["filter"]), model, episode.record, MonteCarlo(seed, runs), watch)
+        episode = job.instantiate(cfg.scenario).draw(NominalNoise(), runs, seed)
+        watch = ScoreRecorder(model, model.assemble(episode.truth))
+        estimate = run_filter(
+            job.instantiate(cfg["filter"]), model, episode.record, PhiloxStream(seed, runs), watch
+        )
     assert not estimate.lost.any()
     nees: NDArray[np.float64] = estimate.trace["nees"].numpy()
     found = {}
     for (name, parts), group in zip(model.groups.items(), np.moveaxis(nees, -1, 0), strict=True):
         each = group.mean(1) / len(parts)
         end = float(group[:, -1].mean() / len(parts))
-        found[name] = Consistency(float(each.mean()), float(each.std(ddof=1) / RUNS**0.5), end, len(parts))
+        found[name] = Consistency(
+            float(each.mean()), float(each.std(ddof=1) / RUNS**0.5), end, len(parts)
+        )
     return found
 
 

@@ -15,7 +15,7 @@ from pymap3d import ned2geodetic
 from scipy.spatial.transform import Rotation
 from synthetic_log import GRAVITY, ORIGIN, drive, tables, write
 
-from pfbench.scenario.logs import STANDARD_GRAVITY, Files, frd, read_log
+from pfbench.scenario.recorded.log_reader import STANDARD_GRAVITY, LogFiles, read_log, swap_frd_rfu
 
 Log = dict[str, pd.DataFrame]
 TO_ENU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -25,13 +25,17 @@ TO_ENU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 def test_everything_becomes_right_forward_up_and_east_north_up(tmp_path: Path, suffix: str) -> None:
     log = read_log(write(tmp_path, tables(), suffix))
     there = drive(log.reference.time)
-    assert np.allclose(log.reference.position, np.stack([there["pe"], there["pn"], -there["pd"]], -1))
-    assert np.allclose(log.reference.velocity, np.stack([there["ve"], there["vn"], -there["vd"]], -1))
+    assert np.allclose(
+        log.reference.position, np.stack([there["pe"], there["pn"], -there["pd"]], -1)
+    )
+    assert np.allclose(
+        log.reference.velocity, np.stack([there["ve"], there["vn"], -there["vd"]], -1)
+    )
     assert np.allclose(log.imu.force[:, 2], GRAVITY)
     assert np.allclose(log.imu.force[:, 1], drive(log.imu.time)["fx"])
     assert np.allclose(log.imu.rate[:, 2], -drive(log.imu.time)["wz"])
     assert log.gravity == STANDARD_GRAVITY
-    assert "states no place" in log.notes[0]
+    assert "does not contain its location" in log.notes[0]
 
 
 def test_attitude_is_the_same_turn_in_other_axes(tmp_path: Path) -> None:
@@ -39,21 +43,27 @@ def test_attitude_is_the_same_turn_in_other_axes(tmp_path: Path) -> None:
     roll, pitch, yaw = 0.7, -1.1, 2.5
     log["reference"] = log["reference"].assign(roll=roll, pitch=pitch, yaw=yaw)
     q = read_log(write(tmp_path, log)).reference.attitude[0]
-    ned = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()  # body FRD to NED: yaw, then pitch, then roll
-    assert np.allclose(Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix(), TO_ENU @ ned @ TO_ENU.T, atol=1e-12)
+    ned = Rotation.from_euler(
+        "ZYX", [yaw, pitch, roll]
+    ).as_matrix()  # body FRD to NED: yaw, then pitch, then roll
+    assert np.allclose(
+        Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix(), TO_ENU @ ned @ TO_ENU.T, atol=1e-12
+    )
 
 
 def test_the_change_of_axes_is_a_rotation_and_its_own_inverse() -> None:
     a, b = np.random.default_rng(1).normal(size=(2, 5, 3))
-    assert np.array_equal(frd(frd(a)), a)
-    assert np.allclose(frd(a), a @ TO_ENU.T)
-    assert np.allclose(frd(np.cross(a, b)), np.cross(frd(a), frd(b)))
+    assert np.array_equal(swap_frd_rfu(swap_frd_rfu(a)), a)
+    assert np.allclose(swap_frd_rfu(a), a @ TO_ENU.T)
+    assert np.allclose(swap_frd_rfu(np.cross(a, b)), np.cross(swap_frd_rfu(a), swap_frd_rfu(b)))
 
 
 def geodetic(log: Log, names: tuple[str, ...]) -> Log:
     for name in names:
         t = log[name]
-        t["lat_deg"], t["lon_deg"], t["h_m"] = ned2geodetic(t.pn.to_numpy(), t.pe.to_numpy(), t.pd.to_numpy(), *ORIGIN)
+        t["lat_deg"], t["lon_deg"], t["h_m"] = ned2geodetic(
+            t.pn.to_numpy(), t.pe.to_numpy(), t.pd.to_numpy(), *ORIGIN
+        )
         log[name] = t.drop(columns=["pn", "pe", "pd"])
     return log
 
@@ -63,10 +73,14 @@ def test_latitudes_become_metres_about_the_origin(tmp_path: Path) -> None:
     log = read_log(write(tmp_path / "both", geodetic(tables(), ("gnss",))), origin=ORIGIN)
     # coordinates in a CSV of full precision; the two mappings are exact
     assert np.allclose(log.fixes.position, plain.fixes.position, atol=1e-6)
-    assert log.gravity == pytest.approx(9.7968, abs=1e-3)  # 40 degrees North, 1500 m: 9.8017 - 3.086e-6 * 1500
+    assert log.gravity == pytest.approx(
+        9.7968, abs=1e-3
+    )  # 40 degrees North, 1500 m: 9.8017 - 3.086e-6 * 1500
     own = read_log(write(tmp_path / "own", geodetic(tables(), ("gnss", "reference"))))
     assert np.allclose(own.reference.position[0], 0.0, atol=1e-9)
-    moved, expected = (part.reference.position - part.reference.position[0] for part in (own, plain))
+    moved, expected = (
+        part.reference.position - part.reference.position[0] for part in (own, plain)
+    )
     assert np.allclose(moved, expected, atol=0.02)  # the tangent plane is another one, 3 m higher
 
 
@@ -76,8 +90,14 @@ def test_an_origin_in_the_metadata_is_used(tmp_path: Path) -> None:
 
     log = geodetic(tables(), ("gnss",))
     folder = write(tmp_path, log, ".parquet")
-    stated = {f"origin_{key}": str(value) for key, value in zip(("lat_deg", "lon_deg", "h_m"), ORIGIN, strict=True)}
-    parquet.write_table(pa.Table.from_pandas(log["reference"]).replace_schema_metadata(stated), folder / "reference.parquet")
+    stated = {
+        f"origin_{key}": str(value)
+        for key, value in zip(("lat_deg", "lon_deg", "h_m"), ORIGIN, strict=True)
+    }
+    parquet.write_table(
+        pa.Table.from_pandas(log["reference"]).replace_schema_metadata(stated),
+        folder / "reference.parquet",
+    )
     read = read_log(folder)
     assert np.allclose(read.fixes.position[:, 1], tables()["gnss"].pn, atol=1e-6)
     assert read.notes == ()
@@ -88,14 +108,18 @@ def test_flights_and_sensors_of_one_table_are_told_apart(tmp_path: Path) -> None
     second = {name: table.copy() for name, table in log.items()}
     second["reference"]["pd"] += 50.0
     parts = [(1, 1, log), (1, 2, log), (2, 1, second)]
-    whole: Log = {"imu": pd.concat([part["imu"].assign(path=path, imu=imu) for path, imu, part in parts])}
+    whole: Log = {
+        "imu": pd.concat([part["imu"].assign(path=path, imu=imu) for path, imu, part in parts])
+    }
     for name in ("gnss", "reference"):
         whole[name] = pd.concat([log[name].assign(path=1), second[name].assign(path=2)])
     folder = write(tmp_path, whole, ".parquet")
     first, other = read_log(folder, path=1, imu=2), read_log(folder, path=2, imu=1)
     assert len(first.imu.time) == len(other.imu.time) == len(log["imu"])
     assert np.allclose(first.reference.position[:, 2] - other.reference.position[:, 2], 50.0)
-    with pytest.raises(ValueError, match=r"column path tells \[1, 2\] apart; choose one of them with path="):
+    with pytest.raises(
+        ValueError, match=r"column path has values \[1, 2\]. Select one of them with path="
+    ):
         read_log(folder, imu=1)
     with pytest.raises(ValueError, match=r"imu=2 is not in the file; it has \[1\]"):
         read_log(folder, path=2, imu=2)
@@ -104,7 +128,7 @@ def test_flights_and_sensors_of_one_table_are_told_apart(tmp_path: Path) -> None
 def test_fixes_may_come_from_the_reference(tmp_path: Path) -> None:
     log = tables()
     del log["gnss"]
-    read = read_log(write(tmp_path, log), Files(gnss="reference"))
+    read = read_log(write(tmp_path, log), LogFiles(gnss="reference"))
     assert np.array_equal(read.fixes.position, read.reference.position)
     assert np.array_equal(read.fixes.velocity, read.reference.velocity)
 
@@ -113,7 +137,9 @@ def test_a_fix_that_is_not_1_is_not_seen(tmp_path: Path) -> None:
     log = tables()
     log["gnss"]["fix"] = 1
     log["gnss"].loc[3:5, "fix"] = 2
-    assert np.flatnonzero(np.isnan(read_log(write(tmp_path, log)).fixes.position[:, 0])).tolist() == [3, 4, 5]
+    assert np.flatnonzero(
+        np.isnan(read_log(write(tmp_path, log)).fixes.position[:, 0])
+    ).tolist() == [3, 4, 5]
 
 
 def test_a_slipped_time_tag_goes_back_and_is_told(tmp_path: Path) -> None:
@@ -122,7 +148,7 @@ def test_a_slipped_time_tag_goes_back_and_is_told(tmp_path: Path) -> None:
         log["imu"].loc[500, "t"] += slip
         read = read_log(write(tmp_path, log))
         assert np.allclose(np.diff(read.imu.time), 0.01)
-        assert "repeats a time beside a double step" in read.notes[0]
+        assert "repeats a time next to a double step" in read.notes[0]
 
 
 def edit(name: str, column: str, change: Callable[[pd.Series], object]) -> Callable[[Log], None]:
@@ -177,28 +203,67 @@ def left_up(log: Log) -> None:
 BAD: dict[str, tuple[Callable[[Log], None], str]] = {
     "missing column": (drop("imu", "fy"), r"imu\.csv: no column fy; it has t, fx, fz.*Rename"),
     "no position": (drop("gnss", "pe"), r"gnss\.csv: no column pe"),
-    "NaN": (put("imu", 7, "wz", np.nan), r"imu\.csv: column wz, line 9 is nan \(1 such\); give numbers"),
+    "NaN": (
+        put("imu", 7, "wz", np.nan),
+        r"imu\.csv: column wz, line 9 is nan \(1 such\); give numbers",
+    ),
     "text": (put("reference", 2, "roll", "n/a?"), r"reference\.csv: column roll, line 4 is n/a\?"),
     "infinite": (put("gnss", 0, "pn", np.inf), r"gnss\.csv: column pn, line 2 is inf"),
-    "duplicate": (put("gnss", 4, "t", 0.6), r"gnss\.csv: column t, line 6 is 0\.6 after 0\.6.*repeats the time before"),
-    "backwards": (put("imu", 50, "t", 0.1), r"imu\.csv: column t, line 52 is 0\.1 after 0\.49.*goes back.*sort"),
-    "imu in ms": (scale("imu", "t", 1e3), r"imu\.csv: column t has a median interval of 10.*in ms, multiply by 0\.001"),
+    "duplicate": (
+        put("gnss", 4, "t", 0.6),
+        r"gnss\.csv: column t, line 6 is 0\.6 after 0\.6.*repeats the previous time",
+    ),
+    "backwards": (
+        put("imu", 50, "t", 0.1),
+        r"imu\.csv: column t, line 52 is 0\.1 after 0\.49.*goes back.*sort",
+    ),
+    "imu in ms": (
+        scale("imu", "t", 1e3),
+        r"imu\.csv: column t has a median interval of 10.*in ms, multiply by 0\.001",
+    ),
     "imu in us": (scale("imu", "t", 1e6), r"in us, multiply by 1e-06"),
     "imu in ns": (scale("imu", "t", 1e9), r"in ns, multiply by 1e-09"),
     "gnss in ms": (scale("gnss", "t", 1e3), r"gnss\.csv: column t.*in ms"),
-    "in g": (scale("imu", "fx fy fz", 1 / GRAVITY), r"fx, fy, fz have a median norm of 1\.\d+: in g; multiply by 9\.80665"),
-    "odd force": (scale("imu", "fx fy fz", 100.0), r"fx, fy, fz have a median norm of .*check the unit"),
+    "in g": (
+        scale("imu", "fx fy fz", 1 / GRAVITY),
+        r"fx, fy, fz have a median norm of 1\.\d+: in g; multiply by 9\.80665",
+    ),
+    "odd force": (
+        scale("imu", "fx fy fz", 100.0),
+        r"fx, fy, fz have a median norm of .*check the unit",
+    ),
     "z up": (left_up, r"fz has a median of \+9\.81.*negate fy, fz, wy, wz"),
-    "fast in deg/s": (scale("imu", "wx wy wz", 1e4), r"wx, wy, wz reach 2400\.0, implausible.*in deg/s, multiply by 0\.01745"),
-    "slow in deg/s": (scale("imu", "wx wy wz", 180 / np.pi), r"turn 57 times as fast as reference\.csv: in deg/s"),
-    "other sense": (scale("imu", "wz", -1.0), r"imu\.csv and reference\.csv do not turn together \(slope -1\.0"),
+    "fast in deg/s": (
+        scale("imu", "wx wy wz", 1e4),
+        r"wx, wy, wz reach 2400\.0, implausible.*in deg/s, multiply by 0\.01745",
+    ),
+    "slow in deg/s": (
+        scale("imu", "wx wy wz", 180 / np.pi),
+        r"turn 57 times as fast as reference\.csv: in deg/s",
+    ),
+    "other sense": (
+        scale("imu", "wz", -1.0),
+        r"imu\.csv and reference\.csv do not turn together \(slope -1\.0",
+    ),
     "yaw in degrees": (scale("reference", "yaw", 180 / np.pi), r"do not turn together"),
-    "pitch in degrees": (edit("reference", "pitch", lambda p: p + 5.0), r"pitch reaches 5 .*if in degrees, multiply"),
-    "no overlap": (edit("gnss", "t", lambda t: t + 1e6), r"imu\.csv covers t = 0\.000 to 20\.000 and gnss\.csv t = 10.*clock"),
-    "reference elsewhere": (edit("reference", "t", lambda t: t - 100), r"imu\.csv covers .*reference\.csv.*no common time"),
-    "gap": (cut_out, r"imu\.csv: a gap of 0\.410 s after line 401 \(t = 3\.99\).*cut the log"),
+    "pitch in degrees": (
+        edit("reference", "pitch", lambda p: p + 5.0),
+        r"pitch reaches 5 .*if in degrees, multiply",
+    ),
+    "no overlap": (
+        edit("gnss", "t", lambda t: t + 1e6),
+        r"imu\.csv covers t = 0\.000 to 20\.000 and gnss\.csv t = 10.*clock",
+    ),
+    "reference elsewhere": (
+        edit("reference", "t", lambda t: t - 100),
+        r"imu\.csv covers .*reference\.csv.*no common time",
+    ),
+    "gap": (cut_out, r"imu\.csv: a gap of 0\.410 s after line 401 \(t = 3\.99\).*Cut the log"),
     "one row": (no_rows, r"gnss\.csv: 1 rows; give at least 2"),
-    "no origin": (one_geodetic, r"gnss\.csv and reference\.csv: one gives lat_deg.*set origin="),
+    "no origin": (
+        one_geodetic,
+        r"gnss\.csv and reference\.csv: one has lat_deg.*Set scenario\.origin=",
+    ),
     "latitude": (far_north, r"column lat_deg, line 2 is 140"),
 }
 
@@ -222,31 +287,35 @@ def test_rows_of_parquet_are_counted_from_0(tmp_path: Path) -> None:
 def test_a_missing_or_doubled_table_is_named(tmp_path: Path) -> None:
     write(tmp_path, tables())
     with pytest.raises(ValueError, match=r"no gps\.parquet and no gps\.csv; a log is a folder"):
-        read_log(tmp_path, Files(gnss="gps"))
+        read_log(tmp_path, LogFiles(gnss="gps"))
     write(tmp_path, tables(), ".parquet")
     with pytest.raises(ValueError, match=r"both imu\.parquet and imu\.csv; delete one"):
         read_log(tmp_path)
 
 
-def test_parquet_without_pyarrow_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parquet_without_pyarrow_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write(tmp_path, tables(), ".parquet")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ValueError, match=r"needs pyarrow: pip install 'pfbench\[data\]', or store the log as CSV"):
+    with pytest.raises(
+        ValueError, match=r"needs pyarrow: pip install 'pfbench\[data\]', or store the log as CSV"
+    ):
         read_log(tmp_path)
 
 
 @pytest.mark.parametrize("origin", [(40.0, 5.0), (140.0, 5.0, 0.0)])
 def test_an_impossible_origin_is_refused(tmp_path: Path, origin: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match=r"origin=\[.*give lat_deg, lon_deg, h_m"):
+    with pytest.raises(ValueError, match=r"origin must be lat_deg .*, lon_deg, h_m, got \["):
         read_log(write(tmp_path, tables()), origin=origin)
 
 
-PAGE = Path(__file__).parents[2] / "docs" / "own_data.md"
+PAGE = Path(__file__).parents[2] / "docs" / "use_your_data.md"
 BLOCK = re.compile(r"^```(python|bash)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 
 @pytest.mark.slow
-def test_the_page_on_own_data_runs_as_it_stands(
+def test_the_page_use_your_data_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -261,4 +330,8 @@ def test_the_page_on_own_data_runs_as_it_stands(
     assert "turn 57 times as fast as reference.csv" in said
     assert len(list(tmp_path.glob("results/*/*.npz"))) == 1
     # 1 Hz fixes of 1.5, 1.5 and 3 m: no worse than the fixes
-    assert 0.0 < float(re.search(r"position error ([\d.]+) m", said)[1]) < np.sqrt(1.5**2 + 1.5**2 + 3.0**2)
+    assert (
+        0.0
+        < float(re.search(r"position error ([\d.]+) m", said)[1])
+        < np.sqrt(1.5**2 + 1.5**2 + 3.0**2)
+    )

@@ -1,4 +1,4 @@
-"""Worlds drawn from a model itself follow that model: moments by the exact recursion, and the convention of the first step."""
+"""Episodes simulated from a model have its moments (exact recursion) and its convention of the first step."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pyro.distributions import Laplace
 from scipy import stats
 
 import pfbench
-from pfbench.model.linear import LinearGaussian, linear_walk, local_level
-from pfbench.model.toys import Pendulum, StochasticVolatility
-from pfbench.noise.regimes import Nominal, Outage, Outliers
-from pfbench.noise.surges import Surge
-from pfbench.scenario.model_world import ModelWorld
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
+from pfbench.model.textbook import Pendulum, StochasticVolatility
+from pfbench.noise.time_varying import VarianceSurge
+from pfbench.noise.white import MeasurementOutage, NominalNoise, OutlierNoise
+from pfbench.scenario.model_simulation import ModelSimulation
 
 RUNS, STEPS = 4000, 15
 
 
 def test_moments_follow_the_exact_recursion() -> None:
     model = linear_walk(0.5, 0.3, 1.0)
-    episode = ModelWorld(model, STEPS, interval=0.5).draw(Nominal(), torch.arange(RUNS), 4)
+    episode = ModelSimulation(model, STEPS, interval_s=0.5).draw(
+        NominalNoise(), torch.arange(RUNS), 4
+    )
     x = episode.truth["state"].numpy()
     f, q = np.array([[1.0, 0.5], [0.0, 1.0]]), 0.09 * np.array([[0.125 / 3, 0.125], [0.125, 0.5]])
     p = np.diag([4.0, 1.0])
@@ -43,18 +44,23 @@ def test_moments_follow_the_exact_recursion() -> None:
     assert episode.time.tolist() == [0.5 * (t + 1) for t in range(STEPS)]
 
 
-def test_measurements_are_the_state_and_white_noise_of_the_stated_size() -> None:
-    episode = ModelWorld(linear_walk(0.5, 0.3, 2.0), STEPS).draw(Nominal(), torch.arange(RUNS), 4)
+def test_measurements_are_the_state_plus_white_noise_of_the_stated_size() -> None:
+    episode = ModelSimulation(linear_walk(0.5, 0.3, 2.0), STEPS).draw(
+        NominalNoise(), torch.arange(RUNS), 4
+    )
     z = (episode.record.y[..., 0] - episode.truth["state"][..., 0]) / 2.0
     assert abs(z.mean()) < 4.5 / math.sqrt(z.numel())
     assert abs(z.std() - 1) < 4.5 / math.sqrt(2 * z.numel())
     assert abs((z[:, 1:] * z[:, :-1]).mean()) < 4.5 / math.sqrt(z.numel())
 
 
-def test_a_surge_multiplies_the_variance_of_what_drives_the_steps_in_its_window() -> None:
+def test_a_surge_multiplies_the_variance_of_the_noise_in_its_window() -> None:
     model = linear_walk(0.5, 0.3, 2.0)
-    surge = Surge(((3.0, 5.0),), (9.0,), (100.0,))
-    episode, calm = (ModelWorld(model, STEPS, interval=0.5).draw(noise, torch.arange(RUNS), 4) for noise in (surge, Nominal()))
+    surge = VarianceSurge(((3.0, 5.0),), (9.0,), (100.0,))
+    episode, calm = (
+        ModelSimulation(model, STEPS, interval_s=0.5).draw(noise, torch.arange(RUNS), 4)
+        for noise in (surge, NominalNoise())
+    )
     x, g = episode.truth["state"], model.g.inverse()
     w = (x[:, 1:] - x[:, :-1] @ model.f.mT) @ g.mT  # of the steps that end at 1.0, 1.5, ...
     for t, seconds in enumerate(np.arange(1.0, 0.5 * STEPS + 0.1, 0.5)):
@@ -69,7 +75,9 @@ def test_a_surge_multiplies_the_variance_of_what_drives_the_steps_in_its_window(
 
 def test_a_model_that_observes_its_initial_state_does_not_move_it_first() -> None:
     model = local_level(30.0, 10.0, 500.0, 5.0, observes_initial=True)
-    level = ModelWorld(model, 2).draw(Nominal(), torch.arange(RUNS), 4).truth["state"][..., 0]
+    level = (
+        ModelSimulation(model, 2).draw(NominalNoise(), torch.arange(RUNS), 4).truth["state"][..., 0]
+    )
     for t, variance in ((0, 25.0), (1, 925.0)):
         assert abs(level[:, t].mean() - 500.0) < 4.5 * math.sqrt(variance / RUNS)
         assert abs(level[:, t].var() / variance - 1) < 4.5 * math.sqrt(2 / RUNS)
@@ -78,52 +86,66 @@ def test_a_model_that_observes_its_initial_state_does_not_move_it_first() -> Non
 def test_a_dense_initial_law_is_drawn_with_its_correlation() -> None:
     factor = [[2.0, 0.0], [1.5, 0.5]]
     model = LinearGaussian(np.eye(2), np.zeros((2, 1)), np.eye(2), [1.0, 1.0], [1.0, -1.0], factor)
-    x = ModelWorld(model, 1).draw(Nominal(), torch.arange(RUNS), 4).truth["state"][:, 0].numpy()
+    x = (
+        ModelSimulation(model, 1)
+        .draw(NominalNoise(), torch.arange(RUNS), 4)
+        .truth["state"][:, 0]
+        .numpy()
+    )
     p = np.array(factor) @ np.array(factor).T
     error = np.sqrt((np.outer(np.diag(p), np.diag(p)) + p**2) / RUNS)
     assert (np.abs(np.cov(x.T) - p) < 4.5 * error).all()
     assert (np.abs(x.mean(0) - [1.0, -1.0]) < 4.5 * np.sqrt(np.diag(p) / RUNS)).all()
 
 
-def test_deviations_that_depend_on_the_state_reach_the_measurement() -> None:
-    episode = ModelWorld(StochasticVolatility(), STEPS).draw(Nominal(), torch.arange(RUNS), 4)
+def test_state_dependent_deviations_reach_the_measurement() -> None:
+    episode = ModelSimulation(StochasticVolatility(), STEPS).draw(
+        NominalNoise(), torch.arange(RUNS), 4
+    )
     z = episode.record.y[..., 0] * torch.exp(-episode.truth["state"][..., 0] / 2)
     assert abs(z.var() - 1) < 4.5 * math.sqrt(2 / z.numel())
 
 
-def test_a_run_is_its_own_and_a_regime_changes_the_measurement_alone() -> None:
-    world = ModelWorld(Pendulum(), 20, interval=0.05)
-    ten, alone = world.draw(Nominal(), torch.arange(10), 4), world.draw(Nominal(), torch.tensor([3]), 4)
-    assert all(torch.allclose(alone.truth[name], value[3:4], rtol=1e-13) for name, value in ten.truth.items())
+def test_a_run_does_not_depend_on_others_and_a_regime_changes_only_measurements() -> None:
+    world = ModelSimulation(Pendulum(), 20, interval_s=0.05)
+    ten, alone = (
+        world.draw(NominalNoise(), torch.arange(10), 4),
+        world.draw(NominalNoise(), torch.tensor([3]), 4),
+    )
+    assert all(
+        torch.allclose(alone.truth[name], value[3:4], rtol=1e-13)
+        for name, value in ten.truth.items()
+    )
     assert torch.allclose(alone.record.y, ten.record.y[3:4], rtol=1e-13)
-    for noise in (Outliers(0.5, 10.0), Outage(((0.2, 0.5),))):
+    for noise in (OutlierNoise(0.5, 10.0), MeasurementOutage(((0.2, 0.5),))):
         other = world.draw(noise, torch.arange(10), 4)
         assert all(torch.equal(other.truth[name], value) for name, value in ten.truth.items())
         assert not torch.equal(other.record.y, ten.record.y)
 
 
-def test_filters_draw_from_other_streams_than_worlds() -> None:
-    """Nothing that a world draws may come back as a particle: streams are told apart by the name of their purpose."""
+def test_filters_draw_from_other_streams_than_episodes() -> None:
+    """No number of an episode may come back as a particle: streams are separated by the name of their purpose."""
     package = Path(pfbench.__file__).parent
 
-    def purposes(*folders: str) -> set[str]:
-        text = "\n".join(file.read_text() for folder in folders for file in (package / folder).glob("*.py"))
-        return set(re.findall(r'\b(?:normal|uniform|markov|_constant)\(\s*f?"([^"]+)"', text))
+    def purposes(pattern: str, *folders: str) -> set[str]:
+        text = "\n".join(
+            file.read_text() for folder in folders for file in (package / folder).rglob("*.py")
+        )
+        return set(re.findall(pattern, text))
 
-    worlds, filters = purposes("scenario", "noise", "nav"), purposes("filter")
-    assert {"world.state", "world.receiver", "world.initial", "world.imu.gyro"} <= worlds
+    drawn = r'\b(?:normal|uniform|markov|_constant)\(\s*f?"([^"]+)"'
+    episodes = purposes(drawn, "scenario", "noise", "nav") | purposes(
+        r'"(world\.[^"]+)"', "scenario", "ppl"
+    )
+    filters = purposes(drawn, "filter") | purposes(
+        r'(?:draw_values|draw_initial_state)\([^"]*?"([^"]+)"', "filter"
+    )
+    assert {"world.state", "world.receiver", "world.initial", "world.imu.gyro"} <= episodes
     assert {"initial", "noise", "resample"} <= filters
-    assert all(purpose.startswith(("world.", "{purpose}.")) for purpose in worlds)
-    assert not any(purpose.startswith("world") for purpose in filters)
+    assert all(purpose.startswith(("world.", "{label}.")) for purpose in episodes)
+    assert not any("world." in file.read_text() for file in (package / "filter").rglob("*.py"))
 
 
-def test_no_steps_and_noise_that_is_not_normal_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"scenario\.steps=0: give at least 1 step"):
-        ModelWorld(Pendulum(), 0)
-
-    class HeavyTailed(Pendulum):
-        def observation(self, x, u):
-            return Laplace(torch.sin(x[..., :1]), 0.3).to_event(1)
-
-    with pytest.raises(ValueError, match="HeavyTailed: worlds are drawn for independent normal measurement noise only"):
-        ModelWorld(HeavyTailed(), 3).draw(Nominal(), torch.arange(2), 1)
+def test_a_scenario_without_steps_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"scenario\.steps must be at least 1, got 0"):
+        ModelSimulation(Pendulum(), 0)

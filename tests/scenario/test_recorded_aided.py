@@ -14,39 +14,50 @@ from scipy.spatial.transform import Rotation
 from synthetic_log import tables, write
 
 from pfbench import job
-from pfbench.cli import conf_dir
-from pfbench.model.strapdown_aided import BelievedAided, StrapdownAided
-from pfbench.noise.regimes import Nominal, Outage
-from pfbench.noise.surges import Surge
-from pfbench.scenario.recorded import Receiver, RecordedDrive
-from pfbench.scenario.recorded_aided import Instruments, RecordedAided, pressure_height
-from pfbench.scenario.told import Told, Witness
-from pfbench.scenario.withholding import Withholding
+from pfbench.job import conf_dir
+from pfbench.model.strapdown_aided import AidedTuning, StrapdownAided
+from pfbench.noise.time_varying import VarianceSurge
+from pfbench.noise.white import MeasurementOutage, NominalNoise
+from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime
+from pfbench.scenario.recorded.aided_flight import (
+    BaroMagSensors,
+    RecordedAidedFlight,
+    pressure_height,
+)
+from pfbench.scenario.recorded.drive import FixReceiver, RecordedDrive
+from pfbench.scenario.recorded.fix_holdout import FixHoldout
 
 FIELD, IRON = [0.17, 0.01, 0.52], [0.4, -0.2, 0.3]  # North, East, Down; forward, right, down
 MOTION = believed([1.0, 1.0, 2.0], [0.1, 0.1, 0.1])
-BELIEVED = BelievedAided(MOTION, 1.0, [0.01] * 3, FIELD, 3.0, 0.1, 0.02, 1e-4)
+BELIEVED = AidedTuning(MOTION, 1.0, [0.01] * 3, FIELD, 3.0, 0.1, 0.02, 1e-4)
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data root with one flight of 20 s whose pressure rises by a pascal a second, in a uniform field."""
     folder, log = tmp_path_factory.mktemp("data"), tables()
-    imu, yaw = log["imu"], np.interp(log["imu"]["t"], log["reference"]["t"], log["reference"]["yaw"])
+    imu, yaw = (
+        log["imu"],
+        np.interp(log["imu"]["t"], log["reference"]["t"], log["reference"]["yaw"]),
+    )
     imu["p_static_kpa"] = 98.0 + 0.001 * imu["t"]
     imu[["mx", "my", "mz"]] = Rotation.from_euler("Z", yaw[:, None]).inv().apply(FIELD) + IRON
     write(folder / "wing", log)
     return folder
 
 
-def wing(root: Path, **changes: object) -> RecordedAided:
-    flight = RecordedDrive(None, "wing", MOTION, Receiver(velocity_sd=[0.0] * 3), withholding=Withholding())
+def wing(root: Path, **changes: object) -> RecordedAidedFlight:
+    flight = RecordedDrive(
+        None, "wing", MOTION, FixReceiver(velocity_sd=[0.0] * 3), holdout=FixHoldout()
+    )
     flight = replace(flight, receiver=replace(flight.receiver, position_sd=[0.0] * 3))
-    return replace(RecordedAided(str(root), flight, BELIEVED, Instruments(IRON)), **changes)
+    return replace(
+        RecordedAidedFlight(str(root), flight, BELIEVED, BaroMagSensors(IRON)), **changes
+    )
 
 
 def test_readings_are_those_of_the_log_at_every_fix_withheld_or_not(root: Path) -> None:
-    episode = wing(root).draw(Nominal(), torch.arange(2), 1)
+    episode = wing(root).draw(NominalNoise(), torch.arange(2), 1)
     y, time = episode.record.y, episode.time.numpy()
     assert y.shape == (2, 80, 10)
     at_fix = torch.arange(1, 81) % 4 == 0
@@ -57,8 +68,16 @@ def test_readings_are_those_of_the_log_at_every_fix_withheld_or_not(root: Path) 
     assert np.allclose(y[0, at_fix, 6], fall[at_fix], atol=1e-9)
     model = StrapdownAided(BELIEVED)
     state = model.assemble(episode.truth).nan_to_num(0.0)
-    seen = torch.stack([model.observation(state[:, t : t + 1], episode.record.at(t).u).mean[:, 0] for t in range(80)], 1)
-    assert (y - seen)[:, at_fix][..., 7:].abs().max() < 2e-4  # the reference's heading between its samples
+    seen = torch.stack(
+        [
+            model.observation(state[:, t : t + 1], episode.record.at_step(t).u).mean[:, 0]
+            for t in range(80)
+        ],
+        1,
+    )
+    assert (y - seen)[:, at_fix][
+        ..., 7:
+    ].abs().max() < 2e-4  # the reference's heading between its samples
 
 
 def test_pressure_height_is_the_standard_atmosphere() -> None:
@@ -67,44 +86,50 @@ def test_pressure_height_is_the_standard_atmosphere() -> None:
 
 
 def test_starts_have_the_believed_law_about_the_log(root: Path) -> None:
-    episode = wing(root).draw(Nominal(), torch.arange(400), 1)
+    episode = wing(root).draw(NominalNoise(), torch.arange(400), 1)
     start = episode.record.start
     assert start is not None
     z = start[:, 16:] / BELIEVED.bias_sd
     assert (z.mean(0).abs() < 4.5 / 20).all()
     assert ((z.std(0) - 1).abs() < 4.5 / 28).all()
-    plain = replace(wing(root).flight, root=str(root)).draw(Nominal(), torch.arange(400), 1)
+    plain = replace(wing(root).flight, root=str(root)).draw(NominalNoise(), torch.arange(400), 1)
     assert torch.equal(start[:, :16], plain.record.start)  # the same flight as without instruments
-    alone = wing(root).draw(Nominal(), torch.tensor([7]), 1)
+    alone = wing(root).draw(NominalNoise(), torch.tensor([7]), 1)
     assert torch.equal(alone.record.start, start[7:8])
     assert torch.equal(alone.record.y.nan_to_num(-1.0), episode.record.y[7:8].nan_to_num(-1.0))
 
 
 def test_a_regime_reaches_fixes_and_readings_at_once_and_can_be_told(root: Path) -> None:
     flight = wing(root).flight
-    noisy = replace(flight, receiver=Receiver(position_sd=[3.0] * 3, velocity_sd=[0.5] * 3))
-    scene = wing(root, flight=noisy, instruments=Instruments(IRON, height_sd=2.0, magnetic_sd=0.01))
-    witness = Witness(Nominal())
+    noisy = replace(flight, receiver=FixReceiver(position_sd=[3.0] * 3, velocity_sd=[0.5] * 3))
+    scene = wing(
+        root, flight=noisy, instruments=BaroMagSensors(IRON, height_sd=2.0, magnetic_sd=0.01)
+    )
+    witness = RecordingRegime(NominalNoise())
     episode = scene.draw(witness, torch.arange(300), 1)
-    away = episode.record.y - wing(root).draw(Nominal(), torch.arange(300), 1).record.y
+    away = episode.record.y - wing(root).draw(NominalNoise(), torch.arange(300), 1).record.y
     sd = torch.stack([column[~torch.isnan(column)].std() for column in away.unbind(-1)])
-    assert torch.allclose(sd, torch.tensor([3.0] * 3 + [0.5] * 3 + [2.0] + [0.01] * 3).double(), rtol=0.06)
-    told = witness.tell(StrapdownAided(BELIEVED), episode.time)
-    assert isinstance(told, Told)
+    assert torch.allclose(
+        sd, torch.tensor([3.0] * 3 + [0.5] * 3 + [2.0] + [0.01] * 3).double(), rtol=0.06
+    )
+    told = witness.to_oracle_model(StrapdownAided(BELIEVED), episode.time)
+    assert isinstance(told, OracleNoiseModel)
     assert told.prepare(episode.record).u.shift.shape == (1, 80, 10)
-    silent = scene.draw(Outage(windows=[[5.0, 10.0]]), torch.arange(2), 1).record.y
+    silent = scene.draw(MeasurementOutage(windows_s=[[5.0, 10.0]]), torch.arange(2), 1).record.y
     assert torch.isnan(silent[:, 19:39]).all()
-    with pytest.raises(ValueError, match="a regime cannot swell their noise"):
-        scene.draw(Surge(((5.0, 9.0),), (1.0,), (4.0,)), torch.arange(2), 1)
+    with pytest.raises(ValueError, match="must not change the process noise"):
+        scene.draw(VarianceSurge(((5.0, 9.0),), (1.0,), (4.0,)), torch.arange(2), 1)
 
 
 def test_what_cannot_be_read_is_refused(root: Path) -> None:
-    with pytest.raises(ValueError, match=r"instruments\.hard_iron=\[1\.0\]: give three"):
-        Instruments([1.0])
-    with pytest.raises(ValueError, match=r"instruments\.height_sd=-1\.0"):
-        Instruments(height_sd=-1.0)
+    with pytest.raises(
+        ValueError, match=r"instruments\.hard_iron must have 3 numbers, got \[1\.0\]"
+    ):
+        BaroMagSensors([1.0])
+    with pytest.raises(ValueError, match=r"instruments\.height_sd must be at least 0, got -1\.0"):
+        BaroMagSensors(height_sd=-1.0)
     with pytest.raises(ValueError, match=r"data\.root is not set"):
-        replace(wing(root), root=None).draw(Nominal(), torch.arange(1), 1)
+        replace(wing(root), root=None).draw(NominalNoise(), torch.arange(1), 1)
 
 
 @recorded
@@ -116,12 +141,12 @@ def test_the_barometer_is_believed_as_the_fixes_of_the_run_itself_say(run: int) 
     known, and 2 s^2 is what is left; s is believed to be twice that, since it is no white noise.
     """
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose("config", ["scenario=fixed_wing_aided", "worlds=null"])
-    scene = job.build(cfg.scenario)
-    y = scene.draw(Nominal(), torch.arange(2), 1).record.y[run]
+        cfg = compose("config", ["scenario=recorded_fixed_wing_aided", "episode_cache_dir=null"])
+    scene = job.instantiate(cfg.scenario)
+    y = scene.draw(NominalNoise(), torch.arange(2), 1).record.y[run]
     off = (y[:, 6] - y[:, 2])[torch.isfinite(y[:, 2])].numpy()  # of every second second
     lags = np.array([6, 10, 20, 40])
     change = [np.mean((off[lag // 2 :] - off[: -lag // 2]) ** 2) for lag in lags]
     slope, level = np.polyfit(lags, change, 1)
-    assert slope == pytest.approx(scene.believed.height_bias_walk**2, rel=0.15)
-    assert 2.0 * np.sqrt(level / 2.0) == pytest.approx(scene.believed.height_sd, rel=0.15)
+    assert slope == pytest.approx(scene.tuning.height_bias_walk**2, rel=0.15)
+    assert 2.0 * np.sqrt(level / 2.0) == pytest.approx(scene.tuning.height_sd, rel=0.15)

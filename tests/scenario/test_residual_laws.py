@@ -18,23 +18,27 @@ from recorded_data import DATA
 from scipy import stats
 from torch import Tensor
 
-from pfbench import cli, job, metrics, survey
-from pfbench.noise.regimes import Nominal
+from pfbench import job
+from pfbench.job import datasheet_data
+from pfbench.noise.white import NominalNoise
+from pfbench.results import consistency
 
-SCENES = sorted(file.stem for file in (cli.conf_dir() / "scenario").glob("*.yaml"))
+SCENES = sorted(file.stem for file in (job.conf_dir() / "scenario").glob("*.yaml"))
 RUNS = torch.arange(20)
 FALSE_ALARM = 1e-3  # of all numbers of all scenes together
-NUMBERS = 24 * (24 + 5) / 2 * len(SCENES)  # at most: a mean, a variance and a lag of 24 components, and their pairs
+NUMBERS = (
+    24 * (24 + 5) / 2 * len(SCENES)
+)  # at most: a mean, a variance and a lag of 24 components, and their pairs
 REACH = float(stats.norm.isf(FALSE_ALARM / NUMBERS / 2))  # standard errors
 
 # Real instruments: a truth beside the measurements is not known, or their errors are not those of any law that a model states.
-# `survey.residuals` knows what hangs on a state without truth, and says NaN.
+# `datasheet_data.compute_residuals` knows what hangs on a state without truth, and says NaN.
 NO_LAW = {
-    "fixed_wing": "the fixes that are handed out are the only truth there is, and it is withheld ones that are truth here",
-    "fixed_wing_aided": "the same flight; barometer and magnetometer hang on biases that nobody knows",
-    "walk": "ranges hang on the receiver's clock, which nobody knows; their errors are reflections, which last for seconds",
-    "berlin": "ranges hang on the receiver's clock; many are reflections, hundreds of metres long and the same for seconds",
-    "own_log": "it is the user's",
+    "recorded_fixed_wing": "the fixes that are handed out are the only truth there is, and it is withheld ones that are truth here",
+    "recorded_fixed_wing_aided": "the same flight; barometer and magnetometer hang on biases that nobody knows",
+    "recorded_walk": "ranges hang on the receiver's clock, which nobody knows; their errors are reflections, which last for seconds",
+    "recorded_berlin": "ranges hang on the receiver's clock; many are reflections, hundreds of metres long and the same for seconds",
+    "user_log": "it is the user's",
 }
 
 
@@ -45,7 +49,7 @@ def shortened(scene: DictConfig) -> DictConfig:
         if "start" in drive and "end" in drive:
             drive.end = drive.start + 60.0
         if "imu_rate" in scene:
-            scene.imu_rate = max(10.0, 2.0 / scene.interval)
+            scene.imu_rate_hz = max(10.0, 2.0 / scene.interval)
         if "paths" in scene:
             scene.paths = scene.paths[:2]
         if "segments" in path:
@@ -59,56 +63,78 @@ def shortened(scene: DictConfig) -> DictConfig:
 
 def at_the_truth(scenario: str) -> Tensor:
     """Residuals [R, T, Dy] in the standard deviations that the model states."""
-    with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
-        cfg: Any = compose("config", [f"scenario={scenario}", "worlds=null"])
-    model, scene = job.build(cfg.model), job.build(shortened(cfg.scenario))
+    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
+        cfg: Any = compose("config", [f"scenario={scenario}", "episode_cache_dir=null"])
+    model, scene = job.instantiate(cfg.model), job.instantiate(shortened(cfg.scenario))
     with torch.no_grad():
-        episode = scene.draw(Nominal(), RUNS, zlib.crc32(scenario.encode()))  # else all scenes would share their draws
-        return survey.residuals(model, model.assemble(episode.truth), episode)
+        episode = scene.draw(
+            NominalNoise(), RUNS, zlib.crc32(scenario.encode())
+        )  # else all scenes would share their draws
+        return datasheet_data.compute_residuals(model, model.assemble(episode.truth), episode)
 
 
 def out_of_law(z: Tensor) -> list[str]:
     """What is not as it should be of components [R, T, K] taken together, NaN where nothing was measured."""
-    law, wider = metrics.whiteness(z.numpy()), REACH / float(stats.norm.isf(0.025))
-    off = {"mean": (law.mean, law.mean_band), "variance": (law.variance - 1, law.variance_band), "lag": (law.lag, law.lag_band)}
+    law, wider = consistency.compute_whiteness(z.numpy()), REACH / float(stats.norm.isf(0.025))
+    off = {
+        "mean": (law.mean, law.mean_band),
+        "variance": (law.variance - 1, law.variance_band),
+        "lag": (law.lag, law.lag_band),
+    }
     bands = {name: (value, wider * band) for name, (value, band) in off.items()}
-    return [f"{name} off by {value:.3f}, band {band:.3f}" for name, (value, band) in bands.items() if not abs(value) < band]
+    return [
+        f"{name} off by {value:.3f}, band {band:.3f}"
+        for name, (value, band) in bands.items()
+        if not abs(value) < band
+    ]
 
 
 def entangled(z: Tensor) -> list[str]:
     """Components of z [R, T, K] that go together."""
     known = (~torch.isnan(z)).flatten(0, 1).double()
     z = z.nan_to_num(0.0).flatten(0, 1)
-    apart = (z.mT @ z / (known.mT @ known).sqrt()).triu(1)  # standard errors, where both were measured
+    apart = (z.mT @ z / (known.mT @ known).sqrt()).triu(
+        1
+    )  # standard errors, where both were measured
     pairs = (apart.abs() > REACH).nonzero().tolist()
     return [f"components {i} and {j}: {float(apart[i, j]):.1f} standard errors" for i, j in pairs]
 
 
 def test_scenes_without_a_law_are_recorded_ones() -> None:
     for scenario in NO_LAW:
-        assert "${data.root}" in (cli.conf_dir() / "scenario" / f"{scenario}.yaml").read_text()
+        assert "${data.root}" in (job.conf_dir() / "scenario" / f"{scenario}.yaml").read_text()
 
 
 def varied(scenario: str) -> bool:
     """Whether it is another scene with other numbers."""
-    built_on = OmegaConf.load(cli.conf_dir() / "scenario" / f"{scenario}.yaml")["defaults"]
+    built_on = OmegaConf.load(job.conf_dir() / "scenario" / f"{scenario}.yaml")["defaults"]
     return any(isinstance(part, str) and part != "_self_" for part in built_on)
 
 
 @pytest.mark.parametrize(
     "scenario",
-    [pytest.param(name, marks=[pytest.mark.slow] if varied(name) else []) for name in SCENES if name != "own_log"],
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if varied(name) else [])
+        for name in SCENES
+        if name != "user_log"
+    ],
 )
 def test_residuals_at_the_truth_have_the_stated_law(scenario: str) -> None:
-    text = (cli.conf_dir() / "scenario" / f"{scenario}.yaml").read_text()
+    text = (job.conf_dir() / "scenario" / f"{scenario}.yaml").read_text()
     if "${data.root}" in text and DATA is None:
         pytest.skip("PFBENCH_DATA does not name the folder of the recorded data sets")
     z = at_the_truth(scenario)
     if scenario in NO_LAW:
-        assert torch.isnan(z).all(), "a truth is known after all: say here what law residuals should have"
+        assert torch.isnan(z).all(), (
+            "a truth is known after all: say here what law residuals should have"
+        )
         return
-    seen = [k for k in range(z.shape[-1]) if not torch.isnan(z[..., k]).all()]  # a satellite may not rise in a minute
+    seen = [
+        k for k in range(z.shape[-1]) if not torch.isnan(z[..., k]).all()
+    ]  # a satellite may not rise in a minute
     assert len(seen) > z.shape[-1] / 2
-    told = {f"component {k}": out_of_law(z[..., k : k + 1]) for k in seen} | {"all together": out_of_law(z)}
+    told = {f"component {k}": out_of_law(z[..., k : k + 1]) for k in seen} | {
+        "all together": out_of_law(z)
+    }
     assert not {name: found for name, found in told.items() if found}
     assert not entangled(z)

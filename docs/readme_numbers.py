@@ -1,0 +1,266 @@
+"""Write the numbers of README.md: `python docs/readme_numbers.py`.
+
+Each block between `<!-- numbers:NAME -->` and `<!-- numbers:end -->` is generated from the published
+reports and the benchmark pages. A test fails if a block differs from them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+TOP = Path(__file__).parents[1]
+README = TOP / "README.md"
+_ARCMIN_PER_DEG = 60.0
+_BLOCK = re.compile(r"<!-- numbers:(\w+) -->\n.*?<!-- numbers:end -->", re.DOTALL)
+_UNDECIDED = ("undecided", "cannot be decided")
+
+Row = dict[str, str]
+
+
+def read_table(page: str, *headings: str) -> list[Row]:
+    """Read the first Markdown table after a sequence of headings.
+
+    Args:
+        page: File relative to the top folder.
+        headings: Headings without number signs, from outer to inner.
+
+    Returns:
+        Rows by column name.
+
+    Raises:
+        ValueError: If a heading or the table is missing.
+    """
+    text = (TOP / page).read_text()
+    for heading in headings:
+        match = re.search(rf"^#+ {re.escape(heading)}$", text, re.MULTILINE)
+        if match is None:
+            raise ValueError(f"{page} must contain the heading {heading}")
+        text = text[match.end() :]
+    lines = re.search(r"^\|.*\n\|[-:| ]+\n(?:\|.*\n)+", text, re.MULTILINE)
+    if lines is None:
+        raise ValueError(f"{page} must contain a table after {headings}")
+    head, _, *rows = [
+        [cell.strip() for cell in line.strip().strip("|").split("|")]
+        for line in lines[0].split("\n")[:-1]
+    ]
+    return [dict(zip(head, row, strict=True)) for row in rows]
+
+
+def format_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Format a Markdown table.
+
+    Args:
+        head: Column names.
+        rows: Cells.
+
+    Returns:
+        The table, without a final line break.
+    """
+    names = list(head)
+    lines = [names, ["---"] * len(names), *(list(row) for row in rows)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _digits(value: float) -> str:
+    """Format a number with three significant digits and no exponent."""
+    return f"{float(f'{value:.3g}'):.15g}"
+
+
+def _recorded(study: str, condition: str) -> str:
+    """Table of position and attitude errors of a recorded study, rows with equal errors joined."""
+    page = f"reports/{study}/report.md"
+    overview, attitude, position = (
+        {row["filter"]: row for row in read_table(page, *headings)}
+        for headings in ((condition,), (condition, "attitude"), (condition, "position"))
+    )
+    filters_by_cells: dict[tuple[str, ...], list[str]] = {}
+    for name in sorted(position, key=lambda key: float(position[key]["RMSE norm in m"])):
+        row = position[name]
+        horizontal = math.hypot(*(float(row[f"RMSE {axis} in m"]) for axis in "EN"))
+        angles = (
+            _digits(float(attitude[name][f"RMSE {axis} in arcmin"]) / _ARCMIN_PER_DEG)
+            for axis in ("roll", "pitch", "yaw")
+        )
+        job = overview[name]
+        cells = (
+            _digits(float(row["RMSE norm in m"])),
+            _digits(horizontal),
+            ", ".join(angles),
+            f"{job['diverged']} of {job['runs']}",
+        )
+        filters_by_cells.setdefault(cells, []).append(f"`{name}`")
+    head = (
+        "filter",
+        "3-D position RMSE [m]",
+        "horizontal RMSE [m]",
+        "roll, pitch, yaw RMSE [deg]",
+        "severely overconfident runs",
+    )
+    return format_table(head, ((", ".join(f), *cells) for cells, f in filters_by_cells.items()))
+
+
+def recorded_quad() -> str:
+    """Errors on the quadrotor flights."""
+    return _recorded("recorded_quad", "quad_flights / nominal / strapdown_total")
+
+
+def recorded_car() -> str:
+    """Errors on the car drive."""
+    return _recorded("recorded_car", "car_drive / nominal / strapdown_total")
+
+
+def claims() -> str:
+    """Verdicts by paper, counted in verdicts.json."""
+    titles = [row["paper"] for row in read_table("reports/claims/report.md")][:-1]
+    records = json.loads((TOP / "reports/claims/verdicts.json").read_text())
+    papers = sorted({record["paper"] for record in records})
+    verdicts = (
+        "reproduced",
+        "reproduced only as printed",
+        "reproduced only as repaired",
+        "not reproduced",
+        "undecided",
+    )
+    counts = {
+        paper: Counter(
+            "undecided" if r["verdict"] in _UNDECIDED else r["verdict"]
+            for r in records
+            if r["paper"] == paper
+        )
+        for paper in papers
+    }
+    rows = [
+        [title, *(str(counts[paper][v]) for v in verdicts), str(counts[paper].total())]
+        for title, paper in zip(titles, papers, strict=True)
+    ]
+    total = sum(counts.values(), Counter())
+    rows.append(["all", *(str(total[verdict]) for verdict in verdicts), str(total.total())])
+    return format_table(("paper", *verdicts, "claims"), rows)
+
+
+def all_seven() -> str:
+    """Ranks, severely overconfident runs and the comparison of proposed methods with their baselines."""
+    page = "reports/all_seven/report.md"
+    text = (TOP / page).read_text().split("\n# ")[0]
+    ranks = {
+        row["filter"]: float(row["rank, main group"]) for row in read_table(page, "Mean ranks")
+    }
+    best, worst = sorted(ranks, key=ranks.__getitem__)[:3], max(ranks, key=ranks.__getitem__)
+    jobs = [
+        (name, int(diverged), int(runs))
+        for name, runs, diverged in re.findall(
+            r"^\| ([\w.]+) \| (?:yes|no) \| (?:yes|no) \| [^|]+ \| (\d+) \| \d+ \| \d+ \| (\d+) \|",
+            text,
+            re.MULTILINE,
+        )
+    ]
+    runs, diverged = sum(n for *_, n in jobs), sum(n for _, n, _ in jobs)
+    sir = [(n, of) for name, n, of in jobs if name == "sir"]
+    sir_share = sum(n for n, _ in sir) / sum(of for _, of in sir)
+    conditions = len(sir)
+    table = format_table(
+        ("method", "baseline", "median RMSE change", "adjusted p", "lower error"),
+        (
+            (
+                f"`{row['method']}`",
+                f"`{row['baseline']}`",
+                f"{float(row['RMSE to baseline in %']):+.3g} %",
+                row["p Holm (15)"],
+                "inconclusive"
+                if "no difference" in row["across cells"]
+                else f"`{row['across cells']}`",
+            )
+            for row in read_table(page, "Proposed methods beside their baselines")
+        ),
+    )
+    return "\n".join(
+        (
+            f"- Best mean ranks over {conditions} conditions, of {len(ranks)} filters: "
+            + ", ".join(f"`{name}` {ranks[name]:.1f}" for name in best)
+            + f". Last: `{worst}` {ranks[worst]:.1f}.",
+            f"- Severely overconfident: {diverged / runs:.0%} of {runs} runs. For `sir`: {sir_share:.0%}.".replace(
+                "%", " %"
+            ),
+            "",
+            table,
+        )
+    )
+
+
+def speed() -> str:
+    """Speed relative to other libraries, on one core."""
+    page = "benchmarks/compare.md"
+    models = dict(re.findall(r"^## (W.*)\n\n(.*)\.$", (TOP / page).read_text(), re.MULTILINE))
+    entries = [
+        (f"{row['workload']}: {models[row['workload']]}", row["fastest peer"], row)
+        for row in read_table(page)
+    ]
+    entries += [
+        ("six studies of W4, whole process", row["against"], row)
+        for row in read_table("benchmarks/campaigns.md")
+    ]
+    return format_table(
+        ("workload", "pfbench", "compared with", "times as fast (quartiles)"),
+        (
+            (workload, row["pfbench's best"], other, row["times as fast (quartiles)"])
+            for workload, other, row in entries
+        ),
+    )
+
+
+def gpu() -> str:
+    """Time of a large job on a GPU."""
+    page = "benchmarks/gpu.md"
+    row = next(
+        row
+        for row in _engine_rows(page)
+        if row["engine"] == "compiled" and row["R x N x T"].startswith("1000 x 10000")
+    )
+    device = (TOP / page).read_text().rstrip().rsplit("\n", 1)[-1].split(";")[0]
+    runs, particles, steps = row["R x N x T"].split(" x ")
+    return (
+        f"{device}: {row['s, median (range)'].split()[0]} s for {runs} runs of {particles} particles "
+        f"and {steps} steps, single precision, `engine=compiled`."
+    )
+
+
+def _engine_rows(page: str) -> list[Row]:
+    """Rows of the second table of a benchmark page, by engine."""
+    text = (TOP / page).read_text()
+    lines = [
+        line for line in text[text.index("| R x N x T") :].split("\n\n")[0].split("\n") if line
+    ]
+    head, _, *rows = [
+        [cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines
+    ]
+    return [dict(zip(head, row, strict=True)) for row in rows]
+
+
+BLOCKS: dict[str, Callable[[], str]] = {
+    block.__name__: block for block in (recorded_quad, recorded_car, claims, all_seven, speed, gpu)
+}
+
+
+def fill_blocks(text: str) -> str:
+    """Replace the content of all number blocks.
+
+    Args:
+        text: Content of README.md.
+
+    Returns:
+        The content with current numbers.
+    """
+
+    def replace(match: re.Match[str]) -> str:
+        return f"<!-- numbers:{match[1]} -->\n{BLOCKS[match[1]]()}\n<!-- numbers:end -->"
+
+    return _BLOCK.sub(replace, text)
+
+
+if __name__ == "__main__":
+    README.write_text(fill_blocks(README.read_text()))

@@ -1,0 +1,1 @@
+"""Claims of the papers: records, measurements, verdicts and their page."""

@@ -1,0 +1,232 @@
+"""Measurements for the claims' tests, read from results: one long table of all runs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pfbench.claims.schema import SCALED, Claim, ClaimTest
+from pfbench.results import metrics, status, store
+from pfbench.results.error_measures import convergence_time, mean_per_run, rmse_per_run
+from pfbench.results.frame import Condition, JobFile, drop_before, load_conditions, select_steps
+from pfbench.results.state_groups import ComponentGroup, component_groups
+
+Side = tuple[str, str, str]  # study, condition, label
+_COLUMNS = ["study", "cell", "label", "measure", "seed", "run", "lost", "unit", "value"]
+
+
+def load_claim_measurements(
+    claims: Sequence[Claim], results: str | Path = "results", *, allow_mixed_versions: bool = False
+) -> pd.DataFrame:
+    """Measure all tests of the claims in all available runs.
+
+    Args:
+        claims: Records.
+        results: Folder of all studies. Jobs without results are left out.
+        mixed: Accept several versions, and several seeds, runs or lengths within a condition.
+
+    Returns:
+        Columns study, cell, label, measure, seed, run, lost, unit, value; infinite or NaN if lost.
+
+    Raises:
+        ValueError: if results do not belong together, or lack a group or component.
+    """
+    tests_by_side: dict[Side, dict[str, ClaimTest]] = {}
+    for test in _list_tests(claims):
+        for side in test.sides:
+            tests_by_side.setdefault(side, {})[test.measure] = test
+    rows: list[pd.DataFrame] = []
+    for side, job in _find_jobs(tests_by_side, results, allow_mixed_versions):
+        head = dict(zip(_COLUMNS, side, strict=False))
+        rows += _measure_job(job.load(), head, tests_by_side[side])
+    return pd.concat(rows, ignore_index=True)[_COLUMNS] if rows else pd.DataFrame(columns=_COLUMNS)
+
+
+def claim_job_metadata(
+    claims: Sequence[Claim], results: str | Path = "results", *, mixed: bool = False
+) -> dict[Side, Mapping[str, Any]]:
+    """Read the metadata of the jobs that the claims' tests use.
+
+    Args:
+        claims: Records.
+        results: Folder of all studies.
+        mixed: As in `load_claim_measurements`.
+
+    Returns:
+        Metadata by study, condition and label.
+    """
+    sides = {side for test in _list_tests(claims) for side in test.sides}
+    return {side: job.meta for side, job in _find_jobs(sides, results, mixed)}
+
+
+def measure_claim_test(result: store.JobResult, test: ClaimTest) -> np.ndarray:
+    """Measure the metric of a test.
+
+    Args:
+        result: Job.
+        test: Test.
+
+    Returns:
+        Value of each run, [R].
+
+    Raises:
+        ValueError: if the job lacks the group, component or time of the test.
+    """
+    result = _drop_after(drop_before(result, test.start), test.end)
+    lost, groups = result.arrays["lost"], result.meta["state"]["groups"]
+    if test.metric in SCALED:
+        return _measure_errors(result, test)
+    if test.metric == "effective":
+        return mean_per_run(result.arrays.get("ess", np.full((lost.size, 1), np.nan)), lost)
+    if test.metric == "severely_overconfident":
+        dofs = [len(parts) for parts in groups.values()]
+        severe = status.is_severely_overconfident(result.arrays["nees"], dofs, lost)
+        return (severe | lost).astype(np.float64)
+    data = metrics.MetricInput(result)
+    if test.metric == "nees":
+        if test.group not in groups:
+            key, options = result.meta["key"], ", ".join(groups)
+            raise ValueError(
+                f"{key}: group of nees must be one of {options}, got no group {test.group!r}."
+            )
+        data = data._replace(state_group=test.group)
+    values = metrics.compute_metric(test.metric, data)
+    return next(iter(values.values()), np.full(lost.size, np.nan))
+
+
+def _list_tests(claims: Sequence[Claim]) -> Iterator[ClaimTest]:
+    """Yield the tests of all claims."""
+    return (test for claim in claims for tests in claim.tests.values() for test in tests)
+
+
+def _find_jobs(
+    sides: Collection[Side], results: str | Path, mixed: bool
+) -> Iterator[tuple[Side, JobFile]]:
+    """Yield the job of each side that has results."""
+    for study in sorted({side[0] for side in sides}):
+        if not any((Path(results) / study).glob("*.npz")):
+            continue
+        for condition in load_conditions(study, results, allow_mixed_versions=mixed):
+            name = f"{condition.scenario}/{condition.noise}/{condition.model}"
+            labels = [label for *where, label in sides if where == [study, name]]
+            for job in condition.jobs:
+                for label in labels:
+                    if _has_label(job, condition, label):
+                        yield (study, name, label), job
+
+
+def _has_label(job: JobFile, condition: Condition, label: str) -> bool:
+    """Check that a job is of the filter and settings of a label, and the only one.
+
+    Raises:
+        ValueError: if another job of the condition matches too.
+    """
+
+    def matches(candidate: JobFile) -> bool:
+        name, _, settings = label.rstrip("]").partition("[")
+        pairs = (setting.partition("=")[::2] for setting in settings.split(",") if setting)
+        config = candidate.meta["config"]
+        is_same = all(_setting(config, key) == _canonical(value) for key, value in pairs)
+        return candidate.meta["label"] == name and is_same
+
+    if matches(job) and sum(map(matches, condition.jobs)) > 1:
+        fault = f"several jobs are {label}, as {job.path.name}"
+        raise ValueError(f"{condition.name}: {fault}. Delete those that do not belong.")
+    return matches(job)
+
+
+def _setting(config: Any, key: str) -> str:
+    """Return the value at a dotted path of a configuration or of its filter."""
+    for path in (f"filter.{key}", key):
+        node: Any = config
+        for part in path.split("."):
+            if isinstance(node, list) and part.isdigit() and int(part) < len(node):
+                node = node[int(part)]
+            else:
+                node = node.get(part) if isinstance(node, Mapping) else None
+        if node is not None:
+            return _canonical(node)
+    return ""
+
+
+def _canonical(value: Any) -> str:
+    """Write a value such that equal numbers have equal texts."""
+    try:
+        return repr(float(value))
+    except (TypeError, ValueError):
+        return str(value)
+
+
+def _measure_errors(result: store.JobResult, test: ClaimTest) -> np.ndarray:
+    """Measure a metric of the errors of a group or of one component."""
+    group = _select_group(result, test)
+    data = metrics.MetricInput(result, group, group.whole)
+    error, lost, time = data.select("error"), result.arrays["lost"], result.arrays["time"]
+    if test.metric == "settled":
+        return convergence_time(time, error, lost, test.settled)
+    if test.metric == "growth":
+        return _log_growth(time, error, lost)
+    if test.metric == "sd":
+        return np.where(lost, np.nan, rmse_per_run(data.select("sd"), lost))
+    if test.metric == "mean_abs":
+        return np.where(lost, np.inf, mean_per_run(np.sqrt((error**2).sum(-1)), lost))
+    values = metrics.compute_metric(test.metric, data)
+    return list(values.values())[-1] if values else np.full(lost.size, np.nan)
+
+
+def _select_group(result: store.JobResult, test: ClaimTest) -> ComponentGroup:
+    """Return the group of a test, reduced to its component."""
+    key = result.meta["key"]
+    groups = {group.group: group for group in component_groups(result.meta["state"])}
+    if test.group not in groups:
+        options = ", ".join(groups)
+        raise ValueError(f"{key}: group must be one of {options}, got no group {test.group!r}.")
+    group = groups[test.group]
+    if test.component == "norm":
+        return group
+    if test.component not in group.components:
+        options = ", ".join(("norm", *group.components))
+        raise ValueError(f"{key}: component must be one of {options}, got {test.component!r}.")
+    index = group.components.index(test.component)
+    return group._replace(places=[group.places[index]], components=[test.component])
+
+
+def _log_growth(time: np.ndarray, error: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    """Compute the change of the log error from first to last step on the regression line [R]."""
+    with np.errstate(divide="ignore"):
+        log = np.log(np.sqrt((error**2).sum(-1)))
+    centred = time - time.mean()
+    slope = (log * centred).sum(1) / (centred**2).sum()
+    return np.where(lost | ~np.isfinite(slope), np.nan, slope * (time[-1] - time[0]))
+
+
+def _drop_after(result: store.JobResult, end: float) -> store.JobResult:
+    """Remove the steps after a time in seconds."""
+    mask = result.arrays["time"] <= end
+    return select_steps(result, mask) if mask.any() else result
+
+
+def _measure_job(
+    result: store.JobResult, head: Mapping[str, str], tests: Mapping[str, ClaimTest]
+) -> Iterator[pd.DataFrame]:
+    """Yield the rows of each test of a job."""
+    lost, first = result.arrays["lost"], result.meta.get("first_run", 0)
+    runs = np.arange(first, first + lost.size)
+    shared = {**head, "seed": result.meta["seed"], "run": runs, "lost": lost}
+    for name, test in tests.items():
+        values = {"unit": _unit(result, test), "value": measure_claim_test(result, test)}
+        yield pd.DataFrame({**shared, "measure": name, **values})
+
+
+def _unit(result: store.JobResult, test: ClaimTest) -> str:
+    """Return the displayed unit of the metric of a test."""
+    units = {metric.name: metric.unit for metric in metrics.METRICS}
+    unit = {"settled": "s", "growth": "", **units}.get(test.metric, metrics.GROUP_UNIT)
+    if unit != metrics.GROUP_UNIT or test.metric not in SCALED:
+        return "" if unit == metrics.GROUP_UNIT else unit
+    groups = component_groups(result.meta["state"])
+    return next((group.unit for group in groups if group.group == test.group), "")

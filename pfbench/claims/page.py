@@ -1,0 +1,316 @@
+"""Page of all claims: statement, paper value, measured value and verdict of each."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pfbench.claims import figures as claims_figures
+from pfbench.claims.claim_tests import OPEN, ClaimTestResult
+from pfbench.claims.measurements import Side, claim_job_metadata, load_claim_measurements
+from pfbench.claims.schema import PAPERS, Claim, ClaimTest, read_claims
+from pfbench.claims.verdicts import VERDICTS, ClaimVerdict, decide_claims
+from pfbench.report import cost, table_formats, writers
+from pfbench.results.frame import natural_sort_key
+
+Jobs = Mapping[Side, Mapping[str, Any]]
+
+STUDY = "claims"  # folder of the page among the reports
+_TEXT_COLUMNS = ("form", "test", "a", "b", "measure", "condition", "unit", "outcome")
+
+
+def write_claims(
+    results: str | Path = "results",
+    out: str | Path = "reports",
+    alpha: float = 0.05,
+    conf: Path | None = None,
+    experiments: Path | None = None,
+    *,
+    allow_mixed_versions: bool = False,
+    formats: tuple[str, ...] = ("svg", "png"),
+) -> Path:
+    """Write `<out>/claims/`: index.html, report.md, verdicts.json, figures/, tables/.
+
+    Equal results give equal bytes.
+
+    Args:
+        results: Folder of all studies. Claims whose studies have no results are not run.
+        out: Folder of all reports, which the page links to.
+        alpha: Level after correction.
+        conf: Folder of configurations, as in `read_claims`.
+        experiments: Folder of experiments, as in `read_claims`.
+        mixed: Accept several versions, and several seeds, runs or lengths within a condition.
+        formats: File formats of the figures.
+
+    Returns:
+        Path of index.html.
+
+    Raises:
+        ValueError: if a record is wrong, or results do not belong together.
+    """
+    claims = read_claims(conf, experiments)
+    verdicts = decide_claims(
+        claims,
+        load_claim_measurements(claims, results, allow_mixed_versions=allow_mixed_versions),
+        alpha,
+    )
+    folder = Path(out) / STUDY
+    writers.remove_old_files(folder)
+    writers.write_table(folder, STUDY, claims_table(verdicts))
+    text = json.dumps([_to_json(verdict) for verdict in verdicts], indent=1, allow_nan=False)
+    (folder / "verdicts.json").write_text(text + "\n", encoding="utf-8")
+    studies = {study for claim in claims for study in claim.studies}
+    jobs = claim_job_metadata(claims, results, mixed=allow_mixed_versions)
+    made = jobs_table(jobs)
+    if len(made):
+        writers.write_table(folder, "studies", made)
+    drawings = claims_figures.claim_figures(verdicts)
+    context = {
+        "papers": rows_by_paper(verdicts, report_anchors(studies, out), jobs),
+        "made": made,
+        "commits": list_commits(jobs.values()),
+        "verdicts": VERDICTS,
+        "count": count_verdicts(verdicts),
+        "alpha": alpha,
+        "n": len(verdicts),
+        "drawings": [
+            writers.render_figure(drawing, STUDY, folder, formats) for drawing in drawings
+        ],
+    }
+    return writers.render_template("page", folder, context, Path(__file__).parent)
+
+
+def report_anchors(studies: Iterable[str], out: str | Path) -> dict[str, set[str]]:
+    """Read the anchors of the pages of studies that have a page."""
+    pages = {study: Path(out) / study / "index.html" for study in sorted(studies)}
+    pattern = r'<(?:section|figure|h3) id="([^"]+)"'
+    return {
+        study: set(re.findall(pattern, path.read_text(encoding="utf-8")))
+        for study, path in pages.items()
+        if path.is_file()
+    }
+
+
+def rows_by_paper(
+    verdicts: Sequence[ClaimVerdict],
+    reports: Mapping[str, Collection[str]] | None = None,
+    jobs: Jobs | None = None,
+) -> list[dict[str, Any]]:
+    """Collect the title of each paper and the rows of its claims for the templates.
+
+    Args:
+        verdicts: Verdicts from `decide_claims`.
+        reports: Anchors of each study that has a page; None for no links.
+        jobs: Metadata from `claim_job_metadata`; None to omit it.
+
+    Returns:
+        One entry per paper.
+    """
+    rows = [(v.claim.paper, _claim_row(v, reports or {}, jobs or {})) for v in verdicts]
+    return [
+        {"key": key, "title": title, "rows": [row for paper, row in rows if paper == key]}
+        for key, title in PAPERS.items()
+    ]
+
+
+def jobs_table(jobs: Jobs) -> pd.DataFrame:
+    """Tabulate runs, budget and commit of each study, of the jobs that claims use."""
+    rows = []
+    for study, metas in _by_study(jobs).items():
+        text = cost.format_budget(metas).removeprefix("Budget: ").removesuffix(".")
+        row = {"study": study, "jobs": len(metas), "runs": _runs(metas), "budget": text}
+        rows.append({**row, "commit": ", ".join(list_commits(metas))})
+    return pd.DataFrame(rows)
+
+
+def list_commits(metas: Iterable[Mapping[str, Any]]) -> list[str]:
+    """List the distinct commits of jobs."""
+    versions = (meta.get("versions", {}) for meta in metas)
+    return _distinct(str(version.get("commit") or "not stated") for version in versions)
+
+
+def describe_jobs(claim: Claim, jobs: Jobs) -> list[str]:
+    """Describe runs and budget of a claim's jobs, and their commit if the page has several."""
+    sides = [side for tests in claim.tests.values() for test in tests for side in test.sides]
+    used = {side: jobs[side] for side in sides if side in jobs}
+    has_several = len(list_commits(jobs.values())) > 1
+    lines = []
+    for study, metas in _by_study(used).items():
+        commit = f" Commit {', '.join(list_commits(metas))}." if has_several else ""
+        lines.append(
+            f"{study}: {_runs(metas)} runs per filter. {cost.format_budget(metas)}{commit}"
+        )
+    return lines
+
+
+def claims_of_study(verdicts: Sequence[ClaimVerdict], study: str) -> list[ClaimVerdict]:
+    """Select the verdicts that use a study."""
+    return [verdict for verdict in verdicts if study in verdict.claim.studies]
+
+
+def count_verdicts(verdicts: Sequence[ClaimVerdict]) -> pd.DataFrame:
+    """Count the claims of each paper by verdict."""
+    rows = []
+    for key, title in [*PAPERS.items(), ("", "all")]:
+        count = Counter(v.verdict for v in verdicts if key in ("", v.claim.paper))
+        by_verdict = {verdict: count[verdict] for verdict in VERDICTS}
+        rows.append({"paper": title, **by_verdict, "claims": count.total()})
+    return pd.DataFrame(rows)
+
+
+def claims_table(verdicts: Sequence[ClaimVerdict]) -> pd.DataFrame:
+    """Tabulate one row per test, and one per claim without tests."""
+    rows: list[dict[str, Any]] = []
+    for v in verdicts:
+        head = {"claim": v.claim.id, "paper value": v.claim.printed}
+        head |= {"verdict": v.verdict, "reason": v.reason}
+        results = [(form, r) for form, values in v.findings.items() for r in values]
+        rows += [{**head, **_test_row(form, r)} for form, r in results] or [head]
+    table = pd.DataFrame(rows)
+    return table.fillna({name: "" for name in _TEXT_COLUMNS if name in table})
+
+
+def format_result(result: ClaimTestResult) -> str:
+    """Format the measured value with its interval, and the printed value."""
+    if np.isnan(result.effect):
+        return result.why
+    unit = f" {result.unit}" if result.unit else ""
+    number, printed = table_formats.format_number, result.comparison.printed
+    has_interval = not (np.isinf(result.low) and np.isinf(result.high))
+    interval = f" [{number(result.low)}, {number(result.high)}]" if has_interval else ""
+    paper = f", printed {number(printed)}" if np.isfinite(printed) else ""
+    return f"{number(result.effect)}{interval}{unit}{paper}"
+
+
+def format_required_runs(result: ClaimTestResult) -> str:
+    """Format the runs required by a test with too few runs; empty for others."""
+    if result.outcome != OPEN or np.isnan(result.needed):
+        return ""
+    if np.isinf(result.needed):
+        return "no number of runs decides an effect of this size"
+    return f"{result.needed:.0f} runs per condition required for power 0.8 at this effect"
+
+
+def _by_study(jobs: Jobs) -> dict[str, list[Mapping[str, Any]]]:
+    """Group metadata by study, each job once."""
+    studies: dict[str, dict[str, Mapping[str, Any]]] = {}
+    for (study, _, _), meta in sorted(
+        jobs.items(), key=lambda item: natural_sort_key("/".join(item[0]))
+    ):
+        studies.setdefault(study, {})[meta["key"]] = meta
+    return {study: list(metas.values()) for study, metas in studies.items()}
+
+
+def _runs(metas: Iterable[Mapping[str, Any]]) -> str:
+    """Format the numbers of runs of jobs."""
+    return " or ".join(_distinct(str(meta["runs"]) for meta in metas))
+
+
+def _distinct(values: Iterable[str]) -> list[str]:
+    """Sort the distinct values."""
+    return sorted(set(values), key=natural_sort_key)
+
+
+def _claim_row(
+    verdict: ClaimVerdict, reports: Mapping[str, Collection[str]], jobs: Jobs
+) -> dict[str, Any]:
+    """Collect the row of a claim for the templates."""
+    claim = verdict.claim
+    results = [(form, r) for form, values in verdict.findings.items() for r in values]
+    tests = [r.comparison for _, r in results]
+    lines: dict[Any, dict[str, Any]] = {}
+    for form, r in results:
+        is_shared = tests.count(r.comparison) > 1  # asked of both forms, shown once
+        line = _test_line(claim, "" if is_shared else form, r, reports)
+        lines.setdefault(r.comparison, line)
+    reason = f": {verdict.reason}" if verdict.reason else ""
+    head = {"claim": claim, "verdict": verdict.verdict, "reason": reason, "note": verdict.note}
+    return {**head, "lines": list(lines.values()), "ran": describe_jobs(claim, jobs)}
+
+
+def _test_line(
+    claim: Claim, form: str, result: ClaimTestResult, reports: Mapping[str, Collection[str]]
+) -> dict[str, Any]:
+    """Collect the line of a test for the templates."""
+    test = result.comparison
+    anchor, is_figure = claims_figures.figure_link(claim, test, reports.get(test.study, ()))
+    lost = result.lost_a + result.lost_b
+    details = (
+        f"{result.pairs} runs" if result.pairs else "",
+        f"adjusted p = {table_formats.format_number(result.p_holm)}"
+        if np.isfinite(result.p_holm)
+        else "",
+        f"{lost} lost" if lost else "",
+        format_required_runs(result),
+    )
+    return {
+        "form": form,
+        "sides": _format_sides(test),
+        "measure": test.measure,
+        "asked": test.statistic.replace("_", " "),
+        "said": format_result(result),
+        "more": ", ".join(text for text in details if text),
+        "outcome": "measured" if test.statistic == "report" else result.outcome,
+        "where": test.cell.replace("/", " / "),
+        "study": test.study,
+        "link": f"../{test.study}/index.html#{anchor}" if anchor else "",
+        "drawn": is_figure,
+    }
+
+
+def _format_sides(test: ClaimTest) -> str:
+    """Format the filters of a test."""
+    if not test.b:
+        return test.a
+    elsewhere = f" in {test.b_cell.rsplit('/', 1)[0]}" if test.b_cell else ""
+    return f"{test.a} {'minus' if test.statistic == 'close' else 'to'} {test.b}{elsewhere}"
+
+
+def _test_row(form: str, result: ClaimTestResult) -> dict[str, Any]:
+    """Collect the row of a test in the table of claims."""
+    test = result.comparison
+    return {
+        "form": form,
+        "test": test.statistic,
+        "a": test.a,
+        "b": test.b,
+        "measure": test.measure,
+        "condition": test.cell,
+        "unit": result.unit,
+        "outcome": result.outcome,
+        "printed effect": test.printed,
+        "our value": result.effect,
+        "lower": result.low,
+        "upper": result.high,
+        "p": result.p,
+        "adjusted p (Holm)": result.p_holm,
+        "runs": result.pairs,
+        "runs required": result.needed,
+    }
+
+
+def _to_json(verdict: ClaimVerdict) -> dict[str, Any]:
+    """Convert a verdict for JSON, which has no infinity."""
+    fields = ("id", "paper", "claim", "source", "printed")
+    claim = {key: getattr(verdict.claim, key) for key in fields}
+    results = {form: [asdict(r) for r in values] for form, values in verdict.findings.items()}
+    decision = {"verdict": verdict.verdict, "reason": verdict.reason, "note": verdict.note}
+    reading = {"reading": verdict.claim.note}
+    return {**claim, **reading, **decision, "findings": _finite_numbers(results)}
+
+
+def _finite_numbers(value: Any) -> Any:
+    """Replace numbers that are not finite by their names, at all levels."""
+    if isinstance(value, Mapping):
+        return {key: _finite_numbers(below) for key, below in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite_numbers(below) for below in value]
+    return str(value) if isinstance(value, float) and not np.isfinite(value) else value

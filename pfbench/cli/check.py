@@ -1,0 +1,71 @@
+"""Command `pfbench check`: versions, device, data, and all configurations."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+
+from pfbench.cli.messages import format_error
+from pfbench.job.configuration import compose, list_groups
+
+HELP = """\
+pfbench check
+
+Print versions, threads, device and data folder, and compose all configurations.
+The exit code is 1 if a configuration does not compose."""
+
+
+def check_installation(words: Sequence[str]) -> None:
+    """Print the state of the installation as a table of item, value and status.
+
+    Args:
+        words: Ignored.
+
+    Raises:
+        ValueError: If a configuration does not compose.
+    """
+    import torch
+
+    from pfbench import job
+
+    rows = [(name, value or "unknown", "ok") for name, value in job.read_versions().items()]
+    rows.append(("threads", f"{torch.get_num_threads()} of {os.cpu_count()} cores", "ok"))
+    has_cuda = torch.cuda.is_available()
+    rows.append(("device", torch.cuda.get_device_name() if has_cuda else "cpu", "ok"))
+    root = compose([]).values["data"]["root"]
+    hint = "recorded scenarios need PFBENCH_DATA or data.root=..."
+    rows.append(("data root", str(root or "not set"), "ok" if root else hint))
+    errors = [f"{choice}: {error}" for choice, error in _compose_all() if error]
+    total = sum(map(len, list_groups().values()))
+    composed = f"{total - len(errors)} of {total}"
+    rows.append(("configurations", composed, "failed" if errors else "ok"))
+    for row in (("item", "value", "status"), *rows):
+        print(f"{row[0]:15} {row[1]:24} {row[2]}")
+    if errors:
+        raise ValueError("configurations must compose, got errors:\n  " + "\n  ".join(errors))
+
+
+def _compose_all() -> Iterator[tuple[str, str]]:
+    """Yield the choice of each configuration file, and its error or an empty text."""
+    for group, files in list_groups().items():
+        for path in files:
+            is_experiment = group == "experiment"
+            choice = f"+experiment={path.stem}" if is_experiment else f"{group}={path.stem}"
+            try:
+                compose([choice, *_matching_scenario(group, path.stem), "data.root=somewhere"])
+                yield choice, ""
+            except Exception as error:
+                yield choice, format_error(error, [choice])
+
+
+def _matching_scenario(group: str, name: str) -> list[str]:
+    """Return the scenario of a model, or of the model that it extends, which sets its values."""
+    if group != "model":
+        return []
+    parts = name.split("_")
+    for model in ("_".join(parts[:n]) for n in range(len(parts), 0, -1)):
+        entry = f"/model@_global_.model: {model}\n"
+        for path in list_groups()["scenario"]:
+            if entry in path.read_text():
+                return [f"scenario={path.stem}"]
+    return []

@@ -1,0 +1,43 @@
+"""Command `pfbench datasheet`: the datasheet of a scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pfbench.cli.compose import given_keys, read_description
+from pfbench.job.configuration import compose, conf_dir
+
+HELP = """\
+pfbench datasheet scenario=NAME [noise=NAME] [runs=20] [key=value ...]
+
+Write the datasheet of a scenario: trajectory, sensors, measurements and truth of its episodes.
+
+  pfbench datasheet scenario=flight_300s
+  pfbench datasheet scenario=flight_300s noise=outliers runs=50
+  pfbench list scenario      scenarios"""
+
+
+def report_scenario(words: Sequence[str]) -> None:
+    """Write the datasheet of a scenario.
+
+    Args:
+        words: Overrides.
+
+    Raises:
+        ValueError: If the scenario is not given, or a value is invalid.
+    """
+    given = given_keys(words)
+    if "scenario" not in given:
+        raise ValueError(
+            "scenario must be set. Use: pfbench datasheet scenario=NAME (pfbench list scenario)"
+        )
+    from pfbench.job.datasheet_data import RUNS, build_datasheet
+    from pfbench.report.datasheet import write_datasheet
+
+    config = compose(words if "runs" in given else [*words, f"runs={RUNS}"])
+    file = conf_dir() / "scenario" / f"{config.choices['scenario']}.yaml"
+    data = build_datasheet(config, read_description(file) if file.exists() else "")
+    page = write_datasheet(
+        data, config.values["reports_dir"], tuple(config.values["report"]["figure_formats"])
+    )
+    print(f"datasheet: {page.resolve()}")

@@ -1,0 +1,87 @@
+"""Entry point of the command line: selects the command and reports errors."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+import pfbench
+from pfbench.cli.messages import format_error, suggest_similar
+
+# command: function of the module of the same name, summary
+COMMANDS = {
+    "run": ("run_jobs", "run one job, or a sweep with -m"),
+    "report": ("report_study", "write the report of a study: figures, tables and tests"),
+    "claims": ("report_claims", "write the page of the papers' claims and verdicts"),
+    "datasheet": ("report_scenario", "write the datasheet of a scenario"),
+    "train": ("train_network", "train the network of a neural_* filter"),
+    "list": ("list_options", "list what a configuration can choose"),
+    "check": ("check_installation", "compose all configurations and print versions"),
+}
+USAGE = """\
+pfbench {version}: benchmarks of particle filters in integrated navigation
+
+{commands}
+
+  pfbench COMMAND --help     options and examples of a command
+  pfbench --version          version
+  --traceback                print the traceback of an error (or set PFBENCH_TRACEBACK=1)
+
+First study: pfbench run -m +experiment=quickstart, then pfbench report study=quickstart
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line.
+
+    Args:
+        argv: Words after `pfbench`. Default: those of the process.
+
+    Raises:
+        SystemExit: With code 1 if the command failed, 2 if it does not exist, 130 if interrupted.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_usage())
+        return
+    if words[0] == "--version":
+        print(f"pfbench {pfbench.__version__}")
+        return
+    command, options = words[0], words[1:]
+    if command not in COMMANDS:
+        similar = suggest_similar(command, list(COMMANDS))
+        print(f"error: command '{command}' does not exist.{similar}\n\n{_usage()}", file=sys.stderr)
+        raise SystemExit(2)
+    if {"-h", "--help"} & set(options):
+        print(import_module(f"pfbench.cli.{command}").HELP)
+        return
+    _run_command(command, options)
+
+
+def _run_command(command: str, options: Sequence[str]) -> None:
+    """Run a command and report its errors."""
+    shows_traceback = "--traceback" in options or bool(os.environ.get("PFBENCH_TRACEBACK"))
+    words = [word for word in options if word != "--traceback"]
+    try:
+        getattr(import_module(f"pfbench.cli.{command}"), COMMANDS[command][0])(words)
+    except KeyboardInterrupt:
+        print(
+            "\nInterrupted. Finished jobs are kept. Repeat the command to resume.", file=sys.stderr
+        )
+        raise SystemExit(130) from None
+    except BrokenPipeError:  # the reader closed the pipe, as in `pfbench list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except Exception as error:
+        if shows_traceback:
+            raise
+        print(f"\nerror {command}: {format_error(error, words)}", file=sys.stderr)
+        print("(add --traceback to see the traceback)", file=sys.stderr)
+        raise SystemExit(1) from error
+
+
+def _usage() -> str:
+    """Format the overview of all commands."""
+    lines = (f"  pfbench {name:10} {summary}" for name, (_, summary) in COMMANDS.items())
+    return USAGE.format(version=pfbench.__version__, commands="\n".join(lines)).rstrip()

@@ -1,0 +1,184 @@
+"""Error messages of the command line: the key and the value given, and what to give instead."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+# extra of the package that installs a launcher
+_EXTRAS = {"ray": "ray", "submitit": "slurm", "joblib": "launch"}
+_ALL_KEYS = " List all: pfbench run --cfg job"
+
+
+def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
+    """Format an error for a user.
+
+    Args:
+        error: Error of a command, of Hydra or of a class that a configuration names.
+        words: Overrides of the command.
+
+    Returns:
+        The key, the value given, and a remedy.
+    """
+    if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
+        return _format_refusal(f"{error}", error.__cause__, words)
+    text = f"{error}".strip() or type(error).__name__
+    if match := re.search(r"Could not override '([^']+)'", text):
+        return _format_unknown_key(match[1], words)
+    launchers = "|".join(_EXTRAS)
+    if match := re.search(rf"[Cc]ould not (?:find|load) 'hydra/launcher/({launchers})", text):
+        given = next((word for word in words if word.startswith("hydra/launcher=")), "launcher")
+        return f'{given} is not installed. Run pip install "pfbench[{_EXTRAS[match[1]]}]"'
+    if match := re.search(r"Could not find '(.+)/([^/']*)'", text):
+        return _format_unknown_choice(match[1], match[2], re.findall(r"^\t(\w+)$", text, re.M))
+    if match := re.search(r"Interpolation key '([^']+)' not found\s+full_key: (\S+)", text):
+        group, _, name = match[1].partition(".")
+        return (
+            f"{match[2]} must be set, since {match[1]} does not exist. "
+            f"Set {match[2]}=... or choose a {group} that defines {name}."
+        )
+    if match := re.search(r"Missing mandatory value: (\S+)", text):
+        return f"{match[1]} must be set. Set {match[1]}=..."
+    if match := re.search(r"Error parsing override '([^']*)'", text):
+        return f"'{match[1]}' must be key=value. Quote it if the shell reads brackets or spaces."
+    renamed = next((find_renamed(word) for word in words if find_renamed(word)), None)
+    return f"{text} {renamed[0]}: renamed to {renamed[1]}" if renamed else text
+
+
+def suggest_similar(name: str, options: Sequence[str]) -> str:
+    """Return a sentence with the options that are similar to a misspelt name.
+
+    Args:
+        name: Name or dotted key that does not exist.
+        options: Existing names or dotted keys. Dotted keys are compared by their last part, too.
+
+    Returns:
+        ` Similar: a, b.`, or an empty text.
+    """
+
+    def similarity(a: str, b: str) -> float:
+        return difflib.SequenceMatcher(None, a, b).ratio()
+
+    def last_part(key: str) -> str:
+        return key.rpartition(".")[2]
+
+    scores = {
+        option: similarity(option, name)
+        for option in options
+        if similarity(last_part(option), last_part(name)) >= 0.6
+    }
+    best = [option for option, score in scores.items() if score > max(scores.values()) - 0.1]
+    return f" Similar: {', '.join(best[:3])}." if best else ""
+
+
+def find_renamed(word: str) -> tuple[str, str] | None:
+    """Find the new name of a renamed key or choice.
+
+    Args:
+        word: Override `key=value`, or a dotted key.
+
+    Returns:
+        The old and the new name, or None.
+    """
+    key, _, value = word.lstrip("+~").partition("=")
+    table = _renamed_keys()
+    if new := table["choices"].get(key, {}).get(value):
+        return f"{key}={value}", f"{key}={new}"
+    group, *parts = key.split(".")
+    if not parts:
+        return (key, table["config"][key]) if key in table["config"] else None
+    new_parts = [
+        _rename_last(table["keys"].get(group, {}), parts[: i + 1]) for i in range(len(parts))
+    ]
+    new_key = ".".join([group, *new_parts])
+    return (key, new_key) if new_key != key else None
+
+
+def _rename_last(table: Mapping[str, str], path: Sequence[str]) -> str:
+    """Rename the last key of a path by the longest entry that matches its end."""
+    pattern = ["*" if part.isdigit() else part for part in path]
+    ends = [".".join(["", *pattern]), *(".".join(pattern[i:]) for i in range(len(pattern)))]
+    return next((table[end] for end in ends if end in table), path[-1])
+
+
+@cache
+def _renamed_keys() -> dict[str, Any]:
+    """Read the table of renamed keys."""
+    import yaml
+
+    table: dict[str, Any] = yaml.safe_load(
+        Path(__file__).with_name("renamed_keys.yaml").read_text()
+    )
+    return table
+
+
+def _format_unknown_choice(group: str, name: str, options: Sequence[str]) -> str:
+    """Format an error about a choice that does not exist."""
+    if renamed := find_renamed(f"{group}={name}"):
+        return f"{renamed[0]}: renamed to {renamed[1]}"
+    is_listed = "/" not in group
+    available = f"pfbench list {group}" if is_listed else ", ".join(options)
+    return f"{group}={name} does not exist.{suggest_similar(name, options)} List all: {available}"
+
+
+def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> str:
+    """Format an error of a class under the full key that the user gave."""
+    place = re.search(r"full_key: (\S+)", text)
+    key = place[1] if place else "configuration"
+    message = " ".join(f"{cause}".split())
+    if unknown := re.search(r"got an unexpected keyword argument '(\w+)'", message):
+        return _format_unknown_key(f"{key}.{unknown[1]}", words)
+    target = re.search(r"Error loading '([\w.]+)'", message)
+    if target and (new := _renamed_keys()["targets"].get(target[1])):
+        return f"{key}._target_={target[1]}: renamed to {new}"
+    if type(cause) is not ValueError:
+        given = [word for word in words if word.lstrip("+").startswith(f"{key}.")]
+        source = " ".join(given) or "its YAML file"
+        return f"{key}: a value is not valid ({type(cause).__name__}: {message}). Check {source}."
+    match = re.match(r"(?:\w+\.)*(\w+)(?=[=:]| must | is not )", message)
+    if match is None:
+        return f"{key}: {message}"
+    keys = (word.lstrip("+").partition("=")[0] for word in words)
+    same_name = [name for name in keys if name.endswith(f".{match[1]}")]
+    full = min(same_name, key=lambda name: not name.startswith(key), default=f"{key}.{match[1]}")
+    return full + message[match.end() :]
+
+
+def _format_unknown_key(name: str, words: Sequence[str]) -> str:
+    """Format an error about a key that does not exist."""
+    given = next((word for word in words if word.lstrip("+~").startswith(f"{name}=")), name)
+    if renamed := find_renamed(name):
+        return f"{renamed[0]}: renamed to {renamed[1]}"
+    keys = _composed_keys(words, name)
+    if name in keys and {"-m", "--multirun"} & set(words):
+        return (
+            f"{given}: not all jobs of this sweep have the key {name}. "
+            "Run those without it in a separate sweep."
+        )
+    similar = suggest_similar(name, [key for key in keys if key != name])
+    return f"{given}: key {name} does not exist.{similar or _ALL_KEYS}"
+
+
+def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:
+    """List the dotted keys of the configuration of all other overrides."""
+    from pfbench.job.configuration import compose
+
+    others = [word for word in words if "=" in word and excluded not in word and "," not in word]
+    try:
+        composed = compose([word for word in others if not word.startswith("hydra")])
+    except Exception:  # with a second mistake, a suggestion would only confuse
+        return []
+    return list(_dotted_keys(composed.values))
+
+
+def _dotted_keys(node: Any, path: str = "") -> Iterator[str]:
+    """Yield the dotted keys of a nested dictionary."""
+    if path:
+        yield path
+    if isinstance(node, dict):
+        for key, value in node.items():
+            yield from _dotted_keys(value, f"{path}.{key}" if path else str(key))

@@ -1,0 +1,127 @@
+"""Command `pfbench report`: reports of studies."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pfbench.cli.claims import write_claims_page
+from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
+from pfbench.cli.messages import format_error
+from pfbench.job.configuration import JobConfig, compose, experiments_dir
+
+HELP = """\
+pfbench report study=NAME [key=value ...]
+pfbench report all [key=value ...]
+
+Write the report of a study: figures, tables and statistical tests, as index.html and report.md.
+`all` writes the reports of all studies with results, and the page of the claims.
+
+  pfbench report study=quickstart
+  pfbench report study=mine report=paper report.figure_formats=[pdf,png]
+  pfbench list report        report configurations
+
+See also: pfbench claims, pfbench datasheet scenario=NAME"""
+
+_NOT_STUDIES = ("datasheets", "claims")  # folders of other reports
+
+
+def report_study(words: Sequence[str]) -> None:
+    """Write the report of a study, or those of all studies.
+
+    Args:
+        words: `all` or overrides.
+
+    Raises:
+        ValueError: If a datasheet or the claims are requested, or the study has no results.
+    """
+    if list(words[:1]) == ["all"]:
+        _report_all(list(words[1:]))
+        return
+    given = given_keys(words)
+    if "scenario" in given and not given & {"study", "experiment"}:
+        scenario = next(word.partition("=")[2] for word in words if "scenario=" in word)
+        raise ValueError(
+            f"study must be set, got scenario={scenario}. "
+            f"For its datasheet use: pfbench datasheet scenario={scenario}"
+        )
+    config = compose_study(words)
+    study = config.values["study"]
+    if study == "claims":
+        raise ValueError("study must be a study, got claims. Use: pfbench claims")
+    if study == "datasheets":
+        raise ValueError(
+            "study must be a study, got datasheets. Use: pfbench datasheet scenario=NAME"
+        )
+    print(f"report: {_write_page(config).resolve()}")
+
+
+def make_report_options(config: JobConfig) -> Any:
+    """Build the options of a report from the group `report`.
+
+    Args:
+        config: Composed configuration.
+
+    Returns:
+        The options.
+    """
+    from pfbench.report.options import ReportOptions
+
+    values = config.values["report"].items()
+    chosen: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values}
+    return ReportOptions(**chosen, planned=count_planned_jobs(config.values["study"]))
+
+
+def _write_page(config: JobConfig) -> Path:
+    """Write the report of one study."""
+    from pfbench.report.page import write_report
+
+    values = config.values
+    return write_report(
+        values["study"], values["results_dir"], values["reports_dir"], make_report_options(config)
+    )
+
+
+def _report_all(words: list[str]) -> None:
+    """Write the reports of all studies with results, and the claims if all their studies exist."""
+    values = compose(words).values
+    results, reports = Path(values["results_dir"]), Path(values["reports_dir"])
+    studies = {path.parent.name for path in results.glob("*/*.npz")} - {"datasheets"}
+    pages = [path for name in ("report.md", "index.html") for path in reports.glob(f"*/{name}")]
+    page_names = {path.parent.name for path in pages}
+    published = page_names - set(_NOT_STUDIES)
+    failed = []
+    for study in sorted(studies):
+        has_experiment = (experiments_dir() / f"{study}.yaml").exists()
+        choice = f"+experiment={study}" if has_experiment else f"study={study}"
+        try:
+            print(f"{study}: {_write_page(compose([choice, *words])).resolve()}")
+        except Exception as error:
+            failed.append(study)
+            print(f"{study}: failed: {format_error(error, words)}", file=sys.stderr)
+    for study in sorted(published - studies):
+        print(
+            f"{study}: the published report is unchanged, since {results} holds no results. "
+            f"Next: pfbench run -m +experiment={study}"
+        )
+    required = _claimed_studies()
+    if "claims" not in page_names:
+        required &= published
+    if missing := sorted((required - studies) | (required & set(failed))):
+        print(f"claims: the page is unchanged, since results of {', '.join(missing)} are missing")
+    else:
+        print(f"claims: {write_claims_page(words).resolve()}")
+    if failed:
+        raise ValueError(
+            f"{len(failed)} of {len(studies)} reports failed: {', '.join(failed)}. "
+            "The messages above give the reasons."
+        )
+
+
+def _claimed_studies() -> set[str]:
+    """Return the studies that the claims refer to."""
+    from pfbench.claims import schema
+
+    return {study for claim in schema.read_claims() for study in claim.studies}

@@ -1,0 +1,52 @@
+"""Command `pfbench train`: training of a neural filter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pfbench.job.configuration import compose
+
+HELP = """\
+pfbench train key=value ...
+
+Train the network of a neural_* filter. The resulting file is the value of `checkpoint` of a job.
+An interrupted training resumes when the command is repeated.
+
+  pfbench train filter=neural_sir scenario=passive_1 train=vsmc train.epochs=20
+  pfbench list train         training configurations"""
+
+_NOT_OF_A_JOB = ("train.", "train=", "overwrite=", "checkpoint=")
+
+
+def train_network(words: Sequence[str]) -> None:
+    """Train the network of a filter and print the command that uses it.
+
+    Args:
+        words: Overrides.
+
+    Raises:
+        ValueError: If a sweep or oracle noise is requested, or a value is invalid.
+    """
+    from pfbench import job
+    from pfbench.learn.training_job import fit
+
+    if {"-m", "--multirun"} & set(words):
+        raise ValueError(
+            "pfbench train must be run without -m: it trains one network. "
+            "Set train.noise_regimes=[a,b] to train on several noise regimes."
+        )
+    config = compose(words)
+    values, choices = config.values, config.choices
+    job.apply_global_settings(values)
+    if values["oracle_noise"]:
+        raise ValueError(
+            "oracle_noise must be false for training, got true. Set oracle_noise=true when the filter runs."
+        )
+    names = list(values["train"]["noise_regimes"]) or [choices["noise"]]
+    regimes = {
+        name: job.instantiate(compose([*words, f"noise={name}"]).values["noise"]) for name in names
+    }
+    about = {"versions": job.read_versions()}
+    path = fit(values, choices, regimes, job.instantiate, about, print)
+    shared = [word for word in words if not word.startswith(_NOT_OF_A_JOB)]
+    print(f"checkpoint: {path.resolve()}\nNext: pfbench run {' '.join(shared)} checkpoint={path}")

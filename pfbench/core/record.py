@@ -1,0 +1,194 @@
+"""Data of a batch of runs: `Record` (what a filter may read) and `Episode` (with its truth)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+from torch import Tensor
+
+
+class FeedbackRun(Protocol):
+    """One pass of a filter through a process that its estimates correct, steps in order."""
+
+    def at_step(self, t: int) -> Record:
+        """Return step t after the corrections so far: y [R, 1, Dy], inputs [R or 1, 1, ...]."""
+
+    def correct(self, mean: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Correct the process by the estimate [R, D] of the latest step.
+
+        Returns:
+            The estimate as it would read without any correction, [R, D], and a function that maps
+            states [R, N, D] to their values after this correction.
+        """
+
+
+class FeedbackProcess(Protocol):
+    """A process that a filter's estimates correct, such as a closed-loop INS."""
+
+    def begin(self, record: Record, groups: dict[str, tuple[int, ...]]) -> FeedbackRun:
+        """Start a pass.
+
+        Args:
+            record: Measurements and inputs without any correction.
+            groups: Component groups of the model.
+
+        Returns:
+            The pass before its first step.
+
+        Raises:
+            ValueError: If the groups do not give the states to correct.
+        """
+
+
+class Record(NamedTuple):
+    """Measurements and inputs: all that a filter may read.
+
+    Attributes:
+        y: Measurements, [R, T, Dy]. NaN marks a missing component.
+        u: Inputs, a NamedTuple of tensors with leading axes [R, T], or [1, T] if shared by all
+            runs. () for none.
+        start: State about which the initial distribution of each run is defined, [R, D]. None if
+            the model's `origin` applies to all runs.
+        spread: Cholesky factor of each run's initial covariance about `start`, [R, d, d]. None if
+            the model's `initial` distribution applies to all runs.
+        loop: Process that the filter's estimates correct. y and u are then its values without any
+            correction. None for data that do not depend on the filter.
+    """
+
+    y: Tensor
+    u: Any = ()
+    start: Tensor | None = None
+    spread: Tensor | None = None
+    feedback: FeedbackProcess | None = None
+
+    def at_step(self, t: int) -> Record:
+        """Return step t: y [R, Dy], inputs [R or 1, ...]; start and spread are kept."""
+        return Record(self.y[:, t], map_inputs(lambda a: a[:, t], self.u), self.start, self.spread)
+
+    def select_steps(self, steps: slice) -> Record:
+        """Return the record of some time steps, with the axis of time."""
+        return self._replace(y=self.y[:, steps], u=map_inputs(lambda a: a[:, steps], self.u))
+
+    def select_runs(self, runs: slice) -> Record:
+        """Return the record of some runs."""
+
+        def select(a: Tensor) -> Tensor:
+            return a[runs] if len(a) > 1 else a
+
+        start, spread = (None if a is None else a[runs] for a in (self.start, self.spread))
+        return Record(self.y[runs], map_inputs(select, self.u), start, spread, self.feedback)
+
+    def to(self, like: Tensor) -> Record:
+        """Move to the device of a tensor, and floating-point numbers to its dtype."""
+
+        def move(a: Tensor) -> Tensor:
+            return a.to(like) if a.is_floating_point() else a.to(like.device)
+
+        start, spread = (None if a is None else move(a) for a in (self.start, self.spread))
+        return Record(move(self.y), map_inputs(move, self.u), start, spread, self.feedback)
+
+
+class SteppedModel(Protocol):
+    """A model that may differ from step to step."""
+
+    def at_step(self, t: int) -> Any:
+        """The model that describes step t."""
+
+
+def iterate_steps(model: SteppedModel, record: Record) -> Iterator[tuple[int, Any, Record]]:
+    """Iterate over the time steps of a record.
+
+    Every walk through a record uses this function: filters, training, online inference, bounds and simulation.
+
+    Args:
+        model: State-space model.
+        record: Measurements [R, T, Dy] and inputs, prepared by the model.
+
+    Yields:
+        Step number t from 0, the model of step t, and the record of step t.
+    """
+    for t in range(record.y.shape[1]):
+        yield t, model.at_step(t), record.at_step(t)
+
+
+def map_inputs(function: Any, u: Any) -> Any:
+    """Apply a function to each tensor of the inputs, in nested NamedTuples too.
+
+    Args:
+        f: Function of a tensor.
+        u: NamedTuple of inputs, or ().
+
+    Returns:
+        NamedTuple of the results.
+    """
+    return (
+        type(u)(
+            *(
+                map_inputs(function, part) if isinstance(part, tuple) else function(part)
+                for part in u
+            )
+        )
+        if u
+        else u
+    )
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Record of a batch of runs, with the truth for scoring.
+
+    Attributes:
+        record: Measurements and inputs.
+        time: Time of each step, s, [T].
+        truth: True state by component group, each [R, T, k]. Groups without truth are absent, steps
+            without truth are NaN.
+        track: True East, North and height relative to the start, m, [R, T, 3]. None if the scenario
+            has no map.
+        notes: Modelling choices of this episode that a report must mention.
+        sheet: Data of run 0 for the datasheet: `force` [T, 3] m/s^2 and `rate` [T, 3] rad/s in body
+            axes, `azimuth` and `elevation` of the satellites [T, S] rad (NaN below the horizon).
+    """
+
+    record: Record
+    time: Tensor
+    truth: dict[str, Tensor]
+    track: Tensor | None = None
+    notes: tuple[str, ...] = ()
+    datasheet: dict[str, Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementChannels:
+    """Description of the measurement components for a noise regime.
+
+    Attributes:
+        sd: Nominal standard deviations, SI units, [Dy].
+        kind: Kind of each component: position, velocity, range, rate, angle or other.
+        source: Number of each component's receiver or transmitter. Components of one source are
+            missing at the same time.
+    """
+
+    sd: Tensor
+    kind: tuple[str, ...]
+    source: tuple[int, ...]
+
+    @staticmethod
+    def of_one_kind(sd: Tensor, kind: str = "other") -> MeasurementChannels:
+        """Return components of one kind from one source.
+
+        Args:
+            sd: Nominal standard deviations, [Dy].
+            kind: Kind of all components.
+
+        Returns:
+            The description.
+        """
+        return MeasurementChannels(sd, (kind,) * len(sd), (0,) * len(sd))
+
+
+def fix_channels(sd: Tensor) -> MeasurementChannels:
+    """Return the channels of a receiver with position [3] or position and velocity [6]."""
+    kind = ("position",) * 3 + ("velocity",) * 3
+    return MeasurementChannels(sd, kind[: len(sd)], (0,) * len(sd))

@@ -1,0 +1,159 @@
+"""Linearisation rules: Taylor expansion, and sigma points with weights.
+
+For x = m + L xi with xi ~ (0, I), a rule computes the statistical linearisation f(x) =
+y + M xi + e, Cov e = Omega [Lefebvre et al. 2002; Garcia-Fernandez et al. 2015]. M is already
+multiplied by the Cholesky factor L, so the rest of the filter works on square roots.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, TypeAlias
+
+import torch
+from torch import Tensor
+
+from pfbench.core.jacobian import jacobian
+from pfbench.kernels import cpp
+from pfbench.kernels.compilation import compilable
+
+Map: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""xi [R, P, d] -> mean [R, P, k] and covariance [R or 1, P or 1, k, k] given each point."""
+
+
+class DifferenceSpace(NamedTuple):
+    """Difference and average of the values of a map.
+
+    Attributes:
+        subtract: (y, y0) -> difference.
+        mean: (y [R, P, k], w [R, P]) -> weighted average [R, k].
+    """
+
+    subtract: Callable[[Tensor, Tensor], Tensor]
+    mean: Callable[[Tensor, Tensor], Tensor]
+
+
+class AffineApproximation(NamedTuple):
+    """Affine approximation of a map in whitened coordinates.
+
+    Attributes:
+        y: Offset, [R, k].
+        m: Slope M, [R, k, d].
+        omega: Residual covariance of the fit plus `noise`, [R, k, k].
+        noise: Covariance of the distribution given a point, [R, k, k].
+    """
+
+    y: Tensor
+    m: Tensor
+    omega: Tensor
+    noise: Tensor
+
+
+class LinearisationRule(Protocol):
+    """Linearise a map of d whitened coordinates, in the dtype and runs of `like`."""
+
+    def __call__(
+        self, f: Map, like: Tensor, d: int, space: DifferenceSpace
+    ) -> AffineApproximation: ...
+
+
+@dataclass(frozen=True)
+class TaylorLinearisation:
+    """First-order Taylor expansion by exact derivatives: extended Kalman filter."""
+
+    def __call__(self, f: Map, like: Tensor, d: int, space: DifferenceSpace) -> AffineApproximation:
+        y, covariance = f(like.new_zeros(like.shape[0], 1, d))
+        noise = covariance[:, 0].expand(like.shape[0], -1, -1)
+        return AffineApproximation(
+            y[:, 0], jacobian(lambda xi: f(xi)[0], y, d, space.subtract), noise, noise
+        )
+
+
+@dataclass(frozen=True)
+class SigmaPointLinearisation:
+    """Linearisation by sigma points and weights: unscented and cubature filters.
+
+    Attributes:
+        points: d -> whitened points [P, d], mean weights [P] and covariance weights [P], with
+            sum w_c xi xi' = I.
+    """
+
+    points: Callable[[int], tuple[Tensor, Tensor, Tensor]]
+
+    def __call__(self, f: Map, like: Tensor, d: int, space: DifferenceSpace) -> AffineApproximation:
+        xi, w_mean, w_cov = (a.to(like) for a in self.points(d))
+        values, covariance = f(xi.expand(like.shape[0], -1, -1))
+        y = space.mean(values, w_mean.expand(values.shape[:2]))
+        r = space.subtract(values, y.unsqueeze(1))
+        m, residual_cov = _fitted(r, xi, w_cov)
+        noise = (
+            (w_mean[:, None, None] * covariance).sum(1)
+            if covariance.shape[1] > 1
+            else covariance[:, 0]
+        )
+        return AffineApproximation(y, m, residual_cov + noise, noise)
+
+
+def _separate_fit(r: Tensor, xi: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit slopes M [R, k, d] and a residual covariance [R, k, k] to r at xi."""
+    m = r.mT @ (w[:, None] * xi)
+    residual = r - xi @ m.mT
+    return m, (w[:, None] * residual).mT @ residual
+
+
+_fitted = compilable(_separate_fit, operator=cpp.fit_affine, use_torch_compiler=False)
+
+
+@dataclass(frozen=True)
+class UnscentedPoints:
+    """Scaled unscented transform [Julier and Uhlmann 1997; van der Merwe 2004].
+
+    With the defaults [ours] the points lie at sqrt(d), as in cubature, and the centre has weight
+    2 in covariances. The usual alpha = 1e-3 makes a centre weight of -1e6, which loses half of
+    the digits.
+
+    Attributes:
+        alpha: Spread of the points.
+        beta: Additional weight of the centre in covariances.
+        kappa: Secondary spread.
+
+    Raises:
+        ValueError: If alpha or, on use, alpha^2 (d + kappa) is not positive.
+    """
+
+    alpha: float = 1.0
+    beta: float = 2.0
+    kappa: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.alpha > 0.0:
+            raise ValueError(
+                f"linearisation.points.alpha must be positive, got {self.alpha}. Set a positive spread."
+            )
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
+        squared_radius = self.alpha**2 * (d + self.kappa)
+        if not squared_radius > 0.0:
+            raise ValueError(
+                f"linearisation.points.kappa must be greater than -d = {-d}, got {self.kappa}. "
+                "alpha^2 (d + kappa) must be positive."
+            )
+        offsets = math.sqrt(squared_radius) * torch.eye(d, dtype=torch.float64)
+        xi = torch.cat([torch.zeros(1, d, dtype=torch.float64), offsets, -offsets])
+        w = torch.full((2 * d + 1,), 0.5 / squared_radius, dtype=torch.float64)
+        w[0] = 1.0 - d / squared_radius
+        w_cov = w.clone()
+        w_cov[0] += 1.0 - self.alpha**2 + self.beta
+        return xi, w, w_cov
+
+
+@dataclass(frozen=True)
+class CubaturePoints:
+    """Third-degree spherical-radial rule, 2 d points [Arasaratnam and Haykin 2009]."""
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
+        offsets = math.sqrt(d) * torch.eye(d, dtype=torch.float64)
+        w = torch.full((2 * d,), 0.5 / d, dtype=torch.float64)
+        return torch.cat([offsets, -offsets]), w, w

@@ -1,0 +1,190 @@
+"""Checkpoint files of trained weights: plain tensors, numbers and texts, no code.
+
+A checkpoint holds the weights of each learned part of a filter and its training configuration,
+data, losses and cost. A job key contains a hash of the weights, independent of the file path.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import torch
+from torch import Tensor, nn
+
+FORMAT = "pfbench checkpoint 1"
+UNTRAINED = "untrained"
+
+
+Weights = dict[str, Tensor]
+
+
+def flatten_parameters(modules: Mapping[str, nn.Module]) -> Weights:
+    """Return the weights of several networks under names with the network as prefix."""
+    return {
+        f"{name}.{key}": value
+        for name, module in modules.items()
+        for key, value in module.state_dict().items()
+    }
+
+
+def write_checkpoint(path: str | Path, content: Mapping[str, Any]) -> None:
+    """Write a checkpoint atomically.
+
+    Args:
+        path: File to write.
+        content: Tensors, numbers, texts, lists and dicts.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name}.{uuid4().hex[:8]}.tmp")
+    try:
+        torch.save({"format": FORMAT, **content}, temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a checkpoint: tensors, numbers, texts, lists and dicts, never code.
+
+    Raises:
+        ValueError: If the file does not exist, is damaged or has another format.
+    """
+    if not Path(path).is_file():
+        raise ValueError(
+            f"checkpoint must be an existing file, got {path}. Use the path that `pfbench train` "
+            "prints, or checkpoint=untrained."
+        )
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+        raise ValueError(
+            f"checkpoint must be a file of weights, got {path}, which is damaged or another file "
+            f"({type(error).__name__}). Use a checkpoint that `pfbench train` wrote."
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        stored = content.get("format") if isinstance(content, dict) else type(content).__name__
+        raise ValueError(
+            f"checkpoint must have the format {FORMAT!r}, got {stored!r} in {path}. Train again."
+        )
+    return content
+
+
+def hash_weights(networks: Mapping[str, Weights]) -> str:
+    """Return 16 hexadecimal digits of the SHA-256 of all weights, names and shapes."""
+    sha256 = hashlib.sha256()
+    for part in sorted(networks):
+        for name in sorted(networks[part]):
+            value = networks[part][name].detach().cpu().contiguous()
+            sha256.update(repr((part, name, str(value.dtype), tuple(value.shape))).encode())
+            sha256.update(value.numpy().tobytes())
+    return sha256.hexdigest()[:16]
+
+
+def replace_checkpoint_by_hash(config: Any) -> Any:
+    """Replace each checkpoint path in a configuration by the hash of its weights.
+
+    Raises:
+        ValueError: As for `read`.
+    """
+    if isinstance(config, Mapping):
+        return {
+            key: _hash_label(value)
+            if key == "checkpoint" and isinstance(value, str)
+            else replace_checkpoint_by_hash(value)
+            for key, value in config.items()
+        }
+    return (
+        [replace_checkpoint_by_hash(value) for value in config]
+        if isinstance(config, list)
+        else config
+    )
+
+
+def checkpoint_provenance(
+    config: Any, scenario: str, seed: int, runs: Tensor
+) -> dict[str, Any] | None:
+    """Return hash, training data and cost of a filter's checkpoint, if it has one.
+
+    Args:
+        config: Configuration of the filter.
+        scenario: Scenario of the job.
+        seed: Seed of the job.
+        runs: Run numbers of the job.
+
+    Raises:
+        ValueError: If runs of this job were used for training or validation, or as for `read`.
+    """
+    path = next(_checkpoints(config), None)
+    if path is None:
+        return None
+    content = read_checkpoint(path)
+    split = content.get("split", {})
+    for name, use in (("train", "training"), ("validation", "validation")):
+        part = split.get(name, {})
+        if (
+            split.get("scenario") == scenario
+            and part.get("seed") == seed
+            and int(runs.min()) < part["runs"]
+        ):
+            raise ValueError(
+                f"seed must differ from the {use} seed of checkpoint={path}, got {seed}: runs 0 to "
+                f"{part['runs'] - 1} of {scenario} are {use} data. Set another seed."
+            )
+    details: dict[str, Any] = {
+        name: content[name] for name in ("choices", "cost", "best") if name in content
+    }
+    return {"weights": hash_weights(content["networks"]), "split": split, **details}
+
+
+def _checkpoints(config: Any) -> Iterator[str]:
+    """Iterate over the checkpoint files in a filter's configuration."""
+    if isinstance(config, Mapping):
+        checkpoint = config.get("checkpoint")
+        yield from [checkpoint] if isinstance(checkpoint, str) and checkpoint != UNTRAINED else []
+        config = list(config.values())
+    if isinstance(config, list):
+        for part in config:
+            yield from _checkpoints(part)
+
+
+def _hash_label(path: str) -> str:
+    """Return the hash of a checkpoint as text."""
+    return (
+        path if path == UNTRAINED else f"weights {hash_weights(read_checkpoint(path)['networks'])}"
+    )
+
+
+def load_parameters(path: str, weights: Weights, modules: Mapping[str, nn.Module]) -> None:
+    """Load weights into modules.
+
+    Args:
+        path: Checkpoint file, for messages.
+        weights: Weights by name.
+        modules: Modules by name.
+
+    Raises:
+        ValueError: If a weight is missing, surplus or of another shape (names the first one).
+    """
+    expected = flatten_parameters(modules)
+    for name in sorted(expected.keys() | weights.keys()):
+        stored, shape = (tuple(a[name].shape) if name in a else None for a in (weights, expected))
+        if stored != shape:
+            raise ValueError(
+                f"checkpoint must have weight {name} of shape {shape}, got {stored} in {path}. "
+                "Set the network of the training (proposal.network, hidden), or train again."
+            )
+    for name, module in modules.items():
+        module.load_state_dict(
+            {
+                key.removeprefix(f"{name}."): a
+                for key, a in weights.items()
+                if key.startswith(f"{name}.")
+            }
+        )

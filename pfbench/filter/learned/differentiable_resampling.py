@@ -1,0 +1,202 @@
+"""Differentiable resampling for training, with the bias of each method.
+
+`resamplers.Resample` ignores that the choice of ancestors depends on the parameters. Variational SMC, FIVO
+and AESMC drop this term too [Naesseth et al. 2018; Maddison et al. 2017; Le et al. 2018]. The gradient then
+has a low variance and a bias.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
+from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
+from pfbench.model.base import StateSpaceModel
+
+
+def _always() -> EssResampler:
+    """Return systematic resampling at every step."""
+    return EssResampler(Systematic(), 1.0)
+
+
+@dataclass(frozen=True)
+class StopGradientResampler:
+    """Resample with weights 1/N w / stop(w): their value is 1/N, their gradient the score.
+
+    For any unbiased scheme the gradient of the estimated evidence (not of its logarithm) is unbiased:
+    E[grad Z_hat] = grad Z. It has the variance of a score and needs many particles.
+
+    Attributes:
+        resampler: Resampler that copies.
+
+    References:
+        Scibior and Wood 2021, "Differentiable particle filtering without modifying the forward pass".
+    """
+
+    resampler: EssResampler = field(default_factory=_always)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the inner resampler is exact."""
+        return is_every_part_exact(**{"resampler.inner": self.resampler})
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        log_a: Tensor,
+        n: Tensor,
+        draws: RandomStream,
+    ) -> tuple[ParticleBelief, Tensor]:
+        # Resample corrects weights by log w - log a; with a detached this has the gradient of the score
+        return self.resampler(model, belief, log_a.detach(), n, draws)
+
+
+@dataclass(frozen=True)
+class SoftResampler:
+    """Ancestors by a' = alpha a + (1 - alpha) / N with weights w / (N a') [Karkus, Hsu, Lee 2018].
+
+    Part of the gradient passes through the weights. The choice of ancestors is ignored, with a smaller bias
+    for a smaller alpha. The target of the particles is the same for any alpha.
+
+    Attributes:
+        alpha: 1 is plain resampling. Towards 0 the weights have no influence.
+        resampler: Resampler that copies. StopGradientResampler removes the remaining bias.
+
+    Raises:
+        ValueError: If alpha is outside (0, 1].
+    """
+
+    alpha: float = 0.5
+    resampler: Resampler = field(default_factory=_always)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the inner resampler is exact."""
+        return is_every_part_exact(**{"resampler.inner": self.resampler})
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.alpha <= 1.0:
+            raise ValueError(
+                f"resampler.alpha must be in (0, 1], got {self.alpha}. Use 1 for resampling by the weights"
+            )
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        log_a: Tensor,
+        n: Tensor,
+        draws: RandomStream,
+    ) -> tuple[ParticleBelief, Tensor]:
+        living = belief.log_w > -torch.inf
+        even = torch.where(living, -torch.log(living.sum(1, keepdim=True).to(log_a)), -torch.inf)
+        if self.alpha < 1.0:
+            log_a = torch.where(
+                living,
+                torch.logaddexp(log_a + math.log(self.alpha), even + math.log1p(-self.alpha)),
+                -torch.inf,
+            )
+        return self.resampler(model, belief, log_a, n, draws)
+
+
+@dataclass(frozen=True)
+class OptimalTransportResampler:
+    """Optimal transport of particles to equal weights, x_j' = N sum_i P_ij x_i.
+
+    P minimises |x_i - x_j|^2 less epsilon times its entropy between weighted and equal particles, by
+    Sinkhorn iterations on logarithms. Distances are in unweighted standard deviations over the root of the
+    dimension. The last half iteration normalises the rows, and the column sums become the new weights
+    [ours], so the mean is kept for any number of iterations. The covariance shrinks with epsilon: the
+    posterior is reached only as N grows and epsilon falls. In a curved chart it uses coordinates about the
+    mean [ours].
+
+    Attributes:
+        epsilon: Weight of the entropy.
+        iterations: Number of Sinkhorn iterations.
+        threshold: As in Resample.
+
+    Raises:
+        ValueError: If epsilon is not positive, there are no iterations or the threshold is outside
+            [0, 1]. On use, if particles have a past or a memory.
+
+    References:
+        Reich 2013. Corenflos et al. 2021.
+    """
+
+    epsilon: float = 0.1
+    iterations: int = 15
+    threshold: float = 1.0
+    is_exact = False
+
+    def __post_init__(self) -> None:
+        if not self.epsilon > 0.0 or self.iterations < 1:
+            values = f"{self.epsilon} and {self.iterations}"
+            raise ValueError(
+                f"resampler.epsilon must be positive and iterations at least 1, got {values}. Raise them"
+            )
+        if not 0.0 <= self.threshold <= 1.0:
+            raise ValueError(
+                f"resampler.threshold must be from 0 (never) to 1 (always), got {self.threshold}. Choose a ratio of ESS to N"
+            )
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        log_a: Tensor,
+        n: Tensor,
+        draws: RandomStream,
+    ) -> tuple[ParticleBelief, Tensor]:
+        if any(value.shape[1] > 1 for value in (*belief.memory.values(), *belief.window.values())):
+            raise ValueError(
+                "resampler must copy particles that have a past or memory, got OptimalTransportResampler; choose SoftResampler or StopGradientResampler"
+            )
+        a = normalise_log_weights(
+            belief.log_w
+        )  # transport needs no correction for other probabilities
+        hit = 1.0 / a.square().sum(-1) <= self.threshold * n.squeeze(1)
+        mean = model.chart.mean(belief.x, a).unsqueeze(1)
+        deviations = model.chart.subtract(belief.x, mean)
+        # unweighted: if one particle has all weight, weighted deviations are 0 and distances infinite
+        living = (belief.log_w > -torch.inf).to(a).unsqueeze(-1)
+        sd = torch.sqrt(
+            (living * deviations.square()).sum(1, keepdim=True) / living.sum(1, keepdim=True)
+        ).detach()
+        near = deviations / torch.where(sd > 0.0, sd, 1.0) / math.sqrt(deviations.shape[-1])
+        plan = compute_transport_plan(
+            near, torch.log_softmax(belief.log_w, 1), self.epsilon, self.iterations
+        )
+        column_sums = plan.sum(1)
+        fresh = belief._replace(
+            x=model.chart.add(mean, plan.mT @ deviations / column_sums.unsqueeze(-1)),
+            log_w=torch.log(column_sums),
+        )
+        return select_by_run(hit, fresh, belief), hit
+
+
+def compute_transport_plan(x: Tensor, log_a: Tensor, epsilon: float, iterations: int) -> Tensor:
+    """Return the transport plan; its rows sum to a exactly, its columns to 1/N nearly.
+
+    Args:
+        x: Points, [R, N, d].
+        log_a: Log weights a, [R, N].
+        epsilon: Weight of the entropy.
+        iterations: Number of Sinkhorn iterations.
+
+    Returns:
+        P, [R, N, N].
+    """
+    cost = -(x.unsqueeze(2) - x.unsqueeze(1)).square().sum(-1) / epsilon
+    log_b = torch.full_like(log_a, -math.log(log_a.shape[1]))
+    f = torch.zeros_like(log_a)
+    for _ in range(iterations):
+        g = log_b - (cost + f.unsqueeze(2)).logsumexp(1)
+        f = log_a - (cost + g.unsqueeze(1)).logsumexp(2)
+    return torch.exp(cost + f.unsqueeze(2) + g.unsqueeze(1))

@@ -1,0 +1,224 @@
+"""Networks whose output is a distribution of noise.
+
+They map features [R, N, F] to a distribution with batch [R, N] and event [W]. Each is made
+from the number of features and the dimension of the noise, so YAML files do not contain them.
+The output of an untrained Diagonal is exactly N(0, I), which is the proposal that it corrects.
+The others start close to it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, cast
+
+import torch
+from pyro.distributions import (
+    Independent,
+    LowRankMultivariateNormal,
+    MixtureSameFamily,
+    Normal,
+    TransformedDistribution,
+    transforms,
+)
+from torch import Tensor, nn
+from torch.distributions import Categorical, Distribution
+from typing_extensions import override
+
+_MAX_LOG_SCALE = 4.0  # log of the largest factor on a standard deviation
+
+
+class SkipMlp(nn.Module):
+    """Multilayer perceptron (tanh) plus linear skip connection, with initial output 0.
+
+    Args:
+        inputs: Number of inputs.
+        outputs: Number of outputs.
+        hidden: Sizes of the hidden layers.
+    """
+
+    def __init__(self, inputs: int, outputs: int, hidden: Sequence[int] = (32, 32)) -> None:
+        super().__init__()
+        sizes = [inputs, *hidden]
+        layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.Tanh())]
+        last, self.skip_layer = nn.Linear(sizes[-1], outputs), nn.Linear(inputs, outputs)
+        self.hidden_layers = nn.Sequential(*layers, last)
+        for end in (last, self.skip_layer):
+            nn.init.zeros_(end.weight)
+            nn.init.zeros_(end.bias)
+
+    @override
+    def forward(self, features: Tensor) -> Tensor:
+        output: Tensor = self.hidden_layers(features) + self.skip_layer(features)
+        return output
+
+
+def bounded_log_scale(log_scale: Tensor) -> Tensor:
+    """Map a log scale smoothly to a factor from e^-4 to e^4, with 0 mapped to 1."""
+    return torch.exp(_MAX_LOG_SCALE * torch.tanh(log_scale / _MAX_LOG_SCALE))
+
+
+def independent_heads(mean: Tensor, sd: Tensor) -> Distribution:
+    """Return the normal distribution N(mean, diag(sd^2)).
+
+    Args:
+        mean: Mean, [..., W].
+        sd: Standard deviations, [..., W].
+    """
+    return Independent(Normal(mean, sd, validate_args=False), 1, validate_args=False)
+
+
+class DiagonalNormalHead(nn.Module):
+    """N(m, diag(s^2)). Initially N(0, I)."""
+
+    def __init__(self, features: int, noise: int, hidden: Sequence[int] = (32, 32)) -> None:
+        super().__init__()
+        self.net = SkipMlp(features, 2 * noise, hidden)
+
+    @override
+    def forward(self, features: Tensor) -> Distribution:
+        mean, log_scale = self.net(features).chunk(2, -1)
+        return independent_heads(mean, bounded_log_scale(log_scale))
+
+
+class LowRankNormalHead(nn.Module):
+    """N(m, diag(s^2) + F F') with `rank` columns in F.
+
+    Initially close to N(0, I). With F = 0 the gradient with respect to F would always be 0.
+    """
+
+    def __init__(
+        self, features: int, noise: int, hidden: Sequence[int] = (32, 32), rank: int = 2
+    ) -> None:
+        super().__init__()
+        self.rank = min(rank, noise)
+        self.net = SkipMlp(features, (2 + self.rank) * noise, hidden)
+        nn.init.normal_(self.net.skip_layer.bias[2 * noise :], std=0.1)
+
+    @override
+    def forward(self, features: Tensor) -> Distribution:
+        mean, log_scale, *columns = self.net(features).chunk(2 + self.rank, -1)
+        return LowRankMultivariateNormal(
+            mean,
+            torch.stack(columns, -1),
+            bounded_log_scale(log_scale).square(),
+            validate_args=False,
+        )
+
+
+class NormalMixtureHead(nn.Module):
+    """Mixture of diagonal normal distributions.
+
+    The initial means differ, since equal components would stay equal.
+    """
+
+    def __init__(
+        self, features: int, noise: int, hidden: Sequence[int] = (32, 32), components: int = 3
+    ) -> None:
+        super().__init__()
+        self.components, self.noise = components, noise
+        self.net = SkipMlp(features, components * (1 + 2 * noise), hidden)
+        nn.init.normal_(self.net.skip_layer.bias[components : components * (1 + noise)], std=0.5)
+
+    @override
+    def forward(self, features: Tensor) -> Distribution:
+        k, w = self.components, self.noise
+        logits, mean, log_scale = self.net(features).split([k, k * w, k * w], -1)
+        component = independent_heads(
+            mean.unflatten(-1, (k, w)), bounded_log_scale(log_scale).unflatten(-1, (k, w))
+        )
+        return MixtureSameFamily(
+            Categorical(logits=logits, validate_args=False), component, validate_args=False
+        )
+
+
+class SplineFlowHead(nn.Module):
+    """Conditional normalising flow: rational splines, then shift and scale.
+
+    Splines of [Durkan et al. 2019]. With more than one component, affine couplings come first and
+    mix the components [Dinh, Sohl-Dickstein, Bengio 2017]. The transforms are Pyro's.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        noise: int,
+        hidden: Sequence[int] = (32, 32),
+        bins: int = 6,
+        bound: float = 4.0,
+    ) -> None:
+        super().__init__()
+        widths = list(hidden)
+        self.net = SkipMlp(features, 2 * noise, hidden)
+        couplings = [
+            transforms.conditional_affine_coupling(noise, features, widths)
+            for _ in range(2 if noise > 1 else 0)
+        ]
+        self.couplings = nn.ModuleList(couplings)
+        self.spline: Any = transforms.conditional_spline(
+            noise, features, widths, count_bins=bins, bound=bound
+        )
+
+    @override
+    def forward(self, features: Tensor) -> Distribution:
+        mean, log_scale = self.net(features).chunk(2, -1)
+        reversal = transforms.Permute(
+            torch.arange(mean.shape[-1] - 1, -1, -1, device=features.device)
+        )
+        steps = [
+            step
+            for coupling in self.couplings
+            for step in (cast(Any, coupling).condition(features), reversal)
+        ]
+        steps += [
+            self.spline.condition(features),
+            transforms.AffineTransform(mean, bounded_log_scale(log_scale), event_dim=1),
+        ]
+        return TransformedDistribution(
+            independent_heads(torch.zeros_like(mean), torch.ones_like(mean)),
+            steps,
+            validate_args=False,
+        )
+
+
+class ZukoFlowHead(nn.Module):
+    """Conditional flow of the library zuko (extra `zuko`), then shift and scale.
+
+    Args:
+        features: Number of features.
+        noise: Dimension of the noise.
+        flow: Makes the flow, with a standard normal base: `zuko.flows.NSF`, `MAF` or `NICE` have
+            closed-form inverses. Others use bisection, and their ratio has six correct digits.
+        hidden: Sizes of the hidden layers, also in the flow.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        noise: int,
+        flow: Callable[..., nn.Module],
+        hidden: Sequence[int] = (32, 32),
+    ) -> None:
+        super().__init__()
+        self.net = SkipMlp(features, 2 * noise, hidden)
+        self.flow = flow(noise, context=features, hidden_features=list(hidden))
+
+    @override
+    def forward(self, features: Tensor) -> Distribution:
+        mean, log_scale = self.net(features).chunk(2, -1)
+        # zuko maps data to base, and its samples share one stream for all runs: use only the map
+        steps = [
+            self.flow(features).transform.inv,
+            transforms.AffineTransform(mean, bounded_log_scale(log_scale), event_dim=1),
+        ]
+        return TransformedDistribution(
+            independent_heads(torch.zeros_like(mean), torch.ones_like(mean)),
+            steps,
+            validate_args=False,
+        )
+
+
+def log_standard_normal(z: Tensor) -> Tensor:
+    """Compute log N(z; 0, I) of z [..., W] as [...]."""
+    return -0.5 * (z * z).sum(-1) - 0.5 * z.shape[-1] * math.log(2.0 * math.pi)

@@ -1,0 +1,218 @@
+"""Loss functions for the learned parts of a filter.
+
+Some losses depend on all earlier steps of the filter, and their gradient passes through it,
+resampling included. Others depend on one step, and the filter runs without a gradient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.core.simulate import draw_initial_state, draw_values, simulate_steps
+from pfbench.filter.belief import ParticleBelief, StepInfo
+from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
+from pfbench.filter.learned.proposal import LearnedProposal
+from pfbench.filter.moves.metropolis import MetropolisHastings
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.model.base import StateSpaceModel, StaticModel, initial_law
+
+
+class TrainingStep(NamedTuple):
+    """One step of a filter with its truth, from which an objective computes a loss.
+
+    Attributes:
+        method: The filter.
+        model: Model of this step.
+        before: Belief before the step.
+        after: Belief after the step.
+        step_info: Estimate and diagnostics of the step.
+        record: Measurements and inputs of the step.
+        truth: True state, [R, D]. NaN where it is unknown.
+        parent: True state before the step, [R, D]. None unless the data were simulated from the
+            model.
+        noise: Noise that drove the true state, [R, W]. None as `parent`.
+        scale: Standard deviations of the initial distribution, [R or 1, d].
+        draws: Random stream of the step.
+    """
+
+    method: ParticleFilter
+    model: StateSpaceModel
+    before: ParticleBelief
+    after: ParticleBelief
+    step_info: StepInfo
+    record: Record
+    truth: Tensor
+    parent: Tensor | None
+    noise: Tensor | None
+    scale: Tensor
+    draws: RandomStream
+
+
+class Objective(Protocol):
+    """A loss of each run and step, [R].
+
+    Attributes:
+        needs_filter_gradient: Whether its gradient passes through the filter.
+        needs_simulated_data: Whether it needs data simulated from the model, with known states and noise.
+            Inputs and gaps are those of the training data.
+    """
+
+    @property
+    def needs_filter_gradient(self) -> bool: ...
+
+    @property
+    def needs_simulated_data(self) -> bool: ...
+
+    def __call__(self, lesson: TrainingStep) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class EvidenceLowerBound:
+    """Negative log evidence of each step: E[log Z_hat] <= log p(y), tighter with more particles.
+
+    The objective of variational SMC, FIVO and AESMC, which differ in when they resample. The loss
+    of a lost run is 0.
+
+    References:
+        C. Naesseth et al. (2018), C. Maddison et al. (2017), T. A. Le et al. (2018).
+    """
+
+    needs_filter_gradient = True
+    needs_simulated_data = False
+
+    def __call__(self, lesson: TrainingStep) -> Tensor:
+        valid = torch.isfinite(lesson.after.log_evidence)
+        log_z = torch.where(valid, lesson.after.log_evidence, 0.0)
+        return torch.where(valid, lesson.before.log_evidence - log_z, 0.0)
+
+
+@dataclass(frozen=True)
+class StateErrorLoss:
+    """Mean square error in standard deviations of the initial distribution [ours].
+
+    It rewards a good mean, not good weights. It needs the truth and a resampler through which
+    gradients pass. The weights of the filter remain corrected.
+
+    References:
+        R. Jonschkowski, D. Rastogi and O. Brock (2018). P. Karkus, D. Hsu and W. S. Lee (2018).
+    """
+
+    needs_filter_gradient = True
+    needs_simulated_data = False
+
+    def __call__(self, lesson: TrainingStep) -> Tensor:
+        error = lesson.model.error(lesson.step_info.mean, lesson.truth) / lesson.scale
+        finite = torch.isfinite(error)
+        return torch.where(finite, error, 0.0).square().sum(-1) / finite.sum(-1).clamp(min=1)
+
+
+@dataclass(frozen=True)
+class InferenceCompilation:
+    """-log q(w | parent, y) of the noise of simulated data: forward KL, which covers all modes.
+
+    The proposal is evaluated at the true parent. The filter runs without a gradient.
+
+    References:
+        T. A. Le, A. G. Baydin and F. Wood (2017).
+    """
+
+    needs_filter_gradient = False
+    needs_simulated_data = True
+
+    def __call__(self, lesson: TrainingStep) -> Tensor:
+        proposal = lesson.method.proposal
+        if not isinstance(proposal, LearnedProposal):
+            raise ValueError(
+                "filter.proposal must be LearnedProposal for train.objective=InferenceCompilation, got "
+                f"{type(proposal).__name__}. Choose filter=neural_sir."
+            )
+        if isinstance(lesson.model, StaticModel):
+            return torch.zeros_like(lesson.after.log_w[:, 0])
+        assert lesson.parent is not None
+        assert lesson.noise is not None
+        return -proposal.log_density(
+            lesson.model, lesson.before, lesson.record, lesson.parent, lesson.noise
+        )
+
+
+@dataclass(frozen=True)
+class ExpectedSquaredJump:
+    """Negative expected squared jump of a learned kernel: acceptance times squared step length.
+
+    References:
+        C. Pasarica and A. Gelman (2010).
+    """
+
+    needs_filter_gradient = False
+    needs_simulated_data = False
+
+    def __call__(self, lesson: TrainingStep) -> Tensor:
+        kernels = [
+            move.kernel for move in lesson.method.moves if isinstance(move, MetropolisHastings)
+        ]
+        learned = [kernel for kernel in kernels if isinstance(kernel, LearnedRandomWalk)]
+        if not learned:
+            raise ValueError(
+                "filter.moves must have a LearnedRandomWalk for train.objective=ExpectedSquaredJump, got none. "
+                "Choose filter=neural_mh."
+            )
+        _, log_alpha, step = learned[0].propose_step(lesson.model, lesson.after, lesson.draws)
+        acceptance = torch.exp(torch.nan_to_num(log_alpha, -torch.inf, 0.0).clamp(max=0.0))
+        weighted = acceptance * lesson.after.log_w.exp()
+        return -(weighted * step.square().mean(-1)).sum(-1)
+
+
+def find_learned_parts(method: ParticleFilter) -> dict[str, LearnedProposal | LearnedRandomWalk]:
+    """Return the trainable parts of a filter, by their name in a checkpoint.
+
+    Raises:
+        ValueError: If the filter has no network.
+    """
+    stages = [
+        method.proposal,
+        *(move.kernel for move in method.moves if isinstance(move, MetropolisHastings)),
+    ]
+    parts = {
+        stage.part: stage
+        for stage in stages
+        if isinstance(stage, LearnedProposal | LearnedRandomWalk)
+    }
+    if not parts:
+        raise ValueError(
+            "filter must have a network to train, got none. Choose one such as filter=neural_sir."
+        )
+    return parts
+
+
+def simulate_from_model(
+    model: StateSpaceModel, record: Record, draws: RandomStream
+) -> tuple[Record, Tensor, Tensor]:
+    """Simulate a record from the model, with the inputs, initial states and gaps of a record.
+
+    Args:
+        model: State-space model.
+        record: Prepared record of R runs and T steps. Its measurements only give the gaps.
+        draws: Random stream.
+
+    Returns:
+        The record with simulated measurements, the states from the initial one on [R, T + 1, D],
+        and the noise [R, T, W].
+
+    Raises:
+        ValueError: a distribution of the model cannot be drawn.
+    """
+    law = initial_law(model, len(record.y), record.spread)
+    x = draw_initial_state(model, law, draws.at_step(0), "imagined", start=record.start)
+    states, noises, rows = [x], [], []
+    for step in simulate_steps(model, record, draws, x, "noise"):
+        y = draw_values(step.distribution, draws.at_step(step.t + 1), "imagined", 1)[:, 0]
+        states.append(step.x)
+        noises.append(step.w)
+        rows.append(torch.where(torch.isnan(step.record.y), torch.nan, y))
+    return record._replace(y=torch.stack(rows, 1)), torch.cat(states, 1), torch.cat(noises, 1)

@@ -1,0 +1,235 @@
+"""Learned proposal: a network parametrises the noise distribution of a step.
+
+The network is any nn.Module that maps features [R, N, F] to a distribution with batch [R, N]
+and event [W]. The ratio p(w) / q(w) is computed here for any network output, so a learned
+proposal does not change the target of the filter. Insufficient training only lowers the
+effective sample size. learned_laws contains networks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.distributions import Distribution
+from typing_extensions import override
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
+from pfbench.filter.learned.features import Feature, FeatureStack, make_feature_context
+from pfbench.filter.learned.network_builder import CheckpointSpec, build_networks
+from pfbench.filter.learned.networks import log_standard_normal
+from pfbench.filter.learned.noise_frame import (
+    append_states,
+    describe_frame,
+    from_frame,
+    log_noise_density,
+    scale_noise,
+    to_frame,
+)
+from pfbench.filter.learned.reparameterised_sampling import sample_from
+from pfbench.filter.particle.defensive_mixture import check_fraction, choose_defensive_particles
+from pfbench.filter.particle.proposals import ProposalSample
+from pfbench.model.base import StateSpaceModel, StaticModel
+
+PAST = "learned.past"  # hidden state of a recurrent network in the belief's memory, [R, 1, H]
+
+Make = Callable[[int, int], nn.Module]
+"""(number of features, dimension of the noise) -> network."""
+
+
+class NoiseDistribution(NamedTuple):
+    """Distribution of a step's noise: zeta ~ law, standardised noise xi = m + U zeta.
+
+    Attributes:
+        distribution: Distribution of zeta, batch [R, N], event [W].
+        memory: Memory of the belief after this step.
+    """
+
+    distribution: Distribution
+    memory: dict[str, Tensor]
+
+
+class LearnedProposal(nn.Module):
+    """Proposal whose network maps features to a noise distribution.
+
+    After [Naesseth et al. 2018]. The network output refers to a frame: to the standard deviations
+    of the noise or, with a `guide_filter`, to coordinates in which the guide's normal distribution is
+    N(0, I). A network with output N(0, I) is therefore the bootstrap or the guided proposal, to
+    the last digit, and training corrects it.
+
+    Args:
+        network: Makes the module from the number of features and the dimension of the noise.
+        features: Input features, by default innovation, parent and spread of the particles.
+        guide_filter: Guided proposal of each particle's noise that is corrected. None corrects the
+            model's noise.
+        defensive_fraction: Fraction of particles drawn from the frame's distribution instead [Hesterberg
+            1995]. It limits each weight to 1 / share times its value there. 0 draws none.
+        memory: Hidden size of a recurrent network (GRU) over past records, one state per run. 0
+            uses none.
+        checkpoint: File of trained weights, or `untrained`. None raises on use.
+        seed: Seed of an untrained network.
+
+    Raises:
+        ValueError: If `defensive_fraction` is not in [0, 1). On use, if no checkpoint is set, or if it belongs
+            to another model or network.
+    """
+
+    is_exact = True
+    part = "proposal"
+
+    def __init__(
+        self,
+        network: Make,
+        features: Sequence[Feature] | None = None,
+        guide_filter: GuidedNoiseProposal | None = None,
+        defensive_fraction: float = 0.05,
+        memory: int = 0,
+        checkpoint: str | None = "untrained",
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        check_fraction("proposal.defensive_fraction", defensive_fraction)
+        if defensive_fraction == 1.0 or memory < 0:
+            raise ValueError(
+                "proposal.defensive_fraction must be below 1 and proposal.memory at least 0, got "
+                f"defensive_fraction={defensive_fraction}, memory={memory}. Use 0 to switch either off."
+            )
+        self.make, self.guide_filter, self.defensive_fraction, self.hidden = (
+            network,
+            guide_filter,
+            defensive_fraction,
+            memory,
+        )
+        self.features_of = FeatureStack() if features is None else FeatureStack(features)
+        self.learnable = CheckpointSpec(self.part, checkpoint, seed, describe_frame(guide_filter))
+        self.network: nn.Module | None = None
+        self.recurrent: nn.Module | None = None
+        self.sizes = 0, 0, memory
+
+    def build(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, fresh: bool = False
+    ) -> None:
+        """Build the networks and load the checkpoint, unless `fresh`.
+
+        Args:
+            model: State-space model.
+            cloud: Belief before the step, which determines the number of features.
+            seen: Record of the step.
+            fresh: Start from untrained weights.
+
+        Raises:
+            ValueError: As for the class.
+        """
+        features, noise = (
+            self.features_of(make_feature_context(model, belief, record)).shape[-1],
+            model.noise_dim,
+        )
+
+        def make() -> dict[str, nn.Module]:
+            parts: dict[str, nn.Module] = {"network": self.make(features + self.hidden, noise)}
+            return parts | ({"recurrent": nn.GRUCell(features, self.hidden)} if self.hidden else {})
+
+        self.sizes = features, noise, self.hidden
+        for name, module in build_networks(self.learnable, make, self.sizes, model, fresh).items():
+            setattr(self, name, module)
+
+    @override
+    def forward(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample:
+        law, memory = self.compute_distribution(model, belief, record)
+        # the label of the corrected proposal: an untrained network then gives the same particles
+        z = draws.normal(
+            "noise" if self.guide_filter is None else "guide", belief.x.shape[1], model.noise_dim
+        )
+        zeta = sample_from(law, z, draws)
+        if isinstance(model, StaticModel):  # no transition in this step
+            return ProposalSample(
+                belief.x, torch.zeros_like(belief.log_w), memory, scale_noise(model, z)
+            )
+        log_q = law.log_prob(zeta)
+        if self.defensive_fraction:
+            stay = choose_defensive_particles(
+                self.defensive_fraction, belief.log_w > -torch.inf, draws, "learned.kept"
+            )
+            zeta = torch.where(stay.mask.unsqueeze(-1), z, zeta)
+            log_q = stay.log_mixture(log_standard_normal(zeta), law.log_prob(zeta))
+        xi, log_det = from_frame(self.guide_filter, model, belief, record, zeta)
+        w = scale_noise(model, xi)
+        return ProposalSample(
+            model.propagate(belief.x, record.u, w),
+            log_noise_density(model, w, xi) - log_q + log_det,
+            memory,
+            w,
+        )
+
+    def compute_distribution(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record
+    ) -> NoiseDistribution:
+        """Compute the noise distribution of the next step.
+
+        Args:
+            model: State-space model.
+            cloud: Belief before the step.
+            seen: Record of the step.
+        """
+        if self.network is None:
+            self.build(model, belief, record)
+        features, memory = self._features(model, belief, record)
+        assert self.network is not None
+        return NoiseDistribution(self.network(features), memory)
+
+    def log_density(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        record: Record,
+        parent: Tensor,
+        w: Tensor,
+    ) -> Tensor:
+        """Compute log q(w | parent), the objective of inference compilation.
+
+        The density is the network's own, without the defensive fraction. The parent is appended to
+        the particles with weight 0, which gives it the features of a particle.
+
+        Args:
+            model: State-space model.
+            cloud: Belief before the step.
+            seen: Record of the step.
+            parent: Parents, [R, D].
+            w: Noises, [R, W].
+
+        Returns:
+            Log density, [R].
+        """
+        xi = ((w - model.noise.mean) / model.noise.stddev).unsqueeze(1)
+        joined = append_states(belief, parent.unsqueeze(1))
+        if self.network is None:
+            self.build(model, joined, record)
+        features, _ = self._features(model, joined, record)
+        assert self.network is not None
+        zeta, log_det = xi, torch.zeros_like(xi[:, 0, :1])
+        if self.guide_filter is not None:
+            zeta, log_det = to_frame(self.guide_filter, model, belief, record, parent, xi)
+        value: Tensor = self.network(features[:, -1:]).log_prob(zeta)
+        return value.squeeze(1) - log_det.squeeze(1) - model.noise.stddev.log().sum()
+
+    def _features(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the network input [R, N, F] and the memory after the step."""
+        features = self.features_of(make_feature_context(model, belief, record))
+        if self.recurrent is None:
+            return features, belief.memory
+        w = normalise_log_weights(belief.log_w).unsqueeze(-1)
+        before = features.new_zeros(len(features), self.hidden)
+        if PAST in belief.memory:
+            before = belief.memory[PAST].squeeze(1)
+        past: Tensor = self.recurrent((w * features).sum(1), before).unsqueeze(1)
+        features = torch.cat([features, past.expand(-1, features.shape[1], -1)], -1)
+        return features, belief.memory | {PAST: past}

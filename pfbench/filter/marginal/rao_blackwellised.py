@@ -1,0 +1,219 @@
+"""Rao-Blackwellised particle filter: particles and conditional Kalman filters.
+
+The components of a state are sampled (s) or marginalised (l). Given the path of s, l is normal.
+A particle contains the sampled s and the conditional mean of l. A root of the conditional
+covariance is stored with it, one for all particles if the model is linear. A step uses the
+joint normal distribution of (s', l') given a particle. It draws s' from its marginal and
+conditions l' on s'. Then it conditions l' on the measurement, whose density given s' is the
+weight.
+
+References:
+    Schon, Gustafsson and Nordlund 2005, Marginalized particle filters for mixed
+    linear/nonlinear state-space models. Doucet, Godsill and Andrieu 2000.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, StepInfo, normalise_log_weights
+from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.marginal.conditional_linearisation import (
+    StatePartition,
+    check_normal,
+    embed_components,
+    linearise_measurement,
+    partition_state,
+    predict_with_root,
+)
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
+from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
+from pfbench.filter.square_root_update import condition_on, kalman_update_root
+from pfbench.filter.whitening import LOG_2PI
+from pfbench.model.base import StateSpaceModel, initial_law
+
+
+@dataclass(frozen=True)
+class MarginalWeightUpdate:
+    """Previous log weights plus log ratio, which contains the measurement density."""
+
+    is_exact = True
+
+    def __call__(
+        self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
+    ) -> Tensor:
+        value = log_w + log_ratio
+        return torch.where(torch.isnan(value), -torch.inf, value)
+
+
+@dataclass(frozen=True)
+class MarginalisedProposal:
+    """Draw the sampled part and condition the rest on it and on the measurement.
+
+    The log ratio is the log density of the measurement given the sampled path, to be used with
+    Given. The states contain sampled values and conditional means. memory["root"] [R, N or 1, l, l]
+    is a root of the conditional covariance.
+
+    Attributes:
+        split: Partition of the state.
+    """
+
+    split: StatePartition
+    is_exact = True  # if l is linear and normal given s
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample:
+        if not self.split.linear:
+            sample = BootstrapProposal()(model, belief, record, draws)
+            return sample._replace(log_ratio=model.log_likelihood(record.y, sample.x, record.u))
+        before = belief.memory["root"]
+        predicted, noise = predict_with_root(model, belief.x, before, record.u, self.split)
+        columns, root = condition_on(noise, self.split.sampled_states, self.split.linear)
+        z = draws.normal("noise", belief.x.shape[1], len(columns)).to(belief.x)
+        x = model.chart.add(predicted, _combined(columns, z, noise))
+        h, r, log_sd = linearise_measurement(model, x, record, self.split)
+        shift, root, log_likelihood = kalman_update_root(root, h, r)
+        x = model.chart.add(x, embed_components(shift, self.split.linear, model.chart.dimension))
+        observed_count = (~torch.isnan(record.y)).sum(-1, dtype=x.dtype).unsqueeze(-1)
+        log_likelihood = log_likelihood - log_sd - 0.5 * LOG_2PI * observed_count
+        valid_mask = (
+            torch.isfinite(root).all(-1).all(-1)
+        )  # otherwise weight 0 and the previous root
+        memory = {"root": torch.where(valid_mask[..., None, None], root, before)}
+        return ProposalSample(x, torch.where(valid_mask, log_likelihood, -torch.inf), memory)
+
+
+@dataclass(frozen=True)
+class RaoBlackwellisedFilter:
+    """Particle filter for part of the state, Kalman filters for the rest.
+
+    Transition and measurement are linearised at each particle in l and in noise that is not
+    additive. This is exact if the model is linear in them given s, otherwise an extended Kalman
+    filter per particle. Process and measurement noise must be normal, and the measurement
+    covariance must not depend on l. The reported mean and covariance are those of the mixture,
+    including the conditional distributions of l.
+
+    Attributes:
+        particles: N.
+        sampled_states: Names of groups or states to be sampled. All others are marginalised. None
+            samples all components that are not declared `linear_given` the rest. The filter is
+            then asymptotically exact, and on a linear model it is the Kalman filter.
+        resampler: As for a particle filter.
+
+    Raises:
+        ValueError: If there are fewer than two particles. On use, if the model does not have a
+            name, declares nothing linear while no name is set, or has noise that is not normal.
+    """
+
+    particles: int
+    sampled_states: Sequence[str] | None = None
+    resampler: Resampler = field(default_factory=lambda: EssResampler(Systematic()))
+
+    def __post_init__(self) -> None:
+        if self.particles < 2:
+            raise ValueError(
+                f"filter.particles must be at least 2, got {self.particles}. Set 2 or more."
+            )
+
+    @property
+    def is_exact(self) -> bool:
+        """Does the cloud target p(x_t | y_1:t) as N grows? Not claimed where components are chosen by name."""
+        return is_every_part_exact(resampler=self.resampler) and self.sampled_states is None
+
+    def init(
+        self,
+        model: StateSpaceModel,
+        runs: int,
+        draws: RandomStream,
+        start: Tensor | None = None,
+        spread: Tensor | None = None,
+    ) -> ParticleBelief:
+        """Draw the sampled part, with the rest at its conditional mean, equal weights.
+
+        Args:
+            model: State-space model.
+            runs: Number of runs.
+            draws: Random numbers of the initial step.
+            start: States about which the distribution is centred, [R, D]. None takes the origin.
+            spread: Cholesky factors of the initial covariance, [R, d, d]. None takes the model's.
+        """
+        split = partition_state(model, self.sampled_states)
+        cloud = ParticleFilter(self.particles).init(model, runs, draws, start, spread)
+        if not split.linear:
+            return cloud
+        check_normal(model, "the driving noise", model.noise)
+        distribution: Any = initial_law(model, runs, spread)
+        root = (
+            distribution.scale_tril
+            if isinstance(distribution, MultivariateNormal)
+            else torch.diag_embed(distribution.stddev)
+        )
+        columns, root = condition_on(root.unsqueeze(1), split.sampled_states, split.linear)
+        z = draws.normal("initial", self.particles, len(columns)).to(cloud.x)
+        origin = model.origin.expand(runs, -1) if start is None else start
+        shift = distribution.mean.unsqueeze(1) + _combined(
+            columns, z, distribution.mean.unsqueeze(1).unsqueeze(-1)
+        )
+        x = model.chart.add(origin.unsqueeze(1), shift)
+        roots = 1 if split.is_common else self.particles
+        return cloud._replace(x=x, memory={"root": root.expand(-1, roots, -1, -1)})
+
+    def step(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> tuple[ParticleBelief, StepInfo]:
+        """Advance the belief from t-1 to t.
+
+        Args:
+            model: State-space model.
+            belief: Belief at t-1.
+            seen: Record of step t.
+            draws: Random numbers of step t.
+        """
+        split = partition_state(model, self.sampled_states)
+        inner = ParticleFilter(
+            self.particles,
+            self.resampler,
+            proposal=MarginalisedProposal(split),
+            weight_update=MarginalWeightUpdate(),
+        )
+        cloud, info = inner.step(model, belief, record, draws)
+        info = info._replace(nis=None)  # the log ratio already contains the measurement
+        return cloud, _with_conditional(info, cloud, split) if split.linear else info
+
+
+def _combined(columns: list[Tensor], z: Tensor, like: Tensor) -> Tensor:
+    """Compute sum_j L_j z_j [R, N, d], zeros without columns."""
+    shift = like.new_zeros(*z.shape[:2], like.shape[-2])
+    for j, column in enumerate(columns):
+        shift = shift + column * z[..., j : j + 1]
+    return shift
+
+
+def _with_conditional(info: StepInfo, belief: ParticleBelief, split: StatePartition) -> StepInfo:
+    """Add the mean conditional covariance of l to the covariance of the particles."""
+    root, w = belief.memory["root"], normalise_log_weights(belief.log_w)
+    conditional_variance = root.square().sum(-1)  # [R, N or 1, l]
+    mean = (
+        conditional_variance[:, 0]
+        if conditional_variance.shape[1] == 1
+        else (w.unsqueeze(-2) @ conditional_variance).squeeze(-2)
+    )
+    variance = info.variance + embed_components(mean, split.linear, info.variance.shape[-1])
+
+    def covariance() -> Tensor:
+        shared = root.shape[1] == 1
+        p = root[:, 0] @ root[:, 0].mT if shared else (w[..., None, None] * (root @ root.mT)).sum(1)
+        embedding = torch.eye(info.variance.shape[-1], dtype=p.dtype, device=p.device)[split.linear]
+        return info.covariance() + embedding.mT @ p @ embedding
+
+    return info._replace(variance=variance, covariance=covariance, observed_components=None)

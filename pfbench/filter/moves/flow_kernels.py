@@ -1,0 +1,232 @@
+"""MCMC kernels that move the start of a path and keep its noise.
+
+t is the newest step of the window. A random-walk step is h A e in the chart. A comes from the
+particle set and not from the particle, so the step is symmetric and cancels in the ratio.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pfbench.core.covariance import factor
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
+from pfbench.filter.linearisation import unwrap_independent
+from pfbench.filter.moves.path_history import PathStatistics, StateHistory, concatenate_histories
+from pfbench.filter.particle.resampling import GaussianSmoothing, SmoothingKernel
+from pfbench.filter.whitening import compute_half_square, whiten
+from pfbench.model.base import StateSpaceModel
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """Step h A e of a random walk, with A A' the covariance of the moved quantity.
+
+    h is the bandwidth of a smoothing kernel times `scale`. The Gaussian bandwidth is close to the
+    best scale in many dimensions, 2.38 / sqrt(d).
+
+    Attributes:
+        scale: Factor on the bandwidth.
+        smoothing: Smoothing kernel, which also gives the distribution of e.
+
+    Raises:
+        ValueError: If the scale is not positive.
+    """
+
+    scale: float = 1.0
+    smoothing: SmoothingKernel = field(default_factory=GaussianSmoothing)
+    is_exact = True  # symmetric: its density ratio is 1
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0.0:
+            raise ValueError(
+                f"kernel.random_walk.scale must be positive, got {self.scale}. "
+                "Set a factor on the optimal bandwidth."
+            )
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, x: Tensor, draws: RandomStream
+    ) -> Tensor:
+        """Draw steps [R, N, d] for x [R, N, D] with the weights of the belief."""
+        covariance = weighted_mean_cov(model.chart, belief._replace(x=x))[1]
+        root, ok = factor(covariance)
+        diagonal_root = torch.diag_embed(
+            covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
+        )
+        active_count = torch.isfinite(belief.log_w).sum(1, keepdim=True).to(x.dtype)
+        h = self.scale * self.smoothing.bandwidth(covariance.shape[-1], active_count)
+        e = self.smoothing.draw(draws, "walk", x.shape[1], covariance.shape[-1])
+        return h.unsqueeze(-1) * (e @ torch.where(ok[:, None, None], root, diagonal_root).mT)
+
+
+@dataclass(frozen=True)
+class NoiseFlowKernel:
+    """Move the start of the window under fixed noises, without a density [ours].
+
+    s = x_t-L and s' = s (+) h A e, with A from the starts at time t. The path follows from s' under
+    the same noises:
+
+    log beta = log p(s') - log p(s) + sum_j log p(y_j | x'_j) - log p(y_j | x_j).
+
+    While t <= L the start is x_0 and its distribution is exact. Later it is the normal
+    distribution with the filter's moments at t - L. The target is then that of a fixed-lag
+    smoother, hence `exact` is False. The cost is L model steps.
+
+    Attributes:
+        lag: L. The window may be longer for another kernel. The flow then starts where the
+            window does.
+        random_walk: Step of the start. On a curved chart it is taken in the coordinates about the mean of
+            the start [ours]. The distribution is normal there, so no volume element is missing.
+        noise_refresh: c. Replaces the noises by w' = sqrt(1 - c^2) w + c e, which leaves their normal
+            distribution invariant.
+
+    Raises:
+        ValueError: If depth is below 1 or refresh outside [0, 1). On use, if noise that is not
+            normal is refreshed.
+    """
+
+    lag: int = 20
+    random_walk: RandomWalk = field(default_factory=RandomWalk)
+    noise_refresh: float = 0.0
+    is_exact = False
+
+    def __post_init__(self) -> None:
+        if self.lag < 1:
+            raise ValueError(
+                f"kernel.lag must be at least 1, got {self.lag}. Set the number of steps."
+            )
+        if not 0.0 <= self.noise_refresh < 1.0:
+            raise ValueError(
+                f"kernel.noise_refresh must be in [0, 1), got {self.noise_refresh}. Use 0 for no refresh."
+            )
+
+    @property
+    def required_history(self) -> StateHistory:
+        """History that the kernel needs."""
+        return StateHistory(self.lag, store_noise=True)
+
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        """Propose paths from moved starts.
+
+        Args:
+            model: State-space model.
+            cloud: Particles with a window of states and noises.
+            draws: Random numbers.
+
+        Returns:
+            Proposed belief and log acceptance ratio [R, N].
+        """
+        window, chart = belief.window, model.chart
+        start, centre = window["states"][:, :, 0], window["mean"][:, :, 0]
+        step, xi = self.random_walk(model, belief, start, draws), chart.subtract(start, centre)
+        proposed_start = start + step if chart.flat else chart.add(centre, xi + step)
+        noise = self._refreshed(model, window["noise"], draws)
+        states, log_like = propagate_path(model, proposed_start, noise, belief.past)
+        root = factor(window["covariance"][:, 0, 0])[0]
+        before, after = (compute_half_square(whiten(a, root)) for a in (xi, xi + step))
+        log_alpha = before - after + (log_like - window["log_like"]).sum(-1)
+        new_window = {"states": states, "log_like": log_like, "noise": noise}
+        return belief._replace(x=states[:, :, -1], window=window | new_window), log_alpha
+
+    def _refreshed(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
+        """Mix the noises [R, N, K, W] with new ones."""
+        if self.noise_refresh == 0.0 or w.shape[2] == 0:
+            return w
+        noise: Any = model.noise
+        if not isinstance(unwrap_independent(noise), torch.distributions.Normal):
+            raise ValueError(
+                f"kernel.noise_refresh must be 0, got {self.noise_refresh}: the noise of "
+                f"{type(model).__name__} is not normal. Set noise_refresh=0."
+            )
+        n, steps, width = w.shape[1:]
+        e = draws.normal("refresh", n, steps * width).unflatten(2, (steps, width))
+        return (
+            noise.mean
+            + (1.0 - self.noise_refresh**2) ** 0.5 * (w - noise.mean)
+            + self.noise_refresh * noise.stddev * e
+        )
+
+
+def propagate_path(
+    model: StateSpaceModel, start: Tensor, noise: Tensor, past: tuple[Record, ...]
+) -> tuple[Tensor, Tensor]:
+    """Propagate a path from its start under given noises.
+
+    Args:
+        model: State-space model.
+        start: First states, [R, N, D].
+        noise: Noises, [R, N, K, W].
+        past: Records of the K + 1 states, or empty.
+
+    Returns:
+        States [R, N, K+1, D] and log p(y_j | x_j) [R, N, K+1].
+    """
+    x, states = start, [start]
+    values = [model.log_likelihood(seen.y, x, seen.u) for seen in past[:1]] or [
+        torch.zeros_like(start[..., 0])
+    ]
+    for j, seen in enumerate(past[1:]):
+        x = model.propagate(x, seen.u, noise[:, :, j])
+        states.append(x)
+        values.append(model.log_likelihood(seen.y, x, seen.u))
+    return concatenate_histories([a.unsqueeze(2) for a in states]), concatenate_histories(
+        [a.unsqueeze(2) for a in values]
+    )
+
+
+@dataclass(frozen=True)
+class NoiseFlowStatKernel:
+    """Move the whole path since t = 0 with its newest state, at constant cost [ours].
+
+    By sufficient statistics [after Storvik 2002; Fearnhead 2002]: x' = x (+) delta, delta = h A e,
+    and log beta = b.delta - delta' Lambda delta / 2. After acceptance b <- b - Lambda delta. Exact
+    on linear-Gaussian models, of first order on others. Information defines b and Lambda.
+
+    Attributes:
+        random_walk: delta, by default with half the optimal bandwidth.
+    """
+
+    random_walk: RandomWalk = field(default_factory=lambda: RandomWalk(0.5))
+    is_exact = False
+    required_history = PathStatistics()
+
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        """Propose shifted states (arguments and results as for Flow.propose)."""
+        b, delta = belief.window["score"], self.random_walk(model, belief, belief.x, draws)
+        information_shift = delta @ belief.window["information"][:, 0]
+        log_alpha = (delta * (b - 0.5 * information_shift)).sum(-1)
+        window = belief.window | {"score": b - information_shift}
+        return belief._replace(x=model.chart.add(belief.x, delta), window=window), log_alpha
+
+
+@dataclass(frozen=True)
+class NoiseFlowGibbsKernel:
+    """FlowStat with delta from its conditional distribution N(Lambda^-1 b, Lambda^-1).
+
+    Always accepted if Lambda has a Cholesky factor.
+    """
+
+    is_exact = False
+    required_history = PathStatistics()
+
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        """Draw shifted states (arguments and results as for Flow.propose)."""
+        b, information = belief.window["score"], belief.window["information"][:, 0]
+        root, ok = factor(information)
+        white = torch.linalg.solve_triangular(root, b.mT, upper=False).mT
+        e = draws.normal("gibbs", b.shape[1], b.shape[2])
+        delta = torch.linalg.solve_triangular(root.mT, (white + e).mT, upper=True).mT
+        log_alpha = torch.where(ok[:, None] & torch.isfinite(delta).all(-1), 0.0, -torch.inf)
+        window = belief.window | {"score": b - delta @ information}
+        return belief._replace(x=model.chart.add(belief.x, delta), window=window), log_alpha

@@ -1,0 +1,276 @@
+"""Histories that particles store for MCMC kernels, and how they grow step by step.
+
+A particle stores everything that a kernel reads. Kernels do not look up parents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.core.covariance import distribution_covariance, factor
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights, weighted_mean_cov
+from pfbench.filter.linearisation import (
+    derivative,
+    mask_covariance,
+    measurement_jacobian,
+    transition_jacobian,
+)
+from pfbench.model.base import StateSpaceModel, StaticModel
+
+
+class PathHistory(Protocol):
+    """History that particles store for a kernel in the window of the belief."""
+
+    def start(
+        self, model: StateSpaceModel, belief: ParticleBelief, mean: Tensor, covariance: Tensor
+    ) -> ParticleBelief:
+        """Add the window to the first belief, given the initial mean and covariance."""
+
+    def append(
+        self,
+        model: StateSpaceModel,
+        before: ParticleBelief,
+        after: ParticleBelief,
+        w: Tensor | None,
+        record: Record,
+    ) -> ParticleBelief:
+        """Extend the window of `before` by one step and attach it to `after`.
+
+        Args:
+            model: State-space model.
+            before: Parents of the particles, slot by slot.
+            after: Particles after the step.
+            w: Noise of the step, [R, N, W], or None if the proposal does not return it.
+            seen: Record of the step.
+        """
+
+    def merge(self, other: PathHistory) -> PathHistory:
+        """Merge two histories into one that serves both kernels.
+
+        Raises:
+            ValueError: If the kernels cannot move the same particles.
+        """
+
+
+@dataclass(frozen=True)
+class StateHistory:
+    """Last steps of each particle. `past` of the belief then holds the records.
+
+    The window begins at x_s, s = max(0, t - depth), with K = t - s: `states` [R, N, K+1, D] and
+    `log_like` [R, N, K+1]. The first log likelihood is 0 unless x_0 itself was measured, since the
+    distribution of x_s with s > 0 contains all measurements up to s.
+
+    Attributes:
+        lag: Maximum of K.
+        store_noise: Also store the noises between the states, `noise` [R, N, K, W]. Store also the
+            filtered distribution of each state (for x_0 the model's), `mean` [R, 1, K+1, D] and
+            `covariance` [R, 1, K+1, d, d].
+        store_density: The kernels need the transition density of the model.
+    """
+
+    lag: int
+    store_noise: bool = False
+    store_density: bool = False
+
+    def merge(self, other: PathHistory) -> PathHistory:
+        if not isinstance(other, StateHistory):
+            return other.merge(self)
+        return StateHistory(
+            max(self.lag, other.lag),
+            self.store_noise or other.store_noise,
+            self.store_density or other.store_density,
+        )
+
+    def start(
+        self, model: StateSpaceModel, belief: ParticleBelief, mean: Tensor, covariance: Tensor
+    ) -> ParticleBelief:
+        """Start the window with the initial particles."""
+        window = {
+            "states": belief.x.unsqueeze(2),
+            "log_like": torch.zeros_like(belief.log_w).unsqueeze(2),
+        }
+        if self.store_noise:
+            window["noise"] = belief.x.new_zeros(*belief.x.shape[:2], 0, model.noise_dim)
+            window |= {"mean": mean[:, None, None], "covariance": covariance[:, None, None]}
+        return belief._replace(window=window)
+
+    def append(
+        self,
+        model: StateSpaceModel,
+        before: ParticleBelief,
+        after: ParticleBelief,
+        w: Tensor | None,
+        record: Record,
+    ) -> ParticleBelief:
+        """Append the newest state, and drop states beyond the depth."""
+        log_like = model.log_likelihood(record.y, after.x, record.u)
+        if isinstance(model, StaticModel):  # x_0 itself is measured
+            window = before.window | {
+                "states": after.x.unsqueeze(2),
+                "log_like": log_like.unsqueeze(2),
+            }
+            return after._replace(window=window, past=(record,))
+        if self.store_density and len(before.past) < 2:
+            get_transition(model, after.x[:, :1], record)
+        past = (*(before.past or (_unobserved(record),)), record)
+        old = max(0, len(past) - 1 - self.lag)
+        additions = {"states": after.x, "log_like": log_like}
+        if self.store_noise:
+            if w is None:
+                raise ValueError(
+                    "filter.proposal must return its noise if moves replay it, got None. "
+                    "Choose BootstrapProposal."
+                )
+            mean, covariance = weighted_mean_cov(model.chart, after)
+            additions |= {
+                "noise": w,
+                "mean": mean.unsqueeze(1),
+                "covariance": covariance.unsqueeze(1),
+            }
+        window = {
+            name: concatenate_histories([before.window[name][:, :, old:], new.unsqueeze(2)])
+            for name, new in additions.items()
+        }
+        if old:
+            past = (_unobserved(past[old]), *past[old + 1 :])
+            zeros = torch.zeros_like(window["log_like"][:, :, :1])
+            window["log_like"] = concatenate_histories([zeros, window["log_like"][:, :, 1:]])
+        return after._replace(window=window, past=past)
+
+
+@dataclass(frozen=True)
+class PathStatistics:
+    """Gradient and curvature of a particle's log path density under fixed noises.
+
+    If the newest state moves by delta, the log density changes by b.delta - delta' Lambda delta / 2
+    to first order, exactly on linear-Gaussian models. `score` b [R, N, d] belongs to each particle,
+    `information` Lambda [R, 1, d, d] to the run. With the Jacobian Phi of a step at the mean,
+
+        Lambda <- Phi^-T Lambda Phi^-1 + J,   b_i <- Phi^-T b_i + d log p(y | x_i) / dx.
+
+    J is the Fisher information of the measurement at the mean. Initially Lambda = P0^-1 and
+    b_i = -P0^-1 xi_i. The derivative at each particle [ours] also uses variance measurements.
+    """
+
+    def merge(self, other: PathHistory) -> PathHistory:
+        if isinstance(other, PathStatistics):
+            return self
+        raise ValueError(
+            "filter.moves must not combine NoiseFlowStatKernel or NoiseFlowGibbsKernel with other kernels, got both. "
+            "Remove the other kernels, since these two do not store paths."
+        )
+
+    def start(
+        self, model: StateSpaceModel, belief: ParticleBelief, mean: Tensor, covariance: Tensor
+    ) -> ParticleBelief:
+        """Start with the information and score of the initial distribution."""
+        information = torch.cholesky_inverse(factor(covariance)[0])
+        score = -model.chart.subtract(belief.x, mean.unsqueeze(1)) @ information
+        return belief._replace(window={"score": score, "information": information.unsqueeze(1)})
+
+    def append(
+        self,
+        model: StateSpaceModel,
+        before: ParticleBelief,
+        after: ParticleBelief,
+        w: Tensor | None,
+        record: Record,
+    ) -> ParticleBelief:
+        """Propagate information and score, and add those of the measurement."""
+        chart = model.chart
+        start, end = (
+            chart.mean(cloud.x, normalise_log_weights(cloud.log_w)).unsqueeze(1)
+            for cloud in (before, after)
+        )
+        inverse_step = torch.linalg.inv_ex(transition_jacobian(model, start, record.u)[:, 0])[0]
+        information = inverse_step.mT @ before.window["information"][
+            :, 0
+        ] @ inverse_step + fisher_information(model, end, record)
+        information = 0.5 * (information + information.mT)
+        score = before.window["score"] @ inverse_step + _likelihood_gradient(model, after.x, record)
+        return after._replace(window={"score": score, "information": information.unsqueeze(1)})
+
+
+def fisher_information(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+    """Compute the Fisher information of a measurement, by moments if not normal.
+
+    Args:
+        model: State-space model.
+        x: State, [R, 1, D].
+        seen: Record of the step.
+
+    Returns:
+        Information matrix, [R, d, d].
+    """
+    observed_mask, h = ~torch.isnan(record.y), measurement_jacobian(model, x, record)[:, 0]
+    distribution: Any = model.observation(x, record.u)
+    information = (
+        h.mT
+        @ torch.linalg.solve_ex(
+            mask_covariance(distribution_covariance(distribution)[:, 0], observed_mask), h
+        )[0]
+    )
+    if isinstance(distribution, torch.distributions.MultivariateNormal):
+        return information
+
+    def log_sd(a: Tensor, xi: Tensor) -> Tensor:
+        shifted: Any = model.observation(model.chart.add(a, xi), record.u)
+        return torch.log(shifted.stddev)
+
+    log_sd_jacobian = torch.where(
+        observed_mask.unsqueeze(-1), derivative(log_sd, x, model.chart.dimension)[:, 0], 0.0
+    )
+    return information + 2.0 * log_sd_jacobian.mT @ log_sd_jacobian
+
+
+def _likelihood_gradient(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+    """Compute d log p(y | x) / dx along the chart for each particle [R, N, d]."""
+    with torch.enable_grad():
+        xi = x.new_zeros(*x.shape[:2], model.chart.dimension, requires_grad=True)
+        total = model.log_likelihood(record.y, model.chart.add(x.detach(), xi), record.u).sum()
+        return (
+            torch.autograd.grad(total, xi, materialize_grads=True)[0]
+            if total.requires_grad
+            else torch.zeros_like(xi)
+        )
+
+
+def get_transition(
+    model: StateSpaceModel, x: Tensor, record: Record
+) -> torch.distributions.Distribution:
+    """Return the distribution of the next state.
+
+    Args:
+        model: State-space model.
+        x: States, [R, N, D].
+        seen: Record of the step.
+
+    Raises:
+        ValueError: If the transition density does not exist.
+    """
+    distribution = model.transition(x, record.u)
+    if distribution is None:
+        raise ValueError(
+            "filter.moves must have a model with a density of x_t given x_t-1, got "
+            f"{type(model).__name__}. Choose NoiseFlowKernel, which needs no density, "
+            "or a model with process noise inflation."
+        )
+    return distribution
+
+
+def concatenate_histories(parts: Sequence[Tensor]) -> Tensor:
+    """Concatenate histories [R, N, L, ...] along L, with contiguous steps in memory."""
+    dims = parts[0].dim()
+    joined = torch.cat([a.permute(*range(2, dims), 0, 1) for a in parts])
+    return joined.permute(dims - 2, dims - 1, *range(dims - 2))
+
+
+def _unobserved(record: Record) -> Record:
+    """Replace all measurements of a record by NaN."""
+    return record._replace(y=torch.full_like(record.y, torch.nan))

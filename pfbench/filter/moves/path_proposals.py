@@ -1,0 +1,156 @@
+"""Paths between two states: forward filtering and backward sampling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pfbench.core.covariance import distribution_covariance, factor
+from pfbench.core.random_stream import RandomStream
+from pfbench.filter.linearisation import (
+    batch_product,
+    linearised_innovation,
+    mask_covariance,
+    mean_noise,
+    measurement_jacobian,
+    transition_jacobian,
+)
+from pfbench.filter.moves.path_block_kernels import PathSegment
+from pfbench.filter.moves.path_history import concatenate_histories, get_transition
+from pfbench.model.base import StateSpaceModel
+
+
+@dataclass(frozen=True)
+class SmoothedSegment:
+    """Draw the block from p(block | fixed state, y) or, with `condition_on_endpoint`, also given x_t.
+
+    Forward filtering, backward sampling. The linearisation is about the noise-free path from the
+    fixed state, so both directions use the same one. On a linear model without the child this is
+    the local resampling of [Yan et al. 2016]. Given the child it is a bridge [ours], which raises
+    the acceptance rate. The ratio is always included, so nonlinear models are exact too.
+
+    Attributes:
+        condition_on_endpoint: Condition on the child.
+    """
+
+    condition_on_endpoint: bool = True
+    is_exact = True
+
+    def __call__(
+        self, model: StateSpaceModel, old: PathSegment, child: Tensor, draws: RandomStream
+    ) -> tuple[Tensor, Tensor | None]:
+        length, ratio = len(old.records) - 1, torch.zeros_like(child[..., 0])
+        if length == 0:
+            return old.states[:, :, :0], ratio
+        chart, block = model.chart, old.states[:, :, 1:-1]
+        links = _links(model, old)
+        filtered = _forward(links, old.states.shape)
+        next_old, next_new = (chart.subtract(x, links[-1].x) for x in (old.states[:, :, -1], child))
+        states: list[Tensor] = []
+        for j in reversed(range(length)):
+            m_old = m_new = filtered[j][0]
+            p, next_link = filtered[j][1], links[j + 1]
+            if self.condition_on_endpoint or j < length - 1:
+                p, gain = _absorb(p, next_link.transition_jacobian, next_link.process_covariance)
+                m_old = m_old + batch_product(
+                    gain, next_old - batch_product(next_link.transition_jacobian, m_old)
+                )
+                m_new = m_new + batch_product(
+                    gain, next_new - batch_product(next_link.transition_jacobian, m_new)
+                )
+            root, ok = factor(p)
+            z = draws.normal(f"block_{j}", child.shape[1], chart.dimension)
+            next_old, next_new = (
+                chart.subtract(block[:, :, j], links[j].x),
+                m_new + batch_product(root, z),
+            )
+            z_old = _solved(root, next_old - m_old)
+            ratio = ratio + torch.where(ok, 0.5 * (z * z - z_old * z_old).sum(-1), torch.nan)
+            states.append(chart.add(links[j].x, next_new))
+        return concatenate_histories([x.unsqueeze(2) for x in reversed(states)]), ratio
+
+
+class LinearisedStep(NamedTuple):
+    """One linearised step of a noise-free path.
+
+    Attributes:
+        x: State after the step, [R, N, D].
+        transition_jacobian: Transition Jacobian F, [R, 1 or N, d, d].
+        process_covariance: Process noise covariance Q, [R, 1 or N, d, d].
+        measurement_jacobian: Measurement Jacobian H, [R, 1 or N, k, d].
+        noise: Measurement covariance, [R, 1 or N, k, k].
+        residual: Measurement residual, [R, N, k].
+    """
+
+    x: Tensor
+    transition_jacobian: Tensor
+    process_covariance: Tensor
+    measurement_jacobian: Tensor
+    noise: Tensor
+    residual: Tensor
+
+
+def _links(model: StateSpaceModel, old: PathSegment) -> list[LinearisedStep]:
+    """Linearise the steps of the noise-free path."""
+    x, links = old.states[:, :, 0], []
+    linearisations = (
+        1 if model.linear else x.shape[1]
+    )  # a linear model has one Jacobian for all particles
+    for seen in old.records:
+        before = x[:, :linearisations]
+        slope, distribution = (
+            transition_jacobian(model, before, seen.u),
+            get_transition(model, before, seen),
+        )
+        x = model.propagate(x, seen.u, mean_noise(model, x))
+        observed_mask, after = ~torch.isnan(seen.y).unsqueeze(1), x[:, :linearisations]
+        noise = mask_covariance(
+            distribution_covariance(model.observation(after, seen.u)), observed_mask
+        )
+        links.append(
+            LinearisedStep(
+                x,
+                slope,
+                distribution_covariance(distribution),
+                measurement_jacobian(model, after, seen),
+                noise,
+                linearised_innovation(model, x, seen),
+            )
+        )
+    return links
+
+
+def _forward(links: list[LinearisedStep], shape: torch.Size) -> list[tuple[Tensor, Tensor]]:
+    """Filter the deviations from the noise-free path, at all steps but the last."""
+    d = links[0].transition_jacobian.shape[-1]
+    m, p, filtered = (
+        links[0].x.new_zeros(*shape[:2], d),
+        links[0].transition_jacobian.new_zeros(1, 1, d, d),
+        [],
+    )
+    for link in links[:-1]:
+        m, p = (
+            batch_product(link.transition_jacobian, m),
+            link.transition_jacobian @ p @ link.transition_jacobian.mT + link.process_covariance,
+        )
+        p, gain = _absorb(p, link.measurement_jacobian, link.noise)
+        m = m + batch_product(gain, link.residual - batch_product(link.measurement_jacobian, m))
+        filtered.append((m, p))
+    return filtered
+
+
+def _absorb(p: Tensor, h: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
+    """Update a covariance by slope h and noise r in Joseph's form; return the gain."""
+    gain = torch.linalg.solve_ex(h @ p @ h.mT + r, h @ p)[0].mT
+    factor_after = torch.eye(p.shape[-1], dtype=p.dtype, device=p.device) - gain @ h
+    return factor_after @ p @ factor_after.mT + gain @ r @ gain.mT, gain
+
+
+def _solved(root: Tensor, x: Tensor) -> Tensor:
+    """Compute root^-1 x for lower triangular [R, 1 or N, d, d], vectors [R, N, d]."""
+    if root.shape[1] == 1:
+        return torch.linalg.solve_triangular(root[:, 0], x.mT, upper=False).mT
+    return torch.linalg.solve_triangular(root, x.unsqueeze(-1), upper=False).squeeze(-1)

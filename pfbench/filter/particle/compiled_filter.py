@@ -1,0 +1,152 @@
+"""A particle filter whose steps run as compiled functions."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+
+from pfbench.core.random_stream import PhiloxStream, RandomStream
+from pfbench.core.record import Record, map_inputs
+from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
+from pfbench.filter.particle.compiled_step import (
+    CallCounter,
+    CompiledStep,
+    compile_step,
+    tensors_in,
+)
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.model.base import StateSpaceModel
+
+log = logging.getLogger("pfbench")
+
+
+@dataclass(eq=False)
+class CompiledParticleFilter:
+    """A particle filter with compiled steps: same random numbers, same results to rounding.
+
+    The first step runs uncompiled, because a proposal may start its memory there. The second is
+    recorded and compiled, and small steps are taken several at a time. A step with a NaN particle is
+    repeated uncompiled. After it, steps are taken one, two, four and so on at a time. If a step
+    cannot be compiled, the filter logs a warning and runs uncompiled. Stages must be pure functions:
+    a number that a stage stored between steps would be frozen.
+
+    Attributes:
+        method: The filter. With moves it runs uncompiled, because their path grows.
+        counter: Counter of likelihood evaluations, which compiled steps cannot increment.
+        clock: Clock that measures the time of compilation, s.
+        seconds: Time of compilation so far, s.
+        graphs: Compiled step by kind of step; None if that kind runs uncompiled.
+    """
+
+    method: ParticleFilter
+    counter: CallCounter | None = None
+    clock: Callable[[], float] = time.perf_counter
+    seconds: float = 0.0
+    graphs: dict[Any, CompiledStep | None] = field(default_factory=dict)
+
+    @property
+    def is_exact(self) -> bool:
+        return self.method.is_exact
+
+    @property
+    def is_active(self) -> bool:
+        """Whether some kind of step runs compiled."""
+        return any(graph is not None for graph in self.graphs.values())
+
+    def init(
+        self,
+        model: StateSpaceModel,
+        runs: int,
+        draws: RandomStream,
+        start: Tensor | None = None,
+        spread: Tensor | None = None,
+    ) -> ParticleBelief | GaussianBelief:
+        """Return the initial belief; see `Filter.init`."""
+        return self.method.init(model, runs, draws, start, spread)
+
+    def step(
+        self, model: StateSpaceModel, belief: ParticleBelief, seen: Record, draws: RandomStream
+    ) -> tuple[ParticleBelief, StepInfo]:
+        """Take a single step; see `Filter.step`."""
+        u = map_inputs(lambda a: a.unsqueeze(1), seen.u)
+        record = seen._replace(y=seen.y.unsqueeze(1), u=u)
+        results, _ = self._take_steps(model, belief, record, draws, 1)
+        return results[0]
+
+    def take_steps(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        record: Record,
+        t: int,
+        draws: RandomStream,
+        limit: int,
+    ) -> tuple[list[tuple[ParticleBelief, StepInfo]], int]:
+        """Take several steps from step `t` on; see `Walker.take_steps`."""
+        rest = record.select_steps(slice(t, None))
+        return self._take_steps(model.at_step(t), belief, rest, draws.at_step(t + 1), limit)
+
+    def _take_steps(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        record: Record,
+        draws: RandomStream,
+        limit: int,
+    ) -> tuple[list[tuple[ParticleBelief, StepInfo]], int]:
+        """Take several steps of a record, `draws` being those of the first one."""
+        graph = self._graph(model, belief, record.at_step(0), draws)
+        results: list[tuple[ParticleBelief, StepInfo]] = []
+        if graph is not None and isinstance(draws, PhiloxStream):
+            steps = min(limit, graph.max_steps, record.y.shape[1])
+            for after, summary in graph.run_steps(belief, record.select_steps(slice(steps)), draws):
+                step_record = partial(record.at_step, len(results))
+                results.append((after, self.method.make_info(model, after, summary, step_record)))
+            if self.counter:
+                self.counter.count += len(results) * graph.evaluations
+            if len(results) == steps:
+                return results, 2 * steps
+            if results:
+                belief = results[-1][0]
+            draws, limit = draws.at_step(int(draws.step) + len(results)), 1
+        results.append(self.method.step(model, belief, record.at_step(len(results)), draws))
+        return results, limit
+
+    def _graph(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> CompiledStep | None:
+        """Return the compiled step of this kind; None if the step must run uncompiled."""
+        if not isinstance(draws, PhiloxStream) or self.method.history is not None:
+            return None
+        key = id(model), belief.x.shape, len(tensors_in((belief, record)))
+        if key not in self.graphs:
+            if int(draws.step) == 1:
+                return None
+            self.graphs[key] = self._compile(model, belief, record, draws)
+        return self.graphs[key]
+
+    def _compile(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: PhiloxStream
+    ) -> CompiledStep | None:
+        """Compile a step; log a warning and return None if that fails."""
+        start_time = self.clock()
+        try:
+            graph = compile_step(self.method, model, belief, record, draws, self.counter)
+        except Exception as error:  # torch raises many kinds
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            log.warning(
+                "engine=compiled: this step cannot be compiled (%s). Using compiled kernels only",
+                reason,
+            )
+            log.debug("compilation failed", exc_info=True)
+            return None
+        elapsed = self.clock() - start_time
+        self.seconds += elapsed
+        log.info("engine=compiled: the step compiled in %.1f s", elapsed)
+        return graph

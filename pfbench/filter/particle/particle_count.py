@@ -1,0 +1,160 @@
+"""Number of particles, fixed or adaptive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.filter.belief import ParticleBelief, ess
+
+
+class ParticleCount(Protocol):
+    """Compute the number of particles of each run, float [R, 1], at most the number of slots."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the number depends on the belief before resampling alone."""
+
+    def initial_count(self, slots: int) -> int:
+        """Return the initial number."""
+
+    def __call__(self, belief: ParticleBelief) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class FixedCount:
+    """All slots at every step."""
+
+    is_exact = True
+
+    def initial_count(self, slots: int) -> int:
+        """Return the initial number."""
+        return slots
+
+    def __call__(self, belief: ParticleBelief) -> Tensor:
+        runs, slots = belief.log_w.shape
+        return torch.full((runs, 1), slots, dtype=torch.float64, device=belief.log_w.device).to(
+            belief.log_w.dtype
+        )
+
+
+@dataclass(frozen=True)
+class CountLimits:
+    """Limits of the number of particles.
+
+    Attributes:
+        minimum: Smallest number.
+        maximum: Largest number.
+        initial: Initial number.
+
+    Raises:
+        ValueError: If the numbers are out of order.
+    """
+
+    minimum: int
+    maximum: int
+    initial: int
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.minimum <= self.initial <= self.maximum:
+            raise ValueError(
+                f"particle_count.limits must satisfy 2 <= minimum <= initial <= maximum, got minimum={self.minimum}, "
+                f"initial={self.initial}, maximum={self.maximum}. Put them in order"
+            )
+
+    def initial_count(self, slots: int) -> int:
+        """Return the initial number.
+
+        Raises:
+            ValueError: If there are fewer slots than `maximum`.
+        """
+        if self.maximum > slots:
+            raise ValueError(
+                f"particle_count.limits.maximum must be at most filter.particles={slots}, got {self.maximum}. "
+                "Raise filter.particles or lower maximum and initial"
+            )
+        return self.initial
+
+
+@dataclass(frozen=True)
+class EssStepCount:
+    """More particles if ESS < threshold N, else fewer [COFM-AMSSRCPF 2024, Measurement and Control].
+
+    ESS is that of the weights at t-1, and decides the number at t, so the evidence stays unbiased.
+    The source computes it before the new weights, where it is always N and N could only fall. ESS / N
+    hardly depends on N, so the number settles at one of its limits.
+
+    Attributes:
+        increment: Increment. 0 keeps the number at `limits.initial`.
+        ess_threshold: Ratio of ESS to N.
+        limits: Limits, which the source does not state [ours].
+
+    Raises:
+        ValueError: If the step is negative or the threshold is outside [0, 1].
+    """
+
+    increment: int = 10
+    ess_threshold: float = 0.5
+    limits: CountLimits = field(default_factory=lambda: CountLimits(100, 200, 150))
+    is_exact = True
+
+    def __post_init__(self) -> None:
+        if self.increment < 0 or not 0.0 <= self.ess_threshold <= 1.0:
+            raise ValueError(
+                f"particle_count.increment must be 0 or more and particle_count.ess_threshold from 0 to 1, got increment={self.increment}, "
+                f"ess_threshold={self.ess_threshold}. Choose both in range"
+            )
+
+    def initial_count(self, slots: int) -> int:
+        """Return the initial number."""
+        return self.limits.initial_count(slots)
+
+    def __call__(self, belief: ParticleBelief) -> Tensor:
+        n = _occupied(belief)
+        if self.increment == 0:
+            return torch.full_like(n, self.limits.initial)
+        number = torch.where(
+            ess(belief.log_w).unsqueeze(1) < self.ess_threshold * n,
+            n + self.increment,
+            n - self.increment,
+        )
+        return number.clamp(self.limits.minimum, self.limits.maximum)
+
+
+@dataclass(frozen=True)
+class EssTargetCount:
+    """As many particles as would have the target ESS: N target / ESS, within limits [ours].
+
+    Attributes:
+        target: Effective sample size.
+        limits: Limits of the number.
+
+    Raises:
+        ValueError: If the target is not positive.
+    """
+
+    target: float = 100.0
+    limits: CountLimits = field(default_factory=lambda: CountLimits(100, 1000, 150))
+    is_exact = True
+
+    def __post_init__(self) -> None:
+        if not self.target > 0.0:
+            raise ValueError(
+                f"particle_count.target must be positive, got {self.target}. Choose an effective sample size"
+            )
+
+    def initial_count(self, slots: int) -> int:
+        """Return the initial number."""
+        return self.limits.initial_count(slots)
+
+    def __call__(self, belief: ParticleBelief) -> Tensor:
+        number = _occupied(belief) * self.target / ess(belief.log_w).unsqueeze(1)
+        return number.round().clamp(self.limits.minimum, self.limits.maximum)
+
+
+def _occupied(belief: ParticleBelief) -> Tensor:
+    """Return the number of active particles [R, 1], as float."""
+    return (belief.log_w > -torch.inf).sum(1, keepdim=True).to(belief.log_w)

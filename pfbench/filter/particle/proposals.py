@@ -1,0 +1,80 @@
+"""Proposals: new particles and their density ratio, which only the proposal computes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.core.simulate import draw_values
+from pfbench.filter.belief import ParticleBelief
+from pfbench.model.base import StandardNormal, StateSpaceModel
+
+
+class ProposalSample(NamedTuple):
+    """Sample of a proposal.
+
+    Attributes:
+        x: Particles, [R, N, D].
+        log_ratio: log p(w) - log q(w) of their noise, [R, N].
+        memory: As in `ParticleBelief`.
+        w: The noise, [R, N, W], for moves. None if the proposal does not draw noise.
+        trace: Numbers per run for the report, {name: [R]}.
+    """
+
+    x: Tensor
+    log_ratio: Tensor
+    memory: dict[str, Tensor]
+    w: Tensor | None = None
+    trace: dict[str, Tensor] = {}  # noqa: RUF012
+
+
+class Proposal(Protocol):
+    """Draw particles at t from those at t-1."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the ratio is that of the densities."""
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample: ...
+
+
+@dataclass(frozen=True)
+class BootstrapProposal:
+    """Noise of the model: x = propagate(x, u, w), ratio 0 [Gordon, Salmond, Smith 1993]."""
+
+    is_exact = True
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample:
+        w = draw_noise(model, belief.x.shape[1], draws)
+        return ProposalSample(
+            model.propagate(belief.x, record.u, w), torch.zeros_like(belief.log_w), belief.memory, w
+        )
+
+
+def draw_noise(model: StateSpaceModel, n: int, draws: RandomStream) -> Tensor:
+    """Draw noise from the model's noise distribution.
+
+    Args:
+        model: State-space model with noise of dimension W.
+        n: Number of particles.
+        draws: Random stream of R runs.
+
+    Returns:
+        Noise w, [R, n, W].
+
+    Raises:
+        ValueError: If the distribution cannot be drawn, see `draw_values`.
+    """
+    distribution = model.noise
+    if isinstance(getattr(distribution, "base_dist", distribution), StandardNormal):
+        return draws.normal("noise", n, model.noise_dim)
+    return draw_values(distribution, draws, "noise", n).to(model.anchor.dtype)

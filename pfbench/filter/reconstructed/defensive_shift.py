@@ -1,0 +1,72 @@
+"""Selection of shifted particles, and their noise-free predictions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.linearisation import mean_noise
+from pfbench.filter.particle.defensive_mixture import DefensiveSelection, choose_defensive_particles
+from pfbench.filter.particle.particle_filter import deactivate_invalid_particles
+from pfbench.filter.particle.proposals import ProposalSample
+from pfbench.model.base import StateSpaceModel
+
+
+def select_defensive(
+    fraction: float, log_w: Tensor, draws: RandomStream
+) -> DefensiveSelection | None:
+    """Draw the particles that are not shifted, or return None if there are none.
+
+    Args:
+        fraction: Fraction that is not shifted.
+        log_w: Log weights, [R, N].
+        draws: Random numbers.
+    """
+    return (
+        choose_defensive_particles(fraction, torch.isfinite(log_w), draws, "reconstruction.keep")
+        if fraction > 0.0
+        else None
+    )
+
+
+def keep_selected(selection: DefensiveSelection | None, old: Tensor, new: Tensor) -> Tensor:
+    """Return `old` for selected particles and `new` for the others, [R, N, ...].
+
+    Args:
+        selection: Selection, or None for no particle.
+        old: Values of selected particles.
+        new: Values of the others.
+    """
+    return new if selection is None else torch.where(selection.mask.unsqueeze(-1), old, new)
+
+
+def predict_without_noise(
+    model: StateSpaceModel, belief: ParticleBelief, record: Record
+) -> tuple[Tensor, Tensor]:
+    """Compute noise-free predictions [R, N, D] and weights [R, N], 0 if not finite.
+
+    Args:
+        model: State-space model.
+        cloud: Belief before the step.
+        seen: Record of the step.
+    """
+    x, log_w = deactivate_invalid_particles(
+        model.propagate(belief.x, record.u, mean_noise(model, belief.x)), belief.log_w, belief.x
+    )
+    return x, normalise_log_weights(log_w)
+
+
+def replace_invalid(sample: ProposalSample, belief: ParticleBelief) -> tuple[Tensor, Tensor]:
+    """Restore the parents of non-finite particles, with weight 0.
+
+    Args:
+        sample: Sample of the proposal.
+        cloud: Belief before the step.
+
+    Returns:
+        Particles [R, N, D] and log ratio [R, N].
+    """
+    return deactivate_invalid_particles(sample.x, sample.log_ratio, belief.x)

@@ -1,0 +1,157 @@
+"""Dynamic Matrix Control: shift of the state for an innovation.
+
+The inputs minimise the weighted output error plus their own weighted size. The solution is
+dU = (A'QA + R)^-1 A'Q (y - y~), x = x~ + B dU [particle filter with state reconstruction by
+Dynamic Matrix Control, eqs 21 to 28]. See also [Cutler and Ramaker 1980].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.linearisation import transition_jacobian
+from pfbench.model.base import StateSpaceModel
+
+
+class DmcResponse(Protocol):
+    """Response of the measurement: H [R, P, Dy, d] -> A [R, P, Dy, d] and B [d].
+
+    B is the effect of the inputs on the state.
+    """
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, h: Tensor
+    ) -> tuple[Tensor, Tensor]: ...
+
+
+@dataclass(frozen=True)
+class StaticResponse:
+    """Immediate response A = H, B = I. Unobserved states are not shifted [ours].
+
+    The paper's B omits the azimuth, which H does not observe either: the shift is equal.
+    """
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, h: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        return h, h.new_ones(h.shape[-1])
+
+
+@dataclass(frozen=True)
+class OneStepResponse:
+    """Response after one interval, A = H Phi B, also of unobserved states [ours].
+
+    Phi is the linearised transition of one interval.
+
+    Attributes:
+        held: Names of the states without an input, such as the azimuth.
+        units: Unit of each state's input in SI units, all 1 if None. They determine how far each
+            state is shifted.
+
+    Raises:
+        ValueError: On use, if a name is not a state, or the number of units differs from it.
+    """
+
+    held: Sequence[str] = ()
+    units: Sequence[float] | None = None
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, h: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        chart, d = model.chart, model.chart.dimension
+        if self.units is not None and len(self.units) != d:
+            raise ValueError(
+                f"response.units must have {d} numbers, got {len(self.units)}. "
+                "Set one for each state."
+            )
+        b = h.new_ones(d) if self.units is None else h.new_tensor(list(self.units))
+        b[state_indices(model, "response.held", self.held)] = 0.0
+        centre = chart.mean(belief.x, normalise_log_weights(belief.log_w)).unsqueeze(1)
+        return h @ transition_jacobian(model, centre, record.u) * b, b
+
+
+@dataclass(frozen=True)
+class DmcController:
+    """Weights of the quadratic cost and response of a DMC controller.
+
+    Attributes:
+        error_weight: Diagonal of Q, [Dy] or one number, 1 in [eq. 32].
+        control_weight: Diagonal of R, [d] or one number, 10 in [eq. 33]. They are meaningful only
+            with both in the units of the measurement: R / Q = 10 is a gain of 1/11 on a directly
+            measured state.
+        response: A and B.
+
+    Raises:
+        ValueError: If a weight is not positive. At the first step, if their number does not fit.
+    """
+
+    error_weight: float | Sequence[float] = 1.0
+    control_weight: float | Sequence[float] = 10.0
+    response: DmcResponse = field(default_factory=StaticResponse)
+
+    def __post_init__(self) -> None:
+        for name, value in (
+            ("error_weight", self.error_weight),
+            ("control_weight", self.control_weight),
+        ):
+            if not bool((torch.as_tensor(value) > 0).all()):
+                raise ValueError(
+                    f"controller.{name} must be positive, got {value}. Set positive weights."
+                )
+
+    def compute_gain(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, h: Tensor
+    ) -> Tensor:
+        """Compute K = B (A'QA + R)^-1 A'Q.
+
+        Args:
+            model: State-space model.
+            cloud: Belief before the step.
+            seen: Record of the step.
+            h: Measurement Jacobian [R, P, Dy, d], with rows 0 for unobserved components.
+
+        Returns:
+            Gain, [R, P, d, Dy].
+        """
+        a, b = self.response(model, belief, record, h)
+        error_variance = 1.0 / _expanded("error_weight", self.error_weight, h, h.shape[-2])
+        # R^-1 A', then the push-through identity: Dy equations instead of d
+        scaled = (a / _expanded("control_weight", self.control_weight, h, h.shape[-1])).mT
+        inner = torch.linalg.solve_ex(a @ scaled + torch.diag(error_variance), scaled.mT)[0]
+        return b.unsqueeze(-1) * inner.mT
+
+
+def state_indices(model: StateSpaceModel, key: str, names: Sequence[str]) -> list[int]:
+    """Return the indices of states by name.
+
+    Args:
+        model: State-space model.
+        key: Configuration key, for messages.
+        names: Names of states.
+
+    Raises:
+        ValueError: If a name is not a state.
+    """
+    unknown = [name for name in names if name not in model.names]
+    if unknown:
+        raise ValueError(
+            f"{key} must be among the states {list(model.names)}, got {unknown}. Correct the names."
+        )
+    return [model.names.index(name) for name in names]
+
+
+def _expanded(name: str, value: float | Sequence[float], like: Tensor, n: int) -> Tensor:
+    """Expand one number to n, or check that there are n."""
+    numbers = torch.as_tensor(value).to(like)
+    if numbers.numel() not in (1, n):
+        raise ValueError(
+            f"controller.{name} must have 1 or {n} numbers, got {numbers.numel()}. Set one or {n}."
+        )
+    return numbers.expand(n)

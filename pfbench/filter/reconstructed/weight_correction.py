@@ -1,0 +1,248 @@
+"""Weight corrections of reconstructed particles.
+
+As printed the weights do not include the shift. The filter is then exact for another model, in
+which the data count twice [particle filter with state reconstruction by Dynamic Matrix Control;
+Akyildiz and Miguez 2020]. The corrections are [ours].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.linearisation import batch_product, linearised_innovation, measurement_jacobian
+from pfbench.filter.particle.defensive_mixture import AffineMap, check_fraction
+from pfbench.filter.particle.proposals import ProposalSample
+from pfbench.filter.reconstructed.defensive_shift import (
+    keep_selected,
+    predict_without_noise,
+    replace_invalid,
+    select_defensive,
+)
+from pfbench.filter.reconstructed.dmc_controller import DmcController, state_indices
+from pfbench.filter.whitening import compute_half_square
+from pfbench.model.base import StateSpaceModel, StaticModel
+
+
+class WeightCorrection(Protocol):
+    """Shift and weights: particles of the base proposal -> reconstructed particles."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the weighted particles are asymptotically exact."""
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        record: Record,
+        sample: ProposalSample,
+        control: DmcController,
+        draws: RandomStream,
+    ) -> ProposalSample: ...
+
+
+@dataclass(frozen=True)
+class NoWeightCorrection:
+    """x~ + K (y - h(x~)) without a change of weights, as printed.
+
+    It does not converge to the posterior.
+
+    Attributes:
+        linearise_per_particle: Linearise the measurement at each particle. False linearises once at their mean,
+            which costs less and is equal for linear measurements.
+        regressed_states: Names of states that follow the shift of all others by regression, which
+            worsens the azimuth. None as printed [ours].
+    """
+
+    linearise_per_particle: bool = True
+    regressed_states: Sequence[str] = ()
+    is_exact = False
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        record: Record,
+        sample: ProposalSample,
+        control: DmcController,
+        draws: RandomStream,
+    ) -> ProposalSample:
+        x, log_ratio = replace_invalid(sample, belief)
+        w = normalise_log_weights(belief.log_w + log_ratio)
+        centre = x if self.linearise_per_particle else model.chart.mean(x, w).unsqueeze(1)
+        gain = control.compute_gain(
+            model, belief, record, measurement_jacobian(model, centre, record)
+        )
+        shift = batch_product(gain, linearised_innovation(model, x, record))
+        if self.regressed_states:
+            shift = _regressed_shift(
+                model,
+                x,
+                w,
+                shift,
+                state_indices(model, "weight_correction.regressed_states", self.regressed_states),
+            )
+        return ProposalSample(model.chart.add(x, shift), log_ratio, sample.memory)
+
+
+@dataclass(frozen=True)
+class TransitionRatioCorrection:
+    """Ratio of transition densities after and before the shift [ours].
+
+    For additive noise. The shift of x = f (+) xi, with f the noise-free prediction of each parent,
+    is xi -> xi + K (y - h(f) - H xi). It is affine, so its Jacobian is known also for a nonlinear
+    measurement. A singular transition has a density on the span of its noise, and the shift is
+    projected on that span. Exact, but useful only with wide noise. Increase the model's noise for
+    all filters alike, rather than for this one.
+
+    Attributes:
+        defensive_fraction: Fraction that is not shifted. Weights are then at most 1/keep times the likelihood.
+        linearise_per_particle: As for Uncorrected, but at the noise-free predictions.
+
+    Raises:
+        ValueError: At the first step, if the model's noise is not additive.
+    """
+
+    defensive_fraction: float = 0.0
+    linearise_per_particle: bool = True
+    is_exact = True
+
+    def __post_init__(self) -> None:
+        check_fraction("weight_correction.defensive_fraction", self.defensive_fraction)
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        record: Record,
+        sample: ProposalSample,
+        control: DmcController,
+        draws: RandomStream,
+    ) -> ProposalSample:
+        if isinstance(model, StaticModel):  # no transition in this step
+            return sample
+        chart, factor_of_noise = model.chart, model.noise_gain(record.u)
+        if factor_of_noise is None:
+            raise ValueError(
+                "proposal.weight_correction TransitionRatioCorrection must have a model with additive noise, got "
+                f"{type(model).__name__}, whose noise is not additive. "
+                "Choose MarginalRatioCorrection or ReconstructedNoiseProposal."
+            )
+        prediction, w = predict_without_noise(model, belief, record)
+        centre = (
+            prediction if self.linearise_per_particle else chart.mean(prediction, w).unsqueeze(1)
+        )
+        x, log_ratio = replace_invalid(sample, belief)
+        scaled_gain = factor_of_noise * model.noise.stddev
+        whiten, colour = _basis(scaled_gain @ scaled_gain.mT)
+        h = measurement_jacobian(model, centre, record)
+        whitened_gain = whiten.unsqueeze(1) @ control.compute_gain(model, belief, record, h)
+        affine = AffineMap(
+            _identity_minus(whitened_gain @ h @ colour.unsqueeze(1)),
+            batch_product(whitened_gain, linearised_innovation(model, prediction, record)),
+        )
+        xi = chart.subtract(x, prediction)
+        a = xi @ whiten.mT
+        defensive = select_defensive(self.defensive_fraction, belief.log_w + log_ratio, draws)
+        new, ratio = affine.apply(a, defensive, lambda e: -compute_half_square(e))
+        shifted = chart.add(prediction, xi + (new - a) @ colour.mT)
+        return ProposalSample(
+            keep_selected(defensive, x, shifted), log_ratio + ratio, sample.memory
+        )
+
+
+@dataclass(frozen=True)
+class MarginalRatioCorrection:
+    """Defensive mixture with the ratio of fitted normal distributions [ours].
+
+    About the predicted mean, o = H xi. The shift o -> o + H K (y - y_hat - o) moves the whole state
+    by its regression on o, which leaves the residual unchanged. The log weights are
+    log p(y | x) + log p(o') - log(keep p(o') + (1 - keep) q(o')). p is the normal distribution
+    fitted to o, and q the one of the shifted particles. Correct if the predicted distribution is
+    normal, as on linear-Gaussian models, otherwise approximate. A shift to a direction without
+    variance has weight 0, and no weight exceeds 1/keep times the likelihood.
+
+    Attributes:
+        defensive_fraction: Fraction that is not shifted. It is drawn in each step, since neighbours are
+            siblings after resampling. 1 gives the base proposal.
+    """
+
+    defensive_fraction: float = 0.5
+    is_exact = False
+
+    def __post_init__(self) -> None:
+        check_fraction("weight_correction.defensive_fraction", self.defensive_fraction)
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        record: Record,
+        sample: ProposalSample,
+        control: DmcController,
+        draws: RandomStream,
+    ) -> ProposalSample:
+        x, log_ratio = replace_invalid(sample, belief)
+        w = normalise_log_weights(belief.log_w + log_ratio)
+        centre = model.chart.mean(x, w).unsqueeze(1)
+        xi, h = model.chart.subtract(x, centre), measurement_jacobian(model, centre, record)
+        o = batch_product(h, xi)
+        weighted_o = w.unsqueeze(-1) * o
+        whiten, colour = _basis(weighted_o.mT @ o)
+        whitened_gain = (
+            whiten @ h[:, 0] @ control.compute_gain(model, belief, record, h)[:, 0]
+        )  # [R, Dy, Dy]
+        affine = AffineMap(
+            _identity_minus(whitened_gain @ colour).unsqueeze(1),
+            linearised_innovation(model, centre, record) @ whitened_gain.mT,
+        )
+        defensive, a = (
+            select_defensive(self.defensive_fraction, belief.log_w + log_ratio, draws),
+            o @ whiten.mT,
+        )
+        new, ratio = affine.apply(a, defensive, lambda e: -compute_half_square(e))
+        shift = (new - a) @ (whiten @ weighted_o.mT @ xi)
+        return ProposalSample(
+            keep_selected(defensive, x, model.chart.add(x, shift)), log_ratio + ratio, sample.memory
+        )
+
+
+def _basis(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return W and C [R, k, k] with W S W' = 1, C W = 1 on the range of S, else 0."""
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    sd = torch.where(variance > 0.0, variance, 1.0).sqrt()
+    correlation = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(correlation, 0.0, 0.0, 0.0))
+    range_mask = values > torch.finfo(values.dtype).eps ** (2 / 3)
+    divisors = torch.where(range_mask, values, torch.inf).sqrt()
+    root_values = torch.where(range_mask, values, 0.0).sqrt()
+    return (vectors / divisors.unsqueeze(-2)).mT / sd.unsqueeze(-2), sd.unsqueeze(
+        -1
+    ) * vectors * root_values.unsqueeze(-2)
+
+
+def _regressed_shift(
+    model: StateSpaceModel, x: Tensor, w: Tensor, shift: Tensor, regressed: list[int]
+) -> Tensor:
+    """Replace the shift [R, N, d] of some states by their regression on the others."""
+    d = model.chart.subtract(x, model.chart.mean(x, w).unsqueeze(1))
+    covariance = (w.unsqueeze(-1) * d).mT @ d
+    others = [i for i in range(d.shape[-1]) if i not in regressed]
+    whiten, _ = _basis(covariance[:, others][:, :, others])
+    predicted_shift = shift[..., others] @ (
+        whiten.mT @ whiten @ covariance[:, others][:, :, regressed]
+    )
+    return shift.index_copy(-1, torch.tensor(regressed, device=shift.device), predicted_shift)
+
+
+def _identity_minus(a: Tensor) -> Tensor:
+    """Return I - a."""
+    return torch.eye(a.shape[-1], dtype=a.dtype, device=a.device) - a

@@ -1,0 +1,242 @@
+"""Particle swarm proposal: move particles towards the measurement, then weight.
+
+A swarm stores the best position of each particle and of all, and a velocity. Gaussian
+attraction [Krohling 2004] gives the swarm-optimised particle filter (PSO-PF). Inertia, chaotic
+perturbation and escape from the worst positions are those of [Tian et al., "Improved adaptive
+particle filter for integrated navigation system"].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.particle.particle_filter import deactivate_invalid_particles
+from pfbench.filter.particle.proposals import ProposalSample, draw_noise
+from pfbench.filter.swarm.chaotic_sequences import (
+    ChaoticPerturbation,
+    PriorStart,
+    SwarmStart,
+    iterate_logistic,
+    logistic_map,
+    safe_seeds,
+)
+from pfbench.filter.swarm.swarm_coordinates import (
+    Fitness,
+    ObservedComponents,
+    PosteriorFitness,
+    SwarmCoordinates,
+    SwarmFrame,
+)
+from pfbench.filter.swarm.swarm_limits import ChiSquareStopping, SwarmLimits
+from pfbench.filter.swarm.swarm_weighting import MixtureWeighting, SwarmWeighting
+from pfbench.filter.swarm.velocity_update import (
+    InertiaVelocity,
+    SwarmState,
+    VelocityUpdate,
+    match_memory_layout,
+    select_particle,
+    select_swarm_by_run,
+)
+from pfbench.model.base import StateSpaceModel
+
+
+@dataclass(frozen=True)
+class SwarmProposal:
+    """Bootstrap prediction followed by particle swarm optimisation [Tian et al.].
+
+    Steps a to f of the paper. A run without measurement does not move, nor does a run that has met
+    `stopping`. Chaotic sequences belong to slots: resampled copies would otherwise share one [ours].
+
+    Attributes:
+        velocity: Velocity update.
+        perturbation: Chaotic perturbation, or None.
+        fitness: Objective of the swarm.
+        coordinates: Coordinates of the swarm.
+        limits: Limits of velocity and position.
+        stopping: Stopping rule before the last iteration, or None.
+        iterations: Maximum number of iterations.
+        swarm_start: Particles of the first step.
+        weighting: Weights of the final swarm.
+
+    Raises:
+        ValueError: If iterations is below 1, or limits by the initial particles are combined with
+            whitened coordinates.
+    """
+
+    velocity: VelocityUpdate = field(
+        default_factory=lambda: InertiaVelocity(escape_coefficient=0.12)
+    )
+    perturbation: ChaoticPerturbation | None = field(default_factory=ChaoticPerturbation)
+    fitness: Fitness = field(default_factory=PosteriorFitness)
+    coordinates: SwarmCoordinates = field(default_factory=lambda: ObservedComponents(whiten=True))
+    limits: SwarmLimits = field(default_factory=SwarmLimits)
+    stopping: ChiSquareStopping | None = None
+    iterations: int = 5
+    swarm_start: SwarmStart = field(default_factory=PriorStart)
+    weighting: SwarmWeighting = field(default_factory=MixtureWeighting)
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(
+                f"proposal.iterations must be at least 1, got {self.iterations}. Set 1 or more."
+            )
+        if self.limits.scale_by_prior and self.coordinates.whiten:
+            raise ValueError(
+                "proposal.limits.scale_by_prior must be false in whitened coordinates, got true. "
+                "Set limits.scale_by_prior or coordinates.whiten to false."
+            )
+
+    @property
+    def is_exact(self) -> bool:
+        return is_every_part_exact(
+            **{"proposal.start": self.swarm_start, "proposal.weights": self.weighting}
+        )
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample:
+        parents, memory = self._first_step(model, belief, draws)
+        w = draw_noise(model, parents.shape[1], draws)
+        x, log_w = deactivate_invalid_particles(
+            model.propagate(parents, record.u, w), belief.log_w, parents
+        )
+        frame = self.coordinates(model, x, normalise_log_weights(log_w), record.u)
+        swarm, iterations = self.optimise(
+            model, frame, torch.isfinite(log_w), memory, record, draws
+        )
+        log_likelihood = model.log_likelihood(record.y, frame.origin(swarm.q), record.u)
+        q, log_ratio = self.weighting(frame, swarm.q, log_likelihood, log_w, draws)
+        if self.perturbation:
+            chaos = memory["swarm.chaos"].index_copy(-1, frame.components, swarm.chaos.unsqueeze(1))
+            memory = memory | {"swarm.chaos": chaos}
+        log_ratio = torch.where(torch.isfinite(log_w), log_ratio, -torch.inf)
+        return ProposalSample(frame.origin(q), log_ratio, memory, trace={"iterations": iterations})
+
+    def optimise(
+        self,
+        model: StateSpaceModel,
+        frame: SwarmFrame,
+        active_mask: Tensor,
+        memory: dict[str, Tensor],
+        record: Record,
+        draws: RandomStream,
+    ) -> tuple[SwarmState, Tensor]:
+        """Run the swarm optimisation.
+
+        Args:
+            model: State-space model.
+            frame: Coordinates of the predicted particles.
+            active_mask: Mask of active slots, [R, N].
+            memory: Initial scale [R, 1, d] and chaotic values [R, 1, N, d], as required.
+            seen: Record of the step.
+            draws: Random numbers.
+
+        Returns:
+            Final swarm, and the number of iterations of each run [R].
+        """
+        penalty = self.fitness(frame)
+
+        def fitness(q: Tensor) -> Tensor:
+            value = model.log_likelihood(record.y, frame.origin(q), record.u) + penalty(q)
+            return torch.where(active_mask & ~torch.isnan(value), value, -torch.inf)
+
+        swarm = initial = self._initial(frame, fitness(frame.q), memory)
+        spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
+        scale = (
+            memory["swarm.scale"][..., frame.components] if self.limits.scale_by_prior else spread
+        )
+        spare = (
+            match_memory_layout(
+                safe_seeds(draws.uniform("swarm.spare", *frame.q.shape[1:])), frame.q
+            )
+            if self.perturbation
+            else None
+        )
+        active = observed_runs = ~torch.isnan(record.y).all(1)
+        iterations = torch.zeros_like(active, dtype=torch.long)
+        for i in range(1, self.iterations + 1):
+            if not active.is_cuda and not bool(active.any()):
+                break
+            v = self.velocity(swarm, active_mask, i / self.iterations, draws, f"swarm.velocity.{i}")
+            iterations = iterations + active
+            updated = self._updated(swarm, v, fitness, scale, spread, spare)
+            swarm = select_swarm_by_run(active, updated, swarm) if self.stopping else updated
+            if self.stopping:
+                best = swarm.best_fitness.argmax(1)
+                active = active & ~self.stopping(
+                    model, select_particle(frame.origin(swarm.best), best), record
+                )
+        return select_swarm_by_run(observed_runs, swarm, initial), iterations
+
+    def _updated(
+        self,
+        swarm: SwarmState,
+        v: Tensor,
+        fitness: Callable[[Tensor], Tensor],
+        scale: Tensor,
+        spread: Tensor,
+        spare: Tensor | None,
+    ) -> SwarmState:
+        """Move to x + v or, if its fitness is higher, x + v + Dx, and update the records."""
+        max_velocity, chaos = 6.0 * self.limits.max_velocity_sd * scale, swarm.chaos
+        max_distance = (
+            torch.full_like(spread, torch.inf)
+            if self.limits.max_distance_sd is None
+            else self.limits.max_distance_sd * spread
+        )
+        v = torch.clamp(v, -max_velocity, max_velocity)
+        q = torch.clamp(swarm.q + v, -max_distance, max_distance)
+        value = fitness(q)
+        if self.perturbation and spare is not None:
+            chaos = logistic_map(chaos, spare)
+            perturbed = torch.clamp(
+                swarm.q + v + self.perturbation(chaos, scale), -max_distance, max_distance
+            )
+            perturbed_value = fitness(perturbed)
+            q = torch.where((perturbed_value > value).unsqueeze(-1), perturbed, q)
+            value = torch.maximum(perturbed_value, value)
+        better, worse = value > swarm.best_fitness, value < swarm.worst_fitness
+        best, worst = (
+            torch.where(a.unsqueeze(-1), q, b)
+            for a, b in ((better, swarm.best), (worse, swarm.worst))
+        )
+        best_fitness, worst_fitness = (
+            torch.maximum(value, swarm.best_fitness),
+            torch.minimum(value, swarm.worst_fitness),
+        )
+        return SwarmState(q, v, value, best, best_fitness, worst, worst_fitness, chaos)
+
+    def _initial(self, frame: SwarmFrame, fitness: Tensor, memory: dict[str, Tensor]) -> SwarmState:
+        """Return the swarm before its first iteration, with stored chaotic values only."""
+        q = frame.q
+        chaos = (
+            match_memory_layout(memory["swarm.chaos"][:, 0, :, frame.components], q)
+            if self.perturbation
+            else q.new_zeros(len(q), 1, 1)
+        )
+        return SwarmState(q, torch.zeros_like(q), fitness, q, fitness, q, fitness, chaos)
+
+    def _first_step(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return parents [R, N, D] and memory, which the first step initialises."""
+        if "swarm.scale" in belief.memory:
+            return belief.x, belief.memory
+        chart = model.chart
+        z = iterate_logistic(draws.uniform("swarm.chaos", belief.x.shape[1], chart.dimension))
+        w = normalise_log_weights(belief.log_w)
+        c = chart.subtract(belief.x, chart.mean(belief.x, w).unsqueeze(1))
+        memory = belief.memory | {
+            "swarm.scale": (w.unsqueeze(-1) * c * c).sum(1, keepdim=True).sqrt()
+        }
+        if self.perturbation:
+            memory = memory | {"swarm.chaos": z.unsqueeze(1)}
+        return self.swarm_start(model, belief, z), memory

@@ -1,0 +1,169 @@
+"""Configuration of a job: composed from conf/ and experiments/, resolved, with plain values.
+
+This module imports Hydra only on use and never imports torch, so that the command line starts fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pfbench
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+CHOICES = ("scenario", "noise", "filter", "model")  # groups that name a job
+
+
+@dataclass(frozen=True)
+class JobConfig:
+    """Resolved configuration of one job.
+
+    Attributes:
+        values: Nested plain dictionary, lists and numbers.
+        choices: Name of the file chosen in each group, for instance `{"filter": "sir", ...}`.
+        uses_shared_particles: Whether `filter.particles` refers to the key `particles`. Only then
+            may a budget replace the number.
+    """
+
+    values: dict[str, Any]
+    choices: dict[str, str]
+    uses_shared_particles: bool = False
+
+    def __post_init__(self) -> None:
+        missing = [group for group in CHOICES if group not in self.choices]
+        if missing:
+            raise ValueError(
+                f"choices must name {', '.join(CHOICES)}, got {sorted(self.choices)}. Add "
+                f"{', '.join(missing)}, or build the configuration with job.compose([...])."
+            )
+
+
+def compose(overrides: Sequence[str] = ()) -> JobConfig:
+    """Compose a configuration from the files of conf/ and experiments/.
+
+    Works within and without a Hydra application. Hydra's global state is the same afterwards.
+
+    Args:
+        overrides: Hydra overrides such as `"scenario=flight_300s"` or `"+experiment=quickstart"`.
+
+    Returns:
+        The configuration of one job.
+    """
+    from hydra import compose as compose_config
+    from hydra import initialize_config_dir
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import open_dict
+
+    register_experiments()
+    with _preserved_hydra_state():
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            composed = compose_config("config", list(overrides), return_hydra_config=True)
+        HydraConfig.instance().set_config(composed)  # an experiment may look up the choices
+        choices = {str(k): str(v) for k, v in composed.hydra.runtime.choices.items()}
+        with open_dict(composed):
+            del composed["hydra"]
+        return resolve_config(composed, choices)
+
+
+def resolve_config(
+    config: JobConfig | DictConfig | Mapping[str, Any], choices: Mapping[str, str] | None = None
+) -> JobConfig:
+    """Resolve all interpolations of a configuration.
+
+    Args:
+        config: Configuration of a job. One that is resolved already is returned unchanged.
+        choices: Names of the chosen scenario, noise, filter and model. Default: `config.choices`.
+
+    Returns:
+        The resolved configuration.
+
+    Raises:
+        ValueError: If the choices do not name scenario, noise, filter and model.
+    """
+    from omegaconf import OmegaConf
+
+    if isinstance(config, JobConfig):
+        return config
+    tree = config if OmegaConf.is_config(config) else OmegaConf.create(dict(config))
+    is_shared = "particles" in tree["filter"] and OmegaConf.is_interpolation(
+        tree["filter"], "particles"
+    )
+    values = OmegaConf.to_container(tree, resolve=True)
+    assert isinstance(values, dict)
+    names = {str(group): str(name) for group, name in (choices or {}).items()}
+    return JobConfig({str(key): value for key, value in values.items()}, names, is_shared)
+
+
+def conf_dir() -> Path:
+    """Return the folder of configurations, of the installed package or of the checkout."""
+    return _find_folder("conf", "config.yaml")
+
+
+def experiments_dir() -> Path:
+    """Return the folder of experiments, of the installed package or of the checkout."""
+    return _find_folder("experiments", "quickstart.yaml")
+
+
+def list_groups() -> dict[str, list[Path]]:
+    """List the files of each configuration group and of the group `experiment`."""
+    folders = [path for path in sorted(conf_dir().iterdir()) if any(path.glob("*.yaml"))]
+    groups = {folder.name: sorted(folder.glob("*.yaml")) for folder in folders}
+    return groups | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
+
+
+_registered: dict[str, tuple[Path, int]] = {}  # experiments in Hydra's store, with the file's time
+
+
+def register_experiments() -> None:
+    """Register experiments/NAME.yaml with Hydra as the group `experiment`.
+
+    The folder lies outside conf/. Reading all files takes as long as composing, so files that did
+    not change since the last call are skipped.
+    """
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import OmegaConf
+
+    store = ConfigStore.instance()
+    stored_names = store.repo.get("experiment", {})
+    for path in experiments_dir().glob("*.yaml"):
+        version = path, path.stat().st_mtime_ns
+        if _registered.get(path.stem) != version or path.name not in stored_names:
+            store.store(
+                group="experiment",
+                name=path.stem,
+                node=OmegaConf.load(path),
+                package="_global_",
+                provider="pfbench.experiments",
+            )
+            _registered[path.stem] = version
+
+
+@contextmanager
+def _preserved_hydra_state() -> Iterator[None]:
+    """Clear Hydra's global state for one composition and restore it afterwards."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.hydra_config import HydraConfig
+
+    application, job = GlobalHydra.instance(), HydraConfig.instance()
+    saved = application.hydra, job.cfg
+    application.clear()
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().hydra, HydraConfig.instance().cfg = saved
+
+
+def _find_folder(name: str, marker: str) -> Path:
+    """Return the folder inside or next to the package that contains the marker file."""
+    package = Path(pfbench.__file__).resolve().parent
+    for folder in (package / name, package.parent / name):
+        if (folder / marker).exists():
+            return folder
+    raise FileNotFoundError(
+        f"{name}/{marker} must be inside or next to {package}, got neither. Reinstall pfbench."
+    )

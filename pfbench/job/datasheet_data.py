@@ -1,0 +1,181 @@
+"""Data of a scenario's datasheet: its episodes before any filter, in one file for the report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pfbench.core.record import Episode, iterate_steps
+from pfbench.job.configuration import JobConfig
+from pfbench.job.metadata import describe_state, make_provenance
+from pfbench.job.pcrb_cache import compute_pcrb
+from pfbench.job.plan import DATASHEETS, IGNORED_IN_KEY, apply_global_settings, instantiate_parts
+from pfbench.model.base import StateSpaceModel
+from pfbench.results import store
+from pfbench.scenario.oracle_noise import RecordingRegime
+
+RUNS = 20  # default: spreads to a sixth, in seconds [ours]
+_PARTS = ("scenario", "model", "noise", "seed", "first_run", "runs", "pcrb")
+
+
+def build_datasheet(config: JobConfig, about: str = "") -> Path:
+    """Write the data of a scenario's datasheet, unless the file exists or with `fresh`.
+
+    The arrays are those of a job and of `compute_datasheet`. `error` is the true state minus its
+    mean over runs. `sd`, `nees` and `log_evidence` are NaN.
+
+    Args:
+        config: Resolved configuration, as for a job.
+        about: Description of the scenario, one line.
+
+    Returns:
+        `<results>/datasheets/<key>.npz`.
+
+    Raises:
+        ValueError: If a value of the configuration is invalid.
+    """
+    values, choices = config.values, config.choices
+    parts = {name: values[name] for name in _PARTS}
+    key = store.config_key(parts, IGNORED_IN_KEY)
+    path = Path(values["results_dir"]) / DATASHEETS / f"{key}.npz"
+    if path.exists() and not values["overwrite"]:
+        return path
+    meta, arrays = compute_datasheet(values)
+    names = {group: choices[group] for group in ("scenario", "noise", "model")} | {"filter": "none"}
+    head = {"key": key, "study": DATASHEETS, "label": "datasheet", "choices": names}
+    return store.write_result(path, {**head, "config": parts, "about": about, **meta}, arrays)
+
+
+def compute_datasheet(
+    values: Mapping[str, Any],
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Draw episodes and compute the data of the datasheet.
+
+    Besides the arrays of a job: `seen` [T, Dy], the share of runs in which a component is measured;
+    `residual` [R, T, Dy], see `compute_residuals`; and where they exist `track` [R, T, 3] (m),
+    `force` [T, 3] (m/s^2), `rate` [T, 3] (rad/s), `azimuth` and `elevation` [T, S] (rad), `range`
+    [T] (m) and `bound` [T, d].
+
+    Args:
+        values: Resolved configuration.
+
+    Returns:
+        Metadata and arrays, see `store.Result`.
+
+    Raises:
+        ValueError: If a value of the configuration is invalid.
+    """
+    apply_global_settings(values)
+    model, scenario, noise = instantiate_parts(values, ("model", "scenario", "noise"))
+    runs = torch.arange(values["first_run"], values["first_run"] + values["runs"])
+    start_time, witness = time.perf_counter(), RecordingRegime(noise)
+    with torch.no_grad():
+        episode: Episode = scenario.draw(witness, runs, values["seed"])
+        drawn_time = time.perf_counter()
+        pcrb, pcrb_text = compute_pcrb(values, model, witness, episode, runs)
+        truth = model.assemble(episode.truth)
+        arrays = {
+            "time": episode.time,
+            **_unfiltered_arrays(model, compute_deviations(model, truth)),
+            "residual": compute_residuals(model, truth, episode).float(),
+            "seen": (~torch.isnan(episode.record.y)).double().mean(0).float(),
+            **{name: value.float() for name, value in episode.datasheet.items()},
+        }
+    for name, value in (("track", episode.track), ("bound", pcrb)):
+        if value is not None:
+            arrays[name] = value.float()
+    seconds = {"world": drawn_time - start_time, "measures": time.perf_counter() - drawn_time}
+    meta = _make_metadata(values, model, episode, witness) | {
+        "bound": pcrb_text,
+        "seconds": seconds,
+    }
+    return meta, {name: value.cpu().numpy() for name, value in arrays.items()}
+
+
+def compute_deviations(model: StateSpaceModel, truth: Tensor) -> Tensor:
+    """Compute true states minus their mean over the runs with known truth.
+
+    Args:
+        model: Model of the state.
+        truth: True states, [R, T, D].
+
+    Returns:
+        Deviations, [R, T, d]. NaN where the truth is unknown.
+    """
+    has_truth = ~torch.isnan(truth)
+    first = has_truth.int().argmax(
+        0, keepdim=True
+    )  # a state near the others: differences are small
+    deviation = model.error(truth, truth.gather(0, first).expand_as(truth))
+    return deviation - deviation.nanmean(0)
+
+
+def compute_residuals(model: StateSpaceModel, truth: Tensor, episode: Episode) -> Tensor:
+    """Compute standardised measurement residuals at the true state.
+
+    Args:
+        model: Model with the measurement distribution.
+        truth: True states, [R, T, D].
+        episode: Episode with the measurements.
+
+    Returns:
+        Measurement minus expectation in standard deviations, [R, T, Dy]. NaN where the expectation
+        depends on a state with unknown truth.
+    """
+    record = model.prepare(episode.record)
+    origin = model.origin.expand(len(truth), -1)
+    # unequal shifts, so that sums and differences of states change, too
+    shift = torch.linspace(0.5, 1.5, model.chart.dimension, dtype=truth.dtype)
+    shifted = model.chart.add(origin, shift.expand(len(truth), -1))
+    residuals = []
+    for t, _, step in iterate_steps(model, record):
+        is_unknown = torch.isnan(truth[:, t])
+        states = (torch.where(is_unknown, fill, truth[:, t]) for fill in (origin, shifted))
+        law, other = (model.observation(x.unsqueeze(1), step.u) for x in states)
+        expected = law.mean[:, 0]
+        is_dependent = (other.mean[:, 0] != expected) & is_unknown.any(1, keepdim=True)
+        z = model.residual(step.y, expected) / law.variance[:, 0].sqrt()
+        residuals.append(torch.where(is_dependent, torch.nan, z))
+    return torch.stack(residuals, 1)
+
+
+def _unfiltered_arrays(model: StateSpaceModel, deviation: Tensor) -> dict[str, Tensor]:
+    """Return the required arrays of a result, without a filter."""
+    runs, steps = deviation.shape[:2]
+    return {
+        "error": deviation.float(),
+        "sd": torch.full_like(deviation, torch.nan, dtype=torch.float32),
+        "nees": torch.full((runs, steps, len(model.groups)), torch.nan),
+        "log_evidence": torch.full((runs,), torch.nan),
+        "lost": torch.zeros(runs, dtype=torch.bool),
+    }
+
+
+def _make_metadata(
+    values: Mapping[str, Any], model: StateSpaceModel, episode: Episode, witness: RecordingRegime
+) -> dict[str, Any]:
+    """Collect the metadata of the episodes."""
+    runs, steps, size = episode.record.y.shape
+    channels = witness.channels
+    has_kinds = channels is not None and len(channels.kind) == size
+    satellites = episode.datasheet["elevation"].shape[1] if "elevation" in episode.datasheet else 0
+    receiver = values["scenario"].get("receiver")
+    names = (receiver.get("satellites") if isinstance(receiver, Mapping) else None) or []
+    numbers = [str(i + 1) for i in range(satellites)]
+    return {
+        "seed": values["seed"],
+        "first_run": values["first_run"],
+        "runs": runs,
+        "steps": steps,
+        "kinds": list(channels.kind) if channels and has_kinds else ["measurement"] * size,
+        "satellites": list(names) if len(names) == satellites else numbers,
+        "choices_made": [*model.choices, *episode.notes],
+        "state": describe_state(model),
+        **make_provenance(),
+    }

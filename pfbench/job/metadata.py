@@ -1,0 +1,86 @@
+"""Metadata of a job: all that a report states about how its results were computed."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import pfbench
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.job.plan import JobPlan
+from pfbench.model.base import StateSpaceModel
+
+
+def make_metadata(
+    plan: JobPlan, model: StateSpaceModel, steps: int, notes: Sequence[str]
+) -> dict[str, Any]:
+    """Collect the metadata of a job.
+
+    Args:
+        plan: Plan of the job.
+        model: Model that the filter received.
+        steps: Number of time steps.
+        notes: Modelling choices of the scenario.
+
+    Returns:
+        Values that JSON can represent.
+    """
+    values, method = plan.values, plan.method
+    device = values["device"]
+    is_exact_kalman = model.linear and isinstance(method, GaussianFilter) and method.plain
+    return {
+        "label": plan.config.choices["filter"],
+        "seed": values["seed"],
+        "first_run": values["first_run"],
+        "runs": values["runs"],
+        "particles": values["filter"].get("particles"),
+        "steps": steps,
+        "dtype": values["dtype"],
+        "device": device if device == "cpu" else torch.cuda.get_device_name(device),
+        "threads": values["threads"],
+        "exact": method.is_exact or is_exact_kalman,
+        "told": values["oracle_noise"],
+        "choices_made": [*model.choices, *notes],
+        "state": describe_state(model),
+        **make_provenance(),
+    }
+
+
+def describe_state(model: StateSpaceModel) -> dict[str, Any]:
+    """Return names and units of the state's components, and its groups."""
+    return {
+        "names": list(model.names),
+        "units": list(model.units),
+        "groups": {name: list(components) for name, components in model.groups.items()},
+    }
+
+
+def make_provenance() -> dict[str, Any]:
+    """Return versions, host and time of creation."""
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"versions": read_versions(), "host": platform.node(), "created": created}
+
+
+def read_versions() -> dict[str, str]:
+    """Return the versions that decide the numbers. `commit` is empty outside a checkout."""
+    folder = Path(pfbench.__file__).resolve().parent
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude", "*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=10)
+        commit = done.stdout.strip()
+    except (OSError, subprocess.TimeoutExpired):
+        commit = ""
+    return {
+        "pfbench": pfbench.__version__,
+        "commit": commit,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+    }

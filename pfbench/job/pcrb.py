@@ -1,0 +1,247 @@
+"""Posterior Cramer-Rao bound (PCRB) of the mean square error of any filter.
+
+The recursion uses square roots of covariances and does not invert the process noise covariance,
+which may be singular:
+
+    prediction  P = Q + F (J + C)^-1 F',  C = E[dF' Q^+ dF],  dF = F_run - F,  F = E[F_run]
+    update      J = P^-1 + E[H' R^-1 H]
+
+For a regular Q this is the published recursion, with D11 - D21 ... by the matrix inversion lemma.
+For a singular Q it is its limit, which exists if dF = Q Q^+ dF: the noise reaches all directions in
+which the Jacobians of the runs differ. [ours]
+
+References:
+    P. Tichavsky, C. Muravchik and A. Nehorai (1998), Posterior Cramer-Rao bounds for discrete-time
+    nonlinear filtering.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+from torch.distributions import Independent, MultivariateNormal, Normal
+
+from pfbench.core.covariance import factor
+from pfbench.core.jacobian import jacobian
+from pfbench.core.record import Record, iterate_steps
+from pfbench.model.base import StateSpaceModel, StaticModel, initial_law
+
+_TOLERANCE = 1e-9  # of differences between Jacobians, in predicted standard deviations
+
+
+@torch.no_grad()
+def compute_posterior_bound(
+    model: StateSpaceModel,
+    truth: Tensor,
+    record: Record,
+    initial: Tensor | None = None,
+    run_by_run: bool = False,
+) -> Tensor:
+    """Compute the lower bound on the error covariance of any filter, in the chart at the truth.
+
+    Expectations are means over the runs, with exact Jacobians along their true states. A component
+    that is missing in some runs contributes its mean information. A state-dependent measurement
+    covariance contributes information too. For a linear model each run has its own recursion, and
+    the bound is the mean of the Kalman covariances.
+
+    Args:
+        model: State-space model with the distributions of the scenario. If the scenario has other
+            distributions, use the oracle noise model if it exists.
+        truth: True states, [R, T, D], or [R, T + 1, D] with the initial states first. Without them
+            a nonlinear map is first differentiated at the centre of the initial distribution. A
+            linear model does not use the truth.
+        record: Inputs, and measurements of which only the missing components matter.
+        initial: Covariance of the initial distribution in the chart, [d, d] or [R, d, d]. None for
+            the covariance that filters use (the record's spread, else the model's initial
+            distribution).
+        run_by_run: Use a recursion for each run and average the covariances. Required if the
+            Jacobians differ between runs in directions that the noise does not reach. Exact for a
+            model that is linear in the state with inputs that differ between runs. Otherwise the
+            bound of a known trajectory (Taylor 1979), which may lie slightly above the PCRB.
+
+    Returns:
+        Lower bound of the error covariance at each step, [T, d, d].
+
+    Raises:
+        ValueError: If a distribution is not normal, the process noise is not additive, the truth is
+            unknown or has another shape, the initial covariance is not positive definite, or the
+            Jacobians do not have a common bound.
+    """
+    converted = record.to(model.anchor)
+    runs = len(record.y)
+    x = _states(model, truth.to(model.anchor), converted)
+    separate = model.linear or run_by_run
+    root = _initial_root(_initial_covariance(model, converted, initial), runs, separate)
+    record = model.prepare(record).to(model.anchor)
+    bounds = []
+    for t, step_model, step in iterate_steps(model, record):
+        if not isinstance(step_model, StaticModel):
+            root = _predict(model, root, x[:, t], step.u)
+        root = _add_information(root, _pool(_information_rows(model, x[:, t + 1], step), separate))
+        bounds.append((root @ root.mT).mean(0))
+    return torch.stack(bounds)
+
+
+def _states(model: StateSpaceModel, truth: Tensor, record: Record) -> Tensor:
+    """Return the true states [R, T + 1, D], with the initial states first."""
+    runs, steps = record.y.shape[:2]
+    start = model.origin.expand(runs, -1) if record.start is None else record.start
+    if (
+        truth.dim() != 3
+        or truth.shape[1] not in (steps, steps + 1)
+        or truth[:, 0].shape != start.shape
+    ):
+        raise ValueError(
+            f"truth must have shape {[runs, steps, model.chart.size]} for this record and "
+            f"{type(model).__name__}, or one more step with the initial states first, got "
+            f"{list(truth.shape)}. Give the true states of the record."
+        )
+    if model.linear:
+        return start[:, None].expand(-1, steps + 1, -1)
+    if bool(torch.isnan(truth).any()):
+        raise ValueError(
+            f"truth must be known at all steps for {type(model).__name__}, a nonlinear model, got "
+            "NaN. Leave the steps without truth out."
+        )
+    return truth if truth.shape[1] > steps else torch.cat([start.unsqueeze(1), truth], 1)
+
+
+def _initial_covariance(model: StateSpaceModel, record: Record, initial: Tensor | None) -> Tensor:
+    """Return the initial covariance."""
+    if initial is not None:
+        return initial.to(model.anchor)
+    law: Any = initial_law(model, record.y.shape[0], record.spread)
+    if isinstance(law, MultivariateNormal):
+        return law.covariance_matrix
+    if isinstance(law, Independent) and isinstance(law.base_dist, Normal):
+        return torch.diag_embed(law.variance)
+    raise ValueError(
+        f"{type(model).__name__}.initial must be a normal distribution, got "
+        f"{type(law).__name__}. Give an initial covariance."
+    )
+
+
+def _initial_root(covariance: Tensor, runs: int, separate: bool) -> Tensor:
+    """Return the root of the inverse mean information of the runs, [R or 1, d, d]."""
+    root, valid = factor(covariance)
+    if not bool((valid & (root.diagonal(dim1=-2, dim2=-1) > 0.0).all(-1)).all()):
+        raise ValueError(
+            "initial must be positive definite, got a covariance without square root. Give another."
+        )
+    if root.dim() == 2 or separate:
+        return root.expand(runs if separate else 1, -1, -1)
+    eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device).expand_as(root)
+    scale = root[:1].diagonal(dim1=-2, dim2=-1)  # removes the units of the states
+    rows = torch.linalg.solve_triangular(root, eye, upper=False) * scale.unsqueeze(-2)
+    triangle = torch.linalg.qr(_pool(rows, False), mode="r")[1]
+    return scale.unsqueeze(-1) * torch.linalg.solve_triangular(triangle, eye[:1], upper=True)
+
+
+def _predict(model: StateSpaceModel, root: Tensor, x: Tensor, u: Any) -> Tensor:
+    """Return the root of the predicted bound [G, d, d] of G groups of runs, at states [R, D]."""
+    chart, law = model.chart, cast(Any, model.noise)
+    gain = model.noise_gain(u)
+    if gain is None or not isinstance(law.base_dist, Normal):
+        raise ValueError(
+            f"{type(model).__name__}: process noise must be additive and normal, got another. "
+            "The bound does not support this model."
+        )
+    gain = gain * law.stddev
+
+    def propagate(d: Tensor) -> Tensor:
+        return model.propagate(chart.add(x.unsqueeze(1), d), u, law.mean.expand(*d.shape[:2], -1))
+
+    f = _jacobian(propagate, x, chart.dimension, chart.subtract)
+    mean, noise = (
+        (f, gain) if len(root) == len(f) else (f.mean(0, keepdim=True), gain.mean(0, keepdim=True))
+    )
+    predicted = _root_of(torch.cat([mean @ root, noise.expand(len(root), -1, -1)], -1))
+    if len(root) == len(f):
+        return predicted
+    sd = predicted.norm(dim=-1, keepdim=True)
+    deviation = (f - mean) @ root / sd  # [R, d, d] in predicted standard deviations
+    inverse = torch.linalg.pinv(noise / sd)
+    unreached = deviation - (noise / sd) @ (inverse @ deviation)
+    if bool((unreached.abs() > _TOLERANCE).any()) or bool(
+        (((gain - noise) / sd).abs() > _TOLERANCE).any()
+    ):
+        raise ValueError(
+            f"{type(model).__name__}: Jacobians must differ between runs only where the noise "
+            "reaches, got other differences. Set run_by_run=True."
+        )
+    if bool((deviation.abs() > _TOLERANCE).any()):
+        root = _add_information(root, _pool(inverse @ ((f - mean) / sd), False))
+        predicted = _root_of(torch.cat([mean @ root, noise], -1))
+    return predicted
+
+
+def _information_rows(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+    """Return rows A [R, k, d] with A' A the information of each run's measurement."""
+    chart, residual = model.chart, model.residual
+
+    def at(d: Tensor) -> Any:
+        return model.observation(chart.add(x.unsqueeze(1), d), record.u)
+
+    observed = ~torch.isnan(record.y)
+    h = _jacobian(lambda d: at(d).mean, x, chart.dimension, residual)
+    h = torch.where(observed.unsqueeze(-1), h, 0.0)
+    law = at(x.new_zeros(len(x), 1, chart.dimension))
+    if isinstance(law, Independent) and isinstance(law.base_dist, Normal):
+        change = _jacobian(lambda d: at(d).base_dist.scale, x, chart.dimension, torch.sub)
+        change = torch.where(observed.unsqueeze(-1), change, 0.0)
+        return torch.cat([h, 2.0**0.5 * change], -2) / torch.cat([law.base_dist.scale] * 2, -1).mT
+    if isinstance(law, MultivariateNormal):
+        change = _jacobian(
+            lambda d: at(d).covariance_matrix.flatten(-2), x, chart.dimension, torch.sub
+        )
+        return _dense_information_rows(h, law.covariance_matrix[:, 0], change, observed)
+    raise ValueError(
+        f"{type(model).__name__}: measurement distribution must be normal, got "
+        f"{type(law).__name__} (heavy tails, a mixture). The bound does not support this model."
+    )
+
+
+def _dense_information_rows(
+    h: Tensor, covariance: Tensor, change: Tensor, observed: Tensor
+) -> Tensor:
+    """Return the information rows of a correlated distribution, from its Jacobians."""
+    both = observed.unsqueeze(-1) & observed.unsqueeze(-2)
+    eye = torch.eye(observed.shape[-1], dtype=h.dtype, device=h.device)
+    root = torch.linalg.cholesky(torch.where(both, covariance, eye))
+    white = torch.linalg.solve_triangular(root, h, upper=False)
+    whitened = torch.where(
+        both.unsqueeze(1), change.mT.unflatten(-1, eye.shape), 0.0
+    )  # [R, d, k, k]
+    for _ in range(2):  # L^-1 dR L^-T; half its square summed is 1/2 tr(R^-1 dR R^-1 dR)
+        whitened = torch.linalg.solve_triangular(root.unsqueeze(1), whitened, upper=False).mT
+    return torch.cat([white, whitened.flatten(-2).mT / 2.0**0.5], -2)
+
+
+def _jacobian(
+    f: Callable[[Tensor], Tensor],
+    template: Tensor,
+    d: int,
+    subtract: Callable[[Tensor, Tensor], Tensor],
+) -> Tensor:
+    """Return the Jacobian [R, k, d] at 0 of a map of differences [R, P, d]."""
+    return jacobian(f, f(template.new_zeros(len(template), 1, d)), d, subtract)
+
+
+def _pool(rows: Tensor, separate: bool) -> Tensor:
+    """Return the rows [R, k, d] unchanged, or pooled with the weight of a mean, [1, R k, d]."""
+    return rows if separate else rows.flatten(0, 1).unsqueeze(0) / len(rows) ** 0.5
+
+
+def _add_information(root: Tensor, rows: Tensor) -> Tensor:
+    """Return the root of (P^-1 + A' A)^-1 from the root of P [G, d, d] and rows A [G, k, d]."""
+    eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device).expand_as(root)
+    triangle = torch.linalg.qr(torch.cat([rows @ root, eye], -2), mode="r")[1]
+    return torch.linalg.solve_triangular(triangle, root, upper=True, left=False)
+
+
+def _root_of(wide: Tensor) -> Tensor:
+    """Return the square root A [G, d, d] with A A' = B B' of a wide matrix B [G, d, k]."""
+    return torch.linalg.qr(wide.mT, mode="r")[1].mT

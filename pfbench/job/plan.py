@@ -1,0 +1,236 @@
+"""Plan of a job: a checked configuration and the objects that it describes, each built once."""
+
+from __future__ import annotations
+
+import copy
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from pfbench.core.record import Episode
+from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
+from pfbench.filter.loop import choose_run_batch
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.job.configuration import JobConfig
+from pfbench.kernels import cpp
+from pfbench.model.base import StateSpaceModel
+from pfbench.results import store
+from pfbench.scenario.base import Scenario
+from pfbench.scenario.oracle_noise import RecordingRegime
+
+DATASHEETS = "datasheets"  # folder of the results that holds the scenarios' datasheets
+
+# paths of the configuration that decide where and how fast a job runs, not what it computes
+IGNORED_IN_KEY = (
+    "results_dir",
+    "reports_dir",
+    "episode_cache_dir",
+    "data",
+    "study",
+    "threads",
+    "engine",
+    "memory_limit_gib",
+    "overwrite",
+    "report",
+    "scenario.root",
+    "scenario.cache_dir",
+    "particles",  # part of the key where a filter uses it, as filter.particles
+    "pcrb",  # does not change the filter's results; overwrite=true adds it to a finished job
+    "runs_in",  # an experiment's table from which `runs` is taken
+    "train",
+    "checkpoint",  # the filter's weights are part of the key, by a hash of their content
+)
+# settings of a comparison that are part of the key only if they differ from the default
+DEFAULTS_NOT_IN_KEY: Mapping[str, Any] = {"budget": store.SAME_N}
+
+
+@dataclass(frozen=True, eq=False)
+class JobPlan:
+    """Objects of a job. Budget and memory are applied to them, never to the configuration.
+
+    Attributes:
+        config: Resolved configuration.
+        model: Model of the filter, on the CPU in double precision.
+        scenario: Source of episodes.
+        witness: Noise regime that records the measurement channels of the scenario.
+        method: Filter.
+        runs: Numbers of the Monte Carlo runs, [R].
+    """
+
+    config: JobConfig
+    model: StateSpaceModel
+    scenario: Scenario
+    witness: RecordingRegime
+    method: Any
+    runs: Tensor
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Values of the configuration."""
+        return self.config.values
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the filter."""
+        dtype: torch.dtype = getattr(torch, self.values["dtype"])
+        return dtype
+
+    def draw_episode(self, runs: Tensor) -> Episode:
+        """Draw the episode of some runs. Each run depends on its number and the seed only.
+
+        Args:
+            runs: Numbers of the runs, [R].
+
+        Returns:
+            Their measurements, inputs and truth.
+        """
+        return self.scenario.draw(self.witness, runs, self.values["seed"])
+
+    def make_filter_model(self, episode: Episode) -> StateSpaceModel:
+        """Copy the model to the device and precision of the job.
+
+        Args:
+            episode: Episode of the job, with whose noise regime an oracle model agrees.
+
+        Returns:
+            The model that the filter receives.
+        """
+        model = copy.deepcopy(self.model)
+        if self.values["oracle_noise"]:
+            model = self.witness.to_oracle_model(model, episode.time)
+        return model.to(self.values["device"], self.dtype)
+
+    def choose_run_batch(self, method: Any, runs: int) -> int:
+        """Choose how many runs are stepped together. On a GPU all runs are.
+
+        Args:
+            method: Filter.
+            runs: Number of runs.
+        """
+        if self.values["device"] != "cpu" or not isinstance(method, ParticleFilter):
+            return runs
+        return choose_run_batch(runs, method.particles, self.model.chart.size)
+
+    def choose_timer(self) -> Callable[[], float]:
+        """Choose processor time for one CPU thread, which other programs do not affect.
+
+        Processor time adds up over threads, so wall time is used otherwise.
+        """
+        is_single = self.values["device"] == "cpu" and self.values["threads"] == 1
+        return time.process_time if is_single else time.perf_counter
+
+
+def build_plan(config: JobConfig) -> JobPlan:
+    """Check a configuration, apply its global settings and build its objects once.
+
+    Args:
+        config: Resolved configuration.
+
+    Returns:
+        The plan. Nothing is drawn yet.
+
+    Raises:
+        ValueError: If a value of the configuration is invalid.
+    """
+    values = config.values
+    apply_global_settings(values)
+    # The model first: a scenario may contain it, and an error then names the key of the model.
+    model, scenario, noise, method = instantiate_parts(
+        values, ("model", "scenario", "noise", "filter")
+    )
+    runs = torch.arange(values["first_run"], values["first_run"] + values["runs"])
+    return JobPlan(config, model, scenario, RecordingRegime(noise), method, runs)
+
+
+def job_key(values: Mapping[str, Any]) -> str:
+    """Compute the key of a job from what it computes and from settings that are not default."""
+    values = {**values, "filter": replace_checkpoint_by_hash(values.get("filter"))}
+    defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
+    return store.config_key(values, (*IGNORED_IN_KEY, *defaults))
+
+
+def instantiate(node: Any) -> Any:
+    """Build the object that a node names by `_target_`. Lists and dicts become plain ones."""
+    return hydra.utils.instantiate(node, _convert_="all")
+
+
+def instantiate_parts(values: Mapping[str, Any], names: Sequence[str]) -> tuple[Any, ...]:
+    """Build several parts of a configuration.
+
+    Args:
+        values: Resolved configuration. Errors name the full key of a part in it.
+        names: Top-level keys of the parts, in the order of their construction.
+
+    Returns:
+        The objects.
+    """
+    tree = OmegaConf.create({name: values[name] for name in names})
+    return tuple(instantiate(tree[name]) for name in names)
+
+
+def check_settings(values: Mapping[str, Any]) -> None:
+    """Check the settings of a job that do not belong to one of its objects.
+
+    Args:
+        values: Configuration.
+
+    Raises:
+        ValueError: If a value is invalid. The message names key, requirement and value.
+    """
+    requirements = {
+        **{key: f"a whole number of at least {least}" for key, least in _INTEGERS.items()},
+        "oracle_noise": "true (the filter receives the true noise regime) or false",
+        "pcrb": "auto (where the model's distributions are the simulated ones), true or false",
+        "memory_limit_gib": "the GiB that the job may use, or null for most of the free memory",
+        "dtype": "float64 (default) or float32",
+        "budget": f"one of {', '.join(store.BUDGETS)}",
+        "engine": "auto, eager, kernels or compiled",
+        "device": "cpu, cuda, or one of several GPUs such as cuda:1",
+    }
+    valid = {
+        **{key: type(values[key]) is int and values[key] >= _INTEGERS[key] for key in _INTEGERS},
+        "oracle_noise": type(values["oracle_noise"]) is bool,
+        "pcrb": values["pcrb"] in (True, False, "auto"),
+        "memory_limit_gib": _is_memory_limit(values["memory_limit_gib"]),
+        "dtype": values["dtype"] in ("float32", "float64"),
+        "budget": values["budget"] in store.BUDGETS,
+        "engine": values["engine"] in ("auto", "eager", "kernels", "compiled"),
+        "device": re.fullmatch(r"cpu|cuda(:\d+)?", str(values["device"])) is not None,
+    }
+    for key, requirement in requirements.items():
+        if not valid[key]:
+            raise ValueError(f"{key} must be {requirement}, got {values[key]}.")
+    device, count = values["device"], torch.cuda.device_count()
+    if device != "cpu" and (torch.device(device).index or 0) >= count:
+        raise ValueError(
+            f"device must be cpu or one of {count} CUDA devices, got {device}. Use device=cpu."
+        )
+
+
+def apply_global_settings(values: Mapping[str, Any]) -> None:
+    """Check the settings of a job and set the process-wide ones: threads and memory allocator.
+
+    Args:
+        values: Configuration.
+
+    Raises:
+        ValueError: If a value is invalid.
+    """
+    check_settings(values)
+    torch.set_num_threads(values["threads"])
+    cpp.keep_freed_memory()
+
+
+_INTEGERS = {"runs": 1, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}  # with minimum
+
+
+def _is_memory_limit(value: Any) -> bool:
+    """Return whether a value is a memory limit: a positive number, or None."""
+    return value is None or (isinstance(value, int | float) and value > 0)

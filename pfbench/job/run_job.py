@@ -1,0 +1,237 @@
+"""Run of a job: one filter in one condition with all its Monte Carlo runs, from plan to file."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from pfbench.core.record import Episode
+from pfbench.filter.learned.checkpoint import checkpoint_provenance
+from pfbench.job.allocation import EpisodeSource, apply_budget, max_runs_in_memory
+from pfbench.job.configuration import CHOICES, JobConfig, resolve_config
+from pfbench.job.filter_pass import TimedFilterPass, pass_filter
+from pfbench.job.metadata import make_metadata
+from pfbench.job.pcrb_cache import compute_pcrb
+from pfbench.job.plan import DATASHEETS, JobPlan, build_plan, job_key
+from pfbench.results import store
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+log = logging.getLogger("pfbench")
+
+_SHARED = ("time", "bound", "range", "scored")  # arrays without an axis of runs
+_RESERVED = (DATASHEETS, "claims")  # folders of reports that are not studies
+
+
+class JobOutcome(NamedTuple):
+    """Outcome of a job.
+
+    Attributes:
+        path: Result file, see `store.load`.
+        status: `finished`, or `skipped` because the file exists.
+        rmse: Root mean square error of the main group (position if there is one) over all valid
+            runs, in its unit.
+    """
+
+    path: Path
+    status: str
+    rmse: float
+
+
+def run(
+    config: JobConfig | DictConfig | Mapping[str, Any],
+    choices: Mapping[str, str] | None = None,
+    counter: str = "",
+) -> JobOutcome:
+    """Run one job and write its result file, unless the file exists.
+
+    Args:
+        config: Configuration, for instance `job.compose(["scenario=flight_300s", "filter=sir"])`.
+        choices: Names of scenario, noise, filter and model, if `config` does not contain them.
+        counter: Start of the log line, for instance `"[3/40] "`.
+
+    Returns:
+        The outcome.
+
+    Raises:
+        ValueError: If a value of the configuration is invalid.
+        Exception: If the job fails. `<key>.failed.json` beside the results holds the traceback.
+    """
+    config = resolve_config(config, choices)
+    values = config.values
+    path = _result_path(values)
+    named = {group: config.choices[group] for group in CHOICES}
+    name = " / ".join(named[group] for group in ("scenario", "noise", "filter"))
+    if path.exists() and not values["overwrite"]:
+        outcome = JobOutcome(
+            path, "skipped", _main_rmse(store.read_result(path).arrays, store.read_metadata(path))
+        )
+        repeat = "(overwrite=true to repeat)"
+        log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
+        return outcome
+    try:
+        meta, arrays = compute_job(config, name)
+    except Exception as error:
+        note = store.write_failure(path, named, error)
+        kept = f"traceback: {note}" if note else f"previous result kept: {path}"
+        log.error("%sfailed    %s   %s: %s   %s", counter, name, type(error).__name__, error, kept)
+        raise
+    head = {"key": path.stem, "study": values["study"], "choices": named, "config": values}
+    store.write_result(path, {**head, **meta}, arrays)
+    outcome = JobOutcome(path, "finished", _main_rmse(arrays, meta))
+    seconds = meta["seconds"]
+    log.info(
+        "%sfinished  t=%.1f s  %s   %s   lost %d/%d   %.3g ms/step",
+        counter,
+        seconds["world"] + seconds["filter"],
+        name,
+        _format_rmse(outcome.rmse, meta),
+        int(arrays["lost"].sum()),
+        meta["runs"],
+        1e3 * seconds["per_step"],
+    )
+    return outcome
+
+
+def compute_job(config: JobConfig, label: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Compute a job without writing it.
+
+    The configuration is instantiated once and the episode drawn once. Only if all runs do not fit
+    into memory, they are computed in batches, with the same numbers.
+
+    Args:
+        config: Resolved configuration.
+        label: Title of the progress bar.
+
+    Returns:
+        Metadata and arrays, see `store.Result`.
+
+    Raises:
+        ValueError: If a value is invalid, if a single run does not fit into memory, or if runs that
+            are drawn in batches have different durations.
+    """
+    plan = build_plan(config)
+    values, total = config.values, len(plan.runs)
+    trained = checkpoint_provenance(
+        values["filter"], config.choices["scenario"], values["seed"], plan.runs
+    )
+    episodes = EpisodeSource(plan)
+    plan, allocation = apply_budget(plan, episodes)
+    size = max_runs_in_memory(plan, episodes)
+    pcrb = _timed_pcrb(plan, episodes.joint, plan.runs) if episodes.joint else None
+    metas, parts = [], []
+    for first in range(0, total, size):
+        runs, episode = plan.runs[first : first + size], episodes.batch(first, size)
+        batch_pcrb = pcrb or _timed_pcrb(plan, episode, runs)
+        title = label if size == total else f"{label}, runs from {int(runs[0])}"
+        result = pass_filter(plan, episode, runs, title)
+        metas.append(_batch_metadata(plan, episode, result, batch_pcrb))
+        parts.append(result.arrays(episode, batch_pcrb[0]))
+    meta, arrays = _join_batches(metas, parts, total)
+    if pcrb:  # the batches share it
+        arrays |= {"bound": parts[0]["bound"]} if "bound" in arrays else {}
+        meta["seconds"]["bound"] = pcrb[2]
+    meta["seconds"] = {"world": episodes.seconds, **meta["seconds"]}
+    if allocation:
+        meta["particles"] = allocation.particles
+    bought = allocation._asdict() if allocation else None
+    return {**meta, "bought": bought, "trained": trained}, arrays
+
+
+def _result_path(values: Mapping[str, Any]) -> Path:
+    """Return the file of a job."""
+    study = values["study"]
+    if not re.fullmatch(r"\w[\w.-]*", str(study)):
+        raise ValueError(
+            "study must be the name of a results folder (letters, digits, points, dashes and "
+            f"underscores), got {study}."
+        )
+    if study in _RESERVED:
+        raise ValueError(
+            f"study must not be {' or '.join(_RESERVED)}, got {study}. These folders hold other "
+            "reports. Choose another name."
+        )
+    return Path(values["results_dir"]) / study / f"{job_key(values)}.npz"
+
+
+def _timed_pcrb(plan: JobPlan, episode: Episode, runs: Tensor) -> tuple[Tensor | None, str, float]:
+    """Compute the bound, its description and the seconds."""
+    start_time = time.perf_counter()
+    sd, text = compute_pcrb(plan.values, plan.model, plan.witness, episode, runs)
+    return sd, text, time.perf_counter() - start_time
+
+
+def _batch_metadata(
+    plan: JobPlan, episode: Episode, result: TimedFilterPass, pcrb: tuple[Tensor | None, str, float]
+) -> dict[str, Any]:
+    """Collect the metadata of a batch."""
+    runs, steps = episode.record.y.shape[:2]
+    meta = make_metadata(plan, result.model, steps, episode.notes) | result.cost
+    if (number := result.estimate.trace.get("particles")) is not None:
+        extremes = {"least": int(number.min()), "most": int(number.max())}
+        meta["particles_used"] = extremes | {"mean": float(number.mean())}
+    return {**meta, "runs": runs, "bound": pcrb[1], "seconds": {"bound": pcrb[2], **result.seconds}}
+
+
+def _join_batches(
+    metas: Sequence[dict[str, Any]], parts: Sequence[dict[str, np.ndarray]], total: int
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Join the batches of a job. A PCRB of the batches becomes its root mean square."""
+    if len(parts) == 1:
+        return metas[0], parts[0]
+    if any(part["time"].shape != parts[0]["time"].shape for part in parts):
+        size = metas[0]["runs"]
+        raise ValueError(
+            "memory must be enough for all runs together, since they have different durations, got "
+            f"enough for {size} runs. Split the job (runs={size}, first_run=...)."
+        )
+    arrays = {
+        name: first if name in _SHARED else np.concatenate([part[name] for part in parts])
+        for name, first in parts[0].items()
+    }
+    weights = np.array([meta["runs"] for meta in metas]) / total
+    if "bound" in arrays:
+        variances = (part["bound"].astype(float) ** 2 for part in parts)
+        mean = sum(weight * v for weight, v in zip(weights, variances, strict=True))
+        arrays["bound"] = np.sqrt(mean).astype(np.float32)
+    memory = [meta["memory"] for meta in metas]
+    times = [meta["seconds"] for meta in metas]
+    meta = {
+        **metas[0],
+        "runs": total,
+        "parts": len(parts),
+        "seconds": {name: sum(batch[name] for batch in times) for name in times[0]},
+        "memory": None if None in memory else max(memory),
+        "likelihoods_per_step": float(weights @ [meta["likelihoods_per_step"] for meta in metas]),
+    }
+    return meta, arrays
+
+
+def _main_group(meta: Mapping[str, Any]) -> str:
+    """Return the group of the headline: position if there is one, else the first."""
+    groups = meta["state"]["groups"]
+    return "position" if "position" in groups else next(iter(groups))
+
+
+def _main_rmse(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> float:
+    """Compute the root mean square of the error norm of the main group over all valid runs."""
+    components = meta["state"]["groups"][_main_group(meta)]
+    errors = arrays["error"][..., components].astype(float)
+    square = (errors**2).sum(-1)[~arrays["lost"]]
+    return math.sqrt(np.nanmean(square)) if np.isfinite(square).any() else math.inf
+
+
+def _format_rmse(rmse: float, meta: Mapping[str, Any]) -> str:
+    """Format the headline error with its unit, if the components share one."""
+    group = _main_group(meta)
+    units = {meta["state"]["units"][i] for i in meta["state"]["groups"][group]}
+    return f"{group} RMSE {rmse:.4g} {units.pop() if len(units) == 1 else ''}".rstrip()

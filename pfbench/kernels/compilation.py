@@ -1,0 +1,154 @@
+"""Compilation of inner loops into one pass over the particles.
+
+A compilable function takes tensors, the first argument among them, and integers. It returns
+tensors. In eager mode each of its operations is a pass over all particles. Compilation takes some
+seconds, so it is used on request:
+
+    with compilation.use_compiled():
+        run_filter(...)
+
+In a compiled step (`pfbench.filter.particle.compiled_filter`) the hand-written kernels stay whole as operators.
+torch's compiler would compute the noise again for each state component.
+"""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache, wraps
+from typing import Any, TypeVar, cast
+
+import torch
+from torch.autograd import forward_ad
+from torch.utils import _pytree as pytree
+
+from pfbench.kernels import cuda
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+log = logging.getLogger("pfbench")
+_failed: set[Callable[..., Any]] = set()  # kernels that did not compile
+
+_fused: ContextVar[bool] = ContextVar("fused", default=False)
+_graph: ContextVar[bool] = ContextVar("graph", default=False)
+
+
+@contextmanager
+def use_compiled(enabled: bool = True) -> Iterator[None]:
+    """Run compilable functions compiled in this context, or eagerly if `enabled` is False."""
+    token = _fused.set(enabled)
+    try:
+        yield
+    finally:
+        _fused.reset(token)
+
+
+@contextmanager
+def capture_graph() -> Iterator[None]:
+    """Mark that a step is recorded in this context: code must not branch on numbers."""
+    token = _graph.set(True)
+    try:
+        yield
+    finally:
+        _graph.reset(token)
+
+
+def is_capturing() -> bool:
+    """Return whether a step is recorded."""
+    return _graph.get()
+
+
+def _plain(args: tuple[Any, ...]) -> bool:
+    """Return whether no argument requires a gradient."""
+    tensors = [a for a in args if isinstance(a, torch.Tensor)]
+    return not any(
+        (a.requires_grad and torch.is_grad_enabled())
+        or forward_ad.unpack_dual(a).tangent is not None
+        for a in tensors
+    )
+
+
+def _on_cuda(args: tuple[Any, ...]) -> bool:
+    """Return whether an argument is on a CUDA device."""
+    return cuda.is_cuda_available() and any(isinstance(a, torch.Tensor) and a.is_cuda for a in args)
+
+
+def compilable(
+    function: F,
+    eager: F | None = None,
+    operator: F | None = None,
+    keep_in_graph: bool | Callable[..., bool] = True,
+    use_torch_compiler: bool = True,
+) -> F:
+    """Make a function of tensors compilable.
+
+    Args:
+        function: Function to compile.
+        eager: Function for eager mode, if separate operations have a faster method.
+        operator: Hand-written kernel. It replaces the compiled function on the CPU with one thread,
+            and on a CUDA device if a kernel of its name exists. It is not used with gradients.
+        keep_in_graph: Whether (or for which tensors) a compiled step on the CPU uses the kernel as one
+            operator. False if torch's compiler does it as well.
+        use_torch_compiler: Whether torch's compiler is used without a kernel. Linear algebra does not gain.
+
+    Returns:
+        The compilable function.
+    """
+    run_eagerly = eager or function
+    in_graph = operator if operator is not None and keep_in_graph else None
+    if in_graph is not None:
+        _register_shapes(in_graph, function)
+    fits_graph = keep_in_graph if callable(keep_in_graph) else lambda *_: True
+
+    @cache
+    def compiled() -> Callable[..., Any]:
+        return torch.compile(function, dynamic=True)
+
+    def kernel(args: tuple[Any, ...]) -> Callable[..., Any] | None:
+        return (
+            cuda.find_kernel(operator.__name__, args)
+            if operator is not None and _plain(args)
+            else None
+        )
+
+    def run_compiled(*args: Any) -> Any:
+        if _on_cuda(args):
+            return (kernel(args) or (compiled() if use_torch_compiler else run_eagerly))(*args)
+        if (
+            operator is not None
+            and operator not in _failed
+            and torch.get_num_threads() == 1
+            and _plain(args)
+        ):
+            try:
+                return operator(*args)
+            except (OSError, subprocess.CalledProcessError) as error:
+                fallback = "torch's compiler" if use_torch_compiler else "eager mode"
+                log.warning(
+                    "%s does not compile here (%s). Using %s",
+                    operator.__name__, type(error).__name__, fallback,
+                )  # fmt: skip
+                _failed.add(operator)
+        return (compiled() if use_torch_compiler else run_eagerly)(*args)
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        if _graph.get():
+            if _on_cuda(args):
+                return (kernel(args) or function)(*args)
+            return (function if in_graph is None or not fits_graph(*args) else in_graph)(*args)
+        return (run_compiled if _fused.get() else run_eagerly)(*args)
+
+    return cast(F, call)
+
+
+def _register_shapes(operator: Callable[..., Any], template: Callable[..., Any]) -> None:
+    """Register an operator's results for torch's compiler: contiguous, shapes as the template's."""
+
+    def shapes(*args: Any) -> Any:
+        return pytree.tree_map(lambda a: a.new_empty(a.shape), template(*args))
+
+    torch.library.register_fake(f"pfbench::{operator.__name__}", shapes)

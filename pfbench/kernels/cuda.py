@@ -1,0 +1,312 @@
+"""Kernels of particles.cu: operators of `pfbench.kernels.cpp` on a CUDA device, compiled by torch's NVRTC.
+
+If they do not compile, a warning is logged and torch's own compiler is used. The file has one
+function per operator, which makes it long.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+log = logging.getLogger("pfbench")
+_SOURCE = Path(__file__).parent / "src" / "particles.cu"
+_REAL = {torch.float32: "float", torch.float64: "double"}
+_ROWS = 65535  # blocks along the second axis of a grid
+_SHARED = 48 * 1024  # bytes of shared memory of a block without a special attribute
+_STATES = {
+    torch.float32: 32,
+    torch.float64: 20,
+}  # components whose sums fit the registers of a thread
+_BLOCK = 512
+
+
+@cache
+def is_cuda_available() -> bool:
+    """Return whether a CUDA device is available."""
+    return torch.cuda.is_available() and torch.version.hip is None
+
+
+@cache
+def _compiles() -> bool:
+    """Return whether torch compiles CUDA C++ here, which needs headers of a CUDA toolkit."""
+    try:
+        _kernel("uniforms", torch.cuda.current_device())
+    except Exception as error:  # torch raises many kinds
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        log.warning("CUDA kernels do not compile here (%s). Using torch's compiler", reason)
+        return False
+    return True
+
+
+def find_kernel(name: str, args: tuple[Any, ...]) -> Callable[..., Any] | None:
+    """Return the operator of this name on a CUDA device; None if it does not take these arguments.
+
+    Args:
+        name: Name of the operator.
+        args: Its arguments.
+
+    Returns:
+        The operator, or None.
+    """
+    accepts = _ACCEPTS.get(name)
+    if accepts is None or not _compiles() or not accepts(*args):
+        return None
+    return cast(Callable[..., Any], getattr(torch.ops.pfbench, name).default)
+
+
+def _draw(
+    seed: Tensor,
+    purpose: int,
+    step: Tensor,
+    runs: Tensor,
+    components: int,
+    quarters: int,
+    dtype: torch.dtype,
+) -> Tensor:
+    out = runs.new_empty(components, len(runs), 4 * quarters, dtype=dtype)
+    name = "normals" if dtype == torch.float32 else "uniforms"
+    threads = min(256, 32 * -(-quarters // 32))
+    grid = -(-quarters // threads), min(_ROWS, components * len(runs)), 1
+    _launch(
+        name,
+        grid,
+        threads,
+        out,
+        runs,
+        int(seed),
+        purpose,
+        int(step),
+        components,
+        len(runs),
+        quarters,
+    )
+    return out
+
+
+def _affine(
+    phi: Tensor, x: Tensor, gain: Tensor, m: int, ancestors: Tensor | None = None, key: Any = (0, 0, 0, None),
+    noise: Tensor | None = None,
+) -> Tensor:  # fmt: skip
+    (d, runs, n), width = x.shape, gain.shape[-1]
+    phi, gain = phi.to(x.dtype).contiguous(), gain.to(x.dtype).contiguous()
+    out, (seed, purpose, step, numbers) = x.new_empty(d, runs, m), key
+    words = [
+        _REAL[x.dtype],
+        d,
+        width,
+        *("true" if flag else "false" for flag in (ancestors is not None, noise is None)),
+    ]
+    # An unused pointer may be any valid address.
+    parent = x if ancestors is None else ancestors
+    w, numbers = x if noise is None else noise, x if numbers is None else numbers
+    per_run = (len(phi) > 1) + 2 * (len(gain) > 1)
+    grid = -(-m // 512), min(_ROWS, runs), 1
+    name = f"affine<{', '.join(map(str, words))}>"
+    _launch(
+        name,
+        grid,
+        128,
+        out,
+        x,
+        parent,
+        w,
+        phi,
+        gain,
+        per_run,
+        numbers,
+        seed,
+        purpose,
+        step,
+        runs,
+        n,
+        m,
+    )
+    return out
+
+
+class CudaKernels:
+    """Operators on a CUDA device, with the names and arguments of `pfbench.kernels.cpp`."""
+
+    @staticmethod
+    def philox_normals(
+        seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
+    ) -> Tensor:
+        """Draw standard normal numbers of blocks."""
+        return _draw(seed, purpose, step, runs, components, quarters, torch.float32)
+
+    @staticmethod
+    def philox_uniforms(
+        seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
+    ) -> Tensor:
+        """Draw uniform numbers of blocks."""
+        return _draw(seed, purpose, step, runs, components, quarters, torch.float64)
+
+    @staticmethod
+    def gather_particles(x: Tensor, ancestors: Tensor) -> Tensor:
+        """Gather particles by their ancestors."""
+        (d, runs, n), m = x.shape, ancestors.shape[1]
+        out = x.new_empty(d, runs, m)
+        grid = -(-m // 256), min(_ROWS, runs), 1
+        _launch(
+            f"copied<{_REAL[x.dtype]}>",
+            grid,
+            256,
+            out,
+            x.contiguous(),
+            ancestors.contiguous(),
+            d,
+            runs,
+            n,
+            m,
+        )
+        return out
+
+    @staticmethod
+    def propagate_affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
+        """Compute phi x + gain w."""
+        stored = x.permute(2, 0, 1).contiguous()
+        return _affine(
+            phi, stored, gain, stored.shape[2], noise=w.permute(2, 0, 1).to(x.dtype).contiguous()
+        )
+
+    @staticmethod
+    def gather_propagate(
+        phi: Tensor,
+        x: Tensor,
+        ancestors: Tensor,
+        gain: Tensor,
+        seed: Tensor,
+        purpose: int,
+        step: Tensor,
+        runs: Tensor,
+    ) -> Tensor:
+        """Gather particles by their ancestors and propagate them."""
+        if x.shape[0] != phi.shape[-1]:
+            raise ValueError(f"x must have {phi.shape[-1]} components, got {x.shape[0]}.")
+        return _affine(
+            phi,
+            x.contiguous(),
+            gain,
+            ancestors.shape[1],
+            ancestors.contiguous(),
+            (int(seed), purpose, int(step), runs),
+        )
+
+    @staticmethod
+    def resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
+        """Resample systematically."""
+        runs, slots = a.shape
+        out = a.new_empty(runs, slots, dtype=torch.int64)
+        inside = 4 * slots <= _SHARED - 1024
+        blocks = min(runs, _ROWS)
+        marks = out if inside else a.new_empty(blocks, slots, dtype=torch.int32)
+        counts = n.to(a.dtype).contiguous()
+        args = (
+            a.contiguous(),
+            counts,
+            int(len(n) > 1),
+            u.to(torch.float64).contiguous(),
+            marks,
+            int(inside),
+            runs,
+            slots,
+        )
+        _launch(
+            f"systematic<{_REAL[a.dtype]}>",
+            (blocks, 1, 1),
+            _BLOCK,
+            out,
+            *args,
+            shared=4 * slots if inside else 0,
+        )
+        return out
+
+    @staticmethod
+    def count_unique(ancestors: Tensor, log_w: Tensor) -> Tensor:
+        """Count distinct values where a weight is positive."""
+        (runs, slots), bytes_ = log_w.shape, 4 * -(-2 * log_w.shape[1] // 4)
+        out = ancestors.new_empty(runs)
+        args = ancestors.contiguous(), log_w.contiguous(), runs, slots
+        _launch(
+            f"distinct<{_REAL[log_w.dtype]}>",
+            (min(runs, _ROWS), 1, 1),
+            _BLOCK,
+            out,
+            *args,
+            shared=bytes_,
+        )
+        return out
+
+    @staticmethod
+    def weighted_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute weighted means and variances."""
+        runs, slots, d = x.shape
+        mean, variance = x.new_empty(runs, d), x.new_empty(runs, d)
+        args = x.permute(2, 0, 1).contiguous(), w.contiguous(), runs, slots
+        _launch(
+            f"moments<{_REAL[x.dtype]}, {d}>", (min(runs, _ROWS), 1, 1), 256, mean, variance, *args
+        )
+        return mean, variance
+
+
+def _fills_device(a: Tensor, most: int) -> bool:
+    """Return whether the runs fill the device with one block each, of at most `most` particles."""
+    return a.dtype in _REAL and a.shape[1] <= most and (len(a) >= 64 or a.shape[1] <= 8192)
+
+
+def _fits_registers(x: Tensor) -> bool:
+    """Return whether a thread can hold the sums of all components."""
+    return x.shape[-1] <= _STATES.get(x.dtype, 0)
+
+
+_ACCEPTS: dict[str, Callable[..., bool]] = {
+    "philox_normals": lambda *_: True,
+    "philox_uniforms": lambda *_: True,
+    "gather_particles": lambda x, ancestors: x.dtype in _REAL,
+    "propagate_affine": lambda phi, x, gain, w: _fits_registers(x),
+    "resample_systematic": lambda a, n, u: _fills_device(a, 1 << 20),
+    "count_unique": lambda ancestors, log_w: _fills_device(log_w, (_SHARED - 1024) // 2),
+    "weighted_moments": lambda x, w: _fills_device(w, 1 << 20) and _fits_registers(x),
+}
+
+
+def _launch(
+    name: str, grid: tuple[int, int, int], threads: int, *args: Tensor | int, shared: int = 0
+) -> None:
+    """Launch a kernel of particles.cu in the current stream of its first argument's device."""
+    assert isinstance(args[0], Tensor)
+    if 0 in grid:  # the driver rejects empty grids
+        return None
+    device = args[0].device
+    if torch.cuda.current_device() != device.index:
+        with torch.cuda.device(device):
+            return _launch(name, grid, threads, *args, shared=shared)
+    function, driver = _kernel(name, device.index)
+    values = [
+        ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_int(a) for a in args
+    ]
+    pointers = (ctypes.c_void_p * len(values))(*map(ctypes.addressof, values))
+    stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
+    code = driver.cuLaunchKernel(function, *grid, threads, 1, 1, shared, stream, pointers, None)
+    if code:
+        raise RuntimeError(f"{name}: the CUDA driver returned error {code}")
+
+
+@cache
+def _kernel(name: str, device: int) -> tuple[Any, Any]:
+    """Return a compiled kernel and the driver, which torch would open again at each call."""
+    return torch.cuda._compile_kernel(_SOURCE.read_text(), name).func, ctypes.CDLL("libcuda.so.1")
+
+
+def register(operators: torch.library.Library) -> None:
+    """Register the kernels for tensors on a CUDA device."""
+    for name in (*_ACCEPTS, "gather_propagate"):
+        operators.impl(name, getattr(CudaKernels, name), "CUDA")

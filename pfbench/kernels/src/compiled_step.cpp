@@ -1,0 +1,95 @@
+// The loop over the steps of a filter, when torch's compiler has made one function of a step (see pfbench/filter/compiled.py).
+//
+// A small step takes a fraction of what Python takes to call it. Through torch's stable interface, as loops.cpp.
+#include <torch/csrc/inductor/aoti_torch/c/shim.h>
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/tensor.h>
+
+#include <cstdint>
+#include <vector>
+
+#ifdef __SSE2__
+#include <immintrin.h>
+#endif
+
+extern "C" int PyGILState_Ensure();
+extern "C" void PyGILState_Release(int);
+
+namespace {
+using torch::stable::Tensor;
+
+typedef void (*Step)(AtenTensorHandle*, AtenTensorHandle*);  // takes its inputs over, leaves its outputs
+
+// The interpreter's lock: a step lets go of it while it works, and so wants to be called by one who has it.
+struct Lock {
+    const int before = PyGILState_Ensure();
+    ~Lock() { PyGILState_Release(before); }
+};
+
+// Numbers below the smallest normal one (1e-38 in single precision) count as 0: a processor takes a hundred times as long for one
+// of them, and the weights of a peaked likelihood have many.
+struct Flush {
+#ifdef __SSE2__
+    const unsigned before = _mm_getcsr();
+    Flush() { _mm_setcsr(before | 0x8040); }  // results, and operands
+    ~Flush() { _mm_setcsr(before); }
+#endif
+};
+
+AtenTensorHandle again(const Tensor& a) {
+    AtenTensorHandle made;
+    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_new_tensor_handle(a.get(), &made));
+    return made;
+}
+
+// a[t], which shares its memory.
+AtenTensorHandle at(const Tensor& a, int64_t t) {
+    const auto size = a.sizes(), stride = a.strides();
+    AtenTensorHandle made;
+    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(
+        a.get(), a.dim() - 1, size.data() + 1, stride.data() + 1, t * stride[0], &made));  // beyond where `a` itself begins
+    return made;
+}
+
+// [..., R, N] as [R, N, ...], which shares its memory.
+AtenTensorHandle particles_first(const Tensor& a) {
+    const int64_t axes = a.dim();
+    std::vector<int64_t> size, stride;
+    for (int64_t k = 0; k < axes; ++k) {
+        const int64_t from = k < 2 ? axes - 2 + k : k - 2;
+        size.push_back(a.size(from));
+        stride.push_back(a.stride(from));
+    }
+    AtenTensorHandle made;
+    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(a.get(), axes, size.data(), stride.data(), 0, &made));
+    return made;
+}
+
+// All that each step leaves, one step after the other, with the axes of particles first. A step is given `constants`, `state` (which is what the one before left
+// first), its part of `seen` [T, ...] and `shared`.
+std::vector<Tensor> follow(int64_t step, int64_t outputs, std::vector<Tensor> constants, std::vector<Tensor> state,
+                           std::vector<Tensor> seen, std::vector<Tensor> shared) {
+    const Lock held;
+    const Flush flushed;
+    const int64_t steps = seen[0].size(0);
+    std::vector<AtenTensorHandle> given, left(outputs);
+    std::vector<Tensor> all;
+    all.reserve(steps * outputs);
+    for (int64_t t = 0; t < steps; ++t) {
+        given.clear();
+        for (const Tensor& a : constants) given.push_back(again(a));
+        for (const Tensor& a : state) given.push_back(again(a));
+        for (const Tensor& a : seen) given.push_back(at(a, t));
+        for (const Tensor& a : shared) given.push_back(again(a));
+        reinterpret_cast<Step>(step)(given.data(), left.data());
+        for (size_t k = 0; k < left.size(); ++k) {
+            const Tensor a(left[k]);
+            all.push_back(a.dim() > 2 ? Tensor(particles_first(a)) : a);
+            if (k < state.size()) state[k] = a;
+        }
+    }
+    return all;
+}
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) { library.impl("run_steps", TORCH_BOX(&follow)); }

@@ -1,0 +1,463 @@
+// The loops over particles of a bootstrap filter's step, one run at a time, so that a run's particles stay in the first-level cache.
+//
+// Particles lie component by component: x [D, R, N]. Compiled without -ffinite-math-only: NaN and infinity keep their meaning.
+// At the end, each loop becomes an operator of torch's, since a small step would take longer to hand pointers over from Python
+// than to use them.
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <memory>
+#include <tuple>
+#include <vector>
+
+#include "tensors.h"
+
+// of normals.cpp
+extern "C" void normals(float*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
+extern "C" void uniforms(double*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
+
+namespace {
+// One uniform u for all slots, positions (j + u) / n: slot j goes to the first particle whose sum of weights lies beyond its position.
+template <class T>
+void systematic(int64_t* ancestor, const T* weight, const double* wanted, const double* uniform, int64_t runs, int64_t slots) {
+    constexpr int64_t PARTS = 4;  // are summed side by side: one sum alone would wait for itself
+    const int64_t part = slots / PARTS;
+    const std::unique_ptr<double[]> sums(new double[slots]);
+    const std::unique_ptr<int32_t[]> ends(new int32_t[slots]), first(new int32_t[slots + 1]);
+    for (int64_t r = 0; r < runs; ++r, weight += slots, ancestor += slots) {
+        double sum[PARTS] = {};
+        for (int64_t i = 0; i < part; ++i)
+            for (int64_t k = 0; k < PARTS; ++k) sums[k * part + i] = sum[k] += weight[k * part + i];
+        for (int64_t i = PARTS * part; i < slots; ++i) sums[i] = sum[PARTS - 1] += weight[i];
+        for (int64_t k = 1; k < PARTS; ++k) sum[k] += sum[k - 1];
+        const T whole = static_cast<T>(sum[PARTS - 1]), n = static_cast<T>(wanted[r]), u = static_cast<T>(uniform[r]);
+        for (int64_t k = 0; k < PARTS; ++k) {
+            const double before = k ? sum[k - 1] : 0.0;
+            for (int64_t i = k * part; i < (k < PARTS - 1 ? (k + 1) * part : slots); ++i) {
+                const T reach = static_cast<T>(before + sums[i]) / whole * n;
+                // not simply ceil: n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0;
+                // the last sum is n exactly, being divided by itself, and NaN is not below n
+                const T end = reach < n ? std::ceil(reach - u) : n;
+                ends[i] = static_cast<int32_t>(end < 0 ? 0 : end);
+            }
+        }
+        // a particle's slots begin where its predecessor's end; of several that begin at a slot, the last one has it
+        std::fill(first.get(), first.get() + slots + 1, 0);
+        for (int64_t i = 1; i < slots; ++i) first[ends[i - 1]] = static_cast<int32_t>(i);
+        int32_t latest = 0;
+        for (int64_t j = 0; j < slots; ++j) ancestor[j] = latest = std::max(latest, first[j]);
+    }
+}
+
+template <class T>
+void copied(T* out, const T* x, const int64_t* ancestor, int64_t components, int64_t runs, int64_t slots, int64_t wanted) {
+    const auto one = [&](int64_t row, const auto* from) {
+        for (int64_t j = 0; j < wanted; ++j) out[row * wanted + j] = x[row * slots + from[j]];
+    };
+    if (components == 1) {
+        for (int64_t r = 0; r < runs; ++r) one(r, ancestor + r * wanted);
+        return;
+    }
+    std::vector<int32_t> from(wanted);  // half as long
+    for (int64_t r = 0; r < runs; ++r) {
+        for (int64_t j = 0; j < wanted; ++j) from[j] = static_cast<int32_t>(ancestor[r * wanted + j]);
+        for (int64_t d = 0; d < components; ++d) one(d * runs + r, from.data());
+    }
+}
+
+// -1/2 sum ((y - mean) scale)^2 - constant; y, scale and constant are of a run, mean [R, N, K] lies as its strides say.
+template <class T>
+void log_normal(T* out, const T* y, const T* mean, const T* scale, const T* constant, const int64_t* stride, int64_t runs,
+                int64_t particles, int64_t components) {
+    for (int64_t r = 0; r < runs; ++r, out += particles) {
+        for (int64_t i = 0; i < particles; ++i) out[i] = -constant[r];
+        for (int64_t k = 0; k < components; ++k) {
+            const T* at = mean + r * stride[0] + k * stride[2];
+            const T centre = y[r * components + k], by = scale[r * components + k];
+            if (stride[1] == 1)  // known to the compiler
+                for (int64_t i = 0; i < particles; ++i) {
+                    const T z = (centre - at[i]) * by;
+                    out[i] -= T(0.5) * z * z;
+                }
+            else
+                for (int64_t i = 0; i < particles; ++i) {
+                    const T z = (centre - at[i * stride[1]]) * by;
+                    out[i] -= T(0.5) * z * z;
+                }
+        }
+    }
+}
+
+// A coefficient that is not zero, and the row that it is for.
+template <class T>
+struct Term {
+    const T* from;
+    T by;
+};
+
+// Rows of sums of terms, the ends of which are in `last`, for particles that fill S registers or more.
+template <class T, int S>
+void summed(T* out, const Term<T>* terms, const std::vector<int64_t>& last, int64_t plane, int64_t particles) {
+    typedef T Lanes __attribute__((vector_size(REGISTER), aligned(sizeof(T)), may_alias));
+    constexpr int64_t WIDE = S * REGISTER / sizeof(T);
+    for (int64_t next = 0; next < particles; next += WIDE) {
+        const int64_t at = std::min(next, particles - WIDE);  // the last ones overlap
+        for (int64_t d = 0, t = 0; d < static_cast<int64_t>(last.size()); ++d) {
+            Lanes sum[S] = {};
+            for (; t < last[d]; ++t) {
+                const Lanes* from = reinterpret_cast<const Lanes*>(terms[t].from + at);
+                for (int k = 0; k < S; ++k) sum[k] += terms[t].by * from[k];
+            }
+            for (int k = 0; k < S; ++k) reinterpret_cast<Lanes*>(out + d * plane + at)[k] = sum[k];
+        }
+    }
+}
+
+// out = phi x + gain w of each particle, by the coefficients that are not zero: in error models of an INS three in four are.
+template <class T>
+void affine(T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t one_phi, int64_t one_gain, int64_t runs,
+            int64_t particles, int64_t rows, int64_t states, int64_t noises) {
+    constexpr int64_t WIDE = REGISTER / sizeof(T);
+    std::vector<Term<T>> terms(rows * (states + noises));
+    std::vector<int64_t> last(rows);
+    const int64_t plane = runs * particles;
+    for (int64_t r = 0; r < runs; ++r) {
+        const T* a = phi + (one_phi ? 0 : r * rows * states);
+        const T* b = gain + (one_gain ? 0 : r * rows * noises);
+        T* to = out + r * particles;
+        int64_t count = 0;
+        for (int64_t d = 0; d < rows; ++d) {
+            for (int64_t k = 0; k < states; ++k)
+                if (const T c = a[d * states + k]; c != 0) terms[count++] = {x + k * plane + r * particles, c};
+            for (int64_t k = 0; k < noises; ++k)
+                if (const T c = b[d * noises + k]; c != 0) terms[count++] = {w + k * plane + r * particles, c};
+            last[d] = count;
+        }
+        if (particles >= 4 * WIDE) summed<T, 4>(to, terms.data(), last, plane, particles);
+        else if (particles >= WIDE) summed<T, 1>(to, terms.data(), last, plane, particles);
+        else
+            for (int64_t d = 0, t = 0; d < rows; ++d) {
+                for (int64_t at = 0; at < particles; ++at) to[d * plane + at] = 0;
+                for (; t < last[d]; ++t)
+                    for (int64_t at = 0; at < particles; ++at) to[d * plane + at] += terms[t].by * terms[t].from[at];
+            }
+    }
+}
+
+// How many of the values 0 to 2 N - 1 occur at slots that hold a particle. Where values do not fall from slot to slot, as after
+// systematic resampling, each new one begins where it differs from the one before.
+template <class T>
+void distinct(int64_t* count, const int64_t* value, const T* log_weight, int64_t runs, int64_t slots) {
+    std::vector<uint8_t> there;
+    for (int64_t r = 0; r < runs; ++r, value += slots, log_weight += slots) {
+        int64_t falls = 0, holes = 0, begun = 1;
+        for (int64_t i = 1; i < slots; ++i) falls |= value[i] < value[i - 1];
+        for (int64_t i = 0; i < slots; ++i) holes |= !(log_weight[i] > -HUGE_VAL);
+        for (int64_t i = 1; i < slots; ++i) begun += value[i] != value[i - 1];
+        if (!falls && !holes) {
+            count[r] = begun;
+            continue;
+        }
+        there.assign(2 * slots, 0);
+        for (int64_t i = 0; i < slots; ++i) there[value[i]] |= log_weight[i] > -HUGE_VAL;
+        count[r] = 0;
+        for (const uint8_t one : there) count[r] += one;
+    }
+}
+
+// Adds the products of A rows with B others, lane by lane, to A x B sums; rows of both lie `chunk` numbers apart. Nine sums and what
+// goes into them fit where there are sixteen registers.
+template <class T, int A, int B>
+void products(T* sums, int64_t down, const T* some, const T* others, int64_t chunk, int64_t particles) {
+    typedef T Lanes __attribute__((vector_size(REGISTER), aligned(sizeof(T)), may_alias));
+    constexpr int64_t WIDE = REGISTER / sizeof(T);
+    Lanes sum[A][B];
+    for (int a = 0; a < A; ++a)
+        for (int b = 0; b < B; ++b) sum[a][b] = *reinterpret_cast<const Lanes*>(sums + a * down + b * WIDE);
+    for (int64_t i = 0; i < particles; i += WIDE) {
+        Lanes left[A];
+        for (int a = 0; a < A; ++a) left[a] = *reinterpret_cast<const Lanes*>(some + a * chunk + i);
+        for (int b = 0; b < B; ++b) {
+            const Lanes right = *reinterpret_cast<const Lanes*>(others + b * chunk + i);
+            for (int a = 0; a < A; ++a) sum[a][b] += left[a] * right;
+        }
+    }
+    for (int a = 0; a < A; ++a)
+        for (int b = 0; b < B; ++b) *reinterpret_cast<Lanes*>(sums + a * down + b * WIDE) = sum[a][b];
+}
+
+// Covariances of the pairs of each group of components; x [R, N, K] lies as its strides say. Particles are taken by chunks that stay
+// in the first-level cache, and pairs by threes with threes, so that a number that is loaded goes into three sums.
+template <class T>
+void spread(T* out, const T* x, const T* mean, const T* weight, const int64_t* component, const int64_t* stride, int64_t groups,
+            int64_t size, int64_t runs, int64_t particles, int64_t components) {
+    constexpr int64_t WIDE = REGISTER / sizeof(T), CHUNK = 1024 / sizeof(T);
+    typedef void (*Tile)(T*, int64_t, const T*, const T*, int64_t, int64_t);
+    constexpr Tile TILES[3][3] = {{products<T, 1, 1>, products<T, 1, 2>, products<T, 1, 3>},
+                                  {products<T, 2, 1>, products<T, 2, 2>, products<T, 2, 3>},
+                                  {products<T, 3, 1>, products<T, 3, 2>, products<T, 3, 3>}};
+    const int64_t down = size * WIDE;
+    std::vector<T> off(size * CHUNK), weighed(size * CHUNK), sums(groups * size * down);
+    for (int64_t r = 0; r < runs; ++r, weight += particles) {
+        std::fill(sums.begin(), sums.end(), T(0));
+        for (int64_t first = 0; first < particles; first += CHUNK) {
+            const int64_t many = std::min(CHUNK, particles - first), whole = (many + WIDE - 1) / WIDE * WIDE;
+            for (int64_t g = 0; g < groups; ++g) {
+                for (int64_t a = 0; a < size; ++a) {
+                    const int64_t k = component[g * size + a];
+                    const T* from = x + r * stride[0] + first * stride[1] + k * stride[2];
+                    const T centre = mean[r * components + k];
+                    T *const __restrict plain = off.data() + a * CHUNK, *const __restrict heavy = weighed.data() + a * CHUNK;
+                    if (stride[1] == 1)  // known to the compiler
+                        for (int64_t i = 0; i < many; ++i) heavy[i] = weight[first + i] * (plain[i] = from[i] - centre);
+                    else
+                        for (int64_t i = 0; i < many; ++i)
+                            heavy[i] = weight[first + i] * (plain[i] = from[i * stride[1]] - centre);
+                    for (int64_t i = many; i < whole; ++i) plain[i] = heavy[i] = 0;
+                }
+                for (int64_t a = 0; a < size; a += 3)
+                    for (int64_t b = a; b < size; b += 3)
+                        TILES[std::min<int64_t>(size - a, 3) - 1][std::min<int64_t>(size - b, 3) - 1](
+                            sums.data() + (g * size + a) * down + b * WIDE, down, weighed.data() + a * CHUNK,
+                            off.data() + b * CHUNK, CHUNK, whole);
+            }
+        }
+        for (int64_t g = 0; g < groups; ++g, out += size * size)
+            for (int64_t a = 0; a < size; ++a)
+                for (int64_t b = a; b < size; ++b) {
+                    const T* lanes = sums.data() + (g * size + a) * down + b * WIDE;
+                    T all = 0;
+                    for (int64_t lane = 0; lane < WIDE; ++lane) all += lanes[lane];
+                    out[a * size + b] = out[b * size + a] = all;
+                }
+    }
+}
+
+// Sum of weight (x - centre), or of weight times its square, by four sums at a time: one alone would wait for itself.
+template <class T, bool SQUARE>
+T weighed(const T* x, T centre, const T* weight, int64_t particles) {
+    typedef T Lanes __attribute__((vector_size(REGISTER), aligned(sizeof(T)), may_alias));
+    constexpr int64_t WIDE = REGISTER / sizeof(T);
+    Lanes sum[4] = {};
+    int64_t i = 0;
+    for (; i + 4 * WIDE <= particles; i += 4 * WIDE)
+        for (int k = 0; k < 4; ++k) {
+            const Lanes off = *reinterpret_cast<const Lanes*>(x + i + k * WIDE) - centre;
+            const Lanes w = *reinterpret_cast<const Lanes*>(weight + i + k * WIDE);
+            sum[k] += SQUARE ? w * off * off : w * off;
+        }
+    const Lanes all = (sum[0] + sum[1]) + (sum[2] + sum[3]);
+    T whole = 0;
+    for (int64_t lane = 0; lane < WIDE; ++lane) whole += all[lane];
+    for (; i < particles; ++i) whole += weight[i] * (x[i] - centre) * (SQUARE ? x[i] - centre : T(1));
+    return whole;
+}
+
+// Sums of parts [R, N] and of their squares, likewise.
+template <class T>
+void totals(T* whole, T* square, const T* part, int64_t runs, int64_t particles) {
+    typedef T Lanes __attribute__((vector_size(REGISTER), aligned(sizeof(T)), may_alias));
+    constexpr int64_t WIDE = REGISTER / sizeof(T);
+    for (int64_t r = 0; r < runs; ++r, part += particles) {
+        Lanes sum[4] = {}, squares[4] = {};
+        int64_t i = 0;
+        for (; i + 4 * WIDE <= particles; i += 4 * WIDE)
+            for (int k = 0; k < 4; ++k) {
+                const Lanes own = *reinterpret_cast<const Lanes*>(part + i + k * WIDE);
+                sum[k] += own;
+                squares[k] += own * own;
+            }
+        const Lanes all = (sum[0] + sum[1]) + (sum[2] + sum[3]), each = (squares[0] + squares[1]) + (squares[2] + squares[3]);
+        whole[r] = square[r] = 0;
+        for (int64_t lane = 0; lane < WIDE; ++lane) whole[r] += all[lane], square[r] += each[lane];
+        for (; i < particles; ++i) whole[r] += part[i], square[r] += part[i] * part[i];
+    }
+}
+
+template <class T>
+void moments(T* mean, T* variance, const T* x, const T* weight, int64_t components, int64_t runs, int64_t particles) {
+    for (int64_t r = 0; r < runs; ++r)
+        for (int64_t d = 0; d < components; ++d) {
+            const T* row = x + (d * runs + r) * particles;
+            const T* w = weight + r * particles;
+            const T centre = weighed<T, false>(row, 0, w, particles);
+            mean[r * components + d] = centre;
+            variance[r * components + d] = weighed<T, true>(row, centre, w, particles);
+        }
+}
+
+constexpr std::array<int64_t, 3> COMPONENTS_FIRST = {2, 0, 1};
+
+template <class T, void (*DRAW)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t)>
+Tensor drawn(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
+    const Tensor out = fresh<T>({components, runs.size(0), 4 * quarters});
+    const Packed<int64_t> run(runs);
+    DRAW(numbers<T>(out), run.data, runs.size(0), components, quarters, *numbers<int64_t>(step), *numbers<int64_t>(seed), purpose);
+    return out;
+}
+
+Tensor systematic_operator(Tensor a, Tensor n, Tensor u) {
+    const int64_t runs = a.size(0), slots = a.size(1);
+    const Tensor out = fresh<int64_t>({runs, slots});
+    const auto wanted = few<double>(n, runs), uniform = few<double>(u, runs);
+    by_type(a, [&](auto one) {
+        systematic(numbers<int64_t>(out), Packed<decltype(one)>(a).data, wanted.data(), uniform.data(), runs, slots);
+    });
+    return out;
+}
+
+Tensor copied_operator(Tensor x, Tensor ancestors) {
+    const int64_t components = x.size(0), runs = x.size(1), wanted = ancestors.size(1);
+    const Packed<int64_t> from(ancestors);
+    return by_type(x, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({components, runs, wanted});
+        copied(numbers<T>(out), Packed<T>(x).data, from.data, components, runs, x.size(2), wanted);
+        return out;
+    });
+}
+
+Tensor log_normal_operator(Tensor y, Tensor mean, Tensor scale, Tensor constant) {
+    const int64_t runs = mean.size(0), particles = mean.size(1), components = mean.size(2);
+    return by_type(mean, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({runs, particles});
+        log_normal(numbers<T>(out), few<T>(y, runs, components).data(), numbers<T>(mean), few<T>(scale, runs, components).data(),
+                   few<T>(constant, runs).data(), mean.strides().data(), runs, particles, components);
+        return out;
+    });
+}
+
+// Whether all particles share one noise, of zeros: a prediction without noise.
+template <class T>
+bool quiet(const Tensor& w) {
+    if (w.size(0) * w.size(1) == 0 || w.stride(0) != 0 || w.stride(1) != 0) return false;
+    for (int64_t k = 0; k < w.size(2); ++k)
+        if (numbers<T>(w)[k * w.stride(2)] != 0) return false;
+    return true;
+}
+
+Tensor affine_operator(Tensor phi, Tensor x, Tensor gain, Tensor w) {
+    const int64_t runs = x.size(0), particles = x.size(1), rows = phi.size(1);
+    const bool one = phi.size(0) == 1 && gain.size(0) == 1;  // runs then lie side by side as particles of one run do
+    return by_type(x, [&](auto like) {
+        using T = decltype(like);
+        const Tensor out = fresh<T>({rows, runs, particles});
+        const auto work = [&](const T* by, const T* noise, int64_t noises) {
+            affine(numbers<T>(out), Packed<T>(phi).data, Packed<T>(x, COMPONENTS_FIRST).data, by, noise, phi.size(0) == 1,
+                   gain.size(0) == 1, one ? 1 : runs, one ? runs * particles : particles, rows, phi.size(2), noises);
+        };
+        if (quiet<T>(w)) work(nullptr, nullptr, 0);
+        else work(Packed<T>(gain).data, Packed<T>(w, COMPONENTS_FIRST).data, gain.size(2));
+        return out;
+    });
+}
+
+Tensor distinct_operator(Tensor copy_of, Tensor log_w) {
+    const int64_t runs = copy_of.size(0);
+    const Tensor out = fresh<int64_t>({runs});
+    by_type(log_w, [&](auto one) {
+        distinct(numbers<int64_t>(out), Packed<int64_t>(copy_of).data, Packed<decltype(one)>(log_w).data, runs, copy_of.size(1));
+    });
+    return out;
+}
+
+std::tuple<Tensor, Tensor> totals_operator(Tensor part) {
+    const int64_t runs = part.size(0);
+    return by_type(part, [&](auto one) {
+        using T = decltype(one);
+        const Tensor whole = fresh<T>({runs, 1}), square = fresh<T>({runs, 1});
+        totals(numbers<T>(whole), numbers<T>(square), Packed<T>(part).data, runs, part.size(1));
+        return std::make_tuple(whole, square);
+    });
+}
+
+std::tuple<Tensor, Tensor> moments_operator(Tensor x, Tensor w) {
+    const int64_t runs = x.size(0), components = x.size(2);
+    return by_type(x, [&](auto one) {
+        using T = decltype(one);
+        const Tensor mean = fresh<T>({runs, components}), variance = fresh<T>({runs, components});
+        moments(numbers<T>(mean), numbers<T>(variance), Packed<T>(x, COMPONENTS_FIRST).data, Packed<T>(w).data, components, runs,
+                x.size(1));
+        return std::make_tuple(mean, variance);
+    });
+}
+
+Tensor spread_operator(Tensor x, Tensor mean, Tensor w, Tensor groups) {
+    const int64_t runs = x.size(0), many = groups.size(0), size = groups.size(1);
+    const Packed<int64_t> components(groups);
+    return by_type(x, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({runs, many, size, size});
+        spread(numbers<T>(out), numbers<T>(x), Packed<T>(mean).data, Packed<T>(w).data, components.data, x.strides().data(), many,
+               size, runs, x.size(1), x.size(2));
+        return out;
+    });
+}
+
+// The same, called by what torch's compiler makes, which would take longer to look an operator up than a small loop takes.
+Tensor borrowed(AtenTensorHandle a) {
+    AtenTensorHandle own;
+    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_new_tensor_handle(a, &own));
+    return Tensor(own);
+}
+int64_t borrowed(int64_t a) { return a; }
+
+void handed(const Tensor& found, AtenTensorHandle* out) { STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_new_tensor_handle(found.get(), out)); }
+
+typedef AtenTensorHandle In;
+typedef AtenTensorHandle* Out;
+
+template <class Work, class... Given>
+AOTITorchError directly(Work work, Out out, Given... given) {
+    try {
+        handed(work(borrowed(given)...), out);
+        return AOTI_TORCH_SUCCESS;
+    } catch (...) {
+        return AOTI_TORCH_FAILURE;
+    }
+}
+
+template <class Work, class... Given>
+AOTITorchError both_directly(Work work, Out first, Out second, Given... given) {
+    try {
+        const auto found = work(borrowed(given)...);
+        handed(std::get<0>(found), first);
+        handed(std::get<1>(found), second);
+        return AOTI_TORCH_SUCCESS;
+    } catch (...) {
+        return AOTI_TORCH_FAILURE;
+    }
+}
+}  // namespace
+
+extern "C" {
+AOTITorchError aoti_torch_cpu_philox_normals(In seed, int64_t purpose, In step, In runs, int64_t components, int64_t quarters, Out out) {
+    return directly(drawn<float, normals>, out, seed, purpose, step, runs, components, quarters);
+}
+AOTITorchError aoti_torch_cpu_philox_uniforms(In seed, int64_t purpose, In step, In runs, int64_t components, int64_t quarters, Out out) {
+    return directly(drawn<double, uniforms>, out, seed, purpose, step, runs, components, quarters);
+}
+AOTITorchError aoti_torch_cpu_resample_systematic(In a, In n, In u, Out out) { return directly(systematic_operator, out, a, n, u); }
+AOTITorchError aoti_torch_cpu_gather_particles(In x, In ancestors, Out out) { return directly(copied_operator, out, x, ancestors); }
+AOTITorchError aoti_torch_cpu_propagate_affine(In phi, In x, In gain, In w, Out out) { return directly(affine_operator, out, phi, x, gain, w); }
+AOTITorchError aoti_torch_cpu_count_unique(In copy_of, In log_w, Out out) { return directly(distinct_operator, out, copy_of, log_w); }
+AOTITorchError aoti_torch_cpu_sum_and_squares(In part, Out whole, Out square) { return both_directly(totals_operator, whole, square, part); }
+AOTITorchError aoti_torch_cpu_weighted_moments(In x, In w, Out mean, Out variance) {
+    return both_directly(moments_operator, mean, variance, x, w);
+}
+}
+
+STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
+    library.impl("philox_normals", TORCH_BOX((&drawn<float, normals>)));
+    library.impl("philox_uniforms", TORCH_BOX((&drawn<double, uniforms>)));
+    library.impl("resample_systematic", TORCH_BOX(&systematic_operator));
+    library.impl("gather_particles", TORCH_BOX(&copied_operator));
+    library.impl("log_normal", TORCH_BOX(&log_normal_operator));
+    library.impl("propagate_affine", TORCH_BOX(&affine_operator));
+    library.impl("count_unique", TORCH_BOX(&distinct_operator));
+    library.impl("sum_and_squares", TORCH_BOX(&totals_operator));
+    library.impl("weighted_moments", TORCH_BOX(&moments_operator));
+    library.impl("group_covariance", TORCH_BOX(&spread_operator));
+}

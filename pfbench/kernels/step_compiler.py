@@ -1,0 +1,179 @@
+"""Compilation of a pure function of tensors by inner parts of torch's compiler.
+
+The parts are `make_fx` (record the operations), Inductor (generate C++ or Triton code) and its cache
+on disk. Operators of pfbench stay whole in the compiled function.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import subprocess
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.fx import Graph as Operations
+from torch.fx import Node
+
+from pfbench.kernels import cpp
+
+log = logging.getLogger("pfbench")
+
+# C++ name of the function that torch's compiler generates
+_ENTRY = "_Z19inductor_entry_implPP16AtenTensorOpaqueS1_"
+
+TensorFunction = Callable[[list[Tensor]], Sequence[Tensor]]
+
+
+class NativeEntry(NamedTuple):
+    """Compiled function that C++ code can call.
+
+    Attributes:
+        address: Address of the function.
+        constants: Tensors that it takes before the arguments.
+    """
+
+    address: int
+    constants: list[Tensor]
+
+
+def compile_function(
+    function: Callable[..., list[Tensor]], example: list[Tensor]
+) -> tuple[TensorFunction, NativeEntry | None]:
+    """Compile a function of tensors for the shapes of an example.
+
+    Args:
+        function: Pure function of tensors, without Python branches on their values.
+        example: Arguments. The compiled function takes the same shapes, types and device.
+
+    Returns:
+        The compiled function, and its C++ entry if torch generated one.
+    """
+    from torch._functorch.config import patch as patch_functorch
+    from torch._guards import TracingContext, tracing
+    from torch._inductor.compile_fx import compile_fx, compile_fx_inner  # takes seconds to import
+    from torch._subclasses import FakeTensorMode
+    from torch.fx.experimental.proxy_tensor import make_fx
+    from torch.fx.experimental.symbolic_shapes import ShapeEnv
+
+    decompositions = {torch.ops.aten.stack.default: _stack_by_component}
+    graph = make_fx(function, decomposition_table=decompositions)(*example)
+    on_cpu = not any(a.is_cuda for a in example)
+    if not on_cpu:
+        _fuse_propagation(graph.graph)
+        graph.recompile()
+    # On the CPU the calls of the kernels are compiled with them: from Python they take 50 % longer.
+    shims = {"aot_inductor.custom_ops_to_c_shims": cpp.declare_shims()} if on_cpu else {}
+    # The shapes are those of the example, so their checks are left out.
+    options = {"cpp_wrapper": on_cpu, "size_asserts": False, **shims}
+    artefacts: list[Any] = []
+
+    def compile_inner(*args: Any, **settings: Any) -> Any:
+        artefacts.append(compile_fx_inner(*args, **settings))
+        return artefacts[-1]
+
+    fake_mode = FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True)
+    # The cache of autograd would return a function without its artefact.
+    with tracing(TracingContext(fake_mode)), patch_functorch(enable_autograd_cache=False):
+        fakes = [fake_mode.from_tensor(a, static_shapes=True) for a in example]
+        run: Any = compile_fx(graph, fakes, inner_compile=compile_inner, config_patches=options)
+    entry = _find_entry(artefacts, run, example) if on_cpu else None
+    return lambda tensors: run(*tensors), entry
+
+
+def _fuse_propagation(graph: Operations) -> None:
+    """Fuse the copy of parents, their noise and `affine` into one operator of a CUDA device."""
+    for node in graph.find_nodes(
+        op="call_function", target=torch.ops.pfbench.propagate_affine.default
+    ):
+        phi, x, gain, w = node.args
+        copied = _find_source(x, torch.ops.pfbench.gather_particles.default)
+        noise = _find_source(w, torch.ops.pfbench.philox_normals.default)
+        if copied is None or noise is None:
+            continue
+        seed, purpose, step, runs, *_ = noise.args
+        with graph.inserting_before(node):
+            fused = graph.call_function(
+                torch.ops.pfbench.gather_propagate.default,
+                (phi, *copied.args, gain, seed, purpose, step, runs),
+            )
+        node.replace_all_uses_with(fused)
+    graph.eliminate_dead_code()
+
+
+def _find_source(node: Any, operator: Any) -> Any:
+    """Return the call of `operator` that a node views as [R, N, ...]; None if it is another node."""
+    aten, permutations = torch.ops.aten, 0
+    copies = aten.alias.default, aten._to_copy.default
+    while isinstance(node, Node) and node.target is not operator:
+        source, *options = node.args
+        if node.target is aten.permute.default and options == [[1, 2, 0]]:
+            permutations += 1
+        elif node.target not in copies and not (
+            node.target is aten.slice.Tensor and options[:2] == [2, 0]
+        ):
+            return None
+        node = source
+    return node if isinstance(node, Node) and permutations == 1 else None
+
+
+def _stack_by_component(parts: Sequence[Tensor], dim: int = 0) -> Tensor:
+    """Stack parts [R, N] as components, component-major in memory; otherwise as torch.stack."""
+    last = parts[0].dim()
+    if dim not in (-1, last) or last < 2:
+        return torch.cat([part.unsqueeze(dim) for part in parts], dim)
+    return torch.cat([part.unsqueeze(0) for part in parts]).permute(*range(1, last + 1), 0)
+
+
+def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> NativeEntry | None:
+    """Return the C++ function behind `run`; log a line and return None if it is not as expected."""
+    arguments: list[Tensor] = []
+    try:
+        (graph,) = artefacts
+        call = graph.current_callable
+
+        def record_arguments(args: list[Tensor]) -> Any:
+            arguments.extend(args)
+            return call(args)
+
+        graph.current_callable = record_arguments
+        try:
+            expected = run(*example)
+        finally:
+            graph.current_callable = call
+        constants, inputs = arguments[: -len(example)], arguments[-len(example) :]
+        if not all(a is b for a, b in zip(inputs, example, strict=True)):
+            raise TypeError("its arguments are in another order")
+        library = inspect.getclosurevars(call).nonlocals["f"].__self__.__file__
+        entry = NativeEntry(cpp.function_address(library, _ENTRY), constants)
+        batched = [a.unsqueeze(0) for a in example]
+        results = cpp.run_steps(entry.address, len(expected), constants, [], batched, [])
+        pairs = zip(results, expected, strict=True)
+        if not all(
+            torch.allclose(a.double(), from_storage(b).double(), equal_nan=True) for a, b in pairs
+        ):
+            raise TypeError("its results differ")
+    except (
+        AttributeError, KeyError, TypeError, ValueError, RuntimeError, OSError, subprocess.CalledProcessError,
+    ) as error:  # fmt: skip
+        name = type(error).__name__
+        log.info("engine=compiled: steps are called from Python (%s: %s)", name, error)
+        return None
+    return entry
+
+
+def to_storage(a: Tensor) -> Tensor:
+    """Return [R, N, ...] as contiguous [..., R, N]; tensors of two axes or fewer keep their shape."""
+    return (a.permute(*range(2, a.dim()), 0, 1) if a.dim() > 2 else a).contiguous()
+
+
+def from_storage(a: Tensor) -> Tensor:
+    """Return the view [R, N, ...] of a result of `to_storage`."""
+    return a.permute(a.dim() - 2, a.dim() - 1, *range(a.dim() - 2)) if a.dim() > 2 else a
+
+
+def steps_to_storage(a: Tensor) -> Tensor:
+    """Return inputs [R, T, ...] as [T, ...], each step in the layout of `to_storage`."""
+    return a.permute(1, *range(3, a.dim()), 0, *range(2, min(a.dim(), 3))).contiguous()

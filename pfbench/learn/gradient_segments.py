@@ -1,0 +1,93 @@
+"""Pass of a filter through training data, with the gradient cut between segments of steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pfbench.core.derived_stream import relabel
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
+from pfbench.filter.learned.objectives import Objective, TrainingStep
+from pfbench.filter.loop import FilterPass
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.learn.training_data import TrainingData
+from pfbench.model.base import StateSpaceModel
+
+
+def iterate_segments(
+    objective: Objective,
+    segment: int | None,
+    method: ParticleFilter,
+    model: StateSpaceModel,
+    worlds: TrainingData,
+    draws: RandomStream,
+    scale: Tensor,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Iterate over segments of steps of training data, without gradients between them.
+
+    Args:
+        objective: Loss function.
+        segment: Steps of a segment. None for all.
+        method: The filter.
+        model: State-space model.
+        worlds: Training data of R runs.
+        draws: Random stream of the filter.
+        scale: Standard deviations of the initial distribution, [R or 1, d].
+
+    Yields:
+        Losses and ESS / N of a segment's S steps, [S, R] each.
+    """
+    steps = worlds.record.y.shape[1]
+    recording = torch.is_grad_enabled() and objective.needs_filter_gradient
+    filter_pass = FilterPass(_GradientMode(method, recording), model, worlds.record, draws)
+    losses, shares, before = [], [], filter_pass.belief
+    for t, step_model, record, info, step_draws in filter_pass:
+        parent, noise = (None if a is None else a[:, t] for a in (worlds.parents, worlds.noises))
+        lesson = TrainingStep(
+            method, step_model, before, filter_pass.belief, info, record,
+            worlds.states[:, t], parent, noise, scale, relabel(step_draws, "lesson."),
+        )  # fmt: skip
+        losses.append(objective(lesson))
+        shares.append(info.trace["ess"].detach() / method.particles)
+        if t + 1 == steps or (segment is not None and (t + 1) % segment == 0):
+            yield torch.stack(losses), torch.stack(shares)
+            losses, shares = [], []
+            filter_pass.belief = _detach(filter_pass.belief)
+        before = filter_pass.belief
+
+
+@dataclass(frozen=True)
+class _GradientMode:
+    """A filter whose steps record gradients, or do not."""
+
+    method: Filter
+    enabled: bool
+
+    @property
+    def is_exact(self) -> bool:
+        return self.method.is_exact
+
+    def init(self, *args: Any) -> Any:
+        return self.method.init(*args)
+
+    def step(
+        self, model: StateSpaceModel, belief: Any, record: Record, draws: RandomStream
+    ) -> tuple[Any, StepInfo]:
+        with torch.set_grad_enabled(self.enabled):
+            return self.method.step(model, belief, record, draws)
+
+
+def _detach(belief: ParticleBelief) -> ParticleBelief:
+    """Return a belief without gradient history."""
+    window, memory = (
+        {name: a.detach() for name, a in tensors.items()}
+        for tensors in (belief.window, belief.memory)
+    )
+    x, log_w, log_z = belief.x.detach(), belief.log_w.detach(), belief.log_evidence.detach()
+    return belief._replace(x=x, log_w=log_w, log_evidence=log_z, window=window, memory=memory)

@@ -1,0 +1,177 @@
+"""Training of a filter, from objects or from a configuration."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from pfbench.filter.learned import checkpoint
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.learn.trainer import TrainingState
+from pfbench.learn.training_config import Progress, Training
+from pfbench.learn.training_data import TrainingData, draw_training_data
+from pfbench.learn.training_log import open_tensorboard, write_losses
+from pfbench.model.base import StateSpaceModel
+from pfbench.noise.base import NoiseRegime
+from pfbench.results import store
+
+
+def train(
+    training: Training,
+    method: ParticleFilter,
+    model: StateSpaceModel,
+    data: TrainingData,
+    validation: TrainingData,
+    path: str | Path,
+    metadata: Mapping[str, Any] | None = None,
+    tell: Callable[[str], object] | None = None,
+) -> Path:
+    """Train the networks of a filter and write the checkpoint of the best epoch.
+
+    After each epoch `<path>.part` holds all that resuming needs. It is used if it exists, and
+    removed at the end. The file `<path>` with the suffix .csv has the losses. If TensorBoard is
+    installed, a folder of the same name has its log.
+
+    Args:
+        training: Settings.
+        method: The filter. Resampler and number of particles are those of the settings.
+        model: State-space model, on its device and in its precision.
+        worlds: Training data (`draw_worlds`).
+        validation: Validation data.
+        path: Path of the checkpoint.
+        about: More content of the checkpoint: config, choices, split. Numbers, strings, lists and
+            dicts.
+        tell: Function that receives the log line of each epoch.
+
+    Returns:
+        Path of the checkpoint.
+
+    Raises:
+        ValueError: If the filter has nothing to train, the objective does not fit it, or a
+            training with other settings was stopped at this path.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    pupil = TrainingState(training, method, model, data)
+    progress = pupil.restore(part)
+    write_board = open_tensorboard(path)
+    with tqdm(
+        total=training.epochs, initial=progress.epoch, desc="training", unit="epoch",
+        disable=None, leave=False,
+    ) as bar:  # fmt: skip
+        while (
+            progress.epoch < training.epochs
+            and progress.epochs_since_best < training.patience_epochs
+        ):
+            line = pupil.run_epoch(progress, data, validation)
+            bar.set_postfix({name: f"{line[name]:.4g}" for name in ("loss", "validation")})
+            bar.update()
+            write_board(line)
+            if tell:
+                with tqdm.external_write_mode():
+                    tell(" ".join(f"{name} {value:.5g}" for name, value in line.items()))
+            pupil.save(part, progress)
+            write_losses(path.with_suffix(".csv"), progress.losses)
+    checkpoint.write_checkpoint(path, _checkpoint_content(pupil, progress, metadata or {}))
+    part.unlink(missing_ok=True)
+    return path
+
+
+def fit(
+    cfg: Mapping[str, Any],
+    choices: Mapping[str, str],
+    regimes: Mapping[str, NoiseRegime],
+    build: Callable[[Any], Any],
+    metadata: Mapping[str, Any],
+    tell: Callable[[str], object],
+) -> Path:
+    """Train the networks of a configuration, unless their checkpoint exists.
+
+    Args:
+        cfg: Resolved configuration.
+        choices: Name chosen in each configuration group.
+        regimes: Noise regimes of the mixture, by name.
+        build: Function that instantiates a node of the configuration.
+        about: More content of the checkpoint.
+        tell: Function that prints the log line of an epoch.
+
+    Returns:
+        Path of the checkpoint.
+
+    Raises:
+        ValueError: If a value is out of range, or as `train`.
+    """
+    model, training, method = (build(cfg[group]) for group in ("model", "train", "filter"))
+    model = model.to(cfg["device"], getattr(torch, cfg["dtype"]))
+    scenario = build(cfg["scenario"])
+    path = _checkpoint_path(cfg, choices, regimes, training.checkpoint_path)
+    if path.exists() and not cfg["overwrite"]:
+        tell(f"skipped  checkpoint exists: {path}   (overwrite=true to repeat)")
+        return path
+    if cfg["overwrite"]:
+        path.with_name(path.name + ".part").unlink(missing_ok=True)
+    runs = {"train": training.training_runs, "validation": training.validation_runs}
+    seeds = {"train": training.seed, "validation": training.seed + 1}
+    data, validation = (
+        draw_training_data(
+            scenario, [*regimes.values()], model, runs[part], seeds[part], training.max_steps
+        )
+        for part in runs
+    )
+    split: dict[str, Any] = {"scenario": choices["scenario"]}
+    split |= {part: {"seed": seeds[part], "runs": runs[part] * len(regimes)} for part in runs}
+    selection = {group: choices[group] for group in ("scenario", "model", "filter", "train")}
+    selection["noise"] = "+".join(regimes)
+    content = {"config": cfg, "choices": selection, "split": split, **metadata}
+    return train(training, method, model, data, validation, path, content, tell)
+
+
+def _checkpoint_path(
+    cfg: Mapping[str, Any],
+    choices: Mapping[str, str],
+    regimes: Mapping[str, NoiseRegime],
+    path: str | None,
+) -> Path:
+    """Return the given path, or one that depends on all settings of the training."""
+    if path:
+        return Path(path)
+    groups = ("model", "scenario", "filter", "train", "noise", "dtype")
+    settings = {group: cfg[group] for group in groups} | {"noises": [*regimes]}
+    ignored = ("scenario.root", "scenario.cache_dir", "train.checkpoint_path")
+    key = store.config_key(checkpoint.replace_checkpoint_by_hash(settings), ignored)
+    name = f"{choices['filter']}_{choices['scenario']}_{key}.pt"
+    return Path(cfg["results_dir"]) / cfg["study"] / "checkpoints" / name
+
+
+def _checkpoint_content(
+    pupil: TrainingState, progress: Progress, about: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return weights of the best epoch, losses, cost and description."""
+    cost = {
+        "seconds": progress.seconds,
+        "epochs": progress.epoch,
+        "updates": progress.updates,
+        "particles": pupil.training.particles,
+        "device": str(pupil.model.anchor.device),
+        "threads": torch.get_num_threads(),
+    }
+    networks = {
+        name: {key: a.cpu() for key, a in weights.items()}
+        for name, weights in progress.best_weights.items()
+    }
+    return {
+        "choices": {},
+        **json.loads(json.dumps(about)),
+        "networks": networks,
+        "sizes": {name: list(part.sizes) for name, part in pupil.parts.items()},
+        "frames": {name: part.learnable.frame for name, part in pupil.parts.items()},
+        "model": {"class": type(pupil.model).__name__, "names": list(pupil.model.names)},
+        "losses": progress.losses,
+        "best": progress.best,
+        "cost": cost,
+    }

@@ -1,0 +1,347 @@
+"""Small nonlinear models from the literature, for tests and tutorials.
+
+Their posteriors can be computed in closed form or on a grid.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+from typing_extensions import override
+
+from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
+from pfbench.core.record import Record
+from pfbench.model.base import (
+    HALF_LOG_2PI,
+    StateSpaceModel,
+    as_float64,
+    check_positive,
+    independent_normal,
+    normal_batch,
+)
+
+
+class TimeIndexInputs(NamedTuple):
+    """Inputs of `UnivariateGrowth`.
+
+    Attributes:
+        t: Time index of the step, 1, 2, ..., [1, T].
+    """
+
+    t: Tensor
+
+
+class UnivariateGrowth(StateSpaceModel):
+    """Univariate nonlinear growth model [Gordon, Salmond, Smith 1993].
+
+    x' = x/2 + 25 x/(1 + x^2) + 8 cos(1.2 t) + process_sd w, y = x^2/20 + measurement_sd v.
+
+    Args:
+        process_sd: Standard deviation of the process noise.
+        measurement_sd: Standard deviation of the measurement noise.
+        initial_sd: Standard deviation of x_0 about 0.
+
+    Raises:
+        ValueError: if a standard deviation is not positive.
+    """
+
+    q: Tensor
+    r: Tensor
+    p0: Tensor
+
+    def __init__(
+        self,
+        process_sd: float = math.sqrt(10.0),
+        measurement_sd: float = 1.0,
+        initial_sd: float = math.sqrt(2.0),
+    ) -> None:
+        super().__init__()
+        self.register_buffer("q", check_positive("model.process_sd", [process_sd]))
+        self.register_buffer("r", check_positive("model.measurement_sd", [measurement_sd]))
+        self.register_buffer("p0", check_positive("model.initial_sd", [initial_sd]))
+        self.names, self.units, self.groups, self.noise_dim = ("x",), ("",), {"state": (0,)}, 1
+
+    @override
+    def prepare(self, record: Record) -> Record:
+        steps = torch.arange(1, record.y.shape[1] + 1, dtype=record.y.dtype, device=record.y.device)
+        return record._replace(u=TimeIndexInputs(steps.unsqueeze(0)))
+
+    @override
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, self.p0)
+
+    @override
+    def propagate(self, x: Tensor, u: TimeIndexInputs, w: Tensor) -> Tensor:
+        return (
+            0.5 * x
+            + 25.0 * x / (1.0 + x * x)
+            + 8.0 * torch.cos(1.2 * u.t)[:, None, None]
+            + self.q * w
+        )
+
+    @override
+    def noise_gain(self, u: TimeIndexInputs) -> Tensor:
+        return self.q.reshape(1, 1, 1)
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return independent_normal(x * x / 20.0, self.r)
+
+    @override
+    def transition(self, x: Tensor, u: TimeIndexInputs) -> Distribution:
+        return independent_normal(self.propagate(x, u, torch.zeros_like(x)), self.q)
+
+
+class StochasticVolatility(StateSpaceModel):
+    """Stochastic volatility model [Taylor 1982; Kim, Shephard, Chib 1998].
+
+    x' = mu + rho (x - mu) + sigma w, y ~ N(0, exp x). x_0 has the stationary distribution, so x_1
+    has it too. Libraries that observe x_0 start from the same distribution.
+
+    Args:
+        mu: Mean of the log volatility.
+        rho: Autocorrelation of the log volatility, |rho| < 1.
+        sigma: Standard deviation of the process noise.
+
+    Raises:
+        ValueError: if |rho| is 1 or more, or sigma is not positive.
+    """
+
+    sigma: Tensor
+    mu: Tensor
+    rho: Tensor
+
+    def __init__(self, mu: float = -1.0, rho: float = 0.95, sigma: float = 0.3) -> None:
+        super().__init__()
+        if not -1.0 < rho < 1.0:
+            raise ValueError(
+                f"model.rho must be between -1 and 1, exclusive, got {rho}. "
+                "Choose a stationary log volatility."
+            )
+        self.register_buffer("sigma", check_positive("model.sigma", [sigma]))
+        self.register_buffer("mu", as_float64([mu]))
+        self.register_buffer("rho", as_float64([rho]))
+        self.names, self.units, self.groups, self.noise_dim = (
+            ("log_volatility",),
+            ("",),
+            {"state": (0,)},
+            1,
+        )
+
+    @override
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, self.sigma / torch.sqrt(1.0 - self.rho**2), self.mu)
+
+    @override
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return self.mu + self.rho * (x - self.mu) + self.sigma * w
+
+    @override
+    def noise_gain(self, u: Any) -> Tensor:
+        return self.sigma.reshape(1, 1, 1)
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return independent_normal(torch.zeros_like(x), torch.exp(0.5 * x))
+
+    @override
+    def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
+        """Compute the log likelihood with one exponential per particle.
+
+        The general formula also needs a quotient and a logarithm.
+
+        Args:
+            y: Measurement, [R, 1].
+            x: Particles, [R, N, 1].
+            u: Not used.
+
+        Returns:
+            Log likelihood, [R, N]. A missing measurement gives 0.
+        """
+        square, log_variance = y.nan_to_num().square(), x[..., 0]
+        return torch.where(
+            torch.isnan(y),
+            0.0,
+            -0.5 * (square * torch.exp(-log_variance) + log_variance) - HALF_LOG_2PI,
+        )
+
+    @override
+    def transition(self, x: Tensor, u: Any) -> Distribution:
+        return independent_normal(self.mu + self.rho * (x - self.mu), self.sigma)
+
+
+class Benes(StateSpaceModel):
+    """Benes model: a nonlinear diffusion with a closed-form filter [Benes 1981].
+
+    dx = tanh(x) dt + dW, sampled every `step`; y = x + measurement_sd v. The transition density
+    cosh(x')/cosh(x) exp(-step/2) N(x'; x, step) is a mixture of N(x + step, step) and
+    N(x - step, step) with odds exp(2 x). Two normal variables drive it. The first is the increment,
+    the second selects the sign.
+
+    Args:
+        step: Sampling interval, s.
+        measurement_sd: Standard deviation of the measurement noise.
+
+    Raises:
+        ValueError: if an argument is not positive.
+    """
+
+    d: Tensor
+    r: Tensor
+
+    def __init__(self, step: float = 0.1, measurement_sd: float = 0.5) -> None:
+        super().__init__()
+        self.register_buffer("d", check_positive("model.step", step))
+        self.register_buffer("r", check_positive("model.measurement_sd", [measurement_sd]))
+        self.names, self.units, self.groups, self.noise_dim = ("x",), ("",), {"state": (0,)}, 2
+
+    @override
+    def initial(self, runs: int) -> Distribution:
+        """Return a distribution at 0, with standard deviation 1e-9 to keep it proper."""
+        return normal_batch(runs, torch.full_like(self.r, 1e-9))
+
+    @override
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        is_upward = torch.special.ndtr(w[..., 1:]) < torch.sigmoid(2.0 * x)
+        return x + torch.where(is_upward, self.d, -self.d) + torch.sqrt(self.d) * w[..., :1]
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return independent_normal(x, self.r)
+
+
+class Pendulum(StateSpaceModel):
+    """Noisy pendulum with measured horizontal deflection [Sarkka 2013, ex. 3.7].
+
+    y = sin(angle) + measurement_sd v. The dynamics use an Euler step.
+
+    Args:
+        step: Time step, s.
+        noise: Root density of the white angular acceleration, rad/s^2/sqrt(Hz).
+        measurement_sd: Standard deviation of the measurement noise.
+        initial_sd: Standard deviations of angle and rate about 0, rad and rad/s, [2].
+
+    Raises:
+        ValueError: if an argument is not positive.
+    """
+
+    l: Tensor
+    r: Tensor
+    p0: Tensor
+
+    def __init__(
+        self,
+        step: float = 0.05,
+        noise: float = 0.1,
+        measurement_sd: float = 0.3,
+        initial_sd: Sequence[float] = (0.5, 0.5),
+    ) -> None:
+        super().__init__()
+        d = float(check_positive("model.step", step))
+        q = check_positive("model.noise", noise) ** 2 * torch.tensor(
+            [[d**3 / 3, d**2 / 2], [d**2 / 2, d]], dtype=torch.float64
+        )
+        self.register_buffer("l", torch.linalg.cholesky(q))
+        self.register_buffer("r", check_positive("model.measurement_sd", [measurement_sd]))
+        self.register_buffer("p0", check_positive("model.initial_sd", list(initial_sd)))
+        self.step, self.noise_dim = d, 2
+        self.names, self.units, self.groups = (
+            ("angle", "rate"),
+            ("rad", "rad/s"),
+            {"angle": (0,), "rate": (1,)},
+        )
+        self.linear_given = self.groups["rate"]
+
+    @property
+    @override
+    def chart(self) -> Chart:
+        return Chart((AngleBlock(1), EuclideanBlock(1)))
+
+    @override
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, self.p0)
+
+    @override
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        angle, rate = x[..., :1], x[..., 1:]
+        predicted_mean = torch.cat(
+            [angle + rate * self.step, rate - 9.81 * torch.sin(angle) * self.step], -1
+        )
+        return self.chart.add(predicted_mean, w @ self.l.mT)
+
+    @override
+    def noise_gain(self, u: Any) -> Tensor:
+        return self.l.unsqueeze(0)
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return independent_normal(torch.sin(x[..., :1]), self.r)
+
+
+class Lorenz63(StateSpaceModel):
+    """Lorenz attractor (10, 28, 8/3) with noisy measurements [Lorenz 1963].
+
+    All three states are measured. Each step is one Runge-Kutta step of order 4.
+
+    Args:
+        step: Time step.
+        process_sd: Standard deviation of the process noise of each state.
+        measurement_sd: Standard deviation of the measurement noise of each state.
+        initial_sd: Standard deviation of each state about (1, 1, 25).
+
+    Raises:
+        ValueError: if an argument is not positive.
+    """
+
+    q: Tensor
+    r: Tensor
+    p0: Tensor
+
+    def __init__(
+        self,
+        step: float = 0.02,
+        process_sd: float = 0.1,
+        measurement_sd: float = 1.0,
+        initial_sd: float = 5.0,
+    ) -> None:
+        super().__init__()
+        self.register_buffer("q", check_positive("model.process_sd", [process_sd] * 3))
+        self.register_buffer("r", check_positive("model.measurement_sd", [measurement_sd] * 3))
+        self.register_buffer("p0", check_positive("model.initial_sd", [initial_sd] * 3))
+        self.step, self.noise_dim = float(check_positive("model.step", step)), 3
+        self.names, self.units, self.groups = ("x", "y", "z"), ("",) * 3, {"state": (0, 1, 2)}
+
+    @override
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, self.p0, self.p0.new_tensor([1.0, 1.0, 25.0]))
+
+    def drift(self, x: Tensor) -> Tensor:
+        """Compute the time derivative of states [..., 3]."""
+        a, b, c = x.unbind(-1)
+        return torch.stack([10.0 * (b - a), a * (28.0 - c) - b, a * b - 8.0 / 3.0 * c], -1)
+
+    @override
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        h = self.step
+        k1 = self.drift(x)
+        k2 = self.drift(x + 0.5 * h * k1)
+        k3 = self.drift(x + 0.5 * h * k2)
+        k4 = self.drift(x + h * k3)
+        return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4) + self.q * w
+
+    @override
+    def noise_gain(self, u: Any) -> Tensor:
+        return torch.diag(self.q).unsqueeze(0)
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return independent_normal(x, self.r)
+
+    @override
+    def transition(self, x: Tensor, u: Any) -> Distribution:
+        return independent_normal(self.propagate(x, u, torch.zeros_like(x)), self.q)

@@ -1,0 +1,220 @@
+"""Trajectories from manoeuvres: a sequence of segments.
+
+A segment changes speed, climb angle and heading by a given amount. Speed changes linearly (or
+smoothly). Angles change by the quintic u^3 (10 - 15 u + 6 u^2), so angular rate and angular
+acceleration are continuous and zero at the joints [ours].
+
+Manoeuvres, which are written in YAML, use degrees where an argument name ends in `_deg`. A
+Segment is in SI units and radians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from pfbench.nav.trajectory import (
+    NODES,
+    MotionProfile,
+    TrajectoryData,
+    TrajectorySource,
+    TrajectoryStart,
+    integrate_motion,
+)
+
+
+@dataclass(frozen=True)
+class ManoeuvreSegment:
+    """A section of motion and the changes along it.
+
+    Attributes:
+        duration: s.
+        speed: Change of speed, m/s.
+        climb: Change of flight-path angle, rad.
+        heading: Change of heading (clockwise from North), rad.
+        smooth: Whether the speed changes by the quintic too, without a step in acceleration.
+            Otherwise it is linear in time.
+
+    Raises:
+        ValueError: If the duration is not positive.
+    """
+
+    duration_s: float
+    speed: float = 0.0
+    climb: float = 0.0
+    heading: float = 0.0
+    smooth: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.duration_s > 0:
+            raise ValueError(f"duration must be positive, got {self.duration_s}. Give seconds.")
+
+
+Manoeuvre: TypeAlias = tuple[ManoeuvreSegment, ...]
+
+
+@dataclass(frozen=True)
+class ManoeuvreTrajectory(TrajectorySource):
+    """Segments in sequence.
+
+    Attributes:
+        segments: Manoeuvres and single segments, see `fly`.
+        start: Initial position, speed and heading.
+    """
+
+    segments: Sequence[Any]
+    start: TrajectoryStart
+
+    @override
+    def generate(self, rate: float) -> TrajectoryData:
+        return generate_manoeuvres(self.segments, self.start, rate)
+
+
+def accelerate(acceleration: float, duration_s: float, smooth: bool = False) -> Manoeuvre:
+    """Accelerate along the track, or brake if the acceleration is negative.
+
+    Args:
+        acceleration: Mean acceleration, m/s^2.
+        duration: s.
+        smooth: Whether the acceleration is continuous. Otherwise it is constant.
+    """
+    return (ManoeuvreSegment(duration_s, speed=acceleration * duration_s, smooth=smooth),)
+
+
+def cruise(duration_s: float) -> Manoeuvre:
+    """Fly straight at the present speed and climb angle."""
+    return (ManoeuvreSegment(duration_s),)
+
+
+def climb(angle_deg: float, pitch_duration_s: float, hold_duration_s: float) -> Manoeuvre:
+    """Pitch to a climb angle, hold it, pitch back. A negative angle descends.
+
+    Args:
+        angle_deg: Climb angle.
+        pitch_duration: Duration of each pitch change, s.
+        hold_duration: Duration at the climb angle, s.
+    """
+    angle = math.radians(angle_deg)
+    return (
+        ManoeuvreSegment(pitch_duration_s, climb=angle),
+        ManoeuvreSegment(hold_duration_s),
+        ManoeuvreSegment(pitch_duration_s, climb=-angle),
+    )
+
+
+def turn(angle_deg: float, duration_s: float) -> Manoeuvre:
+    """Fly a coordinated turn.
+
+    Args:
+        angle_deg: Change of heading, positive to the right.
+        duration: s.
+    """
+    return (ManoeuvreSegment(duration_s, heading=math.radians(angle_deg)),)
+
+
+def generate_manoeuvres(
+    segments: Iterable[ManoeuvreSegment | Iterable[ManoeuvreSegment]],
+    start: TrajectoryStart,
+    rate: float,
+) -> TrajectoryData:
+    """Fly segments in sequence.
+
+    Args:
+        segments: Manoeuvres (tuples of segments) and single segments, in order.
+        start: Initial position, speed and heading. The climb angle starts at 0.
+        rate: Samples per second.
+
+    Returns:
+        Truth and ideal increments, float64.
+
+    Raises:
+        ValueError: If `segments` is empty, a segment does not last a whole number of samples, or
+            the speed becomes negative.
+    """
+    plan = [
+        s for item in segments for s in ([item] if isinstance(item, ManoeuvreSegment) else item)
+    ]
+    counts = _sample_counts(plan, rate)
+    at_samples = _profile(plan, counts, start, rate, torch.zeros(1, dtype=torch.float64))
+    last = _profile(
+        plan[-1:],
+        counts[-1:],
+        _state_after(plan[:-1], start),
+        rate,
+        torch.ones(1, dtype=torch.float64),
+    )
+    samples = MotionProfile(
+        *(torch.cat([a[:, 0], b[-1:, 0]]) for a, b in zip(at_samples, last, strict=True))
+    )
+    return integrate_motion(samples, _profile(plan, counts, start, rate, NODES), start, rate)
+
+
+class _ProfileState(NamedTuple):
+    """Speed, climb angle and heading (rad) at the start of a segment."""
+
+    speed: float
+    climb: float
+    heading: float
+
+
+def _sample_counts(plan: list[ManoeuvreSegment], rate: float) -> list[int]:
+    if not plan:
+        raise ValueError("segments must not be empty. Give at least one manoeuvre.")
+    for k, segment in enumerate(plan):
+        samples = segment.duration_s * rate
+        # a step of acceleration inside a sample would be integrated wrongly without a message
+        if abs(samples - round(samples)) > 1e-6 or round(samples) < 1:
+            raise ValueError(
+                f"the duration of segment {k} must be a multiple of {1 / rate:.6g} s "
+                f"at rate={rate}, got {segment.duration_s} s ({samples:.4f} samples)."
+            )
+    return [round(segment.duration_s * rate) for segment in plan]
+
+
+def _state_after(
+    plan: list[ManoeuvreSegment], start: TrajectoryStart | _ProfileState
+) -> _ProfileState:
+    if isinstance(start, TrajectoryStart):
+        start = _ProfileState(start.speed, 0.0, math.radians(start.heading_deg))
+    return _ProfileState(
+        start.speed + math.fsum(s.speed for s in plan),
+        start.climb + math.fsum(s.climb for s in plan),
+        start.heading + math.fsum(s.heading for s in plan),
+    )
+
+
+def _profile(
+    plan: list[ManoeuvreSegment],
+    counts: list[int],
+    start: TrajectoryStart | _ProfileState,
+    rate: float,
+    offsets: Tensor,
+) -> MotionProfile:
+    """Compute the motion [n, m] at every sample plus `offsets` [m] of a sample."""
+    rows = []
+    for k, (segment, count) in enumerate(zip(plan, counts, strict=True)):
+        begin = _state_after(plan[:k], start)
+        length = count / rate
+        u = (torch.arange(count, dtype=torch.float64)[:, None] + offsets) / count
+        s = u**3 * (10 - 15 * u + 6 * u**2)
+        s1 = 30 * u**2 * (1 - u) ** 2 / length
+        s2 = 60 * u * (1 - u) * (1 - 2 * u) / length**2
+        v, v1 = (s, s1) if segment.smooth else (u, torch.full_like(u, 1 / length))
+        speed = (begin.speed + segment.speed * v, segment.speed * v1)
+        angles = (begin.climb + segment.climb * s, segment.climb * s1)
+        rows.append(
+            (
+                *speed,
+                *angles,
+                begin.heading + segment.heading * s,
+                segment.heading * s1,
+                segment.heading * s2,
+            )
+        )
+    return MotionProfile(*(torch.cat(column) for column in zip(*rows, strict=True)))

@@ -1,0 +1,140 @@
+"""Noise regimes that change with time: variance surges and bias steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import MeasurementChannels
+from pfbench.noise.base import NoiseRegime
+from pfbench.noise.distributions import ErrorDistribution
+from pfbench.noise.time_windows import Windows, check_windows, window_index
+from pfbench.noise.white import NominalNoise
+
+
+@dataclass(frozen=True)
+class VarianceSurge(NoiseRegime):
+    """Variances of measurement and process noise multiplied in time windows.
+
+    Errors outside the windows are identical to errors without a surge. Errors inside are scaled by
+    the square root of the factor. Process noise is the noise of simulated sensors (see
+    `Regime.process`), or the driving noise of a simulated model.
+
+    Attributes: windows: Pairs of seconds (from, to), from inclusive, to exclusive, in order. None
+        as `to` is
+            the end of the record.
+        r_factors: Factor on R in each window.
+        q_factors: Factor on Q in each window.
+        span: Duration in seconds for which the windows are written, to stretch them to the record.
+            None uses them unchanged.
+        of: Errors that are scaled.
+
+    Raises:
+        ValueError: If a window is invalid, the numbers of factors and windows differ, or a factor
+            is not positive.
+    """
+
+    windows_s: Windows
+    measurement_variance_factors: Sequence[float]
+    process_variance_factors: Sequence[float]
+    reference_duration_s: float | None = None
+    base_regime: NoiseRegime = field(default_factory=NominalNoise)
+
+    def __post_init__(self) -> None:
+        check_windows(self.windows_s, self.reference_duration_s)
+        for key, factors in (
+            ("measurement_variance_factors", self.measurement_variance_factors),
+            ("process_variance_factors", self.process_variance_factors),
+        ):
+            valid = all(0.0 < f < float("inf") for f in factors)
+            if len(factors) != len(self.windows_s) or not valid:
+                raise ValueError(
+                    f"noise.{key} must be {len(self.windows_s)} positive factors on the variance, "
+                    f"got {list(factors)}. Give one per window."
+                )
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        return self._factors_at(self.measurement_variance_factors, time).sqrt()[
+            :, None
+        ] * self.base_regime.draw_errors(draws, channels, time)
+
+    @override
+    def process_factors(self, time: Tensor) -> Tensor:
+        return self._factors_at(
+            self.process_variance_factors, time
+        ) * self.base_regime.process_factors(time)
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        family, shift, scale = self.base_regime.error_distribution(channels, time)
+        root = self._factors_at(self.measurement_variance_factors, time).sqrt()[:, None]
+        return ErrorDistribution(family, root * shift, root * scale)
+
+    def _factors_at(self, factors: Sequence[float], time: Tensor) -> Tensor:
+        """Return the factor at each time, [T]."""
+        return time.new_tensor([*factors, 1.0])[
+            window_index(self.windows_s, time, self.reference_duration_s)
+        ]  # index -1 (outside) selects 1
+
+
+@dataclass(frozen=True)
+class BiasStep(NoiseRegime):
+    """A constant bias of one or all components from some time on.
+
+    Attributes: size: Bias in nominal standard deviations of each component, with sign. time: Start
+        time, s. component: Index of the measurement component, from 0. None means all components.
+        span: Duration in seconds for which `time` is written, to stretch it to the record. None
+        uses
+            it unchanged.
+        of: Errors to which the bias is added.
+
+    Raises:
+        ValueError: If the component does not exist, or the time is after the end of the record.
+    """
+
+    bias_sd: float = 5.0
+    onset_s: float = 700.0
+    component: int | None = None
+    reference_duration_s: float | None = None
+    base_regime: NoiseRegime = field(default_factory=NominalNoise)
+
+    def __post_init__(self) -> None:
+        check_windows(((self.onset_s, None),), self.reference_duration_s)
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        return (
+            self.base_regime.draw_errors(draws, channels, time)
+            + self._bias(channels, time) * channels.sd
+        )
+
+    @override
+    def process_factors(self, time: Tensor) -> Tensor:
+        return self.base_regime.process_factors(time)
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        family, shift, scale = self.base_regime.error_distribution(channels, time)
+        return ErrorDistribution(family, shift + self._bias(channels, time), scale)
+
+    def _bias(self, channels: MeasurementChannels, time: Tensor) -> Tensor:
+        """Return the bias in nominal standard deviations, [T, Dy]."""
+        n = len(channels.sd)
+        if self.component is not None and not 0 <= self.component < n:
+            raise ValueError(
+                f"noise.component must be between 0 and {n - 1}, got {self.component}. "
+                f"The scenario measures {n} components."
+            )
+        biased = torch.tensor([self.component in (None, i) for i in range(n)])
+        started = window_index(((self.onset_s, None),), time, self.reference_duration_s) == 0
+        return torch.where(started[:, None] & biased, self.bias_sd, 0.0).to(time)

@@ -1,0 +1,235 @@
+"""One model for each run, so that chains and parameter particles share one filter pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import FunctionType
+from typing import Any
+
+import torch
+from pyro.distributions import Independent
+from torch import Tensor, nn
+from torch.distributions import Distribution, MixtureSameFamily, MultivariateNormal, Normal
+from torch.func import functional_call
+from typing_extensions import override
+
+from pfbench.core.record import Record, map_inputs
+from pfbench.model.base import ModelWrapper, StateSpaceModel, dense_normal, independent_normal
+
+
+class ModelBatch(ModelWrapper):
+    """A batch of models: run r has models[r // each].
+
+    Each method is mapped over the runs with the buffers in which the models differ. It works for
+    every model that stores its parameters in buffers. Gradients reach the buffers.
+
+    Args:
+        models: Models of one class that differ in their buffers only.
+        each: Consecutive runs that share a model.
+
+    Raises:
+        ValueError: if models differ in something other than a buffer, in their origin, or in their
+            noise distribution.
+    """
+
+    def __init__(self, models: Sequence[StateSpaceModel], each: int = 1) -> None:
+        first = models[0]
+        super().__init__(first)
+        self.linear, self.linear_given = first.linear, first.linear_given
+        self.observes_initial, self.choices = first.observes_initial, first.choices
+        self.models, self.each = tuple(models), each
+        self.size = len(models) * each
+        self._call = _Call(first)
+        self._buffers_by_run = {
+            f"model.{name}": value.repeat_interleave(each, 0)
+            for name, value in _differing(models).items()
+        }
+
+    @override
+    def prepare(self, record: Record) -> Record:
+        first = self.model.prepare(record)
+        if all(_same(first.u, model.prepare(record).u) for model in self.models[1:]):
+            return first
+        parts = [
+            self.models[r // self.each].prepare(record.select_runs(slice(r, r + 1)))
+            for r in range(self.size)
+        ]
+        y, u = torch.cat([part.y for part in parts]), _joined([part.u for part in parts])
+        return parts[0]._replace(y=y, u=u)
+
+    @override
+    def initial(self, runs: int) -> Distribution:
+        return self._law(lambda model: model.initial(1))
+
+    @override
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return self._mapped(lambda model, x, u, w: model.propagate(x, u, w), x, u, w)[:, 0]
+
+    @property
+    @override
+    def has_noise_gain(self) -> bool:
+        return self.model.has_noise_gain
+
+    @override
+    def noise_gain(self, u: Any) -> Tensor | None:
+        if self.model.noise_gain(u) is None:
+            return None
+        return self._mapped(lambda model, u: model.noise_gain(u), u)[:, 0]
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return self._law(lambda model, x, u: model.observation(x, u), x, u)
+
+    @override
+    def transition(self, x: Tensor, u: Any) -> Distribution | None:
+        if self.model.transition(x, u) is None:
+            return None
+        return self._law(lambda model, x, u: model.transition(x, u), x, u)
+
+    @override
+    def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
+        if type(self.model).log_likelihood is StateSpaceModel.log_likelihood:
+            return super().log_likelihood(y, x, u)
+        return self._mapped(lambda model, y, x, u: model.log_likelihood(y, x, u), y, x, u)[:, 0]
+
+    def _mapped(self, f: Callable[..., Any], *args: Any) -> Any:
+        """Evaluate f(model, ...) of every run as a batch of one, stacked [R, 1, ...]."""
+
+        def call_run(buffers: dict[str, Tensor], *parts: Any) -> Any:
+            batched = (_map_leaves(lambda a: a.unsqueeze(0), part) for part in parts)
+            return functional_call(self._call, buffers, (f, *batched))
+
+        expanded = [_map_leaves(lambda a: a.expand(self.size, *a.shape[1:]), a) for a in args]
+        return torch.vmap(call_run)(self._buffers_by_run, *expanded)
+
+    def _law(self, f: Callable[..., Any], *args: Any) -> Distribution:
+        """Map a distribution over the runs: its parameters are mapped, then it is built again."""
+        kinds: list[Any] = []
+
+        def parameters(model: StateSpaceModel, *parts: Any) -> dict[str, Tensor]:
+            law: Any = f(model, *parts)
+            base = law.base_dist if isinstance(law, torch.distributions.Independent) else law
+            kinds.append((type(law), type(base)))
+            if isinstance(base, MultivariateNormal):
+                return {"loc": base.loc, "scale_tril": base.scale_tril}
+            batch = len(law.batch_shape) + len(law.event_shape)
+            values = {name: getattr(base, name) for name in base.arg_constraints}
+            return {
+                name: a.reshape(*[1] * (batch - a.dim()), *a.shape) for name, a in values.items()
+            }
+
+        mapped = {name: a[:, 0] for name, a in self._mapped(parameters, *args).items()}
+        outer, base = kinds[0]
+        if issubclass(base, MultivariateNormal):
+            return dense_normal(mapped["loc"], mapped["scale_tril"])
+        if not issubclass(outer, torch.distributions.Independent):
+            raise TypeError(
+                f"{type(self.model).__name__} must use Independent or MultivariateNormal "
+                f"distributions in a batch of models, got {outer.__name__}. Run its models one by "
+                "one."
+            )
+        if issubclass(base, Normal):
+            return independent_normal(mapped["loc"], mapped["scale"])
+        if {"probs", "logits"} <= set(mapped):  # two names of one parameter
+            del mapped["probs"]
+        return Independent(base(**mapped), 1)
+
+
+class _Call(nn.Module):
+    def __init__(self, model: StateSpaceModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, f: Callable[..., Any], *args: Any) -> Any:
+        return f(self.model, *args)
+
+
+def _same_distribution(a: Any, b: Any) -> bool:
+    """Return whether two distributions have the same class and parameters."""
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, torch.distributions.Independent):
+        return _same_distribution(a.base_dist, b.base_dist)
+    if isinstance(a, MixtureSameFamily):
+        same = torch.equal(a.mixture_distribution.logits, b.mixture_distribution.logits)
+        return same and _same_distribution(a.component_distribution, b.component_distribution)
+    return all(_equal(getattr(a, name), getattr(b, name)) for name in a.arg_constraints)
+
+
+def _differing(models: Sequence[StateSpaceModel]) -> dict[str, Tensor]:
+    """Return buffers that differ between models, stacked [len(models), ...]."""
+    first, kind = models[0], type(models[0]).__name__
+    for model in models[1:]:
+        changed = list_non_buffers(first, model)
+        if changed:
+            raise ValueError(
+                f"{kind} must register {changed[0]} as a buffer, because the models of a batch may "
+                "differ in buffers only. Call register_buffer in its constructor."
+            )
+        if not torch.equal(first.origin, model.origin):
+            raise ValueError(
+                f"{kind} must have one origin in a batch of models, got different ones. Put the "
+                "difference into the initial distribution."
+            )
+        if not _same_distribution(first.noise, model.noise):
+            raise ValueError(
+                f"{kind} must have one noise distribution in a batch of models, got different "
+                "ones. Scale the noise inside `propagate`."
+            )
+    names = [name for name, _ in first.named_buffers()]
+    stacked = {name: [dict(model.named_buffers())[name] for model in models] for name in names}
+    differing = {name: torch.stack(v) for name, v in stacked.items() if not _all_same(v)}
+    if differing:
+        return differing
+    name, values = next(iter(stacked.items()))
+    return {name: torch.stack(values)}  # all models are equal: vmap still needs the number of runs
+
+
+def list_non_buffers(a: StateSpaceModel, b: StateSpaceModel) -> list[str]:
+    """List attributes that differ between two models and are not buffers.
+
+    Args:
+        a: Model.
+        b: Model of the same class.
+
+    Returns:
+        Dotted names, attributes of submodules included.
+    """
+    changed = []
+    for (path, module), (_, second) in zip(a.named_modules(), b.named_modules(), strict=True):
+        for name, value in vars(module).items():
+            if not name.startswith("_") and not _equal(value, vars(second).get(name)):
+                changed.append(f"{path}.{name}".lstrip("."))
+    return changed
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if isinstance(a, Tensor) or isinstance(b, Tensor):
+        return torch.equal(torch.as_tensor(a), torch.as_tensor(b))
+    return isinstance(a, FunctionType) or bool(a == b)
+
+
+def _all_same(values: Sequence[Tensor]) -> bool:
+    if any(a.requires_grad for a in values):
+        return False
+    return all(torch.equal(values[0], a) for a in values[1:])
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, Tensor):
+        return a is b or torch.equal(a, b)
+    return all(_same(first, second) for first, second in zip(a, b, strict=True))
+
+
+def _joined(inputs: Sequence[Any]) -> Any:
+    """Concatenate inputs of several records along the runs."""
+    first = inputs[0]
+    if isinstance(first, Tensor):
+        return torch.cat(list(inputs))
+    if not first:
+        return first
+    return type(first)(*(_joined(parts) for parts in zip(*inputs, strict=True)))
+
+
+def _map_leaves(f: Callable[[Tensor], Tensor], part: Any) -> Any:
+    return f(part) if isinstance(part, Tensor) else map_inputs(f, part)

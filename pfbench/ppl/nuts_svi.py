@@ -1,0 +1,158 @@
+"""Gradient-based inference of parameters with Pyro: NUTS and variational inference.
+
+Pyro's samplers use torch's global random state. It is seeded and restored here (`fork_rng`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import pyro
+import torch
+from pyro.distributions import Delta, MultivariateNormal, constraints
+from pyro.infer import MCMC, NUTS, SVI, Trace_ELBO
+from pyro.optim import ClippedAdam
+from torch import Tensor
+from torch.distributions import biject_to
+
+from pfbench.core.record import Record
+from pfbench.ppl.parameter_posterior import ParameterPosterior
+from pfbench.ppl.program import ParameterisedModel, Values
+
+Program = Callable[[Record], Values]
+
+
+class VariationalResult(NamedTuple):
+    """The result of variational inference.
+
+    Attributes:
+        posterior: Draws from the variational guide.
+        losses: Negative evidence lower bound after each step.
+    """
+
+    posterior: ParameterPosterior
+    losses: list[float]
+
+
+def nuts(
+    program: Program,
+    record: Record,
+    draws: int,
+    warmup: int,
+    chains: int = 2,
+    seed: int = 0,
+    progress: bool = False,
+) -> ParameterPosterior:
+    """Draw from a posterior with the no-U-turn sampler, chain after chain.
+
+    Sites that are not scalar (the path of a latent program) are left out of the posterior.
+
+    Args:
+        program: Program with a differentiable likelihood.
+        record: Measurements and inputs.
+        draws: Draws of each chain.
+        warmup: Warm-up steps of each chain.
+        chains: Number of chains.
+        seed: Seed of all random numbers.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Draws and acceptance rates.
+    """
+    samples: list[dict[str, Tensor]] = []
+    accepted = []
+    for chain in range(chains):
+        with torch.random.fork_rng():
+            torch.manual_seed(1000 * seed + chain)
+            sampler = MCMC(
+                NUTS(program),
+                num_samples=draws,
+                warmup_steps=warmup,
+                disable_progbar=not progress,
+            )
+            sampler.run(record)
+        samples.append({name: a for name, a in sampler.get_samples().items() if a.dim() == 1})
+        accepted.append(sampler.diagnostics()["acceptance rate"]["chain 0"])
+    stacked = {name: torch.stack([a[name] for a in samples]) for name in samples[0]}
+    return ParameterPosterior(stacked, torch.tensor(accepted), "NUTS")
+
+
+def svi(
+    program: Program,
+    record: Record,
+    guide: Callable[[Record], Any],
+    steps: int,
+    draws: int,
+    rate: float = 0.05,
+    seed: int = 0,
+    particles: int = 1,
+) -> VariationalResult:
+    """Run stochastic variational inference.
+
+    Args:
+        program: Program with a differentiable likelihood.
+        record: Measurements and inputs.
+        guide: Variational guide: one of Pyro's (`AutoMultivariateNormal(program)`) or
+            `normal_guide`.
+        steps: Steps of Adam; the learning rate falls to a tenth.
+        draws: Draws from the guide at the end.
+        rate: Initial learning rate.
+        seed: Seed of all random numbers.
+        particles: Draws for each gradient.
+
+    Returns:
+        Draws and losses.
+    """
+    with torch.random.fork_rng(), pyro.get_param_store().scope():
+        torch.manual_seed(seed)
+        optimiser = ClippedAdam({"lr": rate, "lrd": 0.1 ** (1.0 / steps)})
+        inference = SVI(program, guide, optimiser, Trace_ELBO(num_particles=particles))
+        losses = [float(inference.step(record)) for _ in range(steps)]
+        with torch.no_grad():
+            samples = [guide(record) for _ in range(draws)]
+    stacked = {name: torch.stack([a[name] for a in samples]).unsqueeze(0) for name in samples[0]}
+    return VariationalResult(ParameterPosterior(stacked, method="SVI"), losses)
+
+
+def normal_guide(
+    unknown: ParameterisedModel, separate_parameters: bool = False, spread: float = 0.3
+) -> Callable[[Record], Values]:
+    """Build a variational guide: a normal distribution of the unconstrained parameters.
+
+    It has all covariances and starts at the medians of the prior.
+
+    Args:
+        unknown: Model and prior.
+        apart: If true, each run has its own distribution, for programs whose runs have their own
+            parameters. Pyro's guides offer one joint distribution, or none between parameters.
+        spread: Initial standard deviation.
+
+    Returns:
+        Guide of a record.
+    """
+    p = len(unknown.prior)
+    medians = unknown.unconstrained(unknown.sample(1001, 0)).median(0).values
+
+    def sample_parameters(runs: torch.Size) -> Values:
+        loc = pyro.param("loc", lambda: medians.expand(*runs, p).clone())
+        eye = spread * torch.eye(p, dtype=torch.float64)
+        lower = constraints.lower_cholesky
+        root = pyro.param("root", lambda: eye.repeat(*runs, 1, 1), constraint=lower)
+        normal = MultivariateNormal(loc, scale_tril=root)
+        z = pyro.sample("_whole", normal, infer={"is_auxiliary": True})
+        values = {}
+        for (name, law), part in zip(unknown.prior.items(), z.unbind(-1), strict=True):
+            to_support = biject_to(law.support)
+            value = to_support(part)
+            log_density = -to_support.log_abs_det_jacobian(part, value)
+            values[name] = pyro.sample(name, Delta(value, log_density=log_density))
+        return values
+
+    def guide(record: Record) -> Values:
+        if not separate_parameters:
+            return sample_parameters(torch.Size())
+        with pyro.plate("runs", len(record.y)):
+            return sample_parameters(torch.Size([len(record.y)]))
+
+    return guide

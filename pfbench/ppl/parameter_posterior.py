@@ -1,0 +1,181 @@
+"""Posterior draws of parameters: table, convergence diagnostics and plot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+from pyro.ops.stats import effective_sample_size, hpdi, split_gelman_rubin
+from scipy.stats import gaussian_kde
+from torch import Tensor
+
+from pfbench.report.plots.plotting import COLUMN, RC, add_legend, line_styles
+
+WELL_MIXED = 1.05  # upper limit of split r-hat for chains that agree
+
+
+@dataclass(frozen=True)
+class ParameterPosterior:
+    """Draws of the parameters.
+
+    Attributes:
+        draws: Draws by parameter, [chains, S], or [chains, S, R] if runs have their own parameters.
+        accepted: Share of accepted proposals, [chains] or [chains, R]; None without proposals.
+        how: Algorithm, for captions.
+    """
+
+    draws: Mapping[str, Tensor]
+    accepted: Tensor | None = None
+    method: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a dictionary that JSON can store; `heard` reads it."""
+        accepted = None if self.accepted is None else self.accepted.tolist()
+        draws = {name: a.tolist() for name, a in self.draws.items()}
+        return {"draws": draws, "accepted": accepted, "how": self.method}
+
+    @staticmethod
+    def from_dict(told: Mapping[str, Any]) -> ParameterPosterior:
+        """Build a posterior from the dictionary of `told`."""
+        draws = {name: torch.tensor(a, dtype=torch.float64) for name, a in told["draws"].items()}
+        accepted = told["accepted"]
+        if accepted is not None:
+            accepted = torch.tensor(accepted, dtype=torch.float64)
+        return ParameterPosterior(draws, accepted, told["how"])
+
+    def run(self, r: int) -> ParameterPosterior:
+        """Return the posterior of run r, if runs have their own parameters."""
+        accepted = None if self.accepted is None else self.accepted[..., r]
+        return ParameterPosterior(
+            {name: a[..., r] for name, a in self.draws.items()}, accepted, self.method
+        )
+
+    def pooled_draws(self, name: str) -> Tensor:
+        """Return the draws of all chains, [chains S]."""
+        return self.draws[name].flatten(0, 1)
+
+    def table(self, mass: float = 0.9) -> pd.DataFrame:
+        """Summarise each parameter in a row.
+
+        Columns are mean, sd, median, the narrowest interval of this mass, split r-hat and effective
+        sample size. Without chains to compare (SVI, or fewer than four draws) r-hat is NaN and the
+        effective sample size is the number of draws.
+
+        Args:
+            mass: Probability of the interval.
+
+        Returns:
+            Table with the parameters as index.
+
+        Raises:
+            ValueError: if runs have their own parameters.
+        """
+        rows = {}
+        for name, a in self.draws.items():
+            if a.dim() != 2:
+                raise ValueError(
+                    "table needs parameters shared by all runs, got one set per run. Use "
+                    "posterior.run(r).table()."
+                )
+            flat = a.flatten().double()
+            low, high = hpdi(flat, mass).tolist()
+            chained = self.accepted is not None and a.shape[1] >= 4
+            rows[name] = {
+                "mean": float(flat.mean()),
+                "sd": float(flat.std()),
+                "median": float(flat.median()),
+                "low": low,
+                "high": high,
+                "r_hat": float(split_gelman_rubin(a.double())) if chained else np.nan,
+                "ess": float(effective_sample_size(a.double())) if chained else float(flat.numel()),
+            }
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+    @property
+    def has_converged(self) -> bool:
+        """Whether split r-hat of all parameters is below 1.05.
+
+        True without chains, False with fewer than four draws.
+        """
+        if self.accepted is None:
+            return True
+        samples = [a.double() for a in self.draws.values()]
+        return all(
+            a.shape[1] >= 4 and bool((split_gelman_rubin(a) < WELL_MIXED).all()) for a in samples
+        )
+
+
+def plot_posterior(
+    posteriors: Mapping[str, ParameterPosterior],
+    prior: Mapping[str, Any],
+    truth: Mapping[str, float] | None = None,
+    names: Mapping[str, str] | None = None,
+) -> Figure:
+    """Plot traces of the chains and densities of the draws, a row for each parameter.
+
+    The dotted line is the prior density.
+
+    Args:
+        posteriors: Posteriors by label; each label has a colour.
+        prior: Prior distributions by parameter.
+        truth: True values by parameter, drawn as vertical lines.
+        names: Axis labels by parameter, with units; None uses the parameter names.
+
+    Returns:
+        Figure.
+    """
+    truth = truth or {}
+    axis_labels = {name: name.replace("_", " ") for name in prior} | dict(names or {})
+    styles = line_styles(list(posteriors))
+    with matplotlib.rc_context(RC):
+        size = (2 * COLUMN, 0.3 + 1.5 * len(prior))
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(len(prior), 2, squeeze=False, width_ratios=(1.4, 1.0))
+        for (trace, density), name in zip(axes, prior, strict=True):
+            for label, posterior in posteriors.items():
+                _plot_draws(trace, density, posterior, name, label, styles[label])
+            _plot_prior(density, prior[name])
+            if name in truth:
+                density.axvline(truth[name], color="black", linewidth=0.8, label="truth")
+            trace.set_ylabel(axis_labels[name])
+            density.set_xlabel(axis_labels[name])
+            density.set_yticks([])
+        axes[0, 0].set_title("chains")
+        axes[0, 1].set_title("density")
+        axes[-1, 0].set_xlabel("stored draws [%]")
+        add_legend(figure, axes[0, 1], columns=len(posteriors) + 2)
+    return figure
+
+
+def _plot_draws(
+    trace: Any, density: Any, posterior: ParameterPosterior, name: str, label: str, style: Any
+) -> None:
+    """Plot chains and density of one parameter."""
+    chains = posterior.draws[name].double().numpy()
+    if posterior.accepted is not None:
+        percent = np.linspace(0.0, 100.0, chains.shape[1])
+        for chain in chains:
+            trace.plot(percent, chain, color=style.colour, linewidth=0.4, alpha=0.7)
+    x, height = _estimate_density(chains.ravel())
+    density.plot(x, height, color=style.colour, linestyle=style.dash, label=label)
+
+
+def _plot_prior(axis: Any, distribution: Any) -> None:
+    """Plot a prior density over the limits of an axis."""
+    low, high = axis.get_xlim()
+    x = torch.linspace(low, high, 200)
+    x = x[distribution.support.check(x)]
+    height = distribution.log_prob(x).exp()
+    axis.plot(x, height, color="0.5", linestyle=":", label="prior")
+
+
+def _estimate_density(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    low, high = np.quantile(draws, [0.001, 0.999])
+    x = np.linspace(low, high, 200)
+    return x, gaussian_kde(draws)(x)

@@ -1,0 +1,196 @@
+"""Budget of compared filters, and the Pareto front of accuracy and time.
+
+A comparison is made at an equal budget: number of particles, time per step, or likelihood evaluations.
+The job key `budget` states the intended budget. The report adds the measured values.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pfbench.results.error_measures import Array
+from pfbench.results.store import BUDGETS, SAME_N, SAME_TIME
+
+_NAMED = 4  # filters that are listed by name if their number of particles differs
+_CLOSE = 1.25  # ratio of times per step below which budgets count as equal: times vary between jobs [ours]
+
+
+@dataclass(frozen=True)
+class ParetoFront:
+    """Accuracy and time of the filters for one group in one condition.
+
+    Attributes:
+        cell: Name of the condition.
+        group: Name of the component group.
+        unit: Unit of the group.
+        filters: Labels, ordered by time.
+        seconds: Time per step, s.
+        rmse: Median over runs of the RMSE; a lost run counts as infinite.
+        kept: Whether the filter is on the Pareto front.
+    """
+
+    cell: str
+    group: str
+    unit: str
+    filters: tuple[str, ...]
+    seconds: tuple[float, ...]
+    rmse: tuple[float, ...]
+    kept: tuple[bool, ...]
+
+
+def format_budget(metas: Sequence[Mapping[str, Any]]) -> str:
+    """Format the budget of compared jobs and its measured values as a table note.
+
+    Args:
+        metas: Metadata of the jobs.
+
+    Raises:
+        ValueError: If the budget of a job is not in `store.BUDGETS`.
+    """
+    kinds = list(dict.fromkeys(_kind(meta) for meta in metas))
+    if len(kinds) > 1:
+        return f"Budget: differs between jobs ({', '.join(kinds)})."
+    (kind,) = kinds
+    return f"Budget: {kind}{_measured(kind, metas)}."
+
+
+def pareto_front(cell: str, rows: pd.DataFrame, group: str) -> ParetoFront:
+    """Compute accuracy and time of the filters for one group in one condition.
+
+    Args:
+        cell: Name of the condition.
+        rows: Rows of `frame` of the condition.
+        group: Name of the component group.
+    """
+    group_rows = rows[(rows.metric == "rmse") & (rows.component == "norm") & (rows.group == group)]
+    error = group_rows.groupby("label").value.median()
+    time = (
+        rows[rows.metric == "seconds_per_step"].groupby("label").value.median().reindex(error.index)
+    )
+    order = sorted(error.index, key=lambda label: (time[label], error[label], label))
+    seconds, rmse = time[order].to_numpy(dtype=np.float64), error[order].to_numpy(dtype=np.float64)
+    unit = str(group_rows.unit.iloc[0]) if len(group_rows) else ""
+    kept = tuple(map(bool, pareto_mask(seconds, rmse)))
+    return ParetoFront(
+        cell,
+        group,
+        unit,
+        tuple(map(str, order)),
+        tuple(map(float, seconds)),
+        tuple(map(float, rmse)),
+        kept,
+    )
+
+
+def pareto_mask(cost: Array, loss: Array) -> np.ndarray:
+    """Return the mask [n] of points that are not dominated in cost and loss.
+
+    A point with an infinite or missing loss is never on the front.
+
+    Args:
+        cost: Cost, [n].
+        loss: Loss, [n].
+    """
+    cost, loss = np.asarray(cost, dtype=np.float64), np.asarray(loss, dtype=np.float64)
+    no_worse = (cost[:, None] <= cost) & (loss[:, None] <= loss)
+    less = (cost[:, None] < cost) | (loss[:, None] < loss)
+    return ~(no_worse & less).any(axis=0) & np.isfinite(loss)
+
+
+def _kind(meta: Mapping[str, Any]) -> str:
+    """Return the budget of a job."""
+    config = meta.get("config")
+    kind = str(
+        meta.get("budget")
+        or (config.get("budget") if isinstance(config, Mapping) else None)
+        or SAME_N
+    )
+    if kind not in BUDGETS:
+        options = ", ".join(BUDGETS)
+        raise ValueError(
+            f"budget must be one of {options}, got {kind} in job {meta.get('key')}. Repeat the job."
+        )
+    return kind
+
+
+def _numbers(metas: Sequence[Mapping[str, Any]]) -> str:
+    """Format the most frequent number of particles and the filters with other numbers."""
+    by_label = [
+        (int(meta["particles"]), str(meta.get("label", "")))
+        for meta in metas
+        if meta.get("particles")
+    ]
+    count = Counter(number for number, _ in by_label)
+    (most, _), *others = sorted(count.items(), key=lambda item: (-item[1], item[0]))
+    texts = []
+    for number, _ in sorted(others):
+        labels = sorted({label for count_, label in by_label if count_ == number and label})
+        texts.append(
+            f"{number} of {', '.join(labels)}" if 0 < len(labels) <= _NAMED else str(number)
+        )
+    return f"N = {', '.join([str(most), *texts])}{_changing(metas)}"
+
+
+def _changing(metas: Sequence[Mapping[str, Any]]) -> str:
+    """Format the particle counts of filters that adapt them."""
+    used: dict[str, list[Mapping[str, float]]] = {}
+    for meta in metas:
+        if "particles_used" in meta:
+            used.setdefault(str(meta.get("label", "")), []).append(meta["particles_used"])
+    texts = [
+        f"{label} used {min(row['least'] for row in rows)} to {max(row['most'] for row in rows)}, "
+        f"{sum(row['mean'] for row in rows) / len(rows):.0f} on average"
+        for label, rows in sorted(used.items())
+    ]
+    return "".join(f", {text}" for text in texts)
+
+
+def _measured(kind: str, metas: Sequence[Mapping[str, Any]]) -> str:
+    """Format the measured budget of the particle filters."""
+    jobs = [meta for meta in metas if meta.get("particles")]
+    if not jobs:
+        return " (without particle filters)"
+    if kind == SAME_N:
+        numbers = sorted({int(meta["particles"]) for meta in jobs})
+        return (
+            f" (N = {numbers[0]} in each particle filter)"
+            if len(numbers) == 1
+            else f" not met ({_numbers(metas)})"
+        )
+    if kind == SAME_TIME:
+        return _kept(
+            [float(meta["seconds"]["per_step"]) for meta in jobs], 1e3, "ms per step", jobs
+        )
+    if any(meta.get("likelihoods_per_step") is None for meta in jobs):
+        return " (as configured; the jobs do not count them)"
+    return _kept([float(meta["likelihoods_per_step"]) for meta in jobs], 1.0, "per step", jobs)
+
+
+def _kept(
+    costs: Sequence[float], scale: float, unit: str, metas: Sequence[Mapping[str, Any]]
+) -> str:
+    """Format the cost of a step, and the filters that miss the target cost.
+
+    The target is the price of the job, which differs between conditions, or else the median cost.
+    """
+    middle = float(np.median(costs))
+    prices = [(meta.get("bought") or {}).get("price", middle) for meta in metas]
+    far: dict[str, list[float]] = {}
+    for meta, cost, price in zip(metas, costs, prices, strict=True):
+        if not price / _CLOSE <= cost <= price * _CLOSE:
+            far.setdefault(str(meta.get("label", "")), []).append(cost / price)
+    text = f"{scale * min(costs):.3g} to {scale * max(costs):.3g} {unit}, particle filters only, {_numbers(metas)}"
+    missed = [f"{label} ({_range(ratios)} times the target)" for label, ratios in far.items()]
+    return f" not met by {', '.join(missed)} ({text})" if missed else f" ({text})"
+
+
+def _range(values: Sequence[float]) -> str:
+    """Format the range of values."""
+    low, high = (f"{value:.2g}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"

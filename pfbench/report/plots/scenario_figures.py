@@ -1,0 +1,267 @@
+"""Figures of a datasheet: track, sensors, satellites, residuals, spread of the runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from pfbench.report import scenario_data
+from pfbench.report.plots.axis_ticks import use_log_if_wide
+from pfbench.report.plots.plotting import (
+    COLUMN,
+    add_legend,
+    format_axis_label,
+    line_styles,
+    select_indices,
+    stacked_axes,
+)
+from pfbench.results import consistency, store
+
+_BOUND: Any = {"color": "black", "ls": (0, (4, 1.5)), "lw": 0.9}
+_AXES = ("right", "forward", "up")
+_LIMIT = 5.0  # standard deviations, limit of a histogram
+
+
+def plot_scenario_track(sheet: store.JobResult) -> Figure:
+    """Plot the plan view and the height over time."""
+    figure = Figure(figsize=(COLUMN, 4.8), layout="constrained")
+    plan, height = figure.subplots(2, 1, height_ratios=(2.2, 1))
+    paths, time = scenario_data.select_tracks(sheet.arrays["track"]), sheet.arrays["time"]
+    reach = np.nanmax(np.abs(paths[..., :2]))
+    unit, scale = ("km", 1e-3) if reach > 5e3 else ("m", 1.0)
+    thin = select_indices(time.size)
+    for path in paths[1:21, thin]:
+        plan.plot(path[:, 0] * scale, path[:, 1] * scale, color="0.75", lw=0.7)
+        height.plot(time[thin], path[:, 2], color="0.75", lw=0.7)
+    first = paths[0][~np.isnan(paths[0]).any(-1)]
+    plan.plot(first[:, 0] * scale, first[:, 1] * scale, color="#0072B2", lw=1.3, label="first run")
+    height.plot(time[thin], paths[0, thin, 2], color="#0072B2", lw=1.3)
+    for label, point, fill in (("start", first[0], "white"), ("end", first[-1], "#0072B2")):
+        shape: Any = {
+            "marker": "o" if label == "start" else "s",
+            "ms": 5,
+            "ls": "none",
+            "zorder": 5,
+        }
+        plan.plot(*(point[:2] * scale), mfc=fill, color="#0072B2", label=label, **shape)
+    plan.set(xlabel=f"east [{unit}]", ylabel=f"north [{unit}]")
+    plan.set_aspect("equal", adjustable="datalim")
+    plan.locator_params(axis="x", nbins=5)
+    height.set(xlabel="time [s]", ylabel="height [m]")
+    add_legend(figure, plan, columns=3)
+    return figure
+
+
+def plot_distance(sheet: store.JobResult) -> Figure:
+    """Plot the horizontal range over time."""
+    figure, (axis,) = stacked_axes(1, 1.6)
+    axis.plot(sheet.arrays["time"], sheet.arrays["range"] / 1e3, color="#0072B2")
+    axis.set(xlabel="time [s]", ylabel="horizontal range [km]")
+    return figure
+
+
+def plot_sensors(sheet: store.JobResult) -> Figure:
+    """Plot specific force and angular rate over time, a line per body axis."""
+    figure, panels = stacked_axes(2, 1.7)
+    lines = list(line_styles(_AXES).values())
+    time, rate = sheet.arrays["time"], sheet.arrays["rate"] * np.degrees(1)
+    rows = (sheet.arrays["force"], "specific force [m/s²]"), (rate, "rate [deg/s]")
+    for axis, (values, ylabel) in zip(panels, rows, strict=True):
+        for k, name in enumerate(_AXES):
+            axis.plot(
+                time, values[:, k], color=lines[k].colour, ls=lines[k].dash, lw=1.1, label=name
+            )
+        axis.set_ylabel(ylabel)
+    panels[-1].set_xlabel("time [s]")
+    add_legend(figure, panels[0], columns=3)
+    return figure
+
+
+def plot_sky(sheet: store.JobResult) -> Figure:
+    """Plot the satellites in the sky, north up, east to the right."""
+    figure = Figure(figsize=(COLUMN, 3.6), layout="constrained")
+    axis: Any = figure.add_subplot(projection="polar")
+    axis.set_theta_zero_location("N")
+    axis.set_theta_direction(-1)
+    axis.set_rlim(0, 90)
+    axis.set_thetagrids(range(0, 360, 45), labels=["N", "NE", "E", "SE", "S", "SW", "W", "NW"])
+    azimuth, zenith = (
+        sheet.arrays["azimuth"].astype(float),
+        90 - np.degrees(sheet.arrays["elevation"].astype(float)),
+    )
+    axis.set_rgrids(
+        [30, 60],
+        labels=["60°", "30°"],
+        angle=_free_direction(azimuth, zenith),
+        color="0.4",
+        fontsize=6.5,
+    )
+    paths = [
+        (name, azimuth[:, s], zenith[:, s])
+        for s, name in enumerate(scenario_data.count_satellites(sheet))
+    ]
+    for look, (name, theta, r) in zip(
+        line_styles([path[0] for path in paths]).values(), paths, strict=True
+    ):
+        steps = np.flatnonzero(~np.isnan(theta) & ~np.isnan(r))
+        if not steps.size:
+            continue
+        axis.plot(theta[steps], r[steps], color=look.colour, lw=1.6, solid_capstyle="round")
+        tip, before = steps[-1], steps[max(0, steps.size - 1 - max(1, steps.size // 10))]
+        if (
+            tip != before
+            and np.hypot(r[tip] * (theta[tip] - theta[before]), r[tip] - r[before]) > 0.05
+        ):
+            arrow: Any = {
+                "arrowstyle": "-|>",
+                "color": look.colour,
+                "lw": 0.8,
+                "mutation_scale": 9,
+                "shrinkA": 0,
+                "shrinkB": 0,
+            }
+            axis.annotate("", (theta[tip], r[tip]), (theta[before], r[before]), arrowprops=arrow)
+        offset: Any = {
+            "textcoords": "offset points",
+            "fontsize": 7,
+            "color": look.colour,
+            "ha": "center",
+            "va": "center",
+        }
+        axis.annotate(
+            str(name),
+            (theta[steps[0]], r[steps[0]]),
+            _label_offset(theta[steps], r[steps]),
+            **offset,
+        )
+    return figure
+
+
+def plot_measurements(sheet: store.JobResult) -> Figure:
+    """Plot the number of satellites and of observed components over time."""
+    a = sheet.arrays
+    counts = {"components": (a["seen"].astype(float).sum(1), "#D55E00")}
+    if "azimuth" in a:
+        counts = {"satellites": (scenario_data.visible_satellites(sheet), "#0072B2"), **counts}
+    figure, panels = stacked_axes(len(counts), 1.3)
+    for axis, (name, (count, colour)) in zip(panels, counts.items(), strict=True):
+        sparse = scenario_data.has_sparse_counts(count)
+        shown = count > 0 if sparse else np.ones_like(count, dtype=bool)
+        line: Any = (
+            {"ls": "none", "marker": ".", "ms": 2.5}
+            if sparse
+            else {"ls": "-", "lw": 1.1, "drawstyle": "steps-mid"}
+        )
+        axis.plot(a["time"][shown], count[shown], color=colour, **line)
+        axis.set(ylabel=name)
+        axis.set_ylim(bottom=0)
+    panels[-1].set_xlabel("time [s]")
+    return figure
+
+
+def plot_residuals(sheet: store.JobResult) -> Figure:
+    """Plot residual histograms with the standard normal density, a panel per measurement kind."""
+    kinds = scenario_data.group_residuals(sheet)
+    figure, panels = stacked_axes(len(kinds), 1.5)
+    x = np.linspace(-_LIMIT, _LIMIT, 201)
+    for axis, (kind, z) in zip(panels, kinds.items(), strict=True):
+        law = consistency.compute_whiteness(z)
+        values = np.clip(z[~np.isnan(z)], -_LIMIT, _LIMIT)
+        bins = int(np.clip(2 * np.sqrt(values.size), 11, 61))
+        axis.hist(
+            values,
+            bins=bins,
+            range=(-_LIMIT, _LIMIT),
+            density=True,
+            color="#56B4E9",
+            alpha=0.75,
+            label="residuals",
+        )
+        axis.plot(
+            x,
+            np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi),
+            color="black",
+            lw=1,
+            label="standard normal",
+        )
+        title = f"{kind}: variance {law.variance:.3g} (1 ± {law.variance_band:.2g}), "
+        axis.set_title(f"{title}lag-1 {law.lag:+.2g} (± {law.lag_band:.2g})", fontsize=7)
+        axis.set_ylabel("density")
+    panels[-1].set_xlabel("residual [sd]")
+    add_legend(figure, panels[0])
+    return figure
+
+
+def plot_over_time(sheet: store.JobResult) -> Figure:
+    """Plot the residuals of the first run over time."""
+    kinds = scenario_data.group_residuals(sheet)
+    figure, panels = stacked_axes(len(kinds), 1.3)
+    for axis, (kind, z) in zip(panels, kinds.items(), strict=True):
+        first = z[0]
+        time = np.broadcast_to(sheet.arrays["time"][:, None], first.shape)
+        finite_mask = ~np.isnan(first)
+        axis.plot(
+            time[finite_mask],
+            first[finite_mask],
+            ls="none",
+            marker=".",
+            ms=3,
+            color="#0072B2",
+            alpha=0.8,
+            mew=0,
+        )
+        for edge in (-2, 2):
+            axis.axhline(edge, color="black", lw=0.7, ls=(0, (4, 2)))
+        axis.set(title=kind, ylabel="residual [sd]")
+    panels[-1].set_xlabel("time [s]")
+    return figure
+
+
+def plot_error_spread(sheet: store.JobResult) -> Figure:
+    """Plot the standard deviation over runs of each group, and the PCRB."""
+    rows = scenario_data.compute_spreads(sheet)
+    figure, panels = stacked_axes(len(rows), 1.15)
+    for axis, (block, time, value, bound) in zip(panels, rows, strict=True):
+        thin = select_indices(time.size)
+        mark = "." if time.size == 1 else ""
+        axis.plot(time[thin], value[thin], color="#0072B2", label="spread of the runs", marker=mark)
+        if bound is not None:
+            axis.plot(time[thin], bound[thin], label="PCRB", marker=mark, **_BOUND)
+        axis.set(title=block.group, ylabel=format_axis_label("spread", block.unit))
+        use_log_if_wide(axis, axis.yaxis, [np.asarray(line.get_ydata()) for line in axis.lines])
+    panels[-1].set_xlabel("time [s]")
+    add_legend(figure, panels[0])
+    return figure
+
+
+def _free_direction(azimuth: np.ndarray, zenith: np.ndarray) -> float:
+    """Return the direction (deg) in which ring labels are farthest from all satellites."""
+    finite_mask = ~np.isnan(azimuth)
+    positions = zenith[finite_mask] * np.exp(1j * azimuth[finite_mask])
+    directions = np.arange(22.5, 360, 45)
+
+    def room(direction: float) -> float:
+        return min(
+            float(np.abs(positions - ring * np.exp(1j * np.radians(direction))).min(initial=90))
+            for ring in (30, 60)
+        )
+
+    return float(max(directions, key=room))
+
+
+def _label_offset(theta: np.ndarray, r: np.ndarray) -> tuple[float, float]:
+    """Return the label offset in points, against the motion, or outwards if there is none."""
+    east, north = r * np.sin(theta), r * np.cos(theta)
+    step = np.array(
+        [east[0] - east[min(len(east) - 1, 20)], north[0] - north[min(len(east) - 1, 20)]]
+    )
+    if np.hypot(*step) < 0.05:
+        step = np.array([east[0], north[0]])
+    length = float(np.hypot(*step))
+    return (
+        (10.0 * float(step[0]) / length, 10.0 * float(step[1]) / length)
+        if length > 0
+        else (0.0, 9.0)
+    )

@@ -1,0 +1,1 @@
+"""Stored results, metrics and statistics of studies. Needs neither torch nor hydra."""

@@ -1,0 +1,277 @@
+"""Paired tests and effect sizes: Wilcoxon, equivalence, Holm, Bayesian signed rank, improvement.
+
+Each procedure is defined once in the package. Tests across conditions that need ranks of all
+filters are in `rank_tests`, intervals in `intervals`, sample sizes in `power`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache, lru_cache
+from itertools import product
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy import stats
+from scipy.special import ndtr
+
+from pfbench.results.error_measures import Array
+
+# Errors are stored in single precision: smaller differences of a logarithm are rounding. Without
+# the tolerance, EKF and UKF of a linear model would differ by how they round.
+LOG_TOLERANCE = 1e-6
+_SIGNS_ENUMERATED = 13  # tied differences up to which all signs are enumerated, as in scipy
+_EXACT = 50  # untied differences up to which the distribution is exact, as in scipy
+_DIRICHLET_DRAWS = 20_000
+_PRIOR_STRENGTH = 0.5  # pseudo-observation at zero [Benavoli et al. 2014], as in baycomp
+
+Alternative = Literal["two-sided", "greater", "less"]
+
+
+class SignedRankResult(NamedTuple):
+    """Result of Wilcoxon's signed-rank test.
+
+    Attributes:
+        statistic: Smaller rank sum, or the positive one of a one-sided test.
+        p: p-value.
+    """
+
+    statistic: float
+    p: float
+
+
+class ProportionEstimate(NamedTuple):
+    """Probability estimated from n runs.
+
+    Attributes:
+        value: Estimate, 0 to 1.
+        parts: Contribution of each run, [n]. Their mean is the value, and their variance divided
+            by n is the variance of the value.
+    """
+
+    value: float
+    parts: Array
+
+
+def log_ratio(a: Array, b: Array) -> Array:
+    """Compute finite log ratios of the losses of two filters.
+
+    Where one of the two is lost, the result lies beyond all others. Where both are lost, or the
+    ratio differs from 1 by less than the stored precision, it is 0.
+
+    Args:
+        a: Losses of the first filter, [n], non-negative, infinite where lost.
+        b: Losses of the second filter, [n].
+
+    Returns:
+        log(a / b), [n].
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        d = np.log(a) - np.log(b)
+    d = np.where((a == b) | (np.abs(d) <= LOG_TOLERANCE), 0.0, d)
+    return np.where(np.isfinite(d), d, np.sign(d) * beyond_finite(d))
+
+
+def beyond_finite(d: Array) -> float:
+    """Return a number so large that its mean with any finite difference exceeds them all."""
+    return 4 * float(np.abs(d[np.isfinite(d)]).max(initial=0.0)) + 1
+
+
+def holm(p: Sequence[float] | Array) -> Array:
+    """Adjust p-values for multiple tests [Holm 1979], in the given order.
+
+    The version of statsmodels collects garbage at each call, which dominates a report's time.
+    """
+    raw = np.asarray(p, dtype=np.float64)
+    order = np.argsort(raw, kind="stable")
+    adjusted = np.empty(raw.size)
+    steps = raw[order] * np.arange(raw.size, 0, -1)
+    adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return adjusted
+
+
+def wilcoxon_signed_rank(d: Array, alternative: Alternative = "two-sided") -> SignedRankResult:
+    """Test whether paired differences are centred at zero; see `wilcoxon_signed_rank_rows`."""
+    statistic, p = wilcoxon_signed_rank_rows(np.asarray(d, dtype=np.float64)[None], alternative)
+    return SignedRankResult(float(statistic[0]), float(p[0]))
+
+
+def wilcoxon_signed_rank_rows(
+    d: Array, alternative: Alternative = "two-sided"
+) -> tuple[Array, Array]:
+    """Test each row of paired differences with Wilcoxon's signed-rank test.
+
+    Ranks of zeros are split evenly [Demsar 2006]. The null distribution is chosen as scipy does:
+    exact up to 13 differences, and up to 50 if none are tied, otherwise normal. All rows are
+    tested at once, since one call of scipy per pair dominated the time of a report.
+
+    Args:
+        d: Differences, [K, n].
+        alternative: "two-sided", or the side of zero on which the centre is claimed to lie.
+
+    Returns:
+        Statistic and p-value of each row, [K]. The statistic is the smaller rank sum of a
+        two-sided test, else the sum of the positive ranks. A row of zeros has p = 1.
+    """
+    n = d.shape[1]
+    size = np.abs(d)
+    ranks = np.asarray(stats.rankdata(size, axis=1), dtype=np.float64)
+    ordered = np.sort(size, axis=1)
+    has_ties = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1) | (d == 0).any(axis=1)
+    half_zero = np.where(d == 0, ranks, 0.0).sum(axis=1) / 2
+    above = np.where(d > 0, ranks, 0.0).sum(axis=1) + half_zero
+    below = np.where(d < 0, ranks, 0.0).sum(axis=1) + half_zero
+    more, less, two_sided = (np.ones(len(d)) for _ in range(3))
+    exact = ~has_ties & (n <= _EXACT)
+    if exact.any():
+        more[exact], less[exact] = _exact_tails(n, above[exact])
+    enumerated = has_ties & (n <= _SIGNS_ENUMERATED)
+    for k in np.flatnonzero(enumerated):
+        sums = _all_signs(n) @ np.where(d[k] == 0, 0.0, ranks[k]) + half_zero[k]  # halves: exact
+        more[k], less[k] = (sums >= above[k]).mean(), (sums <= above[k]).mean()
+    two_sided = np.minimum(1.0, 2 * np.minimum(more, less))
+    normal = ~exact & ~enumerated
+    if normal.any():
+        z = _normal_score(ranks[normal], size[normal], above[normal])
+        more[normal], less[normal], two_sided[normal] = ndtr(-z), ndtr(z), 2 * ndtr(-np.abs(z))
+    constant = ~d.any(axis=1)
+    p = {"two-sided": two_sided, "greater": more, "less": less}[alternative]
+    statistic = np.minimum(above, below) if alternative == "two-sided" else above
+    return np.where(constant, n * (n + 1) / 4, statistic), np.where(constant, 1.0, p)
+
+
+def equivalence_p_value(d: Array, margin: float) -> float:
+    """Test whether differences are centred within a margin; see `equivalence_p_values`."""
+    return float(equivalence_p_values(np.asarray(d, dtype=np.float64)[None], margin)[0])
+
+
+def equivalence_p_values(d: Array, margin: float) -> Array:
+    """Test whether each row of differences is centred within a margin.
+
+    Two one-sided signed-rank tests, against a centre at or below -margin and at or above +margin
+    [Schuirmann 1987; Wellek 2010, section 5.4]. The distribution of d is assumed to be symmetric.
+
+    Args:
+        d: Differences, [K, n].
+        margin: Half width of the region of equivalence, in the unit of d.
+
+    Returns:
+        The larger of both p-values, [K].
+
+    Raises:
+        ValueError: if the margin is not positive.
+    """
+    if not margin > 0:
+        raise ValueError(f"margin must be positive, got {margin}. Use 0.05 for five per cent.")
+    sides = (wilcoxon_signed_rank_rows(side, "greater")[1] for side in (d + margin, margin - d))
+    return np.maximum(*sides)
+
+
+def rank_with_ties(values: Array) -> tuple[Array, Array]:
+    """Return ranks of values [n] from 1, ties averaged, and the number of values in each tie."""
+    _, index, count = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - (count - 1) / 2)[index], count.astype(np.float64)
+
+
+def rank_biserial(d: Array) -> float:
+    """Compute the matched-pairs rank-biserial correlation [Kerby 2014] of d = log(a / b).
+
+    Positive if a has the smaller losses, 1 if it always has.
+    """
+    rank, _ = rank_with_ties(np.abs(d))
+    return float((rank[d < 0].sum() - rank[d > 0].sum()) / rank.sum())
+
+
+def rank_biserial_proportion(d: Array) -> ProportionEstimate:
+    """Express the rank-biserial correlation r of differences as the probability (1 + r) / 2.
+
+    It is the probability that the mean of two differences is below zero.
+    """
+    value = (1 + rank_biserial(d)) / 2
+    return ProportionEstimate(value, 1 - np.sign(d[:, None] + d).mean(1) - value)
+
+
+def probability_of_improvement(a: Array, b: Array) -> ProportionEstimate:
+    """Estimate the probability that a run of a has a smaller loss than a run of b.
+
+    All pairs of runs count, ties half [Vargha, Delaney 2000].
+
+    Args:
+        a: Losses of the first filter, [n], infinite where lost.
+        b: Losses of the second filter in the same runs, [n].
+
+    Returns:
+        The probability and the contribution of each run.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        d = np.log(a)[:, None] - np.log(b)
+    is_tie = np.isnan(d) | (np.abs(d) <= LOG_TOLERANCE)
+    won = (1 - np.where(is_tie, 0.0, np.sign(d))) / 2
+    value = float(won.mean())
+    return ProportionEstimate(value, won.mean(1) + won.mean(0) - value)
+
+
+def bayesian_signed_rank(d: Array, rope: float, seed: int = 0) -> tuple[float, float, float]:
+    """Compute posterior probabilities of the three positions of a centre [Benavoli et al. 2014].
+
+    The distribution of d is a Dirichlet process with half a pseudo-observation at zero. Each draw
+    decides for the position with the largest weight of means of two differences.
+
+    Args:
+        d: Differences, [B].
+        rope: Half width of the region of practical equivalence.
+        seed: Seed of the Dirichlet draws.
+
+    Returns:
+        Probabilities that the centre is below -rope, within the region, and above rope.
+    """
+    full = np.concatenate([[0.0], d])
+    sums = full[:, None] + full
+    below, above = (np.heaviside(side, 0.5) for side in (-sums - 2 * rope, sums - 2 * rope))
+    weight = _dirichlet_weights(d.size, seed)
+    low, high = (np.einsum("si,si->s", weight @ side, weight) for side in (below, above))
+    largest = np.argmax(np.column_stack([low, 1 - low - high, high]), axis=1)
+    first, second, third = np.bincount(largest, minlength=3) / _DIRICHLET_DRAWS
+    return float(first), float(second), float(third)
+
+
+def _exact_tails(n: int, above: Array) -> tuple[Array, Array]:
+    """Return P(T >= above) and P(T <= above) of the rank sum of n untied differences."""
+    cumulative = _rank_sum_cdf(n)
+    index = np.rint(above).astype(int)  # untied ranks are integers
+    # By symmetry, so that small tails are not differences from 1.
+    return cumulative[cumulative.size - 1 - index], cumulative[index]
+
+
+@cache
+def _rank_sum_cdf(n: int) -> Array:
+    """Return the distribution function of the positive rank sum of n untied differences."""
+    count = np.zeros(n * (n + 1) // 2 + 1, dtype=np.int64)  # at most 2^50: sums are exact
+    count[0] = 1
+    for rank in range(1, n + 1):
+        count[rank:] = count[rank:] + count[:-rank]
+    return np.asarray(np.cumsum(count) / 2.0**n)
+
+
+def _normal_score(ranks: Array, size: Array, above: Array) -> Array:
+    """Standardise positive rank sums [K], with the variance corrected for ties."""
+    n = ranks.shape[1]
+    last, first = (stats.rankdata(size, method=m, axis=1) for m in ("max", "min"))
+    count = (last - first + 1).astype(np.float64)
+    ties = (count**2 - 1).sum(axis=1)  # over values, equals the sum of t^3 - t over ties
+    deviation = np.sqrt((n * (n + 1) * (2 * n + 1) - ties / 2) / 24)
+    with np.errstate(invalid="ignore"):  # all zero; the caller sets p = 1
+        return np.asarray((above - n * (n + 1) / 4) / deviation)
+
+
+@cache
+def _all_signs(n: int) -> Array:
+    """Enumerate the positive differences among n in all 2^n ways, [2^n, n]."""
+    return np.array(list(product((0.0, 1.0), repeat=n)))
+
+
+@lru_cache(maxsize=2)
+def _dirichlet_weights(n: int, seed: int) -> Array:
+    """Draw Dirichlet weights of n differences and the pseudo-observation; shared by all pairs."""
+    concentration = np.concatenate([[_PRIOR_STRENGTH], np.ones(n)])
+    return np.random.default_rng([n, seed]).dirichlet(concentration, _DIRICHLET_DRAWS)

@@ -1,0 +1,318 @@
+"""Results on disk: one `<key>.npz` per job, readable with numpy alone, written atomically.
+
+A file holds `meta`, a JSON text, and plain arrays without pickles. A failed job leaves
+`<key>.failed.json` in the same folder. Longer than 250 lines, since reading and writing share one
+check of the format.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import traceback
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+from uuid import uuid4
+
+import numpy as np
+
+FORMAT = 1
+# values of the key `budget`
+SAME_N, SAME_TIME, SAME_LIKELIHOODS = BUDGETS = (
+    "particles",
+    "time",
+    "likelihoods",
+)
+
+# Axes that must agree across arrays: R runs, T steps, D components, G groups, S scored steps.
+_AXES = {
+    "time": "T",
+    "error": "RTD",
+    "sd": "RTD",
+    "nees": "RTG",
+    "log_evidence": "R",
+    "lost": "R",
+}
+_OPTIONAL = {
+    "scored": "S",
+    "crps": "RSD",
+    "pit": "RSD",
+    "energy": "RSG",
+    "bound": "TD",
+    "range": "T",
+}
+_META = ("key", "study", "choices", "config", "label", "seed", "runs", "state")
+
+
+class JobResult(NamedTuple):
+    """Result of a finished job.
+
+    Attributes:
+        meta: Metadata: key, study, choices, config, label, seed, versions, seconds, and state
+            (names, units, groups).
+        arrays: `time` [T] (s), `error` and `sd` [R, T, D], `nees` [R, T, G], `log_evidence` and
+            `lost` [R]. Optional: traces [R, T], `track` [R, T, 3] (m; East, North, Up), and the
+            scored steps [S] with `crps`, `pit` [R, S, D] and `energy` [R, S, G].
+    """
+
+    meta: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+
+def config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) -> str:
+    """Compute the key of a job: 16 hexadecimal digits of the SHA-256 of its configuration.
+
+    Args:
+        config: Plain nested dictionary with string keys.
+        ignore: Dotted paths that change where a job runs but not what it computes, such as
+            `results` or `data.root`. A path covers all keys below it and may be missing.
+
+    Returns:
+        The key.
+
+    Raises:
+        ValueError: If JSON cannot represent a value (NaN included).
+    """
+    relevant = _without(config, {tuple(path.split(".")) for path in ignore})
+    try:
+        text = json.dumps(relevant, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"configuration must be numbers, texts, lists and dicts, got {error}."
+        ) from error
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def write_result(path: str | Path, meta: Mapping[str, Any], arrays: Mapping[str, Any]) -> Path:
+    """Write a finished job. An interruption leaves the old or the new file, never a partial one.
+
+    The failure note of the same key and temporary files of interrupted writes are removed.
+
+    Args:
+        path: `<folder>/<key>.npz`. The folder is created.
+        meta: See `JobResult`. `format` is added.
+        arrays: See `JobResult`. Tensors must be converted first.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: If a part is missing, is not a plain array, or has an inconsistent shape.
+    """
+    path = Path(path)
+    full = {"format": FORMAT, **meta}
+    plain: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
+    _check_meta(path, full)
+    _check_arrays(path, full, plain)
+    # Unsorted, since the order of the groups is that of the last axis of nees.
+    text = np.array(json.dumps(full))
+    _write(path, lambda file: np.savez_compressed(file, meta=text, **plain))
+    _note(path).unlink(missing_ok=True)
+    for stale in path.parent.glob(f"{path.stem}.*.tmp"):
+        stale.unlink(missing_ok=True)
+    return path
+
+
+def read_result(path: str | Path) -> JobResult:
+    """Read a job.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file is damaged, is not a result of pfbench, or has another format.
+    """
+    path = Path(path)
+    with _opened(path) as file:
+        meta = _meta(path, file)
+        arrays = {name: _member(path, file, name) for name in file.files if name != "meta"}
+    _check_arrays(path, meta, arrays)
+    return JobResult(meta, arrays)
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """Read the metadata of a job without its arrays. Errors as in `load`."""
+    path = Path(path)
+    with _opened(path) as file:
+        return _meta(path, file)
+
+
+def write_failure(
+    path: str | Path, choices: Mapping[str, Any], error: BaseException
+) -> Path | None:
+    """Write the failure note of a job.
+
+    Args:
+        path: `<folder>/<key>.npz`.
+        choices: Names of scenario, noise, filter and model.
+        error: Error of the job.
+
+    Returns:
+        The note `<key>.failed.json`, or None if a result of that key exists, which is kept.
+    """
+    path = Path(path)
+    if path.exists():
+        return None
+    note = {
+        "key": path.stem,
+        "choices": dict(choices),
+        "message": f"{type(error).__name__}: {error}",
+        "traceback": "".join(traceback.format_exception(error)),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    text = json.dumps(note, indent=1, sort_keys=True)
+    _write(_note(path), lambda file: file.write(text.encode()))
+    return _note(path)
+
+
+def list_results(folder: str | Path) -> Iterator[JobResult]:
+    """Read all finished jobs of a folder, sorted by scenario, noise, label, seed and key.
+
+    Arrays are read one job at a time.
+
+    Raises:
+        ValueError: If a file cannot be read, see `load`.
+    """
+    paths = sorted(Path(folder).glob("*.npz"), key=_rank)
+    return map(read_result, paths)
+
+
+def list_failures(folder: str | Path) -> list[dict[str, Any]]:
+    """Read the failure notes of a folder, by key, of jobs without a result."""
+    notes = sorted(Path(folder).glob("*.failed.json"))
+    open_notes = (
+        n for n in notes if not n.with_name(n.name.replace(".failed.json", ".npz")).exists()
+    )
+    return [json.loads(note.read_text()) for note in open_notes]
+
+
+def _without(config: Any, paths: set[tuple[str, ...]]) -> Any:
+    if not isinstance(config, Mapping):
+        return config
+    below = {name: {path[1:] for path in paths if path[0] == name} for name in config}
+    return {
+        name: _without(value, below[name])
+        for name, value in config.items()
+        if () not in below[name]
+    }
+
+
+def _note(path: Path) -> Path:
+    return path.with_name(f"{path.stem}.failed.json")
+
+
+def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name.split('.')[0]}.{uuid4().hex[:8]}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            fill(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except FileNotFoundError:
+        # Another sweep finished the same key and removed this temporary file. Its result is kept.
+        if not path.exists():
+            raise
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
+    if not path.exists():
+        raise FileNotFoundError(f"result {path} does not exist")
+    # opened here, since numpy leaves a damaged file open
+    with path.open("rb") as raw:
+        try:
+            file = np.load(raw, allow_pickle=False)
+        except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+            raise ValueError(
+                f"{path} is damaged or not an npz file ({error}). Delete it and run the job again"
+            ) from error
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise ValueError(
+                f"{path} must be a result of pfbench, got a single array. Move it away"
+            )
+        yield file
+
+
+def _member(path: Path, file: np.lib.npyio.NpzFile, name: str) -> np.ndarray:
+    try:
+        return file[name]
+    except KeyError as error:
+        raise ValueError(
+            f"{path} must be a result of pfbench, got a file without {name!r}. Move it away"
+        ) from error
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(
+            f"{path} is damaged at {name!r} ({error}). Delete it and run the job again"
+        ) from error
+
+
+def _meta(path: Path, file: np.lib.npyio.NpzFile) -> dict[str, Any]:
+    text = str(_member(path, file, "meta"))
+    try:
+        meta = json.loads(text)
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: 'meta' must be JSON ({error}). This is not a result of pfbench: move it away"
+        ) from error
+    _check_meta(path, meta)
+    return meta
+
+
+def _rank(path: Path) -> tuple[str, str, str, int, str]:
+    meta = read_metadata(path)
+    choices = meta["choices"]
+    return (
+        str(choices["scenario"]),
+        str(choices["noise"]),
+        str(meta["label"]),
+        int(meta["seed"]),
+        str(meta["key"]),
+    )
+
+
+def _check_meta(path: Path, meta: Any) -> None:
+    """Raise ValueError if required metadata are missing."""
+    version = meta.get("format") if isinstance(meta, dict) else None
+    if version != FORMAT:
+        raise ValueError(f"{path} must have format {FORMAT}, got {version}. Run the job again.")
+    missing = [name for name in _META if name not in meta]
+    if missing:
+        raise ValueError(f"{path}: metadata must contain {', '.join(missing)}")
+
+
+def _check_arrays(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise ValueError if arrays are missing, pickled, or inconsistent in R, T, D, G or S."""
+    missing = [name for name in _AXES if name not in arrays]
+    if missing:
+        raise ValueError(f"{path}: a result must contain the arrays {', '.join(missing)}")
+    for name, value in arrays.items():
+        # the first three are arguments of numpy's savez
+        if name in ("file", "args", "allow_pickle", "meta"):
+            raise ValueError(f"{path}: the array name {name!r} is reserved. Use another name")
+        if value.dtype.hasobject:
+            raise ValueError(
+                f"{path}: {name} must be numbers, booleans or texts, got Python objects"
+            )
+    size: dict[str, int] = {
+        "R": int(meta["runs"]),
+        "D": len(meta["state"]["names"]),
+        "G": len(meta["state"]["groups"]),
+        "T": arrays["time"].size,
+        "S": arrays["scored"].size if "scored" in arrays else 0,
+    }
+    for name, axes in (
+        _AXES | {name: axes for name, axes in _OPTIONAL.items() if name in arrays}
+    ).items():
+        expected = tuple(size[axis] for axis in axes)
+        if arrays[name].shape != expected:
+            raise ValueError(
+                f"{path}: {name} must have shape {list(axes)} = {expected}, got {arrays[name].shape}"
+            )

@@ -1,0 +1,262 @@
+"""Oracle noise: a model that receives the true noise regime of the episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
+from typing_extensions import override
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import MeasurementChannels, Record
+from pfbench.model.base import ModelWrapper, StateSpaceModel, dense_normal, independent_normal
+from pfbench.noise import distributions
+from pfbench.noise.base import NoiseRegime, process_variance_factors
+from pfbench.noise.distributions import ErrorDistribution, MixtureDistribution
+from pfbench.scenario.closed_loop import ClosedLoopRun
+
+
+@dataclass(eq=False)
+class RecordingRegime:
+    """Noise regime that records the measurement channels of the scenario.
+
+    All calls go to the inner regime. `OracleNoiseModel` needs the channels.
+
+    Attributes:
+        regime: Inner regime.
+        channels: Latest measurement channels. None before the first draw.
+    """
+
+    regime: NoiseRegime
+    channels: MeasurementChannels | None = None
+
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        """Draw errors from the inner regime and record the channels.
+
+        Args:
+            draws: Random stream.
+            channels: Measurement components.
+            time: Times, s, [T].
+
+        Returns:
+            Errors, [R, T, Dy].
+        """
+        self.channels = channels
+        return self.regime.draw_errors(draws, channels, time)
+
+    def process_factors(self, time: Tensor) -> Tensor:
+        """Return the factors on the process noise variance at times [T], s."""
+        return self.regime.process_factors(time)
+
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        """Return the distribution of the errors at each step.
+
+        Args:
+            channels: Measurement components.
+            time: Times, s, [T].
+
+        Returns:
+            Family, shift and scale of the errors.
+        """
+        return self.regime.error_distribution(channels, time)
+
+    def to_oracle_model(self, model: StateSpaceModel, time: Tensor) -> OracleNoiseModel:
+        """Build the model with the true noise of the latest episode.
+
+        Args:
+            model: Model without oracle noise.
+            time: Times of the steps, s, [T].
+
+        Returns:
+            The model with oracle noise.
+
+        Raises:
+            ValueError: if the scenario drew no errors; see `OracleNoiseModel`.
+        """
+        if self.channels is None:
+            raise ValueError(
+                "oracle_noise must be false for a scenario without errors from a noise regime, "
+                "got true. Set oracle_noise=false."
+            )
+        return OracleNoiseModel(model, self.regime, self.channels, time)
+
+
+class OracleNoiseInputs(NamedTuple):
+    """Inputs of a model with oracle noise.
+
+    Attributes:
+        inputs: Inputs of the inner model.
+        root: Square root of the factor on the process noise variance, [1, T].
+        shift: Shift of the measurement errors, in standard deviations, [1, T, Dy].
+        scale: Scale of the measurement errors, in standard deviations, [1, T, Dy].
+    """
+
+    inputs: Any
+    root: Tensor
+    shift: Tensor
+    scale: Tensor
+
+
+class OracleNoiseModel(ModelWrapper):
+    """A model with the true noise of each step.
+
+    The true noise consists of the factor on Q and the distribution of the errors. The process noise w is scaled about its mean by the root of the factor. The measurement
+    distribution is of the regime's family, with shift and scale relative to the normal distribution
+    of the inner model. All other properties are those of the inner model. It is linear only with
+    normal errors.
+
+    Args:
+        model: Inner model with normal measurement noise.
+        regime: Noise regime of the episode.
+        channels: Measurement channels of the episode.
+        time: Times of the steps, s, [T].
+
+    Raises:
+        ValueError: if the regime does not define a distribution at each step. Methods raise it for a
+            record of a different length, and for measurement noise that is not normal. A regime that
+            is not normal also needs independent components.
+    """
+
+    def __init__(
+        self,
+        model: StateSpaceModel,
+        regime: NoiseRegime,
+        channels: MeasurementChannels,
+        time: Tensor,
+    ) -> None:
+        super().__init__(model)
+        self.observes_initial = model.observes_initial
+        self.family, shift, scale = regime.error_distribution(channels, time)
+        process = process_variance_factors(regime, time)
+        self.scales_process, self.changes_errors = (
+            bool((process != 1.0).any()),
+            bool((shift != 0.0).any() or (scale != 1.0).any()),
+        )
+        self.linear = model.linear and self.family is distributions.make_normal
+        self.linear_given = model.linear_given if self.family is distributions.make_normal else ()
+        choice = (
+            "the filter model receives the true noise: at each step the factor on Q "
+            "and the distribution of the errors"
+        )
+        self.choices = (*model.choices, choice)
+        for name, value in (
+            ("root", process.sqrt()),
+            ("shift", shift),
+            ("scale", scale),
+        ):
+            self.register_buffer(f"oracle_{name}", value.unsqueeze(0))
+
+    @override
+    def prepare(self, record: Record) -> Record:
+        if isinstance(record.u, OracleNoiseInputs):
+            return record
+        record = self.model.prepare(record)
+        noise = [self.get_buffer(f"oracle_{name}") for name in ("root", "shift", "scale")]
+        if isinstance(record.feedback, ClosedLoopRun):
+            # the record of a closed-loop run has one step
+            noise = [a[:, record.feedback.t].unsqueeze(1) for a in noise]
+        if record.y.shape[1] != noise[0].shape[1]:
+            raise ValueError(
+                f"The record must have {noise[0].shape[1]} steps, as the oracle noise, "
+                f"got {record.y.shape[1]}. Use the record of the same episode."
+            )
+        return record._replace(u=OracleNoiseInputs(record.u, *noise))
+
+    @override
+    def propagate(self, x: Tensor, u: OracleNoiseInputs, w: Tensor) -> Tensor:
+        if self.scales_process:
+            centre = self.model.noise.mean
+            w = centre + u.root[:, None, None] * (w - centre)
+        return self.model.propagate(x, u.inputs, w)
+
+    @property
+    @override
+    def has_noise_gain(self) -> bool:
+        return self.model.has_noise_gain
+
+    @override
+    def noise_gain(self, u: OracleNoiseInputs) -> Tensor | None:
+        gain = self.model.noise_gain(u.inputs)
+        return u.root[:, None, None] * gain if self.scales_process and gain is not None else gain
+
+    @override
+    def transition(self, x: Tensor, u: OracleNoiseInputs) -> Distribution | None:
+        """Return the transition distribution with scaled process noise.
+
+        Args:
+            x: Particles, [R, N, D].
+            u: Inputs of the step.
+
+        Returns:
+            Distribution with batch [R, N]. None if the inner model does not define it, or if scaled
+            noise is not additive.
+        """
+        distribution = self.model.transition(x, u.inputs)
+        if distribution is None or not self.scales_process:
+            return distribution
+        if self.model.noise_gain(u.inputs) is None:
+            return None
+        root = u.root[:, None, None]
+        if isinstance(distribution, Independent) and isinstance(distribution.base_dist, Normal):
+            return independent_normal(
+                distribution.base_dist.loc, root * distribution.base_dist.scale
+            )
+        if isinstance(distribution, MultivariateNormal):
+            return dense_normal(distribution.mean, root.unsqueeze(-1) * distribution.scale_tril)
+        return None
+
+    @override
+    def observation(self, x: Tensor, u: OracleNoiseInputs) -> Distribution:
+        distribution = self.model.observation(x, u.inputs)
+        if self.family is distributions.make_normal and not self.changes_errors:
+            return distribution
+        shift, scale = (a.unsqueeze(1) for a in (u.shift, u.scale))
+        if isinstance(distribution, Independent) and isinstance(distribution.base_dist, Normal):
+            centre, sd = distribution.base_dist.loc, distribution.base_dist.scale
+            return self.family(centre + shift * sd, scale * sd)
+        if (
+            isinstance(distribution, MultivariateNormal)
+            and self.family is distributions.make_normal
+        ):
+            return dense_normal(
+                distribution.mean + shift * distribution.stddev,
+                scale.unsqueeze(-1) * distribution.scale_tril,
+            )
+        raise ValueError(
+            "oracle_noise must be false for a model without independent normal measurement noise, "
+            f"got true with {type(self.model).__name__}. Set oracle_noise=false."
+        )
+
+    @override
+    def assemble(self, truth: dict[str, Tensor]) -> Tensor:
+        return self.model.assemble(truth)
+
+    @override
+    def error(self, mean: Tensor, truth: Tensor) -> Tensor:
+        return self.model.error(mean, truth)
+
+    @override
+    def log_likelihood(self, y: Tensor, x: Tensor, u: OracleNoiseInputs) -> Tensor:
+        if self.family is distributions.make_normal and not self.changes_errors:
+            return self.model.log_likelihood(y, x, u.inputs)
+        distribution = self.observation(x, u)
+        if isinstance(distribution, MixtureDistribution):
+            densities = [self._log_density(component, y) for component in distribution.components]
+            return distribution.combine_log_densities(densities)
+        return (
+            self._log_density(distribution, y)
+            if isinstance(distribution, Independent)
+            else super().log_likelihood(y, x, u)
+        )
+
+    def _log_density(self, distribution: Any, y: Tensor) -> Tensor:
+        """Compute the log density [R, N] of the observed components of y [R, Dy]."""
+        observed_mask, centre = ~torch.isnan(y).unsqueeze(1), distribution.mean
+        r = torch.where(observed_mask, self.residual(y.unsqueeze(1), centre), 0.0)
+        density: Tensor = (distribution.base_dist.log_prob(centre + r) * observed_mask).sum(-1)
+        return density

@@ -1,0 +1,233 @@
+"""Resampling of a log to filter steps.
+
+Steps end on fixes and divide the time between fixes evenly. Measurements keep their times and
+values. The reference is interpolated to the steps, but not across gaps. IMU samples are split at
+the steps.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pfbench.core import quaternion
+from pfbench.scenario.recorded.log_reader import ImuLog, NavigationLog, ReferenceLog
+from pfbench.scenario.recorded.log_tables import Array
+
+SAME_TIME = 1e-3  # s
+
+
+class ResampledLog(NamedTuple):
+    """Log on T filter steps, with positions relative to the recorded start.
+
+    Attributes:
+        start_s: Time of the start, s.
+        time: End of each step, s, [T].
+        fix_steps: Mask of steps that end on a fix, [T].
+        fixes: Recorded position, m, and velocity, m/s, at the end of each step, [T, 6]. NaN without
+            a fix.
+        start: Recorded attitude, velocity and position at the start, [10].
+        truth: Attitude, velocity and position at the end of each step, [T, 10]. NaN in a gap of the
+            reference.
+        force: Mean specific force of the S pieces of each step, m/s^2, [T, S, 3].
+        rate: Mean angular rate of the pieces, rad/s, [T, S, 3].
+        spans: Durations of the pieces, s, [T, S]. Unused pieces have duration 0.
+        gravity: Gravity, m/s^2.
+        notes: Corrections and assumptions, for the report.
+    """
+
+    start_s: float
+    time: Array
+    fix_steps: NDArray[np.bool_]
+    fixes: Array
+    start: Array
+    truth: Array
+    force: Array
+    rate: Array
+    spans: Array
+    gravity: float
+    notes: tuple[str, ...]
+
+    @property
+    def since_start(self) -> Array:
+        """Time from the start to the end of each step, s, [T]."""
+        return self.time - self.start_s
+
+    def sensed(self) -> dict[str, Array]:
+        """Compute the mean force, m/s^2, and rate, rad/s, of each step, [T, 3].
+
+        Values are NaN in a gap of the IMU.
+        """
+        share = self.spans / np.where(self.spans.sum(1) > 0, self.spans.sum(1), np.nan)[:, None]
+        return {
+            "force": (self.force * share[..., None]).sum(1),
+            "rate": (self.rate * share[..., None]).sum(1),
+        }
+
+
+def resample_log(
+    log: NavigationLog,
+    interval: float,
+    step: float,
+    velocity: bool = False,
+    start: float | None = None,
+    end: float | None = None,
+) -> ResampledLog:
+    """Resample a log to filter steps.
+
+    Args:
+        log: Log.
+        interval: Time between used fixes, s.
+        step: Longest step, s.
+        velocity: Whether velocities are required.
+        start: Start, s of the log. None for the start of the data common to IMU and reference.
+        end: End, s of the log. None for the end of the data common to IMU and reference.
+
+    Returns:
+        The log on filter steps.
+
+    Raises:
+        ValueError: if the common time contains fewer than two fixes, required velocities are not
+            recorded, or the reference has a gap at the start.
+    """
+    low = max(log.imu.time[0], log.reference.time[0], -np.inf if start is None else start)
+    high = min(log.imu.time[-1], log.reference.time[-1], np.inf if end is None else end)
+    selection = select_fixes(log.fixes.time, interval, low, high)
+    if len(selection) < 2:
+        raise ValueError(
+            f"{len(selection)} fixes between t = {low:.3f} and {high:.3f}, the time common to IMU, reference, start and end. "
+            "At least 2 are required. Use a longer log, an earlier start or a later end."
+        )
+    if velocity and np.isnan(log.fixes.velocity).all():
+        raise ValueError(
+            "scenario.receiver.velocity_sd must be null for fixes without vn, ve, vd. "
+            "Set it to null or add these columns."
+        )
+    grid, fix_mask = divide_interval(log.fixes.time[selection], step)
+    fixes = np.full((len(grid), 6), np.nan)
+    fixes[fix_mask] = np.hstack([log.fixes.position, log.fixes.velocity])[selection]
+    truth = interpolate(log.reference, grid)
+    if np.isnan(truth[0]).any():
+        raise ValueError(
+            f"scenario.start_s must not be in a gap of the reference, got t = {grid[0]:.3f}. "
+            "Select another start."
+        )
+    origin = truth[0, 7:].copy()
+    fixes[:, :3] -= origin
+    truth[:, 7:] -= origin
+    missing, total = int(np.isnan(fixes[fix_mask, 0][1:]).sum()), int(fix_mask.sum()) - 1
+    notes = log.notes + (
+        (f"{missing} of {total} fixes not used (fix is not 1)",) if missing else ()
+    )
+    pieces = split_samples(log.imu, grid)
+    return ResampledLog(
+        float(grid[0]),
+        grid[1:],
+        fix_mask[1:],
+        fixes[1:],
+        truth[0],
+        truth[1:],
+        *pieces,
+        log.gravity,
+        notes,
+    )
+
+
+def select_fixes(time: Array, interval: float, low: float, high: float) -> NDArray[np.intp]:
+    """Select fixes at intervals.
+
+    The tolerance is half the median time between recorded fixes.
+
+    Args:
+        time: Times of the fixes, s, [n].
+        interval: Time between selected fixes, s.
+        low: Earliest time, s.
+        high: Latest time, s.
+
+    Returns:
+        Indices of the selected fixes.
+    """
+    tolerance = 0.5 * float(np.median(np.diff(time)))
+    selection: list[int] = []
+    for i in np.flatnonzero((time >= low) & (time <= high)):
+        if not selection or time[i] - time[selection[-1]] >= max(interval - tolerance, 0.0):
+            selection.append(int(i))
+    return np.array(selection, dtype=np.intp)
+
+
+def divide_interval(fixes: Array, step: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Divide the time between fixes evenly.
+
+    Args:
+        fixes: Times of the fixes, s, [n].
+        step: Longest step, s.
+
+    Returns:
+        Times from the first to the last fix, s, [T + 1], and a mask of the fixes, [T + 1].
+    """
+    pieces = np.maximum(1, np.ceil(np.diff(fixes) / step - 1e-6).astype(int))
+    ends = np.concatenate([[0], np.cumsum(pieces)])
+    fix_mask = np.zeros(ends[-1] + 1, dtype=bool)
+    fix_mask[ends] = True
+    return np.interp(np.arange(len(fix_mask)), ends, fixes), fix_mask
+
+
+def interpolate(motion: ReferenceLog, time: Array) -> Array:
+    """Interpolate a reference.
+
+    Velocity and position are linear between samples. The attitude follows the shortest rotation.
+
+    Args:
+        motion: Reference.
+        time: Times, s, [T].
+
+    Returns:
+        Attitude, velocity and position, [T, 10]. NaN in a gap of about two sample intervals or
+        more.
+    """
+    longest = 1.9 * float(np.median(np.diff(motion.time)))
+    after = np.clip(np.searchsorted(motion.time, time - SAME_TIME), 1, len(motion.time) - 1)
+    before = after - 1
+    gap = motion.time[after] - motion.time[before]
+    fraction = ((time - motion.time[before]) / gap)[:, None]
+    flat = np.hstack([motion.velocity, motion.position])
+    linear = (1.0 - fraction) * flat[before] + fraction * flat[after]
+    q = torch.from_numpy(motion.attitude)
+    inverse = q[before] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
+    rotation = quaternion.rotation_vector_from_quaternion(
+        quaternion.quaternion_multiply(inverse, q[after])
+    ) * torch.from_numpy(fraction)
+    rotated = quaternion.quaternion_multiply(
+        q[before], quaternion.quaternion_from_rotation_vector(rotation)
+    ).numpy()
+    on_sample = np.minimum(fraction, 1.0 - fraction)[:, 0] * gap <= SAME_TIME
+    valid_mask = (gap <= longest) | on_sample
+    valid_mask &= (time >= motion.time[0] - SAME_TIME) & (time <= motion.time[-1] + SAME_TIME)
+    return np.where(valid_mask[:, None], np.hstack([rotated, linear]), np.nan)
+
+
+def split_samples(imu: ImuLog, grid: Array) -> tuple[Array, Array, Array]:
+    """Split linearly interpolated IMU samples at grid points.
+
+    Args:
+        imu: IMU samples.
+        grid: Grid points, s, [T + 1].
+
+    Returns:
+        Mean force, m/s^2, and rate, rad/s, of the pieces, [T, S, 3], and their durations, s, [T, S].
+    """
+    inside = imu.time[(imu.time > grid[0]) & (imu.time < grid[-1])]
+    nodes = np.union1d(inside, grid)
+    values = np.stack(
+        [np.interp(nodes, imu.time, column) for column in (*imu.force.T, *imu.rate.T)], axis=-1
+    )
+    mean = 0.5 * (values[1:] + values[:-1])
+    step = np.searchsorted(grid, nodes[:-1], side="right") - 1
+    piece_index = np.arange(len(step)) - np.searchsorted(step, step)
+    shape = (len(grid) - 1, int(piece_index.max()) + 1)
+    spans, pieces = np.zeros(shape), np.zeros((*shape, 6))
+    spans[step, piece_index], pieces[step, piece_index] = np.diff(nodes), mean
+    return pieces[..., :3], pieces[..., 3:], spans

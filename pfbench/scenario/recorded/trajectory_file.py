@@ -1,0 +1,128 @@
+"""Recorded trajectories for flights with simulated sensors."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pfbench.nav import attitude, earth
+from pfbench.nav.motion_spline import MotionSpline, RecordedMotion
+from pfbench.nav.trajectory import TrajectoryData
+from pfbench.scenario.recorded.drive import find_dataset
+from pfbench.scenario.recorded.log_reader import swap_frd_rfu
+from pfbench.scenario.recorded.log_tables import parse_numbers, read_table, read_times
+
+
+@dataclass(frozen=True)
+class RecordedTrajectory:
+    """Recorded trajectory, smoothed by splines and sampled at any rate.
+
+    It is a `TrajectorySource` of `SimulatedFlight`. The `repr` is part of the episode cache key. It
+    contains the checksum of the file, but not its location.
+
+    Attributes:
+        root: Folder of all data sets (configuration key data.root).
+        folder: Folder of the trajectory in `root`.
+        origin: lat_deg, lon_deg, h_m of pn = pe = pd = 0.
+        file: Name of the table, without .parquet or .csv.
+        start_s: Start, s of the file. None for the start of the file.
+        end_s: End, s of the file. None for the end of the file.
+        knot_interval_s: Time between the knots of the splines, s; see `MotionSpline`.
+        use_full_log: Time unit, s. The duration is an integer multiple of it. It must be a multiple
+            of the filter interval.
+        checksum: Checksum of the table, set by the class.
+
+    Raises:
+        ValueError: if root, folder or file is missing, or the end is not after the start.
+            `generate` raises it for an invalid table, and for errors of `MotionSpline`.
+    """
+
+    root: str | None = field(repr=False)
+    folder: str
+    origin: Sequence[float]
+    file: str = "trajectory"
+    start_s: float | None = None
+    end_s: float | None = None
+    knot_interval_s: float = 0.4
+    use_full_log: float = 1.0
+    checksum: str = field(init=False, default="")
+
+    def __post_init__(self) -> None:
+        if self.start_s is not None and self.end_s is not None and not self.start_s < self.end_s:
+            raise ValueError(
+                f"scenario.trajectory.end_s must be later than start_s = {self.start_s}, "
+                f"got {self.end_s}. Change start_s or end_s."
+            )
+        content = read_table(find_dataset(self.root, self.folder), self.file, {}).rows
+        digest = hashlib.sha256(content.to_csv(index=False).encode()).hexdigest()
+        object.__setattr__(self, "checksum", digest[:16])
+
+    def generate(self, rate: float) -> TrajectoryData:
+        """Generate truth and ideal sensors at `rate` samples per second."""
+        recorded = read_motion(find_dataset(self.root, self.folder), self.file, self.origin)
+        low, high = (
+            limit if setting is None else setting
+            for setting, limit in ((self.start_s, -math.inf), (self.end_s, math.inf))
+        )
+        selected_mask = (recorded.time >= low) & (recorded.time <= high)
+        if int(selected_mask.sum()) < 2:
+            first, last = float(recorded.time[0]), float(recorded.time[-1])
+            raise ValueError(
+                "scenario.trajectory.start_s and end_s must select at least 2 rows, "
+                f"got {self.start_s} and {self.end_s}. "
+                f"The file covers t = {first:.3f} to {last:.3f} s."
+            )
+        return MotionSpline(
+            RecordedMotion(*(leaf[selected_mask] for leaf in recorded)),
+            self.knot_interval_s,
+            self.use_full_log,
+        ).generate(rate)
+
+
+def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> RecordedMotion:
+    """Read a trajectory from a table.
+
+    The columns are t [s], pn, pe, pd [m], vn, ve, vd [m/s] and roll, pitch, yaw [rad], in
+    forward-right-down axes. North and East of any map grid are accepted. The meridian convergence
+    of the grid rotates the track slightly, which does not affect the motion. The height is -pd above
+    the height of the origin, not above its tangent plane [ours].
+
+    Args:
+        folder: Folder of the table.
+        name: Name of the table, without .parquet or .csv.
+        origin: lat_deg, lon_deg, h_m of pn = pe = pd = 0.
+
+    Returns:
+        The recorded motion.
+
+    Raises:
+        ValueError: if the table or the origin is invalid.
+    """
+    if len(origin) != 3 or not abs(origin[0]) <= 89.0:
+        raise ValueError(
+            "scenario.trajectory.origin must be lat_deg (-89 to 89), lon_deg, h_m, "
+            f"got {list(origin)}. Set the point pn = pe = pd = 0."
+        )
+    table = read_table(Path(folder), name, {})
+    time = torch.from_numpy(read_times(table, longest=1.0))
+    enu, vel = (
+        torch.from_numpy(swap_frd_rfu(parse_numbers(table, columns)))
+        for columns in (("pn", "pe", "pd"), ("vn", "ve", "vd"))
+    )
+    roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
+    if np.abs(pitch).max() > 1.001 * math.pi / 2:
+        raise ValueError(
+            f"{table.name}: pitch reaches {np.abs(pitch).max():g} rad; if in degrees, multiply angles by pi / 180"
+        )
+    dcm = attitude.dcm_from_euler(torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1)))
+    centre = torch.tensor(
+        [math.radians(origin[0]), math.radians(origin[1]), origin[2]], dtype=torch.float64
+    )
+    plan = earth.from_local_enu(enu * enu.new_tensor([1.0, 1.0, 0.0]), centre)
+    return RecordedMotion(time, torch.cat([plan[:, :2], centre[2] + enu[:, 2:]], -1), vel, dcm)

@@ -1,0 +1,342 @@
+"""Recorded city drive with raw pseudoranges and odometry.
+
+`urban_error_fit` estimates the distribution of the range errors. The log contains satellite
+positions in the Earth-fixed axes of transmission. They are rotated to the axes of reception at the
+start. A range is then a distance, accurate to a millimetre within a kilometre of the start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Episode, MeasurementChannels, Record
+from pfbench.model.urban_gnss import NormalRangeError, UrbanGnss, UrbanInputs, UrbanTuning
+from pfbench.nav import earth
+from pfbench.nav.gnss.orbits import azimuth_elevation
+from pfbench.noise.base import NoiseRegime, check_unit_process
+from pfbench.scenario.base import check_divergence_threshold
+from pfbench.scenario.recorded.drive import encode_names, find_dataset
+from pfbench.scenario.recorded.log_tables import Array, parse_numbers, read_table, read_times
+
+LIGHT = 299792458.0  # m/s
+MOVING = 1.0  # m/s; smallest speed at which the velocity determines the heading
+_SAME_TIME = 1e-3  # s
+
+
+class UrbanLog(NamedTuple):
+    """Recorded drive with T epochs and S satellites. Missing values are NaN.
+
+    Attributes:
+        time: Times, s, [T].
+        speed: Wheel speed, m/s, [T].
+        yaw_rate: Yaw rate of the gyro, clockwise from above, rad/s, [T].
+        position: Reference latitude, longitude, height, rad and m, [T, 3].
+        velocity: Reference velocity East and North, m/s, [T, 2].
+        satellites: Names, such as G12.
+        range: Pseudorange, corrected for satellite clock, troposphere and ionosphere, m, [T, S].
+        sd: Standard deviation reported by the receiver, m, [T, S].
+        cn0: Carrier-to-noise density, dB-Hz, [T, S].
+        place: Satellite positions in the Earth-fixed axes of transmission, m, [T, S, 3].
+    """
+
+    time: Array
+    speed: Array
+    yaw_rate: Array
+    position: Array
+    velocity: Array
+    satellites: tuple[str, ...]
+    range: Array
+    sd: Array
+    cn0: Array
+    place: Array
+
+
+def read_drive(folder: Path) -> UrbanLog:
+    """Read the tables `pseudorange`, `odometry` and `truth` of a folder.
+
+    Raises:
+        ValueError: if a table or column is missing, or the tables have different epochs.
+    """
+    pseudoranges, wheels, truth = (
+        read_table(folder, name, {}) for name in ("pseudorange", "odometry", "truth")
+    )
+    time = read_times(wheels, 1.0)
+    reference = parse_numbers(truth, ("t", "lat_deg", "lon_deg", "h_m", "ve_d", "vn_d"))
+    if not np.array_equal(time, reference[:, 0]):
+        raise ValueError(
+            f"{folder}: {wheels.name} and {truth.name} must have equal times t. "
+            "Use the same epochs in both."
+        )
+    t, svid, value, variance, cn0, *positions = parse_numbers(
+        pseudoranges, ("t", "svid", "pr", "pr_var", "cn0", "sx", "sy", "sz")
+    ).T
+    row = np.searchsorted(time, t - _SAME_TIME).clip(max=len(time) - 1)
+    if np.abs(time[row] - t).max() > _SAME_TIME:
+        raise ValueError(
+            f"{folder}: {pseudoranges.name} must have only times t of {wheels.name}. "
+            "Use the same epochs in both."
+        )
+    names = [
+        f"{system}{int(number):02d}"
+        for system, number in zip(pseudoranges.rows["sys"], svid, strict=True)
+    ]
+    satellites, slot = np.unique(names, return_inverse=True)
+    columns = np.full((6, len(time), len(satellites)), np.nan)
+    columns[:, row, slot] = value, np.sqrt(variance), cn0, *positions
+    position = np.column_stack([np.radians(reference[:, 1:3]), reference[:, 3]])
+    speed, yaw_rate = parse_numbers(wheels, ("v_fwd", "yaw_rate_ned")).T
+    sky_columns = columns[0], columns[1], columns[2], np.moveaxis(columns[3:], 0, -1)
+    return UrbanLog(
+        time, speed, yaw_rate, position, reference[:, 4:], tuple(satellites.tolist()), *sky_columns
+    )
+
+
+def rotate_heading(place: Array, at: Array) -> Array:
+    """Rotate satellites from Earth-fixed axes at transmission to those at reception.
+
+    Args:
+        place: Satellite positions, m, [..., 3].
+        at: Position of the receiver, m, [..., 3].
+
+    Returns:
+        Satellite positions, m, [..., 3].
+    """
+    angle = earth.OMEGA / LIGHT * np.linalg.norm(place - at, axis=-1)
+    c, s = np.cos(angle), np.sin(angle)
+    x, y, z = np.moveaxis(place, -1, 0)
+    return np.stack([c * x + s * y, c * y - s * x, z], -1)
+
+
+@dataclass(frozen=True)
+class PseudorangeReceiver:
+    """Conversion of recorded pseudoranges to measurements.
+
+    Attributes:
+        fix_interval_s: Time between used epochs, s.
+        range_sd: Standard deviation of added range errors, m. With 0 a noise regime can only remove
+            satellites.
+        clock_drift: Nominal drift of the receiver clock, m/s. It is subtracted from the ranges.
+
+    Raises:
+        ValueError: if the interval is not positive, or range_sd is negative.
+    """
+
+    fix_interval_s: float = 1.0
+    range_sd: float = 0.0
+    clock_drift: float = -49.7
+
+    def __post_init__(self) -> None:
+        if not self.fix_interval_s > 0.0:
+            raise ValueError(
+                "scenario.receiver.fix_interval_s must be positive, "
+                f"got {self.fix_interval_s}. Set a time in seconds."
+            )
+        if not self.range_sd >= 0.0:
+            raise ValueError(
+                f"scenario.receiver.range_sd must be at least 0, got {self.range_sd}. "
+                "Use 0 for no added errors."
+            )
+
+
+@dataclass(frozen=True)
+class UrbanDrive:
+    """One recorded city drive. Runs differ in initial and added errors.
+
+    Steps end at the epochs of the odometry. Steps at intervals of `receiver.fix_interval_s` have
+    pseudoranges. The true clock bias at the start is the 20 % quantile of the GPS range residuals
+    against the reference, since delays are not negative. The nominal drift, inter-system bias, wheel
+    scale and yaw-rate bias are true when starts are drawn.
+
+    Attributes:
+        root: Folder of all data sets (configuration key data.root).
+        folder: Folder of the drive in `root`.
+        tuning: Parameters that the filter assumes. The initial errors of the runs have the assumed
+            distribution.
+        receiver: Selection of pseudoranges, and standard deviation of added errors.
+        start_s: Start, s of the drive. None for the start of the drive.
+        end_s: End, s of the drive. None for the end of the drive.
+        divergence_threshold_m: Position error, m, beyond which a run counts as diverged. None if
+            the scenario does not define divergence.
+
+    Raises:
+        ValueError: if the threshold is not positive. `draw` raises it for a missing root or folder,
+            an invalid table, fewer than two epochs, a start without heading, or a regime that
+            changes the process noise.
+    """
+
+    root: str | None
+    folder: str
+    tuning: UrbanTuning
+    receiver: PseudorangeReceiver = field(default_factory=PseudorangeReceiver)
+    start_s: float | None = None
+    end_s: float | None = None
+    divergence_threshold_m: float | None = None
+
+    def __post_init__(self) -> None:
+        check_divergence_threshold(self.divergence_threshold_m)
+
+    def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
+        """Read the drive and draw the errors of some runs.
+
+        Args:
+            noise: Noise regime.
+            runs: Run numbers, [R].
+            seed: Seed. With the run number it fixes all random numbers of a run.
+
+        Returns:
+            Episode with R runs. Times are those of the drive.
+        """
+        drive = select_stretch(
+            read_drive(find_dataset(self.root, self.folder)), self.start_s, self.end_s
+        )
+        draws = PhiloxStream(seed, runs)
+        time, (reduced, inputs) = (
+            torch.from_numpy(drive.time[1:]),
+            reduce_ranges(drive, self.receiver.clock_drift),
+        )
+        truth = {
+            name: values[1:].expand(len(runs), -1, -1)
+            for name, values in interpolate_reference(drive).items()
+        }
+        clock_bias = np.nanquantile(
+            reduced[0, [name.startswith("G") for name in drive.satellites]].numpy(), 0.2
+        )
+        epochs = select_epochs(drive.time, self.receiver.fix_interval_s)[1:]
+        y = torch.where(
+            torch.from_numpy(epochs)[:, None], reduced[1:] - clock_bias, torch.nan
+        ).repeat(len(runs), 1, 1)
+        satellites = len(drive.satellites)
+        sd = torch.full((satellites,), self.receiver.range_sd, dtype=torch.float64)
+        channels = MeasurementChannels(sd, ("range",) * satellites, tuple(range(satellites)))
+        check_unit_process(noise, time)
+        y[:, epochs] += noise.draw_errors(draws.at_step(0), channels, time[epochs])
+        record = Record(y, inputs, self._draw_start(drive, draws))
+        track = torch.cat([truth["position"], truth["height"]], -1)
+        notes = (f"clock: nominal drift {self.receiver.clock_drift} m/s subtracted",)
+        return Episode(record, time, truth, track, notes, line_of_sight_directions(drive))
+
+    def _draw_start(self, drive: UrbanLog, draws: PhiloxStream) -> Tensor:
+        """Draw starts [R, 9], about which the reference has the assumed distribution."""
+        heading = interpolate_reference(drive)["heading"][0]
+        if bool(torch.isnan(heading)):
+            raise ValueError(
+                "scenario.start_s must be a time at which the car moves, "
+                f"got {self.start_s} (standing at {drive.time[0]} s). Select another start."
+            )
+        model = UrbanGnss(self.tuning, NormalRangeError())
+        true = torch.cat([heading.new_zeros(3), heading, heading.new_zeros(5)])
+        error = model.p0 * draws.at_step(0).normal("world.start", 1, len(model.p0))[:, 0]
+        return model.chart.add(true.expand_as(error), -error)
+
+
+def select_stretch(drive: UrbanLog, start: float | None, end: float | None) -> UrbanLog:
+    """Select the epochs from start to end, both inclusive.
+
+    Args:
+        drive: Drive.
+        start: Start, s of the drive. None for the start of the drive.
+        end: End, s of the drive. None for the end of the drive.
+
+    Returns:
+        The selected part of the drive.
+
+    Raises:
+        ValueError: if it contains fewer than two epochs.
+    """
+    low, high = (-np.inf if start is None else start), (np.inf if end is None else end)
+    inside = (drive.time >= low) & (drive.time <= high)
+    if inside.sum() < 2:
+        raise ValueError(
+            "scenario.start_s and end_s must select at least 2 epochs, "
+            f"got {inside.sum()} between {start} and {end}. "
+            f"The drive covers {drive.time[0]} to {drive.time[-1]} s."
+        )
+    leaves = {
+        name: value[inside] for name, value in drive._asdict().items() if name != "satellites"
+    }
+    return drive._replace(**leaves)
+
+
+def select_epochs(time: Array, interval: float) -> NDArray[np.bool_]:
+    """Select epochs at intervals from the first one.
+
+    Args:
+        time: Times of the epochs, s, [T].
+        interval: Time between selected epochs, s.
+
+    Returns:
+        Mask [T] of the first epochs at or after 0, interval, 2 interval, ...
+    """
+    count = np.floor((time - time[0] + _SAME_TIME) / interval)
+    return np.diff(count, prepend=-1.0) > 0
+
+
+def interpolate_reference(drive: UrbanLog) -> dict[str, Tensor]:
+    """Return the reference of each component group of the model, [T, k].
+
+    The heading is NaN at speeds below `MOVING`.
+    """
+    position = torch.from_numpy(drive.position)
+    enu = earth.local_enu(position, position[0])
+    east, north = torch.from_numpy(drive.velocity).unbind(-1)
+    heading = torch.where(torch.hypot(east, north) > MOVING, torch.atan2(east, north), torch.nan)
+    return {"position": enu[:, :2], "height": enu[:, 2:], "heading": heading[:, None]}
+
+
+def line_of_sight_directions(drive: UrbanLog) -> dict[str, Tensor]:
+    """Compute azimuth and elevation from the start, for the datasheet.
+
+    Args:
+        drive: Drive.
+
+    Returns:
+        Azimuth and elevation, rad, [T - 1, S], without the first epoch, and encoded names.
+    """
+    origin = torch.from_numpy(drive.position[0])
+    place = torch.from_numpy(rotate_heading(drive.place[1:], earth.ecef(origin).numpy()))
+    azimuth, elevation = azimuth_elevation(origin, place)
+    return {
+        "azimuth": azimuth,
+        "elevation": elevation,
+        "satellites": encode_names(drive.satellites),
+    }
+
+
+def reduce_ranges(drive: UrbanLog, clock_drift: float) -> tuple[Tensor, UrbanInputs]:
+    """Subtract the ranges from the start and the nominal clock drift.
+
+    Args:
+        drive: Drive.
+        clock_drift: Nominal drift of the receiver clock, m/s.
+
+    Returns:
+        Reduced pseudoranges, m, [T, S], and the inputs of the T - 1 steps.
+    """
+    origin = torch.from_numpy(drive.position[0])
+    at = earth.ecef(origin).numpy()
+    direction = rotate_heading(drive.place, at) - at
+    reach = np.linalg.norm(direction, axis=-1)
+    reduced = drive.range - reach - (clock_drift * (drive.time - drive.time[0]))[:, None]
+    line = direction / reach[..., None] @ earth.local_axes(origin).numpy().T
+    step_means = [0.5 * (a[1:] + a[:-1]) for a in (drive.speed, drive.yaw_rate)]
+    glonass = np.broadcast_to(
+        [float(name.startswith("R")) for name in drive.satellites], reach.shape
+    )
+    # finite values replace missing inputs, since a NaN would propagate to gradients
+    line = np.where(np.isnan(line), [0.0, 0.0, 1.0], line)
+    filled = [
+        np.where(np.isnan(a), fill, a)
+        for a, fill in ((reach, 2e7), (glonass, 0.0), (drive.cn0, 40.0), (drive.sd, 1.0))
+    ]
+    leaves = [np.diff(drive.time), *step_means, *(a[1:] for a in (line, *filled))]
+    return torch.from_numpy(reduced), UrbanInputs(
+        *(torch.from_numpy(np.ascontiguousarray(leaf))[None] for leaf in leaves)
+    )

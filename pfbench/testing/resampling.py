@@ -1,0 +1,147 @@
+"""Test of resamplers and schemes: expected counts N w, and everything of a particle is copied together."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor
+
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.particle.resampling import EssResampler, Resampler, ResamplingScheme
+from pfbench.model.linear_gaussian import local_level
+from pfbench.testing.results import LawCheck, check_p_values
+
+_LAW = "a resampler gives each particle its weight on average"
+
+
+def check_resampling(
+    stage: Resampler | ResamplingScheme,
+    particles: int = 24,
+    wanted: int | None = None,
+    runs: int = 20_000,
+    seed: int = 1,
+) -> LawCheck:
+    """Check that a resampler or a scheme is unbiased and copies each particle as a whole.
+
+    The weights are uneven, some are 0. The total weight of the copies of each particle must average
+    to its weight, by Hotelling's test over runs. States, stored past, memory and ancestors of a slot
+    must belong to one particle. A resampler is tested with the weights as resampling probabilities,
+    and with others, for which its weights must correct.
+
+    Args:
+        stage: Resampler, or scheme to be used in every run.
+        particles: Number of particles before resampling.
+        wanted: Number of particles after it. The same by default.
+        runs: Number of independent repetitions.
+        seed: Of the random stream.
+
+    Returns:
+        The smaller of the p-values.
+
+    Raises:
+        AssertionError: If the law does not hold.
+    """
+    count = particles if wanted is None else wanted
+    resampler: Any = EssResampler(stage, 1.0) if _is_scheme(stage) else stage  # type: ignore[arg-type]
+    a = _uneven_weights(particles, np.random.default_rng(0))
+    log_w = torch.log(torch.tensor(a))
+    tilt = torch.linspace(-1.0, 1.0, particles, dtype=torch.float64)
+    probabilities = {
+        "the weights": log_w,
+        "other probabilities": torch.log_softmax(0.5 * log_w + tilt, -1),
+    }
+    p_values, deviations = {}, {}
+    for name, log_a in probabilities.items():
+        shares = _shares(resampler, log_w.expand(runs, -1), log_a, count, seed)
+        assert not shares[:, a == 0.0].any(), (
+            f"{_LAW}: with {name}, a particle of weight 0 was copied"
+        )
+        p_values[name], deviations[name] = _hotelling(count * (shares - a))
+    return check_p_values(
+        _LAW, p_values, 1e-4, largest_deviation_in_copies=max(deviations.values())
+    )
+
+
+def _is_scheme(stage: object) -> bool:
+    """Return whether a stage takes (a, n, draws), not a belief."""
+    return len(inspect.signature(stage).parameters) == 3  # type: ignore[arg-type]
+
+
+def _uneven_weights(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw weights of all sizes [N], with zeros at both ends and inside, and an exact multiple of 1/N."""
+    a = rng.gamma(0.5, size=n)
+    a[[0, n // 2, 3, -1]] = 0.0
+    a *= (1 - 2 / n) / a.sum()
+    a[3] = 2 / n
+    return a
+
+
+def _shares(resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int) -> np.ndarray:
+    """Resample particles that are numbered, and return the weight of all copies of each [runs, N]."""
+    runs, n = log_w.shape
+    number = torch.arange(n, dtype=torch.float64).expand(runs, -1)
+    places = torch.tensor(
+        np.random.default_rng(1).permutation(n)
+    ).double()  # so that a sorting resampler moves them
+    parts = {
+        "state": places.expand(runs, -1).unsqueeze(2),
+        "window": number[..., None, None],
+        "memory": number.unsqueeze(2),
+    }
+    parts = {name: part.clone() for name, part in parts.items()}
+    belief = ParticleBelief(
+        parts["state"],
+        log_w,
+        torch.zeros(runs, dtype=torch.float64),
+        {"w": parts["window"]},
+        {"m": parts["memory"]},
+    )
+    same = torch.equal(log_a, log_w[0])  # by identity: nothing to correct
+    wanted = torch.full((runs, 1), float(count), dtype=torch.float64)
+    draws = PhiloxStream(seed, torch.arange(runs)).at_step(3)
+    after, _ = resampler(
+        local_level(1.0, 1.0, 0.0, 1.0),
+        belief,
+        log_w if same else log_a.expand(runs, -1),
+        wanted,
+        draws,
+    )
+    live = torch.isfinite(after.log_w)
+    assert int(live.sum(1).max()) <= count, (
+        f"{_LAW}: at most {count} slots must be active, got {int(live.sum(1).max())}"
+    )
+    w, m = after.window["w"][..., 0, 0], after.memory["m"][..., 0]
+    whole = (after.x[..., 0] == places[w.long()]) & (w == m)
+    if after.ancestors is not None:  # ancestors may be numbered in another order, but one to one
+        first = torch.full((runs, n), -1.0, dtype=torch.float64).scatter(1, after.ancestors, w)
+        back = torch.full((runs, n), -1, dtype=torch.long).scatter(1, w.long(), after.ancestors)
+        whole = (
+            whole
+            & (first.gather(1, after.ancestors) == w)
+            & (back.gather(1, w.long()) == after.ancestors)
+        )
+    assert bool(whole[live].all()), (
+        f"{_LAW}: state, window, memory and ancestor of a slot must be of one particle"
+    )
+    weight = torch.where(live, after.log_w.exp(), 0.0)
+    return torch.zeros(runs, n, dtype=torch.float64).scatter_add(1, w.long(), weight).numpy()
+
+
+def _hotelling(deviations: np.ndarray) -> tuple[float, float]:
+    """Return the p-value of a mean of 0 and the largest mean; directions without spread must be exact."""
+    runs, mean = len(deviations), deviations.mean(0)
+    spread, axes = np.linalg.eigh(np.cov(deviations.T))
+    free = spread > 1e-9
+    z = math.sqrt(runs) * (mean @ axes)
+    largest = float(np.abs(mean).max())
+    if np.abs(z[~free]).max(initial=0.0) > 1e-3:
+        return 0.0, largest  # copies that are certain, and wrong
+    return float(
+        stats.chi2(free.sum()).sf((z[free] ** 2 / spread[free]).sum())
+    ) if free.any() else 1.0, largest

@@ -1,0 +1,67 @@
+"""Composed configurations and short episodes of scenarios, for tests of all of conf/."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from functools import cache
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from pfbench import job
+from pfbench.core.record import Episode, Record, map_inputs
+from pfbench.noise.white import NominalNoise
+
+CONF = job.conf_dir()
+
+SEED, RUNS, STEPS = 1, torch.arange(2), 5
+
+GROUPS = {
+    group: [file.stem for file in sorted((CONF / group).glob("*.yaml"))]
+    for group in ("filter", "model", "noise", "scenario")
+}
+
+
+@cache
+def composed(*words: str) -> DictConfig:
+    """Compose a configuration, to be read only: equal words are composed once, in 0.25 s."""
+    job.register_experiments()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose(
+            "config", ["checkpoint=untrained", "episode_cache_dir=null", "particles=30", *words]
+        )
+
+
+def truncated(episode: Episode, steps: int = STEPS) -> Episode:
+    """Return the first steps of an episode."""
+    record = episode.record
+    inputs = map_inputs(lambda a: a[:, :steps], record.u)
+    truth = {name: value[:, :steps] for name, value in episode.truth.items()}
+    cut = Record(record.y[:, :steps], inputs, record.start, record.spread, record.feedback)
+    return Episode(cut, episode.time[:steps], truth, None, episode.notes)
+
+
+WORLDS: dict[str, Episode] = {}
+
+
+def world(scenario: str) -> Episode:
+    """Return five steps of a scenario; a flight is cut, because all of it takes seconds."""
+    if scenario not in WORLDS:
+        cfg = deepcopy(composed(f"scenario={scenario}"))
+        flown = cfg.scenario._target_.endswith("SimulatedFlight")
+        if flown:  # its first seconds: 10 s of flight_300s, 20 s of flight_500s
+            if "segments" in cfg.scenario.trajectory:
+                cfg.scenario.trajectory.segments = cfg.scenario.trajectory.segments[:1]
+            elif "duration_s" in cfg.scenario.trajectory:
+                cfg.scenario.trajectory.duration_s = 10.0
+            cfg.scenario.imu_rate_hz = 20.0
+        WORLDS[scenario] = truncated(job.instantiate(cfg.scenario).draw(NominalNoise(), RUNS, SEED))
+    return WORLDS[scenario]
+
+
+RECORDED = [
+    file.stem
+    for file in sorted((CONF / "scenario").glob("*.yaml"))
+    if "${data.root}" in file.read_text()
+]

@@ -1,0 +1,242 @@
+"""Observation distributions of particle and Gaussian filters: densities, missing components, existence of moments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from pyro import distributions as dist
+from scipy import stats
+from torch import Tensor
+from torch.distributions import Distribution, Independent
+
+from pfbench.core.chart import wrap_angle
+from pfbench.core.density import has_finite_moments
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+    UnscentedPoints,
+)
+from pfbench.filter.loop import run_filter
+from pfbench.filter.particle.particle_filter import ParticleFilter, compute_nis
+from pfbench.model.base import StateSpaceModel, StaticModel, normal_batch
+from pfbench.noise.white import NominalNoise
+from pfbench.scenario.model_simulation import ModelSimulation
+
+
+def f64(values: Any) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+class Walk(StateSpaceModel):
+    """A random walk in two dimensions; subclasses state its observation distribution."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("sd", f64([0.5, 0.5]))
+        self.names, self.units, self.groups, self.noise_dim = (
+            ("a", "b"),
+            ("", ""),
+            {"state": (0, 1)},
+            2,
+        )
+
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, self.sd)
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return x + self.sd * w
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return LAWS["laplace"][0](x)
+
+
+def normal_mixture(x: Tensor) -> Distribution:
+    """Coordinates of one vector belong to one component."""
+    parts = dist.Normal(x.unsqueeze(-2).expand(*x.shape[:-1], 2, 2), f64([[1.0], [5.0]])).to_event(
+        1
+    )
+    return dist.MixtureSameFamily(dist.Categorical(f64([0.8, 0.2]).expand(*x.shape[:-1], 2)), parts)
+
+
+def mixture_logpdf(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    parts = [np.log(p) + stats.norm.logpdf(y, x, sd).sum(-1) for p, sd in ((0.8, 1.0), (0.2, 5.0))]
+    return np.logaddexp(*parts)
+
+
+def by_component(f: Any) -> Any:
+    return lambda y, x: f(y, x).sum(-1)
+
+
+LAWS: dict[str, tuple[Any, Any]] = {
+    "laplace": (
+        lambda x: dist.Laplace(x, torch.ones_like(x)).to_event(1),
+        by_component(lambda y, x: stats.laplace.logpdf(y, x)),
+    ),
+    "cauchy": (
+        lambda x: dist.Cauchy(x, torch.ones_like(x)).to_event(1),
+        by_component(lambda y, x: stats.cauchy.logpdf(y, x)),
+    ),
+    "student 1": (
+        lambda x: dist.StudentT(f64(1.0), x, torch.ones_like(x)).to_event(1),
+        by_component(lambda y, x: stats.t.logpdf(y, 1.0, x)),
+    ),
+    "mixture": (normal_mixture, mixture_logpdf),
+    "poisson": (
+        lambda x: dist.Poisson(torch.exp(x)).to_event(1),
+        by_component(lambda y, x: stats.poisson.logpmf(y, np.exp(x))),
+    ),
+    "negative binomial": (
+        lambda x: dist.NegativeBinomial(3.0, logits=x).to_event(1),
+        by_component(lambda y, x: stats.nbinom.logpmf(y, 3, 1 / (1 + np.exp(x)))),
+    ),
+    "exponential": (
+        lambda x: dist.Exponential(torch.exp(x)).to_event(1),
+        by_component(lambda y, x: stats.expon.logpdf(y, scale=np.exp(-x))),
+    ),
+}
+
+
+def observed(name: str, kind: type[Walk] = Walk) -> Walk:
+    class Observed(kind):  # type: ignore[misc, valid-type]
+        def observation(self, x: Tensor, u: Any) -> Distribution:
+            law: Distribution = LAWS[name][0](x)
+            return law
+
+    return Observed()
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_likelihood_is_the_density_of_the_observed_components(name: str) -> None:
+    model, x = observed(name), PhiloxStream(1, torch.arange(3)).normal("x", 5, 2).requires_grad_()
+    y = f64([[2.0, 1.0], [torch.nan, 3.0], [torch.nan, torch.nan]])
+    value = model.log_likelihood(y, x, ())
+    logpdf, states = LAWS[name][1], x.detach().numpy()
+    assert np.allclose(value.detach()[0], logpdf(y[:1].numpy(), states[0]), rtol=1e-12)
+    assert np.allclose(value.detach()[1], logpdf(y[1:2, 1:].numpy(), states[1][:, 1:]), rtol=1e-12)
+    assert np.all(np.abs(value.detach()[2].numpy()) < 1e-12)
+    (gradient,) = torch.autograd.grad(value.sum(), x)
+    assert torch.isfinite(gradient).all()
+    assert not gradient[2].any()
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_particle_filters_work_with_it(name: str) -> None:
+    model = observed(name)
+    episode = ModelSimulation(model, 8).draw(NominalNoise(), torch.arange(40), 2)
+    y = episode.record.y.clone()
+    y[0, 3, 0] = torch.nan
+    estimate = run_filter(
+        ParticleFilter(400), model, Record(y), PhiloxStream(1, torch.arange(40)),
+        watch=lambda t, info: {"nis": info.nis()[0]} if info.nis else {},
+    )  # fmt: skip
+    assert torch.isfinite(estimate.log_evidence).all()
+    error = estimate.mean - episode.truth["state"]
+    z = (error.square() / estimate.variance).mean()
+    assert 0.6 < float(z) < 1.6  # consistent: filter and episodes share the distribution
+    assert torch.isfinite(estimate.trace["nis"]).all() == (name not in ("cauchy", "student 1"))
+
+
+def test_the_innovation_of_a_distribution_without_moments_is_nan() -> None:
+    model, x = observed("cauchy"), torch.zeros(2, 4, 2, dtype=torch.float64)
+    record = Record(f64([[1.0, torch.nan], [2.0, 3.0]]))
+    nis, count = compute_nis(
+        model, x, torch.full((2, 4), -np.log(4.0), dtype=torch.float64), record
+    )
+    assert torch.isnan(nis).all()
+    assert count.tolist() == [1, 2]
+
+
+def test_a_joint_distribution_needs_complete_measurements() -> None:
+    class Joint(Walk):
+        def observation(self, x: Tensor, u: Any) -> Distribution:
+            root = torch.eye(2, dtype=torch.float64).expand(*x.shape[:2], 2, 2)
+            return dist.MultivariateStudentT(f64(4.0).expand(x.shape[:2]), x, root)
+
+    model, x = Joint(), torch.zeros(2, 3, 2, dtype=torch.float64)
+    value = model.log_likelihood(f64([[1.0, 2.0], [torch.nan, torch.nan]]), x, ())
+    assert np.allclose(value[0], stats.multivariate_t.logpdf([1.0, 2.0], [0, 0], np.eye(2), 4))
+    assert not value[1].any()
+    with pytest.raises(
+        ValueError, match=r"Joint\.observation must return Independent.*MultivariateStudentT"
+    ):
+        model.log_likelihood(f64([[1.0, torch.nan], [1.0, 2.0]]), x, ())
+
+
+class Angular(Walk):
+    def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
+        return wrap_angle(y - y_hat)
+
+
+def test_a_residual_wraps_about_the_mean_and_needs_one() -> None:
+    x, y = torch.zeros(1, 3, 2, dtype=torch.float64), f64([[0.3, -0.2]])
+    model = observed("laplace", Angular)
+    assert torch.allclose(
+        model.log_likelihood(y, x, ()), model.log_likelihood(y + 2 * torch.pi, x, ())
+    )
+    for name in ("cauchy", "student 1"):
+        with pytest.raises(
+            ValueError, match=r"with a mean where the model defines residual, got (Cauchy|StudentT)"
+        ):
+            observed(name, Angular).log_likelihood(y, x, ())
+    inner = observed("cauchy")  # a wrapper that passes a plain residual on defines none
+    assert torch.equal(StaticModel(inner).log_likelihood(y, x, ()), inner.log_likelihood(y, x, ()))
+
+
+GAUSSIAN = {
+    "ekf": GaussianFilter(TaylorLinearisation()),
+    "ukf": GaussianFilter(SigmaPointLinearisation(UnscentedPoints())),
+    "ckf": GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
+    "enkf": EnsembleKalmanFilter(20),
+}
+
+
+@pytest.mark.parametrize("method", GAUSSIAN.values(), ids=GAUSSIAN.keys())
+@pytest.mark.parametrize("name", ["cauchy", "student 1", "laplace", "poisson"])
+def test_gaussian_filters_need_a_mean_and_a_variance(method: Any, name: str) -> None:
+    record, draws = (
+        Record(torch.zeros(2, 3, 2, dtype=torch.float64)),
+        PhiloxStream(1, torch.arange(2)),
+    )
+    if name in ("laplace", "poisson"):
+        assert torch.isfinite(run_filter(method, observed(name), record, draws).mean).all()
+        return
+    with pytest.raises(
+        ValueError, match=r"Observed\.observation must have a finite mean.*Use a particle filter"
+    ):
+        run_filter(method, observed(name), record, draws)
+
+
+def test_gaussian_filters_check_initial_and_noise_distributions_at_the_start() -> None:
+    class Wild(Walk):
+        @property
+        def noise(self) -> Distribution:
+            return dist.Cauchy(torch.zeros(2), torch.ones(2)).to_event(1)
+
+    class Far(Walk):
+        def initial(self, runs: int) -> Distribution:
+            return dist.StudentT(2.0, torch.zeros(runs, 2), torch.ones(runs, 2)).to_event(1)
+
+    for model, name in ((Wild(), "noise"), (Far(), "initial")):
+        with pytest.raises(
+            ValueError, match=rf"{type(model).__name__}\.{name} must have a finite mean"
+        ):
+            GaussianFilter(TaylorLinearisation()).init(model, 2, PhiloxStream(1, torch.arange(2)))
+
+
+def test_moments_are_undefined_only_where_the_parameters_are_finite() -> None:
+    """A lost run has NaN parameters; it must not be taken for a distribution without moments."""
+    loc = f64([[0.0, torch.nan]])
+    assert has_finite_moments(Independent(dist.Laplace(loc, f64(1.0), validate_args=False), 1))
+    assert not has_finite_moments(Independent(dist.Cauchy(loc, f64(1.0), validate_args=False), 1))
+    assert not has_finite_moments(
+        Independent(dist.StudentT(f64(2.0), loc, f64(1.0), validate_args=False), 1)
+    )
+    assert has_finite_moments(normal_mixture(f64([[0.0, 1.0]])))

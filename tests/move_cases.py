@@ -1,0 +1,35 @@
+"""Moves for the tests: filters with a move, and one that accepts everything."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.moves.metropolis import McmcKernel, Move
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+
+
+def moving(*moves: Move, n: int = 40, threshold: float = 1.0) -> ParticleFilter:
+    return ParticleFilter(n, EssResampler(Systematic(), threshold), moves=moves)
+
+
+@dataclasses.dataclass(frozen=True)
+class Always:
+    """Accepts whatever is proposed."""
+
+    kernel: McmcKernel
+    is_exact = False
+
+    @property
+    def required_history(self) -> Any:
+        return self.kernel.required_history
+
+    def propose(
+        self, model: Any, belief: ParticleBelief, draws: Any
+    ) -> tuple[ParticleBelief, Tensor]:
+        return self.kernel.propose(model, belief, draws)[0], torch.zeros_like(belief.log_w)

@@ -1,0 +1,164 @@
+"""The recipes of CONTRIBUTING.md are followed: files are written, blocks executed and commands run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from command_line import pfbench
+
+import pfbench as package
+from pfbench.results import metrics, store
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "CONTRIBUTING.md").read_text()
+RECIPES = {
+    title: body
+    for title, body in re.findall(r"^### (.*?)\n(.*?)(?=^##|\Z)", TEXT, re.M | re.DOTALL)
+}
+FILE = re.compile(r"^File `([^`]+)`:\n\n```\w+\n(.*?)^```$", re.M | re.DOTALL)
+BLOCK = re.compile(r"^```(python|sh)\n(.*?)^```$", re.M | re.DOTALL)
+COMMAND = "python -m pfbench "
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Yield a folder with the files of all recipes, in which Python finds `mylab`."""
+    home = tmp_path_factory.mktemp("contributing")
+    (home / "mylab").mkdir()
+    (home / "mylab" / "__init__.py").touch()
+    for name, content in FILE.findall(TEXT):
+        (home / name).parent.mkdir(parents=True, exist_ok=True)
+        (home / name).write_text(content)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(home))
+        yield home
+    for name in [name for name in sys.modules if name.partition(".")[0] == "mylab"]:
+        del sys.modules[name]
+
+
+def follow(title: str, folder: Path) -> dict[str, Any]:
+    """Execute the blocks of a recipe and run its commands; return the names that the blocks define."""
+    scope: dict[str, Any] = {"__name__": "recipe"}
+    for language, block in BLOCK.findall(FILE.sub("", RECIPES[title])):
+        if language == "python":
+            exec(compile(block, title, "exec"), scope)
+            continue
+        for line in block.splitlines():
+            assert line.startswith(COMMAND)
+            printed = pfbench(*shlex.split(line.removeprefix(COMMAND)), home=folder)
+            assert printed.code == 0, printed.err
+    return scope
+
+
+def results(folder: Path, study: str) -> dict[str, store.JobResult]:
+    """Read the results of a study by label."""
+    jobs = [store.read_result(path) for path in (folder / "results" / study).glob("*.npz")]
+    return {job.meta["label"]: job for job in jobs}
+
+
+@pytest.mark.parametrize(
+    ("title", "study", "jobs"),
+    [
+        ("Add a resampler", "resamplers", 2),
+        ("Add a filter", "robust", 1),
+        ("Add a model", "room", 2),
+        ("Add a scenario", "window", 1),
+        ("Add a noise regime", "growing", 2),
+    ],
+)
+def test_a_recipe_runs(
+    title: str, study: str, jobs: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    follow(title, folder)
+    paths = list((folder / "results" / study).glob("*.npz"))
+    assert len(paths) == jobs
+    for path in paths:
+        arrays = store.read_result(path).arrays
+        assert arrays["error"].shape[1] == 5  # steps
+        assert np.isfinite(arrays["error"]).all()
+        assert not arrays["lost"].any()
+
+
+def test_the_metric_appears_in_the_table(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = follow("Add a metric", folder)["MEDIAN_ERROR"]
+    monkeypatch.setattr(metrics, "METRICS", (*metrics.METRICS, entry))
+    small_study(tmp_path)
+    table = package.load("small", tmp_path / "results")
+    rows = table[(table.metric == "median_error") & (table.component == "norm")]
+    (job,) = [job for job in results(tmp_path, "small").values() if "sir" in job.meta["label"]]
+    error = np.linalg.norm(job.arrays["error"].astype(float), axis=-1)
+    group_rows = rows[rows.label == job.meta["label"]]
+    assert len(group_rows) == 3 * group_rows.group.nunique()
+    if group_rows.group.nunique() == 1:
+        np.testing.assert_allclose(group_rows.value, np.median(error, -1))
+
+
+def test_the_figure_is_written(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pfbench.report.plots.condition_figures import write_figure
+    from pfbench.report.plots.plotting import line_styles
+
+    scope = follow("Add a figure to the report", folder)
+    small_study(tmp_path)
+    jobs = results(tmp_path, "small")
+    figure = scope["make_mean_nees_figure"](jobs, line_styles(list(jobs)))
+    (path,) = write_figure(figure, tmp_path, ["svg"])
+    assert path.name == "mean_nees.svg"
+    assert path.stat().st_size > 1000
+
+
+def small_study(home: Path) -> None:
+    """Run two filters for five steps."""
+    words = "run -m scenario=local_level scenario.steps=5 runs=3 particles=50 filter=sir,ekf study=small"
+    printed = pfbench(*words.split(), home=home)
+    assert printed.code == 0, printed.err
+
+
+def test_every_kind_of_part_has_a_recipe() -> None:
+    kinds = ("resampler", "filter", "model", "scenario", "noise regime", "metric")
+    assert list(RECIPES) == [*(f"Add a {kind}" for kind in kinds), "Add a figure to the report"]
+
+
+def test_named_files_exist() -> None:
+    """Paths of the checkout exist, except those that a recipe adds."""
+    added = {name for name, _ in FILE.findall(TEXT)}
+    added |= {"pfbench/scenario/open_window.py", "pfbench/model/room.py"}
+    paths = re.findall(r"`((?:pfbench|tests|conf|benchmarks)/[\w./]+)`", TEXT)
+    assert len(paths) > 20
+    assert [path for path in paths if path not in added and not (ROOT / path).exists()] == []
+
+
+def test_versions_agree() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == package.__version__
+    assert f"## {package.__version__} " in (ROOT / "CHANGELOG.md").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "pfbench.__version__"}
+    assert project["project"]["dynamic"] == ["version"]
+
+
+def test_workflows_cover_the_allowed_versions() -> None:
+    """Python versions and the oldest torch of the workflows are those of pyproject."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    jobs = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text())["jobs"]
+    matrix = jobs["test"]["strategy"]["matrix"]
+    low, high = re.findall(r"3\.(\d+)", project["requires-python"])
+    assert matrix["python"] == [f"3.{minor}" for minor in range(int(low), int(high))]
+    (torch,) = [name for name in project["dependencies"] if name.startswith("torch")]
+    oldest = torch.removeprefix("torch>=").partition(",")[0]
+    assert f"torch=={oldest}.*" in matrix["torch"]
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    assert [repo["repo"] for repo in hooks] == ["local"]  # nothing is downloaded

@@ -1,0 +1,108 @@
+"""Files in git: no ignored file, no figure twice, reports reduced, numbers of README from the files."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+TOP = Path(__file__).parents[1]
+REPORT_FILE = re.compile(
+    r"reports/(README\.md|\w+/(report\.md|verdicts\.json(\.gz)?|headline\.(png|svg)))"
+)
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, TOP / "docs" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def list_git_files(*options: str) -> list[str]:
+    if shutil.which("git") is None or not (TOP / ".git").exists():
+        pytest.skip("not a git checkout")
+    command = ("git", "ls-files", *options)
+    return subprocess.run(
+        command, cwd=TOP, check=True, capture_output=True, text=True
+    ).stdout.splitlines()
+
+
+def test_no_file_in_git_is_ignored() -> None:
+    assert list_git_files("-ci", "--exclude-standard") == []
+
+
+def test_git_stores_only_the_published_files_of_a_report() -> None:
+    stored = [name for name in list_git_files() if name.startswith("reports/")]
+    assert [name for name in stored if not REPORT_FILE.fullmatch(name)] == []
+    studies = {name.split("/")[1] for name in stored} - {"README.md"}
+    assert studies == set(load("publish_reports").HEADLINES)
+    for study in studies:
+        figures = [name for name in stored if name.startswith(f"reports/{study}/headline.")]
+        assert len(figures) == 1, study
+        assert f"reports/{study}/report.md" in stored
+
+
+def test_no_figure_is_stored_in_two_formats() -> None:
+    figures = [Path(name) for name in list_git_files() if name.endswith((".png", ".svg"))]
+    stems = [figure.with_suffix("") for figure in figures]
+    assert len(stems) == len(set(stems))
+
+
+def test_published_reports_are_reduced() -> None:
+    publish = load("publish_reports")
+    for study, stem in publish.HEADLINES.items():
+        folder = publish.REPORTS / study
+        text = (folder / "report.md").read_text()
+        assert publish.reduce_markdown(text, folder, stem) == text, study
+
+
+def test_a_report_keeps_its_headline_figure_only(tmp_path: Path) -> None:
+    publish = load("publish_reports")
+    folder = tmp_path / "claims"
+    (folder / "figures").mkdir(parents=True)
+    (folder / "figures" / "claims_printed_ratios.svg").write_text("<svg/>")
+    page = (
+        "# claims\n\n![a](figures/claims_printed_ratios.svg)\n\n*Kept.*\n\n"
+        "## Levels\n\n![b](figures/claims_printed_levels.svg)\n\n*Removed.*\n\n"
+        "## Claims\n\n- 0.2 [0.1, 0.3]; [figure of x](../paper_000/index.html#a)\n"
+    )
+    (folder / "report.md").write_text(page)
+    publish.publish_report(folder)
+    assert (folder / "headline.svg").read_text() == "<svg/>"
+    assert (folder / "report.md").read_text() == (
+        "# claims\n\n![a](headline.svg)\n\n*Kept.*\n\n"
+        "## Claims\n\n- 0.2 [0.1, 0.3]; [x](../paper_000/report.md)\n"
+    )
+
+
+def test_the_numbers_of_the_readme_are_those_of_the_published_files() -> None:
+    numbers = load("readme_numbers")
+    text = numbers.README.read_text()
+    assert set(re.findall(r"<!-- numbers:(\w+) -->", text)) - {"end"} == set(numbers.BLOCKS)
+    assert numbers.fill_blocks(text) == text, "run: python docs/readme_numbers.py"
+
+
+def test_a_changed_number_of_the_readme_is_found() -> None:
+    numbers = load("readme_numbers")
+    text = numbers.README.read_text()
+    ratio = numbers.read_table("benchmarks/campaigns.md")[0]["times as fast (quartiles)"]
+    assert ratio in text
+    assert numbers.fill_blocks(text.replace(ratio, "9.9")) == text
+
+
+def test_the_readme_has_no_measured_number_outside_the_blocks() -> None:
+    text = (TOP / "README.md").read_text()
+    prose = re.sub(
+        r"<!-- numbers:\w+ -->.*?<!-- numbers:end -->|```.*?```", "", text, flags=re.DOTALL
+    )
+    assert re.findall(r"\d+(?:\.\d+)? (?:times|%|s for|ms)\b", prose) == []
+    (count,) = set(re.findall(r"(\d+) claims", text))
+    assert re.search(rf"^\| all \|.*\| {count} \|$", text, re.MULTILINE)

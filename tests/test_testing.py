@@ -1,0 +1,263 @@
+"""pfbench.testing: what is right passes, planted faults fail with numbers, and a silent stage is never called exact."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from move_cases import Always
+from torch import Tensor
+
+import pfbench.testing
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.learned.differentiable_resampling import SoftResampler, StopGradientResampler
+from pfbench.filter.loop import FilterResult
+from pfbench.filter.moves.flow_kernels import NoiseFlowKernel, NoiseFlowStatKernel
+from pfbench.filter.moves.metropolis import KernelCycle, MetropolisHastings
+from pfbench.filter.moves.path_block_kernels import LastStateKernel, PathBlockKernel
+from pfbench.filter.moves.path_proposals import SmoothedSegment
+from pfbench.filter.particle.auxiliary_weights import TemperedPosterior, TemperedWeights
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
+from pfbench.filter.particle.resampling import (
+    EssResampler,
+    Multinomial,
+    RegularisedResampler,
+    Residual,
+    Ssp,
+    Systematic,
+)
+from pfbench.filter.particle.sqmc import HilbertSortedResampler, SqmcProposal, SqmcScheme
+from pfbench.filter.particle.weight_update import BayesWeightUpdate
+from pfbench.model.base import StateSpaceModel
+from pfbench.ppl.pmmh import SortedResampler
+from pfbench.testing import (
+    check_causality,
+    check_convergence,
+    check_evidence,
+    check_filter,
+    check_independence,
+    check_move,
+    check_proposal,
+    check_resampling,
+    filter_record,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class HalfToFirst:
+    """A scheme that gives half of the slots to particle 0."""
+
+    def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
+        ancestors = Systematic()(a, n, draws)
+        slots = torch.arange(a.shape[1])
+        return torch.where(2 * slots < n, 0, ancestors)
+
+
+@dataclasses.dataclass(frozen=True)
+class StatesOnly:
+    """A resampler that forgets to copy what belongs to the particles."""
+
+    is_exact = True
+
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        log_a: Tensor,
+        n: Tensor,
+        draws: RandomStream,
+    ) -> tuple[ParticleBelief, Tensor]:
+        after, touched = EssResampler(Systematic(), 1.0)(model, belief, log_a, n, draws)
+        return after._replace(window=belief.window), touched
+
+
+@dataclasses.dataclass(frozen=True)
+class Wide:
+    """A proposal of twice the noise, with a ratio for noise of another size."""
+
+    claimed: float
+    is_exact = True
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample:
+        z = draws.normal("noise", belief.x.shape[1], model.noise_dim)
+        w = 2.0 * z
+        z = w / self.claimed
+        log_ratio = (0.5 * z * z - 0.5 * w * w + math.log(self.claimed)).sum(-1)
+        return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scaled(BayesWeightUpdate):
+    """Weights times a factor: the estimate stays right, the evidence does not."""
+
+    factor: float = 1.05
+
+    def __call__(
+        self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
+    ) -> Tensor:
+        return super().__call__(model, log_w, x, log_ratio, record) + math.log(self.factor)
+
+
+@dataclasses.dataclass(frozen=True)
+class Mixing(BootstrapProposal):
+    """Noise that depends on the other runs of the batch."""
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample:
+        sent = super().__call__(model, belief, record, draws)
+        return sent._replace(x=sent.x + 1e-6 * sent.x.mean(0, keepdim=True))
+
+
+def peek(method: Any, model: StateSpaceModel, y: Tensor) -> FilterResult:
+    """Filters records that come one step early."""
+    return filter_record(method, model, torch.cat([y[:, 1:], y[:, -1:]], 1))
+
+
+# what is right passes
+
+
+@pytest.mark.parametrize(
+    "stage",
+    [
+        Systematic(), Residual(), EssResampler(Ssp(), 0.5), EssResampler(Multinomial(), 0.0), SoftResampler(0.5), StopGradientResampler(),
+        HilbertSortedResampler(EssResampler(SqmcScheme(), 1.0)), SortedResampler(EssResampler(Systematic(), 1.0)),
+    ],
+    ids=lambda s: type(s).__name__,
+)  # fmt: skip
+def test_resamplers_pass(stage: Any) -> None:
+    assert check_resampling(stage).statistic > 1e-4
+
+
+def test_moves_pass_as_kernels_and_as_moves() -> None:
+    for move in (
+        PathBlockKernel(3, SmoothedSegment()),
+        NoiseFlowStatKernel(),
+        KernelCycle(
+            (MetropolisHastings(LastStateKernel()), MetropolisHastings(NoiseFlowKernel(10))), 2
+        ),
+    ):
+        assert check_move(move, paths=500).details["moved"] > 0.5
+
+
+def test_proposals_pass() -> None:
+    for proposal in (BootstrapProposal(), SqmcProposal(), Wide(2.0)):
+        assert check_proposal(proposal).statistic < 4.5
+
+
+def test_a_filter_is_checked_in_one_line() -> None:
+    assert set(check_filter(ParticleFilter(50), runs=400)) == {
+        "causality",
+        "independence",
+        "evidence",
+        "convergence",
+    }
+    inexact = ParticleFilter(50, RegularisedResampler(EssResampler(Systematic())))
+    assert set(check_filter(inexact)) == {"causality", "independence"}
+
+
+# planted faults fail
+
+FAULTS: dict[str, tuple[Callable[[], Any], str]] = {
+    "a scheme that prefers a particle": (lambda: check_resampling(HalfToFirst()), "weight 0 was copied"),
+    "a resampler that is not unbiased": (lambda: check_resampling(EssResampler(HalfToFirst(), 1.0)), "weight 0"),
+    "a window that does not go with its particle": (lambda: check_resampling(StatesOnly()), "of one particle"),
+    "particles that are moved, not copied": (lambda: check_resampling(RegularisedResampler(EssResampler(Systematic(), 1.0))), "of one"),
+    "a move that accepts everything": (lambda: check_move(Always(LastStateKernel())), "p = "),
+    "a move that does nothing": (lambda: check_move(MetropolisHastings(LastStateKernel(), 0)), "must move to decide"),
+    "a ratio of another proposal": (lambda: check_proposal(Wide(1.8)), r"\+-"),
+    "no ratio": (lambda: check_proposal(Wide(1.0)), r"\+-"),
+    "an evidence off by 5 percent a step": (lambda: check_evidence(ParticleFilter(100, weight_update=Scaled())), r"Z_hat / Z.* \+-"),
+    "flattened weights": (lambda: check_evidence(ParticleFilter(100, weight_update=TemperedPosterior())), r"\+-"),
+    "weights for good, with many particles": (
+        lambda: check_convergence(ParticleFilter(100, weight_update=TemperedPosterior()), runs=40, faster=True), "slope must be -0.5"
+    ),
+    "a filter that peeks": (lambda: check_causality(ParticleFilter(50), run=peek), "must not change, got"),
+    "runs that mix": (lambda: check_independence(ParticleFilter(50, proposal=Mixing())), "differs by"),
+    "too few runs": (lambda: check_evidence(ParticleFilter(3), runs=20), "too uncertain"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_planted_faults_fail_with_numbers(fault: str) -> None:
+    check, message = FAULTS[fault]
+    with pytest.raises(AssertionError, match=message):
+        check()
+
+
+def test_a_model_without_its_record_is_refused() -> None:
+    with pytest.raises(ValueError, match="model and y must be given together"):
+        check_evidence(ParticleFilter(10), y=torch.zeros(1, 1))
+
+
+# exactness is asked of every part
+
+
+class Silent:
+    """Any stage; it does not state whether it is exact."""
+
+    required_history = None
+
+    def __call__(self, *args: Any) -> Any:
+        raise NotImplementedError
+
+
+SILENT = {
+    "scheme": lambda s: ParticleFilter(10, EssResampler(s)),
+    "scheme under a sorting": lambda s: ParticleFilter(10, HilbertSortedResampler(EssResampler(s))),
+    "scheme under a soft resampler": lambda s: ParticleFilter(
+        10, SoftResampler(0.5, EssResampler(s))
+    ),
+    "resampler": lambda s: ParticleFilter(10, s),
+    "size": lambda s: ParticleFilter(10, particle_count=s),
+    "preference": lambda s: ParticleFilter(10, auxiliary_weights=s),
+    "form": lambda s: ParticleFilter(10, auxiliary_weights=TemperedWeights(s)),
+    "move": lambda s: ParticleFilter(10, moves=(s,)),
+    "move in a cycle": lambda s: ParticleFilter(10, moves=(KernelCycle((s,)),)),
+    "proposal": lambda s: ParticleFilter(10, proposal=s),
+    "points": lambda s: ParticleFilter(10, points=s),
+    "points of a proposal": lambda s: ParticleFilter(10, proposal=SqmcProposal(s)),
+    "weigh": lambda s: ParticleFilter(10, weight_update=s),
+}
+
+
+@pytest.mark.parametrize("stage", SILENT)
+def test_a_silent_stage_is_not_exact_and_the_warning_says_what_to_state(stage: str) -> None:
+    with pytest.warns(UserWarning, match=r"got Silent without `is_exact`.*Add `is_exact = True`"):
+        method = SILENT[stage](Silent())
+    with pytest.warns(UserWarning, match="counts as not exact"):
+        assert method.is_exact is False
+
+
+@pytest.mark.parametrize("stage", SILENT)
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_stage_decides_by_what_it_states(stage: str, exact: bool) -> None:
+    part = Silent()
+    part.is_exact = exact  # type: ignore[attr-defined]
+    assert SILENT[stage](part).is_exact is exact
+
+
+def test_a_kernel_decides_unless_it_makes_no_step() -> None:
+    kernel = Always(LastStateKernel())
+    assert not ParticleFilter(10, moves=(MetropolisHastings(kernel),)).is_exact
+    assert ParticleFilter(10, moves=(MetropolisHastings(kernel, 0),)).is_exact
+
+
+def test_the_checks_do_not_need_pytest() -> None:
+    files = (Path(pfbench.testing.__file__).parent).glob("*.py")
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text()))]
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {str(node.module) for node in nodes if isinstance(node, ast.ImportFrom)}
+    assert "numpy" in names
+    assert "pytest" not in names
