@@ -139,7 +139,7 @@ def taught(world: World, count: int, seed: int, objective: Objective, path: Path
     own = draw_training_data(scenario, [NominalNoise()], model, count, 1000 * seed, world.steps)
     again = torch.arange(world.counts[-1]) % count
     plan = Training(
-        objective, EssResampler(Systematic(), 0.5), world.few, segment=world.segment, epochs=1, batch=15,
+        objective, EssResampler(Systematic(), 0.5), world.few, gradient_steps=world.segment, epochs=1, batch_size=15,
         learning_rate=world.rate, seed=seed,
     )  # fmt: skip
     path.unlink(missing_ok=True)

@@ -43,7 +43,7 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
     if name == "rbpf" and not (model.linear or model.linear_given):
         return "no component that is linear given the rest"
     if record.feedback is not None and (method_past(name) or name == "rbpf"):
-        return "corrected INS"
+        return "scenario with feedback"
     return ""
 
 

@@ -85,7 +85,9 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
     return [
         particle_filter._flat_moments(1e3 + x, torch.softmax(z, 1)),
         particle_filter._normalise(hidden),
-        base._log_normal(0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen),
+        density.log_normal_density(
+            0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen
+        ),
         resampling._evenly(a, n, u.double()),
     ]
 

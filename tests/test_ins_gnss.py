@@ -385,7 +385,7 @@ def test_the_kalman_filter_is_consistent_on_flights_that_its_model_did_not_draw(
     short = np.ones(len(model.groups))
     if model.markov:
         imu, end = model.imu, episode.time[-1].item()
-        kept = math.exp(-2 * end / imu.accelerometer_markov_time)
+        kept = math.exp(-2 * end / imu.accelerometer_markov_time_s)
         constant, walk = imu.accelerometer_bias**2, imu.accelerometer_markov**2
         short[-1] = math.sqrt((constant + walk) / (kept * constant + walk))
         assert 1.0 < short[-1] < 1.3

@@ -292,7 +292,7 @@ def test_worlds_that_are_not_the_models_have_no_bound_unless_asked() -> None:
     looped = Episode(episode.record._replace(feedback=cast(Any, object())), episode.time, {})
     assert "closed loop" in _missing_reason(config, looped)
     assert (
-        _missing_reason({**config, "bound": True, "scenario": {"root": "somewhere"}}, episode) == ""
+        _missing_reason({**config, "pcrb": True, "scenario": {"root": "somewhere"}}, episode) == ""
     )
 
 

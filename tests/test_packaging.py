@@ -176,16 +176,14 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
         for top in ("conf", "experiments")
         for file in (ROOT / top).rglob("*.yaml")
     }
-    report = [
+    data = [
         file
-        for ending in ("jinja", "css", "yaml")
-        for file in (ROOT / "pfbench/report").glob(f"*.{ending}")
+        for ending in ("jinja", "css", "yaml", "cpp", "cu", "h")
+        for file in (ROOT / "pfbench").rglob(f"*.{ending}")
     ]
-    wanted |= {f"pfbench/report/{file.name}" for file in report}
-    loops = [
-        file for ending in ("cpp", "cu", "h") for file in (ROOT / "pfbench").glob(f"*.{ending}")
-    ]
-    wanted |= {f"pfbench/{file}" for file in ("py.typed", *(file.name for file in loops))}
+    assert len(data) > 10
+    wanted |= {f"pfbench/{file.relative_to(ROOT / 'pfbench')}" for file in data}
+    wanted |= {"pfbench/py.typed"}
     wanted |= {"pfbench/conf/__init__.py"} | {
         f"pfbench/{file.relative_to(ROOT)}" for file in (ROOT / "experiments").glob("*.py")
     }
@@ -291,4 +289,4 @@ def test_another_program_composes_from_the_installed_yamls(installed: Path, tmp_
         command, capture_output=True, text=True, env=env, cwd=tmp_path, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["LinearGaussian", "ModelWorld", "Outliers", "70", "42"]
+    assert done.stdout.split() == ["LinearGaussian", "ModelSimulation", "OutlierNoise", "70", "42"]

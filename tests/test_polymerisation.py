@@ -736,7 +736,8 @@ def test_no_filter_beats_the_bound_and_the_repair_beats_the_print(scenario: str)
     )
     bound = compute_posterior_bound(model, model.assemble(episode.truth), episode.record)
     least = (
-        100 * (torch.sqrt(bound[:, 0, 0] + bound[:, 1, 1]) / episode.sheet["range"])[-20:].mean()
+        100
+        * (torch.sqrt(bound[:, 0, 0] + bound[:, 1, 1]) / episode.datasheet["range"])[-20:].mean()
     )
     error = {}
     for name in ("sir", "gpf", "qmc_gpf", "qmc_polymerised", "qmc_polymerised_printed", "sqmc"):
@@ -746,7 +747,9 @@ def test_no_filter_beats_the_bound_and_the_repair_beats_the_print(scenario: str)
             )
         mean = run_filter(method, model, episode.record, PhiloxStream(1, torch.arange(50))).mean
         off = (
-            100 * (mean[..., :2] - episode.truth["position"]).norm(dim=-1) / episode.sheet["range"]
+            100
+            * (mean[..., :2] - episode.truth["position"]).norm(dim=-1)
+            / episode.datasheet["range"]
         )
         error[name] = off[:, -20:].mean(1)
         assert float(off[:, -20:].square().mean().sqrt()) > 0.9 * float(least)

@@ -588,7 +588,7 @@ def test_the_yamls_say_what_they_should() -> None:
     assert job.instantiate(composed("scenario=azimuth_fast").scenario).filter_interval_s == 0.1
     errors = job.instantiate(
         composed("scenario=azimuth_constant_errors").scenario
-    ).initial.draw_errors(PhiloxStream(1, torch.arange(3)))
+    ).initial_errors.draw_errors(PhiloxStream(1, torch.arange(3)))
     printed = torch.tensor(
         [0.0, 0.0, math.radians(20.0), 1.0, 1.0, 1.0, 10.0, 10.0, 10.0], dtype=torch.float64
     )
@@ -661,7 +661,7 @@ def test_the_unscented_filter_gives_the_prototype_s_numbers(fixed: Episode, row:
 def test_the_filter_that_models_the_biases_is_consistent_and_the_others_are_not() -> None:
     runs, level = 24, 1e-4
     flight = job.instantiate(composed("scenario=azimuth").scenario)
-    episode = replace(flight, imu_rate=20.0).draw(NominalNoise(), torch.arange(runs), 21)
+    episode = replace(flight, imu_rate_hz=20.0).draw(NominalNoise(), torch.arange(runs), 21)
 
     def nees(rule: Any, *words: str) -> np.ndarray:
         estimate = filtered(

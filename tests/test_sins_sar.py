@@ -120,7 +120,7 @@ def test_the_model_follows_the_mechanisation_through_every_manoeuvre(
 @pytest.mark.slow
 def test_the_model_follows_the_mechanisation_for_a_thousand_seconds() -> None:
     """To 0.15 m of a hundred kilometres, with misalignments of degrees, at steps of 0.04 s."""
-    path = job.instantiate(composed("scenario=sar_flight").scenario).path
+    path = job.instantiate(composed("scenario=sar_flight").scenario).trajectory
     missed, grown = followed(
         SimulatedFlight(path, SILENT, SarSensor(), MISALIGNED, imu_rate_hz=50.0), torch.arange(4)
     )

@@ -863,7 +863,7 @@ def flown(runs: int, steps: int, model: str) -> tuple[Any, Episode]:
     cfg.scenario.trajectory.segments = (
         cfg.scenario.trajectory.segments[:2] + cfg.scenario.trajectory.segments[3:4]
     )
-    cfg.scenario.trajectory.segments[2].duration = 20.0
+    cfg.scenario.trajectory.segments[2].duration_s = 20.0
     cfg.scenario.imu_rate_hz = 20.0
     episode: Episode = job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(runs), 1)
     record = episode.record

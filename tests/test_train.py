@@ -175,7 +175,12 @@ def optimal(x: Tensor, y: Tensor) -> tuple[Tensor, float]:
 def test_a_network_finds_the_optimal_proposal(objective: Any, way: float, tmp_path: Path) -> None:
     """On a linear model the noise's posterior is normal: most of the way from the prior to it is gone in twelve epochs."""
     plan = replace(
-        QUICK, objective=objective, worlds=48, epochs=12, patience_epochs=12, learning_rate=0.03
+        QUICK,
+        objective=objective,
+        training_runs=48,
+        epochs=12,
+        patience_epochs=12,
+        learning_rate=0.03,
     )
     method = fresh()
     path, _ = trained(tmp_path, plan, method)
@@ -270,7 +275,9 @@ def test_a_kernel_learns_to_jump_farther(tmp_path: Path) -> None:
         20, moves=(MetropolisHastings(LearnedRandomWalk(SMALL, lag=1, checkpoint=None)),)
     )
     _, kept = trained(
-        tmp_path, replace(QUICK, objective=ExpectedSquaredJump(), epochs=5, worlds=32), method
+        tmp_path,
+        replace(QUICK, objective=ExpectedSquaredJump(), epochs=5, training_runs=32),
+        method,
     )
     values = [line["validation"] for line in kept["losses"]]
     assert min(values) < 1.1 * values[0] < 0.0  # a tenth farther
@@ -290,7 +297,10 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Pat
         if line.startswith("epoch 2 "):
             raise Stop
 
-    worlds, others = lessons(plan.training_runs, plan.seed), lessons(plan.validation_runs, plan.seed + 1)
+    worlds, others = (
+        lessons(plan.training_runs, plan.seed),
+        lessons(plan.validation_runs, plan.seed + 1),
+    )
     with pytest.raises(Stop):
         train(plan, fresh(memory=2), LEVEL, worlds, others, tmp_path / "two.pt", tell=stop)
     assert (tmp_path / "two.pt.part").exists()

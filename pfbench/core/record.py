@@ -147,7 +147,7 @@ class Episode:
         track: True East, North and height relative to the start, m, [R, T, 3]. None if the scenario
             has no map.
         notes: Modelling choices of this episode that a report must mention.
-        sheet: Data of run 0 for the datasheet: `force` [T, 3] m/s^2 and `rate` [T, 3] rad/s in body
+        datasheet: Data of run 0 for the datasheet: `force` [T, 3] m/s^2 and `rate` [T, 3] rad/s in body
             axes, `azimuth` and `elevation` of the satellites [T, S] rad (NaN below the horizon).
     """
 

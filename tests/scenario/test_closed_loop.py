@@ -428,7 +428,7 @@ def test_on_the_published_flight_both_loops_are_equally_accurate() -> None:
     rms = []
     for closed in (False, True):
         estimate = filtered(
-            UKF, model, replace(scene, closed=closed).draw(NominalNoise(), runs, 1), runs
+            UKF, model, replace(scene, closed_loop=closed).draw(NominalNoise(), runs, 1), runs
         )
         assert not estimate.lost.any()
         rms.append(estimate.trace["error"][:, 60:].square().mean((0, 1)).sqrt())

@@ -197,7 +197,7 @@ def test_the_filter_is_as_good_as_the_data_sheet_says() -> None:
         "scenario.filter_step_s=0.5",
     ]  # with take-off
     figures, runs = {1: 1.8, 10: 8.3}, 2
-    gaps = [f"scenario.holdout.{key}" for key in ("given", "withheld")]
+    gaps = [f"scenario.holdout.{key}" for key in ("used_fixes", "withheld_fixes")]
     found = [drawn(runs, *words, *(f"{key}={gap}" for key in gaps)) for gap in figures]
     (one, model), (ten, _) = found
     assert all(
