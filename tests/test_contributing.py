@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from checkout import ROOT
 from command_line import pfbench
 
 import pfbench as package
 from pfbench.results import metrics, store
 
-ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
 RECIPES = {
     title: body

@@ -1,18 +1,17 @@
 """Every Python block of the documentation runs, page by page, in order. Every link has a target."""
 
 import re
-from pathlib import Path
 
 import pytest
+from checkout import ROOT
 
-TOP = Path(__file__).parents[1]
 # use_your_data.md and write_a_scenario.md also run shell commands: their own tests run all blocks
 # glossary.md and renamed.md contain tables only
 TABLES = {"glossary.md", "renamed.md"}
-ALL_PAGES = (TOP / "README.md", *sorted((TOP / "docs").glob("*.md")))
+ALL_PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 PAGES = [page for page in ALL_PAGES if page.name not in TABLES | {"use_your_data.md"}]
 FOLDERS = ("docs", "reports", "benchmarks")
-LINKING_PAGES = (TOP / "README.md", *(page for f in FOLDERS for page in (TOP / f).rglob("*.md")))
+LINKING_PAGES = (ROOT / "README.md", *(page for f in FOLDERS for page in (ROOT / f).rglob("*.md")))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

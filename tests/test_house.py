@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+from checkout import ROOT
+
 PACKAGE = ROOT / "pfbench"
 FILES = sorted(PACKAGE.rglob("*.py"))
 

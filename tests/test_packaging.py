@@ -14,12 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checkout import ROOT
 from command_line import Said, environment, process
 
 from pfbench import job
-
-ROOT = Path(__file__).resolve().parents[1]
-
 
 # a project of somebody else, in two files and a folder
 

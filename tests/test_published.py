@@ -10,15 +10,15 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from checkout import ROOT
 
-TOP = Path(__file__).parents[1]
 REPORT_FILE = re.compile(
     r"reports/(README\.md|\w+/(report\.md|verdicts\.json(\.gz)?|headline\.(png|svg)))"
 )
 
 
 def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, TOP / "docs" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -27,11 +27,11 @@ def load(name: str) -> ModuleType:
 
 
 def list_git_files(*options: str) -> list[str]:
-    if shutil.which("git") is None or not (TOP / ".git").exists():
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("not a git checkout")
     command = ("git", "ls-files", *options)
     return subprocess.run(
-        command, cwd=TOP, check=True, capture_output=True, text=True
+        command, cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout.splitlines()
 
 
@@ -99,7 +99,7 @@ def test_a_changed_number_of_the_readme_is_found() -> None:
 
 
 def test_the_readme_has_no_measured_number_outside_the_blocks() -> None:
-    text = (TOP / "README.md").read_text()
+    text = (ROOT / "README.md").read_text()
     prose = re.sub(
         r"<!-- numbers:\w+ -->.*?<!-- numbers:end -->|```.*?```", "", text, flags=re.DOTALL
     )

@@ -72,10 +72,10 @@ def test_what_a_test_decides_names_a_test_that_is_there() -> None:
     shown = {claim.id: text for claim in ALL for _, text in claim.shown.values()}
     assert set(shown) == {"002-01", "002-02"}
     for text in shown.values():
-        ((path, name),) = re.findall(r'(tests/\w+\.py), "([^"]+)"', text)
+        ((path, name),) = re.findall(r'(tests/[\w/]+\.py), "([^"]+)"', text)
         assert f"def test_{name.replace(' ', '_')}(" in (STUDIES.parent / path).read_text()
     for _, text in next(claim for claim in ALL if claim.id == "C001-10").why.values():
-        (path,) = re.findall(r"tests/\w+\.py", text)
+        (path,) = re.findall(r"tests/[\w/]+\.py", text)
         assert (STUDIES.parent / path).is_file()
 
 
@@ -414,10 +414,20 @@ def test_the_verdict_on_times_says_that_there_is_one_timing_or_their_range() -> 
 
 def test_a_claim_that_a_test_shows_is_decided_without_runs() -> None:
     nothing = frame(LESS, a=[1.0])
-    record = replace(claim(LESS), tests={}, shown={"": ("holds", "tests/test_rules.py counts it")})
+    record = replace(
+        claim(LESS),
+        tests={},
+        shown={"": ("holds", "tests/filter/gaussian/test_linearisation_rules.py counts it")},
+    )
     (found,) = verdicts.decide_claims([record], nothing)
-    assert (found.verdict, found.reason, found.note) == (YES, "", "tests/test_rules.py counts it")
-    against = replace(record, shown={"": ("fails", "tests/test_rules.py counts it")})
+    assert (found.verdict, found.reason, found.note) == (
+        YES,
+        "",
+        "tests/filter/gaussian/test_linearisation_rules.py counts it",
+    )
+    against = replace(
+        record, shown={"": ("fails", "tests/filter/gaussian/test_linearisation_rules.py counts it")}
+    )
     assert verdicts.decide_claims([against], nothing)[0].verdict == NO
     forms = replace(record, shown={"printed": ("fails", "one"), "repaired": ("holds", "two")})
     (found,) = verdicts.decide_claims([forms], nothing)

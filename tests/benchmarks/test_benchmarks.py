@@ -6,7 +6,6 @@ import math
 import sys
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from types import ModuleType
 from types import SimpleNamespace as Work
 
@@ -14,10 +13,9 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from checkout import ROOT
 
-sys.path.insert(
-    0, str(Path(__file__).resolve().parent.parent / "benchmarks")
-)  # scripts, not a package
+sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
 import house
 import naive
 import workload

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from checkout import ROOT
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from recorded_data import believed, recorded
@@ -35,7 +36,7 @@ from pfbench.noise.base import NoiseRegime
 from pfbench.noise.white import MeasurementOutage, NominalNoise
 from pfbench.scenario.recorded.raw_gnss_walk import RawGnssReceiver, RecordedWalk
 
-CONF = Path(__file__).parents[2] / "conf"
+CONF = ROOT / "conf"
 BIAS, DRIFT, OTHER = -4.6e5, -60.0, 12.0  # of the clock, and of the other system
 
 MOTION = believed([1.0, 1.0, 1.0], None)

@@ -9,6 +9,7 @@ import textwrap
 
 import numpy as np
 import pytest
+from checkout import TESTS
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -141,7 +142,7 @@ def test_a_kill_in_the_middle_leaves_no_result_and_the_next_save_sweeps_up(tmp_p
     code = textwrap.dedent(
         f"""
         import os, signal, sys
-        sys.path.insert(0, {os.path.dirname(__file__)!r})
+        sys.path.insert(0, {str(TESTS)!r})
         import numpy as np
         import test_store as t
         from pfbench.results import store

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from checkout import ROOT
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from recorded_data import DATA, recorded
@@ -24,7 +25,7 @@ from pfbench.noise.white import NominalNoise
 from pfbench.scenario.recorded.trajectory_file import RecordedTrajectory, read_motion
 from pfbench.scenario.simulated_flight import SimulatedFlight
 
-CONF = Path(__file__).parents[2] / "conf"
+CONF = ROOT / "conf"
 
 
 @pytest.fixture(scope="module")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import oracles
 import pytest
 import torch
+from checkout import TESTS
 from pyro.distributions import GaussianHMM, MultivariateNormal
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
@@ -51,9 +51,9 @@ RULES: dict[str, LinearisationRule] = {
     "cubature": SigmaPointLinearisation(CubaturePoints()),
 }
 every_rule = pytest.mark.parametrize("rule", RULES.values(), ids=RULES.keys())
-NILE = torch.tensor(
-    np.loadtxt(Path(__file__).parent / "nile.csv", delimiter=",", skiprows=1)[:, 1]
-).reshape(1, 100, 1)
+NILE = torch.tensor(np.loadtxt(TESTS / "nile.csv", delimiter=",", skiprows=1)[:, 1]).reshape(
+    1, 100, 1
+)
 
 
 def run(

@@ -11,6 +11,7 @@ import pandas as pd
 import pymap3d
 import pytest
 import torch
+from checkout import ROOT
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from recorded_data import DATA, recorded
@@ -45,7 +46,7 @@ from pfbench.scenario.recorded.urban_error_fit import (
     range_residuals,
 )
 
-CONF = Path(__file__).parents[2] / "conf"
+CONF = ROOT / "conf"
 
 BELIEVED = UrbanTuning(
     distance_density=0.1,

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checkout import ROOT
 
-sys.path.insert(
-    0, str(Path(__file__).resolve().parent.parent / "benchmarks")
-)  # scripts, not a package
+sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
 import campaigns
 import workload
 from race import Result

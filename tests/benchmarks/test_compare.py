@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import shutil
 import sys
-from pathlib import Path
 from types import SimpleNamespace as Work
 
 import numpy as np
 import pytest
 import torch
+from checkout import ROOT
 
-sys.path.insert(
-    0, str(Path(__file__).resolve().parent.parent / "benchmarks")
-)  # scripts, not a package
+sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
 import compare
 import fused
 import house

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import oracles
 import pytest
 import torch
+from checkout import TESTS
 from particle_cases import CASES, WALK, WALK_Y, Drifting, Spiky, belief, benes_case, singular_case
 from pyro.distributions import Uniform
 from scipy import stats
@@ -176,9 +176,7 @@ def test_noise_follows_the_model_s_law(kind: type[LinearGaussian], law: Any) -> 
 
 
 def test_nile_evidence() -> None:
-    y = torch.tensor(
-        np.loadtxt(Path(__file__).parent / "nile.csv", delimiter=",", skiprows=1)[:, 1:]
-    )
+    y = torch.tensor(np.loadtxt(TESTS / "nile.csv", delimiter=",", skiprows=1)[:, 1:])
     model = local_level(math.sqrt(1470.0), math.sqrt(15100.0), 1000.0, math.sqrt(1000.0))
     estimate = filter_record(ParticleFilter(400), model, y, runs=200)
     ratio = torch.exp(estimate.log_evidence + 638.8133628).numpy()

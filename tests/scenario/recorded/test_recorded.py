@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from checkout import ROOT
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from recorded_data import DATA, believed, recorded
@@ -42,7 +43,7 @@ from pfbench.scenario.recorded.time_grid import (
     split_samples,
 )
 
-CONF = Path(__file__).parents[2] / "conf"
+CONF = ROOT / "conf"
 
 BELIEVED = believed([1.0, 1.0, 2.0], None)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from checkout import ROOT
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from recorded_data import DATA, believed, recorded
@@ -25,7 +26,7 @@ from pfbench.noise.white import MeasurementOutage, NominalNoise
 from pfbench.scenario.recorded.drive import FixReceiver, RecordedDrive
 from pfbench.scenario.recorded.fix_holdout import FixHoldout
 
-CONF = Path(__file__).parents[2] / "conf"
+CONF = ROOT / "conf"
 MISSED = np.array([0.3, -0.2, 0.1])  # m North, East, down: the errors of the synthetic fixes
 
 AS_RECORDED = FixReceiver(position_sd=(0.0, 0.0, 0.0), velocity_sd=(0.0, 0.0, 0.0))

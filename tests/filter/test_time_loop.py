@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from pathlib import Path
 
-PACKAGE = Path(__file__).resolve().parent.parent / "pfbench"
+from checkout import ROOT
+
+PACKAGE = ROOT / "pfbench"
 
 
 def is_walk(node: ast.AST) -> bool:

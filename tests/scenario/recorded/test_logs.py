@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from checkout import ROOT
 from command_line import block
 from pymap3d import ned2geodetic
 from scipy.spatial.transform import Rotation
@@ -310,7 +311,7 @@ def test_an_impossible_origin_is_refused(tmp_path: Path, origin: tuple[float, ..
         read_log(write(tmp_path, tables()), origin=origin)
 
 
-PAGE = Path(__file__).parents[2] / "docs" / "use_your_data.md"
+PAGE = ROOT / "docs" / "use_your_data.md"
 BLOCK = re.compile(r"^```(python|bash)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 

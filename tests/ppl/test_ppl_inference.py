@@ -2,11 +2,11 @@
 
 import csv
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from checkout import TESTS
 from oracles import kalman
 from pfbench.experiments.learn_noise_calibration import (
     LEVELS,
@@ -50,7 +50,7 @@ LEVEL = ParameterisedModel(
 
 @cache
 def nile(years: int) -> Record:
-    with (Path(__file__).parent / "nile.csv").open() as file:
+    with (TESTS / "nile.csv").open() as file:
         volumes = [float(row["volume"]) for row in csv.DictReader(file)]
     return Record(torch.tensor(volumes, dtype=torch.float64)[None, :years, None])
 

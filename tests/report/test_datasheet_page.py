@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from checkout import ROOT
 from command_line import block, pfbench
 
 from pfbench.core.record import Episode, Record
@@ -19,7 +20,7 @@ from pfbench.report import datasheet
 from pfbench.scenario.model_simulation import ModelSimulation
 
 WALK = ("scenario=linear_walk", "scenario.steps=12")
-PAGE = Path(__file__).parents[1] / "docs" / "write_a_scenario.md"
+PAGE = ROOT / "docs" / "write_a_scenario.md"
 
 
 def doubles(values: Any) -> torch.Tensor:
