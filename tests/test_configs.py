@@ -58,45 +58,54 @@ def raw(file: Path) -> dict[str, Any]:
 # what is written
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}/{file.stem}")
-def test_every_yaml_says_in_one_line_what_it_is(file: Path) -> None:
+def has_description(file: Path) -> bool:
+    """Return whether a file begins with a comment of one sentence, which `pfbench list` prints."""
     first, *rest = [
         line for line in file.read_text().splitlines() if not line.startswith("# @package")
     ]
-    assert first.startswith("# ")
-    assert 10 < len(first) <= 130
-    assert first.rstrip()[-1] in ".]?)" or "pfbench run" in first
-    assert rest
-    if file.parent.parent == CONF and file.parent.name in GROUPS:
-        assert (
-            read_description(file) == first.removeprefix("# ").strip()
-        )  # what `pfbench list` shows
-
-
-@pytest.mark.parametrize(
-    "file",
-    [file for file in FILES if file.parent.name in GROUPS],
-    ids=lambda f: f"{f.parent.name}/{f.stem}",
-)
-def test_a_yaml_lies_in_the_folder_of_its_class(file: Path) -> None:
-    content = raw(file)
-    own = content.get("_target_")
-    if own is None:  # it builds on another yaml of its group
-        based = [part for part in content["defaults"] if isinstance(part, str) and part != "_self_"]
-        assert len(based) == 1
-        assert based[0] in GROUPS[file.parent.name]
-        return
-    room = {"train": "learn"}.get(file.parent.name, file.parent.name)
-    assert own.startswith(f"pfbench.{room}.")
-    if file.parent.name == "filter":  # and so does each of its stages
-        assert all(target.startswith("pfbench.filter.") for target in targets(content))
-
-
-@pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}/{file.stem}")
-def test_no_yaml_points_at_somebodys_disk(file: Path) -> None:
-    assert not re.search(
-        r"(^|[\s'\"\[=])(~/|/[a-z]+/|[A-Z]:)", re.sub(r"override /\S+", "", file.read_text()), re.M
+    is_sentence = first.rstrip()[-1] in ".]?)" or "pfbench run" in first
+    is_listed = file.parent.parent != CONF or file.parent.name not in GROUPS
+    is_listed = is_listed or read_description(file) == first.removeprefix("# ").strip()
+    return (
+        first.startswith("# ")
+        and 10 < len(first) <= 130
+        and is_sentence
+        and is_listed
+        and bool(rest)
     )
+
+
+def lies_in_the_folder_of_its_class(file: Path) -> bool:
+    content = raw(file)
+    if "_target_" not in content:  # it builds on another yaml of its group
+        based = [part for part in content["defaults"] if isinstance(part, str) and part != "_self_"]
+        return len(based) == 1 and based[0] in GROUPS[file.parent.name]
+    folder = {"train": "learn"}.get(file.parent.name, file.parent.name)
+    stages = targets(content) if folder == "filter" else [content["_target_"]]
+    return all(target.startswith(f"pfbench.{folder}.") for target in stages)
+
+
+def names_a_local_path(text: str) -> bool:
+    text = re.sub(r"override /\S+", "", text)
+    return re.search(r"(^|[\s'\"\[=])(~/|/[a-z]+/|[A-Z]:)", text, re.M) is not None
+
+
+def test_yaml_files_follow_the_rules() -> None:
+    assert len(FILES) > 150
+    assert [file.name for file in FILES if not has_description(file)] == []
+    grouped = [file for file in FILES if file.parent.name in GROUPS]
+    assert [file.name for file in grouped if not lies_in_the_folder_of_its_class(file)] == []
+    assert [file.name for file in FILES if names_a_local_path(file.read_text())] == []
+
+
+def test_the_rules_for_yaml_files_find_faults(tmp_path: Path) -> None:
+    folder = tmp_path / "noise"
+    folder.mkdir()
+    file = folder / "a.yaml"
+    file.write_text("_target_: pfbench.filter.Systematic\n")
+    assert not has_description(file)
+    assert not lies_in_the_folder_of_its_class(file)
+    assert all(map(names_a_local_path, ("root: /home/me/data", "root: ~/data", "root: 'C:/data'")))
 
 
 # what runs

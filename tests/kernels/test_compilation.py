@@ -392,7 +392,9 @@ def test_a_loop_by_hand_scores_components(dtype: torch.dtype, particles: int) ->
         off = torch.where(
             torch.isinf(crps) & (found[0] == crps), 0.0, (found[0].double() - crps).abs()
         )
-        assert (off[known] <= 20 * eps * (far[known] + torch.finfo(dtype).tiny)).all()
+        # each of N terms below the smallest normal number may be off by the spacing there, eps * tiny
+        spacing = max(20, particles) * eps * torch.finfo(dtype).tiny
+        assert (off[known] <= 20 * eps * far[known] + spacing).all()
         torch.testing.assert_close(found[1].double(), below, rtol=0.0, atol=100 * eps)
         assert torch.isnan(found[0]).nonzero().tolist() == [[0, 0], [2, 6]]
 
