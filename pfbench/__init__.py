@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__version__ = "0.1.0"
+try:
+    __version__ = version("pfbench")
+except PackageNotFoundError:  # a checkout on the path that is not installed
+    __version__ = "0.0.0"
 
 
 def load(
