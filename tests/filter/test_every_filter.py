@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import is_dataclass, replace
+from collections import Counter
+from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any
 
 import pytest
@@ -130,6 +131,28 @@ def test_missing_measurements_change_nothing_but_what_they_should(name: str) -> 
     torch.testing.assert_close(silent.mean, without.mean, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(silent.variance, without.variance, rtol=1e-7, atol=1e-9)
     torch.testing.assert_close(silent.log_evidence, without.log_evidence, rtol=1e-9, atol=1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class CountingStream(PhiloxStream):
+    """A stream that writes down the step and the purpose of all that is drawn."""
+
+    counts: Counter[tuple[int, str]] = field(default_factory=Counter)
+
+    def _counter(self, purpose: str, n: int, w: int) -> Any:
+        self.counts[int(self.step), purpose] += 1
+        return super()._counter(purpose, n, w)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_random_numbers_are_used_once(name: str) -> None:
+    """No two draws of one step have the same purpose: they would be the same numbers."""
+    draws, record = CountingStream(1, torch.arange(4)), Record(Y.expand(4, -1, -1))
+    with torch.no_grad():
+        run_filter(method_of(name), tracker(), record, draws)
+    if name == "rbpf":  # draws the sampled components instead of the whole state, by the same numbers
+        assert draws.counts.pop((0, "initial")) == 2
+    assert {key: n for key, n in draws.counts.items() if n > 1} == {}
 
 
 @pytest.mark.parametrize("name", PARTICLES)

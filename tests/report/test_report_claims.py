@@ -469,6 +469,13 @@ def test_what_lacks_power_says_the_runs_that_it_takes() -> None:
     share = alone("share", metric="severely_overconfident", low=0.05)
     (found,) = ruled(share, a=np.arange(20) < 2).findings[""]
     assert found.needed == power.required_runs_proportion(0.1, 0.05, 0.05)
+
+
+def test_a_share_is_tested_from_one_side() -> None:
+    share = alone("share", metric="severely_overconfident", low=0.5)
+    for count in (3, 14):
+        (result,) = ruled(share, a=np.arange(20) < count).findings[""]
+        assert result.p == pytest.approx(stats.binom.sf(count - 1, 20, 0.5))
     open_one = ruled(LESS, **normal(-0.1, 0.5, 20))
     assert claims_page.claims_table([open_one])["runs required"].iloc[0] > 20
     assert (

@@ -395,6 +395,17 @@ def test_ratios_are_what_the_formulas_say(name: str) -> None:
     assert torch.equal(proposed.x, proposed.window["states"][:, :, -1])
 
 
+def test_the_ratio_of_a_copied_block_is_that_of_the_last_state() -> None:
+    """The paper gives no density of the copied block, so the ratio is that of the last state alone."""
+    case = simulate_path_posterior(0.3, 200)
+    kernel = PathBlockKernel(3, CopiedSegment(), RandomWalk())
+    proposed, log_alpha = kernel.propose(case.model, case.belief(FULL), one())
+    old, new = terms(case.model, case.belief(FULL)), terms(case.model, proposed)
+    expected = (new.moved + new.seen - old.moved - old.seen)[..., -1]
+    assert expected.std() > 0.1
+    torch.testing.assert_close(log_alpha, expected, rtol=1e-7, atol=1e-7)
+
+
 # nonlinear models: successive-conditional simulation
 
 
