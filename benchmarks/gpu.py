@@ -32,10 +32,12 @@ from torch.utils._pytree import tree_leaves
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record, map_inputs
-from pfbench.filter.loop import FilterResult, choose_run_batch, run_filter
+from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.run_batches import choose_run_batch
 from pfbench.kernels import compilation, cpp
 from pfbench.model.base import StateSpaceModel
 

@@ -22,10 +22,12 @@ from workload import ins_model
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.loop import choose_run_batch, run_filter
+from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.run_batches import choose_run_batch
 from pfbench.kernels import compilation, cpp
 from pfbench.model.base import StateSpaceModel, affine_map, independent_normal, normal_batch
 from pfbench.model.ins_gnss import LooseStep

@@ -27,8 +27,9 @@ from race import cpu_name
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
-from pfbench.filter.loop import Watch, choose_run_batch, run_filter
+from pfbench.filter.loop import Watch, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.kernels import compilation, cpp
 from pfbench.model.linear_gaussian import LinearGaussian

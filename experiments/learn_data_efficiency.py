@@ -47,7 +47,8 @@ from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.job import instantiate
 from pfbench.learn.training_config import Training
 from pfbench.learn.training_data import draw_training_data

@@ -48,12 +48,9 @@ from pfbench.filter.particle.gaussian_particle_filter import GaussianResampler
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.point_sets import HaltonPoints
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
-from pfbench.filter.particle.resampling import (
-    EssResampler,
-    RegularisedResampler,
-    Resampler,
-    Systematic,
-)
+from pfbench.filter.particle.regularised_resampling import RegularisedResampler
+from pfbench.filter.particle.resampling import EssResampler, Resampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.polymerised.partition import AxisAlignedCells, WhitenedCells, divide_cells
 from pfbench.filter.polymerised.placement import ScaledCentrePlacement
 from pfbench.filter.polymerised.resampler import PolymerisedResampler, UnchangedAllocation

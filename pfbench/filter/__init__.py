@@ -88,15 +88,13 @@ __getattr__, __dir__ = lazy_attributes(
         "particle.particle_filter": ("Stage", "ParticleFilter"),
         "particle.point_sets": ("PointSet", "HaltonPoints", "SobolPoints"),
         "particle.proposals": ("Proposal", "BootstrapProposal"),
-        "particle.resampling": (
-            "ResamplingScheme",
-            "Resampler",
-            "EssResampler",
+        "particle.regularised_resampling": (
             "SmoothingKernel",
             "GaussianSmoothing",
             "RegularisedResampler",
-            "Systematic",
         ),
+        "particle.resampling": ("ResamplingScheme", "Resampler", "EssResampler"),
+        "particle.resampling_schemes": ("Systematic",),
         "particle.sqmc": ("SqmcScheme", "HilbertSortedResampler", "SqmcProposal"),
         "particle.thompson_taylor": ("ThompsonTaylorResampler",),
         "particle.weight_update": ("WeightUpdate", "FlooredWeightUpdate"),

@@ -1,4 +1,4 @@
-"""The time loop of every filter: `TimedFilterPass` steps a belief through a record.
+"""The time loop of every filter: `FilterPass` takes a belief through a record step by step.
 
 `run_filter`, training, online inference and filters that take several steps together all use it.
 """
@@ -14,11 +14,10 @@ from torch import Tensor
 
 from pfbench.core.random_stream import BatchRandomStream, RandomStream
 from pfbench.core.record import FeedbackRun, Record, iterate_steps
-from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo
-from pfbench.filter.gaussian.linearisation_rules import DifferenceSpace, TaylorLinearisation
+from pfbench.filter.belief import Filter, StepInfo
+from pfbench.filter.feedback import apply_feedback, correctable_groups
+from pfbench.filter.run_batches import join_infos, join_runs, split_runs
 from pfbench.model.base import StateSpaceModel
-
-_BATCH_NUMBERS = 1_000_000  # numbers (runs x particles x components) of a batch of runs
 
 Watch = Callable[[int, StepInfo], dict[str, Tensor]]
 
@@ -62,11 +61,11 @@ class MultiStepFilter(Protocol):
         """Take at least one and at most `limit` steps from step `t` on.
 
         Args:
-            model: State-space model. It is asked for the model of each step.
+            model: State-space model. Its `at_step` gives the model of each step.
             belief: Belief before step `t`.
-            record: Whole record, prepared by the model.
+            record: All steps of the record, prepared by the model.
             t: First step, from 0. Step t uses `draws.at_step(t + 1)`.
-            draws: Random stream of the whole record.
+            draws: Random stream of the record.
             limit: Maximum number of steps.
 
         Returns:
@@ -75,7 +74,7 @@ class MultiStepFilter(Protocol):
 
 
 class PassStep(NamedTuple):
-    """One step of a `TimedFilterPass`.
+    """One step of a `FilterPass`.
 
     Attributes:
         t: Step number from 0.
@@ -105,7 +104,7 @@ class FilterPass:
         draws: Random stream. Step 0 is the initial distribution, step t + 1 the record's step t.
         feedback: Process that the estimates correct, or None.
         lookahead: Allow several steps in one call, where the filter can do so. The caller must then
-            leave belief and model alone. Not used with feedback.
+            not change belief or model. Not used with feedback.
 
     Attributes:
         belief: Belief after the latest step.
@@ -189,9 +188,9 @@ def run_filter(
         draws: Random stream. Step 0 is the initial distribution, step t the t-th measurement.
         watch: (t, info) -> {name: [R] or [R, ...]}, for results other than mean and variance. It
             cannot influence the filter.
-        tick: Called after each step (progress bar).
-        at_once: Runs that a step takes together, one batch after the other. None takes all. The
-            result agrees to rounding (`runs_at_once`). With feedback all runs go together.
+        on_step: Function called after each step, such as a progress bar.
+        run_batch: Runs that a step takes together, one batch after the other. None takes all. The
+            result agrees to rounding (`choose_run_batch`). With feedback all runs form one batch.
 
     Returns:
         Means, variances, evidence and diagnostics.
@@ -200,27 +199,20 @@ def run_filter(
         ValueError: If the record is empty or has infinite values, or if model or filter do not
             support the record's feedback.
     """
-    if record.y.shape[1] == 0:
-        raise ValueError("record.y must have at least one time step, got 0. Add measurements.")
-    if bool(torch.isinf(record.y).any()):
-        raise ValueError("record.y must be finite, got infinity. Mark a missing component as NaN.")
+    _check_measurements(record)
     feedback = None
     if record.feedback is not None:
-        feedback = record.feedback.begin(record, _correctable_groups(model))
-    record = prepare_record(model, record)
-    runs = record.y.shape[0]
-    size = runs if run_batch is None or feedback is not None else run_batch
-    parts: list[tuple[Record, RandomStream]] = [(record, draws)]
-    if size < runs:
-        batches = [slice(first, first + size) for first in range(0, runs, size)]
-        parts = [(record.select_runs(batch), draws.select_runs(batch)) for batch in batches]
-    passes = [FilterPass(method, model, *part, feedback, lookahead=True) for part in parts]
+        feedback = record.feedback.begin(record, correctable_groups(model))
+    batches = split_runs(
+        prepare_record(model, record), draws, None if feedback is not None else run_batch
+    )
+    passes = [FilterPass(method, model, *batch, feedback, lookahead=True) for batch in batches]
     means, variances, evidences, traces = [], [], [], []
     for t, steps in enumerate(zip(*passes, strict=True)):
-        info = _join_infos([step.info for step in steps])
+        info = join_infos([step.info for step in steps])
         means.append(info.mean)
         variances.append(info.variance)
-        evidences.append(_join([part.belief.log_evidence for part in passes]))
+        evidences.append(join_runs([run.belief.log_evidence for run in passes]))
         traces.append(info.trace | (watch(t, info) if watch else {}))
         if on_step:
             on_step()
@@ -232,103 +224,9 @@ def run_filter(
     return FilterResult(mean, variance, evidences[-1], trace)
 
 
-def choose_run_batch(runs: int, particles: int, dimension: int) -> int:
-    """Choose how many runs a step takes together on the CPU.
-
-    Batches have about equal size and a million numbers each, so memory depends on the size of a
-    batch and not on the number of runs. Smaller batches would stay in the cache of a core, but below
-    some 100 000 numbers the overhead of single operations dominates. [Measured on a 15-state INS
-    with 500 particles: 100 runs together were 10 % faster than 50 on an idle machine, and 33 %
-    slower while other processes used the shared cache.]
-
-    Args:
-        runs: Number of runs.
-        particles: Number of particles of a run.
-        dimension: Number of components of a particle.
-
-    Returns:
-        Runs per batch.
-    """
-    return -(-runs // max(1, round(runs * particles * dimension / _BATCH_NUMBERS)))
-
-
-def _join(parts: list[Tensor]) -> Tensor:
-    """Concatenate the parts of a batch of runs; return a single part unchanged."""
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
-
-
-def _join_infos(infos: list[StepInfo]) -> StepInfo:
-    """Join the infos of batches of runs."""
-    if len(infos) == 1:
-        return infos[0]
-    mean, variance = (
-        _join([getattr(info, name) for info in infos]) for name in ("mean", "variance")
-    )
-    trace = {name: _join([info.trace[name] for info in infos]) for name in infos[0].trace}
-
-    def pairs(name: str) -> Callable[[], tuple[Tensor, Tensor]] | None:
-        functions = [getattr(info, name) for info in infos if getattr(info, name) is not None]
-
-        def joined() -> tuple[Tensor, Tensor]:
-            first, second = zip(*(function() for function in functions), strict=True)
-            return torch.cat(first), torch.cat(second)
-
-        return joined if functions else None
-
-    def covariance() -> Tensor:
-        return torch.cat([info.covariance() for info in infos])
-
-    def covariance_of_groups(groups: Tensor) -> Tensor:
-        return torch.cat([info.covariance_of(groups) for info in infos])
-
-    return StepInfo(
-        mean, variance, covariance, trace, pairs("cloud"), pairs("nis"), covariance_of_groups
-    )
-
-
-def apply_feedback(
-    model: StateSpaceModel,
-    feedback: FeedbackRun,
-    belief: ParticleBelief | GaussianBelief,
-    info: StepInfo,
-) -> tuple[ParticleBelief | GaussianBelief, StepInfo]:
-    """Correct the process by the estimate of valid runs, and the belief accordingly.
-
-    The mean of a Gaussian belief is moved. Its covariance is transformed by the derivative of that
-    move, since a rotation of the axes turns it [ours].
-
-    Args:
-        model: State-space model.
-        feedback: Process that the estimate corrects.
-        belief: Belief after the step.
-        info: Estimate of the step.
-
-    Returns:
-        Belief about the corrected process, and the info with the uncorrected estimate.
-
-    Raises:
-        ValueError: If particles carry their past, which refers to the uncorrected process.
-    """
-    valid = torch.isfinite(belief.log_evidence).unsqueeze(-1)
-    uncorrected, correct = feedback.correct(torch.where(valid, info.mean, 0.0))
-    info = info._replace(mean=torch.where(valid, uncorrected.to(info.mean), info.mean))
-    if isinstance(belief, ParticleBelief):
-        if belief.window or belief.memory:
-            raise ValueError(
-                "filter must not store a particle's past in a scenario with feedback, got one with "
-                "moves or a proposal's memory. Choose another filter, or set scenario.closed_loop=false."
-            )
-        return belief._replace(x=correct(belief.x)), info
-    chart, centre = model.chart, belief.mean.unsqueeze(1)
-
-    def corrected(xi: Tensor) -> tuple[Tensor, Tensor]:
-        return correct(chart.add(centre, xi)), xi.new_zeros(1, 1, 1, 1)
-
-    space = DifferenceSpace(chart.subtract, chart.mean)
-    mean, slope, *_ = TaylorLinearisation()(corrected, belief.mean, chart.dimension, space)
-    return belief._replace(mean=mean, covariance=slope @ belief.covariance @ slope.mT), info
-
-
-def _correctable_groups(model: StateSpaceModel) -> dict[str, tuple[int, ...]]:
-    """Return the component groups of a model whose states are differences, else none."""
-    return model.groups if model.chart.size == len(model.names) else {}
+def _check_measurements(record: Record) -> None:
+    """Raise a ValueError if a record is empty or has infinite measurements."""
+    if record.y.shape[1] == 0:
+        raise ValueError("record.y must have at least one time step, got 0. Add measurements.")
+    if bool(torch.isinf(record.y).any()):
+        raise ValueError("record.y must be finite, got infinity. Mark a missing component as NaN.")

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from pfbench.core.record import Episode
 from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
-from pfbench.filter.loop import choose_run_batch
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.configuration import JobConfig
 from pfbench.kernels import cpp
 from pfbench.model.base import StateSpaceModel

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 from pfbench.filter.learned import checkpoint
 from pfbench.filter.learned.objectives import EvidenceLowerBound, Objective
-from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler, Resampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
 from pfbench.filter.loop import FilterPass, prepare_record
-from pfbench.filter.particle.resampling import Systematic
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.ppl.pmmh import repeat_runs
 from pfbench.ppl.program import ParameterisedModel, Values

@@ -14,7 +14,8 @@ from command_line import pfbench
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.job import budget
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.model.linear_gaussian import linear_walk

@@ -20,7 +20,8 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter, make_step_info, summarise
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.particle_moments import make_step_info, summarise
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder, score_normal, score_particles
 from pfbench.kernels import compilation
 from pfbench.model.linear_gaussian import linear_walk

@@ -24,7 +24,7 @@ from pfbench.filter.gaussian.spherical_radial import (
     SphericalRadialPoints,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle import particle_filter, resampling
+from pfbench.filter.particle import particle_moments, resampling_schemes, weight_update
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import filter_pass, scoring
 from pfbench.kernels import compilation, cpp
@@ -83,12 +83,12 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
         torch.tensor([[0.1], [0.5], [0.9]]),
     )
     return [
-        particle_filter._flat_moments(1e3 + x, torch.softmax(z, 1)),
-        particle_filter._normalise(hidden),
+        particle_moments._flat_moments(1e3 + x, torch.softmax(z, 1)),
+        weight_update.normalise_updated_weights(hidden),
         density.log_normal_density(
             0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen
         ),
-        resampling._evenly(a, n, u.double()),
+        resampling_schemes._evenly(a, n, u.double()),
     ]
 
 
@@ -134,7 +134,9 @@ def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
     a[5] = torch.nan
     n = torch.tensor([[N], [N // 3], [2], [N], [N], [N]], dtype=dtype)
     u = torch.linspace(1.0 - 1e-9, 1e-9, 6, dtype=torch.float64)[:, None]
-    assert torch.equal(cpp.resample_systematic(a, n, u), resampling._counted_evenly(a, n, u))
+    assert torch.equal(
+        cpp.resample_systematic(a, n, u), resampling_schemes._counted_evenly(a, n, u)
+    )
     assert torch.equal(
         cpp.resample_systematic(a[:1], n[:1], u[:1]), cpp.resample_systematic(a, n[:1], u)[:1]
     )
@@ -288,11 +290,11 @@ def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(
         equal_nan=True,
     )
     torch.testing.assert_close(
-        cpp.weighted_moments(x, w), particle_filter._separate_moments(x, w), equal_nan=True
+        cpp.weighted_moments(x, w), particle_moments._separate_moments(x, w), equal_nan=True
     )
     w[2, 3] = torch.nan
     torch.testing.assert_close(
-        cpp.sum_and_squares(w), particle_filter._separate_totals(w), equal_nan=True
+        cpp.sum_and_squares(w), weight_update._separate_totals(w), equal_nan=True
     )
 
 
@@ -314,7 +316,7 @@ def test_a_loop_by_hand_spreads_about_the_mean_in_any_memory_order(
         for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
             found, wanted = (
                 cpp.group_covariance(laid, mean, w, groups),
-                particle_filter._separate_spread(x, mean, w, groups),
+                particle_moments._separate_spread(x, mean, w, groups),
             )
             eps = torch.finfo(dtype).eps
             torch.testing.assert_close(found, wanted, equal_nan=True, rtol=1e3 * eps, atol=20 * eps)
@@ -473,7 +475,7 @@ def test_a_gradient_goes_round_the_loops_by_hand() -> None:
         torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1),
     )
     with compilation.use_compiled():
-        particle_filter._flat_moments(x, w)[0].sum().backward()
+        particle_moments._flat_moments(x, w)[0].sum().backward()
     torch.testing.assert_close(x.grad, w.unsqueeze(-1).expand_as(x))
 
 

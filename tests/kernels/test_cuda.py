@@ -17,7 +17,7 @@ from torch import Tensor
 from pfbench.core import random_stream
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter import belief
-from pfbench.filter.particle import particle_filter, resampling
+from pfbench.filter.particle import particle_moments, resampling_schemes
 from pfbench.kernels import cpp, cuda
 from pfbench.model import base
 
@@ -166,7 +166,9 @@ def test_resampling(loop: Loop, runs: int, n: int, d: int, dtype: torch.dtype) -
         counts = torch.zeros(runs, n).scatter_add(1, found, torch.ones(found.shape))
         assert ((counts - wanted * w).abs() < 1.0 + 1e-6 * wanted).all()
         off = (
-            (found != resampling._counted_evenly(w.double(), number, u)[:, :wanted]).double().mean()
+            (found != resampling_schemes._counted_evenly(w.double(), number, u)[:, :wanted])
+            .double()
+            .mean()
         )
         assert off < (2e-3 if dtype == torch.float32 else 1e-9)
 
@@ -179,7 +181,7 @@ def test_resampling_with_numbers_of_their_own(loop: Loop) -> None:
     )
     found, wanted = (
         loop("resample_systematic", w, number, u),
-        resampling._counted_evenly(w, number, u),
+        resampling_schemes._counted_evenly(w, number, u),
     )
     for r, n in enumerate((30, 7, 1)):
         assert torch.equal(found[r, :n], wanted[r, :n])
@@ -196,13 +198,13 @@ def test_clouds(loop: Loop, runs: int, n: int, d: int, dtype: torch.dtype) -> No
     )
     copy_of = 2 * ancestors % (2 * n - 1)
     assert torch.equal(
-        loop("count_unique", copy_of, w.log()), particle_filter._marked(copy_of, w.log())
+        loop("count_unique", copy_of, w.log()), particle_moments._marked(copy_of, w.log())
     )
     x = x + 1e4 * torch.arange(1, d + 1)
     x[:, 0], w[:, 0] = 1e9, 0.0  # an outlier without weight spoils nothing
     w = w / w.sum(1, keepdim=True)
     mean, variance = loop("weighted_moments", x, w)
-    exact = particle_filter._separate_moments(
+    exact = particle_moments._separate_moments(
         x.double(), w.double() / w.double().sum(1, keepdim=True)
     )
     deviation = exact[1].sqrt().max()

@@ -31,7 +31,8 @@ from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.swarm.swarm_proposal import SwarmProposal
 from pfbench.kernels import compilation
 from pfbench.learn.training_config import Training

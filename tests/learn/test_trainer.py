@@ -45,7 +45,8 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.learn.trainer import TrainingState
 from pfbench.learn.training_config import Progress, Training
 from pfbench.learn.training_data import TrainingData, draw_training_data

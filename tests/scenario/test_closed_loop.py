@@ -14,13 +14,14 @@ from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, FeedbackRun, MeasurementChannels, Record
 from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
+from pfbench.filter.feedback import apply_feedback
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import (
     SigmaPointLinearisation,
     TaylorLinearisation,
     UnscentedPoints,
 )
-from pfbench.filter.loop import FilterResult, apply_feedback, run_filter
+from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import conf_dir
 from pfbench.job.scoring import ScoreRecorder

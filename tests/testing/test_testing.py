@@ -27,14 +27,9 @@ from pfbench.filter.moves.path_proposals import SmoothedSegment
 from pfbench.filter.particle.auxiliary_weights import TemperedPosterior, TemperedWeights
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
-from pfbench.filter.particle.resampling import (
-    EssResampler,
-    Multinomial,
-    RegularisedResampler,
-    Residual,
-    Ssp,
-    Systematic,
-)
+from pfbench.filter.particle.regularised_resampling import RegularisedResampler
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Multinomial, Residual, Ssp, Systematic
 from pfbench.filter.particle.sqmc import HilbertSortedResampler, SqmcProposal, SqmcScheme
 from pfbench.filter.particle.weight_update import BayesWeightUpdate
 from pfbench.model.base import StateSpaceModel

@@ -21,12 +21,10 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo
 from pfbench.filter.gaussian.gaussian_filter import around_first
 from pfbench.filter.linearisation import check_moments, mask_covariance
-from pfbench.filter.particle.particle_filter import (
-    ParticleFilter,
-    deactivate_invalid_particles,
-    summarise,
-)
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.particle_moments import summarise
 from pfbench.filter.particle.proposals import BootstrapProposal
+from pfbench.filter.particle.weight_update import deactivate_invalid_particles
 from pfbench.filter.whitening import LOG_2PI, log_determinant
 from pfbench.model.base import StateSpaceModel
 

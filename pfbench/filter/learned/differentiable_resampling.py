@@ -16,7 +16,8 @@ from torch import Tensor
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
 from pfbench.filter.exactness import is_every_part_exact
-from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler, Resampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.model.base import StateSpaceModel
 
 

@@ -17,8 +17,9 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.linearisation import unwrap_independent
-from pfbench.filter.moves.path_history import PathStatistics, StateHistory, concatenate_histories
-from pfbench.filter.particle.resampling import GaussianSmoothing, SmoothingKernel
+from pfbench.filter.moves.path_history import StateHistory, concatenate_histories
+from pfbench.filter.moves.path_statistics import PathStatistics
+from pfbench.filter.particle.regularised_resampling import GaussianSmoothing, SmoothingKernel
 from pfbench.filter.whitening import compute_half_square, whiten
 from pfbench.model.base import StateSpaceModel
 

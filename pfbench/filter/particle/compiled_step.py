@@ -17,7 +17,8 @@ from torch import Tensor
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.particle.particle_filter import ParticleFilter, StepSummary
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.particle_moments import StepSummary
 from pfbench.kernels import compilation, cpp
 from pfbench.kernels.step_compiler import (
     NativeEntry,

@@ -18,9 +18,9 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.exactness import is_every_part_exact
-from pfbench.filter.particle.particle_filter import deactivate_invalid_particles
 from pfbench.filter.particle.point_sets import IidPoints, PointSet
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
+from pfbench.filter.particle.weight_update import deactivate_invalid_particles
 from pfbench.model.base import StateSpaceModel
 
 

@@ -1,7 +1,8 @@
-"""Weight updates by the measurement."""
+"""Weight updates by the measurement, and normalisation of the weights."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -9,6 +10,8 @@ import torch
 from torch import Tensor
 
 from pfbench.core.record import Record
+from pfbench.kernels import cpp
+from pfbench.kernels.compilation import compilable, is_capturing
 from pfbench.model.base import StateSpaceModel
 
 
@@ -68,3 +71,66 @@ class FlooredWeightUpdate:
         ).nan_to_num(nan=0.0)
         weight = torch.log(torch.exp(log_w.double()) * likelihood + self.weight_floor)
         return torch.where(torch.isneginf(log_w), -torch.inf, weight).to(log_w)
+
+
+def deactivate_invalid_particles(
+    x: Tensor, log_w: Tensor, parents: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Set the log weight of non-finite particles to -inf and restore the parent state.
+
+    Otherwise one NaN would spread to the estimate of its run, because 0 * NaN is NaN.
+
+    Args:
+        x: Particles, [R, N, D].
+        log_w: Log weights, [R, N].
+        parents: Particles before the step, [R, N, D].
+
+    Returns:
+        Particles and log weights.
+    """
+    if is_capturing():  # the caller of the graph checks, and repeats the step
+        return x, log_w
+    if not x.is_cuda and bool(torch.isfinite(x.sum())):  # this check is cheap on the CPU
+        return x, log_w
+    healthy = torch.isfinite(x.sum(-1))
+    log_w = torch.where(healthy, log_w, -torch.inf)
+    return torch.where(healthy, x.permute(2, 0, 1), parents.permute(2, 0, 1)).permute(
+        1, 2, 0
+    ), log_w
+
+
+def normalise_updated_weights(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Normalise the log weights of a step. A run without a finite one gets equal weights.
+
+    Args:
+        log_w: Log weights, [R, N].
+
+    Returns:
+        Normalised log weights [R, N], their logsumexp before [R] (-inf if none is finite), weights
+        [R, N] and effective sample size [R].
+    """
+    # one exponential for each particle: they cost most of a small step besides random numbers and copies
+    maximum = log_w.detach().amax(1, keepdim=True)
+    maximum = torch.where(torch.isfinite(maximum), maximum, 0.0)
+    scaled_w = torch.exp(log_w - maximum)
+    total, square_total = _totals(scaled_w)
+    lost = ~(torch.isfinite(total) & (total > 0.0))
+    total, slots = torch.where(lost, 1.0, total), log_w.shape[1]
+    log_total = maximum + torch.log(total)
+    log_w = torch.where(lost, -math.log(slots), log_w - log_total)
+    w = torch.where(lost, 1.0 / slots, scaled_w * (1.0 / total))
+    ess = torch.where(lost, slots, total * total / square_total).squeeze(1)
+    return log_w, torch.where(lost, -torch.inf, log_total).squeeze(1), w, ess
+
+
+def _separate_totals(a: Tensor) -> tuple[Tensor, Tensor]:
+    """Return sums of rows [R, N] and of their squares, [R, 1] each."""
+    return a.sum(1, keepdim=True), a.square().sum(1, keepdim=True)
+
+
+def has_long_rows(a: Tensor, *_: Tensor) -> bool:
+    """Return whether rows [R, N, ...] are too long for the compiler to sum in registers."""
+    return a.shape[1] > 4096
+
+
+_totals = compilable(_separate_totals, operator=cpp.sum_and_squares, keep_in_graph=has_long_rows)

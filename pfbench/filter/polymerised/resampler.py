@@ -22,7 +22,7 @@ from torch import Tensor
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
 from pfbench.filter.particle.gaussian_particle_filter import refuse_history
-from pfbench.filter.particle.resampling import Systematic
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.polymerised.partition import CellPartition, WhitenedCells, divide_cells
 from pfbench.filter.polymerised.placement import (
     CellAggregates,

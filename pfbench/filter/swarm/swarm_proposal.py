@@ -18,8 +18,8 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.exactness import is_every_part_exact
-from pfbench.filter.particle.particle_filter import deactivate_invalid_particles
 from pfbench.filter.particle.proposals import ProposalSample, draw_noise
+from pfbench.filter.particle.weight_update import deactivate_invalid_particles
 from pfbench.filter.swarm.chaotic_sequences import (
     ChaoticPerturbation,
     PriorStart,

@@ -48,7 +48,8 @@ from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.point_sets import SobolPoints
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.reconstructed.proposal import ReconstructedProposal
 from pfbench.filter.reconstructed.weight_correction import MarginalRatioCorrection
 from pfbench.model.base import StateSpaceModel

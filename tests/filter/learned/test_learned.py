@@ -55,7 +55,8 @@ from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.moves.path_history import StateHistory
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.testing import check_evidence, filter_record, simulate_path_posterior

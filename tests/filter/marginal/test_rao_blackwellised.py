@@ -27,7 +27,9 @@ from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.marginal.conditional_linearisation import StatePartition, partition_state
 from pfbench.filter.marginal.rao_blackwellised import MarginalisedProposal, RaoBlackwellisedFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, RegularisedResampler, Systematic
+from pfbench.filter.particle.regularised_resampling import RegularisedResampler
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.square_root_update import condition_on, kalman_update_root
 from pfbench.job import conf_dir
 from pfbench.model.azimuth_errors import (

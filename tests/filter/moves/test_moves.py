@@ -39,17 +39,18 @@ from pfbench.filter.moves.path_block_kernels import (
     PriorSegment,
     driving_noise,
 )
-from pfbench.filter.moves.path_history import PathStatistics, StateHistory, fisher_information
+from pfbench.filter.moves.path_history import StateHistory
 from pfbench.filter.moves.path_proposals import SmoothedSegment
+from pfbench.filter.moves.path_statistics import PathStatistics, fisher_information
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
-from pfbench.filter.particle.resampling import (
+from pfbench.filter.particle.regularised_resampling import (
     EpanechnikovSmoothing,
-    EssResampler,
     GaussianSmoothing,
     RegularisedResampler,
-    Systematic,
 )
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth

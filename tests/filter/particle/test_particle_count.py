@@ -32,13 +32,8 @@ from pfbench.filter.particle.particle_count import (
     ParticleCount,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import (
-    EssResampler,
-    Multinomial,
-    ResamplingScheme,
-    Stratified,
-    Systematic,
-)
+from pfbench.filter.particle.resampling import EssResampler, ResamplingScheme
+from pfbench.filter.particle.resampling_schemes import Multinomial, Stratified, Systematic
 from pfbench.testing import check_evidence, reference_moments
 
 STRENGTHS = [0.1, 0.5, 1.0]

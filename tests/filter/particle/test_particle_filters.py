@@ -29,14 +29,14 @@ from pfbench.filter.particle.gaussian_particle_filter import (
     GaussianPredictionProposal,
     GaussianResampler,
 )
-from pfbench.filter.particle.particle_filter import ParticleFilter, count_distinct_ancestors
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.particle_moments import count_distinct_ancestors
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
-from pfbench.filter.particle.resampling import (
-    EssResampler,
+from pfbench.filter.particle.regularised_resampling import RegularisedResampler
+from pfbench.filter.particle.resampling import EssResampler, ResamplingScheme
+from pfbench.filter.particle.resampling_schemes import (
     Killing,
     Multinomial,
-    RegularisedResampler,
-    ResamplingScheme,
     Residual,
     Ssp,
     Stratified,

@@ -23,7 +23,8 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.point_sets import HaltonPoints, IidPoints, SobolPoints
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.particle.thompson_taylor import ThompsonTaylorResampler, nearest_neighbours
 from pfbench.filter.polymerised.partition import (
     AxisAlignedCells,

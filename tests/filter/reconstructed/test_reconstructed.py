@@ -20,7 +20,8 @@ from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.linearisation import linearised_innovation, measurement_jacobian
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.reconstructed.dmc_controller import (
     DmcController,
     OneStepResponse,

@@ -24,7 +24,8 @@ from pfbench.core.record import Episode, Record, map_inputs
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.swarm.chaotic_sequences import (
     ChaoticPerturbation,
     ChaoticPoints,

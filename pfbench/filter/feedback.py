@@ -1,0 +1,59 @@
+"""Feedback: the estimate of a step corrects the process that the filter estimates."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pfbench.core.record import FeedbackRun
+from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
+from pfbench.filter.gaussian.linearisation_rules import DifferenceSpace, TaylorLinearisation
+from pfbench.model.base import StateSpaceModel
+
+
+def apply_feedback(
+    model: StateSpaceModel,
+    feedback: FeedbackRun,
+    belief: ParticleBelief | GaussianBelief,
+    info: StepInfo,
+) -> tuple[ParticleBelief | GaussianBelief, StepInfo]:
+    """Correct the process by the estimate of valid runs, and the belief accordingly.
+
+    The mean of a Gaussian belief is moved. Its covariance is transformed by the derivative of that
+    move, since a rotation of the axes turns it [ours].
+
+    Args:
+        model: State-space model.
+        feedback: Process that the estimate corrects.
+        belief: Belief after the step.
+        info: Estimate of the step.
+
+    Returns:
+        Belief about the corrected process, and the info with the uncorrected estimate.
+
+    Raises:
+        ValueError: If particles carry their past, which refers to the uncorrected process.
+    """
+    valid = torch.isfinite(belief.log_evidence).unsqueeze(-1)
+    uncorrected, correct = feedback.correct(torch.where(valid, info.mean, 0.0))
+    info = info._replace(mean=torch.where(valid, uncorrected.to(info.mean), info.mean))
+    if isinstance(belief, ParticleBelief):
+        if belief.window or belief.memory:
+            raise ValueError(
+                "filter must not store a particle's past in a scenario with feedback, got one with "
+                "moves or a proposal's memory. Choose another filter, or set scenario.closed_loop=false."
+            )
+        return belief._replace(x=correct(belief.x)), info
+    chart, centre = model.chart, belief.mean.unsqueeze(1)
+
+    def corrected(xi: Tensor) -> tuple[Tensor, Tensor]:
+        return correct(chart.add(centre, xi)), xi.new_zeros(1, 1, 1, 1)
+
+    space = DifferenceSpace(chart.subtract, chart.mean)
+    mean, slope, *_ = TaylorLinearisation()(corrected, belief.mean, chart.dimension, space)
+    return belief._replace(mean=mean, covariance=slope @ belief.covariance @ slope.mT), info
+
+
+def correctable_groups(model: StateSpaceModel) -> dict[str, tuple[int, ...]]:
+    """Return the component groups of a model whose states are differences; otherwise none."""
+    return model.groups if model.chart.size == len(model.names) else {}

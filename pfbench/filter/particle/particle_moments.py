@@ -1,0 +1,187 @@
+"""Moments and diagnostics of weighted particles, for the information of a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from pfbench.core.covariance import shared_distribution_covariance, squared_length
+from pfbench.core.density import has_finite_moments
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, StepInfo, normalise_log_weights
+from pfbench.filter.gaussian.gaussian_filter import around_first
+from pfbench.filter.linearisation import mask_covariance
+from pfbench.filter.particle.weight_update import has_long_rows
+from pfbench.kernels import cpp
+from pfbench.kernels.compilation import compilable
+from pfbench.model.base import StateSpaceModel
+
+
+class StepSummary(NamedTuple):
+    """Moments and diagnostics of one filter step.
+
+    Attributes:
+        mean: Mean of the particles, [R, D].
+        variance: Variance in the chart, [R, d].
+        predicted_log_w: Log weights before the measurement update, [R, N], not normalised.
+        trace: Numbers per run, {name: [R]}.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    predicted_log_w: Tensor
+    trace: dict[str, Tensor]
+
+
+def summarise(model: StateSpaceModel, belief: ParticleBelief, trace: dict[str, Tensor]) -> StepInfo:
+    """Return mean and variance of particles for the report, without a copy of them.
+
+    Args:
+        model: State-space model.
+        cloud: Weighted particles.
+        trace: Numbers per run, {name: [R]}.
+
+    Returns:
+        Information of the step.
+    """
+    return make_step_info(
+        model,
+        belief,
+        *weighted_mean_variance(model, belief, normalise_log_weights(belief.log_w)),
+        trace,
+    )
+
+
+def weighted_mean_variance(
+    model: StateSpaceModel, belief: ParticleBelief, w: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the mean [R, D] and, in the chart about it, the variance [R, d].
+
+    Args:
+        model: State-space model.
+        cloud: Particles.
+        w: Normalised weights, [R, N].
+
+    Returns:
+        Mean and variance.
+    """
+    if model.chart.flat:
+        mean, variance = _flat_moments(belief.x, w)
+        return mean, variance
+    mean = model.chart.mean(belief.x, w)
+    return mean, (
+        w.unsqueeze(-2) @ model.chart.subtract(belief.x, mean.unsqueeze(1)).square()
+    ).squeeze(-2)
+
+
+def make_step_info(
+    model: StateSpaceModel,
+    belief: ParticleBelief,
+    mean: Tensor,
+    variance: Tensor,
+    trace: dict[str, Tensor],
+    nis: Callable[[], tuple[Tensor, Tensor]] | None = None,
+) -> StepInfo:
+    """Return what a report needs of particles whose mean and variance are computed.
+
+    Args:
+        model: State-space model.
+        cloud: Weighted particles.
+        mean: Their mean, [R, D].
+        variance: Their variance in the chart, [R, d].
+        trace: Numbers per run, {name: [R]}.
+        nis: Computes the NIS and the observed components, [R] each.
+
+    Returns:
+        Information of the step; covariances are computed on request.
+    """
+
+    def deviations() -> tuple[Tensor, Tensor]:
+        return model.chart.subtract(belief.x, mean.unsqueeze(1)), belief.log_w
+
+    def covariance() -> Tensor:
+        d, log_w = deviations()
+        return (normalise_log_weights(log_w).unsqueeze(-1) * d).mT @ d
+
+    @cache
+    def w() -> Tensor:  # once for all groups; the weights are normalised already
+        return torch.exp(belief.log_w)
+
+    def some(groups: Tensor) -> Tensor:
+        if model.chart.flat:
+            return _spread(belief.x, mean, w(), groups)
+        return _spread(deviations()[0], torch.zeros_like(variance), w(), groups)
+
+    return StepInfo(mean, variance, covariance, trace, deviations, nis, some)
+
+
+def compute_nis(
+    model: StateSpaceModel, x: Tensor, log_w: Tensor, record: Record
+) -> tuple[Tensor, Tensor]:
+    """Compute the normalised innovation squared (NIS) of predicted particles.
+
+    Args:
+        model: State-space model.
+        x: Predicted particles, [R, N, D].
+        log_w: Log weights before the measurement update, [R, N].
+        seen: Record of the step; NaN marks a missing component.
+
+    Returns:
+        NIS [R], NaN where the observation distribution has no finite mean and variance, and the
+        number of observed components [R], which is its expectation.
+    """
+    law: Any = model.observation(x, record.u)
+    w, observed_mask = normalise_log_weights(log_w).unsqueeze(-1), ~torch.isnan(record.y)
+    if not has_finite_moments(law):
+        return torch.full_like(log_w[:, 0], torch.nan), observed_mask.sum(1)
+    y_hat = around_first(model.residual)(law.mean, w.squeeze(-1))
+    deviations = torch.where(w > 0.0, model.residual(law.mean, y_hat.unsqueeze(1)), 0.0)
+    covariance = shared_distribution_covariance(law)
+    noise = (w.unsqueeze(-1) * covariance).sum(1) if covariance.shape[1] > 1 else covariance[:, 0]
+    r = torch.where(observed_mask, model.residual(record.y.nan_to_num(), y_hat), 0.0)
+    every = torch.arange(deviations.shape[-1], device=deviations.device).unsqueeze(0)
+    spread = _spread(deviations, torch.zeros_like(y_hat), w.squeeze(-1), every).squeeze(1)
+    return squared_length(r, mask_covariance(spread + noise, observed_mask)), observed_mask.sum(1)
+
+
+def _marked(copy_of: Tensor, log_w: Tensor) -> Tensor:
+    """Return the number of distinct values below 2 N in copy_of [R, N] at active slots, [R]."""
+    marks = torch.zeros(len(copy_of), 2 * copy_of.shape[1], dtype=log_w.dtype, device=log_w.device)
+    return (marks.scatter_add_(1, copy_of, (log_w > -torch.inf).to(log_w.dtype)) > 0.0).sum(1)
+
+
+count_distinct_ancestors = compilable(_marked, operator=cpp.count_unique)
+
+
+def _separate_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weighted mean and variance [R, D], by matrix products."""
+    mean = w.unsqueeze(-2) @ x
+    d = x - mean
+    return mean.squeeze(-2), (w.unsqueeze(-2) @ (d * d)).squeeze(-2)
+
+
+def _fused_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weighted mean and variance [R, D] of numbers [R, N, D] by weights [R, N]."""
+    parts = x.permute(2, 0, 1)
+    mean = (w * parts).sum(-1)
+    d = parts - mean.unsqueeze(-1)
+    return mean.T, (w * d * d).sum(-1).T
+
+
+def _separate_spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tensor:
+    """Return covariances [R, G, s, s] of groups of components [G, s] of numbers [R, N, k]."""
+    deviations = x.permute(0, 2, 1)[:, groups] - mean[:, groups].unsqueeze(-1)  # [R, G, s, N]
+    return (w[:, None, None] * deviations) @ deviations.mT
+
+
+_spread = compilable(_separate_spread, operator=cpp.group_covariance, keep_in_graph=False)
+_flat_moments = compilable(
+    _fused_moments,
+    eager=_separate_moments,
+    operator=cpp.weighted_moments,
+    keep_in_graph=has_long_rows,
+)

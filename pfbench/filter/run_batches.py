@@ -1,0 +1,88 @@
+"""Batches of runs: a filter takes the runs of a record together, in batches that fit memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import BatchRandomStream, RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import StepInfo
+
+_BATCH_NUMBERS = 1_000_000  # numbers (runs x particles x components) of a batch of runs
+
+
+def choose_run_batch(runs: int, particles: int, dimension: int) -> int:
+    """Choose how many runs a step takes together on the CPU.
+
+    Batches have about equal size and a million numbers each, so memory depends on the size of a
+    batch and not on the number of runs. Smaller batches would stay in the cache of a core, but below
+    some 100 000 numbers the overhead of single operations dominates. [Measured on a 15-state INS
+    with 500 particles: 100 runs together were 10 % faster than 50 on an idle machine, and 33 %
+    slower while other processes used the shared cache.]
+
+    Args:
+        runs: Number of runs.
+        particles: Number of particles of a run.
+        dimension: Number of components of a particle.
+
+    Returns:
+        Runs per batch.
+    """
+    return -(-runs // max(1, round(runs * particles * dimension / _BATCH_NUMBERS)))
+
+
+def split_runs(
+    record: Record, draws: BatchRandomStream, run_batch: int | None
+) -> list[tuple[Record, RandomStream]]:
+    """Split a record and its random stream into batches of runs.
+
+    Args:
+        record: Record of R runs.
+        draws: Random stream of these runs.
+        run_batch: Runs of a batch. None takes all.
+
+    Returns:
+        Record and random stream of each batch.
+    """
+    runs = len(record.y)
+    if run_batch is None or run_batch >= runs:
+        return [(record, draws)]
+    batches = [slice(first, first + run_batch) for first in range(0, runs, run_batch)]
+    return [(record.select_runs(batch), draws.select_runs(batch)) for batch in batches]
+
+
+def join_runs(batches: list[Tensor]) -> Tensor:
+    """Concatenate batches of runs; return a single batch unchanged."""
+    return batches[0] if len(batches) == 1 else torch.cat(batches)
+
+
+def join_infos(infos: list[StepInfo]) -> StepInfo:
+    """Join the infos of batches of runs."""
+    if len(infos) == 1:
+        return infos[0]
+    mean, variance = (
+        join_runs([getattr(info, name) for info in infos]) for name in ("mean", "variance")
+    )
+    trace = {name: join_runs([info.trace[name] for info in infos]) for name in infos[0].trace}
+
+    def pairs(name: str) -> Callable[[], tuple[Tensor, Tensor]] | None:
+        functions = [getattr(info, name) for info in infos if getattr(info, name) is not None]
+
+        def joined() -> tuple[Tensor, Tensor]:
+            first, second = zip(*(function() for function in functions), strict=True)
+            return torch.cat(first), torch.cat(second)
+
+        return joined if functions else None
+
+    def covariance() -> Tensor:
+        return torch.cat([info.covariance() for info in infos])
+
+    def covariance_of_groups(groups: Tensor) -> Tensor:
+        return torch.cat([info.covariance_of(groups) for info in infos])
+
+    return StepInfo(
+        mean, variance, covariance, trace, pairs("cloud"), pairs("nis"), covariance_of_groups
+    )
