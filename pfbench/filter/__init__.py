@@ -64,9 +64,10 @@ __getattr__, __dir__ = lazy_attributes(
             "NoiseFlowGibbsKernel",
         ),
         "moves.metropolis": ("Move", "McmcKernel", "MetropolisHastings", "KernelCycle"),
-        "moves.path_block_kernels": ("LastStateKernel", "SegmentProposal", "PathBlockKernel"),
+        "moves.path_block_kernels": ("LastStateKernel", "PathBlockKernel"),
         "moves.path_history": ("PathHistory",),
         "moves.path_proposals": ("SmoothedSegment",),
+        "moves.path_segments": ("SegmentProposal",),
         "particle.auxiliary_weights": (
             "AuxiliaryWeights",
             "LookAheadWeights",

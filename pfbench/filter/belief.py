@@ -1,4 +1,4 @@
-"""Belief (what the next step needs) and info (what the report wants). Both are flat NamedTuples of tensors."""
+"""Belief, which the next step needs, and info, which a report needs: flat NamedTuples of tensors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ParticleBelief(NamedTuple):
         memory: Memory of the proposal, [R, N or 1, ...], gathered with the particles.
         past: Records of the steps in the window, oldest first, as `Record.at` returns them.
         ancestors: Slot that each particle copies within a step, [R, N]; N or more if a move changed
-            it. None if particles were drawn anew.
+            it. None if the particles are not copies.
     """
 
     x: Tensor
@@ -69,8 +69,8 @@ class StepInfo(NamedTuple):
             None for a Gaussian filter.
         nis: Computes the normalised innovation squared under the predicted moments, and the number of
             observed components, [R] each. None if the filter does not support it.
-        observed_components: Computes covariances of groups of components [R, G, s, s] from indices [G, s], if that
-            is cheaper than the full covariance.
+        group_covariance: Computes covariances of groups of components [R, G, s, s] from indices
+            [G, s], where that is cheaper than the full covariance.
     """
 
     mean: Tensor
@@ -79,21 +79,21 @@ class StepInfo(NamedTuple):
     trace: dict[str, Tensor]
     cloud: Callable[[], tuple[Tensor, Tensor]] | None = None
     nis: Callable[[], tuple[Tensor, Tensor]] | None = None
-    observed_components: Callable[[Tensor], Tensor] | None = None
+    group_covariance: Callable[[Tensor], Tensor] | None = None
 
     def covariance_of(self, groups: Tensor) -> Tensor:
         """Return covariances [R, G, s, s] of groups of components, indices [G, s]."""
-        if self.observed_components is not None:
-            return self.observed_components(groups)
+        if self.group_covariance is not None:
+            return self.group_covariance(groups)
         return self.covariance()[:, groups.unsqueeze(-1), groups.unsqueeze(-2)]
 
 
 class Filter(Protocol):
-    """Filter: turns a belief and a record into the next belief. It holds no state."""
+    """Filter: computes the next belief from a belief and a record. The object is stateless."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether the belief converges to p(x_t | y_1:t) as N grows."""
+        """True if the belief converges to p(x_t | y_1:t) as N grows."""
 
     def init(
         self,
@@ -120,14 +120,24 @@ class Filter(Protocol):
     def step(
         self, model: StateSpaceModel, belief: Any, record: Record, draws: RandomStream
     ) -> tuple[ParticleBelief | GaussianBelief, StepInfo]:
-        """Return the belief after a step, and its information."""
+        """Take a step.
+
+        Args:
+            model: State-space model of the step.
+            belief: Belief before the step.
+            record: Measurements and inputs of the step.
+            draws: Random stream of the step.
+
+        Returns:
+            Belief after the step, and its information.
+        """
 
 
 def gather_ancestors(belief: ParticleBelief, ancestors: Tensor) -> ParticleBelief:
-    """Return the particles of given ancestors, with everything that belongs to them.
+    """Copy particles by their ancestors, with weights, window and memory.
 
     Args:
-        cloud: Weighted particles.
+        belief: Weighted particles.
         ancestors: Slots, [R, M].
 
     Returns:
@@ -145,11 +155,11 @@ def gather_ancestors(belief: ParticleBelief, ancestors: Tensor) -> ParticleBelie
 def select_by_run(
     resampled_mask: Tensor, new: ParticleBelief, old: ParticleBelief
 ) -> ParticleBelief:
-    """Return `new` for selected runs and `old` for others, with the evidence of `new`.
+    """Return `new` for resampled runs and `old` for others, with the evidence of `new`.
 
     Args:
-        hit: Selected runs, [R].
-        new: Particles of selected runs.
+        resampled_mask: Resampled runs, [R].
+        new: Particles of resampled runs.
         old: Particles of other runs.
 
     Returns:
@@ -189,7 +199,7 @@ def weighted_mean_cov(chart: Chart, belief: ParticleBelief) -> tuple[Tensor, Ten
 
     Args:
         chart: Chart of the state.
-        cloud: Weighted particles.
+        belief: Weighted particles.
 
     Returns:
         Mean [R, D] and covariance in the chart about it, [R, d, d].

@@ -1,4 +1,4 @@
-"""Whether a filter is asymptotically exact: every part states it, and one that does not counts as inexact."""
+"""Asymptotic exactness of a filter: every part states it, and a silent part counts as inexact."""
 
 from __future__ import annotations
 
@@ -12,27 +12,25 @@ def is_every_part_exact(**parts: object) -> bool:
     exact because a stage written by a user is silent.
 
     Args:
-        **parts: Stages by the configuration key under which they stand, each with `exact: bool`.
+        **parts: Stages by their configuration key, each with `is_exact: bool`.
 
     Returns:
         True if `is_exact` is True for every part.
     """
-    stated = [
-        _stated(key, part) for key, part in parts.items()
-    ]  # all of them: each silent part warns
-    return all(stated)
+    statements = [_stated(key, stage) for key, stage in parts.items()]  # each silent part warns
+    return all(statements)
 
 
-def _stated(key: str, part: object) -> bool:
-    """Return `part.is_exact`, or False with a warning."""
-    value = getattr(part, "is_exact", None)
+def _stated(key: str, stage: object) -> bool:
+    """Return `stage.is_exact`, or False with a warning."""
+    value = getattr(stage, "is_exact", None)
     if isinstance(value, bool):
         return value
-    name = getattr(part, "__name__", type(part).__name__)
+    name = getattr(stage, "__name__", type(stage).__name__)
     warnings.warn(
         f"filter: {key} must state whether it is asymptotically exact, got {name} without `is_exact`. "
         "The filter counts as not exact. Add `is_exact = True` to it (or `is_exact = False`) "
-        "and test it with pfbench.testing",
+        "and test it with pfbench.testing.",
         stacklevel=4,
     )
     return False

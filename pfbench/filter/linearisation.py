@@ -63,8 +63,8 @@ def compute_additive_gain(model: StateSpaceModel, x: Tensor, root: Tensor, u: An
     state. It is the gain if `propagate` agrees with x (+) L w at other states (several standard
     deviations and units away) and for large noises of both signs. Otherwise the noise is treated as
     not additive. This is always valid, because the noise then passes through the linearisation
-    rule. It is also treated so in single precision, which cannot verify it, and while a step is
-    recorded for compilation.
+    rule. Noise is also treated as not additive in single precision, which cannot verify the gain,
+    and while a step is recorded for compilation.
 
     Args:
         model: State-space model.
@@ -103,7 +103,7 @@ def compute_additive_gain(model: StateSpaceModel, x: Tensor, root: Tensor, u: An
 
 
 def check_moments(model: StateSpaceModel, name: str, distribution: Any) -> None:
-    """Raise ValueError if a Gaussian filter cannot approximate a distribution of a model.
+    """Check that a Gaussian filter can approximate a distribution of a model.
 
     Normal distributions cost a type check only.
 
@@ -113,7 +113,7 @@ def check_moments(model: StateSpaceModel, name: str, distribution: Any) -> None:
         distribution: The distribution.
 
     Raises:
-        ValueError: if mean or variance are not finite.
+        ValueError: If mean or variance are not finite.
     """
     if not has_finite_moments(distribution):
         kind = type(unwrap_independent(distribution)).__name__
@@ -124,7 +124,15 @@ def check_moments(model: StateSpaceModel, name: str, distribution: Any) -> None:
 
 
 def mean_noise(model: StateSpaceModel, x: Tensor) -> Tensor:
-    """Return the mean noise for each of the states x [R, N, ...]: [R, N, W]."""
+    """Return the mean noise of each state.
+
+    Args:
+        model: State-space model with noise of dimension W.
+        x: States, [R, N, ...].
+
+    Returns:
+        Mean noise, [R, N, W].
+    """
     return model.noise.mean.expand(*x.shape[:2], -1)
 
 
@@ -153,7 +161,7 @@ def measurement_jacobian(model: StateSpaceModel, x: Tensor, record: Record) -> T
     Args:
         model: State-space model.
         x: States, [R, N, D].
-        seen: Measurement and inputs of the step.
+        record: Measurement and inputs of the step.
 
     Returns:
         Jacobian, [R, N, k, d]; rows of missing components are 0.
@@ -172,7 +180,7 @@ def linearised_innovation(model: StateSpaceModel, x: Tensor, record: Record) -> 
     Args:
         model: State-space model.
         x: States, [R, N, D].
-        seen: Measurement and inputs of the step.
+        record: Measurement and inputs of the step.
 
     Returns:
         Innovation, [R, N, k]; 0 for missing components.
@@ -182,37 +190,45 @@ def linearised_innovation(model: StateSpaceModel, x: Tensor, record: Record) -> 
     return torch.where(torch.isnan(y), 0.0, r)
 
 
-def linearised_mean(law: Any) -> Tensor:
+def linearised_mean(distribution: Any) -> Tensor:
     """Return the mean of a distribution."""
-    value: Tensor = law.mean
+    value: Tensor = distribution.mean
     return value
 
 
-def unwrap_independent(law: Distribution) -> Distribution:
+def unwrap_independent(distribution: Distribution) -> Distribution:
     """Return the univariate distribution of independent components, or the distribution itself."""
-    return law.base_dist if isinstance(law, Independent) else law
+    return distribution.base_dist if isinstance(distribution, Independent) else distribution
 
 
-def is_normal(law: Distribution) -> bool:
+def is_normal(distribution: Distribution) -> bool:
     """Return whether a distribution is normal."""
-    return isinstance(unwrap_independent(law), Normal | MultivariateNormal)
+    return isinstance(unwrap_independent(distribution), Normal | MultivariateNormal)
 
 
-def mask_covariance(covariance: Tensor, there: Tensor) -> Tensor:
+def mask_covariance(covariance: Tensor, observed_mask: Tensor) -> Tensor:
     """Replace rows and columns of missing components by those of the unit matrix.
 
     Args:
         covariance: Covariance, [..., k, k].
-        there: Observed components, bool [..., k].
+        observed_mask: Observed components, bool [..., k].
 
     Returns:
         Covariance, [..., k, k].
     """
-    both = there.unsqueeze(-1) & there.unsqueeze(-2)
-    eye = torch.eye(there.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    both = observed_mask.unsqueeze(-1) & observed_mask.unsqueeze(-2)
+    eye = torch.eye(observed_mask.shape[-1], dtype=covariance.dtype, device=covariance.device)
     return torch.where(both, covariance, eye)
 
 
 def batch_product(m: Tensor, e: Tensor) -> Tensor:
-    """Multiply matrices [R, 1 or N, k, l] by vectors [R, 1 or N, l] -> [R, N, k]."""
+    """Multiply each vector by its matrix.
+
+    Args:
+        m: Matrices, [R, 1 or N, k, l].
+        e: Vectors, [R, 1 or N, l].
+
+    Returns:
+        Products, [R, N, k].
+    """
     return e @ m[:, 0].mT if m.shape[1] == 1 else (m @ e.unsqueeze(-1)).squeeze(-1)

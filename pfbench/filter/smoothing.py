@@ -133,8 +133,8 @@ def sample_trajectories(
         Sampled paths, [R, paths, T, D]. NaN where a run is lost.
 
     Raises:
-        ValueError: If paths is below 1, the filter has no particles, the model has no transition
-            density, or the record has feedback.
+        ValueError: If paths is below 1, the filter is not a particle filter, the model lacks a
+            transition density, or the record has feedback.
 
     References:
         S. Godsill, A. Doucet and M. West (2004), Monte Carlo smoothing for nonlinear time series.
@@ -200,7 +200,7 @@ def _check_open(record: Record) -> None:
 
 
 def _check_dense(model: StateSpaceModel, inputs: Record, record: Record) -> None:
-    """Raise an error if the model has no transition density."""
+    """Raise an error if the model lacks a transition density."""
     start = (
         model.origin.expand(len(record.y), 1, -1)
         if inputs.start is None

@@ -13,8 +13,8 @@ def condition_on(
 ) -> tuple[list[Tensor], Tensor]:
     """Condition the normal vector e = A xi, xi ~ N(0, I), on some of its components.
 
-    Gram-Schmidt, component by component. A component of s without variance of its own does not
-    remove variance from l. No covariance is formed.
+    Gram-Schmidt, component by component. A component of s without remaining variance does
+    not remove variance from l. No covariance is formed.
 
     Args:
         a: Root A, [..., d, m], with m at least the size of l.

@@ -11,9 +11,9 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 
 def fill_missing(root: Tensor) -> Tensor:
-    """Return a root [..., k, k] with 1 on the diagonal where a component has no spread.
+    """Return a root [..., k, k] with 1 on the diagonal of components without variance.
 
-    Its whitened coordinate is 0, and its density is left out.
+    The whitened coordinate of such a component is 0, and its density is omitted.
     """
     return root + torch.diag_embed((root.diagonal(dim1=-2, dim2=-1) == 0.0).to(root))
 

@@ -182,7 +182,7 @@ def test_an_honest_filter_is_calibrated_and_a_confident_one_is_not(
         return proud(
             t,
             info._replace(
-                covariance=lambda: 0.36 * info.covariance(), cloud=cloud, observed_components=None
+                covariance=lambda: 0.36 * info.covariance(), cloud=cloud, group_covariance=None
             ),
         )
 

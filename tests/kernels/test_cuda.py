@@ -198,7 +198,7 @@ def test_clouds(loop: Loop, runs: int, n: int, d: int, dtype: torch.dtype) -> No
     )
     copy_of = 2 * ancestors % (2 * n - 1)
     assert torch.equal(
-        loop("count_unique", copy_of, w.log()), particle_moments._marked(copy_of, w.log())
+        loop("count_unique", copy_of, w.log()), particle_moments._count_distinct(copy_of, w.log())
     )
     x = x + 1e4 * torch.arange(1, d + 1)
     x[:, 0], w[:, 0] = 1e9, 0.0  # an outlier without weight spoils nothing

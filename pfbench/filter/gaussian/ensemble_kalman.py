@@ -189,7 +189,7 @@ class EnsembleKalmanFilter:
         return cloud, info._replace(
             variance=bessel * info.variance,
             covariance=lambda: bessel * info.covariance(),
-            observed_components=lambda groups: bessel * info.covariance_of(groups),
+            group_covariance=lambda groups: bessel * info.covariance_of(groups),
             nis=lambda: (
                 (along.square() / (1.0 + forecast.values)).sum(-1),
                 (~torch.isnan(record.y)).sum(1),

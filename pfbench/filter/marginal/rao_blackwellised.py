@@ -217,4 +217,4 @@ def _with_conditional(info: StepInfo, belief: ParticleBelief, split: StatePartit
         embedding = torch.eye(info.variance.shape[-1], dtype=p.dtype, device=p.device)[split.linear]
         return info.covariance() + embedding.mT @ p @ embedding
 
-    return info._replace(variance=variance, covariance=covariance, observed_components=None)
+    return info._replace(variance=variance, covariance=covariance, group_covariance=None)

@@ -11,13 +11,15 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.linearisation import unwrap_independent
-from pfbench.filter.moves.path_history import StateHistory, concatenate_histories
+from pfbench.filter.moves.metropolis import McmcKernel
+from pfbench.filter.moves.path_history import StateHistory, stack_history
 from pfbench.filter.moves.path_statistics import PathStatistics
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing, SmoothingKernel
 from pfbench.filter.whitening import compute_half_square, whiten
@@ -53,20 +55,28 @@ class RandomWalk:
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, x: Tensor, draws: RandomStream
     ) -> Tensor:
-        """Draw steps [R, N, d] for x [R, N, D] with the weights of the belief."""
+        """Draw steps.
+
+        Args:
+            model: State-space model.
+            belief: Weighted particles.
+            x: States that the steps will move, [R, N, D], with the weights of the belief.
+            draws: Random stream.
+
+        Returns:
+            Steps in the chart, [R, N, d].
+        """
         covariance = weighted_mean_cov(model.chart, belief._replace(x=x))[1]
         root, ok = factor(covariance)
-        diagonal_root = torch.diag_embed(
-            covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
-        )
+        sd = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
         active_count = torch.isfinite(belief.log_w).sum(1, keepdim=True).to(x.dtype)
         h = self.scale * self.smoothing.bandwidth(covariance.shape[-1], active_count)
         e = self.smoothing.draw(draws, "walk", x.shape[1], covariance.shape[-1])
-        return h.unsqueeze(-1) * (e @ torch.where(ok[:, None, None], root, diagonal_root).mT)
+        return h.unsqueeze(-1) * (e @ torch.where(ok[:, None, None], root, torch.diag_embed(sd)).mT)
 
 
 @dataclass(frozen=True)
-class NoiseFlowKernel:
+class NoiseFlowKernel(McmcKernel):
     """Move the start of the window under fixed noises, without a density [ours].
 
     s = x_t-L and s' = s (+) h A e, with A from the starts at time t. The path follows from s' under
@@ -76,18 +86,19 @@ class NoiseFlowKernel:
 
     While t <= L the start is x_0 and its distribution is exact. Later it is the normal
     distribution with the filter's moments at t - L. The target is then that of a fixed-lag
-    smoother, hence `exact` is False. The cost is L model steps.
+    smoother, so `is_exact` is False. The cost is L model steps.
 
     Attributes:
         lag: L. The window may be longer for another kernel. The flow then starts where the
             window does.
-        random_walk: Step of the start. On a curved chart it is taken in the coordinates about the mean of
-            the start [ours]. The distribution is normal there, so no volume element is missing.
+        random_walk: Step of the start. On a curved chart it is taken in the coordinates about the
+            mean of the start [ours]. The distribution is normal there, so no volume element is
+            missing.
         noise_refresh: c. Replaces the noises by w' = sqrt(1 - c^2) w + c e, which leaves their normal
             distribution invariant.
 
     Raises:
-        ValueError: If depth is below 1 or refresh outside [0, 1). On use, if noise that is not
+        ValueError: If the lag is below 1 or the refresh outside [0, 1). On use, if noise that is not
             normal is refreshed.
     """
 
@@ -103,27 +114,19 @@ class NoiseFlowKernel:
             )
         if not 0.0 <= self.noise_refresh < 1.0:
             raise ValueError(
-                f"kernel.noise_refresh must be in [0, 1), got {self.noise_refresh}. Use 0 for no refresh."
+                f"kernel.noise_refresh must be in [0, 1), got {self.noise_refresh}. "
+                "Use 0 for no refresh."
             )
 
     @property
+    @override
     def required_history(self) -> StateHistory:
-        """History that the kernel needs."""
         return StateHistory(self.lag, store_noise=True)
 
+    @override
     def propose(
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
     ) -> tuple[ParticleBelief, Tensor]:
-        """Propose paths from moved starts.
-
-        Args:
-            model: State-space model.
-            cloud: Particles with a window of states and noises.
-            draws: Random numbers.
-
-        Returns:
-            Proposed belief and log acceptance ratio [R, N].
-        """
         window, chart = belief.window, model.chart
         start, centre = window["states"][:, :, 0], window["mean"][:, :, 0]
         step, xi = self.random_walk(model, belief, start, draws), chart.subtract(start, centre)
@@ -143,8 +146,8 @@ class NoiseFlowKernel:
         noise: Any = model.noise
         if not isinstance(unwrap_independent(noise), torch.distributions.Normal):
             raise ValueError(
-                f"kernel.noise_refresh must be 0, got {self.noise_refresh}: the noise of "
-                f"{type(model).__name__} is not normal. Set noise_refresh=0."
+                "kernel.noise_refresh must be 0 for noise that is not normal, got "
+                f"{self.noise_refresh} with {type(model).__name__}. Set noise_refresh=0."
             )
         n, steps, width = w.shape[1:]
         e = draws.normal("refresh", n, steps * width).unflatten(2, (steps, width))
@@ -158,7 +161,7 @@ class NoiseFlowKernel:
 def propagate_path(
     model: StateSpaceModel, start: Tensor, noise: Tensor, past: tuple[Record, ...]
 ) -> tuple[Tensor, Tensor]:
-    """Propagate a path from its start under given noises.
+    """Propagate a path from its start with fixed noises.
 
     Args:
         model: State-space model.
@@ -170,25 +173,23 @@ def propagate_path(
         States [R, N, K+1, D] and log p(y_j | x_j) [R, N, K+1].
     """
     x, states = start, [start]
-    values = [model.log_likelihood(seen.y, x, seen.u) for seen in past[:1]] or [
+    values = [model.log_likelihood(record.y, x, record.u) for record in past[:1]] or [
         torch.zeros_like(start[..., 0])
     ]
-    for j, seen in enumerate(past[1:]):
-        x = model.propagate(x, seen.u, noise[:, :, j])
+    for j, record in enumerate(past[1:]):
+        x = model.propagate(x, record.u, noise[:, :, j])
         states.append(x)
-        values.append(model.log_likelihood(seen.y, x, seen.u))
-    return concatenate_histories([a.unsqueeze(2) for a in states]), concatenate_histories(
-        [a.unsqueeze(2) for a in values]
-    )
+        values.append(model.log_likelihood(record.y, x, record.u))
+    return stack_history(states), stack_history(values)
 
 
 @dataclass(frozen=True)
-class NoiseFlowStatKernel:
+class NoiseFlowStatKernel(McmcKernel):
     """Move the whole path since t = 0 with its newest state, at constant cost [ours].
 
     By sufficient statistics [after Storvik 2002; Fearnhead 2002]: x' = x (+) delta, delta = h A e,
     and log beta = b.delta - delta' Lambda delta / 2. After acceptance b <- b - Lambda delta. Exact
-    on linear-Gaussian models, of first order on others. Information defines b and Lambda.
+    on linear-Gaussian models, of first order on others. `PathStatistics` defines b and Lambda.
 
     Attributes:
         random_walk: delta, by default with half the optimal bandwidth.
@@ -198,10 +199,10 @@ class NoiseFlowStatKernel:
     is_exact = False
     required_history = PathStatistics()
 
+    @override
     def propose(
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
     ) -> tuple[ParticleBelief, Tensor]:
-        """Propose shifted states (arguments and results as for Flow.propose)."""
         b, delta = belief.window["score"], self.random_walk(model, belief, belief.x, draws)
         information_shift = delta @ belief.window["information"][:, 0]
         log_alpha = (delta * (b - 0.5 * information_shift)).sum(-1)
@@ -210,8 +211,8 @@ class NoiseFlowStatKernel:
 
 
 @dataclass(frozen=True)
-class NoiseFlowGibbsKernel:
-    """FlowStat with delta from its conditional distribution N(Lambda^-1 b, Lambda^-1).
+class NoiseFlowGibbsKernel(McmcKernel):
+    """`NoiseFlowStatKernel` with delta from its conditional distribution N(Lambda^-1 b, Lambda^-1).
 
     Always accepted if Lambda has a Cholesky factor.
     """
@@ -219,10 +220,10 @@ class NoiseFlowGibbsKernel:
     is_exact = False
     required_history = PathStatistics()
 
+    @override
     def propose(
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
     ) -> tuple[ParticleBelief, Tensor]:
-        """Draw shifted states (arguments and results as for Flow.propose)."""
         b, information = belief.window["score"], belief.window["information"][:, 0]
         root, ok = factor(information)
         white = torch.linalg.solve_triangular(root, b.mT, upper=False).mT

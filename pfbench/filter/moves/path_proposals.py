@@ -1,4 +1,4 @@
-"""Paths between two states: forward filtering and backward sampling."""
+"""Path proposals between two states by forward filtering and backward sampling."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import distribution_covariance, factor
 from pfbench.core.random_stream import RandomStream
@@ -18,13 +19,13 @@ from pfbench.filter.linearisation import (
     measurement_jacobian,
     transition_jacobian,
 )
-from pfbench.filter.moves.path_block_kernels import PathSegment
-from pfbench.filter.moves.path_history import concatenate_histories, get_transition
+from pfbench.filter.moves.path_history import get_transition, stack_history
+from pfbench.filter.moves.path_segments import PathSegment, SegmentProposal
 from pfbench.model.base import StateSpaceModel
 
 
 @dataclass(frozen=True)
-class SmoothedSegment:
+class SmoothedSegment(SegmentProposal):
     """Draw the block from p(block | fixed state, y) or, with `condition_on_endpoint`, also given x_t.
 
     Forward filtering, backward sampling. The linearisation is about the noise-free path from the
@@ -39,6 +40,7 @@ class SmoothedSegment:
     condition_on_endpoint: bool = True
     is_exact = True
 
+    @override
     def __call__(
         self, model: StateSpaceModel, old: PathSegment, child: Tensor, draws: RandomStream
     ) -> tuple[Tensor, Tensor | None]:
@@ -54,23 +56,18 @@ class SmoothedSegment:
             m_old = m_new = filtered[j][0]
             p, next_link = filtered[j][1], links[j + 1]
             if self.condition_on_endpoint or j < length - 1:
-                p, gain = _absorb(p, next_link.transition_jacobian, next_link.process_covariance)
-                m_old = m_old + batch_product(
-                    gain, next_old - batch_product(next_link.transition_jacobian, m_old)
-                )
-                m_new = m_new + batch_product(
-                    gain, next_new - batch_product(next_link.transition_jacobian, m_new)
-                )
+                f = next_link.transition_jacobian
+                p, gain = _update_covariance(p, f, next_link.process_covariance)
+                m_old = m_old + batch_product(gain, next_old - batch_product(f, m_old))
+                m_new = m_new + batch_product(gain, next_new - batch_product(f, m_new))
             root, ok = factor(p)
             z = draws.normal(f"block_{j}", child.shape[1], chart.dimension)
-            next_old, next_new = (
-                chart.subtract(block[:, :, j], links[j].x),
-                m_new + batch_product(root, z),
-            )
-            z_old = _solved(root, next_old - m_old)
+            next_old = chart.subtract(block[:, :, j], links[j].x)
+            next_new = m_new + batch_product(root, z)
+            z_old = _whiten(root, next_old - m_old)
             ratio = ratio + torch.where(ok, 0.5 * (z * z - z_old * z_old).sum(-1), torch.nan)
             states.append(chart.add(links[j].x, next_new))
-        return concatenate_histories([x.unsqueeze(2) for x in reversed(states)]), ratio
+        return stack_history(states[::-1]), ratio
 
 
 class LinearisedStep(NamedTuple):
@@ -96,60 +93,50 @@ class LinearisedStep(NamedTuple):
 def _links(model: StateSpaceModel, old: PathSegment) -> list[LinearisedStep]:
     """Linearise the steps of the noise-free path."""
     x, links = old.states[:, :, 0], []
-    linearisations = (
-        1 if model.linear else x.shape[1]
-    )  # a linear model has one Jacobian for all particles
-    for seen in old.records:
-        before = x[:, :linearisations]
-        slope, distribution = (
-            transition_jacobian(model, before, seen.u),
-            get_transition(model, before, seen),
-        )
-        x = model.propagate(x, seen.u, mean_noise(model, x))
-        observed_mask, after = ~torch.isnan(seen.y).unsqueeze(1), x[:, :linearisations]
-        noise = mask_covariance(
-            distribution_covariance(model.observation(after, seen.u)), observed_mask
-        )
+    jacobians = 1 if model.linear else x.shape[1]  # a linear model has one for all particles
+    for record in old.records:
+        before = x[:, :jacobians]
+        transition = transition_jacobian(model, before, record.u)
+        process_covariance = distribution_covariance(get_transition(model, before, record))
+        x = model.propagate(x, record.u, mean_noise(model, x))
+        after, observed_mask = x[:, :jacobians], ~torch.isnan(record.y).unsqueeze(1)
+        noise = distribution_covariance(model.observation(after, record.u))
         links.append(
             LinearisedStep(
                 x,
-                slope,
-                distribution_covariance(distribution),
-                measurement_jacobian(model, after, seen),
-                noise,
-                linearised_innovation(model, x, seen),
+                transition,
+                process_covariance,
+                measurement_jacobian(model, after, record),
+                mask_covariance(noise, observed_mask),
+                linearised_innovation(model, x, record),
             )
         )
     return links
 
 
 def _forward(links: list[LinearisedStep], shape: torch.Size) -> list[tuple[Tensor, Tensor]]:
-    """Filter the deviations from the noise-free path, at all steps but the last."""
+    """Filter the deviations from the noise-free path, except at the last step."""
     d = links[0].transition_jacobian.shape[-1]
-    m, p, filtered = (
-        links[0].x.new_zeros(*shape[:2], d),
-        links[0].transition_jacobian.new_zeros(1, 1, d, d),
-        [],
-    )
+    m = links[0].x.new_zeros(*shape[:2], d)
+    p = links[0].transition_jacobian.new_zeros(1, 1, d, d)
+    filtered = []
     for link in links[:-1]:
-        m, p = (
-            batch_product(link.transition_jacobian, m),
-            link.transition_jacobian @ p @ link.transition_jacobian.mT + link.process_covariance,
-        )
-        p, gain = _absorb(p, link.measurement_jacobian, link.noise)
-        m = m + batch_product(gain, link.residual - batch_product(link.measurement_jacobian, m))
+        f, h = link.transition_jacobian, link.measurement_jacobian
+        m, p = batch_product(f, m), f @ p @ f.mT + link.process_covariance
+        p, gain = _update_covariance(p, h, link.noise)
+        m = m + batch_product(gain, link.residual - batch_product(h, m))
         filtered.append((m, p))
     return filtered
 
 
-def _absorb(p: Tensor, h: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
+def _update_covariance(p: Tensor, h: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
     """Update a covariance by slope h and noise r in Joseph's form; return the gain."""
     gain = torch.linalg.solve_ex(h @ p @ h.mT + r, h @ p)[0].mT
-    factor_after = torch.eye(p.shape[-1], dtype=p.dtype, device=p.device) - gain @ h
-    return factor_after @ p @ factor_after.mT + gain @ r @ gain.mT, gain
+    remainder = torch.eye(p.shape[-1], dtype=p.dtype, device=p.device) - gain @ h
+    return remainder @ p @ remainder.mT + gain @ r @ gain.mT, gain
 
 
-def _solved(root: Tensor, x: Tensor) -> Tensor:
+def _whiten(root: Tensor, x: Tensor) -> Tensor:
     """Compute root^-1 x for lower triangular [R, 1 or N, d, d], vectors [R, N, d]."""
     if root.shape[1] == 1:
         return torch.linalg.solve_triangular(root[:, 0], x.mT, upper=False).mT

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import distribution_covariance, factor
 from pfbench.core.record import Record
@@ -22,7 +23,7 @@ from pfbench.model.base import StateSpaceModel
 
 
 @dataclass(frozen=True)
-class PathStatistics:
+class PathStatistics(PathHistory):
     """Gradient and curvature of a particle's log path density under fixed noises.
 
     If the newest state moves by delta, the log density changes by b.delta - delta' Lambda delta / 2
@@ -35,14 +36,16 @@ class PathStatistics:
     b_i = -P0^-1 xi_i. The derivative at each particle [ours] also uses variance measurements.
     """
 
-    def merge(self, other: PathHistory) -> PathHistory:
-        if isinstance(other, PathStatistics):
+    @override
+    def merge(self, history: PathHistory) -> PathHistory:
+        if isinstance(history, PathStatistics):
             return self
         raise ValueError(
-            "filter.moves must not combine NoiseFlowStatKernel or NoiseFlowGibbsKernel with other kernels, got both. "
-            "Remove the other kernels, since these two do not store paths."
+            "filter.moves must not combine NoiseFlowStatKernel or NoiseFlowGibbsKernel with other "
+            "kernels, got both. Remove the other kernels, because these two do not store paths."
         )
 
+    @override
     def start(
         self, model: StateSpaceModel, belief: ParticleBelief, mean: Tensor, covariance: Tensor
     ) -> ParticleBelief:
@@ -51,6 +54,7 @@ class PathStatistics:
         score = -model.chart.subtract(belief.x, mean.unsqueeze(1)) @ information
         return belief._replace(window={"score": score, "information": information.unsqueeze(1)})
 
+    @override
     def append(
         self,
         model: StateSpaceModel,
@@ -62,37 +66,32 @@ class PathStatistics:
         """Propagate information and score, and add those of the measurement."""
         chart = model.chart
         start, end = (
-            chart.mean(cloud.x, normalise_log_weights(cloud.log_w)).unsqueeze(1)
-            for cloud in (before, after)
+            chart.mean(belief.x, normalise_log_weights(belief.log_w)).unsqueeze(1)
+            for belief in (before, after)
         )
         inverse_step = torch.linalg.inv_ex(transition_jacobian(model, start, record.u)[:, 0])[0]
-        information = inverse_step.mT @ before.window["information"][
-            :, 0
-        ] @ inverse_step + fisher_information(model, end, record)
+        information = inverse_step.mT @ before.window["information"][:, 0] @ inverse_step
+        information = information + fisher_information(model, end, record)
         information = 0.5 * (information + information.mT)
         score = before.window["score"] @ inverse_step + _likelihood_gradient(model, after.x, record)
         return after._replace(window={"score": score, "information": information.unsqueeze(1)})
 
 
 def fisher_information(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
-    """Compute the Fisher information of a measurement, by moments if not normal.
+    """Compute the Fisher information of a measurement, by its moments if it is not normal.
 
     Args:
         model: State-space model.
         x: State, [R, 1, D].
-        seen: Record of the step.
+        record: Record of the step.
 
     Returns:
         Information matrix, [R, d, d].
     """
     observed_mask, h = ~torch.isnan(record.y), measurement_jacobian(model, x, record)[:, 0]
     distribution: Any = model.observation(x, record.u)
-    information = (
-        h.mT
-        @ torch.linalg.solve_ex(
-            mask_covariance(distribution_covariance(distribution)[:, 0], observed_mask), h
-        )[0]
-    )
+    covariance = mask_covariance(distribution_covariance(distribution)[:, 0], observed_mask)
+    information = h.mT @ torch.linalg.solve_ex(covariance, h)[0]
     if isinstance(distribution, torch.distributions.MultivariateNormal):
         return information
 
@@ -111,8 +110,6 @@ def _likelihood_gradient(model: StateSpaceModel, x: Tensor, record: Record) -> T
     with torch.enable_grad():
         xi = x.new_zeros(*x.shape[:2], model.chart.dimension, requires_grad=True)
         total = model.log_likelihood(record.y, model.chart.add(x.detach(), xi), record.u).sum()
-        return (
-            torch.autograd.grad(total, xi, materialize_grads=True)[0]
-            if total.requires_grad
-            else torch.zeros_like(xi)
-        )
+        if not total.requires_grad:
+            return torch.zeros_like(xi)
+        return torch.autograd.grad(total, xi, materialize_grads=True)[0]

@@ -1,4 +1,8 @@
-"""Resampling probabilities. The weights correct for them, so the filter stays exact, except with Flattened."""
+"""Auxiliary weights: resampling probabilities other than the weights, and tempering of weights.
+
+The weights after resampling correct for the probabilities, so the filter stays exact.
+`TemperedPosterior` is an exception, because it replaces the weights themselves.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
@@ -16,34 +21,43 @@ from pfbench.model.base import StateSpaceModel
 
 
 class AuxiliaryWeights(Protocol):
-    """Compute log resampling probabilities [R, N], logsumexp 0, of particles at t-1 from the record at t."""
+    """Resampling probabilities of the particles at t-1, given the record at t."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether every particle of positive weight has a positive probability."""
+        """True if every particle of positive weight has a positive probability."""
 
-    def __call__(
-        self, model: StateSpaceModel, belief: ParticleBelief, record: Record
-    ) -> Tensor: ...
+    def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
+        """Compute log resampling probabilities.
+
+        Args:
+            model: State-space model of the step.
+            belief: Weighted particles at t-1.
+            record: Record at t.
+
+        Returns:
+            Log probabilities [R, N], logsumexp 0.
+        """
 
 
 @dataclass(frozen=True)
-class PosteriorWeights:
+class PosteriorWeights(AuxiliaryWeights):
     """The weights themselves, as in the plain particle filter."""
 
     is_exact = True
 
+    @override
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
         return belief.log_w
 
 
 @dataclass(frozen=True)
-class LookAheadWeights:
+class LookAheadWeights(AuxiliaryWeights):
     """First-stage weights of the auxiliary particle filter: w p(y | x propagated with mean noise).
 
     Attributes:
-        likelihood_power: Exponent of the look-ahead likelihood. 1 is as published. Less avoids heavy-tailed
-            second-stage weights if the look-ahead is overconfident.
+        likelihood_power: Exponent of the look-ahead likelihood. 1 is as published. A smaller one
+            avoids heavy-tailed second-stage weights if the look-ahead is overconfident.
 
     References:
         Pitt and Shephard 1999.
@@ -55,9 +69,11 @@ class LookAheadWeights:
     def __post_init__(self) -> None:
         if not 0.0 < self.likelihood_power <= 1.0:
             raise ValueError(
-                f"auxiliary_weights.likelihood_power must be in (0, 1], got {self.likelihood_power}. Use 1 for the published filter"
+                f"auxiliary_weights.likelihood_power must be in (0, 1], got {self.likelihood_power}. "
+                "Use 1 for the published filter."
             )
 
+    @override
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
         mean_noise = model.noise.mean.expand(*belief.x.shape[:2], model.noise_dim)
         ahead = model.log_likelihood(
@@ -71,17 +87,18 @@ class LookAheadWeights:
 
 
 class Tempering(Protocol):
-    """Flatten log weights [R, N], logsumexp 0; -inf marks an inactive slot."""
+    """Tempering of weights: it makes them more uniform."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether positive weights stay positive."""
+        """True if positive weights stay positive."""
 
-    def __call__(self, log_w: Tensor) -> Tensor: ...
+    def __call__(self, log_w: Tensor) -> Tensor:
+        """Temper log weights [R, N], logsumexp 0; -inf marks an inactive slot."""
 
 
 @dataclass(frozen=True)
-class PowerTempering:
+class PowerTempering(Tempering):
     """a ~ W^(1 / (1 + strength)), which minimises KL(a || W) - strength H(a) [ours].
 
     Attributes:
@@ -95,14 +112,15 @@ class PowerTempering:
     def __post_init__(self) -> None:
         _check_strength(self.strength, torch.inf)
 
+    @override
     def __call__(self, log_w: Tensor) -> Tensor:
-        if self.strength == 0.0:  # the same object: the resampler then skips the correction
+        if self.strength == 0.0:  # the same object: the resampler then omits the correction
             return log_w
         return torch.log_softmax(log_w / (1.0 + self.strength), -1)
 
 
 @dataclass(frozen=True)
-class AdditiveTempering:
+class AdditiveTempering(Tempering):
     """a ~ W (1 - strength log W): each weight and its part of the entropy, a literal reading [ours].
 
     Attributes:
@@ -115,6 +133,7 @@ class AdditiveTempering:
     def __post_init__(self) -> None:
         _check_strength(self.strength, torch.inf)
 
+    @override
     def __call__(self, log_w: Tensor) -> Tensor:
         if self.strength == 0.0:
             return log_w
@@ -123,7 +142,7 @@ class AdditiveTempering:
 
 
 @dataclass(frozen=True)
-class UniformTempering:
+class UniformTempering(Tempering):
     """a = (1 - strength) W + strength / N, with N active particles [ours].
 
     Attributes:
@@ -136,6 +155,7 @@ class UniformTempering:
     def __post_init__(self) -> None:
         _check_strength(self.strength, 1.0)
 
+    @override
     def __call__(self, log_w: Tensor) -> Tensor:
         if self.strength == 0.0:
             return log_w
@@ -146,40 +166,42 @@ class UniformTempering:
 
 
 @dataclass(frozen=True)
-class TemperedWeights:
-    """Flattened weights as resampling probabilities only: more particles survive, without bias.
+class TemperedWeights(AuxiliaryWeights):
+    """Tempered weights as resampling probabilities only: more particles survive, without bias.
 
     Attributes:
-        tempering: How the weights are flattened.
+        tempering: Tempering of the weights.
     """
 
     tempering: Tempering = field(default_factory=PowerTempering)
 
     @property
+    @override
     def is_exact(self) -> bool:
-        """Whether the form keeps positive weights positive."""
         return is_every_part_exact(**{"preference.form": self.tempering})
 
+    @override
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
         return self.tempering(belief.log_w)
 
 
 @dataclass(frozen=True)
-class TemperedPosterior:
-    """Weights replaced by flattened ones, as printed, which biases the estimate and the evidence.
+class TemperedPosterior(WeightUpdate):
+    """Weights replaced by tempered ones, as printed, which biases the estimate and the evidence.
 
     The particles then represent another distribution, closer to the proposal. The sum of the weights
-    is kept, because flattening follows normalisation.
+    does not change, because tempering follows normalisation.
 
     Attributes:
-        tempering: How the weights are flattened.
-        weight_update: Weight update before flattening.
+        tempering: Tempering of the weights.
+        weight_update: Weight update before tempering.
     """
 
     tempering: Tempering = field(default_factory=PowerTempering)
     weight_update: WeightUpdate = field(default_factory=BayesWeightUpdate)
     is_exact = False
 
+    @override
     def __call__(
         self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
     ) -> Tensor:
@@ -187,13 +209,14 @@ class TemperedPosterior:
         total = value.logsumexp(1, keepdim=True)
         valid = torch.isfinite(total)
         log_w = torch.where(valid, value - total, 0.0)
-        flat = self.tempering(log_w)
-        return value if flat is log_w else torch.where(valid, flat + total, value)
+        tempered = self.tempering(log_w)
+        return value if tempered is log_w else torch.where(valid, tempered + total, value)
 
 
-def _check_strength(strength: float, most: float) -> None:
-    """Raise a ValueError if the strength is outside [0, most]."""
-    if not 0.0 <= strength <= most:
+def _check_strength(strength: float, maximum: float) -> None:
+    """Raise a ValueError if the strength is outside [0, maximum]."""
+    if not 0.0 <= strength <= maximum:
         raise ValueError(
-            f"tempering.strength must be from 0 to {most:g}, got {strength}. Use 0 for unchanged weights"
+            f"tempering.strength must be from 0 to {maximum:g}, got {strength}. "
+            "Use 0 for unchanged weights."
         )

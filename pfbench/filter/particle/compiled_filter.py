@@ -10,10 +10,12 @@ from functools import partial
 from typing import Any
 
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record, map_inputs
-from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
+from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo
+from pfbench.filter.loop import MultiStepFilter
 from pfbench.filter.particle.compiled_step import (
     CallCounter,
     CompiledStep,
@@ -27,14 +29,14 @@ log = logging.getLogger("pfbench")
 
 
 @dataclass(eq=False)
-class CompiledParticleFilter:
-    """A particle filter with compiled steps: same random numbers, same results to rounding.
+class CompiledParticleFilter(Filter, MultiStepFilter):
+    """Particle filter with compiled steps: same random numbers, same results to rounding.
 
     The first step runs uncompiled, because a proposal may start its memory there. The second is
     recorded and compiled, and small steps are taken several at a time. A step with a NaN particle is
     repeated uncompiled. After it, steps are taken one, two, four and so on at a time. If a step
-    cannot be compiled, the filter logs a warning and runs uncompiled. Stages must be pure functions:
-    a number that a stage stored between steps would be frozen.
+    cannot be compiled, the filter logs a warning and runs uncompiled. Stages must be pure functions,
+    because a compiled step would not change a number that a stage stores between steps.
 
     Attributes:
         method: The filter. With moves it runs uncompiled, because their path grows.
@@ -51,14 +53,16 @@ class CompiledParticleFilter:
     graphs: dict[Any, CompiledStep | None] = field(default_factory=dict)
 
     @property
+    @override
     def is_exact(self) -> bool:
         return self.method.is_exact
 
     @property
     def is_active(self) -> bool:
-        """Whether some kind of step runs compiled."""
+        """True if a kind of step runs compiled."""
         return any(graph is not None for graph in self.graphs.values())
 
+    @override
     def init(
         self,
         model: StateSpaceModel,
@@ -67,18 +71,18 @@ class CompiledParticleFilter:
         start: Tensor | None = None,
         spread: Tensor | None = None,
     ) -> ParticleBelief | GaussianBelief:
-        """Return the initial belief; see `Filter.init`."""
         return self.method.init(model, runs, draws, start, spread)
 
+    @override
     def step(
-        self, model: StateSpaceModel, belief: ParticleBelief, seen: Record, draws: RandomStream
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> tuple[ParticleBelief, StepInfo]:
-        """Take a single step; see `Filter.step`."""
-        u = map_inputs(lambda a: a.unsqueeze(1), seen.u)
-        record = seen._replace(y=seen.y.unsqueeze(1), u=u)
-        results, _ = self._take_steps(model, belief, record, draws, 1)
+        u = map_inputs(lambda a: a.unsqueeze(1), record.u)
+        with_time_axis = record._replace(y=record.y.unsqueeze(1), u=u)
+        results, _ = self._take_steps(model, belief, with_time_axis, draws, 1)
         return results[0]
 
+    @override
     def take_steps(
         self,
         model: StateSpaceModel,
@@ -88,7 +92,6 @@ class CompiledParticleFilter:
         draws: RandomStream,
         limit: int,
     ) -> tuple[list[tuple[ParticleBelief, StepInfo]], int]:
-        """Take several steps from step `t` on; see `Walker.take_steps`."""
         rest = record.select_steps(slice(t, None))
         return self._take_steps(model.at_step(t), belief, rest, draws.at_step(t + 1), limit)
 

@@ -7,7 +7,7 @@ operations that it consists of, and torch's compiler makes one function of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -30,9 +30,7 @@ from pfbench.kernels.step_compiler import (
 )
 from pfbench.model.base import StateSpaceModel
 
-_MAX_NUMBERS = (
-    1 << 20
-)  # numbers that steps taken together keep: the overhead of a call is then shared
+_MAX_NUMBERS = 1 << 20  # results of steps taken together; they share the overhead of a call
 _MAX_STEPS_CUDA = 64
 
 
@@ -54,7 +52,7 @@ class CompiledStep:
         trace: Names of the step's diagnostics.
         evaluations: Likelihood evaluations of a step.
         max_steps: Steps that may be taken together.
-        model: Model of the step. Kept alive, because steps are found by the model's identity.
+        model: Model of the step. Its identity is the key of the step, so it must stay alive.
     """
 
     run: TensorFunction
@@ -68,7 +66,7 @@ class CompiledStep:
     def run_steps(
         self, belief: ParticleBelief, record: Record, draws: PhiloxStream
     ) -> list[tuple[ParticleBelief, StepSummary]]:
-        """Take all steps of a record, without a look at the numbers of one before the next.
+        """Take all steps of a record in one call, without a check of numbers between them.
 
         Args:
             belief: Belief before the first step.
@@ -136,23 +134,8 @@ def compile_step(
         Exception: If the step cannot be recorded or compiled. torch raises many kinds.
     """
     names: list[list[str]] = []
-    state = _stored_belief(belief)
-
-    def step(*flat: Tensor) -> list[Tensor]:
-        number, *inputs, seed, runs = flat[len(state) :]
-        remaining = map(from_storage, [*flat[: len(state)], *inputs])
-        x, log_w, log_z = (next(remaining) for _ in range(3))
-        memory = replace_tensors(belief.memory, remaining)
-        step_record = replace_tensors(record, remaining)
-        before = belief._replace(x=x, log_w=log_w, log_evidence=log_z, memory=memory)
-        stream = PhiloxStream(seed, runs, draws.dtype, number)
-        with torch.no_grad(), compilation.capture_graph():
-            after, summary = method.compute_step(model, before, step_record, stream)
-        names[:] = [list(after.memory), list(summary.trace)]
-        carried = [after.x, after.log_w, after.log_evidence, *after.memory.values()]
-        return [to_storage(a) for a in (*carried, *summary[:3], *summary.trace.values())]
-
-    inputs = [to_storage(a) for a in tensors_in(record)]
+    step = _make_tensor_function(method, model, belief, record, draws, names)
+    state, inputs = _stored_belief(belief), [to_storage(a) for a in tensors_in(record)]
     shared = [torch.as_tensor(draws.seed), draws.runs]
     example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
     count = counter.count if counter else 0
@@ -170,16 +153,44 @@ def compile_step(
     return CompiledStep(run, entry, memory, trace, evaluations, max_steps, model)
 
 
+def _make_tensor_function(
+    method: ParticleFilter,
+    model: StateSpaceModel,
+    belief: ParticleBelief,
+    record: Record,
+    draws: PhiloxStream,
+    names: list[list[str]],
+) -> Callable[..., list[Tensor]]:
+    """Return a step as a function of tensors; it fills in the names of its memory and trace."""
+    carried_count = len(_stored_belief(belief))
+
+    def step(*flat: Tensor) -> list[Tensor]:
+        number, *inputs, seed, runs = flat[carried_count:]
+        remaining = map(from_storage, [*flat[:carried_count], *inputs])
+        x, log_w, log_z = (next(remaining) for _ in range(3))
+        memory = replace_tensors(belief.memory, remaining)
+        step_record = replace_tensors(record, remaining)
+        before = belief._replace(x=x, log_w=log_w, log_evidence=log_z, memory=memory)
+        stream = PhiloxStream(seed, runs, draws.dtype, number)
+        with torch.no_grad(), compilation.capture_graph():
+            after, summary = method.compute_step(model, before, step_record, stream)
+        names[:] = [list(after.memory), list(summary.trace)]
+        carried = [after.x, after.log_w, after.log_evidence, *after.memory.values()]
+        return [to_storage(a) for a in (*carried, *summary[:3], *summary.trace.values())]
+
+    return step
+
+
 def tensors_in(tree: Any) -> list[Tensor]:
     """Return the tensors of nested tuples and dicts, in order."""
     if isinstance(tree, Tensor):
         return [tree]
-    parts = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, tuple) else ()
-    return [a for part in parts for a in tensors_in(part)]
+    subtrees = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, tuple) else ()
+    return [a for subtree in subtrees for a in tensors_in(subtree)]
 
 
 def replace_tensors(tree: Any, tensors: Iterator[Tensor]) -> Any:
-    """Return nested tuples and dicts with other tensors.
+    """Replace the tensors of nested tuples and dicts.
 
     Args:
         tree: Nested tuples and dicts.
@@ -191,10 +202,10 @@ def replace_tensors(tree: Any, tensors: Iterator[Tensor]) -> Any:
     if isinstance(tree, Tensor):
         return next(tensors)
     if isinstance(tree, dict):
-        return {name: replace_tensors(part, tensors) for name, part in tree.items()}
+        return {name: replace_tensors(subtree, tensors) for name, subtree in tree.items()}
     if isinstance(tree, tuple):
-        parts = [replace_tensors(part, tensors) for part in tree]
-        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+        subtrees = [replace_tensors(subtree, tensors) for subtree in tree]
+        return type(tree)(*subtrees) if hasattr(tree, "_fields") else tuple(subtrees)
     return tree
 
 

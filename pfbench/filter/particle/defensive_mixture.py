@@ -1,4 +1,7 @@
-"""Defensive mixtures: a fraction of the particles follows the model, which bounds all weights [Hesterberg 1995]."""
+"""Defensive mixtures: a fraction of the particles follows the model, which bounds all weights.
+
+See [Hesterberg 1995].
+"""
 
 from __future__ import annotations
 
@@ -24,32 +27,41 @@ class DefensiveSelection(NamedTuple):
     fraction: Tensor
 
     def log_mixture(self, log_p: Tensor, log_q: Tensor) -> Tensor:
-        """Return log(share p + (1 - share) q), [R, N]."""
+        """Compute the log density of the mixture, log(fraction p + (1 - fraction) q).
+
+        Args:
+            log_p: Log density p of the model, [R, N].
+            log_q: Log density q of the other particles, [R, N].
+
+        Returns:
+            Log density, [R, N].
+        """
         return torch.logaddexp(
             log_p + torch.log(self.fraction), log_q + torch.log1p(-self.fraction)
         )
 
 
 def choose_defensive_particles(
-    share: float, live: Tensor, draws: RandomStream, purpose: str
+    fraction: float, active_mask: Tensor, draws: RandomStream, purpose: str
 ) -> DefensiveSelection:
     """Choose a fraction of the active particles by a random order, and all inactive slots.
 
     The order is drawn at each step, because neighbours after resampling are copies of one particle.
 
     Args:
-        share: Fraction.
-        live: Active particles, [R, N].
+        fraction: Fraction of the active particles.
+        active_mask: Active particles, [R, N].
         draws: Random stream.
         purpose: Label of the draw.
 
     Returns:
         Mask and fraction.
     """
-    count = live.sum(1, keepdim=True).clamp(min=1).to(draws.dtype)
-    lot = torch.where(live, draws.uniform(purpose, live.shape[1], 1).squeeze(-1), torch.inf)
-    target = torch.round(share * count)
-    return DefensiveSelection((lot.argsort(1).argsort(1) < target) | ~live, target / count)
+    count = active_mask.sum(1, keepdim=True).clamp(min=1).to(draws.dtype)
+    u = draws.uniform(purpose, active_mask.shape[1], 1).squeeze(-1)
+    rank = torch.where(active_mask, u, torch.inf).argsort(1).argsort(1)
+    target = torch.round(fraction * count)
+    return DefensiveSelection((rank < target) | ~active_mask, target / count)
 
 
 def check_fraction(name: str, value: float) -> None:
@@ -63,7 +75,7 @@ def check_fraction(name: str, value: float) -> None:
         ValueError: If it is outside [0, 1].
     """
     if not 0.0 <= value <= 1.0:
-        raise ValueError(f"{name} must be from 0 to 1, got {value}. Choose a fraction")
+        raise ValueError(f"{name} must be from 0 to 1, got {value}. Choose a fraction.")
 
 
 class AffineMap(NamedTuple):
@@ -84,22 +96,19 @@ class AffineMap(NamedTuple):
 
         Args:
             e: Samples, [R, N, k].
-            kept: Defensive selection, None for none.
+            selection: Defensive selection, None for no particle.
             log_p: Log density, [R, N].
 
         Returns:
             New samples and log p - log q, where q is p under the map, mixed with p.
         """
-        new, log_det = (
-            batch_product(self.matrix, e) + self.offset,
-            torch.linalg.slogdet(self.matrix)[1],
-        )
+        new = batch_product(self.matrix, e) + self.offset
+        log_det = torch.linalg.slogdet(self.matrix)[1]
         if selection is None:
             return new, log_p(new) - log_p(e) + log_det
-        stays = selection.mask.unsqueeze(-1)
-        back = torch.where(
-            stays, batch_product(torch.linalg.inv_ex(self.matrix)[0], e - self.offset), e
-        )  # the preimage of new
-        new = torch.where(stays, e, new)
+        mask = selection.mask.unsqueeze(-1)
+        preimage_of_e = batch_product(torch.linalg.inv_ex(self.matrix)[0], e - self.offset)
+        preimage = torch.where(mask, preimage_of_e, e)
+        new = torch.where(mask, e, new)
         log_new = log_p(new)
-        return new, log_new - selection.log_mixture(log_new, log_p(back) - log_det)
+        return new, log_new - selection.log_mixture(log_new, log_p(preimage) - log_det)

@@ -1,8 +1,8 @@
 """Gaussian particle filter: the belief is a normal distribution, and particles only integrate.
 
 As stages: the resampler draws particles from the normal distribution with the old mean and covariance,
-and the proposal propagates them. Only two moments are kept, so particles have no past. On linear-Gaussian
-models it converges to the Kalman filter.
+and the proposal propagates them. The belief stores two moments only, so moves, which need the past of
+particles, are impossible. On linear-Gaussian models the filter converges to the Kalman filter.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.chart import Chart
 from pfbench.core.covariance import factor
@@ -19,13 +20,14 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.exactness import is_every_part_exact
 from pfbench.filter.particle.point_sets import IidPoints, PointSet
-from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
+from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
+from pfbench.filter.particle.resampling import Resampler
 from pfbench.filter.particle.weight_update import deactivate_invalid_particles
 from pfbench.model.base import StateSpaceModel
 
 
 @dataclass(frozen=True)
-class GaussianResampler:
+class GaussianResampler(Resampler):
     """New equally weighted particles from N(mean, covariance) of the old ones, in the chart.
 
     Low-discrepancy points give the quasi-Monte-Carlo Gaussian particle filter [Guo and Wang 2006].
@@ -41,6 +43,7 @@ class GaussianResampler:
     points: PointSet = field(default_factory=IidPoints)
     is_exact = False  # unless the posterior is normal
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,
@@ -57,8 +60,8 @@ class GaussianResampler:
 
 
 @dataclass(frozen=True)
-class GaussianPredictionProposal:
-    """Noise of the model, and optionally new particles from the normal distribution of the prediction.
+class GaussianPredictionProposal(Proposal):
+    """Noise of the model, and optionally new particles from the predicted normal distribution.
 
     With the second draw q = N(predicted mean, covariance), so the weight p(y | x) N(x; predicted) / q(x)
     is p(y | x). Without it the propagated particles are weighted. In both cases the ratio is 0.
@@ -66,7 +69,7 @@ class GaussianPredictionProposal:
     Attributes:
         points: Point set of noise and second draw. The noise uses the axes after those of the
             resampler, so states and noises are points of one set.
-        redraw_after_prediction: Whether to draw again, as published.
+        redraw_after_prediction: True draws again, as published.
 
     References:
         Kotecha and Djuric 2003. Pu and Qin, "Application of quasi Monte Carlo polymerization
@@ -77,12 +80,14 @@ class GaussianPredictionProposal:
     redraw_after_prediction: bool = True
 
     @property
+    @override
     def is_exact(self) -> bool:
-        """Whether the particles are those of the model."""
+        """True if the particles are those of the model."""
         return not self.redraw_after_prediction and is_every_part_exact(
             **{"proposal.points": self.points}
         )
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
@@ -91,20 +96,18 @@ class GaussianPredictionProposal:
         )
         if not self.redraw_after_prediction:
             return first
-        x, log_w = deactivate_invalid_particles(
-            first.x, belief.log_w, belief.x
-        )  # one NaN would spread to all particles
-        x, ok = _redrawn(
-            model.chart, belief._replace(x=x, log_w=log_w), self.points(draws), "predicted"
-        )
-        lost = torch.where(ok.unsqueeze(-1), first.log_ratio, -torch.inf)
-        return ProposalSample(x, lost, belief.memory)
+        # one NaN would spread to all particles
+        x, log_w = deactivate_invalid_particles(first.x, belief.log_w, belief.x)
+        predicted = belief._replace(x=x, log_w=log_w)
+        x, ok = _redrawn(model.chart, predicted, self.points(draws), "predicted")
+        log_ratio = torch.where(ok.unsqueeze(-1), first.log_ratio, -torch.inf)
+        return ProposalSample(x, log_ratio, belief.memory)
 
 
 def _redrawn(
     chart: Chart, belief: ParticleBelief, draws: RandomStream, purpose: str
 ) -> tuple[Tensor, Tensor]:
-    """Draw particles from the normal distribution of a belief, with a mask of valid covariances [R]."""
+    """Draw particles from the normal distribution of a belief; mask valid covariances [R]."""
     mean, covariance = weighted_mean_cov(chart, belief)
     root, ok = factor(covariance)
     z = draws.normal(purpose, belief.x.shape[1], covariance.shape[-1])
@@ -112,11 +115,11 @@ def _redrawn(
 
 
 def refuse_history(belief: ParticleBelief, method_name: str) -> None:
-    """Check that particles store nothing of their own.
+    """Check that particles store no window and no memory of their own.
 
     Args:
-        cloud: Weighted particles.
-        who: Name of the method, for the message.
+        belief: Weighted particles.
+        method_name: Name of the method, for the message.
 
     Raises:
         ValueError: If new particles would lose a past or a memory.
@@ -127,6 +130,7 @@ def refuse_history(belief: ParticleBelief, method_name: str) -> None:
     ]
     if stored:
         raise ValueError(
-            f"filter.resampler must copy particles that store {', '.join(stored)}, but {method_name} draws new ones without a past; "
-            "choose a proposal without memory and no moves, or another resampler"
+            f"filter.resampler must copy particles that store {', '.join(stored)}, got {method_name}, "
+            "which draws new ones without a past. Choose a proposal without memory and no moves, or "
+            "another resampler."
         )

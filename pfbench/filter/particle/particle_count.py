@@ -7,38 +7,40 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.filter.belief import ParticleBelief, ess
 
 
 class ParticleCount(Protocol):
-    """Compute the number of particles of each run, float [R, 1], at most the number of slots."""
+    """Number of active particles of each run, at most the number of slots."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether the number depends on the belief before resampling alone."""
+        """True if the number depends on the belief before resampling alone."""
 
     def initial_count(self, slots: int) -> int:
         """Return the initial number."""
 
-    def __call__(self, belief: ParticleBelief) -> Tensor: ...
+    def __call__(self, belief: ParticleBelief) -> Tensor:
+        """Compute the number for the next step, float [R, 1], from the belief before it."""
 
 
 @dataclass(frozen=True)
-class FixedCount:
+class FixedCount(ParticleCount):
     """All slots at every step."""
 
     is_exact = True
 
+    @override
     def initial_count(self, slots: int) -> int:
-        """Return the initial number."""
         return slots
 
+    @override
     def __call__(self, belief: ParticleBelief) -> Tensor:
         runs, slots = belief.log_w.shape
-        return torch.full((runs, 1), slots, dtype=torch.float64, device=belief.log_w.device).to(
-            belief.log_w.dtype
-        )
+        count = torch.full((runs, 1), slots, dtype=torch.float64, device=belief.log_w.device)
+        return count.to(belief.log_w.dtype)
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,9 @@ class CountLimits:
     def __post_init__(self) -> None:
         if not 2 <= self.minimum <= self.initial <= self.maximum:
             raise ValueError(
-                f"particle_count.limits must satisfy 2 <= minimum <= initial <= maximum, got minimum={self.minimum}, "
-                f"initial={self.initial}, maximum={self.maximum}. Put them in order"
+                "particle_count.limits must satisfy 2 <= minimum <= initial <= maximum, got "
+                f"minimum={self.minimum}, initial={self.initial}, maximum={self.maximum}. "
+                "Put them in order."
             )
 
     def initial_count(self, slots: int) -> int:
@@ -74,13 +77,13 @@ class CountLimits:
         if self.maximum > slots:
             raise ValueError(
                 f"particle_count.limits.maximum must be at most filter.particles={slots}, got {self.maximum}. "
-                "Raise filter.particles or lower maximum and initial"
+                "Raise filter.particles or lower maximum and initial."
             )
         return self.initial
 
 
 @dataclass(frozen=True)
-class EssStepCount:
+class EssStepCount(ParticleCount):
     """More particles if ESS < threshold N, else fewer [COFM-AMSSRCPF 2024, Measurement and Control].
 
     ESS is that of the weights at t-1, and decides the number at t, so the evidence stays unbiased.
@@ -104,16 +107,18 @@ class EssStepCount:
     def __post_init__(self) -> None:
         if self.increment < 0 or not 0.0 <= self.ess_threshold <= 1.0:
             raise ValueError(
-                f"particle_count.increment must be 0 or more and particle_count.ess_threshold from 0 to 1, got increment={self.increment}, "
-                f"ess_threshold={self.ess_threshold}. Choose both in range"
+                "particle_count.increment must be 0 or more and particle_count.ess_threshold from 0 to 1, "
+                f"got increment={self.increment}, ess_threshold={self.ess_threshold}. "
+                "Choose both in range."
             )
 
+    @override
     def initial_count(self, slots: int) -> int:
-        """Return the initial number."""
         return self.limits.initial_count(slots)
 
+    @override
     def __call__(self, belief: ParticleBelief) -> Tensor:
-        n = _occupied(belief)
+        n = _active_count(belief)
         if self.increment == 0:
             return torch.full_like(n, self.limits.initial)
         number = torch.where(
@@ -125,8 +130,8 @@ class EssStepCount:
 
 
 @dataclass(frozen=True)
-class EssTargetCount:
-    """As many particles as would have the target ESS: N target / ESS, within limits [ours].
+class EssTargetCount(ParticleCount):
+    """N target / ESS particles, within limits: the target ESS if ESS / N does not change [ours].
 
     Attributes:
         target: Effective sample size.
@@ -143,18 +148,20 @@ class EssTargetCount:
     def __post_init__(self) -> None:
         if not self.target > 0.0:
             raise ValueError(
-                f"particle_count.target must be positive, got {self.target}. Choose an effective sample size"
+                f"particle_count.target must be positive, got {self.target}. "
+                "Choose an effective sample size."
             )
 
+    @override
     def initial_count(self, slots: int) -> int:
-        """Return the initial number."""
         return self.limits.initial_count(slots)
 
+    @override
     def __call__(self, belief: ParticleBelief) -> Tensor:
-        number = _occupied(belief) * self.target / ess(belief.log_w).unsqueeze(1)
+        number = _active_count(belief) * self.target / ess(belief.log_w).unsqueeze(1)
         return number.round().clamp(self.limits.minimum, self.limits.maximum)
 
 
-def _occupied(belief: ParticleBelief) -> Tensor:
+def _active_count(belief: ParticleBelief) -> Tensor:
     """Return the number of active particles [R, 1], as float."""
     return (belief.log_w > -torch.inf).sum(1, keepdim=True).to(belief.log_w)

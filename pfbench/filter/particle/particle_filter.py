@@ -9,16 +9,17 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import distribution_covariance
 from pfbench.core.derived_stream import relabel
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
-from pfbench.filter.belief import ParticleBelief, StepInfo
+from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
 from pfbench.filter.exactness import is_every_part_exact
-from pfbench.filter.moves.metropolis import Move, combine_histories
-from pfbench.filter.moves.path_history import PathHistory
+from pfbench.filter.moves.metropolis import Move
+from pfbench.filter.moves.path_history import PathHistory, combine_histories
 from pfbench.filter.particle.auxiliary_weights import AuxiliaryWeights, PosteriorWeights
 from pfbench.filter.particle.particle_count import FixedCount, ParticleCount
 from pfbench.filter.particle.particle_moments import (
@@ -42,15 +43,15 @@ from pfbench.model.base import StateSpaceModel, initial_law
 
 
 class Stage(Protocol):
-    """What every stage states."""
+    """Stage of a particle filter, which states whether it is asymptotically exact."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether the weighted particles converge to the posterior as N grows."""
+        """True if the weighted particles converge to the posterior as N grows."""
 
 
 @dataclass(frozen=True)
-class ParticleFilter:
+class ParticleFilter(Filter):
     """Particle filter composed of stages. The object holds no particles.
 
     A step resamples first, so the belief that it returns is weighted, and the log evidence is a sum of
@@ -83,18 +84,20 @@ class ParticleFilter:
     def __post_init__(self) -> None:
         if self.particles < 2:
             raise ValueError(
-                f"filter.particles must be at least 2, got {self.particles}. Choose more particles"
+                f"filter.particles must be at least 2, got {self.particles}. Choose more particles."
             )
         _ = self.is_exact  # warns of each stage that does not state it
         if self.history is not None and not isinstance(self.resampler, EssResampler):
             name = type(self.resampler).__name__
             raise ValueError(
-                f"filter.resampler must copy particles with their past for moves, got {name}. Choose EssResampler"
+                f"filter.resampler must copy particles with their past for moves, got {name}. "
+                "Choose EssResampler."
             )
 
     @property
+    @override
     def is_exact(self) -> bool:
-        """Whether every stage states that the particles converge to p(x_t | y_1:t)."""
+        """True if every stage states that the particles converge to p(x_t | y_1:t)."""
         stages = (
             "resampler",
             "particle_count",
@@ -109,8 +112,9 @@ class ParticleFilter:
     @property
     def history(self) -> PathHistory | None:
         """History that the moves require."""
-        return combine_histories(self.moves)
+        return combine_histories([move.required_history for move in self.moves])
 
+    @override
     def init(
         self,
         model: StateSpaceModel,
@@ -120,78 +124,103 @@ class ParticleFilter:
         spread: Tensor | None = None,
     ) -> ParticleBelief:
         """Draw N equally weighted particles of the initial distribution."""
-        law: Any = initial_law(model, runs, spread)
-        x = draw_initial_state(model, law, self.points(draws), "initial", self.particles, start)
+        initial: Any = initial_law(model, runs, spread)
+        x = draw_initial_state(model, initial, self.points(draws), "initial", self.particles, start)
         first = self.particle_count.initial_count(self.particles)
         log_w = torch.full(x.shape[:2], -math.log(first), dtype=x.dtype, device=x.device)
         log_w[:, first:] = -torch.inf
-        cloud = ParticleBelief(
+        belief = ParticleBelief(
             x=x, log_w=log_w, log_evidence=torch.zeros_like(log_w[:, 0], dtype=torch.float64)
         )
         if self.history is None:
-            return cloud
+            return belief
         origin = model.origin.expand(1, -1) if start is None else start
-        mean = model.chart.add(origin, law.mean)
-        return self.history.start(
-            model, cloud, mean.expand(runs, -1), distribution_covariance(law).expand(runs, -1, -1)
-        )
+        mean = model.chart.add(origin, initial.mean).expand(runs, -1)
+        covariance = distribution_covariance(initial).expand(runs, -1, -1)
+        return self.history.start(model, belief, mean, covariance)
 
+    @override
     def step(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> tuple[ParticleBelief, StepInfo]:
         """Return the weighted particles at t from those at t-1 and the record at t."""
-        cloud, told = self.compute_step(model, belief, record, draws)
-        return cloud, self.make_info(model, cloud, told, lambda: record)
+        belief, summary = self.compute_step(model, belief, record, draws)
+        return belief, self.make_info(model, belief, summary, lambda: record)
 
     def compute_step(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> tuple[ParticleBelief, StepSummary]:
-        """Do the same with tensors only, for the compiler."""
-        trace: dict[str, Tensor] = {}
-        log_a = self.auxiliary_weights(model, belief, record)
-        cloud, trace["resampled"] = self.resampler(
-            model, belief, log_a, self.particle_count(belief), draws
-        )
-        if cloud.ancestors is not None:
-            trace["ancestors"] = count_distinct_ancestors(cloud.ancestors, cloud.log_w)
-        for i, move in enumerate(self.moves):
-            cloud, trace[f"accepted_{i}"] = move(
-                model, cloud, trace["resampled"], relabel(draws, f"move_{i}.")
-            )
-        if self.moves and cloud.ancestors is not None:
-            trace["unique"] = count_distinct_ancestors(cloud.ancestors, cloud.log_w)
-        x, log_ratio, memory, w, told = self.proposal(model, cloud, record, draws)
-        log_w = self.weight_update(model, cloud.log_w, x, log_ratio, record)
-        x, log_w = deactivate_invalid_particles(x, log_w, cloud.x)
-        expected = cloud.log_w + log_ratio
+        """Take a step with tensors only, as the compiler requires.
+
+        Args:
+            model: State-space model of the step.
+            belief: Weighted particles at t-1.
+            record: Record at t.
+            draws: Random stream of the step.
+
+        Returns:
+            Weighted particles at t, and a summary of the step.
+        """
+        parents, trace = self._resample_and_move(model, belief, record, draws)
+        x, log_ratio, memory, w, proposal_trace = self.proposal(model, parents, record, draws)
+        log_w = self.weight_update(model, parents.log_w, x, log_ratio, record)
+        x, log_w = deactivate_invalid_particles(x, log_w, parents.x)
+        predicted_log_w = parents.log_w + log_ratio
         # a lost run keeps an evidence of -inf and continues with equal weights
         log_w, total, normalised_w, trace["ess"] = normalise_updated_weights(log_w)
         if not isinstance(self.particle_count, FixedCount):
-            trace["particles"] = (cloud.log_w > -torch.inf).sum(1).to(log_w)
-        parents, keeper = cloud, self.history
-        cloud = cloud._replace(
+            trace["particles"] = (parents.log_w > -torch.inf).sum(1).to(log_w)
+        children = parents._replace(
             x=x,
             log_w=log_w,
             log_evidence=belief.log_evidence + total,
             memory=memory,
             ancestors=None,
         )
-        if keeper is not None:
-            cloud = keeper.append(model, parents, cloud, w, record)
-        return cloud, StepSummary(
-            *weighted_mean_variance(model, cloud, normalised_w), expected, trace | told
+        if (history := self.history) is not None:
+            children = history.append(model, parents, children, w, record)
+        moments = weighted_mean_variance(model, children, normalised_w)
+        return children, StepSummary(*moments, predicted_log_w, trace | proposal_trace)
+
+    def _resample_and_move(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> tuple[ParticleBelief, dict[str, Tensor]]:
+        """Return the parents of the particles at t, and diagnostics of resampling and moves."""
+        trace: dict[str, Tensor] = {}
+        log_a = self.auxiliary_weights(model, belief, record)
+        belief, trace["resampled"] = self.resampler(
+            model, belief, log_a, self.particle_count(belief), draws
         )
+        if belief.ancestors is not None:
+            trace["ancestors"] = count_distinct_ancestors(belief.ancestors, belief.log_w)
+        for i, move in enumerate(self.moves):
+            belief, trace[f"accepted_{i}"] = move(
+                model, belief, trace["resampled"], relabel(draws, f"move_{i}.")
+            )
+        if self.moves and belief.ancestors is not None:
+            trace["unique"] = count_distinct_ancestors(belief.ancestors, belief.log_w)
+        return belief, trace
 
     def make_info(
         self,
         model: StateSpaceModel,
         belief: ParticleBelief,
-        told: StepSummary,
-        seen: Callable[[], Record],
+        summary: StepSummary,
+        get_record: Callable[[], Record],
     ) -> StepInfo:
-        """Return what a report needs. It rarely asks for the record."""
+        """Make the information of a step for a report.
+
+        Args:
+            model: State-space model of the step.
+            belief: Weighted particles after the step.
+            summary: Summary of the step.
+            get_record: Returns the record of the step. A report rarely needs it.
+
+        Returns:
+            Information of the step; covariances and NIS are computed on request.
+        """
 
         def nis() -> tuple[Tensor, Tensor]:
-            return compute_nis(model, belief.x, told.predicted_log_w, seen())
+            return compute_nis(model, belief.x, summary.predicted_log_w, get_record())
 
-        return make_step_info(model, belief, told.mean, told.variance, told.trace, nis)
+        return make_step_info(model, belief, summary.mean, summary.variance, summary.trace, nis)

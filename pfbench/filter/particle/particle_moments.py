@@ -38,11 +38,11 @@ class StepSummary(NamedTuple):
 
 
 def summarise(model: StateSpaceModel, belief: ParticleBelief, trace: dict[str, Tensor]) -> StepInfo:
-    """Return mean and variance of particles for the report, without a copy of them.
+    """Return mean and variance of particles for a report, without a copy of them.
 
     Args:
         model: State-space model.
-        cloud: Weighted particles.
+        belief: Weighted particles.
         trace: Numbers per run, {name: [R]}.
 
     Returns:
@@ -63,7 +63,7 @@ def weighted_mean_variance(
 
     Args:
         model: State-space model.
-        cloud: Particles.
+        belief: Particles.
         w: Normalised weights, [R, N].
 
     Returns:
@@ -86,11 +86,11 @@ def make_step_info(
     trace: dict[str, Tensor],
     nis: Callable[[], tuple[Tensor, Tensor]] | None = None,
 ) -> StepInfo:
-    """Return what a report needs of particles whose mean and variance are computed.
+    """Make the information of a step from particles, their mean and their variance.
 
     Args:
         model: State-space model.
-        cloud: Weighted particles.
+        belief: Weighted particles.
         mean: Their mean, [R, D].
         variance: Their variance in the chart, [R, d].
         trace: Numbers per run, {name: [R]}.
@@ -111,12 +111,12 @@ def make_step_info(
     def w() -> Tensor:  # once for all groups; the weights are normalised already
         return torch.exp(belief.log_w)
 
-    def some(groups: Tensor) -> Tensor:
+    def group_covariance(groups: Tensor) -> Tensor:
         if model.chart.flat:
             return _spread(belief.x, mean, w(), groups)
         return _spread(deviations()[0], torch.zeros_like(variance), w(), groups)
 
-    return StepInfo(mean, variance, covariance, trace, deviations, nis, some)
+    return StepInfo(mean, variance, covariance, trace, deviations, nis, group_covariance)
 
 
 def compute_nis(
@@ -128,33 +128,33 @@ def compute_nis(
         model: State-space model.
         x: Predicted particles, [R, N, D].
         log_w: Log weights before the measurement update, [R, N].
-        seen: Record of the step; NaN marks a missing component.
+        record: Record of the step; NaN marks a missing component.
 
     Returns:
-        NIS [R], NaN where the observation distribution has no finite mean and variance, and the
-        number of observed components [R], which is its expectation.
+        NIS [R] and the number of observed components [R], which is its expectation. The NIS is NaN
+        where the mean or variance of the observation distribution is infinite.
     """
-    law: Any = model.observation(x, record.u)
+    predicted_y: Any = model.observation(x, record.u)
     w, observed_mask = normalise_log_weights(log_w).unsqueeze(-1), ~torch.isnan(record.y)
-    if not has_finite_moments(law):
+    if not has_finite_moments(predicted_y):
         return torch.full_like(log_w[:, 0], torch.nan), observed_mask.sum(1)
-    y_hat = around_first(model.residual)(law.mean, w.squeeze(-1))
-    deviations = torch.where(w > 0.0, model.residual(law.mean, y_hat.unsqueeze(1)), 0.0)
-    covariance = shared_distribution_covariance(law)
+    y_hat = around_first(model.residual)(predicted_y.mean, w.squeeze(-1))
+    deviations = torch.where(w > 0.0, model.residual(predicted_y.mean, y_hat.unsqueeze(1)), 0.0)
+    covariance = shared_distribution_covariance(predicted_y)
     noise = (w.unsqueeze(-1) * covariance).sum(1) if covariance.shape[1] > 1 else covariance[:, 0]
     r = torch.where(observed_mask, model.residual(record.y.nan_to_num(), y_hat), 0.0)
-    every = torch.arange(deviations.shape[-1], device=deviations.device).unsqueeze(0)
-    spread = _spread(deviations, torch.zeros_like(y_hat), w.squeeze(-1), every).squeeze(1)
+    all_components = torch.arange(deviations.shape[-1], device=deviations.device).unsqueeze(0)
+    spread = _spread(deviations, torch.zeros_like(y_hat), w.squeeze(-1), all_components).squeeze(1)
     return squared_length(r, mask_covariance(spread + noise, observed_mask)), observed_mask.sum(1)
 
 
-def _marked(copy_of: Tensor, log_w: Tensor) -> Tensor:
+def _count_distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:
     """Return the number of distinct values below 2 N in copy_of [R, N] at active slots, [R]."""
     marks = torch.zeros(len(copy_of), 2 * copy_of.shape[1], dtype=log_w.dtype, device=log_w.device)
     return (marks.scatter_add_(1, copy_of, (log_w > -torch.inf).to(log_w.dtype)) > 0.0).sum(1)
 
 
-count_distinct_ancestors = compilable(_marked, operator=cpp.count_unique)
+count_distinct_ancestors = compilable(_count_distinct, operator=cpp.count_unique)
 
 
 def _separate_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
@@ -166,9 +166,9 @@ def _separate_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
 
 def _fused_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """Return weighted mean and variance [R, D] of numbers [R, N, D] by weights [R, N]."""
-    parts = x.permute(2, 0, 1)
-    mean = (w * parts).sum(-1)
-    d = parts - mean.unsqueeze(-1)
+    components = x.permute(2, 0, 1)
+    mean = (w * components).sum(-1)
+    d = components - mean.unsqueeze(-1)
     return mean.T, (w * d * d).sum(-1).T
 
 

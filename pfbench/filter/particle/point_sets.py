@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
+from typing_extensions import override
 
 from pfbench.core.derived_stream import DerivedStream
 from pfbench.core.random_stream import PhiloxStream, RandomStream
@@ -24,11 +25,11 @@ _BITS = 30  # of a point of the Sobol engine of torch
 
 
 class PointSet(Protocol):
-    """Return a stream that draws n points in w dimensions at a time."""
+    """Point set: n points in w dimensions at a time, as a random stream."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether each point has the stream's distribution."""
+        """True if each point has the stream's distribution."""
 
     def __call__(self, draws: RandomStream, first: int = 0) -> RandomStream:
         """Return the stream of points.
@@ -44,24 +45,49 @@ class PointSet(Protocol):
 
 
 @dataclass(frozen=True)
-class IidPoints:
+class IidPoints(PointSet):
     """Plain Monte Carlo."""
 
     is_exact = True
 
+    @override
     def __call__(self, draws: RandomStream, first: int = 0) -> RandomStream:
         return draws
 
 
+class ShiftedPoints(PointSet, Protocol):
+    """Fixed points with a new uniform shift for each run, step, label and axis."""
+
+    def shift_points(self, axes: range, n: int, shift: Tensor) -> Tensor:
+        """Compute points 0 to n - 1 under a shift.
+
+        Args:
+            axes: Axes of the set, w of them.
+            n: Number of points.
+            shift: Uniform shift, [w, R, 1].
+
+        Returns:
+            Points in (0, 1), [w, R, n].
+        """
+
+    @override
+    def __call__(self, draws: RandomStream, first: int = 0) -> RandomStream:
+        def uniforms(draws: RandomStream, purpose: str, n: int, w: int) -> Tensor:
+            shift = draws.uniform(purpose, 1, w).permute(2, 0, 1)
+            return self.shift_points(range(first, first + w), n, shift).permute(1, 2, 0)
+
+        return DerivedStream(draws, uniforms)
+
+
 @dataclass(frozen=True)
-class HaltonPoints:
+class HaltonPoints(ShiftedPoints):
     """Radical inverses in the first prime bases [Halton 1960], shifted modulo 1.
 
     Attributes:
         skip: Number of points omitted at the beginning.
-        permute_digits: Permute the digits of each base by a fixed permutation [Owen 2017; ours]. Without it
-            neighbouring axes of large base are correlated: 0.27 for some of 21 axes with 400 points,
-            0.05 by chance. With six axes the effect is negligible.
+        permute_digits: Permute the digits of each base by a fixed permutation [Owen 2017; ours].
+            Without it neighbouring axes of large base are correlated: 0.27 for some of 21 axes with
+            400 points, 0.05 by chance. With six axes the effect is negligible.
 
     Raises:
         ValueError: If the number is negative.
@@ -77,57 +103,38 @@ class HaltonPoints:
     def __post_init__(self) -> None:
         if self.skip < 0:
             raise ValueError(
-                f"points.skip must be 0 or more, got {self.skip}. Choose the number of points to omit"
+                f"points.skip must be 0 or more, got {self.skip}. Choose the number of points to omit."
             )
 
-    def __call__(self, draws: RandomStream, first: int = 0) -> RandomStream:
-        return _of_set(self, draws, first)
-
+    @override
     def shift_points(self, axes: range, n: int, shift: Tensor) -> Tensor:
-        """Return shifted points [w, R, n]."""
         base = halton_points(self.skip, n, axes, self.permute_digits).to(shift.device)
         return ((base.unsqueeze(1) + shift) % 1.0).clamp(_EDGE, 1.0 - _EDGE)
 
 
 @dataclass(frozen=True)
-class SobolPoints:
-    """Sobol points with the direction numbers of Joe and Kuo, shifted digit by digit, so they stay a net."""
+class SobolPoints(ShiftedPoints):
+    """Sobol points with the direction numbers of Joe and Kuo. A digital shift preserves the net."""
 
     is_exact = True
 
-    def __call__(self, draws: RandomStream, first: int = 0) -> RandomStream:
-        return _of_set(self, draws, first)
-
+    @override
     def shift_points(self, axes: range, n: int, shift: Tensor) -> Tensor:
-        """Return shifted points [w, R, n]."""
         digits = sobol_digits(n, axes).to(shift.device).unsqueeze(1)
         return ((digits ^ (shift * 2.0**_BITS).long()).double() + 0.5) * 2.0**-_BITS
 
 
-class _Set(Protocol):
-    def shift_points(self, axes: range, n: int, shift: Tensor) -> Tensor:
-        """Return points 0..n-1 on these axes in (0, 1) under a uniform shift [w, R, 1], [w, R, n]."""
-
-
-def _of_set(points: _Set, draws: RandomStream, first: int) -> RandomStream:
-    """Return a stream of the points, with a new shift for each run, step, label and axis."""
-
-    def uniforms(draws: RandomStream, purpose: str, n: int, w: int) -> Tensor:
-        shift = draws.uniform(purpose, 1, w).permute(2, 0, 1)
-        return points.shift_points(range(first, first + w), n, shift).permute(1, 2, 0)
-
-    return DerivedStream(draws, uniforms)
-
-
 @cache
 def halton_points(skip: int, n: int, axes: range, permuted: bool = False) -> Tensor:
-    """Return Halton points skip + 1 to skip + n without shift; in base 2: 1/2, 1/4, 3/4, 1/8.
+    """Compute Halton points without shift, in base 2 for example 1/2, 1/4, 3/4, 1/8.
+
+    The set begins with point `skip` + 1.
 
     Args:
         skip: Number of points omitted.
         n: Number of points.
         axes: Indices of the prime bases, w of them.
-        permuted: Whether digits are permuted.
+        permuted: True permutes the digits of each base.
 
     Returns:
         Points, [w, n].
@@ -143,12 +150,8 @@ def _radical_inverse(start: int, n: int, base: int, permuted: bool) -> Tensor:
     while bool((number > 0).any()):
         digits, weight = number % base, weight / base
         if permuted:  # from a fixed stream: the same for all seeds and machines
-            order = (
-                PhiloxStream(0, torch.tensor([base]))
-                .at_step(digit)
-                .uniform("points.digits", base, 1)
-            )
-            digits = order[0, :, 0].argsort()[digits]
+            stream = PhiloxStream(0, torch.tensor([base])).at_step(digit)
+            digits = stream.uniform("points.digits", base, 1)[0, :, 0].argsort()[digits]
         value, number, digit = value + weight * digits.double(), number // base, digit + 1
     return value
 

@@ -1,4 +1,4 @@
-"""Proposals: new particles and their density ratio, which only the proposal computes."""
+"""Proposals: new particles and their density ratio."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
@@ -34,23 +35,35 @@ class ProposalSample(NamedTuple):
 
 
 class Proposal(Protocol):
-    """Draw particles at t from those at t-1."""
+    """Proposal distribution of the particles at t, given those at t-1 and the record at t."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether the ratio is that of the densities."""
+        """True if the ratio is that of the densities."""
 
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
-    ) -> ProposalSample: ...
+    ) -> ProposalSample:
+        """Draw particles.
+
+        Args:
+            model: State-space model of the step.
+            belief: Parents of the particles, at t-1.
+            record: Record at t.
+            draws: Random stream of the step.
+
+        Returns:
+            Particles at t and their density ratio.
+        """
 
 
 @dataclass(frozen=True)
-class BootstrapProposal:
-    """Noise of the model: x = propagate(x, u, w), ratio 0 [Gordon, Salmond, Smith 1993]."""
+class BootstrapProposal(Proposal):
+    """Noise of the model, x = propagate(x, u, w), with ratio 0 [Gordon, Salmond, Smith 1993]."""
 
     is_exact = True
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:

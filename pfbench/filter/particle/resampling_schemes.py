@@ -11,22 +11,24 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
+from pfbench.filter.particle.resampling import ResamplingScheme
 from pfbench.kernels import cpp
 from pfbench.kernels.compilation import compilable
 
-_DOUBLE_FROM = (
-    100_000  # particles; float32 then gets one ancestor in 500 wrong, and the evidence drifts
-)
+# particles from which sums are float64: in float32 one ancestor in 500 would be wrong
+_DOUBLE_FROM = 100_000
 
 
 @dataclass(frozen=True)
-class Systematic:
-    """One uniform for all slots, at positions (j + u) / n. Counts differ from n a by less than 1."""
+class Systematic(ResamplingScheme):
+    """One uniform u for all slots, at positions (j + u) / n. Counts differ from n a by less than 1."""
 
     is_exact = True
 
+    @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
         return _evenly(_precise(a), n, draws.uniform("resample", 1, 1).squeeze(1))
 
@@ -42,52 +44,53 @@ _evenly = compilable(_counted_evenly, operator=cpp.resample_systematic)
 
 
 @dataclass(frozen=True)
-class Stratified:
+class Stratified(ResamplingScheme):
     """One uniform per slot, at positions (j + u_j) / n."""
 
     is_exact = True
 
+    @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
         u = draws.uniform("resample", a.shape[1], 1).squeeze(2)
         reach = _cumulative(a) * n
-        whole = torch.floor(reach).long().clamp(max=a.shape[1] - 1)
-        inside = (
-            u.gather(1, whole) <= reach - whole
-        )  # whether the position in the last slot lies below the sum
-        return _ancestors(whole + inside, n)
+        last_slot = torch.floor(reach).long().clamp(max=a.shape[1] - 1)
+        is_below_sum = u.gather(1, last_slot) <= reach - last_slot  # the position in that slot
+        return _ancestors(last_slot + is_below_sum, n)
 
 
 @dataclass(frozen=True)
-class Multinomial:
+class Multinomial(ResamplingScheme):
     """Independent draws, the textbook scheme with the highest variance."""
 
     is_exact = True
 
+    @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
-        return _pick(_cumulative(a), draws.uniform("resample", a.shape[1], 1).squeeze(2))
+        return _invert(_cumulative(a), draws.uniform("resample", a.shape[1], 1).squeeze(2))
 
 
 @dataclass(frozen=True)
-class Residual:
-    """floor(n a) copies, the rest multinomial by the remainders [Liu and Chen 1998]."""
+class Residual(ResamplingScheme):
+    """floor(n a) copies, and multinomial draws by the remainders [Liu and Chen 1998]."""
 
     is_exact = True
 
+    @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
-        wanted = _wanted(a, n)
+        expected = _expected_copies(a, n)
         # 49 (1/49) is less than 1: without this tolerance equal weights would all be drawn at random
-        sure = torch.floor(wanted * (1.0 + 4.0 * torch.finfo(a.dtype).eps))
-        missing = n - sure.sum(1, keepdim=True).long()
-        left = (wanted - sure).clamp(min=0.0)
-        left = left / left.sum(1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny)
-        drawn = _pick(_cumulative(left), draws.uniform("resample", a.shape[1], 1).squeeze(2))
+        certain = torch.floor(expected * (1.0 + 4.0 * torch.finfo(a.dtype).eps))
+        missing = n - certain.sum(1, keepdim=True).long()
+        residual = (expected - certain).clamp(min=0.0)
+        residual = residual / residual.sum(1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny)
+        index = _invert(_cumulative(residual), draws.uniform("resample", a.shape[1], 1).squeeze(2))
         slots = torch.arange(a.shape[1], device=a.device)
-        counts = sure.long().scatter_add(1, drawn, (slots < missing).long())
+        counts = certain.long().scatter_add(1, index, (slots < missing).long())
         return _ancestors(counts.cumsum(1), n)
 
 
 @dataclass(frozen=True)
-class Ssp:
+class Ssp(ResamplingScheme):
     """Srinivasan's sampling process: counts floor(n a) or one more, negatively associated.
 
     Pairs of fractional parts are resolved in a tournament of log2 N batched rounds. The order of the
@@ -99,34 +102,35 @@ class Ssp:
 
     is_exact = True
 
+    @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
-        wanted = _wanted(a, n)
-        counts = torch.floor(wanted)
+        expected = _expected_copies(a, n)
+        counts = torch.floor(expected)
         width = 1 << max(1, (a.shape[1] - 1).bit_length())
         pad = width - a.shape[1]
-        p = torch.nn.functional.pad(wanted - counts, (0, pad))
+        p = torch.nn.functional.pad(expected - counts, (0, pad))
         holder = torch.arange(width, device=a.device).expand(a.shape[0], -1)
         u = draws.uniform("resample", width, 1).squeeze(2)
         extra = torch.zeros_like(p)
-        used = 0
+        offset = 0
         while p.shape[1] > 1:
             first, second = p[:, 0::2], p[:, 1::2]
-            toss = u[:, used : used + first.shape[1]]
-            used += first.shape[1]
-            p, settled, leaves = _settle(first, second, toss)
-            out = torch.where(leaves, holder[:, 0::2], holder[:, 1::2])
-            holder = torch.where(leaves, holder[:, 1::2], holder[:, 0::2])
-            extra = extra.scatter_add(1, out, settled)
-        extra = extra.scatter_add(1, holder, p.round())  # the fractions sum to a whole number
+            pair_u = u[:, offset : offset + first.shape[1]]
+            offset += first.shape[1]
+            p, final, is_first = _resolve_pairs(first, second, pair_u)
+            resolved = torch.where(is_first, holder[:, 0::2], holder[:, 1::2])
+            holder = torch.where(is_first, holder[:, 1::2], holder[:, 0::2])
+            extra = extra.scatter_add(1, resolved, final)
+        extra = extra.scatter_add(1, holder, p.round())  # the fractions sum to an integer
         counts = (counts + extra[:, : a.shape[1]]).long()
         return _ancestors(counts.cumsum(1), n)
 
 
 @dataclass(frozen=True)
-class Killing:
-    """Keep a particle with probability a / max a, else replace it by a multinomial draw.
+class Killing(ResamplingScheme):
+    """Keep a particle with probability a / max a, otherwise replace it by a multinomial draw.
 
-    Slots keep their particles, so the number of particles must be constant.
+    A surviving particle stays in its slot, so the number of particles must be constant.
 
     References:
         Del Moral 2004.
@@ -134,26 +138,30 @@ class Killing:
 
     is_exact = True
 
+    @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
         u = draws.uniform("resample", a.shape[1], 2)
-        survives = u[..., 0] * a.max(1, keepdim=True).values < a
-        slots = torch.arange(a.shape[1], device=a.device).expand_as(survives)
-        return torch.where(survives, slots, _pick(_cumulative(a), u[..., 1]))
+        survivors = u[..., 0] * a.max(1, keepdim=True).values < a
+        slots = torch.arange(a.shape[1], device=a.device).expand_as(survivors)
+        return torch.where(survivors, slots, _invert(_cumulative(a), u[..., 1]))
 
 
-def _settle(first: Tensor, second: Tensor, toss: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the remaining fraction, the count of the member that leaves, and whether it is the first."""
-    both = first + second
-    over = both >= 1.0
-    # sum below 1: one leaves with 0, the other carries the sum; above: one leaves with 1, the other carries the rest
-    chance = torch.where(
-        over, (1.0 - second) / (2.0 - both).clamp(min=1e-300), second / both.clamp(min=1e-300)
+def _resolve_pairs(first: Tensor, second: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the remaining fraction of pairs, the count of the final member, and its mask as first."""
+    total = first + second
+    is_over = total >= 1.0
+    # below 1 the final member gets 0 and the fraction of the other is the sum; otherwise 1, and the sum less 1
+    probability = torch.where(
+        is_over, (1.0 - second) / (2.0 - total).clamp(min=1e-300), second / total.clamp(min=1e-300)
     )
-    return both - over.to(both.dtype), over.to(both.dtype), toss < chance
+    return total - is_over.to(total.dtype), is_over.to(total.dtype), u < probability
 
 
-def _wanted(a: Tensor, n: Tensor) -> Tensor:
-    """Return expected copies [R, N] in float64: in float32, weights of 1e6 particles sum to 1 within 5 slots."""
+def _expected_copies(a: Tensor, n: Tensor) -> Tensor:
+    """Return expected copies [R, N], in float64.
+
+    In float32 the weights of 1e6 particles sum to 1 within 5 slots.
+    """
     return a.double() * (n / a.sum(1, keepdim=True, dtype=torch.float64))
 
 
@@ -168,7 +176,7 @@ def _precise(a: Tensor) -> Tensor:
     return a.double() if a.shape[1] >= _DOUBLE_FROM else a
 
 
-def _pick(cumulative: Tensor, u: Tensor) -> Tensor:
+def _invert(cumulative: Tensor, u: Tensor) -> Tensor:
     """Draw independent indices [R, M] by inversion of cumulative sums [R, N] at u [R, M]."""
     return torch.searchsorted(cumulative, u.to(cumulative.dtype).contiguous()).clamp(
         max=cumulative.shape[1] - 1
@@ -177,13 +185,12 @@ def _pick(cumulative: Tensor, u: Tensor) -> Tensor:
 
 def _ancestors(below: Tensor, n: Tensor) -> Tensor:
     """Return ancestors [R, N] from cumulative counts of copies, int64 [R, N], non-decreasing."""
-    # slot j belongs to the first particle that ends after it: count particles by where they end, and sum
-    (runs, slots), wanted = below.shape, n.long()
-    ends = torch.minimum(below, wanted).clamp(
-        min=0
-    )  # in float32 the largest uniform is 1 and ends a weight of 0 at -1
+    # slot j belongs to the first particle that ends after it: count particles by their end, and sum
+    (runs, slots), total = below.shape, n.long()
+    # in float32 the largest uniform is 1 and ends a weight of 0 at -1
+    ends = torch.minimum(below, total).clamp(min=0)
     last = torch.arange(slots, device=below.device) == slots - 1
-    ends = torch.where(last, wanted, ends)  # exact in spite of rounding
+    ends = torch.where(last, total, ends)  # exact in spite of rounding
     counts = torch.zeros(runs, slots + 1, dtype=torch.long, device=ends.device).scatter_add(
         1, ends, torch.ones_like(ends)
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.chart import Chart
 from pfbench.core.random_stream import RandomStream
@@ -18,37 +19,38 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, gather_ancestors, weighted_mean_cov
 from pfbench.filter.exactness import is_every_part_exact
 from pfbench.filter.particle.point_sets import PointSet, SobolPoints
-from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
-from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
+from pfbench.filter.particle.resampling import EssResampler, Resampler, ResamplingScheme
 from pfbench.model.base import StateSpaceModel
 
 _BITS = 62  # of a Hilbert index, in an int64
 
 
 @dataclass(frozen=True)
-class SqmcScheme:
+class SqmcScheme(ResamplingScheme):
     """Scheme: quantiles of the probabilities at the first coordinates of a point set.
 
     Attributes:
-        points: Point set, of which the first axis is used.
+        points: Point set. Only its first axis is used.
     """
 
     points: PointSet = field(default_factory=SobolPoints)
 
     @property
+    @override
     def is_exact(self) -> bool:
-        """Whether each point is uniform."""
         return is_every_part_exact(**{"scheme.points": self.points})
 
+    @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
         u = self.points(draws).uniform("quantile", a.shape[1], 1).squeeze(2)
         reach = a.double().cumsum(1)
-        chosen = torch.searchsorted(reach / reach[:, -1:], u.contiguous())
-        return chosen.clamp(max=a.shape[1] - 1)
+        ancestors = torch.searchsorted(reach / reach[:, -1:], u.contiguous())
+        return ancestors.clamp(max=a.shape[1] - 1)
 
 
 @dataclass(frozen=True)
-class HilbertSortedResampler:
+class HilbertSortedResampler(Resampler):
     """Sort particles along a Hilbert curve before another resampler.
 
     With `SqmcScheme` this is the resampling of SQMC. Other schemes benefit from the order too.
@@ -60,10 +62,11 @@ class HilbertSortedResampler:
     resampler: EssResampler
 
     @property
+    @override
     def is_exact(self) -> bool:
-        """Whether the inner resampler is exact."""
         return is_every_part_exact(**{"resampler.inner": self.resampler})
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,
@@ -74,17 +77,12 @@ class HilbertSortedResampler:
     ) -> tuple[ParticleBelief, Tensor]:
         order = compute_hilbert_order(model.chart, belief)
         ordered = gather_ancestors(belief, order)
-        return self.resampler(
-            model,
-            ordered,
-            ordered.log_w if log_a is belief.log_w else log_a.gather(1, order),
-            n,
-            draws,
-        )
+        log_a = ordered.log_w if log_a is belief.log_w else log_a.gather(1, order)
+        return self.resampler(model, ordered, log_a, n, draws)
 
 
 @dataclass(frozen=True)
-class SqmcProposal:
+class SqmcProposal(Proposal):
     """Noise of the model at the coordinates that the choice of ancestors does not use.
 
     Attributes:
@@ -94,10 +92,11 @@ class SqmcProposal:
     points: PointSet = field(default_factory=SobolPoints)
 
     @property
+    @override
     def is_exact(self) -> bool:
-        """Whether each point has the stream's distribution."""
         return is_every_part_exact(**{"proposal.points": self.points})
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
@@ -111,7 +110,7 @@ def compute_hilbert_order(chart: Chart, belief: ParticleBelief) -> Tensor:
 
     Args:
         chart: Chart of the state.
-        cloud: Weighted particles.
+        belief: Weighted particles.
 
     Returns:
         Slots in order, [R, N].
@@ -140,9 +139,9 @@ def compute_hilbert_index(cells: Tensor, bits: int) -> Tensor:
     for level in reversed(range(1, bits)):
         low = (1 << level) - 1
         for i in range(len(x)):
-            set_ = (x[i] >> level) & 1 == 1
-            swap = torch.where(set_, 0, (x[0] ^ x[i]) & low)
-            x[0] = torch.where(set_, x[0] ^ low, x[0]) ^ swap
+            is_set = (x[i] >> level) & 1 == 1
+            swap = torch.where(is_set, 0, (x[0] ^ x[i]) & low)
+            x[0] = torch.where(is_set, x[0] ^ low, x[0]) ^ swap
             x[i] = x[i] ^ swap
     for i in range(1, len(x)):
         x[i] = x[i] ^ x[i - 1]

@@ -7,26 +7,27 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
-from pfbench.filter.particle.resampling import EssResampler
+from pfbench.filter.particle.resampling import EssResampler, Resampler
 from pfbench.filter.whitening import whiten
 from pfbench.model.base import StateSpaceModel
 
-_PAIRS = 20_000_000  # distances held at a time
+_PAIRS = 20_000_000  # distances that are computed at a time
 
 
 @dataclass(frozen=True)
-class ThompsonTaylorResampler:
+class ThompsonTaylorResampler(Resampler):
     """Resample, then z = xbar + sum_l u_l (x_l - xbar) over the m nearest neighbours x_l of each copy.
 
     The neighbours include the copy, xbar is their mean, and u_l is uniform with mean 1/m and variance
     (m - 1)/m^2 [Taylor and Thompson 1986]. The covariance within a neighbourhood is multiplied by
-    (m - 1)/m, so mean and covariance of the sample are almost kept for any shape. Distances are taken in
-    whitened coordinates [ours]. Copies of one particle are neighbours of each other, so m copies stay
-    together, as in the published algorithm.
+    (m - 1)/m, so mean and covariance of the sample hardly change for any shape. Distances are
+    Euclidean in whitened coordinates [ours]. Copies of one particle are neighbours of each other, so m
+    copies stay equal, as in the published algorithm.
 
     Attributes:
         resampler: Resampler that copies, to equal weights.
@@ -50,9 +51,11 @@ class ThompsonTaylorResampler:
     def __post_init__(self) -> None:
         if self.neighbours < 2:
             raise ValueError(
-                f"resampler.neighbours must be at least 2, got {self.neighbours}. Count the particle itself"
+                f"resampler.neighbours must be at least 2, got {self.neighbours}. "
+                "Count the particle itself as one."
             )
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,
@@ -64,20 +67,20 @@ class ThompsonTaylorResampler:
         slots, m = belief.x.shape[1], self.neighbours
         if m > slots:
             raise ValueError(
-                f"resampler.neighbours must be at most {slots} (the particles), got {m}. Choose fewer"
+                f"resampler.neighbours must be at most {slots} (the particles), got {m}. Choose fewer."
             )
         mean, covariance = weighted_mean_cov(model.chart, belief)
-        fresh, hit = self.resampler(model, belief, log_a, n, draws)
-        d = model.chart.subtract(fresh.x, mean.unsqueeze(1))
-        near = nearest_neighbours(whiten(d, factor(covariance)[0]), fresh.log_w > -torch.inf, m)
+        copies, resampled_mask = self.resampler(model, belief, log_a, n, draws)
+        d = model.chart.subtract(copies.x, mean.unsqueeze(1))
+        near = nearest_neighbours(whiten(d, factor(covariance)[0]), copies.log_w > -torch.inf, m)
         rows = d.gather(1, near.flatten(1).unsqueeze(-1).expand(-1, -1, d.shape[-1])).unflatten(
             1, (slots, m)
         )
         centre = rows.mean(2)
-        x = model.chart.add(
-            mean.unsqueeze(1), centre + self._combined(rows - centre.unsqueeze(2), draws)
-        )
-        return fresh._replace(x=torch.where(hit[:, None, None], x, fresh.x)), hit
+        combination = self._combined(rows - centre.unsqueeze(2), draws)
+        x = model.chart.add(mean.unsqueeze(1), centre + combination)
+        x = torch.where(resampled_mask[:, None, None], x, copies.x)
+        return copies._replace(x=x), resampled_mask
 
     def _combined(self, r: Tensor, draws: RandomStream) -> Tensor:
         """Combine the deviations r [R, N, m, d] of neighbours from their mean, [R, N, d]."""
@@ -92,23 +95,21 @@ class ThompsonTaylorResampler:
         return u[..., :1] * neighbour
 
 
-def nearest_neighbours(z: Tensor, alive: Tensor, m: int) -> Tensor:
+def nearest_neighbours(z: Tensor, active_mask: Tensor, m: int) -> Tensor:
     """Return the indices of the m nearest active points of each point, including itself.
 
     Args:
         z: Points, [R, N, d].
-        alive: Active points, [R, N].
+        active_mask: Active points, [R, N].
         m: Number of neighbours.
 
     Returns:
         Indices, [R, N, m].
     """
     block = max(1, _PAIRS // max(1, z.shape[0] * z.shape[1]))
-    far = torch.where(alive, 0.0, torch.inf).unsqueeze(1)
-    return torch.cat(
-        [
-            (torch.cdist(part, z) + far).topk(m, largest=False, sorted=False).indices
-            for part in z.split(block, 1)
-        ],
-        1,
-    )
+    penalty = torch.where(active_mask, 0.0, torch.inf).unsqueeze(1)
+    indices = [
+        (torch.cdist(points, z) + penalty).topk(m, largest=False, sorted=False).indices
+        for points in z.split(block, 1)
+    ]
+    return torch.cat(indices, 1)

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.record import Record
 from pfbench.kernels import cpp
@@ -16,39 +17,52 @@ from pfbench.model.base import StateSpaceModel
 
 
 class WeightUpdate(Protocol):
-    """Compute log weights [R, N], not normalised, from those before, the particles and the record."""
+    """Weight update by the measurement."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether the weights are those of the posterior."""
-
-    def __call__(
-        self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
-    ) -> Tensor: ...
-
-
-@dataclass(frozen=True)
-class BayesWeightUpdate:
-    """Bayes' rule: log w + log p(y | x) + log p(w) - log q(w). A NaN becomes weight 0."""
-
-    is_exact = True
+        """True if the weights are those of the posterior."""
 
     def __call__(
         self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
     ) -> Tensor:
-        value = log_w + model.log_likelihood(record.y, x, record.u) + log_ratio
-        return torch.where(value == value, value, -torch.inf)  # isnan would not compile
+        """Compute the weights after the measurement.
+
+        Args:
+            model: State-space model of the step.
+            log_w: Log weights before the measurement, [R, N].
+            x: Particles, [R, N, D].
+            log_ratio: Density ratio of the proposal, log p(w) - log q(w), [R, N].
+            record: Record of the step.
+
+        Returns:
+            Log weights, [R, N], not normalised.
+        """
 
 
 @dataclass(frozen=True)
-class FlooredWeightUpdate:
-    """Weights multiplied as plain numbers with a floor added, as common code does, for comparison [ours].
+class BayesWeightUpdate(WeightUpdate):
+    """Bayes' rule: log w + log p(y | x) + log p(w) - log q(w). A NaN becomes weight 0."""
+
+    is_exact = True
+
+    @override
+    def __call__(
+        self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
+    ) -> Tensor:
+        value = log_w + model.log_likelihood(record.y, x, record.u) + log_ratio
+        return torch.where(value == value, value, -torch.inf)  # isnan does not compile
+
+
+@dataclass(frozen=True)
+class FlooredWeightUpdate(WeightUpdate):
+    """Weights as plain numbers plus a floor, as in much code, for comparison [ours].
 
     The smallest double is e^-745. A particle 38 standard deviations from the measurement gets weight
-    0, so the floor decides. If all particles are that far away, the measurement has no effect.
+    0, so only the floor remains. If all particles are that far away, all weights become equal.
 
     Attributes:
-        weight_floor: Added to each particle's weight before normalisation.
+        weight_floor: Number added to each particle's weight before normalisation.
 
     Raises:
         ValueError: If the floor is not positive.
@@ -60,9 +74,11 @@ class FlooredWeightUpdate:
     def __post_init__(self) -> None:
         if not self.weight_floor > 0.0:
             raise ValueError(
-                f"weight_update.weight_floor must be positive, got {self.weight_floor}. Choose a small number, or BayesWeightUpdate, which needs none"
+                f"weight_update.weight_floor must be positive, got {self.weight_floor}. "
+                "Choose a small number, or BayesWeightUpdate, which needs none."
             )
 
+    @override
     def __call__(
         self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
     ) -> Tensor:
@@ -94,9 +110,8 @@ def deactivate_invalid_particles(
         return x, log_w
     healthy = torch.isfinite(x.sum(-1))
     log_w = torch.where(healthy, log_w, -torch.inf)
-    return torch.where(healthy, x.permute(2, 0, 1), parents.permute(2, 0, 1)).permute(
-        1, 2, 0
-    ), log_w
+    x = torch.where(healthy, x.permute(2, 0, 1), parents.permute(2, 0, 1)).permute(1, 2, 0)
+    return x, log_w
 
 
 def normalise_updated_weights(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

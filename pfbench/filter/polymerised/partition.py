@@ -7,6 +7,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import factor
 from pfbench.filter.whitening import whiten
@@ -27,7 +28,7 @@ class CellPartition(Protocol):
 
 
 @dataclass(frozen=True)
-class WhitenedCells:
+class WhitenedCells(CellPartition):
     """Cells of z = chol(P)^-1 p, independent of outliers and units [ours].
 
     Attributes:
@@ -49,21 +50,22 @@ class WhitenedCells:
             )
 
     @property
+    @override
     def side(self) -> int:
-        """Number of cells along an axis."""
         return 2 * self._half + 1
 
     @property
     def _half(self) -> int:
         return int(self.reach / self.cell_size + 0.5)
 
+    @override
     def __call__(self, p: Tensor, alive: Tensor, covariance: Tensor) -> Tensor:
         z = whiten(p, factor(covariance)[0]).clamp(-self.reach, self.reach)
         return torch.floor(z / self.cell_size + 0.5).long() + self._half
 
 
 @dataclass(frozen=True)
-class AxisAlignedCells:
+class AxisAlignedCells(CellPartition):
     """Equal boxes along the axes of the state, between the outermost particles.
 
     Attributes:
@@ -82,10 +84,11 @@ class AxisAlignedCells:
             )
 
     @property
+    @override
     def side(self) -> int:
-        """Number of cells along an axis."""
         return self.cells_per_axis
 
+    @override
     def __call__(self, p: Tensor, alive: Tensor, covariance: Tensor) -> Tensor:
         active_mask = alive.unsqueeze(-1)
         low = torch.where(active_mask, p, torch.inf).amin(1, keepdim=True)

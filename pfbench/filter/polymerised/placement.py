@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import factor
 from pfbench.core.random_stream import RandomStream
@@ -40,7 +41,7 @@ class ParticlePlacement(Protocol):
 
 
 @dataclass(frozen=True)
-class PooledCovariancePlacement:
+class PooledCovariancePlacement(ParticlePlacement):
     """Normal placement about the polymer with pooled covariance inside cells [ours].
 
     Mean and covariance of the particles are preserved.
@@ -51,6 +52,7 @@ class PooledCovariancePlacement:
 
     points: PointSet = field(default_factory=HaltonPoints)
 
+    @override
     def __call__(
         self, polymers: CellAggregates, slot: Tensor, draws: RandomStream
     ) -> tuple[Tensor, Tensor]:
@@ -60,7 +62,7 @@ class PooledCovariancePlacement:
 
 
 @dataclass(frozen=True)
-class ScaledCentrePlacement:
+class ScaledCentrePlacement(ParticlePlacement):
     """Polymer first, other particles at c + c o u [Pu and Qin, eq. 18].
 
     c is the difference of the polymer from the mean, and u uniform on [low, 1) per component.
@@ -87,6 +89,7 @@ class ScaledCentrePlacement:
                 "Use 0 (as printed) or -1 (centred)."
             )
 
+    @override
     def __call__(
         self, polymers: CellAggregates, slot: Tensor, draws: RandomStream
     ) -> tuple[Tensor, Tensor]:

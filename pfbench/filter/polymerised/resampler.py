@@ -18,10 +18,12 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
 from pfbench.filter.particle.gaussian_particle_filter import refuse_history
+from pfbench.filter.particle.resampling import Resampler
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.polymerised.partition import CellPartition, WhitenedCells, divide_cells
 from pfbench.filter.polymerised.placement import (
@@ -50,9 +52,10 @@ class CellAllocation(Protocol):
 
 
 @dataclass(frozen=True)
-class ProportionalAllocation:
+class ProportionalAllocation(CellAllocation):
     """n W particles for a cell, rounded systematically, which selects cells [ours]."""
 
+    @override
     def __call__(
         self, share: Tensor, cell: Tensor, alive: Tensor, n: Tensor, draws: RandomStream
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -62,13 +65,14 @@ class ProportionalAllocation:
 
 
 @dataclass(frozen=True)
-class UnchangedAllocation:
+class UnchangedAllocation(CellAllocation):
     """As many particles as the cell had, as printed, without selection.
 
     If the target number differs from the number of particles, or some have become impossible,
     cells get particles in proportion to their previous number [ours].
     """
 
+    @override
     def __call__(
         self, share: Tensor, cell: Tensor, alive: Tensor, n: Tensor, draws: RandomStream
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -79,7 +83,7 @@ class UnchangedAllocation:
 
 
 @dataclass(frozen=True)
-class PolymerisedResampler:
+class PolymerisedResampler(Resampler):
     """Aggregate the particles of each cell and place new ones around the polymers.
 
     A new particle of a cell with n_i of them has weight W_i / n_i [Pu and Qin, eq. 19], divided by
@@ -123,6 +127,7 @@ class PolymerisedResampler:
                 "Use null for the default."
             )
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,

@@ -13,6 +13,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
@@ -32,12 +33,13 @@ class DmcResponse(Protocol):
 
 
 @dataclass(frozen=True)
-class StaticResponse:
+class StaticResponse(DmcResponse):
     """Immediate response A = H, B = I. Unobserved states are not shifted [ours].
 
     The paper's B omits the azimuth, which H does not observe either: the shift is equal.
     """
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, h: Tensor
     ) -> tuple[Tensor, Tensor]:
@@ -45,7 +47,7 @@ class StaticResponse:
 
 
 @dataclass(frozen=True)
-class OneStepResponse:
+class OneStepResponse(DmcResponse):
     """Response after one interval, A = H Phi B, also of unobserved states [ours].
 
     Phi is the linearised transition of one interval.
@@ -62,6 +64,7 @@ class OneStepResponse:
     held: Sequence[str] = ()
     units: Sequence[float] | None = None
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, h: Tensor
     ) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import factor
 from pfbench.core.random_stream import RandomStream
@@ -41,7 +42,7 @@ from pfbench.model.base import StateSpaceModel
 
 
 @dataclass(frozen=True)
-class ReconstructedProposal:
+class ReconstructedProposal(Proposal):
     """Particles of `base`, shifted by the DMC law.
 
     Attributes:
@@ -55,11 +56,13 @@ class ReconstructedProposal:
     weight_correction: WeightCorrection = field(default_factory=MarginalRatioCorrection)
 
     @property
+    @override
     def is_exact(self) -> bool:
         return is_every_part_exact(
             **{"proposal.base": self.base, "proposal.correction": self.weight_correction}
         )
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
@@ -68,7 +71,7 @@ class ReconstructedProposal:
 
 
 @dataclass(frozen=True)
-class ReconstructedNoiseProposal:
+class ReconstructedNoiseProposal(Proposal):
     """DMC with the process noise as input, which is a Kalman update of the noise w.
 
     B is the noise gain, and the weights are Q = R_v^-1 and R = 1. The transition may be singular,
@@ -99,9 +102,11 @@ class ReconstructedNoiseProposal:
         check_fraction("proposal.defensive_fraction", self.defensive_fraction)
 
     @property
+    @override
     def is_exact(self) -> bool:
         return is_every_part_exact(**{"proposal.base": self.base})
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:

@@ -13,6 +13,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
@@ -50,7 +51,7 @@ class WeightCorrection(Protocol):
 
 
 @dataclass(frozen=True)
-class NoWeightCorrection:
+class NoWeightCorrection(WeightCorrection):
     """x~ + K (y - h(x~)) without a change of weights, as printed.
 
     It does not converge to the posterior.
@@ -66,6 +67,7 @@ class NoWeightCorrection:
     regressed_states: Sequence[str] = ()
     is_exact = False
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,
@@ -94,7 +96,7 @@ class NoWeightCorrection:
 
 
 @dataclass(frozen=True)
-class TransitionRatioCorrection:
+class TransitionRatioCorrection(WeightCorrection):
     """Ratio of transition densities after and before the shift [ours].
 
     For additive noise. The shift of x = f (+) xi, with f the noise-free prediction of each parent,
@@ -118,6 +120,7 @@ class TransitionRatioCorrection:
     def __post_init__(self) -> None:
         check_fraction("weight_correction.defensive_fraction", self.defensive_fraction)
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,
@@ -160,7 +163,7 @@ class TransitionRatioCorrection:
 
 
 @dataclass(frozen=True)
-class MarginalRatioCorrection:
+class MarginalRatioCorrection(WeightCorrection):
     """Defensive mixture with the ratio of fitted normal distributions [ours].
 
     About the predicted mean, o = H xi. The shift o -> o + H K (y - y_hat - o) moves the whole state
@@ -181,6 +184,7 @@ class MarginalRatioCorrection:
     def __post_init__(self) -> None:
         check_fraction("weight_correction.defensive_fraction", self.defensive_fraction)
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,

@@ -13,10 +13,12 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.derived_stream import DerivedStream
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
+from pfbench.filter.particle.point_sets import PointSet
 from pfbench.model.base import StateSpaceModel
 
 _QUARTERS = 4  # 0, 1/4, 1/2, 3/4 and 1 lead to a fixed point
@@ -72,17 +74,18 @@ class SwarmStart(Protocol):
 
 
 @dataclass(frozen=True)
-class PriorStart:
+class PriorStart(SwarmStart):
     """Initial particles without change."""
 
     is_exact = True
 
+    @override
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, z: Tensor) -> Tensor:
         return belief.x
 
 
 @dataclass(frozen=True)
-class IntervalStart:
+class IntervalStart(SwarmStart):
     """a + (b - a) z, [a, b] the range of the initial particles [Tian et al., eq. 39].
 
     Not the initial distribution: for 100 normal draws the interval is 5 sigma wide. The particles
@@ -91,6 +94,7 @@ class IntervalStart:
 
     is_exact = False
 
+    @override
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, z: Tensor) -> Tensor:
         mean = weighted_mean_cov(model.chart, belief)[0].unsqueeze(1)
         d = model.chart.subtract(belief.x, mean)
@@ -127,7 +131,7 @@ class ChaoticPerturbation:
 
 
 @dataclass(frozen=True)
-class ChaoticPoints:
+class ChaoticPoints(PointSet):
     """Point set for the initial distribution from chaotic values made uniform [ours].
 
     The distribution is exactly the initial one.
@@ -135,6 +139,7 @@ class ChaoticPoints:
 
     is_exact = True
 
+    @override
     def __call__(self, draws: RandomStream, first: int = 0) -> RandomStream:
         return DerivedStream(
             draws, lambda d, p, n, w: arcsine_cdf(iterate_logistic(d.uniform(p, n, w)))

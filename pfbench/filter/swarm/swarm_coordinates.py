@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import factor
 from pfbench.filter.linearisation import derivative
@@ -42,11 +43,12 @@ class SwarmCoordinates(Protocol):
 
 
 @dataclass(frozen=True)
-class AllComponents:
+class AllComponents(SwarmCoordinates):
     """All components of the chart, as in the paper, including unobserved ones."""
 
     whiten = False
 
+    @override
     def __call__(self, model: StateSpaceModel, x: Tensor, w: Tensor, u: Any) -> SwarmFrame:
         chart = model.chart
         mean = chart.mean(x, w).unsqueeze(1)
@@ -56,7 +58,7 @@ class AllComponents:
 
 
 @dataclass(frozen=True)
-class ObservedComponents:
+class ObservedComponents(SwarmCoordinates):
     """Components o that the measurement depends on. The others may follow [ours].
 
     Attributes:
@@ -68,6 +70,7 @@ class ObservedComponents:
     regress_unobserved: bool = True
     whiten: bool = False
 
+    @override
     def __call__(self, model: StateSpaceModel, x: Tensor, w: Tensor, u: Any) -> SwarmFrame:
         chart = model.chart
         mean = chart.mean(x, w).unsqueeze(1)
@@ -105,18 +108,19 @@ class Fitness(Protocol):
 
 
 @dataclass(frozen=True)
-class LikelihoodFitness:
+class LikelihoodFitness(Fitness):
     """No additional term: ln Y = ln p(y | x), the meaning of eq. 37.
 
     As printed, eq. 37 is linear in the residual, without a maximum.
     """
 
+    @override
     def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
         return lambda q: q.new_zeros(q.shape[:-1])
 
 
 @dataclass(frozen=True)
-class PosteriorFitness:
+class PosteriorFitness(Fitness):
     """Log density of the normal distribution fitted to the predicted particles [ours].
 
     The swarm then seeks a mode of the posterior.
@@ -137,6 +141,7 @@ class PosteriorFitness:
                 "Use 0 for no shrinkage."
             )
 
+    @override
     def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
         s = frame.covariance
         root = bounded_root(

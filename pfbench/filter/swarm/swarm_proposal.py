@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.exactness import is_every_part_exact
-from pfbench.filter.particle.proposals import ProposalSample, draw_noise
+from pfbench.filter.particle.proposals import Proposal, ProposalSample, draw_noise
 from pfbench.filter.particle.weight_update import deactivate_invalid_particles
 from pfbench.filter.swarm.chaotic_sequences import (
     ChaoticPerturbation,
@@ -49,7 +50,7 @@ from pfbench.model.base import StateSpaceModel
 
 
 @dataclass(frozen=True)
-class SwarmProposal:
+class SwarmProposal(Proposal):
     """Bootstrap prediction followed by particle swarm optimisation [Tian et al.].
 
     Steps a to f of the paper. A run without measurement does not move, nor does a run that has met
@@ -95,11 +96,13 @@ class SwarmProposal:
             )
 
     @property
+    @override
     def is_exact(self) -> bool:
         return is_every_part_exact(
             **{"proposal.start": self.swarm_start, "proposal.weights": self.weighting}
         )
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:

@@ -12,6 +12,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.particle.defensive_mixture import choose_defensive_particles
@@ -40,7 +41,7 @@ class SwarmWeighting(Protocol):
 
 
 @dataclass(frozen=True)
-class PrintedWeighting:
+class PrintedWeighting(SwarmWeighting):
     """Weights that ignore the move [Tian et al., eqs. 38 and 45].
 
     They do not converge to the posterior.
@@ -48,6 +49,7 @@ class PrintedWeighting:
 
     is_exact = False
 
+    @override
     def __call__(
         self,
         frame: SwarmFrame,
@@ -60,7 +62,7 @@ class PrintedWeighting:
 
 
 @dataclass(frozen=True)
-class UnchangedWeighting:
+class UnchangedWeighting(SwarmWeighting):
     """Weights that do not change: removes the likelihood that `BayesWeightUpdate` will add [ours].
 
     Shows the effect of the swarm alone.
@@ -68,6 +70,7 @@ class UnchangedWeighting:
 
     is_exact = False
 
+    @override
     def __call__(
         self,
         frame: SwarmFrame,
@@ -80,7 +83,7 @@ class UnchangedWeighting:
 
 
 @dataclass(frozen=True)
-class MixtureWeighting:
+class MixtureWeighting(SwarmWeighting):
     """Proposal centred on the final swarm, mixed with the predicted particles [ours].
 
     In whitened coordinates a, p = N(0, I) for the prediction, m_j for the swarm, and h the optimal
@@ -111,10 +114,12 @@ class MixtureWeighting:
             )
 
     @property
+    @override
     def is_exact(self) -> bool:
-        """Whether the proposal is the bootstrap one."""
+        """True if the proposal is the bootstrap one."""
         return self.defensive_fraction == 1.0
 
+    @override
     def __call__(
         self,
         frame: SwarmFrame,

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 
@@ -53,12 +54,13 @@ class VelocityUpdate(Protocol):
 
 
 @dataclass(frozen=True)
-class GaussianVelocity:
+class GaussianVelocity(VelocityUpdate):
     """Gaussian attraction |n1| (pbest - x) + |n2| (gbest - x), n ~ N(0, 1).
 
     See [Krohling 2004; Tian et al., eq. 29].
     """
 
+    @override
     def __call__(
         self, flock: SwarmState, live: Tensor, phase: float, draws: RandomStream, purpose: str
     ) -> Tensor:
@@ -68,7 +70,7 @@ class GaussianVelocity:
 
 
 @dataclass(frozen=True)
-class InertiaVelocity:
+class InertiaVelocity(VelocityUpdate):
     """Velocity update with inertia, attraction and escape.
 
     Velocity [Tian et al., eqs. 27 and 34] with r ~ U(0, 1):
@@ -110,6 +112,7 @@ class InertiaVelocity:
         """Return c3 = c4 for a phase from 0 to 1."""
         return self.escape_coefficient * (1.0 - math.cos(math.pi * phase))
 
+    @override
     def __call__(
         self, flock: SwarmState, live: Tensor, phase: float, draws: RandomStream, purpose: str
     ) -> Tensor:

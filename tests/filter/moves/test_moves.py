@@ -31,16 +31,15 @@ from pfbench.filter.moves.flow_kernels import (
     propagate_path,
 )
 from pfbench.filter.moves.metropolis import KernelCycle, McmcKernel, MetropolisHastings
-from pfbench.filter.moves.path_block_kernels import (
+from pfbench.filter.moves.path_block_kernels import LastStateKernel, PathBlockKernel
+from pfbench.filter.moves.path_history import StateHistory
+from pfbench.filter.moves.path_proposals import SmoothedSegment
+from pfbench.filter.moves.path_segments import (
     CopiedSegment,
-    LastStateKernel,
-    PathBlockKernel,
     PathSegment,
     PriorSegment,
     driving_noise,
 )
-from pfbench.filter.moves.path_history import StateHistory
-from pfbench.filter.moves.path_proposals import SmoothedSegment
 from pfbench.filter.moves.path_statistics import PathStatistics, fisher_information
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
