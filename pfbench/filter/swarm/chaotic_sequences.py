@@ -29,12 +29,8 @@ _BURN_IN = 50  # iterations to the invariant distribution, each halves the diffe
 
 def safe_seeds(u: Tensor) -> Tensor:
     """Map uniforms on (0, 1) to uniforms at least 1e-3 from 0, 1/4, 1/2, 3/4 and 1."""
-    quarter = torch.floor(_QUARTERS * u.double()).clamp(max=_QUARTERS - 1)
-    return (
-        quarter / _QUARTERS
-        + _SEED_MARGIN
-        + (u - quarter / _QUARTERS) * (1.0 - 2.0 * _QUARTERS * _SEED_MARGIN)
-    )
+    start = torch.floor(_QUARTERS * u.double()).clamp(max=_QUARTERS - 1) / _QUARTERS
+    return start + _SEED_MARGIN + (u - start) * (1.0 - 2.0 * _QUARTERS * _SEED_MARGIN)
 
 
 def logistic_map(z: Tensor, spare: Tensor) -> Tensor:
@@ -43,6 +39,9 @@ def logistic_map(z: Tensor, spare: Tensor) -> Tensor:
     Args:
         z: Values, [R, N, k].
         spare: Seeds of restarted sequences, [R, N, k].
+
+    Returns:
+        Next values, [R, N, k].
     """
     z = 4.0 * z * (1.0 - z)
     stuck = (z < _STUCK) | (z > 1.0 - _STUCK) | ((z - 0.75).abs() < _STUCK)
@@ -64,13 +63,23 @@ def arcsine_cdf(z: Tensor) -> Tensor:
 
 
 class SwarmStart(Protocol):
-    """Initial particles and chaotic values z [R, N, d] -> particles of the first step."""
+    """Start of a swarm: its particles before the first step."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether the particles have the initial distribution."""
+        """True if the particles have the initial distribution."""
 
-    def __call__(self, model: StateSpaceModel, belief: ParticleBelief, z: Tensor) -> Tensor: ...
+    def __call__(self, model: StateSpaceModel, belief: ParticleBelief, z: Tensor) -> Tensor:
+        """Return the particles of the first step.
+
+        Args:
+            model: State-space model.
+            belief: Initial particles.
+            z: Chaotic values, [R, N, d].
+
+        Returns:
+            Particles, [R, N, D].
+        """
 
 
 @dataclass(frozen=True)
@@ -98,9 +107,9 @@ class IntervalStart(SwarmStart):
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, z: Tensor) -> Tensor:
         mean = weighted_mean_cov(model.chart, belief)[0].unsqueeze(1)
         d = model.chart.subtract(belief.x, mean)
-        live = torch.isfinite(belief.log_w).unsqueeze(-1)
-        a = torch.where(live, d, torch.inf).amin(1, keepdim=True)
-        b = torch.where(live, d, -torch.inf).amax(1, keepdim=True)
+        active_mask = torch.isfinite(belief.log_w).unsqueeze(-1)
+        a = torch.where(active_mask, d, torch.inf).amin(1, keepdim=True)
+        b = torch.where(active_mask, d, -torch.inf).amax(1, keepdim=True)
         return model.chart.add(mean, a + (b - a) * z.to(d.dtype))
 
 
@@ -126,7 +135,15 @@ class ChaoticPerturbation:
             )
 
     def __call__(self, z: Tensor, scale: Tensor) -> Tensor:
-        """Compute Dx [R, N, k] for chaotic values z [R, N, k] and scale [R, 1, k]."""
+        """Compute a perturbation.
+
+        Args:
+            z: Chaotic values, [R, N, k].
+            scale: Scale of each coordinate, [R, 1, k].
+
+        Returns:
+            Perturbation Dx, [R, N, k].
+        """
         return 6.0 * self.beta * scale * (2.0 * z.to(scale.dtype) - 1.0)
 
 

@@ -23,23 +23,34 @@ class SwarmFrame(NamedTuple):
         q: Predicted particles, [R, N, k].
         covariance: Covariance of the predicted particles, [R, k, k].
         components: Indices of the chart components, [k].
-        origin: q [R, N, k] -> states [R, N, D].
+        to_states: Map of coordinates q [R, N, k] to states [R, N, D].
     """
 
     q: Tensor
     covariance: Tensor
     components: Tensor
-    origin: Callable[[Tensor], Tensor]
+    to_states: Callable[[Tensor], Tensor]
 
 
 class SwarmCoordinates(Protocol):
-    """Predicted particles x [R, N, D] with weights w [R, N] -> swarm coordinates."""
+    """Coordinates in which a swarm moves."""
 
     @property
     def whiten(self) -> bool:
-        """Whether the coordinates are whitened."""
+        """True if the coordinates are whitened."""
 
-    def __call__(self, model: StateSpaceModel, x: Tensor, w: Tensor, u: Any) -> SwarmFrame: ...
+    def __call__(self, model: StateSpaceModel, x: Tensor, w: Tensor, u: Any) -> SwarmFrame:
+        """Compute the coordinates of predicted particles.
+
+        Args:
+            model: State-space model of the step.
+            x: Predicted particles, [R, N, D].
+            w: Weights, [R, N].
+            u: Inputs of the step.
+
+        Returns:
+            Coordinates, and their map to states.
+        """
 
 
 @dataclass(frozen=True)
@@ -62,8 +73,8 @@ class ObservedComponents(SwarmCoordinates):
     """Components o that the measurement depends on. The others may follow [ours].
 
     Attributes:
-        regress_unobserved: The others move by their regression S_uo S_oo^-1 (o' - o) on o, which leaves their
-            residual unchanged. False leaves them in place.
+        regress_unobserved: The others move by their regression S_uo S_oo^-1 (o' - o) on o, which
+            leaves their residual unchanged. False does not move them.
         whiten: Use a = L^-1 o, L L' = S_oo, with the same standard deviation in all directions.
     """
 
@@ -76,35 +87,34 @@ class ObservedComponents(SwarmCoordinates):
         mean = chart.mean(x, w).unsqueeze(1)
         c = chart.subtract(x, mean)
         index = observed_components(model, mean, u)
-        o = c[..., index]
-        joint = (w.unsqueeze(-1) * o).mT @ c  # [R, k, d]
+        observed = c[..., index]
+        joint = (w.unsqueeze(-1) * observed).mT @ c  # [R, k, d]
         covariance = joint[..., index]
         root = bounded_root(covariance)
         eye = torch.eye(len(index), dtype=c.dtype, device=c.device)
-        direction = torch.linalg.solve_triangular(
-            root, joint, upper=False
-        )  # (d c / d a)', [R, k, d]
+        # (d c / d a)', [R, k, d]
+        direction = torch.linalg.solve_triangular(root, joint, upper=False)
         if not self.regress_unobserved:
             direction = direction.new_zeros(direction.shape)
-        direction = direction.index_copy(
-            -1, index, (root * (o.square().sum(1) > 0.0).unsqueeze(-1)).mT
-        )
+        has_spread = (observed.square().sum(1) > 0.0).unsqueeze(-1)
+        direction = direction.index_copy(-1, index, (root * has_spread).mT)
         if self.whiten:
-            o, covariance = whiten(o, root), eye.expand_as(covariance)
+            q, covariance = whiten(observed, root), eye.expand_as(covariance)
         else:
+            q = observed
             direction = torch.linalg.solve_triangular(root.mT, direction, upper=True).index_copy(
                 -1, index, eye.expand_as(covariance)
             )
-        return SwarmFrame(o, covariance, index, lambda q: chart.add(mean, c + (q - o) @ direction))
+        return SwarmFrame(
+            q, covariance, index, lambda moved: chart.add(mean, c + (moved - q) @ direction)
+        )
 
 
 class Fitness(Protocol):
-    """Swarm coordinates -> function q [R, N, k] -> term of the fitness [R, N].
+    """Fitness of swarm positions, as a term that is added to the log likelihood."""
 
-    The term is added to the log likelihood.
-    """
-
-    def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]: ...
+    def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
+        """Return the function q [R, N, k] -> term of the fitness [R, N] in swarm coordinates."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,7 @@ class PosteriorFitness(Fitness):
         covariance_shrinkage: Shrinkage of the covariance towards its diagonal, for few particles.
 
     Raises:
-        ValueError: If shrink is outside [0, 1].
+        ValueError: If the shrinkage is outside [0, 1].
     """
 
     covariance_shrinkage: float = 0.05
@@ -137,28 +147,28 @@ class PosteriorFitness(Fitness):
     def __post_init__(self) -> None:
         if not 0.0 <= self.covariance_shrinkage <= 1.0:
             raise ValueError(
-                f"proposal.fitness.covariance_shrinkage must be from 0 to 1, got {self.covariance_shrinkage}. "
-                "Use 0 for no shrinkage."
+                "proposal.fitness.covariance_shrinkage must be from 0 to 1, got "
+                f"{self.covariance_shrinkage}. Use 0 for no shrinkage."
             )
 
     @override
     def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
         s = frame.covariance
-        root = bounded_root(
-            s + self.covariance_shrinkage * (torch.diag_embed(s.diagonal(dim1=-2, dim2=-1)) - s)
-        )
+        diagonal = torch.diag_embed(s.diagonal(dim1=-2, dim2=-1))
+        root = bounded_root(s + self.covariance_shrinkage * (diagonal - s))
         return lambda q: -compute_half_square(whiten(q, root))
 
 
 def observed_components(model: StateSpaceModel, mean: Tensor, u: Any) -> Tensor:
-    """Return indices [k] of the components that the measurement depends on.
-
-    Both mean and variance of the measurement count.
+    """Return the components on which mean or variance of the measurement depends.
 
     Args:
         model: State-space model.
         mean: State at which the derivative is taken, [R, 1, D].
         u: Inputs of the step.
+
+    Returns:
+        Indices of the components, [k].
     """
 
     def moments_of_y(at: Tensor, xi: Tensor) -> Tensor:

@@ -21,14 +21,14 @@ class SwarmLimits:
     and expansion would feed back.
 
     Attributes:
-        scale_by_prior: The scale is the standard deviation of the initial particles, the paper's recorded
-            interval. False takes the predicted particles.
+        scale_by_prior: The scale is the standard deviation of the initial particles, the paper's
+            recorded interval. False takes the predicted particles.
         max_velocity_sd: v_max over six scales.
-        max_distance_sd: Largest distance from the predicted mean in standard deviations of the predicted
-            particles. None sets no limit.
+        max_distance_sd: Largest distance from the predicted mean in standard deviations of the
+            predicted particles. None sets no limit.
 
     Raises:
-        ValueError: If speed or box is not positive.
+        ValueError: If a limit is not positive.
     """
 
     scale_by_prior: bool = False
@@ -40,7 +40,8 @@ class SwarmLimits:
             self.max_distance_sd is not None and not self.max_distance_sd > 0.0
         ):
             raise ValueError(
-                f"proposal.limits must be positive, got max_velocity_sd={self.max_velocity_sd}, max_distance_sd={self.max_distance_sd}. "
+                "proposal.limits must be positive, got "
+                f"max_velocity_sd={self.max_velocity_sd}, max_distance_sd={self.max_distance_sd}. "
                 "Use max_distance_sd=null for no limit of position."
             )
 
@@ -65,11 +66,21 @@ class ChiSquareStopping:
     def __post_init__(self) -> None:
         if not 0.0 < self.quantile < 1.0:
             raise ValueError(
-                f"proposal.stopping.quantile must be in (0, 1), got {self.quantile}. Use 0.5 (median)."
+                f"proposal.stopping.quantile must be in (0, 1), got {self.quantile}. "
+                "Use 0.5 for the median."
             )
 
     def __call__(self, model: StateSpaceModel, best: Tensor, record: Record) -> Tensor:
-        """Return which runs stop [R], given their best states [R, 1, D]."""
+        """Compute the mask of the runs that stop.
+
+        Args:
+            model: State-space model of the step.
+            best: Best state of each run, [R, 1, D].
+            record: Record of the step.
+
+        Returns:
+            Mask, [R].
+        """
         y_hat: Tensor = model.observation(best, record.u).mean[:, 0]
         observed_mask = ~torch.isnan(record.y)
         nearest = model.log_likelihood(torch.where(observed_mask, y_hat, torch.nan), best, record.u)
@@ -79,6 +90,6 @@ class ChiSquareStopping:
 
 
 @cache
-def _quantiles(p: float, most: int) -> list[float]:
-    """Return chi-square quantiles for 0 to `most` degrees of freedom."""
-    return [0.0, *(float(stats.chi2.ppf(p, k)) for k in range(1, most + 1))]
+def _quantiles(p: float, maximum: int) -> list[float]:
+    """Return chi-square quantiles for 0 to `maximum` degrees of freedom."""
+    return [0.0, *(float(stats.chi2.ppf(p, k)) for k in range(1, maximum + 1))]

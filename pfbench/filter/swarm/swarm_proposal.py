@@ -53,8 +53,9 @@ from pfbench.model.base import StateSpaceModel
 class SwarmProposal(Proposal):
     """Bootstrap prediction followed by particle swarm optimisation [Tian et al.].
 
-    Steps a to f of the paper. A run without measurement does not move, nor does a run that has met
-    `stopping`. Chaotic sequences belong to slots: resampled copies would otherwise share one [ours].
+    Steps a to f of the paper. A run without measurement does not move. A run that satisfies
+    `stopping` moves no further. Chaotic sequences belong to slots, because resampled copies would
+    otherwise share a sequence [ours].
 
     Attributes:
         velocity: Velocity update.
@@ -115,13 +116,15 @@ class SwarmProposal(Proposal):
         swarm, iterations = self.optimise(
             model, frame, torch.isfinite(log_w), memory, record, draws
         )
-        log_likelihood = model.log_likelihood(record.y, frame.origin(swarm.q), record.u)
+        log_likelihood = model.log_likelihood(record.y, frame.to_states(swarm.q), record.u)
         q, log_ratio = self.weighting(frame, swarm.q, log_likelihood, log_w, draws)
         if self.perturbation:
             chaos = memory["swarm.chaos"].index_copy(-1, frame.components, swarm.chaos.unsqueeze(1))
             memory = memory | {"swarm.chaos": chaos}
         log_ratio = torch.where(torch.isfinite(log_w), log_ratio, -torch.inf)
-        return ProposalSample(frame.origin(q), log_ratio, memory, trace={"iterations": iterations})
+        return ProposalSample(
+            frame.to_states(q), log_ratio, memory, trace={"iterations": iterations}
+        )
 
     def optimise(
         self,
@@ -139,7 +142,7 @@ class SwarmProposal(Proposal):
             frame: Coordinates of the predicted particles.
             active_mask: Mask of active slots, [R, N].
             memory: Initial scale [R, 1, d] and chaotic values [R, 1, N, d], as required.
-            seen: Record of the step.
+            record: Record of the step.
             draws: Random numbers.
 
         Returns:
@@ -148,7 +151,7 @@ class SwarmProposal(Proposal):
         penalty = self.fitness(frame)
 
         def fitness(q: Tensor) -> Tensor:
-            value = model.log_likelihood(record.y, frame.origin(q), record.u) + penalty(q)
+            value = model.log_likelihood(record.y, frame.to_states(q), record.u) + penalty(q)
             return torch.where(active_mask & ~torch.isnan(value), value, -torch.inf)
 
         swarm = initial = self._initial(frame, fitness(frame.q), memory)
@@ -175,7 +178,7 @@ class SwarmProposal(Proposal):
             if self.stopping:
                 best = swarm.best_fitness.argmax(1)
                 active = active & ~self.stopping(
-                    model, select_particle(frame.origin(swarm.best), best), record
+                    model, select_particle(frame.to_states(swarm.best), best), record
                 )
         return select_swarm_by_run(observed_runs, swarm, initial), iterations
 

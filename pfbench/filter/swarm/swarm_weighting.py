@@ -16,6 +16,7 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.particle.defensive_mixture import choose_defensive_particles
+from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
 from pfbench.filter.swarm.swarm_coordinates import SwarmFrame, bounded_root
 from pfbench.filter.whitening import compute_half_square, whiten
 
@@ -24,11 +25,11 @@ _PAIRS, _PAIRS_CUDA = 2**17, 2**27
 
 
 class SwarmWeighting(Protocol):
-    """Final positions q [R, N, k], log likelihood [R, N] -> positions, log p - log q."""
+    """Weighting of the final swarm."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether the weighted particles are asymptotically exact."""
+        """True if the weighted particles are asymptotically exact."""
 
     def __call__(
         self,
@@ -37,7 +38,19 @@ class SwarmWeighting(Protocol):
         log_likelihood: Tensor,
         log_w: Tensor,
         draws: RandomStream,
-    ) -> tuple[Tensor, Tensor]: ...
+    ) -> tuple[Tensor, Tensor]:
+        """Compute positions and density ratio of the particles.
+
+        Args:
+            frame: Coordinates of the swarm.
+            q: Final positions, [R, N, k].
+            log_likelihood: Log likelihood of the final positions, [R, N].
+            log_w: Log weights before the measurement, [R, N].
+            draws: Random stream of the step.
+
+        Returns:
+            Positions [R, N, k] and log p - log q [R, N].
+        """
 
 
 @dataclass(frozen=True)
@@ -63,9 +76,9 @@ class PrintedWeighting(SwarmWeighting):
 
 @dataclass(frozen=True)
 class UnchangedWeighting(SwarmWeighting):
-    """Weights that do not change: removes the likelihood that `BayesWeightUpdate` will add [ours].
+    """Weights that do not change, which shows the effect of the swarm alone [ours].
 
-    Shows the effect of the swarm alone.
+    The ratio is the inverse of the likelihood that `BayesWeightUpdate` adds.
     """
 
     is_exact = False
@@ -89,19 +102,20 @@ class MixtureWeighting(SwarmWeighting):
     In whitened coordinates a, p = N(0, I) for the prediction, m_j for the swarm, and h the optimal
     Gaussian bandwidth of N points in k dimensions [Silverman 1986]:
 
-        log ratio = log p(a) - log(keep p(a) + (1 - keep) sum_j w_j N(a; m_j, h^2 I)).
+        log ratio = log p(a) - log(c p(a) + (1 - c) sum_j w_j N(a; m_j, h^2 I)),
 
-    This deterministic mixture is at most -log keep. It converges to the posterior if the predicted
-    distribution is normal, as on linear-Gaussian models, and all unobserved components are
-    regressed (`ObservedComponents`). Otherwise p is an approximation. The cost is N^2 k. In many dimensions
-    (18, for example) few particles have weight.
+    with c the defensive fraction. The ratio of this deterministic mixture is at most -log c. The
+    filter converges to the posterior if the predicted distribution is normal, as on linear-Gaussian
+    models, and all unobserved components are regressed (`ObservedComponents`). Otherwise p is an
+    approximation. The cost is N^2 k. In many dimensions (18, for example) few particles have weight.
 
     Attributes:
-        defensive_fraction: Fraction of predicted particles that do not move, in (0, 1]. It is drawn in each
-            step, since neighbours are siblings after resampling. 1 gives the bootstrap filter.
+        defensive_fraction: Fraction of predicted particles that do not move, in (0, 1]. They are
+            chosen at random in each step, since neighbours are siblings after resampling. 1 gives
+            the bootstrap filter.
 
     Raises:
-        ValueError: If keep is outside (0, 1].
+        ValueError: If the fraction is outside (0, 1].
     """
 
     defensive_fraction: float = 0.5
@@ -109,8 +123,8 @@ class MixtureWeighting(SwarmWeighting):
     def __post_init__(self) -> None:
         if not 0.0 < self.defensive_fraction <= 1.0:
             raise ValueError(
-                f"proposal.weighting.defensive_fraction must be in (0, 1], got {self.defensive_fraction}. "
-                "Use 1 for the bootstrap proposal."
+                "proposal.weighting.defensive_fraction must be in (0, 1], got "
+                f"{self.defensive_fraction}. Use 1 for the bootstrap proposal."
             )
 
     @property
@@ -135,14 +149,12 @@ class MixtureWeighting(SwarmWeighting):
         defensive = choose_defensive_particles(
             self.defensive_fraction, active_mask, draws, "swarm.keep"
         )
-        h = (4.0 / (k + 2)) ** (1.0 / (k + 4)) * active_mask.sum(1, keepdim=True).to(q.dtype) ** (
-            -1.0 / (k + 4)
-        )  # [R, 1]
+        count = active_mask.sum(1, keepdim=True).to(q.dtype)
+        h = GaussianSmoothing().bandwidth(k, count)
         a = centres + h.unsqueeze(-1) * draws.normal("swarm.kernel", n, k)
         a = torch.where(defensive.mask.unsqueeze(-1), predicted, a)
-        log_g = _kernels(
-            a / h.unsqueeze(-1), centres / h.unsqueeze(-1), torch.log_softmax(log_w, 1)
-        ) - k * torch.log(h)
+        scaled, scaled_centres = a / h.unsqueeze(-1), centres / h.unsqueeze(-1)
+        log_g = _kernels(scaled, scaled_centres, torch.log_softmax(log_w, 1)) - k * torch.log(h)
         log_p = -compute_half_square(a)
         log_ratio = log_p - defensive.log_mixture(log_p, log_g)
         return torch.where(defensive.mask.unsqueeze(-1), frame.q, a @ root.mT), log_ratio

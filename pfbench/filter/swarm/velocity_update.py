@@ -40,17 +40,29 @@ class SwarmState(NamedTuple):
         """Return the best position of all iterations [R, 1, k]."""
         return select_particle(self.best, self.best_fitness.argmax(1))
 
-    def worst_position(self, live: Tensor) -> Tensor:
-        """Return the worst position of this iteration [R, 1, k]."""
-        return select_particle(self.q, torch.where(live, self.fitness, torch.inf).argmin(1))
+    def worst_position(self, active_mask: Tensor) -> Tensor:
+        """Return the worst position of this iteration [R, 1, k] among active slots [R, N]."""
+        return select_particle(self.q, torch.where(active_mask, self.fitness, torch.inf).argmin(1))
 
 
 class VelocityUpdate(Protocol):
-    """Next velocities [R, N, k]. `phase` increases from 0 to 1 over the iterations."""
+    """Velocity update of a swarm."""
 
     def __call__(
-        self, flock: SwarmState, live: Tensor, phase: float, draws: RandomStream, purpose: str
-    ) -> Tensor: ...
+        self, swarm: SwarmState, active: Tensor, phase: float, draws: RandomStream, purpose: str
+    ) -> Tensor:
+        """Compute the next velocities.
+
+        Args:
+            swarm: State of the swarm.
+            active: Mask of active slots, [R, N].
+            phase: Progress over the iterations, from 0 to 1.
+            draws: Random stream of the step.
+            purpose: Label of the random numbers.
+
+        Returns:
+            Velocities, [R, N, k].
+        """
 
 
 @dataclass(frozen=True)
@@ -62,11 +74,11 @@ class GaussianVelocity(VelocityUpdate):
 
     @override
     def __call__(
-        self, flock: SwarmState, live: Tensor, phase: float, draws: RandomStream, purpose: str
+        self, swarm: SwarmState, active: Tensor, phase: float, draws: RandomStream, purpose: str
     ) -> Tensor:
-        n, k = flock.q.shape[1:]
+        n, k = swarm.q.shape[1:]
         cognitive, social = draws.normal(purpose, n, 2 * k).abs().unflatten(-1, (2, k)).unbind(-2)
-        return cognitive * (flock.best - flock.q) + social * (flock.best_position() - flock.q)
+        return cognitive * (swarm.best - swarm.q) + social * (swarm.best_position() - swarm.q)
 
 
 @dataclass(frozen=True)
@@ -76,9 +88,9 @@ class InertiaVelocity(VelocityUpdate):
     Velocity [Tian et al., eqs. 27 and 34] with r ~ U(0, 1):
     w v + c1 r1 (pb - x) + c2 r2 (pg - x) - c3 (r3 (pw - x) + r4 (gw - x)).
 
-    The factor c3 = escape (1 - cos(pi it / iterations)) increases from 0 to twice `escape_coefficient`, the
-    meaning of eq. 35. As printed c3 is constant apart from ripples, but the paper's figure shows
-    an increase.
+    The factor c3 = escape (1 - cos(pi it / iterations)) increases from 0 to twice
+    `escape_coefficient`, the meaning of eq. 35. As printed c3 is almost constant, but the paper's
+    figure shows an increase.
 
     Attributes:
         inertia_weight: w.
@@ -89,7 +101,7 @@ class InertiaVelocity(VelocityUpdate):
         escape_coefficient: Coefficient of escape. 0 gives the plain swarm.
 
     Raises:
-        ValueError: If inertia is outside [0, 1) or a coefficient is negative.
+        ValueError: If the inertia weight is outside [0, 1) or a coefficient is negative.
     """
 
     inertia_weight: float = 0.8
@@ -100,13 +112,15 @@ class InertiaVelocity(VelocityUpdate):
     def __post_init__(self) -> None:
         if not 0.0 <= self.inertia_weight < 1.0:
             raise ValueError(
-                f"proposal.velocity.inertia_weight must be in [0, 1), got {self.inertia_weight}. Reduce it."
+                f"proposal.velocity.inertia_weight must be in [0, 1), got {self.inertia_weight}. "
+                "Reduce it."
             )
-        if min(self.cognitive_coefficient, self.social_coefficient, self.escape_coefficient) < 0.0:
-            raise ValueError(
-                "proposal.velocity.cognitive_coefficient, social_coefficient and escape_coefficient must be at least 0, got "
-                f"cognitive_coefficient={self.cognitive_coefficient}, social_coefficient={self.social_coefficient}, escape_coefficient={self.escape_coefficient}. Set 0 or more."
-            )
+        for name in ("cognitive_coefficient", "social_coefficient", "escape_coefficient"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(
+                    f"proposal.velocity.{name} must be at least 0, got {getattr(self, name)}. "
+                    "Set 0 or more."
+                )
 
     def compute_escape_factor(self, phase: float) -> float:
         """Return c3 = c4 for a phase from 0 to 1."""
@@ -114,46 +128,61 @@ class InertiaVelocity(VelocityUpdate):
 
     @override
     def __call__(
-        self, flock: SwarmState, live: Tensor, phase: float, draws: RandomStream, purpose: str
+        self, swarm: SwarmState, active: Tensor, phase: float, draws: RandomStream, purpose: str
     ) -> Tensor:
-        n, k = flock.q.shape[1:]
+        n, k = swarm.q.shape[1:]
         terms = 4 if self.escape_coefficient else 2
-        r = (
-            draws.uniform(purpose, n, terms * k)
-            .to(flock.q.dtype)
-            .unflatten(-1, (terms, k))
-            .unbind(-2)
-        )
+        u = draws.uniform(purpose, n, terms * k).to(swarm.q.dtype)
+        r = u.unflatten(-1, (terms, k)).unbind(-2)
         v = (
-            self.inertia_weight * flock.v
-            + self.cognitive_coefficient * r[0] * (flock.best - flock.q)
-            + self.social_coefficient * r[1] * (flock.best_position() - flock.q)
+            self.inertia_weight * swarm.v
+            + self.cognitive_coefficient * r[0] * (swarm.best - swarm.q)
+            + self.social_coefficient * r[1] * (swarm.best_position() - swarm.q)
         )
         if self.escape_coefficient:
-            from_worst = r[2] * (flock.worst - flock.q) + r[3] * (
-                flock.worst_position(live) - flock.q
-            )
+            from_worst = r[2] * (swarm.worst - swarm.q)
+            from_worst = from_worst + r[3] * (swarm.worst_position(active) - swarm.q)
             v = v - self.compute_escape_factor(phase) * from_worst
         return v
 
 
-def match_memory_layout(a: Tensor, like: Tensor) -> Tensor:
+def match_memory_layout(a: Tensor, template: Tensor) -> Tensor:
     """Copy a tensor into the memory layout of another one, for faster loops.
 
     Args:
         a: Tensor to copy.
-        like: Tensor of the same shape whose layout is used.
+        template: Tensor of the same shape and the new layout.
+
+    Returns:
+        Copy of the tensor.
     """
-    return torch.empty_like(like, dtype=a.dtype).copy_(a)
+    return torch.empty_like(template, dtype=a.dtype).copy_(a)
 
 
 def select_particle(q: Tensor, i: Tensor) -> Tensor:
-    """Select one particle per run: q [R, N, k] and i [R] -> [R, 1, k]."""
+    """Select one particle per run.
+
+    Args:
+        q: Positions, [R, N, k].
+        i: Slot of each run, [R].
+
+    Returns:
+        Positions, [R, 1, k].
+    """
     return q.gather(1, i[:, None, None].expand(-1, 1, q.shape[-1]))
 
 
 def select_swarm_by_run(active: Tensor, new: SwarmState, old: SwarmState) -> SwarmState:
-    """Select the swarm by run: `new` where active [R], else `old`."""
+    """Select the swarm of each run.
+
+    Args:
+        active: Mask of the runs that take `new`, [R].
+        new: Swarm of active runs.
+        old: Swarm of other runs.
+
+    Returns:
+        Swarm.
+    """
     return SwarmState(
         *(
             torch.where(active.reshape(-1, *[1] * (a.dim() - 1)), a, b)

@@ -332,16 +332,16 @@ def test_limits_hold_and_the_best_only_improves(velocity: Any, coordinates: Any)
         ).all()
         assert (after.best_fitness >= before.best_fitness).all()
         assert (after.worst_fitness <= before.worst_fitness).all()
-        fitness = model.log_likelihood(seen.y, frame.origin(after.best), ())
+        fitness = model.log_likelihood(seen.y, frame.to_states(after.best), ())
         assert torch.allclose(fitness, after.best_fitness, rtol=0, atol=1e-9)
         assert torch.allclose(
-            model.log_likelihood(seen.y, frame.origin(after.q), ()),
+            model.log_likelihood(seen.y, frame.to_states(after.q), ()),
             after.fitness,
             rtol=0,
             atol=1e-9,
         )
         assert torch.allclose(
-            model.log_likelihood(seen.y, frame.origin(after.worst), ()),
+            model.log_likelihood(seen.y, frame.to_states(after.worst), ()),
             after.worst_fitness,
             rtol=0,
             atol=1e-9,
@@ -412,7 +412,7 @@ def test_a_run_stops_where_its_best_particle_is_close_enough() -> None:
     assert 1 < flown[1] < 40
     assert flown[3] > 1
     assert flown[4] == 0
-    best = frame.origin(flock.best_position().expand(-1, 30, -1))[:, 0] @ model.h.mT
+    best = frame.to_states(flock.best_position().expand(-1, 30, -1))[:, 0] @ model.h.mT
     distance = ((torch.where(torch.isnan(y), best, y) - best) / model.r).square().sum(-1)
     limits = [stats.chi2.ppf(0.5, k) for k in (2, 2, 2, 1)]
     assert all(d <= c for d, c, n in zip(distance, limits, flown, strict=False) if n < 40)
@@ -487,7 +487,7 @@ def test_frames_place_the_cloud_where_it_is_and_move_what_they_should(coordinate
     )
     w = log_w.exp()
     frame: SwarmFrame = coordinates(model, x, w, ())
-    assert torch.allclose(frame.origin(frame.q), x, rtol=0, atol=1e-12)
+    assert torch.allclose(frame.to_states(frame.q), x, rtol=0, atol=1e-12)
     assert torch.allclose(
         (w.unsqueeze(-1) * frame.q).mT @ frame.q, frame.covariance, rtol=0, atol=1e-10
     )
@@ -501,7 +501,7 @@ def test_frames_place_the_cloud_where_it_is_and_move_what_they_should(coordinate
     if isinstance(coordinates, AllComponents):
         return
     k = len(frame.components)
-    moved = frame.origin(frame.q + torch.tensor([0.5, -1.0], dtype=torch.float64)) - x
+    moved = frame.to_states(frame.q + torch.tensor([0.5, -1.0], dtype=torch.float64)) - x
     assert torch.allclose(moved, moved[:, :1].expand_as(moved), rtol=0, atol=1e-12)
     if not coordinates.whiten:
         assert torch.allclose(
@@ -528,7 +528,7 @@ def test_the_posterior_fitness_is_highest_at_the_kalman_mean() -> None:
     gain = s @ h.mT @ torch.linalg.inv(h @ s @ h.mT + r)
     mode = (gain @ (y[0] - h @ x.mean(1)[0]))[None, None]
     penalty = PosteriorFitness(covariance_shrinkage=0.0)(frame)
-    value = lambda q: model.log_likelihood(y, frame.origin(q), ()) + penalty(q)  # noqa: E731
+    value = lambda q: model.log_likelihood(y, frame.to_states(q), ()) + penalty(q)  # noqa: E731
     steps = 0.1 * torch.eye(4, dtype=torch.float64)
     up, down = (value(mode + sign * steps) for sign in (1, -1))
     assert torch.allclose(up, down, rtol=0, atol=1e-9)
