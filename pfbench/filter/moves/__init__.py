@@ -1,0 +1,1 @@
+"""MCMC moves of particles after resampling, and the histories that they require."""

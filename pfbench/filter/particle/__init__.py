@@ -1,0 +1,1 @@
+"""Particle filter and the stages that compose it."""

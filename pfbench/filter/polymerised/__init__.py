@@ -1,0 +1,1 @@
+"""Polymerised resampling: partition, allocation and placement."""

@@ -14,17 +14,23 @@ from pfbench.filter.whitening import whiten
 
 
 class CellPartition(Protocol):
-    """Partition into cells along each axis.
-
-    Called with differences p [R, N, k] from the mean, the mask of active particles [R, N] and the
-    covariance [R, k, k]. Returns int64 cell numbers [R, N, k] from 0 to `side` - 1.
-    """
+    """Partition into cells along each axis."""
 
     @property
     def side(self) -> int:
         """Number of cells along an axis."""
 
-    def __call__(self, p: Tensor, alive: Tensor, covariance: Tensor) -> Tensor: ...
+    def __call__(self, p: Tensor, active_mask: Tensor, covariance: Tensor) -> Tensor:
+        """Compute the cell of each particle along each axis.
+
+        Args:
+            p: Differences from the mean, [R, N, k].
+            active_mask: Mask of active particles, [R, N].
+            covariance: Covariance of the particles, [R, k, k].
+
+        Returns:
+            Cell numbers from 0 to `side` - 1, int64 [R, N, k].
+        """
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,7 @@ class WhitenedCells(CellPartition):
         reach: Distance of the outermost cells, which contain all farther particles.
 
     Raises:
-        ValueError: If cell is not in (0, reach].
+        ValueError: If the cell size is not in (0, reach].
     """
 
     cell_size: float = 1.0
@@ -59,7 +65,7 @@ class WhitenedCells(CellPartition):
         return int(self.reach / self.cell_size + 0.5)
 
     @override
-    def __call__(self, p: Tensor, alive: Tensor, covariance: Tensor) -> Tensor:
+    def __call__(self, p: Tensor, active_mask: Tensor, covariance: Tensor) -> Tensor:
         z = whiten(p, factor(covariance)[0]).clamp(-self.reach, self.reach)
         return torch.floor(z / self.cell_size + 0.5).long() + self._half
 
@@ -72,7 +78,7 @@ class AxisAlignedCells(CellPartition):
         cells_per_axis: Number along each axis, not specified in the paper.
 
     Raises:
-        ValueError: If cells is below 1.
+        ValueError: If the number is below 1.
     """
 
     cells_per_axis: int = 8
@@ -80,7 +86,8 @@ class AxisAlignedCells(CellPartition):
     def __post_init__(self) -> None:
         if self.cells_per_axis < 1:
             raise ValueError(
-                f"resampler.partition.cells_per_axis must be at least 1, got {self.cells_per_axis}. Set 1 or more."
+                f"resampler.partition.cells_per_axis must be at least 1, got {self.cells_per_axis}. "
+                "Set 1 or more."
             )
 
     @property
@@ -89,29 +96,32 @@ class AxisAlignedCells(CellPartition):
         return self.cells_per_axis
 
     @override
-    def __call__(self, p: Tensor, alive: Tensor, covariance: Tensor) -> Tensor:
-        active_mask = alive.unsqueeze(-1)
-        low = torch.where(active_mask, p, torch.inf).amin(1, keepdim=True)
-        high = torch.where(active_mask, p, -torch.inf).amax(1, keepdim=True)
+    def __call__(self, p: Tensor, active_mask: Tensor, covariance: Tensor) -> Tensor:
+        mask, count = active_mask.unsqueeze(-1), self.cells_per_axis
+        low = torch.where(mask, p, torch.inf).amin(1, keepdim=True)
+        high = torch.where(mask, p, -torch.inf).amax(1, keepdim=True)
         width = torch.where(high > low, high - low, 1.0)
-        return (
-            (self.cells_per_axis * (p - low) / width).clamp(0.0, self.cells_per_axis - 0.5).long()
-        )
+        return (count * (p - low) / width).clamp(0.0, count - 0.5).long()
 
 
-def divide_cells(grid: CellPartition, p: Tensor, active_mask: Tensor, covariance: Tensor) -> Tensor:
-    """Assign particles to cells [R, N], numbered from 0 without gaps in each run.
+def divide_cells(
+    partition: CellPartition, p: Tensor, active_mask: Tensor, covariance: Tensor
+) -> Tensor:
+    """Assign particles to cells that are numbered from 0 without gaps in each run.
 
     Args:
-        grid: Partition.
+        partition: Partition.
         p: Differences from the mean, [R, N, k].
         active_mask: Mask of active particles, [R, N].
         covariance: Covariance of the particles, [R, k, k].
+
+    Returns:
+        Cell of each particle, [R, N].
     """
-    index = grid(p, active_mask, covariance)
+    index = partition(p, active_mask, covariance)
     key = index[..., 0]
     for axis in range(1, index.shape[-1]):
-        key = key * grid.side + index[..., axis]
+        key = key * partition.side + index[..., axis]
     ordered, order = key.sort(1)
     number = torch.nn.functional.pad((ordered[:, 1:] != ordered[:, :-1]).cumsum(1), (1, 0))
     return torch.zeros_like(key).scatter(1, order, number)

@@ -16,13 +16,13 @@ from pfbench.filter.whitening import whiten
 
 
 class CellAggregates(NamedTuple):
-    """Particles aggregated by cell. Of N places for cells, empty ones weigh 0.
+    """Particles aggregated by cell. A run has up to N cells, and empty ones have weight 0.
 
     Attributes:
         weight: Sum W of the weights of a cell, [R, N].
         centre: Weighted mean of its particles minus the overall mean, [R, N, d].
-        within: Pooled covariance inside the cells, [R, d, d]. The total covariance is this plus
-            the covariance of the centres.
+        within: Pooled covariance inside the cells, [R, d, d]. The total covariance is the sum of it
+            and the covariance of the centres.
         covariance: Total covariance, [R, d, d].
     """
 
@@ -33,11 +33,21 @@ class CellAggregates(NamedTuple):
 
 
 class ParticlePlacement(Protocol):
-    """Polymers, cell of each slot [R, N] -> differences [R, N, d], valid mask [R]."""
+    """Placement of new particles, as differences from the mean."""
 
     def __call__(
         self, polymers: CellAggregates, slot: Tensor, draws: RandomStream
-    ) -> tuple[Tensor, Tensor]: ...
+    ) -> tuple[Tensor, Tensor]:
+        """Place particles.
+
+        Args:
+            polymers: Particles aggregated by cell.
+            slot: Cell of each new slot, [R, N].
+            draws: Random stream of the step.
+
+        Returns:
+            Differences from the mean [R, N, d], and the mask of valid runs [R].
+        """
 
 
 @dataclass(frozen=True)
@@ -47,7 +57,7 @@ class PooledCovariancePlacement(ParticlePlacement):
     Mean and covariance of the particles are preserved.
 
     Attributes:
-        points: Source of the d normal coordinates.
+        points: Point set of the d normal coordinates.
     """
 
     points: PointSet = field(default_factory=HaltonPoints)
@@ -65,16 +75,17 @@ class PooledCovariancePlacement(ParticlePlacement):
 class ScaledCentrePlacement(ParticlePlacement):
     """Polymer first, other particles at c + c o u [Pu and Qin, eq. 18].
 
-    c is the difference of the polymer from the mean, and u uniform on [low, 1) per component.
+    c is the difference of the polymer from the mean, and u uniform on [`min_scale`, 1) per
+    component.
 
     Attributes:
         min_scale: 0 as printed: every particle moves away from the mean. -1 centres the move. [ours]
         whiten: Apply to whitened axes instead of the state's. [ours]
         match_moments: Divide by sqrt(E (1 + u)^2), which preserves second moments. [ours]
-        points: Source of u.
+        points: Point set of u.
 
     Raises:
-        ValueError: If low is outside [-1, 1).
+        ValueError: If the smallest scale is outside [-1, 1).
     """
 
     min_scale: float = 0.0
@@ -96,16 +107,12 @@ class ScaledCentrePlacement(ParticlePlacement):
         centre = select_rows(polymers.centre, slot)
         ok = torch.isfinite(polymers.weight.sum(1))
         is_polymer = torch.nn.functional.pad(slot[:, 1:] != slot[:, :-1], (1, 0), value=True)
-        point_index = ((~is_polymer).cumsum(1) - 1).clamp(
-            min=0
-        )  # polymers do not consume points of the set
-        u = select_rows(
-            self.points(draws).uniform("polymer", slot.shape[1], centre.shape[-1]).to(centre),
-            point_index,
-        )
-        stretch = (1.0 + self.min_scale + (1.0 - self.min_scale) * u) / (
-            self._growth if self.match_moments else 1.0
-        )
+        # polymers do not consume points of the set
+        point_index = ((~is_polymer).cumsum(1) - 1).clamp(min=0)
+        u = self.points(draws).uniform("polymer", slot.shape[1], centre.shape[-1]).to(centre)
+        u = select_rows(u, point_index)
+        growth = self._growth if self.match_moments else 1.0
+        stretch = (1.0 + self.min_scale + (1.0 - self.min_scale) * u) / growth
         stretch = torch.where(is_polymer.unsqueeze(-1), 1.0, stretch)
         if not self.whiten:
             return centre * stretch, ok
@@ -115,10 +122,8 @@ class ScaledCentrePlacement(ParticlePlacement):
     @property
     def _growth(self) -> float:
         """Return sqrt(E (1 + u)^2)."""
-        return (
-            float((1.0 + 0.5 * (1.0 + self.min_scale)) ** 2 + (1.0 - self.min_scale) ** 2 / 12.0)
-            ** 0.5
-        )
+        mean, width = 1.0 + 0.5 * (1.0 + self.min_scale), 1.0 - self.min_scale
+        return float(mean**2 + width**2 / 12.0) ** 0.5
 
 
 def select_rows(a: Tensor, index: Tensor) -> Tensor:

@@ -38,17 +38,24 @@ _ESS_ROUNDING = 1e-5  # relative error of ESS for a million equal weights in sin
 
 
 class CellAllocation(Protocol):
-    """Number of particles per cell.
-
-    Called with the cells' shares of the resampling probability [R, N], each slot's cell [R, N],
-    the mask of active slots [R, N] and the target number n [R, 1]. Returns the cell of each new
-    slot [R, N], non-decreasing, the probability that a cell gets a particle [R, N], and the mask of
-    used slots [R or 1, N].
-    """
+    """Number of particles per cell."""
 
     def __call__(
-        self, share: Tensor, cell: Tensor, alive: Tensor, n: Tensor, draws: RandomStream
-    ) -> tuple[Tensor, Tensor, Tensor]: ...
+        self, share: Tensor, cell: Tensor, active_mask: Tensor, n: Tensor, draws: RandomStream
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Allocate slots to cells.
+
+        Args:
+            share: Resampling probability of each cell, [R, N].
+            cell: Cell of each slot, [R, N].
+            active_mask: Mask of active slots, [R, N].
+            n: Target number of particles, [R, 1].
+            draws: Random stream of the step.
+
+        Returns:
+            Cell of each new slot [R, N], non-decreasing, the probability that a cell gets a particle
+            [R, N], and the mask of used slots [R or 1, N].
+        """
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ class ProportionalAllocation(CellAllocation):
 
     @override
     def __call__(
-        self, share: Tensor, cell: Tensor, alive: Tensor, n: Tensor, draws: RandomStream
+        self, share: Tensor, cell: Tensor, active_mask: Tensor, n: Tensor, draws: RandomStream
     ) -> tuple[Tensor, Tensor, Tensor]:
         chance = (n * share).clamp(torch.finfo(share.dtype).tiny, 1.0)
         slots = torch.arange(share.shape[1], device=share.device)
@@ -74,12 +81,11 @@ class UnchangedAllocation(CellAllocation):
 
     @override
     def __call__(
-        self, share: Tensor, cell: Tensor, alive: Tensor, n: Tensor, draws: RandomStream
+        self, share: Tensor, cell: Tensor, active_mask: Tensor, n: Tensor, draws: RandomStream
     ) -> tuple[Tensor, Tensor, Tensor]:
-        previous = torch.zeros_like(share).scatter_add(1, cell, alive.to(share))
-        return ProportionalAllocation()(
-            previous / previous.sum(1, keepdim=True), cell, alive, n, draws
-        )
+        previous = torch.zeros_like(share).scatter_add(1, cell, active_mask.to(share))
+        previous_share = previous / previous.sum(1, keepdim=True)
+        return ProportionalAllocation()(previous_share, cell, active_mask, n, draws)
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,7 @@ class PolymerisedResampler(Resampler):
     A new particle of a cell with n_i of them has weight W_i / n_i [Pu and Qin, eq. 19], divided by
     the probability that the cell gets one. Otherwise cells with less than one particle's weight
     would be lost, and with them the tails [ours]. The mass of a cell is then correct on average,
-    and exactly so if it is large. The placement assumes a shape inside cells, so `exact` is False.
+    and exactly so if it is large. The placement assumes a shape inside cells, so `is_exact` is False.
     The defaults preserve mean and covariance on average.
 
     Attributes:
@@ -98,12 +104,12 @@ class PolymerisedResampler(Resampler):
         placement: Placement.
         axes: Components that the grid divides. None takes the first two of the group `position`,
             else the first two of the state, or its only one. [ours]
-        ess_threshold: Resample runs with ESS < threshold n. 1 as published: always, except equal
-            weights in the target number, such as initial particles without a measurement.
+        ess_threshold: Resample runs with ESS < threshold n. 1 as published: at every step, except
+            runs with equal weights in the target number, such as initial particles.
 
     Raises:
-        ValueError: If the threshold is outside [0, 1] or axes repeat. On the first use, if the
-            model does not have the axes, or particles store a history.
+        ValueError: If the threshold is outside [0, 1] or axes repeat. On the first use, if an axis
+            is not a component of the model, or if particles store a history.
     """
 
     partition: CellPartition = field(default_factory=WhitenedCells)
@@ -117,7 +123,7 @@ class PolymerisedResampler(Resampler):
         if not 0.0 <= self.ess_threshold <= 1.0:
             raise ValueError(
                 f"resampler.ess_threshold must be from 0 to 1, got {self.ess_threshold}. "
-                "Use 0 to resample never, 1 always."
+                "Use 0 to resample never, 1 at every step."
             )
         if self.axes is not None and (
             not self.axes or len(set(self.axes)) < len(self.axes) or min(self.axes) < 0
@@ -151,16 +157,12 @@ class PolymerisedResampler(Resampler):
         share = torch.zeros_like(a).scatter_add(1, cell, a)
         slot, chance, used_mask = self.allocation(share, cell, active_mask, n, draws)
         placed, ok = self.placement(polymers, slot, draws)
-        log_w = torch.where(
-            used_mask & ok.unsqueeze(-1),
-            _log_weights(_log_sums(cell, belief.log_w), chance, slot, used_mask),
-            -torch.inf,
-        )
+        log_w = _log_weights(_log_sums(cell, belief.log_w), chance, slot, used_mask)
+        log_w = torch.where(used_mask & ok.unsqueeze(-1), log_w, -torch.inf)
         resampled = belief._replace(x=model.chart.add(mean.unsqueeze(1), placed), log_w=log_w)
         target = n.squeeze(1)
-        resampled_mask = (
-            1.0 / a.square().sum(-1) < self.ess_threshold * (1.0 - _ESS_ROUNDING) * target
-        )
+        min_ess = self.ess_threshold * (1.0 - _ESS_ROUNDING) * target
+        resampled_mask = 1.0 / a.square().sum(-1) < min_ess
         if self.ess_threshold == 1.0:
             resampled_mask = resampled_mask | ((w > 0).sum(1) != target)
         return select_by_run(resampled_mask, resampled, belief), resampled_mask
@@ -188,6 +190,9 @@ def aggregate_cells(cell: Tensor, w: Tensor, d: Tensor, covariance: Tensor) -> C
         w: Weights, [R, N].
         d: Differences from the weighted mean, [R, N, d].
         covariance: Covariance of the particles, [R, d, d].
+
+    Returns:
+        Particles aggregated by cell.
     """
     zero = torch.zeros_like(w)
     weight = zero.scatter_add(1, cell, w)
@@ -210,7 +215,6 @@ def _log_sums(cell: Tensor, log_w: Tensor) -> Tensor:
 
 def _log_weights(log_weight: Tensor, chance: Tensor, slot: Tensor, used_mask: Tensor) -> Tensor:
     """Compute log W_i / (n_i probability_i) of each slot's cell i [R, N]."""
-    count = torch.zeros_like(log_weight).scatter_add(
-        1, slot, used_mask.to(log_weight).expand_as(log_weight)
-    )
+    used = used_mask.to(log_weight).expand_as(log_weight)
+    count = torch.zeros_like(log_weight).scatter_add(1, slot, used)
     return (log_weight - chance.log()).gather(1, slot) - count.gather(1, slot).log()

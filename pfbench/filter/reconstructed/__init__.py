@@ -1,0 +1,1 @@
+"""Proposals with state reconstruction by Dynamic Matrix Control."""

@@ -23,22 +23,26 @@ def select_defensive(
     Args:
         fraction: Fraction that is not shifted.
         log_w: Log weights, [R, N].
-        draws: Random numbers.
+        draws: Random stream.
+
+    Returns:
+        Selection of these particles.
     """
-    return (
-        choose_defensive_particles(fraction, torch.isfinite(log_w), draws, "reconstruction.keep")
-        if fraction > 0.0
-        else None
-    )
+    if fraction == 0.0:
+        return None
+    return choose_defensive_particles(fraction, torch.isfinite(log_w), draws, "reconstruction.keep")
 
 
 def keep_selected(selection: DefensiveSelection | None, old: Tensor, new: Tensor) -> Tensor:
-    """Return `old` for selected particles and `new` for the others, [R, N, ...].
+    """Return `old` for selected particles and `new` for the others.
 
     Args:
         selection: Selection, or None for no particle.
-        old: Values of selected particles.
-        new: Values of the others.
+        old: Values of selected particles, [R, N, ...].
+        new: Values of the others, [R, N, ...].
+
+    Returns:
+        Values, [R, N, ...].
     """
     return new if selection is None else torch.where(selection.mask.unsqueeze(-1), old, new)
 
@@ -46,16 +50,18 @@ def keep_selected(selection: DefensiveSelection | None, old: Tensor, new: Tensor
 def predict_without_noise(
     model: StateSpaceModel, belief: ParticleBelief, record: Record
 ) -> tuple[Tensor, Tensor]:
-    """Compute noise-free predictions [R, N, D] and weights [R, N], 0 if not finite.
+    """Compute noise-free predictions.
 
     Args:
         model: State-space model.
-        cloud: Belief before the step.
-        seen: Record of the step.
+        belief: Belief before the step.
+        record: Record of the step.
+
+    Returns:
+        Predictions [R, N, D] and weights [R, N], 0 where the prediction is not finite.
     """
-    x, log_w = deactivate_invalid_particles(
-        model.propagate(belief.x, record.u, mean_noise(model, belief.x)), belief.log_w, belief.x
-    )
+    x = model.propagate(belief.x, record.u, mean_noise(model, belief.x))
+    x, log_w = deactivate_invalid_particles(x, belief.log_w, belief.x)
     return x, normalise_log_weights(log_w)
 
 
@@ -64,7 +70,7 @@ def replace_invalid(sample: ProposalSample, belief: ParticleBelief) -> tuple[Ten
 
     Args:
         sample: Sample of the proposal.
-        cloud: Belief before the step.
+        belief: Belief before the step.
 
     Returns:
         Particles [R, N, D] and log ratio [R, N].

@@ -22,21 +22,29 @@ from pfbench.model.base import StateSpaceModel
 
 
 class DmcResponse(Protocol):
-    """Response of the measurement: H [R, P, Dy, d] -> A [R, P, Dy, d] and B [d].
-
-    B is the effect of the inputs on the state.
-    """
+    """Response of measurement and state to the inputs of the controller."""
 
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, h: Tensor
-    ) -> tuple[Tensor, Tensor]: ...
+    ) -> tuple[Tensor, Tensor]:
+        """Compute the response.
+
+        Args:
+            model: State-space model of the step.
+            belief: Belief before the step.
+            record: Record of the step.
+            h: Measurement Jacobian, [R, P, Dy, d].
+
+        Returns:
+            Effect A of the inputs on the measurement [R, P, Dy, d], and B on the state [d].
+        """
 
 
 @dataclass(frozen=True)
 class StaticResponse(DmcResponse):
     """Immediate response A = H, B = I. Unobserved states are not shifted [ours].
 
-    The paper's B omits the azimuth, which H does not observe either: the shift is equal.
+    The paper's B omits the azimuth. H does not observe it, so the shift is equal.
     """
 
     @override
@@ -58,7 +66,7 @@ class OneStepResponse(DmcResponse):
             state is shifted.
 
     Raises:
-        ValueError: On use, if a name is not a state, or the number of units differs from it.
+        ValueError: On use, if a name is not a state, or the number of units is not that of states.
     """
 
     held: Sequence[str] = ()
@@ -116,17 +124,17 @@ class DmcController:
 
         Args:
             model: State-space model.
-            cloud: Belief before the step.
-            seen: Record of the step.
+            belief: Belief before the step.
+            record: Record of the step.
             h: Measurement Jacobian [R, P, Dy, d], with rows 0 for unobserved components.
 
         Returns:
             Gain, [R, P, d, Dy].
         """
         a, b = self.response(model, belief, record, h)
-        error_variance = 1.0 / _expanded("error_weight", self.error_weight, h, h.shape[-2])
+        error_variance = 1.0 / _expand("error_weight", self.error_weight, h, h.shape[-2])
         # R^-1 A', then the push-through identity: Dy equations instead of d
-        scaled = (a / _expanded("control_weight", self.control_weight, h, h.shape[-1])).mT
+        scaled = (a / _expand("control_weight", self.control_weight, h, h.shape[-1])).mT
         inner = torch.linalg.solve_ex(a @ scaled + torch.diag(error_variance), scaled.mT)[0]
         return b.unsqueeze(-1) * inner.mT
 
@@ -139,6 +147,9 @@ def state_indices(model: StateSpaceModel, key: str, names: Sequence[str]) -> lis
         key: Configuration key, for messages.
         names: Names of states.
 
+    Returns:
+        Index of each name.
+
     Raises:
         ValueError: If a name is not a state.
     """
@@ -150,9 +161,9 @@ def state_indices(model: StateSpaceModel, key: str, names: Sequence[str]) -> lis
     return [model.names.index(name) for name in names]
 
 
-def _expanded(name: str, value: float | Sequence[float], like: Tensor, n: int) -> Tensor:
-    """Expand one number to n, or check that there are n."""
-    numbers = torch.as_tensor(value).to(like)
+def _expand(name: str, value: float | Sequence[float], template: Tensor, n: int) -> Tensor:
+    """Expand one number to n, or check the number of several."""
+    numbers = torch.as_tensor(value).to(template)
     if numbers.numel() not in (1, n):
         raise ValueError(
             f"controller.{name} must have 1 or {n} numbers, got {numbers.numel()}. Set one or {n}."

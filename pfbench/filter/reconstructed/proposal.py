@@ -43,7 +43,7 @@ from pfbench.model.base import StateSpaceModel
 
 @dataclass(frozen=True)
 class ReconstructedProposal(Proposal):
-    """Particles of `base`, shifted by the DMC law.
+    """Particles of `base`, shifted by a DMC controller.
 
     Attributes:
         base: Proposal of the particles.
@@ -79,15 +79,16 @@ class ReconstructedNoiseProposal(Proposal):
     parent's noise-free prediction, A = d y_hat / d w and P = (1 + A' R_v^-1 A)^-1. The ratio of
     w' = P A' R_v^-1 (y - y_hat) + S w is p(w') |S| / p(w).
 
-    Deterministic, S = P: narrower than the posterior. If A A' exceeds R_v, the weights have no
-    finite variance unless `defensive_fraction` is positive. Stochastic, S S' = P: the optimal proposal if the
-    measurement is linear [Doucet et al. 2000].
+    Deterministic, S = P: narrower than the posterior. If A A' exceeds R_v, the variance of the
+    weights is infinite unless `defensive_fraction` is positive. Stochastic, S S' = P: the optimal
+    proposal if the measurement is linear [Doucet et al. 2000].
 
     Attributes:
         base: Source of the noise.
         sample_noise: Draw from the posterior of the noise. False shifts deterministically.
         defensive_fraction: Fraction that is not shifted.
-        linearise_per_particle: Linearise at each parent's prediction. False linearises once, at their mean.
+        linearise_per_particle: Linearise at each parent's prediction. False linearises once, at
+            their mean.
 
     Raises:
         ValueError: At the first step, if the base does not return its noise.
@@ -116,21 +117,19 @@ class ReconstructedNoiseProposal(Proposal):
                 "proposal.base must return its noise, got "
                 f"{type(self.base).__name__}. Choose BootstrapProposal."
             )
-        defensive = select_defensive(
-            self.defensive_fraction, belief.log_w + replace_invalid(sample, belief)[1], draws
-        )
+        log_w = belief.log_w + replace_invalid(sample, belief)[1]
+        defensive = select_defensive(self.defensive_fraction, log_w, draws)
 
-        def sized(xi: Tensor) -> Tensor:
+        def scale(xi: Tensor) -> Tensor:
             return noise.mean + noise.stddev * xi
 
-        before = (sample.w - noise.mean) / noise.stddev
+        xi = (sample.w - noise.mean) / noise.stddev
         new, ratio = self._posterior(model, belief, record).apply(
-            before, defensive, lambda xi: noise.log_prob(sized(xi))
+            xi, defensive, lambda xi: noise.log_prob(scale(xi))
         )
-        w = keep_selected(defensive, sample.w, sized(new))
-        return ProposalSample(
-            model.propagate(belief.x, record.u, w), sample.log_ratio + ratio, sample.memory, w
-        )
+        w = keep_selected(defensive, sample.w, scale(new))
+        x = model.propagate(belief.x, record.u, w)
+        return ProposalSample(x, sample.log_ratio + ratio, sample.memory, w)
 
     def _posterior(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record
@@ -139,27 +138,25 @@ class ReconstructedNoiseProposal(Proposal):
         chart, noise, gain = model.chart, model.noise, model.noise_gain(record.u)
         prediction, w = predict_without_noise(model, belief, record)
         if gain is not None:
-            centre = (
-                prediction
-                if self.linearise_per_particle
-                else chart.mean(prediction, w).unsqueeze(1)
-            )
+            centre = prediction
+            if not self.linearise_per_particle:
+                centre = chart.mean(prediction, w).unsqueeze(1)
             a = measurement_jacobian(model, centre, record) @ (gain * noise.stddev).unsqueeze(1)
         else:
-            parent = (
-                belief.x if self.linearise_per_particle else chart.mean(belief.x, w).unsqueeze(1)
-            )
+            parent = belief.x
+            if not self.linearise_per_particle:
+                parent = chart.mean(belief.x, w).unsqueeze(1)
             centre = model.propagate(parent, record.u, mean_noise(model, parent))
             a = _noise_jacobian(model, parent, record)
         a, r = _whitened(model, centre, record, a, linearised_innovation(model, prediction, record))
         eye = torch.eye(a.shape[-1], dtype=a.dtype, device=a.device)
         root = torch.linalg.cholesky_ex(a.mT @ a + eye)[0]
-        covariance_root = torch.linalg.solve_triangular(root, eye, upper=False).mT  # half half' = P
+        covariance_root = torch.linalg.solve_triangular(
+            root, eye, upper=False
+        ).mT  # its square is P
         covariance = covariance_root @ covariance_root.mT
-        return AffineMap(
-            covariance_root if self.sample_noise else covariance,
-            batch_product(covariance, batch_product(a.mT, r)),
-        )
+        offset = batch_product(covariance, batch_product(a.mT, r))
+        return AffineMap(covariance_root if self.sample_noise else covariance, offset)
 
 
 def _noise_jacobian(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
@@ -167,11 +164,8 @@ def _noise_jacobian(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor
     noise = model.noise
 
     def predict(at: Tensor, xi: Tensor) -> Tensor:
-        return linearised_mean(
-            model.observation(
-                model.propagate(at, record.u, noise.mean + noise.stddev * xi), record.u
-            )
-        )
+        x_next = model.propagate(at, record.u, noise.mean + noise.stddev * xi)
+        return linearised_mean(model.observation(x_next, record.u))
 
     a = derivative(predict, x, model.noise_dim, model.residual)
     return torch.where(torch.isnan(record.y)[:, None, :, None], 0.0, a)
@@ -185,9 +179,7 @@ def _whitened(
     if not isinstance(distribution, torch.distributions.MultivariateNormal):
         scale = distribution.variance.rsqrt()
         return scale.unsqueeze(-1) * a, scale * r
-    root = factor(
-        mask_covariance(distribution.covariance_matrix, ~torch.isnan(record.y).unsqueeze(1))
-    )[0]
-    return torch.linalg.solve_triangular(root, a, upper=False), batch_product(
-        torch.linalg.inv_ex(root)[0], r
-    )
+    observed_mask = ~torch.isnan(record.y).unsqueeze(1)
+    root = factor(mask_covariance(distribution.covariance_matrix, observed_mask))[0]
+    whitened_r = batch_product(torch.linalg.inv_ex(root)[0], r)
+    return torch.linalg.solve_triangular(root, a, upper=False), whitened_r

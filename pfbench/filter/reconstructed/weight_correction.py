@@ -33,11 +33,11 @@ from pfbench.model.base import StateSpaceModel, StaticModel
 
 
 class WeightCorrection(Protocol):
-    """Shift and weights: particles of the base proposal -> reconstructed particles."""
+    """Shift of the particles of a base proposal, and correction of their weights."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether the weighted particles are asymptotically exact."""
+        """True if the weighted particles are asymptotically exact."""
 
     def __call__(
         self,
@@ -47,7 +47,20 @@ class WeightCorrection(Protocol):
         sample: ProposalSample,
         control: DmcController,
         draws: RandomStream,
-    ) -> ProposalSample: ...
+    ) -> ProposalSample:
+        """Reconstruct particles.
+
+        Args:
+            model: State-space model of the step.
+            belief: Belief before the step.
+            record: Record of the step.
+            sample: Sample of the base proposal.
+            control: Controller that determines the shift.
+            draws: Random stream of the step.
+
+        Returns:
+            Shifted particles and their density ratio.
+        """
 
 
 @dataclass(frozen=True)
@@ -57,10 +70,10 @@ class NoWeightCorrection(WeightCorrection):
     It does not converge to the posterior.
 
     Attributes:
-        linearise_per_particle: Linearise the measurement at each particle. False linearises once at their mean,
-            which costs less and is equal for linear measurements.
-        regressed_states: Names of states that follow the shift of all others by regression, which
-            worsens the azimuth. None as printed [ours].
+        linearise_per_particle: Linearise the measurement at each particle. False linearises once at
+            their mean, which costs less and is equal for linear measurements.
+        regressed_states: Names of states that follow the shift of all others by regression [ours].
+            None as printed. For the azimuth the regression increases the error.
     """
 
     linearise_per_particle: bool = True
@@ -80,18 +93,13 @@ class NoWeightCorrection(WeightCorrection):
         x, log_ratio = replace_invalid(sample, belief)
         w = normalise_log_weights(belief.log_w + log_ratio)
         centre = x if self.linearise_per_particle else model.chart.mean(x, w).unsqueeze(1)
-        gain = control.compute_gain(
-            model, belief, record, measurement_jacobian(model, centre, record)
-        )
+        h = measurement_jacobian(model, centre, record)
+        gain = control.compute_gain(model, belief, record, h)
         shift = batch_product(gain, linearised_innovation(model, x, record))
         if self.regressed_states:
-            shift = _regressed_shift(
-                model,
-                x,
-                w,
-                shift,
-                state_indices(model, "weight_correction.regressed_states", self.regressed_states),
-            )
+            key = "weight_correction.regressed_states"
+            regressed = state_indices(model, key, self.regressed_states)
+            shift = _regressed_shift(model, x, w, shift, regressed)
         return ProposalSample(model.chart.add(x, shift), log_ratio, sample.memory)
 
 
@@ -103,11 +111,12 @@ class TransitionRatioCorrection(WeightCorrection):
     is xi -> xi + K (y - h(f) - H xi). It is affine, so its Jacobian is known also for a nonlinear
     measurement. A singular transition has a density on the span of its noise, and the shift is
     projected on that span. Exact, but useful only with wide noise. Increase the model's noise for
-    all filters alike, rather than for this one.
+    all filters of a comparison, rather than for this one.
 
     Attributes:
-        defensive_fraction: Fraction that is not shifted. Weights are then at most 1/keep times the likelihood.
-        linearise_per_particle: As for Uncorrected, but at the noise-free predictions.
+        defensive_fraction: Fraction c that is not shifted. Weights are then at most 1/c times the
+            likelihood.
+        linearise_per_particle: As for `NoWeightCorrection`, but at the noise-free predictions.
 
     Raises:
         ValueError: At the first step, if the model's noise is not additive.
@@ -132,19 +141,19 @@ class TransitionRatioCorrection(WeightCorrection):
     ) -> ProposalSample:
         if isinstance(model, StaticModel):  # no transition in this step
             return sample
-        chart, factor_of_noise = model.chart, model.noise_gain(record.u)
-        if factor_of_noise is None:
+        chart, noise_gain = model.chart, model.noise_gain(record.u)
+        if noise_gain is None:
             raise ValueError(
-                "proposal.weight_correction TransitionRatioCorrection must have a model with additive noise, got "
-                f"{type(model).__name__}, whose noise is not additive. "
+                "proposal.weight_correction TransitionRatioCorrection must have a model with additive "
+                f"noise, got {type(model).__name__}. "
                 "Choose MarginalRatioCorrection or ReconstructedNoiseProposal."
             )
         prediction, w = predict_without_noise(model, belief, record)
-        centre = (
-            prediction if self.linearise_per_particle else chart.mean(prediction, w).unsqueeze(1)
-        )
+        centre = prediction
+        if not self.linearise_per_particle:
+            centre = chart.mean(prediction, w).unsqueeze(1)
         x, log_ratio = replace_invalid(sample, belief)
-        scaled_gain = factor_of_noise * model.noise.stddev
+        scaled_gain = noise_gain * model.noise.stddev
         whiten, colour = _basis(scaled_gain @ scaled_gain.mT)
         h = measurement_jacobian(model, centre, record)
         whitened_gain = whiten.unsqueeze(1) @ control.compute_gain(model, belief, record, h)
@@ -157,25 +166,27 @@ class TransitionRatioCorrection(WeightCorrection):
         defensive = select_defensive(self.defensive_fraction, belief.log_w + log_ratio, draws)
         new, ratio = affine.apply(a, defensive, lambda e: -compute_half_square(e))
         shifted = chart.add(prediction, xi + (new - a) @ colour.mT)
-        return ProposalSample(
-            keep_selected(defensive, x, shifted), log_ratio + ratio, sample.memory
-        )
+        x = keep_selected(defensive, x, shifted)
+        return ProposalSample(x, log_ratio + ratio, sample.memory)
 
 
 @dataclass(frozen=True)
 class MarginalRatioCorrection(WeightCorrection):
     """Defensive mixture with the ratio of fitted normal distributions [ours].
 
-    About the predicted mean, o = H xi. The shift o -> o + H K (y - y_hat - o) moves the whole state
-    by its regression on o, which leaves the residual unchanged. The log weights are
-    log p(y | x) + log p(o') - log(keep p(o') + (1 - keep) q(o')). p is the normal distribution
-    fitted to o, and q the one of the shifted particles. Correct if the predicted distribution is
-    normal, as on linear-Gaussian models, otherwise approximate. A shift to a direction without
-    variance has weight 0, and no weight exceeds 1/keep times the likelihood.
+    About the predicted mean, o = H xi. The shift o -> o + H K (y - y_hat - o) moves all components
+    of the state by their regression on o, which leaves the residual unchanged. The log weights are
+
+        log p(y | x) + log p(o') - log(c p(o') + (1 - c) q(o')),
+
+    with c the defensive fraction, p the normal distribution fitted to o, and q that of the shifted
+    particles. Correct if the predicted distribution is normal, as on linear-Gaussian models,
+    otherwise approximate. A shift to a direction without variance has weight 0, and no weight
+    exceeds 1/c times the likelihood.
 
     Attributes:
-        defensive_fraction: Fraction that is not shifted. It is drawn in each step, since neighbours are
-            siblings after resampling. 1 gives the base proposal.
+        defensive_fraction: Fraction that is not shifted. These particles are chosen at random in
+            each step, since neighbours are siblings after resampling. 1 gives the base proposal.
     """
 
     defensive_fraction: float = 0.5
@@ -198,25 +209,21 @@ class MarginalRatioCorrection(WeightCorrection):
         w = normalise_log_weights(belief.log_w + log_ratio)
         centre = model.chart.mean(x, w).unsqueeze(1)
         xi, h = model.chart.subtract(x, centre), measurement_jacobian(model, centre, record)
-        o = batch_product(h, xi)
-        weighted_o = w.unsqueeze(-1) * o
-        whiten, colour = _basis(weighted_o.mT @ o)
-        whitened_gain = (
-            whiten @ h[:, 0] @ control.compute_gain(model, belief, record, h)[:, 0]
-        )  # [R, Dy, Dy]
+        deviation_y = batch_product(h, xi)  # o
+        weighted_y = w.unsqueeze(-1) * deviation_y
+        whiten, colour = _basis(weighted_y.mT @ deviation_y)
+        gain = control.compute_gain(model, belief, record, h)[:, 0]
+        whitened_gain = whiten @ h[:, 0] @ gain  # [R, Dy, Dy]
         affine = AffineMap(
             _identity_minus(whitened_gain @ colour).unsqueeze(1),
             linearised_innovation(model, centre, record) @ whitened_gain.mT,
         )
-        defensive, a = (
-            select_defensive(self.defensive_fraction, belief.log_w + log_ratio, draws),
-            o @ whiten.mT,
-        )
+        a = deviation_y @ whiten.mT
+        defensive = select_defensive(self.defensive_fraction, belief.log_w + log_ratio, draws)
         new, ratio = affine.apply(a, defensive, lambda e: -compute_half_square(e))
-        shift = (new - a) @ (whiten @ weighted_o.mT @ xi)
-        return ProposalSample(
-            keep_selected(defensive, x, model.chart.add(x, shift)), log_ratio + ratio, sample.memory
-        )
+        shift = (new - a) @ (whiten @ weighted_y.mT @ xi)
+        x = keep_selected(defensive, x, model.chart.add(x, shift))
+        return ProposalSample(x, log_ratio + ratio, sample.memory)
 
 
 def _basis(covariance: Tensor) -> tuple[Tensor, Tensor]:
@@ -228,9 +235,8 @@ def _basis(covariance: Tensor) -> tuple[Tensor, Tensor]:
     range_mask = values > torch.finfo(values.dtype).eps ** (2 / 3)
     divisors = torch.where(range_mask, values, torch.inf).sqrt()
     root_values = torch.where(range_mask, values, 0.0).sqrt()
-    return (vectors / divisors.unsqueeze(-2)).mT / sd.unsqueeze(-2), sd.unsqueeze(
-        -1
-    ) * vectors * root_values.unsqueeze(-2)
+    whiten = (vectors / divisors.unsqueeze(-2)).mT / sd.unsqueeze(-2)
+    return whiten, sd.unsqueeze(-1) * vectors * root_values.unsqueeze(-2)
 
 
 def _regressed_shift(
@@ -241,9 +247,8 @@ def _regressed_shift(
     covariance = (w.unsqueeze(-1) * d).mT @ d
     others = [i for i in range(d.shape[-1]) if i not in regressed]
     whiten, _ = _basis(covariance[:, others][:, :, others])
-    predicted_shift = shift[..., others] @ (
-        whiten.mT @ whiten @ covariance[:, others][:, :, regressed]
-    )
+    regression = whiten.mT @ whiten @ covariance[:, others][:, :, regressed]
+    predicted_shift = shift[..., others] @ regression
     return shift.index_copy(-1, torch.tensor(regressed, device=shift.device), predicted_shift)
 
 

@@ -106,7 +106,7 @@ class ObservedComponents(SwarmCoordinates):
                 -1, index, eye.expand_as(covariance)
             )
         return SwarmFrame(
-            q, covariance, index, lambda moved: chart.add(mean, c + (moved - q) @ direction)
+            q, covariance, index, lambda new_q: chart.add(mean, c + (new_q - q) @ direction)
         )
 
 
