@@ -1,4 +1,4 @@
-"""Coordinates in which a covariance is the unit matrix, by its lower triangular root."""
+"""Coordinates in which a covariance is the unit matrix."""
 
 from __future__ import annotations
 
@@ -42,3 +42,23 @@ def compute_half_square(a: Tensor) -> Tensor:
     It is the negative log density of N(0, I) up to a constant.
     """
     return 0.5 * (a * a).sum(-1)
+
+
+def whitening_basis(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute whitening and colouring matrices of a covariance S that may be singular.
+
+    Args:
+        covariance: Covariance S, [R, k, k].
+
+    Returns:
+        W and C [R, k, k] with W S W' = 1 and C W = 1 on the range of S. Both are 0 off this range.
+    """
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    sd = torch.where(variance > 0.0, variance, 1.0).sqrt()
+    correlation = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(correlation, 0.0, 0.0, 0.0))
+    range_mask = values > torch.finfo(values.dtype).eps ** (2 / 3)
+    divisors = torch.where(range_mask, values, torch.inf).sqrt()
+    root_values = torch.where(range_mask, values, 0.0).sqrt()
+    whitening = (vectors / divisors.unsqueeze(-2)).mT / sd.unsqueeze(-2)
+    return whitening, sd.unsqueeze(-1) * vectors * root_values.unsqueeze(-2)

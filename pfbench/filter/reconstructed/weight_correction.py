@@ -28,7 +28,7 @@ from pfbench.filter.reconstructed.defensive_shift import (
     select_defensive,
 )
 from pfbench.filter.reconstructed.dmc_controller import DmcController, state_indices
-from pfbench.filter.whitening import compute_half_square
+from pfbench.filter.whitening import compute_half_square, whitening_basis
 from pfbench.model.base import StateSpaceModel, StaticModel
 
 
@@ -154,7 +154,7 @@ class TransitionRatioCorrection(WeightCorrection):
             centre = chart.mean(prediction, w).unsqueeze(1)
         x, log_ratio = replace_invalid(sample, belief)
         scaled_gain = noise_gain * model.noise.stddev
-        whiten, colour = _basis(scaled_gain @ scaled_gain.mT)
+        whiten, colour = whitening_basis(scaled_gain @ scaled_gain.mT)
         h = measurement_jacobian(model, centre, record)
         whitened_gain = whiten.unsqueeze(1) @ control.compute_gain(model, belief, record, h)
         affine = AffineMap(
@@ -211,7 +211,7 @@ class MarginalRatioCorrection(WeightCorrection):
         xi, h = model.chart.subtract(x, centre), measurement_jacobian(model, centre, record)
         deviation_y = batch_product(h, xi)  # o
         weighted_y = w.unsqueeze(-1) * deviation_y
-        whiten, colour = _basis(weighted_y.mT @ deviation_y)
+        whiten, colour = whitening_basis(weighted_y.mT @ deviation_y)
         gain = control.compute_gain(model, belief, record, h)[:, 0]
         whitened_gain = whiten @ h[:, 0] @ gain  # [R, Dy, Dy]
         affine = AffineMap(
@@ -226,19 +226,6 @@ class MarginalRatioCorrection(WeightCorrection):
         return ProposalSample(x, log_ratio + ratio, sample.memory)
 
 
-def _basis(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return W and C [R, k, k] with W S W' = 1, C W = 1 on the range of S, else 0."""
-    variance = covariance.diagonal(dim1=-2, dim2=-1)
-    sd = torch.where(variance > 0.0, variance, 1.0).sqrt()
-    correlation = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(correlation, 0.0, 0.0, 0.0))
-    range_mask = values > torch.finfo(values.dtype).eps ** (2 / 3)
-    divisors = torch.where(range_mask, values, torch.inf).sqrt()
-    root_values = torch.where(range_mask, values, 0.0).sqrt()
-    whiten = (vectors / divisors.unsqueeze(-2)).mT / sd.unsqueeze(-2)
-    return whiten, sd.unsqueeze(-1) * vectors * root_values.unsqueeze(-2)
-
-
 def _regressed_shift(
     model: StateSpaceModel, x: Tensor, w: Tensor, shift: Tensor, regressed: list[int]
 ) -> Tensor:
@@ -246,7 +233,7 @@ def _regressed_shift(
     d = model.chart.subtract(x, model.chart.mean(x, w).unsqueeze(1))
     covariance = (w.unsqueeze(-1) * d).mT @ d
     others = [i for i in range(d.shape[-1]) if i not in regressed]
-    whiten, _ = _basis(covariance[:, others][:, :, others])
+    whiten, _ = whitening_basis(covariance[:, others][:, :, others])
     regression = whiten.mT @ whiten @ covariance[:, others][:, :, regressed]
     predicted_shift = shift[..., others] @ regression
     return shift.index_copy(-1, torch.tensor(regressed, device=shift.device), predicted_shift)
