@@ -1,4 +1,4 @@
-"""Filters and their stages: the public names of this folder, imported on first use."""
+"""Filters and their stages: the public names, imported on first use."""
 
 from pfbench.core.lazy_import import lazy_attributes
 

@@ -1,4 +1,4 @@
-"""Belief, which the next step needs, and info, which a report needs: flat NamedTuples of tensors."""
+"""Belief, which the next step needs, and information of a step for reports."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ class StepInfo(NamedTuple):
     Attributes:
         mean: Estimate, [R, D].
         variance: [R, d].
-        covariance: Computes the covariance in the chart, [R, d, d]. For particles it costs a tenth of
-            a step.
+        covariance: Computes the covariance in the chart, [R, d, d]. For particles it costs a tenth
+            of a step.
         trace: Numbers per run, {name: [R]}, such as `ess` or `resampled`.
         cloud: Computes deviations of the particles from the mean [R, N, d] and log weights [R, N].
             None for a Gaussian filter.
-        nis: Computes the normalised innovation squared under the predicted moments, and the number of
-            observed components, [R] each. None if the filter does not support it.
+        nis: Computes the normalised innovation squared under the predicted moments, and the number
+            of observed components, [R] each. None if the filter does not support it.
         group_covariance: Computes covariances of groups of components [R, G, s, s] from indices
             [G, s], where that is cheaper than the full covariance.
     """
@@ -89,7 +89,7 @@ class StepInfo(NamedTuple):
 
 
 class Filter(Protocol):
-    """Filter: computes the next belief from a belief and a record. The object is stateless."""
+    """Stateless filter: computes the next belief from a belief and a record."""
 
     @property
     def is_exact(self) -> bool:
@@ -155,7 +155,7 @@ def gather_ancestors(belief: ParticleBelief, ancestors: Tensor) -> ParticleBelie
 def select_by_run(
     resampled_mask: Tensor, new: ParticleBelief, old: ParticleBelief
 ) -> ParticleBelief:
-    """Return `new` for resampled runs and `old` for others, with the evidence of `new`.
+    """Return `new` for resampled runs and `old` for others; the evidence is of `new`.
 
     Args:
         resampled_mask: Resampled runs, [R].
@@ -219,8 +219,9 @@ def _gather_states(x: Tensor, ancestors: Tensor) -> Tensor:
 
 
 def _flat_select(first: Tensor, ancestors: Tensor) -> Tensor:
-    """Gather [D, R, N] by ancestors [R, M]; one flat index costs a fifth of an expanded one."""
+    """Gather [D, R, N] by ancestors [R, M]."""
     d, runs, n = first.shape
+    # one flat index costs a fifth of an expanded one
     flat = ancestors + n * torch.arange(runs, device=first.device)[:, None]
     return first.reshape(d, runs * n).index_select(1, flat.flatten()).reshape(d, *ancestors.shape)
 

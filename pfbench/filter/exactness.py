@@ -1,4 +1,4 @@
-"""Asymptotic exactness of a filter: every part states it, and a silent part counts as inexact."""
+"""Asymptotic exactness of a filter, which each of its parts states."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def _stated(key: str, stage: object) -> bool:
         return value
     name = getattr(stage, "__name__", type(stage).__name__)
     warnings.warn(
-        f"filter: {key} must state whether it is asymptotically exact, got {name} without `is_exact`. "
-        "The filter counts as not exact. Add `is_exact = True` to it (or `is_exact = False`) "
-        "and test it with pfbench.testing.",
+        f"filter: {key} must state whether it is asymptotically exact, got {name} without "
+        "`is_exact`. The filter counts as not exact. Add `is_exact = True` to it (or "
+        "`is_exact = False`) and test it with pfbench.testing.",
         stacklevel=4,
     )
     return False

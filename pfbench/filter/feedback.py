@@ -41,7 +41,8 @@ def apply_feedback(
         if belief.window or belief.memory:
             raise ValueError(
                 "filter must not store a particle's past in a scenario with feedback, got one with "
-                "moves or a proposal's memory. Choose another filter, or set scenario.closed_loop=false."
+                "moves or a proposal's memory. Choose another filter, or set "
+                "scenario.closed_loop=false."
             )
         return belief._replace(x=correct(belief.x)), info
     chart, centre = model.chart, belief.mean.unsqueeze(1)
@@ -55,5 +56,5 @@ def apply_feedback(
 
 
 def correctable_groups(model: StateSpaceModel) -> dict[str, tuple[int, ...]]:
-    """Return the component groups of a model whose states are differences; otherwise none."""
+    """Return the component groups of a model, none if its states are not differences."""
     return model.groups if model.chart.size == len(model.names) else {}

@@ -1,4 +1,4 @@
-"""Derivatives of a model along its chart, and checks that a Gaussian approximation is possible."""
+"""Derivatives of a model along its chart, and checks of Gaussian approximations."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ def linearised_mean(distribution: Any) -> Tensor:
 
 
 def unwrap_independent(distribution: Distribution) -> Distribution:
-    """Return the univariate distribution of independent components, or the distribution itself."""
+    """Return the univariate distribution of independent components, else the argument."""
     return distribution.base_dist if isinstance(distribution, Independent) else distribution
 
 

@@ -1,4 +1,4 @@
-"""The time loop of every filter: `FilterPass` takes a belief through a record step by step.
+"""The time loop of every filter: `FilterPass` steps a belief through a record.
 
 `run_filter`, training, online inference and filters that take several steps together all use it.
 """

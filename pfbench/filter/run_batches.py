@@ -1,4 +1,4 @@
-"""Batches of runs: a filter takes the runs of a record together, in batches that fit memory."""
+"""Batches of runs, which a filter takes together."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def choose_run_batch(runs: int, particles: int, dimension: int) -> int:
     """Choose how many runs a step takes together on the CPU.
 
     Batches have about equal size and a million numbers each, so memory depends on the size of a
-    batch and not on the number of runs. Smaller batches would stay in the cache of a core, but below
-    some 100 000 numbers the overhead of single operations dominates. [Measured on a 15-state INS
-    with 500 particles: 100 runs together were 10 % faster than 50 on an idle machine, and 33 %
+    batch and not on the number of runs. Smaller batches would stay in the cache of a core, but
+    below some 100 000 numbers the overhead of single operations dominates. [Measured on a 15-state
+    INS with 500 particles: 100 runs together were 10 % faster than 50 on an idle machine, and 33 %
     slower while other processes used the shared cache.]
 
     Args:

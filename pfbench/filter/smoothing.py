@@ -1,4 +1,4 @@
-"""Smoothing: distributions of all states given the whole record, by a backward pass.
+"""Smoothing: distributions of states given all measurements, by a backward pass.
 
 Gaussian filters use the recursion of Rauch, Tung and Striebel. Particle filters use
 backward sampling of paths.
@@ -25,7 +25,7 @@ _PAIRS = 4_000_000  # numbers of pairs of particle and path that are weighted at
 
 
 class SmoothedStates(NamedTuple):
-    """Normal distribution of each state given the whole record, in the chart about `mean`.
+    """Normal distribution of each state, given all measurements, in the chart.
 
     Attributes:
         mean: Smoothed means, [R, T, D]. NaN for a lost run.
@@ -174,7 +174,7 @@ def sample_trajectories(
 
 
 def _log_densities(model: StateSpaceModel, x: Tensor, next_x: Tensor, u: Any) -> Tensor:
-    """Return log p(next | x) [R, M, N] of next states [R, M, D] from particles [R, N, D]."""
+    """Return log p(next | x) [R, M, N] of next states [R, M, D] and x [R, N, D]."""
     parts, n = [], x.shape[1]
     for block in next_x.split(max(1, _PAIRS // x.numel()), 1):
         distribution: Any = model.transition(x.repeat(1, block.shape[1], 1), u)

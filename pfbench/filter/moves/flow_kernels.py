@@ -94,12 +94,12 @@ class NoiseFlowKernel(McmcKernel):
         random_walk: Step of the start. On a curved chart it is taken in the coordinates about the
             mean of the start [ours]. The distribution is normal there, so no volume element is
             missing.
-        noise_refresh: c. Replaces the noises by w' = sqrt(1 - c^2) w + c e, which leaves their normal
-            distribution invariant.
+        noise_refresh: c. Replaces the noises by w' = sqrt(1 - c^2) w + c e, which leaves their
+            normal distribution invariant.
 
     Raises:
-        ValueError: If the lag is below 1 or the refresh outside [0, 1). On use, if noise that is not
-            normal is refreshed.
+        ValueError: If the lag is below 1 or the refresh outside [0, 1). On use, if noise that is
+            not normal is refreshed.
     """
 
     lag: int = 20
@@ -212,9 +212,9 @@ class NoiseFlowStatKernel(McmcKernel):
 
 @dataclass(frozen=True)
 class NoiseFlowGibbsKernel(McmcKernel):
-    """`NoiseFlowStatKernel` with delta from its conditional distribution N(Lambda^-1 b, Lambda^-1).
+    """`NoiseFlowStatKernel` with delta from its conditional distribution.
 
-    Always accepted if Lambda has a Cholesky factor.
+    The distribution is N(Lambda^-1 b, Lambda^-1). Always accepted if Lambda has a Cholesky factor.
     """
 
     is_exact = False

@@ -1,7 +1,7 @@
 """MCMC moves of particles after resampling.
 
-A kernel leaves the distribution of a particle's path given the record invariant. A move makes copies
-distinct and keeps the target.
+A kernel leaves the distribution of a particle's path given the record invariant. A move makes
+copies distinct and keeps the target.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class McmcKernel(Protocol):
 
 @dataclass(frozen=True)
 class MetropolisHastings(Move):
-    """Metropolis-Hastings steps, one chain per particle, in one batch [Gilks and Berzuini 2001].
+    """Metropolis-Hastings steps, one chain per particle [Gilks and Berzuini 2001].
 
     Attributes:
         kernel: Proposal of a step.

@@ -26,7 +26,7 @@ from pfbench.model.base import StateSpaceModel
 
 @dataclass(frozen=True)
 class SmoothedSegment(SegmentProposal):
-    """Draw the block from p(block | fixed state, y) or, with `condition_on_endpoint`, also given x_t.
+    """Block from p(block | fixed state, y), optionally also given x_t.
 
     Forward filtering, backward sampling. The linearisation is about the noise-free path from the
     fixed state, so both directions use the same one. On a linear model without the child this is
@@ -34,7 +34,7 @@ class SmoothedSegment(SegmentProposal):
     the acceptance rate. The ratio is always included, so nonlinear models are exact too.
 
     Attributes:
-        condition_on_endpoint: Condition on the child.
+        condition_on_endpoint: Condition also on the child x_t.
     """
 
     condition_on_endpoint: bool = True

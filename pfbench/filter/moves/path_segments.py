@@ -1,4 +1,4 @@
-"""Segments of a path: their densities, and proposals that use no measurement of the segment."""
+"""Segments of a path: densities, and proposals that ignore the measurements."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ class SegmentProposal(Protocol):
             draws: Random stream.
 
         Returns:
-            States [R, N, L, D], and a log ratio [R, N]: log g of the old states given the old child,
-            minus log g of the new ones. The ratio is None if g without a density replaces
+            States [R, N, L, D], and a log ratio [R, N]: log g of the old states given the old
+            child, minus log g of the new ones. The ratio is None if g without a density replaces
             p(block | fixed state, y).
         """
 
@@ -122,7 +122,7 @@ def driving_noise(model: StateSpaceModel, path: PathSegment) -> Tensor:
 
 @dataclass(frozen=True)
 class PriorSegment(SegmentProposal):
-    """Draw the block from the model's dynamics, which is rarely accepted.
+    """Block from the model's dynamics, which is rarely accepted.
 
     The block depends neither on the measurements nor on the child.
     """
@@ -147,7 +147,7 @@ class PriorSegment(SegmentProposal):
 
 @dataclass(frozen=True)
 class CopiedSegment(SegmentProposal):
-    """Copy the block of another particle. Without a density, the ratio is approximate."""
+    """Block of another particle. It lacks a density, so the ratio is approximate."""
 
     is_exact = False
 

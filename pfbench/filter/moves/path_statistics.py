@@ -1,4 +1,4 @@
-"""Sufficient statistics of a particle's path under fixed noises, for kernels that shift its newest state."""
+"""Sufficient statistics of paths under fixed noises, for kernels that shift x_t."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class PathStatistics(PathHistory):
 
 
 def fisher_information(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
-    """Compute the Fisher information of a measurement, by its moments if it is not normal.
+    """Compute the Fisher information of a measurement, by moments if not normal.
 
     Args:
         model: State-space model.

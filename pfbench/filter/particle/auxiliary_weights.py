@@ -1,4 +1,4 @@
-"""Auxiliary weights: resampling probabilities other than the weights, and tempering of weights.
+"""Auxiliary weights, which are resampling probabilities, and tempering of weights.
 
 The weights after resampling correct for the probabilities, so the filter stays exact.
 `TemperedPosterior` is an exception, because it replaces the weights themselves.
@@ -53,7 +53,9 @@ class PosteriorWeights(AuxiliaryWeights):
 
 @dataclass(frozen=True)
 class LookAheadWeights(AuxiliaryWeights):
-    """First-stage weights of the auxiliary particle filter: w p(y | x propagated with mean noise).
+    """First-stage weights of the auxiliary particle filter.
+
+    w p(y | f(x)), with f(x) the state propagated with mean noise.
 
     Attributes:
         likelihood_power: Exponent of the look-ahead likelihood. 1 is as published. A smaller one
@@ -69,8 +71,8 @@ class LookAheadWeights(AuxiliaryWeights):
     def __post_init__(self) -> None:
         if not 0.0 < self.likelihood_power <= 1.0:
             raise ValueError(
-                f"auxiliary_weights.likelihood_power must be in (0, 1], got {self.likelihood_power}. "
-                "Use 1 for the published filter."
+                "auxiliary_weights.likelihood_power must be in (0, 1], got "
+                f"{self.likelihood_power}. Use 1 for the published filter."
             )
 
     @override
@@ -121,7 +123,7 @@ class PowerTempering(Tempering):
 
 @dataclass(frozen=True)
 class AdditiveTempering(Tempering):
-    """a ~ W (1 - strength log W): each weight and its part of the entropy, a literal reading [ours].
+    """a ~ W (1 - strength log W), each weight plus its term of the entropy [ours].
 
     Attributes:
         strength: 0 leaves the weights unchanged.
@@ -167,7 +169,7 @@ class UniformTempering(Tempering):
 
 @dataclass(frozen=True)
 class TemperedWeights(AuxiliaryWeights):
-    """Tempered weights as resampling probabilities only: more particles survive, without bias.
+    """Tempered weights as resampling probabilities: more particles survive, no bias.
 
     Attributes:
         tempering: Tempering of the weights.
@@ -187,10 +189,11 @@ class TemperedWeights(AuxiliaryWeights):
 
 @dataclass(frozen=True)
 class TemperedPosterior(WeightUpdate):
-    """Weights replaced by tempered ones, as printed, which biases the estimate and the evidence.
+    """Weights replaced by tempered ones, as printed.
 
-    The particles then represent another distribution, closer to the proposal. The sum of the weights
-    does not change, because tempering follows normalisation.
+    This biases the estimate and the evidence: the particles then represent another distribution,
+    closer to the proposal. The sum of the weights does not change, because tempering follows
+    normalisation.
 
     Attributes:
         tempering: Tempering of the weights.

@@ -30,13 +30,14 @@ log = logging.getLogger("pfbench")
 
 @dataclass(eq=False)
 class CompiledParticleFilter(Filter, MultiStepFilter):
-    """Particle filter with compiled steps: same random numbers, same results to rounding.
+    """Particle filter with compiled steps.
 
-    The first step runs uncompiled, because a proposal may start its memory there. The second is
-    recorded and compiled, and small steps are taken several at a time. A step with a NaN particle is
-    repeated uncompiled. After it, steps are taken one, two, four and so on at a time. If a step
-    cannot be compiled, the filter logs a warning and runs uncompiled. Stages must be pure functions,
-    because a compiled step would not change a number that a stage stores between steps.
+    Random numbers are the same, and results agree to rounding. The first step runs uncompiled,
+    because a proposal may start its memory there. The second is recorded and compiled, and small
+    steps are taken several at a time. A step with a NaN particle is repeated uncompiled. After it,
+    steps are taken one, two, four and so on at a time. If a step cannot be compiled, the filter
+    logs a warning and runs uncompiled. Stages must be pure functions, because a compiled step would
+    not change a number that a stage stores between steps.
 
     Attributes:
         method: The filter. With moves it runs uncompiled, because their path grows.

@@ -161,7 +161,7 @@ def _make_tensor_function(
     draws: PhiloxStream,
     names: list[list[str]],
 ) -> Callable[..., list[Tensor]]:
-    """Return a step as a function of tensors; it fills in the names of its memory and trace."""
+    """Return a step as a function of tensors. It writes its memory and trace names."""
     carried_count = len(_stored_belief(belief))
 
     def step(*flat: Tensor) -> list[Tensor]:

@@ -1,6 +1,6 @@
-"""Defensive mixtures: a fraction of the particles follows the model, which bounds all weights.
+"""Defensive mixtures: a fraction of the particles follows the model.
 
-See [Hesterberg 1995].
+This bounds all weights [Hesterberg 1995].
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class DefensiveSelection(NamedTuple):
 def choose_defensive_particles(
     fraction: float, active_mask: Tensor, draws: RandomStream, purpose: str
 ) -> DefensiveSelection:
-    """Choose a fraction of the active particles by a random order, and all inactive slots.
+    """Choose a fraction of the active particles at random, and all inactive slots.
 
-    The order is drawn at each step, because neighbours after resampling are copies of one particle.
+    The choice is random, because neighbours after resampling are copies of one particle.
 
     Args:
         fraction: Fraction of the active particles.
@@ -92,7 +92,7 @@ class AffineMap(NamedTuple):
     def apply(
         self, e: Tensor, selection: DefensiveSelection | None, log_p: Callable[[Tensor], Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Map samples of density p, except the defensive ones, and return the density ratio.
+        """Map samples of density p, except the defensive ones, and compute the ratio.
 
         Args:
             e: Samples, [R, N, k].

@@ -1,8 +1,9 @@
-"""Gaussian particle filter: the belief is a normal distribution, and particles only integrate.
+"""Gaussian particle filter, whose belief is a normal distribution.
 
-As stages: the resampler draws particles from the normal distribution with the old mean and covariance,
-and the proposal propagates them. The belief stores two moments only, so moves, which need the past of
-particles, are impossible. On linear-Gaussian models the filter converges to the Kalman filter.
+As stages: the resampler draws particles from the normal distribution with the old mean and
+covariance, and the proposal propagates them. The belief stores two moments only, so moves, which
+need the past of particles, are impossible. On linear-Gaussian models the filter converges to the
+Kalman filter.
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ from pfbench.model.base import StateSpaceModel
 
 @dataclass(frozen=True)
 class GaussianResampler(Resampler):
-    """New equally weighted particles from N(mean, covariance) of the old ones, in the chart.
+    """Equally weighted particles from N(mean, covariance) of the old ones.
 
-    Low-discrepancy points give the quasi-Monte-Carlo Gaussian particle filter [Guo and Wang 2006].
-    Resampling probabilities are ignored. A covariance without Cholesky factor loses the run.
+    The distribution is normal in the chart. Low-discrepancy points give the quasi-Monte-Carlo Gaussian
+    particle filter [Guo and Wang 2006]. Resampling probabilities are ignored. A covariance without
+    Cholesky factor loses the run.
 
     Attributes:
         points: Point set of the d normal coordinates of each particle.
@@ -61,10 +63,11 @@ class GaussianResampler(Resampler):
 
 @dataclass(frozen=True)
 class GaussianPredictionProposal(Proposal):
-    """Noise of the model, and optionally new particles from the predicted normal distribution.
+    """Noise of the model, and optionally particles from the predicted normal.
 
-    With the second draw q = N(predicted mean, covariance), so the weight p(y | x) N(x; predicted) / q(x)
-    is p(y | x). Without it the propagated particles are weighted. In both cases the ratio is 0.
+    With the second draw q = N(predicted mean, covariance), so the weight p(y | x) N(x; predicted) /
+    q(x) is p(y | x). Without it the propagated particles are weighted. In both cases the ratio is
+    0.
 
     Attributes:
         points: Point set of noise and second draw. The noise uses the axes after those of the
@@ -107,7 +110,7 @@ class GaussianPredictionProposal(Proposal):
 def _redrawn(
     chart: Chart, belief: ParticleBelief, draws: RandomStream, purpose: str
 ) -> tuple[Tensor, Tensor]:
-    """Draw particles from the normal distribution of a belief; mask valid covariances [R]."""
+    """Draw particles from the normal distribution of a belief; mask valid runs [R]."""
     mean, covariance = weighted_mean_cov(chart, belief)
     root, ok = factor(covariance)
     z = draws.normal(purpose, belief.x.shape[1], covariance.shape[-1])
@@ -130,7 +133,7 @@ def refuse_history(belief: ParticleBelief, method_name: str) -> None:
     ]
     if stored:
         raise ValueError(
-            f"filter.resampler must copy particles that store {', '.join(stored)}, got {method_name}, "
-            "which draws new ones without a past. Choose a proposal without memory and no moves, or "
-            "another resampler."
+            f"filter.resampler must copy particles that store {', '.join(stored)}, got "
+            f"{method_name}, which draws new ones without a past. Choose a proposal without memory "
+            "and no moves, or another resampler."
         )

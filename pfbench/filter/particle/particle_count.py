@@ -76,19 +76,20 @@ class CountLimits:
         """
         if self.maximum > slots:
             raise ValueError(
-                f"particle_count.limits.maximum must be at most filter.particles={slots}, got {self.maximum}. "
-                "Raise filter.particles or lower maximum and initial."
+                f"particle_count.limits.maximum must be at most filter.particles={slots}, got "
+                f"{self.maximum}. Raise filter.particles or lower maximum and initial."
             )
         return self.initial
 
 
 @dataclass(frozen=True)
 class EssStepCount(ParticleCount):
-    """More particles if ESS < threshold N, else fewer [COFM-AMSSRCPF 2024, Measurement and Control].
+    """More particles if ESS < threshold N, otherwise fewer.
 
-    ESS is that of the weights at t-1, and decides the number at t, so the evidence stays unbiased.
-    The source computes it before the new weights, where it is always N and N could only fall. ESS / N
-    hardly depends on N, so the number settles at one of its limits.
+    See [COFM-AMSSRCPF 2024, Measurement and Control]. ESS is that of the weights at t-1, and
+    decides the number at t, so the evidence stays unbiased. The source computes it before the new
+    weights, where it is always N and N could only fall. ESS / N hardly depends on N, so the number
+    settles at one of its limits.
 
     Attributes:
         increment: Increment. 0 keeps the number at `limits.initial`.
@@ -107,8 +108,8 @@ class EssStepCount(ParticleCount):
     def __post_init__(self) -> None:
         if self.increment < 0 or not 0.0 <= self.ess_threshold <= 1.0:
             raise ValueError(
-                "particle_count.increment must be 0 or more and particle_count.ess_threshold from 0 to 1, "
-                f"got increment={self.increment}, ess_threshold={self.ess_threshold}. "
+                "particle_count.increment must be 0 or more and ess_threshold from 0 to 1, got "
+                f"increment={self.increment}, ess_threshold={self.ess_threshold}. "
                 "Choose both in range."
             )
 
@@ -131,7 +132,9 @@ class EssStepCount(ParticleCount):
 
 @dataclass(frozen=True)
 class EssTargetCount(ParticleCount):
-    """N target / ESS particles, within limits: the target ESS if ESS / N does not change [ours].
+    """N target / ESS particles, within limits [ours].
+
+    This number has the target ESS if ESS / N does not change.
 
     Attributes:
         target: Effective sample size.

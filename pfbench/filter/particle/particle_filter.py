@@ -1,4 +1,7 @@
-"""The particle filter: resample, move, propose, weight. Each method is a choice of stages."""
+"""The particle filter: resample, move, propose, weight.
+
+Each method is a choice of stages.
+"""
 
 from __future__ import annotations
 
@@ -54,8 +57,8 @@ class Stage(Protocol):
 class ParticleFilter(Filter):
     """Particle filter composed of stages. The object holds no particles.
 
-    A step resamples first, so the belief that it returns is weighted, and the log evidence is a sum of
-    one term per step. The defaults make the SIR filter.
+    A step resamples first, so the belief that it returns is weighted, and the log evidence is a sum
+    of one term per step. The defaults make the SIR filter.
 
     Attributes:
         particles: Number of slots N.
@@ -185,7 +188,7 @@ class ParticleFilter(Filter):
     def _resample_and_move(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> tuple[ParticleBelief, dict[str, Tensor]]:
-        """Return the parents of the particles at t, and diagnostics of resampling and moves."""
+        """Return the parents of the particles at t, and diagnostics."""
         trace: dict[str, Tensor] = {}
         log_a = self.auxiliary_weights(model, belief, record)
         belief, trace["resampled"] = self.resampler(

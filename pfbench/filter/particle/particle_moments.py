@@ -149,7 +149,7 @@ def compute_nis(
 
 
 def _count_distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:
-    """Return the number of distinct values below 2 N in copy_of [R, N] at active slots, [R]."""
+    """Count distinct values below 2 N in copy_of [R, N] at active slots, [R]."""
     marks = torch.zeros(len(copy_of), 2 * copy_of.shape[1], dtype=log_w.dtype, device=log_w.device)
     return (marks.scatter_add_(1, copy_of, (log_w > -torch.inf).to(log_w.dtype)) > 0.0).sum(1)
 
@@ -173,7 +173,7 @@ def _fused_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _separate_spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tensor:
-    """Return covariances [R, G, s, s] of groups of components [G, s] of numbers [R, N, k]."""
+    """Return covariances [R, G, s, s] of groups [G, s] of numbers [R, N, k]."""
     deviations = x.permute(0, 2, 1)[:, groups] - mean[:, groups].unsqueeze(-1)  # [R, G, s, N]
     return (w[:, None, None] * deviations) @ deviations.mT
 

@@ -1,8 +1,8 @@
-"""Point sets: plain Monte Carlo, or low-discrepancy points with a new random shift at each draw.
+"""Point sets: independent points, or low-discrepancy points with random shifts.
 
-Each shifted point is uniform, so averages are unbiased and their spread over runs is a valid error.
-The base set is fixed and cached. The shift comes from the counter-based stream, so the points of a run
-depend only on seed, run, step and label.
+Each draw has a new shift. Each shifted point is uniform, so averages are unbiased and their spread
+over runs is a valid error. The base set is fixed and cached. The shift comes from the counter-based
+stream, so the points of a run depend only on seed, run, step and label.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class PointSet(Protocol):
 
         Args:
             draws: Random stream of the shifts.
-            first: First axis of the set to use. Two stages with separate axes draw the points of one
-                joint set. With common axes their draws would be dependent.
+            first: First axis of the set to use. Two stages with separate axes draw the points of
+                one joint set. With common axes their draws would be dependent.
 
         Returns:
             Random stream.
@@ -103,7 +103,8 @@ class HaltonPoints(ShiftedPoints):
     def __post_init__(self) -> None:
         if self.skip < 0:
             raise ValueError(
-                f"points.skip must be 0 or more, got {self.skip}. Choose the number of points to omit."
+                f"points.skip must be 0 or more, got {self.skip}. "
+                "Choose the number of points to omit."
             )
 
     @override
@@ -114,7 +115,10 @@ class HaltonPoints(ShiftedPoints):
 
 @dataclass(frozen=True)
 class SobolPoints(ShiftedPoints):
-    """Sobol points with the direction numbers of Joe and Kuo. A digital shift preserves the net."""
+    """Sobol points with the direction numbers of Joe and Kuo, and a digital shift.
+
+    The digital shift preserves the net.
+    """
 
     is_exact = True
 

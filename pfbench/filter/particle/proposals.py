@@ -35,7 +35,7 @@ class ProposalSample(NamedTuple):
 
 
 class Proposal(Protocol):
-    """Proposal distribution of the particles at t, given those at t-1 and the record at t."""
+    """Proposal distribution of the particles at t."""
 
     @property
     def is_exact(self) -> bool:
@@ -59,7 +59,11 @@ class Proposal(Protocol):
 
 @dataclass(frozen=True)
 class BootstrapProposal(Proposal):
-    """Noise of the model, x = propagate(x, u, w), with ratio 0 [Gordon, Salmond, Smith 1993]."""
+    """Noise of the model, x = propagate(x, u, w), with ratio 0.
+
+    References:
+        Gordon, Salmond and Smith 1993.
+    """
 
     is_exact = True
 

@@ -18,7 +18,7 @@ from pfbench.model.base import StateSpaceModel
 
 
 class SmoothingKernel(Protocol):
-    """Symmetric density K(e) of d whitened coordinates, for smoothed particles x + h A e."""
+    """Symmetric density K(e) of d whitened coordinates, for particles x + h A e."""
 
     def bandwidth(self, d: int, n: Tensor) -> Tensor:
         """Return the optimal bandwidth h for a normal distribution.
@@ -98,10 +98,10 @@ class EpanechnikovSmoothing(SmoothingKernel):
 
 @dataclass(frozen=True)
 class RegularisedResampler(Resampler):
-    """Resample from a kernel density estimate: copies by `resampler`, plus h A e in the chart.
+    """Resampling from a kernel density estimate.
 
-    A A' is the covariance of the weighted particles before resampling. h is the kernel's optimal
-    bandwidth times `scale`.
+    The new particles are copies by `resampler` plus h A e in the chart. A A' is the covariance of
+    the weighted particles before resampling. h is the kernel's optimal bandwidth times `scale`.
 
     Attributes:
         resampler: Resampler that copies.

@@ -39,7 +39,7 @@ class ResamplingScheme(Protocol):
 
 
 class Resampler(Protocol):
-    """Stage that replaces particles by others with more equal weights and the same target."""
+    """Stage that replaces particles by others of the same target."""
 
     @property
     def is_exact(self) -> bool:

@@ -1,8 +1,8 @@
 """Resampling schemes: ancestors drawn by probabilities.
 
 Every scheme gives a particle n a copies on average for probabilities a. All are batched and use
-counting or sorted search. Indices stay in range: cumulative sums are float64 from N = 1e5, and their
-last value is set to 1.
+counting or sorted search. Indices stay in range: cumulative sums are float64 from N = 1e5, and
+their last value is set to 1.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ _DOUBLE_FROM = 100_000
 
 @dataclass(frozen=True)
 class Systematic(ResamplingScheme):
-    """One uniform u for all slots, at positions (j + u) / n. Counts differ from n a by less than 1."""
+    """One uniform u for all slots, at positions (j + u) / n.
+
+    Counts differ from n a by less than 1.
+    """
 
     is_exact = True
 
@@ -36,7 +39,7 @@ class Systematic(ResamplingScheme):
 def _counted_evenly(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     """Return ancestors [R, N] by the positions (j + u) / n of slots j, u [R, 1]."""
     reach = _cumulative(a) * n
-    # where, since n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0
+    # where, since n - u may round to n - 1 in float32, which gives the last slot to a weight of 0
     return _ancestors(torch.where(reach < n, torch.ceil(reach - u.to(reach.dtype)), n).long(), n)
 
 
@@ -78,7 +81,7 @@ class Residual(ResamplingScheme):
     @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
         expected = _expected_copies(a, n)
-        # 49 (1/49) is less than 1: without this tolerance equal weights would all be drawn at random
+        # 49 (1/49) < 1: without this tolerance all copies of equal weights would be random
         certain = torch.floor(expected * (1.0 + 4.0 * torch.finfo(a.dtype).eps))
         missing = n - certain.sum(1, keepdim=True).long()
         residual = (expected - certain).clamp(min=0.0)
@@ -91,10 +94,10 @@ class Residual(ResamplingScheme):
 
 @dataclass(frozen=True)
 class Ssp(ResamplingScheme):
-    """Srinivasan's sampling process: counts floor(n a) or one more, negatively associated.
+    """Srinivasan's sampling process, with counts floor(n a) or one more.
 
-    Pairs of fractional parts are resolved in a tournament of log2 N batched rounds. The order of the
-    pairs is free [Srinivasan 2001].
+    The counts are negatively associated. Pairs of fractional parts are resolved in a tournament of
+    log2 N batched rounds. The order of the pairs is free [Srinivasan 2001].
 
     References:
         Gerber, Chopin, Whiteley 2019.
@@ -128,7 +131,7 @@ class Ssp(ResamplingScheme):
 
 @dataclass(frozen=True)
 class Killing(ResamplingScheme):
-    """Keep a particle with probability a / max a, otherwise replace it by a multinomial draw.
+    """Survival of a particle with probability a / max a, otherwise a multinomial draw.
 
     A surviving particle stays in its slot, so the number of particles must be constant.
 
@@ -147,10 +150,11 @@ class Killing(ResamplingScheme):
 
 
 def _resolve_pairs(first: Tensor, second: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the remaining fraction of pairs, the count of the final member, and its mask as first."""
+    """Return remaining fraction, count of the final member, mask where it is first."""
     total = first + second
     is_over = total >= 1.0
-    # below 1 the final member gets 0 and the fraction of the other is the sum; otherwise 1, and the sum less 1
+    # total below 1: the final member gets 0, and the other one keeps the total
+    # otherwise: the final member gets 1, and the other one keeps the total minus 1
     probability = torch.where(
         is_over, (1.0 - second) / (2.0 - total).clamp(min=1e-300), second / total.clamp(min=1e-300)
     )
@@ -177,14 +181,14 @@ def _precise(a: Tensor) -> Tensor:
 
 
 def _invert(cumulative: Tensor, u: Tensor) -> Tensor:
-    """Draw independent indices [R, M] by inversion of cumulative sums [R, N] at u [R, M]."""
+    """Draw indices [R, M] by inversion of cumulative sums [R, N] at u [R, M]."""
     return torch.searchsorted(cumulative, u.to(cumulative.dtype).contiguous()).clamp(
         max=cumulative.shape[1] - 1
     )
 
 
 def _ancestors(below: Tensor, n: Tensor) -> Tensor:
-    """Return ancestors [R, N] from cumulative counts of copies, int64 [R, N], non-decreasing."""
+    """Return ancestors [R, N], non-decreasing, from cumulative counts, int64 [R, N]."""
     # slot j belongs to the first particle that ends after it: count particles by their end, and sum
     (runs, slots), total = below.shape, n.long()
     # in float32 the largest uniform is 1 and ends a weight of 0 at -1

@@ -1,8 +1,9 @@
-"""Sequential quasi-Monte-Carlo: one point of d + 1 coordinates gives a particle's ancestor and noise.
+"""Sequential quasi-Monte Carlo (SQMC).
 
-Ancestors are quantiles of the weights in the order of a Hilbert curve through the particles. Close points
-then select close ancestors, which preserves the low discrepancy. The filter is as unbiased as with plain
-Monte Carlo [Gerber and Chopin 2015, "Sequential quasi Monte Carlo"].
+One point of d + 1 coordinates gives ancestor and noise of a particle. Ancestors are quantiles of
+the weights in the order of a Hilbert curve through the particles. Close points then select close
+ancestors, which preserves the low discrepancy. The evidence is unbiased, as with plain Monte Carlo
+[Gerber and Chopin 2015, "Sequential quasi Monte Carlo"].
 """
 
 from __future__ import annotations
@@ -104,9 +105,10 @@ class SqmcProposal(Proposal):
 
 
 def compute_hilbert_order(chart: Chart, belief: ParticleBelief) -> Tensor:
-    """Return the order of particles along a Hilbert curve [Gerber and Chopin 2015, section 3.3].
+    """Compute the order of particles along a Hilbert curve.
 
-    The logistic function maps their deviations from the mean, in standard deviations, to the unit cube.
+    See [Gerber and Chopin 2015, section 3.3]. The logistic function maps their deviations from the
+    mean, in standard deviations, to the unit cube.
 
     Args:
         chart: Chart of the state.
@@ -126,7 +128,7 @@ def compute_hilbert_order(chart: Chart, belief: ParticleBelief) -> Tensor:
 
 
 def compute_hilbert_index(cells: Tensor, bits: int) -> Tensor:
-    """Return the index of cells on the Hilbert curve of a cube [Skilling 2004].
+    """Compute the index of cells on the Hilbert curve of a cube [Skilling 2004].
 
     Args:
         cells: Integer coordinates, [..., k].

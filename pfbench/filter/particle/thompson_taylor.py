@@ -1,4 +1,4 @@
-"""Thompson-Taylor generator: a particle is a random combination of nearest neighbours."""
+"""Thompson-Taylor generator: particles combine nearest neighbours at random."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ _PAIRS = 20_000_000  # distances that are computed at a time
 
 @dataclass(frozen=True)
 class ThompsonTaylorResampler(Resampler):
-    """Resample, then z = xbar + sum_l u_l (x_l - xbar) over the m nearest neighbours x_l of each copy.
+    """Random combinations of the neighbours of resampled particles.
 
-    The neighbours include the copy, xbar is their mean, and u_l is uniform with mean 1/m and variance
-    (m - 1)/m^2 [Taylor and Thompson 1986]. The covariance within a neighbourhood is multiplied by
-    (m - 1)/m, so mean and covariance of the sample hardly change for any shape. Distances are
-    Euclidean in whitened coordinates [ours]. Copies of one particle are neighbours of each other, so m
-    copies stay equal, as in the published algorithm.
+    z = xbar + sum_l u_l (x_l - xbar) over the m nearest neighbours x_l of each copy. The neighbours
+    include the copy, xbar is their mean, and u_l is uniform with mean 1/m and variance (m - 1)/m^2
+    [Taylor and Thompson 1986]. The covariance within a neighbourhood is multiplied by (m - 1)/m, so
+    mean and covariance of the sample hardly change for any shape. Distances are Euclidean in
+    whitened coordinates [ours]. Copies of one particle are neighbours of each other, so m copies
+    stay equal, as in the published algorithm.
 
     Attributes:
         resampler: Resampler that copies, to equal weights.
         neighbours: Number of neighbours m.
-        as_printed: Use a single random neighbour, z = xbar + u_k (x_k - xbar), as printed. The sum is
-            missing there, and the covariance within a neighbourhood shrinks to 1/m.
+        as_printed: Use a single random neighbour, z = xbar + u_k (x_k - xbar), as printed. The sum
+            is missing there, and the covariance within a neighbourhood shrinks to 1/m.
 
     Raises:
         ValueError: If there are fewer than two neighbours, or, on use, more than particles.
@@ -67,7 +68,8 @@ class ThompsonTaylorResampler(Resampler):
         slots, m = belief.x.shape[1], self.neighbours
         if m > slots:
             raise ValueError(
-                f"resampler.neighbours must be at most {slots} (the particles), got {m}. Choose fewer."
+                f"resampler.neighbours must be at most {slots} (the particles), got {m}. "
+                "Choose fewer."
             )
         mean, covariance = weighted_mean_cov(model.chart, belief)
         copies, resampled_mask = self.resampler(model, belief, log_a, n, draws)
@@ -96,7 +98,7 @@ class ThompsonTaylorResampler(Resampler):
 
 
 def nearest_neighbours(z: Tensor, active_mask: Tensor, m: int) -> Tensor:
-    """Return the indices of the m nearest active points of each point, including itself.
+    """Find the m nearest active points of each point, including itself.
 
     Args:
         z: Points, [R, N, d].

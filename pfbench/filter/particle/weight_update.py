@@ -58,8 +58,9 @@ class BayesWeightUpdate(WeightUpdate):
 class FlooredWeightUpdate(WeightUpdate):
     """Weights as plain numbers plus a floor, as in much code, for comparison [ours].
 
-    The smallest double is e^-745. A particle 38 standard deviations from the measurement gets weight
-    0, so only the floor remains. If all particles are that far away, all weights become equal.
+    The smallest double is e^-745. A particle 38 standard deviations from the measurement gets
+    weight 0, so only the floor remains. If all particles are that far away, all weights become
+    equal.
 
     Attributes:
         weight_floor: Number added to each particle's weight before normalisation.
@@ -115,7 +116,9 @@ def deactivate_invalid_particles(
 
 
 def normalise_updated_weights(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Normalise the log weights of a step. A run without a finite one gets equal weights.
+    """Normalise the log weights of a step.
+
+    A run without a finite weight gets equal weights.
 
     Args:
         log_w: Log weights, [R, N].
@@ -124,7 +127,7 @@ def normalise_updated_weights(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Te
         Normalised log weights [R, N], their logsumexp before [R] (-inf if none is finite), weights
         [R, N] and effective sample size [R].
     """
-    # one exponential for each particle: they cost most of a small step besides random numbers and copies
+    # one exponential per particle, because exponentials dominate the cost of a small step
     maximum = log_w.detach().amax(1, keepdim=True)
     maximum = torch.where(torch.isfinite(maximum), maximum, 0.0)
     scaled_w = torch.exp(log_w - maximum)
@@ -144,7 +147,7 @@ def _separate_totals(a: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def has_long_rows(a: Tensor, *_: Tensor) -> bool:
-    """Return whether rows [R, N, ...] are too long for the compiler to sum in registers."""
+    """Return whether the compiler cannot sum rows [R, N, ...] in registers."""
     return a.shape[1] > 4096
 
 

@@ -86,8 +86,8 @@ class AxisAlignedCells(CellPartition):
     def __post_init__(self) -> None:
         if self.cells_per_axis < 1:
             raise ValueError(
-                f"resampler.partition.cells_per_axis must be at least 1, got {self.cells_per_axis}. "
-                "Set 1 or more."
+                "resampler.partition.cells_per_axis must be at least 1, got "
+                f"{self.cells_per_axis}. Set 1 or more."
             )
 
     @property

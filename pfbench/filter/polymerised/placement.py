@@ -16,7 +16,9 @@ from pfbench.filter.whitening import whiten
 
 
 class CellAggregates(NamedTuple):
-    """Particles aggregated by cell. A run has up to N cells, and empty ones have weight 0.
+    """Particles aggregated by cell.
+
+    A run has N slots for cells. Those without particles have weight 0.
 
     Attributes:
         weight: Sum W of the weights of a cell, [R, N].
@@ -79,7 +81,8 @@ class ScaledCentrePlacement(ParticlePlacement):
     component.
 
     Attributes:
-        min_scale: 0 as printed: every particle moves away from the mean. -1 centres the move. [ours]
+        min_scale: 0 as printed: every particle moves away from the mean. -1 centres the move
+            [ours].
         whiten: Apply to whitened axes instead of the state's. [ours]
         match_moments: Divide by sqrt(E (1 + u)^2), which preserves second moments. [ours]
         points: Point set of u.

@@ -53,8 +53,8 @@ class CellAllocation(Protocol):
             draws: Random stream of the step.
 
         Returns:
-            Cell of each new slot [R, N], non-decreasing, the probability that a cell gets a particle
-            [R, N], and the mask of used slots [R or 1, N].
+            Cell of each new slot [R, N], non-decreasing, the probability that a cell gets a
+            particle [R, N], and the mask of used slots [R or 1, N].
         """
 
 
@@ -95,8 +95,8 @@ class PolymerisedResampler(Resampler):
     A new particle of a cell with n_i of them has weight W_i / n_i [Pu and Qin, eq. 19], divided by
     the probability that the cell gets one. Otherwise cells with less than one particle's weight
     would be lost, and with them the tails [ours]. The mass of a cell is then correct on average,
-    and exactly so if it is large. The placement assumes a shape inside cells, so `is_exact` is False.
-    The defaults preserve mean and covariance on average.
+    and exactly so if it is large. The placement assumes a shape inside cells, so `is_exact` is
+    False. The defaults preserve mean and covariance on average.
 
     Attributes:
         partition: Partition. The defaults of all three are the repaired method. [ours]

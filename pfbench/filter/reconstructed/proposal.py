@@ -1,8 +1,8 @@
 """State reconstruction: shift of particles by Dynamic Matrix Control (DMC).
 
-The states are outputs of a plant with inputs [particle filter with state reconstruction by
-Dynamic Matrix Control, eqs 21 to 28]. The inputs are those of the state (`ReconstructedProposal`) or
-the process noise (`ReconstructedNoiseProposal`).
+The states are outputs of a plant with inputs [particle filter with state reconstruction by Dynamic
+Matrix Control, eqs 21 to 28]. The inputs are those of the state (`ReconstructedProposal`) or the
+process noise (`ReconstructedNoiseProposal`).
 """
 
 from __future__ import annotations

@@ -144,8 +144,8 @@ class TransitionRatioCorrection(WeightCorrection):
         chart, noise_gain = model.chart, model.noise_gain(record.u)
         if noise_gain is None:
             raise ValueError(
-                "proposal.weight_correction TransitionRatioCorrection must have a model with additive "
-                f"noise, got {type(model).__name__}. "
+                "proposal.weight_correction TransitionRatioCorrection must have a model with "
+                f"additive noise, got {type(model).__name__}. "
                 "Choose MarginalRatioCorrection or ReconstructedNoiseProposal."
             )
         prediction, w = predict_without_noise(model, belief, record)

@@ -114,7 +114,7 @@ class Fitness(Protocol):
     """Fitness of swarm positions, as a term that is added to the log likelihood."""
 
     def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
-        """Return the function q [R, N, k] -> term of the fitness [R, N] in swarm coordinates."""
+        """Return the fitness term [R, N] as a function of coordinates q [R, N, k]."""
 
 
 @dataclass(frozen=True)

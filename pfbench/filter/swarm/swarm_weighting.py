@@ -107,7 +107,8 @@ class MixtureWeighting(SwarmWeighting):
     with c the defensive fraction. The ratio of this deterministic mixture is at most -log c. The
     filter converges to the posterior if the predicted distribution is normal, as on linear-Gaussian
     models, and all unobserved components are regressed (`ObservedComponents`). Otherwise p is an
-    approximation. The cost is N^2 k. In many dimensions (18, for example) few particles have weight.
+    approximation. The cost is N^2 k. In many dimensions (18, for example) few particles have
+    weight.
 
     Attributes:
         defensive_fraction: Fraction of predicted particles that do not move, in (0, 1]. They are
