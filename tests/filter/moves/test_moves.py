@@ -1061,7 +1061,7 @@ class Spiky(LinearGaussian):
 
 
 def test_what_moves_cannot_do_without() -> None:
-    with pytest.raises(ValueError, match="must return its noise if moves replay it"):
+    with pytest.raises(ValueError, match="must return its noise if moves use it again"):
         filter_record(
             dataclasses.replace(moving(MetropolisHastings(NoiseFlowKernel(3))), proposal=Silent()),
             WALK,
