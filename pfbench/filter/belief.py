@@ -214,11 +214,11 @@ def _gather_states(x: Tensor, ancestors: Tensor) -> Tensor:
     """Gather [R, N, D] by ancestors [R, M], in the memory order of x."""
     first = x.permute(2, 0, 1)
     if first.is_contiguous():
-        return _picked(first, ancestors).permute(1, 2, 0)
+        return _gather_components(first, ancestors).permute(1, 2, 0)
     return x.mT.gather(2, ancestors.unsqueeze(1).expand(-1, x.shape[2], -1)).mT
 
 
-def _flat_select(first: Tensor, ancestors: Tensor) -> Tensor:
+def _select_components(first: Tensor, ancestors: Tensor) -> Tensor:
     """Gather [D, R, N] by ancestors [R, M]."""
     d, runs, n = first.shape
     # one flat index costs a fifth of an expanded one
@@ -226,7 +226,7 @@ def _flat_select(first: Tensor, ancestors: Tensor) -> Tensor:
     return first.reshape(d, runs * n).index_select(1, flat.flatten()).reshape(d, *ancestors.shape)
 
 
-_picked = compilable(_flat_select, operator=cpp.gather_particles)
+_gather_components = compilable(_select_components, operator=cpp.gather_particles)
 
 
 def _gather_rows(a: Tensor, ancestors: Tensor) -> Tensor:
@@ -236,6 +236,6 @@ def _gather_rows(a: Tensor, ancestors: Tensor) -> Tensor:
     (runs, n, *rest), dims = a.shape, a.dim()
     first = a.permute(*range(2, dims), 0, 1)
     if rest and first.is_contiguous():  # keep particles last in memory
-        picked = _picked(first.reshape(math.prod(rest), runs, n), ancestors)
-        return picked.reshape(*rest, *ancestors.shape).permute(dims - 2, dims - 1, *range(dims - 2))
+        copies = _gather_components(first.reshape(math.prod(rest), runs, n), ancestors)
+        return copies.reshape(*rest, *ancestors.shape).permute(dims - 2, dims - 1, *range(dims - 2))
     return a.gather(1, ancestors.reshape(*ancestors.shape, *[1] * len(rest)).expand(-1, -1, *rest))

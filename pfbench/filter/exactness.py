@@ -17,11 +17,13 @@ def is_every_part_exact(**parts: object) -> bool:
     Returns:
         True if `is_exact` is True for every part.
     """
-    statements = [_stated(key, stage) for key, stage in parts.items()]  # each silent part warns
+    statements = [
+        _is_stated_exact(key, stage) for key, stage in parts.items()
+    ]  # each silent part warns
     return all(statements)
 
 
-def _stated(key: str, stage: object) -> bool:
+def _is_stated_exact(key: str, stage: object) -> bool:
     """Return `stage.is_exact`, or False with a warning."""
     value = getattr(stage, "is_exact", None)
     if isinstance(value, bool):

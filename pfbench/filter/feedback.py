@@ -19,8 +19,8 @@ def apply_feedback(
 ) -> tuple[ParticleBelief | GaussianBelief, StepInfo]:
     """Correct the process by the estimate of valid runs, and the belief accordingly.
 
-    The mean of a Gaussian belief is moved. Its covariance is transformed by the derivative of that
-    move, since a rotation of the axes turns it [ours].
+    The correction applies to particles or to the mean of a Gaussian belief. Its derivative
+    transforms the covariance, because a correction of the attitude rotates the axes [ours].
 
     Args:
         model: State-space model.
@@ -29,7 +29,7 @@ def apply_feedback(
         info: Estimate of the step.
 
     Returns:
-        Belief about the corrected process, and the info with the uncorrected estimate.
+        Belief about the correct_increment process, and the info with the uncorrected estimate.
 
     Raises:
         ValueError: If particles carry their past, which refers to the uncorrected process.
@@ -47,11 +47,11 @@ def apply_feedback(
         return belief._replace(x=correct(belief.x)), info
     chart, centre = model.chart, belief.mean.unsqueeze(1)
 
-    def corrected(xi: Tensor) -> tuple[Tensor, Tensor]:
+    def correct_increment(xi: Tensor) -> tuple[Tensor, Tensor]:
         return correct(chart.add(centre, xi)), xi.new_zeros(1, 1, 1, 1)
 
     space = DifferenceSpace(chart.subtract, chart.mean)
-    mean, slope, *_ = TaylorLinearisation()(corrected, belief.mean, chart.dimension, space)
+    mean, slope, *_ = TaylorLinearisation()(correct_increment, belief.mean, chart.dimension, space)
     return belief._replace(mean=mean, covariance=slope @ belief.covariance @ slope.mT), info
 
 

@@ -88,7 +88,7 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
         density.log_normal_density(
             0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen
         ),
-        resampling_schemes._evenly(a, n, u.double()),
+        resampling_schemes._systematic(a, n, u.double()),
     ]
 
 
@@ -135,7 +135,7 @@ def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
     n = torch.tensor([[N], [N // 3], [2], [N], [N], [N]], dtype=dtype)
     u = torch.linspace(1.0 - 1e-9, 1e-9, 6, dtype=torch.float64)[:, None]
     assert torch.equal(
-        cpp.resample_systematic(a, n, u), resampling_schemes._counted_evenly(a, n, u)
+        cpp.resample_systematic(a, n, u), resampling_schemes._eager_systematic(a, n, u)
     )
     assert torch.equal(
         cpp.resample_systematic(a[:1], n[:1], u[:1]), cpp.resample_systematic(a, n[:1], u)[:1]

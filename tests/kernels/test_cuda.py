@@ -166,7 +166,7 @@ def test_resampling(loop: Loop, runs: int, n: int, d: int, dtype: torch.dtype) -
         counts = torch.zeros(runs, n).scatter_add(1, found, torch.ones(found.shape))
         assert ((counts - wanted * w).abs() < 1.0 + 1e-6 * wanted).all()
         off = (
-            (found != resampling_schemes._counted_evenly(w.double(), number, u)[:, :wanted])
+            (found != resampling_schemes._eager_systematic(w.double(), number, u)[:, :wanted])
             .double()
             .mean()
         )
@@ -181,7 +181,7 @@ def test_resampling_with_numbers_of_their_own(loop: Loop) -> None:
     )
     found, wanted = (
         loop("resample_systematic", w, number, u),
-        resampling_schemes._counted_evenly(w, number, u),
+        resampling_schemes._eager_systematic(w, number, u),
     )
     for r, n in enumerate((30, 7, 1)):
         assert torch.equal(found[r, :n], wanted[r, :n])
@@ -194,7 +194,7 @@ def test_clouds(loop: Loop, runs: int, n: int, d: int, dtype: torch.dtype) -> No
     ancestors = (PhiloxStream(3, torch.arange(runs)).uniform("a", n, 1)[..., 0] * n).long()
     first = x.permute(2, 0, 1).contiguous()
     assert torch.equal(
-        loop("gather_particles", first, ancestors), belief._flat_select(first, ancestors)
+        loop("gather_particles", first, ancestors), belief._select_components(first, ancestors)
     )
     copy_of = 2 * ancestors % (2 * n - 1)
     assert torch.equal(
@@ -237,7 +237,7 @@ def test_moving(
         .permute(1, 2, 0)
     )
     wanted = base._dense_affine(
-        phi, belief._flat_select(first, ancestors).permute(1, 2, 0), gain, noise
+        phi, belief._select_components(first, ancestors).permute(1, 2, 0), gain, noise
     )
     torch.testing.assert_close(
         loop("gather_propagate", phi, first, ancestors, gain, *key), wanted, rtol=1e-5, atol=5e-5

@@ -131,7 +131,7 @@ class NoiseFlowKernel(McmcKernel):
         start, centre = window["states"][:, :, 0], window["mean"][:, :, 0]
         step, xi = self.random_walk(model, belief, start, draws), chart.subtract(start, centre)
         proposed_start = start + step if chart.flat else chart.add(centre, xi + step)
-        noise = self._refreshed(model, window["noise"], draws)
+        noise = self._refresh_noise(model, window["noise"], draws)
         states, log_like = propagate_path(model, proposed_start, noise, belief.past)
         root = factor(window["covariance"][:, 0, 0])[0]
         before, after = (compute_half_square(whiten(a, root)) for a in (xi, xi + step))
@@ -139,7 +139,7 @@ class NoiseFlowKernel(McmcKernel):
         new_window = {"states": states, "log_like": log_like, "noise": noise}
         return belief._replace(x=states[:, :, -1], window=window | new_window), log_alpha
 
-    def _refreshed(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
+    def _refresh_noise(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
         """Mix the noises [R, N, K, W] with new ones."""
         if self.noise_refresh == 0.0 or w.shape[2] == 0:
             return w

@@ -48,25 +48,25 @@ class SmoothedSegment(SegmentProposal):
         if length == 0:
             return old.states[:, :, :0], ratio
         chart, block = model.chart, old.states[:, :, 1:-1]
-        links = _links(model, old)
-        filtered = _forward(links, old.states.shape)
-        next_old, next_new = (chart.subtract(x, links[-1].x) for x in (old.states[:, :, -1], child))
+        steps = _linearise_path(model, old)
+        filtered = _filter_path(steps, old.states.shape)
+        next_old, next_new = (chart.subtract(x, steps[-1].x) for x in (old.states[:, :, -1], child))
         states: list[Tensor] = []
         for j in reversed(range(length)):
             m_old = m_new = filtered[j][0]
-            p, next_link = filtered[j][1], links[j + 1]
+            p, next_step = filtered[j][1], steps[j + 1]
             if self.condition_on_endpoint or j < length - 1:
-                f = next_link.transition_jacobian
-                p, gain = _update_covariance(p, f, next_link.process_covariance)
+                f = next_step.transition_jacobian
+                p, gain = _update_covariance(p, f, next_step.process_covariance)
                 m_old = m_old + batch_product(gain, next_old - batch_product(f, m_old))
                 m_new = m_new + batch_product(gain, next_new - batch_product(f, m_new))
             root, ok = factor(p)
             z = draws.normal(f"block_{j}", child.shape[1], chart.dimension)
-            next_old = chart.subtract(block[:, :, j], links[j].x)
+            next_old = chart.subtract(block[:, :, j], steps[j].x)
             next_new = m_new + batch_product(root, z)
             z_old = _whiten(root, next_old - m_old)
             ratio = ratio + torch.where(ok, 0.5 * (z * z - z_old * z_old).sum(-1), torch.nan)
-            states.append(chart.add(links[j].x, next_new))
+            states.append(chart.add(steps[j].x, next_new))
         return stack_history(states[::-1]), ratio
 
 
@@ -90,9 +90,9 @@ class LinearisedStep(NamedTuple):
     residual: Tensor
 
 
-def _links(model: StateSpaceModel, old: PathSegment) -> list[LinearisedStep]:
+def _linearise_path(model: StateSpaceModel, old: PathSegment) -> list[LinearisedStep]:
     """Linearise the steps of the noise-free path."""
-    x, links = old.states[:, :, 0], []
+    x, steps = old.states[:, :, 0], []
     jacobians = 1 if model.linear else x.shape[1]  # a linear model has one for all particles
     for record in old.records:
         before = x[:, :jacobians]
@@ -101,7 +101,7 @@ def _links(model: StateSpaceModel, old: PathSegment) -> list[LinearisedStep]:
         x = model.propagate(x, record.u, mean_noise(model, x))
         after, observed_mask = x[:, :jacobians], ~torch.isnan(record.y).unsqueeze(1)
         noise = distribution_covariance(model.observation(after, record.u))
-        links.append(
+        steps.append(
             LinearisedStep(
                 x,
                 transition,
@@ -111,20 +111,20 @@ def _links(model: StateSpaceModel, old: PathSegment) -> list[LinearisedStep]:
                 linearised_innovation(model, x, record),
             )
         )
-    return links
+    return steps
 
 
-def _forward(links: list[LinearisedStep], shape: torch.Size) -> list[tuple[Tensor, Tensor]]:
+def _filter_path(steps: list[LinearisedStep], shape: torch.Size) -> list[tuple[Tensor, Tensor]]:
     """Filter the deviations from the noise-free path, except at the last step."""
-    d = links[0].transition_jacobian.shape[-1]
-    m = links[0].x.new_zeros(*shape[:2], d)
-    p = links[0].transition_jacobian.new_zeros(1, 1, d, d)
+    d = steps[0].transition_jacobian.shape[-1]
+    m = steps[0].x.new_zeros(*shape[:2], d)
+    p = steps[0].transition_jacobian.new_zeros(1, 1, d, d)
     filtered = []
-    for link in links[:-1]:
-        f, h = link.transition_jacobian, link.measurement_jacobian
-        m, p = batch_product(f, m), f @ p @ f.mT + link.process_covariance
-        p, gain = _update_covariance(p, h, link.noise)
-        m = m + batch_product(gain, link.residual - batch_product(h, m))
+    for step in steps[:-1]:
+        f, h = step.transition_jacobian, step.measurement_jacobian
+        m, p = batch_product(f, m), f @ p @ f.mT + step.process_covariance
+        p, gain = _update_covariance(p, h, step.noise)
+        m = m + batch_product(gain, step.residual - batch_product(h, m))
         filtered.append((m, p))
     return filtered
 

@@ -77,7 +77,7 @@ class CompiledStep:
             Belief and summary after each step before the first one with a NaN particle.
         """
         first, steps, carried = int(draws.step), record.y.shape[1], 3 + len(self.memory)
-        state = _stored_belief(belief)
+        state = _belief_to_storage(belief)
         inputs = [steps_to_storage(a) for a in tensors_in((record.y, record.u))]
         inputs = [torch.arange(first, first + steps), *inputs]
         shared = [to_storage(a) for a in tensors_in((record.start, record.spread))]
@@ -135,7 +135,7 @@ def compile_step(
     """
     names: list[list[str]] = []
     step = _make_tensor_function(method, model, belief, record, draws, names)
-    state, inputs = _stored_belief(belief), [to_storage(a) for a in tensors_in(record)]
+    state, inputs = _belief_to_storage(belief), [to_storage(a) for a in tensors_in(record)]
     shared = [torch.as_tensor(draws.seed), draws.runs]
     example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
     count = counter.count if counter else 0
@@ -162,7 +162,7 @@ def _make_tensor_function(
     names: list[list[str]],
 ) -> Callable[..., list[Tensor]]:
     """Return a step as a function of tensors. It writes its memory and trace names."""
-    carried_count = len(_stored_belief(belief))
+    carried_count = len(_belief_to_storage(belief))
 
     def step(*flat: Tensor) -> list[Tensor]:
         number, *inputs, seed, runs = flat[carried_count:]
@@ -209,7 +209,7 @@ def replace_tensors(tree: Any, tensors: Iterator[Tensor]) -> Any:
     return tree
 
 
-def _stored_belief(belief: ParticleBelief) -> list[Tensor]:
+def _belief_to_storage(belief: ParticleBelief) -> list[Tensor]:
     """Return the tensors that a step carries, in storage layout."""
     carried = tensors_in((belief.x, belief.log_w, belief.log_evidence, belief.memory))
     return [to_storage(a) for a in carried]

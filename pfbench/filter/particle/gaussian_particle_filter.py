@@ -55,7 +55,7 @@ class GaussianResampler(Resampler):
         draws: RandomStream,
     ) -> tuple[ParticleBelief, Tensor]:
         refuse_history(belief, "a Gaussian particle filter")
-        x, ok = _redrawn(model.chart, belief, self.points(draws), "gaussian")
+        x, ok = _draw_from_normal(model.chart, belief, self.points(draws), "gaussian")
         slots = torch.arange(belief.x.shape[1], device=x.device)
         log_w = torch.where((slots < n) & ok.unsqueeze(-1), -torch.log(n.to(x.dtype)), -torch.inf)
         return belief._replace(x=x, log_w=log_w), torch.ones_like(ok)
@@ -102,12 +102,12 @@ class GaussianPredictionProposal(Proposal):
         # one NaN would spread to all particles
         x, log_w = deactivate_invalid_particles(first.x, belief.log_w, belief.x)
         predicted = belief._replace(x=x, log_w=log_w)
-        x, ok = _redrawn(model.chart, predicted, self.points(draws), "predicted")
+        x, ok = _draw_from_normal(model.chart, predicted, self.points(draws), "predicted")
         log_ratio = torch.where(ok.unsqueeze(-1), first.log_ratio, -torch.inf)
         return ProposalSample(x, log_ratio, belief.memory)
 
 
-def _redrawn(
+def _draw_from_normal(
     chart: Chart, belief: ParticleBelief, draws: RandomStream, purpose: str
 ) -> tuple[Tensor, Tensor]:
     """Draw particles from the normal distribution of a belief; mask valid runs [R]."""

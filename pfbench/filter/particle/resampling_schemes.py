@@ -33,17 +33,17 @@ class Systematic(ResamplingScheme):
 
     @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
-        return _evenly(_precise(a), n, draws.uniform("resample", 1, 1).squeeze(1))
+        return _systematic(_precise(a), n, draws.uniform("resample", 1, 1).squeeze(1))
 
 
-def _counted_evenly(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
+def _eager_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     """Return ancestors [R, N] by the positions (j + u) / n of slots j, u [R, 1]."""
     reach = _cumulative(a) * n
     # where, since n - u may round to n - 1 in float32, which gives the last slot to a weight of 0
     return _ancestors(torch.where(reach < n, torch.ceil(reach - u.to(reach.dtype)), n).long(), n)
 
 
-_evenly = compilable(_counted_evenly, operator=cpp.resample_systematic)
+_systematic = compilable(_eager_systematic, operator=cpp.resample_systematic)
 
 
 @dataclass(frozen=True)

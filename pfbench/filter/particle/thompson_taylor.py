@@ -79,12 +79,12 @@ class ThompsonTaylorResampler(Resampler):
             1, (slots, m)
         )
         centre = rows.mean(2)
-        combination = self._combined(rows - centre.unsqueeze(2), draws)
+        combination = self._combine(rows - centre.unsqueeze(2), draws)
         x = model.chart.add(mean.unsqueeze(1), centre + combination)
         x = torch.where(resampled_mask[:, None, None], x, copies.x)
         return copies._replace(x=x), resampled_mask
 
-    def _combined(self, r: Tensor, draws: RandomStream) -> Tensor:
+    def _combine(self, r: Tensor, draws: RandomStream) -> Tensor:
         """Combine the deviations r [R, N, m, d] of neighbours from their mean, [R, N, d]."""
         m = self.neighbours
         half = math.sqrt(3.0 * (m - 1.0)) / m

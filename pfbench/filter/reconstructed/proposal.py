@@ -148,7 +148,9 @@ class ReconstructedNoiseProposal(Proposal):
                 parent = chart.mean(belief.x, w).unsqueeze(1)
             centre = model.propagate(parent, record.u, mean_noise(model, parent))
             a = _noise_jacobian(model, parent, record)
-        a, r = _whitened(model, centre, record, a, linearised_innovation(model, prediction, record))
+        a, r = _whiten_noise(
+            model, centre, record, a, linearised_innovation(model, prediction, record)
+        )
         eye = torch.eye(a.shape[-1], dtype=a.dtype, device=a.device)
         root = torch.linalg.cholesky_ex(a.mT @ a + eye)[0]
         covariance_root = torch.linalg.solve_triangular(
@@ -171,7 +173,7 @@ def _noise_jacobian(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor
     return torch.where(torch.isnan(record.y)[:, None, :, None], 0.0, a)
 
 
-def _whitened(
+def _whiten_noise(
     model: StateSpaceModel, x: Tensor, record: Record, a: Tensor, r: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Compute R_v^-1/2 A and R_v^-1/2 r at x. An infinite variance gives zeros."""

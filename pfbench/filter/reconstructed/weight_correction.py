@@ -99,7 +99,7 @@ class NoWeightCorrection(WeightCorrection):
         if self.regressed_states:
             key = "weight_correction.regressed_states"
             regressed = state_indices(model, key, self.regressed_states)
-            shift = _regressed_shift(model, x, w, shift, regressed)
+            shift = _regress_shift(model, x, w, shift, regressed)
         return ProposalSample(model.chart.add(x, shift), log_ratio, sample.memory)
 
 
@@ -226,7 +226,7 @@ class MarginalRatioCorrection(WeightCorrection):
         return ProposalSample(x, log_ratio + ratio, sample.memory)
 
 
-def _regressed_shift(
+def _regress_shift(
     model: StateSpaceModel, x: Tensor, w: Tensor, shift: Tensor, regressed: list[int]
 ) -> Tensor:
     """Replace the shift [R, N, d] of some states by their regression on the others."""

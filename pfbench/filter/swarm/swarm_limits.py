@@ -45,6 +45,34 @@ class SwarmLimits:
                 "Use max_distance_sd=null for no limit of position."
             )
 
+    def clamp_velocity(self, v: Tensor, scale: Tensor) -> Tensor:
+        """Clamp velocities to their limits.
+
+        Args:
+            v: Velocities, [R, N, k].
+            scale: Scale of each coordinate, [R, 1, k].
+
+        Returns:
+            Velocities, [R, N, k].
+        """
+        limit = 6.0 * self.max_velocity_sd * scale
+        return torch.clamp(v, -limit, limit)
+
+    def clamp_position(self, q: Tensor, sd: Tensor) -> Tensor:
+        """Clamp positions to their limits.
+
+        Args:
+            q: Positions, [R, N, k].
+            sd: Standard deviations of the predicted particles, [R, 1, k].
+
+        Returns:
+            Positions, [R, N, k].
+        """
+        if self.max_distance_sd is None:
+            return q
+        limit = self.max_distance_sd * sd
+        return torch.clamp(q, -limit, limit)
+
 
 @dataclass(frozen=True)
 class ChiSquareStopping:

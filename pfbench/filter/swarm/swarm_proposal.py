@@ -107,7 +107,7 @@ class SwarmProposal(Proposal):
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
-        parents, memory = self._first_step(model, belief, draws)
+        parents, memory = self._start_step(model, belief, draws)
         w = draw_noise(model, parents.shape[1], draws)
         x, log_w = deactivate_invalid_particles(
             model.propagate(parents, record.u, w), belief.log_w, parents
@@ -122,9 +122,8 @@ class SwarmProposal(Proposal):
             chaos = memory["swarm.chaos"].index_copy(-1, frame.components, swarm.chaos.unsqueeze(1))
             memory = memory | {"swarm.chaos": chaos}
         log_ratio = torch.where(torch.isfinite(log_w), log_ratio, -torch.inf)
-        return ProposalSample(
-            frame.to_states(q), log_ratio, memory, trace={"iterations": iterations}
-        )
+        x = frame.to_states(q)
+        return ProposalSample(x, log_ratio, memory, trace={"iterations": iterations})
 
     def optimise(
         self,
@@ -154,18 +153,14 @@ class SwarmProposal(Proposal):
             value = model.log_likelihood(record.y, frame.to_states(q), record.u) + penalty(q)
             return torch.where(active_mask & ~torch.isnan(value), value, -torch.inf)
 
-        swarm = initial = self._initial(frame, fitness(frame.q), memory)
+        swarm = initial = self._initialise_swarm(frame, fitness(frame.q), memory)
         spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
-        scale = (
-            memory["swarm.scale"][..., frame.components] if self.limits.scale_by_prior else spread
-        )
-        spare = (
-            match_memory_layout(
-                safe_seeds(draws.uniform("swarm.spare", *frame.q.shape[1:])), frame.q
-            )
-            if self.perturbation
-            else None
-        )
+        scale, spare = spread, None
+        if self.limits.scale_by_prior:
+            scale = memory["swarm.scale"][..., frame.components]
+        if self.perturbation:
+            spare = safe_seeds(draws.uniform("swarm.spare", *frame.q.shape[1:]))
+            spare = match_memory_layout(spare, frame.q)
         active = observed_runs = ~torch.isnan(record.y).all(1)
         iterations = torch.zeros_like(active, dtype=torch.long)
         for i in range(1, self.iterations + 1):
@@ -173,16 +168,15 @@ class SwarmProposal(Proposal):
                 break
             v = self.velocity(swarm, active_mask, i / self.iterations, draws, f"swarm.velocity.{i}")
             iterations = iterations + active
-            updated = self._updated(swarm, v, fitness, scale, spread, spare)
+            updated = self._move_swarm(swarm, v, fitness, scale, spread, spare)
             swarm = select_swarm_by_run(active, updated, swarm) if self.stopping else updated
             if self.stopping:
                 best = swarm.best_fitness.argmax(1)
-                active = active & ~self.stopping(
-                    model, select_particle(frame.to_states(swarm.best), best), record
-                )
+                best_state = select_particle(frame.to_states(swarm.best), best)
+                active = active & ~self.stopping(model, best_state, record)
         return select_swarm_by_run(observed_runs, swarm, initial), iterations
 
-    def _updated(
+    def _move_swarm(
         self,
         swarm: SwarmState,
         v: Tensor,
@@ -192,35 +186,26 @@ class SwarmProposal(Proposal):
         spare: Tensor | None,
     ) -> SwarmState:
         """Move to x + v or, if its fitness is higher, x + v + Dx, and update the records."""
-        max_velocity, chaos = 6.0 * self.limits.max_velocity_sd * scale, swarm.chaos
-        max_distance = (
-            torch.full_like(spread, torch.inf)
-            if self.limits.max_distance_sd is None
-            else self.limits.max_distance_sd * spread
-        )
-        v = torch.clamp(v, -max_velocity, max_velocity)
-        q = torch.clamp(swarm.q + v, -max_distance, max_distance)
-        value = fitness(q)
+        v = self.limits.clamp_velocity(v, scale)
+        q = self.limits.clamp_position(swarm.q + v, spread)
+        value, chaos = fitness(q), swarm.chaos
         if self.perturbation and spare is not None:
             chaos = logistic_map(chaos, spare)
-            perturbed = torch.clamp(
-                swarm.q + v + self.perturbation(chaos, scale), -max_distance, max_distance
-            )
+            step = self.perturbation(chaos, scale)
+            perturbed = self.limits.clamp_position(swarm.q + v + step, spread)
             perturbed_value = fitness(perturbed)
             q = torch.where((perturbed_value > value).unsqueeze(-1), perturbed, q)
             value = torch.maximum(perturbed_value, value)
         better, worse = value > swarm.best_fitness, value < swarm.worst_fitness
-        best, worst = (
-            torch.where(a.unsqueeze(-1), q, b)
-            for a, b in ((better, swarm.best), (worse, swarm.worst))
-        )
-        best_fitness, worst_fitness = (
-            torch.maximum(value, swarm.best_fitness),
-            torch.minimum(value, swarm.worst_fitness),
-        )
+        best = torch.where(better.unsqueeze(-1), q, swarm.best)
+        worst = torch.where(worse.unsqueeze(-1), q, swarm.worst)
+        best_fitness = torch.maximum(value, swarm.best_fitness)
+        worst_fitness = torch.minimum(value, swarm.worst_fitness)
         return SwarmState(q, v, value, best, best_fitness, worst, worst_fitness, chaos)
 
-    def _initial(self, frame: SwarmFrame, fitness: Tensor, memory: dict[str, Tensor]) -> SwarmState:
+    def _initialise_swarm(
+        self, frame: SwarmFrame, fitness: Tensor, memory: dict[str, Tensor]
+    ) -> SwarmState:
         """Return the swarm before its first iteration, with stored chaotic values only."""
         q = frame.q
         chaos = (
@@ -230,7 +215,7 @@ class SwarmProposal(Proposal):
         )
         return SwarmState(q, torch.zeros_like(q), fitness, q, fitness, q, fitness, chaos)
 
-    def _first_step(
+    def _start_step(
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return parents [R, N, D] and memory, which the first step initialises."""

@@ -331,7 +331,7 @@ class NoRatio:
 class Drifting(NoiseFlowKernel):
     """Renews the noises by w + c e, which widens them."""
 
-    def _refreshed(self, model: StateSpaceModel, w: Tensor, draws: Any) -> Tensor:
+    def _refresh_noise(self, model: StateSpaceModel, w: Tensor, draws: Any) -> Tensor:
         return w + 0.3 * draws.normal("refresh", w.shape[1], w[0, 0].numel()).unflatten(
             2, w.shape[2:]
         )
