@@ -104,7 +104,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter):
         draws: RandomStream,
         limit: int,
     ) -> tuple[list[tuple[ParticleBelief, StepInfo]], int]:
-        """Take several steps of a record, `draws` being those of the first one."""
+        """Take several steps of a record. `draws` belongs to the first of them."""
         graph = self._graph(model, belief, record.at_step(0), draws)
         results: list[tuple[ParticleBelief, StepInfo]] = []
         if graph is not None and isinstance(draws, PhiloxStream):

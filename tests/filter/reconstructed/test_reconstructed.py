@@ -343,7 +343,7 @@ def test_corrected_versions_are_unbiased(name: str, case: str) -> None:
     model, y, exact = CASES[case]()
     method = ParticleFilter(60, EssResampler(Systematic(), 0.7), proposal=EXACT[name])
     if (name, case) == ("density", "benes"):
-        with pytest.raises(ValueError, match="not additive"):
+        with pytest.raises(ValueError, match="with additive noise"):
             check_evidence(method, model, y, exact, runs=2)
         return
     if (name, case) == (
