@@ -19,6 +19,7 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.defensive_mixture import check_fraction, choose_defensive_particles
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.learned.features import Feature, FeatureStack, make_feature_context
 from pfbench.filter.learned.network_builder import CheckpointSpec, build_networks
@@ -32,7 +33,6 @@ from pfbench.filter.learned.noise_frame import (
     to_frame,
 )
 from pfbench.filter.learned.reparameterised_sampling import sample_from
-from pfbench.filter.particle.defensive_mixture import check_fraction, choose_defensive_particles
 from pfbench.filter.particle.proposals import ProposalSample
 from pfbench.model.base import StateSpaceModel, StaticModel
 

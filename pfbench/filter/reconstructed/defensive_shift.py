@@ -8,8 +8,8 @@ from torch import Tensor
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.defensive_mixture import DefensiveSelection, choose_defensive_particles
 from pfbench.filter.linearisation import mean_noise
-from pfbench.filter.particle.defensive_mixture import DefensiveSelection, choose_defensive_particles
 from pfbench.filter.particle.proposals import ProposalSample
 from pfbench.filter.particle.weight_update import deactivate_invalid_particles
 from pfbench.model.base import StateSpaceModel

@@ -18,6 +18,7 @@ from pfbench.core.covariance import factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.defensive_mixture import AffineMap, check_fraction
 from pfbench.filter.exactness import is_every_part_exact
 from pfbench.filter.linearisation import (
     batch_product,
@@ -28,7 +29,6 @@ from pfbench.filter.linearisation import (
     mean_noise,
     measurement_jacobian,
 )
-from pfbench.filter.particle.defensive_mixture import AffineMap, check_fraction
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
 from pfbench.filter.reconstructed.defensive_shift import (
     keep_selected,

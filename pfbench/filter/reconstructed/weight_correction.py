@@ -18,8 +18,8 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.defensive_mixture import AffineMap, check_fraction
 from pfbench.filter.linearisation import batch_product, linearised_innovation, measurement_jacobian
-from pfbench.filter.particle.defensive_mixture import AffineMap, check_fraction
 from pfbench.filter.particle.proposals import ProposalSample
 from pfbench.filter.reconstructed.defensive_shift import (
     keep_selected,

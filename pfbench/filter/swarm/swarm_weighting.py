@@ -15,7 +15,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
-from pfbench.filter.particle.defensive_mixture import choose_defensive_particles
+from pfbench.filter.defensive_mixture import choose_defensive_particles
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
 from pfbench.filter.swarm.swarm_coordinates import SwarmFrame, bounded_root
 from pfbench.filter.whitening import compute_half_square, whiten
