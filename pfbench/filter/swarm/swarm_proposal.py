@@ -155,12 +155,9 @@ class SwarmProposal(Proposal):
 
         swarm = initial = self._initialise_swarm(frame, fitness(frame.q), memory)
         spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
-        scale, spare = spread, None
-        if self.limits.scale_by_prior:
-            scale = memory["swarm.scale"][..., frame.components]
-        if self.perturbation:
-            spare = safe_seeds(draws.uniform("swarm.spare", *frame.q.shape[1:]))
-            spare = match_memory_layout(spare, frame.q)
+        by_prior = self.limits.scale_by_prior
+        scale = memory["swarm.scale"][..., frame.components] if by_prior else spread
+        spare = self._draw_spare_seeds(frame.q, draws)
         active = observed_runs = ~torch.isnan(record.y).all(1)
         iterations = torch.zeros_like(active, dtype=torch.long)
         for i in range(1, self.iterations + 1):
@@ -175,6 +172,12 @@ class SwarmProposal(Proposal):
                 best_state = select_particle(frame.to_states(swarm.best), best)
                 active = active & ~self.stopping(model, best_state, record)
         return select_swarm_by_run(observed_runs, swarm, initial), iterations
+
+    def _draw_spare_seeds(self, q: Tensor, draws: RandomStream) -> Tensor | None:
+        """Draw seeds for chaotic sequences that restart, [R, N, k]."""
+        if not self.perturbation:
+            return None
+        return match_memory_layout(safe_seeds(draws.uniform("swarm.spare", *q.shape[1:])), q)
 
     def _move_swarm(
         self,
