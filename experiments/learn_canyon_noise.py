@@ -53,8 +53,9 @@ from pfbench.model.urban_gnss import (
 from pfbench.model.urban_gnss import NormalRangeError as NormalRanges
 from pfbench.noise.white import NominalNoise
 from pfbench.ppl.parameter_posterior import WELL_MIXED, ParameterPosterior, plot_posterior
-from pfbench.ppl.pmmh import pmmh, repeat_runs
-from pfbench.ppl.program import ParameterisedModel
+from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
+from pfbench.ppl.posterior_estimate import repeat_runs
 from pfbench.report.markdown import (
     markdown_bullets,
     markdown_head,
@@ -177,8 +178,8 @@ def learn(stretch: str, best: LosNlosRangeError, draws: int, warmup: int) -> Par
         leave=False,
     ) as bar:
         return pmmh(
-            ParameterisedModel(make, PRIOR), ParticleFilter(PARTICLES), record, draws, warmup, chains=CHAINS, seed=4, start=start,
-            leaps=LEAPS, tick=bar.update,
+            ParameterisedModel(make, PRIOR), ParticleFilter(PARTICLES), record, draws, warmup, chains=CHAINS, seed=4,
+            settings=PmmhSettings(start=start, leaps=LEAPS, tick=bar.update),
         )  # fmt: skip
 
 

@@ -28,10 +28,12 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import local_level
 from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
+from pfbench.ppl.marginal_likelihood import FilterLikelihood, GaussianHmmLikelihood
 from pfbench.ppl.nuts_svi import normal_guide, svi
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.pmmh import pmmh
-from pfbench.ppl.program import FilterLikelihood, GaussianHmmLikelihood, ParameterisedModel, program
+from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
+from pfbench.ppl.pyro_program import program
 from pfbench.ppl.sbc import SbcRanks, sbc_histograms, simulation_based_calibration
 from pfbench.report.plots.plotting import render_palette_png
 
@@ -73,7 +75,7 @@ def by_pmmh(
         warmup,
         chains=1,
         seed=3,
-        separate_parameters=True,
+        settings=PmmhSettings(separate_parameters=True),
     )
 
 

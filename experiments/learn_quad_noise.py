@@ -43,8 +43,8 @@ from pfbench.job.resumable import ResumableResults
 from pfbench.model.strapdown_total import StrapdownTotal, StrapdownTuning
 from pfbench.noise.white import NominalNoise
 from pfbench.ppl.parameter_posterior import WELL_MIXED, ParameterPosterior, plot_posterior
-from pfbench.ppl.pmmh import pmmh
-from pfbench.ppl.program import ParameterisedModel
+from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
 from pfbench.report.markdown import (
     markdown_bullets,
     markdown_head,
@@ -103,7 +103,8 @@ def learned(draws: int, warmup: int, step: float) -> ParameterPosterior:
         total=warmup + draws, desc="posterior", unit="iteration", mininterval=10.0, leave=False
     ) as bar:
         return pmmh(
-            unknown, GaussianFilter(TaylorLinearisation()), record, draws, warmup, chains=CHAINS, seed=2, leaps=LEAPS, tick=bar.update
+            unknown, GaussianFilter(TaylorLinearisation()), record, draws, warmup, chains=CHAINS, seed=2,
+            settings=PmmhSettings(leaps=LEAPS, tick=bar.update),
         )  # fmt: skip
 
 

@@ -8,10 +8,13 @@ __all__ = [
     "MarginalLikelihood",
     "ParameterPosterior",
     "ParameterisedModel",
+    "PmmhSettings",
     "SbcRanks",
     "SortedResampler",
     "SwitchingNoise",
+    "latent_program",
     "normal_guide",
+    "nuts",
     "plot_posterior",
     "pmmh",
     "program",
@@ -26,33 +29,38 @@ __all__ = [
 __getattr__, __dir__ = lazy_attributes(
     __name__,
     {
+        "correlated_numbers": ("SortedResampler",),
+        "ibis_smc2": ("smc2",),
+        "marginal_likelihood": (
+            "FilterLikelihood",
+            "GaussianHmmLikelihood",
+            "MarginalLikelihood",
+        ),
         "nuts_svi": (
-            "svi",
             "normal_guide",
+            "nuts",
+            "svi",
         ),
         "parameter_posterior": (
             "ParameterPosterior",
             "plot_posterior",
         ),
-        "pmmh": (
-            "SortedResampler",
+        "parameterised_model": ("ParameterisedModel",),
+        "particle_mcmc": (
+            "PmmhSettings",
             "pmmh",
-            "repeat_runs",
         ),
-        "program": (
-            "MarginalLikelihood",
-            "FilterLikelihood",
-            "GaussianHmmLikelihood",
-            "ParameterisedModel",
+        "posterior_estimate": ("repeat_runs",),
+        "prior_predictive": ("simulate",),
+        "pyro_program": (
+            "latent_program",
             "program",
-            "simulate",
         ),
         "sbc": (
             "SbcRanks",
-            "simulation_based_calibration",
             "sbc_histograms",
+            "simulation_based_calibration",
         ),
-        "smc2": ("smc2",),
         "switching": ("SwitchingNoise",),
     },
 )

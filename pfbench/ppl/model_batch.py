@@ -18,30 +18,30 @@ from pfbench.model.base import ModelWrapper, StateSpaceModel, dense_normal, inde
 
 
 class ModelBatch(ModelWrapper):
-    """A batch of models: run r has models[r // each].
+    """A batch of models: run r has models[r // runs_per_model].
 
     Each method is mapped over the runs with the buffers in which the models differ. It works for
     every model that stores its parameters in buffers. Gradients reach the buffers.
 
     Args:
         models: Models of one class that differ in their buffers only.
-        each: Consecutive runs that share a model.
+        runs_per_model: Number of consecutive runs that share a model.
 
     Raises:
         ValueError: if models differ in something other than a buffer, in their origin, or in their
             noise distribution.
     """
 
-    def __init__(self, models: Sequence[StateSpaceModel], each: int = 1) -> None:
+    def __init__(self, models: Sequence[StateSpaceModel], runs_per_model: int = 1) -> None:
         first = models[0]
         super().__init__(first)
         self.linear, self.linear_given = first.linear, first.linear_given
         self.observes_initial, self.choices = first.observes_initial, first.choices
-        self.models, self.each = tuple(models), each
-        self.size = len(models) * each
+        self.models, self.runs_per_model = tuple(models), runs_per_model
+        self.size = len(models) * runs_per_model
         self._call = _Call(first)
         self._buffers_by_run = {
-            f"model.{name}": value.repeat_interleave(each, 0)
+            f"model.{name}": value.repeat_interleave(runs_per_model, 0)
             for name, value in _differing(models).items()
         }
 
@@ -50,16 +50,16 @@ class ModelBatch(ModelWrapper):
         first = self.model.prepare(record)
         if all(_same(first.u, model.prepare(record).u) for model in self.models[1:]):
             return first
-        parts = [
-            self.models[r // self.each].prepare(record.select_runs(slice(r, r + 1)))
+        records = [
+            self.models[r // self.runs_per_model].prepare(record.select_runs(slice(r, r + 1)))
             for r in range(self.size)
         ]
-        y, u = torch.cat([part.y for part in parts]), _joined([part.u for part in parts])
-        return parts[0]._replace(y=y, u=u)
+        y, u = torch.cat([run.y for run in records]), _joined([run.u for run in records])
+        return records[0]._replace(y=y, u=u)
 
     @override
     def initial(self, runs: int) -> Distribution:
-        return self._law(lambda model: model.initial(1))
+        return self._map_distribution(lambda model: model.initial(1))
 
     @override
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
@@ -78,13 +78,13 @@ class ModelBatch(ModelWrapper):
 
     @override
     def observation(self, x: Tensor, u: Any) -> Distribution:
-        return self._law(lambda model, x, u: model.observation(x, u), x, u)
+        return self._map_distribution(lambda model, x, u: model.observation(x, u), x, u)
 
     @override
     def transition(self, x: Tensor, u: Any) -> Distribution | None:
         if self.model.transition(x, u) is None:
             return None
-        return self._law(lambda model, x, u: model.transition(x, u), x, u)
+        return self._map_distribution(lambda model, x, u: model.transition(x, u), x, u)
 
     @override
     def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
@@ -95,24 +95,25 @@ class ModelBatch(ModelWrapper):
     def _mapped(self, f: Callable[..., Any], *args: Any) -> Any:
         """Evaluate f(model, ...) of every run as a batch of one, stacked [R, 1, ...]."""
 
-        def call_run(buffers: dict[str, Tensor], *parts: Any) -> Any:
-            batched = (_map_leaves(lambda a: a.unsqueeze(0), part) for part in parts)
+        def call_run(buffers: dict[str, Tensor], *run_args: Any) -> Any:
+            batched = (_map_leaves(lambda a: a.unsqueeze(0), value) for value in run_args)
             return functional_call(self._call, buffers, (f, *batched))
 
         expanded = [_map_leaves(lambda a: a.expand(self.size, *a.shape[1:]), a) for a in args]
         return torch.vmap(call_run)(self._buffers_by_run, *expanded)
 
-    def _law(self, f: Callable[..., Any], *args: Any) -> Distribution:
+    def _map_distribution(self, f: Callable[..., Any], *args: Any) -> Distribution:
         """Map a distribution over the runs: its parameters are mapped, then it is built again."""
         kinds: list[Any] = []
 
-        def parameters(model: StateSpaceModel, *parts: Any) -> dict[str, Tensor]:
-            law: Any = f(model, *parts)
-            base = law.base_dist if isinstance(law, torch.distributions.Independent) else law
-            kinds.append((type(law), type(base)))
+        def parameters(model: StateSpaceModel, *run_args: Any) -> dict[str, Tensor]:
+            distribution: Any = f(model, *run_args)
+            is_independent = isinstance(distribution, torch.distributions.Independent)
+            base = distribution.base_dist if is_independent else distribution
+            kinds.append((type(distribution), type(base)))
             if isinstance(base, MultivariateNormal):
                 return {"loc": base.loc, "scale_tril": base.scale_tril}
-            batch = len(law.batch_shape) + len(law.event_shape)
+            batch = len(distribution.batch_shape) + len(distribution.event_shape)
             values = {name: getattr(base, name) for name in base.arg_constraints}
             return {
                 name: a.reshape(*[1] * (batch - a.dim()), *a.shape) for name, a in values.items()
@@ -231,5 +232,5 @@ def _joined(inputs: Sequence[Any]) -> Any:
     return type(first)(*(_joined(parts) for parts in zip(*inputs, strict=True)))
 
 
-def _map_leaves(f: Callable[[Tensor], Tensor], part: Any) -> Any:
-    return f(part) if isinstance(part, Tensor) else map_inputs(f, part)
+def _map_leaves(f: Callable[[Tensor], Tensor], inputs: Any) -> Any:
+    return f(inputs) if isinstance(inputs, Tensor) else map_inputs(f, inputs)

@@ -18,7 +18,7 @@ from torch.distributions import biject_to
 
 from pfbench.core.record import Record
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.program import ParameterisedModel, Values
+from pfbench.ppl.parameterised_model import ParameterisedModel, Values
 
 Program = Callable[[Record], Values]
 
@@ -124,8 +124,9 @@ def normal_guide(
 
     Args:
         unknown: Model and prior.
-        apart: If true, each run has its own distribution, for programs whose runs have their own
-            parameters. Pyro's guides offer one joint distribution, or none between parameters.
+        separate_parameters: Whether each run has its own distribution, for programs whose runs have
+            their own parameters. Pyro's guides offer one joint distribution, or independent
+            parameters.
         spread: Initial standard deviation.
 
     Returns:
@@ -142,10 +143,10 @@ def normal_guide(
         normal = MultivariateNormal(loc, scale_tril=root)
         z = pyro.sample("_whole", normal, infer={"is_auxiliary": True})
         values = {}
-        for (name, law), part in zip(unknown.prior.items(), z.unbind(-1), strict=True):
-            to_support = biject_to(law.support)
-            value = to_support(part)
-            log_density = -to_support.log_abs_det_jacobian(part, value)
+        for (name, prior), column in zip(unknown.prior.items(), z.unbind(-1), strict=True):
+            to_support = biject_to(prior.support)
+            value = to_support(column)
+            log_density = -to_support.log_abs_det_jacobian(column, value)
             values[name] = pyro.sample(name, Delta(value, log_density=log_density))
         return values
 

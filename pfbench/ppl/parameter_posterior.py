@@ -26,8 +26,8 @@ class ParameterPosterior:
 
     Attributes:
         draws: Draws by parameter, [chains, S], or [chains, S, R] if runs have their own parameters.
-        accepted: Share of accepted proposals, [chains] or [chains, R]; None without proposals.
-        how: Algorithm, for captions.
+        accepted: Acceptance rate, [chains] or [chains, R]; None without proposals.
+        method: Algorithm, for captions.
     """
 
     draws: Mapping[str, Tensor]
@@ -35,19 +35,19 @@ class ParameterPosterior:
     method: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary that JSON can store; `heard` reads it."""
+        """Return a dictionary that JSON can store and `from_dict` reads."""
         accepted = None if self.accepted is None else self.accepted.tolist()
         draws = {name: a.tolist() for name, a in self.draws.items()}
         return {"draws": draws, "accepted": accepted, "how": self.method}
 
     @staticmethod
-    def from_dict(told: Mapping[str, Any]) -> ParameterPosterior:
-        """Build a posterior from the dictionary of `told`."""
-        draws = {name: torch.tensor(a, dtype=torch.float64) for name, a in told["draws"].items()}
-        accepted = told["accepted"]
+    def from_dict(content: Mapping[str, Any]) -> ParameterPosterior:
+        """Build a posterior from the dictionary of `to_dict`."""
+        draws = {name: torch.tensor(a, dtype=torch.float64) for name, a in content["draws"].items()}
+        accepted = content["accepted"]
         if accepted is not None:
             accepted = torch.tensor(accepted, dtype=torch.float64)
-        return ParameterPosterior(draws, accepted, told["how"])
+        return ParameterPosterior(draws, accepted, content["how"])
 
     def run(self, r: int) -> ParameterPosterior:
         """Return the posterior of run r, if runs have their own parameters."""
@@ -99,9 +99,9 @@ class ParameterPosterior:
 
     @property
     def has_converged(self) -> bool:
-        """Whether split r-hat of all parameters is below 1.05.
+        """True if split r-hat of all parameters is below 1.05.
 
-        True without chains, False with fewer than four draws.
+        Also true without chains. False with fewer than four draws.
         """
         if self.accepted is None:
             return True

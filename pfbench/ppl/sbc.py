@@ -20,7 +20,8 @@ from torch import Tensor
 
 from pfbench.core.record import Record
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.program import ParameterisedModel, simulate
+from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.prior_predictive import simulate
 from pfbench.report.plots.plotting import COLUMN, RC
 
 Infer = Callable[[Record], ParameterPosterior]
@@ -108,7 +109,7 @@ def sbc_histograms(ranks: Mapping[str, SbcRanks], bins: int = 10) -> Figure:
     The band contains 95 % of the bins of uniform ranks.
 
     Args:
-        found: Ranks by label.
+        ranks: Ranks by label.
         bins: Number of bins.
 
     Returns:

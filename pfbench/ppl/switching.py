@@ -11,7 +11,7 @@ from pyro.distributions import DiscreteHMM, Normal, Unit
 from torch import Tensor
 
 from pfbench.core.record import Record
-from pfbench.ppl.program import Law, Values
+from pfbench.ppl.parameterised_model import Prior, Values
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class SwitchingNoise:
         surge_stay: Distribution of the probability to stay in the surge.
     """
 
-    sd: Law
-    ratio: Law
-    stay: Law
-    surge_stay: Law
+    sd: Prior
+    ratio: Prior
+    stay: Prior
+    surge_stay: Prior
 
     @property
-    def prior(self) -> dict[str, Law]:
+    def prior(self) -> dict[str, Prior]:
         """Distributions of the parameters by name."""
         return {
             "sd": self.sd,
@@ -52,7 +52,7 @@ class SwitchingNoise:
         """
 
         def run(record: Record) -> Values:
-            values = {name: pyro.sample(name, law) for name, law in self.prior.items()}
+            values = {name: pyro.sample(name, prior) for name, prior in self.prior.items()}
             pyro.factor("evidence", self.chain(values, emission_distribution(record, values)).sum())
             return values
 

@@ -31,7 +31,9 @@ from pfbench.model.textbook import Pendulum
 from pfbench.noise.time_varying import VarianceSurge
 from pfbench.noise.white import MeasurementOutage, NominalNoise, OutlierNoise
 from pfbench.ppl.model_batch import ModelBatch
-from pfbench.ppl.program import ParameterisedModel, latent_program, simulate
+from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.prior_predictive import simulate
+from pfbench.ppl.pyro_program import latent_program
 from pfbench.scenario.model_simulation import ModelSimulation
 
 RUNS = 20_000

@@ -34,19 +34,17 @@ from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_lev
 from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
 from pfbench.model.textbook import Pendulum, StochasticVolatility, UnivariateGrowth
 from pfbench.model.urban_gnss import NormalExponentialMixture
+from pfbench.ppl.correlated_numbers import CorrelatedStream, SortedResampler
+from pfbench.ppl.ibis_smc2 import smc2
+from pfbench.ppl.marginal_likelihood import FilterLikelihood, GaussianHmmLikelihood
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.ppl.parameter_posterior import ParameterPosterior, plot_posterior
-from pfbench.ppl.pmmh import CorrelatedStream, SortedResampler, _Walk, pmmh, repeat_runs
-from pfbench.ppl.program import (
-    FilterLikelihood,
-    GaussianHmmLikelihood,
-    ParameterisedModel,
-    compute_path,
-    latent_program,
-    program,
-    simulate,
-)
-from pfbench.ppl.smc2 import smc2
+from pfbench.ppl.parameter_walk import ParameterWalk
+from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
+from pfbench.ppl.posterior_estimate import repeat_runs
+from pfbench.ppl.prior_predictive import simulate
+from pfbench.ppl.pyro_program import compute_path, latent_program, program
 from pfbench.ppl.switching import SwitchingNoise, emission_distribution
 
 EKF, CKF, UKF = (
@@ -434,7 +432,7 @@ def test_leaps_are_of_a_t_law_and_know_its_density() -> None:
     z = mean + 2.0 * torch.randn(
         2000, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
     )
-    walk = _Walk(mean, covariance, torch.zeros(1, dtype=torch.float64))
+    walk = ParameterWalk(mean, covariance, torch.zeros(1, dtype=torch.float64))
     new, log_back = walk.leap(z, PhiloxStream(1, torch.arange(2000)).at_step(1))
     law = multivariate_t(mean[0].numpy(), covariance[0].numpy() + 1e-6 * np.eye(3), df=5)
     np.testing.assert_allclose(
@@ -454,8 +452,8 @@ def test_chains_that_start_elsewhere_come_to_the_posterior_by_steps_and_by_leaps
     start = {"a": LogNormal(0.6, 0.9), "b": LogNormal(-0.6, 0.9)}
     ticks: list[None] = []
     found = pmmh(
-        LEVELS, EKF, Record(torch.full((1, 1, 1), torch.nan, dtype=torch.float64)), 5, 16, chains=120, seed=3, thin=4,
-        start=start, leaps=leaps, tick=lambda: ticks.append(None),
+        LEVELS, EKF, Record(torch.full((1, 1, 1), torch.nan, dtype=torch.float64)), 5, 16, chains=120, seed=3,
+        settings=PmmhSettings(start=start, leaps=leaps, thin=4, tick=lambda: ticks.append(None)),
     )  # fmt: skip
     assert len(ticks) == 36
     for name, law in LEVELS.prior.items():
@@ -467,11 +465,11 @@ def test_chains_that_start_elsewhere_come_to_the_posterior_by_steps_and_by_leaps
 def test_pmmh_says_what_it_cannot_do() -> None:
     record = Record(torch.zeros(1, 3, 1, dtype=torch.float64))
     with pytest.raises(ValueError, match="leaps=-1"):
-        pmmh(LEVELS, EKF, record, 1, 1, leaps=-1)
+        pmmh(LEVELS, EKF, record, 1, 1, settings=PmmhSettings(leaps=-1))
     with pytest.raises(ValueError, match=r"a distribution for each of \['a', 'b'\], got \['a'\]"):
-        pmmh(LEVELS, EKF, record, 1, 1, start={"a": LogNormal(0.0, 1.0)})
+        pmmh(LEVELS, EKF, record, 1, 1, settings=PmmhSettings(start={"a": LogNormal(0.0, 1.0)}))
     with pytest.raises(ValueError, match="rho=1"):
-        pmmh(LEVELS, EKF, record, 1, 1, rho=1.0)
+        pmmh(LEVELS, EKF, record, 1, 1, settings=PmmhSettings(rho=1.0))
     with pytest.raises(ValueError, match="draws=0"):
         pmmh(LEVELS, EKF, record, 0, 1)
     impossible = Record(torch.full((1, 3, 1), 1e200, dtype=torch.float64))

@@ -25,18 +25,14 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import local_level
+from pfbench.ppl.ibis_smc2 import smc2
+from pfbench.ppl.marginal_likelihood import FilterLikelihood, GaussianHmmLikelihood
 from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.pmmh import pmmh
-from pfbench.ppl.program import (
-    FilterLikelihood,
-    GaussianHmmLikelihood,
-    ParameterisedModel,
-    latent_program,
-    program,
-)
+from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
+from pfbench.ppl.pyro_program import latent_program, program
 from pfbench.ppl.sbc import SbcRanks, sbc_histograms, simulation_based_calibration
-from pfbench.ppl.smc2 import smc2
 
 EKF, YEARS = GaussianFilter(TaylorLinearisation()), 12
 NILE = ParameterisedModel(
@@ -135,7 +131,16 @@ def test_particle_marginal_chains_find_the_grid_s_posterior() -> None:
 @pytest.mark.parametrize("leaps", [0, 3])
 def test_metropolis_on_a_kalman_likelihood_finds_it_too(leaps: int) -> None:
     agrees(
-        pmmh(NILE, EKF, nile(YEARS), draws=60, warmup=40, chains=24, seed=2, leaps=leaps).table(),
+        pmmh(
+            NILE,
+            EKF,
+            nile(YEARS),
+            draws=60,
+            warmup=40,
+            chains=24,
+            seed=2,
+            settings=PmmhSettings(leaps=leaps),
+        ).table(),
         YEARS,
     )
 

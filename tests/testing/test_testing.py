@@ -33,7 +33,7 @@ from pfbench.filter.particle.resampling_schemes import Multinomial, Residual, Ss
 from pfbench.filter.particle.sqmc import HilbertSortedResampler, SqmcProposal, SqmcScheme
 from pfbench.filter.particle.weight_update import BayesWeightUpdate
 from pfbench.model.base import StateSpaceModel
-from pfbench.ppl.pmmh import SortedResampler
+from pfbench.ppl.correlated_numbers import SortedResampler
 from pfbench.testing import (
     check_causality,
     check_convergence,

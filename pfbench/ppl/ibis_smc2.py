@@ -20,8 +20,8 @@ from pfbench.filter.belief import Filter
 from pfbench.filter.loop import FilterPass, prepare_record
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.model.base import StateSpaceModel
-from pfbench.ppl.pmmh import repeat_runs
-from pfbench.ppl.program import ParameterisedModel, Values
+from pfbench.ppl.parameterised_model import ParameterisedModel, Values
+from pfbench.ppl.posterior_estimate import repeat_runs
 
 
 class Smc2Result(NamedTuple):
@@ -34,7 +34,7 @@ class Smc2Result(NamedTuple):
         sd: Posterior standard deviation after each step, {name: [T]}.
         log_evidence: log p(y_1:t) with the parameters integrated out, [T].
         ess: Effective sample size of the parameter particles, [T].
-        moved: Acceptance rate of the moves, [T]. NaN for a step without moves.
+        acceptance: Acceptance rate of the moves, [T]. NaN for a step without moves.
     """
 
     values: Values
@@ -85,12 +85,12 @@ def smc2(
     """
     if particles < 2 or moves < 0:
         raise ValueError(
-            f"online: particles must be at least 2 and moves at least 0, got particles={particles}, "
-            f"moves={moves}. Change these values."
+            f"smc2.particles must be at least 2 and smc2.moves at least 0, got particles={particles} "
+            f"and moves={moves}. Change these values."
         )
     if not 0.0 <= threshold <= 1.0:
         raise ValueError(
-            f"online: threshold must be from 0 to 1, got {threshold}. Give a fraction of particles."
+            f"smc2.threshold must be from 0 to 1, got {threshold}. Give a fraction of the particles."
         )
     with torch.no_grad():
         sampler = _ParameterSampler(unknown, method, record, particles, seed)
@@ -120,7 +120,7 @@ class _ParameterSampler:
             total = log_w.logsumexp(0)
             if not bool(torch.isfinite(total)):
                 raise ValueError(
-                    f"online: at least one filter must be valid at step {t}, got none. Use a wider "
+                    f"smc2 needs at least one valid filter at step {t}, got none. Use a wider "
                     "prior or more particles."
                 )
             self.log_w, log_evidence = log_w - total, log_evidence + total

@@ -1,0 +1,170 @@
+"""Particle marginal Metropolis-Hastings: a random walk of parameters with a filter run per step.
+
+All chains move at once, as runs of one batch. `ModelBatch` maps the model of each chain over them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import PhiloxStream, RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import Filter
+from pfbench.ppl.parameter_posterior import ParameterPosterior
+from pfbench.ppl.parameter_walk import ParameterWalk
+from pfbench.ppl.parameterised_model import ParameterisedModel, Prior
+from pfbench.ppl.posterior_estimate import PosteriorEstimator
+
+_Proposal: TypeAlias = Callable[[Tensor, RandomStream], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class PmmhSettings:
+    """Settings of particle marginal Metropolis-Hastings.
+
+    Attributes:
+        separate_parameters: Whether each run has its own parameters, R posteriors. Otherwise the
+            runs share them.
+        rho: Correlation of the filter's random numbers between iterations; they are all stored.
+            It needs a resampler `SortedResampler` and helps little for more than a few states.
+        thin: Iterations for each draw.
+        start: Distributions of the chains' starts and of the walk's first covariance, by parameter,
+            with the supports of the prior. They should be wider than the posterior, so that r-hat
+            detects chains that disagree. None is the prior.
+        leaps: Leaps after each step of the walk. They improve mixing if the posterior is nearly
+            normal.
+        tick: Function that is called after each iteration, for a progress bar.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    separate_parameters: bool = False
+    rho: float = 0.0
+    thin: int = 1
+    start: Mapping[str, Prior] | None = None
+    leaps: int = 0
+    tick: Callable[[], object] | None = None
+
+    def __post_init__(self) -> None:
+        _check_minima({"thin": (self.thin, 1), "leaps": (self.leaps, 0)})
+        if not 0.0 <= self.rho < 1.0:
+            raise ValueError(
+                f"pmmh.rho must be in [0, 1), got rho={self.rho}. Use 0 for no correlation."
+            )
+
+
+def pmmh(
+    unknown: ParameterisedModel,
+    method: Filter,
+    record: Record,
+    draws: int,
+    warmup: int,
+    chains: int = 4,
+    seed: int = 0,
+    settings: PmmhSettings | None = None,
+) -> ParameterPosterior:
+    """Draw from p(parameters | y_1:T) by particle marginal Metropolis-Hastings.
+
+    It is exact for any number of particles if the filter's likelihood estimate is unbiased
+    [Andrieu, Doucet and Holenstein 2010]. With a Gaussian filter it is Metropolis-Hastings with
+    that filter's likelihood.
+
+    The random walk of the unconstrained parameters is normal. Its covariance and size are learned
+    in the warm-up from all chains of a posterior [Andrieu and Thoms 2008, algorithm 4] and then
+    stay fixed. Chains start from draws of the prior, repeated while the filter is lost. Leaps are
+    proposed from a t distribution with the learned mean and covariance.
+
+    Args:
+        unknown: Model and prior.
+        method: Any filter. A number of particles that gives the log likelihood a variance of about
+            1 is efficient.
+        record: Measurements [R, T, Dy] and inputs.
+        draws: Draws of each chain.
+        warmup: Iterations before the draws.
+        chains: Chains of each posterior.
+        seed: Seed of all random numbers.
+        settings: Further settings. None for the defaults.
+
+    Returns:
+        Draws and acceptance rates.
+
+    Raises:
+        ValueError: If a count is too small, `start` has other parameters than the prior, or the
+            filter is lost for all starts of a chain.
+    """
+    settings = settings or PmmhSettings()
+    _check_minima({"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1)})
+    start = unknown
+    if settings.start is not None:
+        if set(settings.start) != set(unknown.names):
+            raise ValueError(
+                f"pmmh.start must have a distribution for each of {sorted(unknown.names)}, got "
+                f"{sorted(settings.start)}. Name the same parameters."
+            )
+        distributions = {name: settings.start[name] for name in unknown.names}
+        start = ParameterisedModel(unknown.make, distributions)
+    target = PosteriorEstimator(
+        unknown, method, record, chains, seed, settings.separate_parameters, settings.rho
+    )
+    with torch.no_grad():
+        return _run_chains(target, start, draws, warmup, settings)
+
+
+def _run_chains(
+    target: PosteriorEstimator,
+    start: ParameterisedModel,
+    draws: int,
+    warmup: int,
+    settings: PmmhSettings,
+) -> ParameterPosterior:
+    """Run all chains of a posterior."""
+    z, log_p = target.draw_start(start)
+    log_size = torch.full((z.shape[1],), -0.5, dtype=z.dtype)
+    walk = ParameterWalk(z.mean(0), target.start_covariance(start), log_size)
+    samples, accepted_count = [], torch.zeros_like(log_p)
+    for i in range(1, warmup + draws * settings.thin + 1):
+        is_step = i % (settings.leaps + 1) == 0
+        proposal = walk.step if is_step else walk.leap
+        z, log_p, probability, is_accepted = _metropolis_step(target, proposal, z, log_p, i)
+        if i <= warmup:
+            walk = walk.adapt(z, probability.mean(0) if is_step else None, (i + 1.0) ** -0.6)
+        else:
+            accepted_count += is_accepted
+            if (i - warmup) % settings.thin == 0:
+                samples.append(z)
+        if settings.tick:
+            settings.tick()
+    values, _ = target.unknown.constrained(torch.stack(samples, 1))  # {name: [C, S, Q]}
+    acceptance = accepted_count / (draws * settings.thin)
+    if not settings.separate_parameters:
+        values, acceptance = {name: a[..., 0] for name, a in values.items()}, acceptance[:, 0]
+    return ParameterPosterior(values, acceptance, "PMMH")
+
+
+def _metropolis_step(
+    target: PosteriorEstimator, proposal: _Proposal, z: Tensor, log_p: Tensor, iteration: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return new states and log densities, the probabilities of acceptance and the outcomes."""
+    stream = PhiloxStream(target.seed, torch.arange(log_p.numel())).at_step(iteration)
+    proposed_z, log_back = proposal(z, stream)
+    proposed_log_p, numbers = target(proposed_z, iteration)
+    probability = torch.exp(proposed_log_p - log_p + log_back).clamp(max=1.0)
+    is_accepted = stream.uniform("pmmh.accept", 1, 1).view_as(probability) < probability
+    target.store_numbers(numbers, is_accepted)
+    z = torch.where(is_accepted.unsqueeze(-1), proposed_z, z)
+    return z, torch.where(is_accepted, proposed_log_p, log_p), probability, is_accepted
+
+
+def _check_minima(counts: Mapping[str, tuple[int, int]]) -> None:
+    """Raise ValueError if a count is below its minimum."""
+    for name, (value, minimum) in counts.items():
+        if value < minimum:
+            raise ValueError(
+                f"pmmh.{name} must be at least {minimum}, got {name}={value}. Increase {name}."
+            )
