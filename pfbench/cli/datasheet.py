@@ -26,15 +26,15 @@ def report_scenario(words: Sequence[str]) -> None:
     Raises:
         ValueError: If the scenario is not given, or a value is invalid.
     """
-    given = given_keys(words)
-    if "scenario" not in given:
+    keys = given_keys(words)
+    if "scenario" not in keys:
         raise ValueError(
             "scenario must be set. Use: pfbench datasheet scenario=NAME (pfbench list scenario)"
         )
     from pfbench.job.datasheet_data import RUNS, build_datasheet
     from pfbench.report.datasheet import write_datasheet
 
-    config = compose(words if "runs" in given else [*words, f"runs={RUNS}"])
+    config = compose(words if "runs" in keys else [*words, f"runs={RUNS}"])
     file = conf_dir() / "scenario" / f"{config.choices['scenario']}.yaml"
     data = build_datasheet(config, read_description(file) if file.exists() else "")
     page = write_datasheet(

@@ -31,8 +31,8 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
         return _format_unknown_key(match[1], words)
     launchers = "|".join(_EXTRAS)
     if match := re.search(rf"[Cc]ould not (?:find|load) 'hydra/launcher/({launchers})", text):
-        given = next((word for word in words if word.startswith("hydra/launcher=")), "launcher")
-        return f'{given} is not installed. Run pip install "pfbench[{_EXTRAS[match[1]]}]"'
+        launcher = next((word for word in words if word.startswith("hydra/launcher=")), "launcher")
+        return f'{launcher} is not installed. Run pip install "pfbench[{_EXTRAS[match[1]]}]"'
     if match := re.search(r"Could not find '(.+)/([^/']*)'", text):
         return _format_unknown_choice(match[1], match[2], re.findall(r"^\t(\w+)$", text, re.M))
     if match := re.search(r"Interpolation key '([^']+)' not found\s+full_key: (\S+)", text):
@@ -100,7 +100,7 @@ def find_renamed(word: str) -> tuple[str, str] | None:
 
 def _rename_last(table: Mapping[str, str], path: Sequence[str]) -> str:
     """Rename the last key of a path by the longest entry that matches its end."""
-    pattern = ["*" if part.isdigit() else part for part in path]
+    pattern = ["*" if name.isdigit() else name for name in path]
     ends = [".".join(["", *pattern]), *(".".join(pattern[i:]) for i in range(len(pattern)))]
     return next((table[end] for end in ends if end in table), path[-1])
 
@@ -127,8 +127,8 @@ def _format_unknown_choice(group: str, name: str, options: Sequence[str]) -> str
 
 def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> str:
     """Format an error of a class under the full key that the user gave."""
-    place = re.search(r"full_key: (\S+)", text)
-    key = place[1] if place else "configuration"
+    location = re.search(r"full_key: (\S+)", text)
+    key = location[1] if location else "configuration"
     message = " ".join(f"{cause}".split())
     if unknown := re.search(r"got an unexpected keyword argument '(\w+)'", message):
         return _format_unknown_key(f"{key}.{unknown[1]}", words)
@@ -136,8 +136,8 @@ def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> st
     if target and (new := _renamed_keys()["targets"].get(target[1])):
         return f"{key}._target_={target[1]}: renamed to {new}"
     if type(cause) is not ValueError:
-        given = [word for word in words if word.lstrip("+").startswith(f"{key}.")]
-        source = " ".join(given) or "its YAML file"
+        overrides = [word for word in words if word.lstrip("+").startswith(f"{key}.")]
+        source = " ".join(overrides) or "its YAML file"
         return f"{key}: a value is not valid ({type(cause).__name__}: {message}). Check {source}."
     match = re.match(r"(?:\w+\.)*(\w+)(?=[=:]| must | is not )", message)
     if match is None:
@@ -150,17 +150,17 @@ def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> st
 
 def _format_unknown_key(name: str, words: Sequence[str]) -> str:
     """Format an error about a key that does not exist."""
-    given = next((word for word in words if word.lstrip("+~").startswith(f"{name}=")), name)
+    override = next((word for word in words if word.lstrip("+~").startswith(f"{name}=")), name)
     if renamed := find_renamed(name):
         return f"{renamed[0]}: renamed to {renamed[1]}"
     keys = _composed_keys(words, name)
     if name in keys and {"-m", "--multirun"} & set(words):
         return (
-            f"{given}: not all jobs of this sweep have the key {name}. "
+            f"{override}: not all jobs of this sweep have the key {name}. "
             "Run those without it in a separate sweep."
         )
     similar = suggest_similar(name, [key for key in keys if key != name])
-    return f"{given}: key {name} does not exist.{similar or _ALL_KEYS}"
+    return f"{override}: key {name} does not exist.{similar or _ALL_KEYS}"
 
 
 def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:

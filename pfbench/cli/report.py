@@ -35,13 +35,13 @@ def report_study(words: Sequence[str]) -> None:
         words: `all` or overrides.
 
     Raises:
-        ValueError: If a datasheet or the claims are requested, or the study has no results.
+        ValueError: If the study is a datasheet or the claims, or its results do not exist.
     """
     if list(words[:1]) == ["all"]:
         _report_all(list(words[1:]))
         return
-    given = given_keys(words)
-    if "scenario" in given and not given & {"study", "experiment"}:
+    keys = given_keys(words)
+    if "scenario" in keys and not keys & {"study", "experiment"}:
         scenario = next(word.partition("=")[2] for word in words if "scenario=" in word)
         raise ValueError(
             f"study must be set, got scenario={scenario}. "
@@ -70,8 +70,8 @@ def make_report_options(config: JobConfig) -> Any:
     from pfbench.report.options import ReportOptions
 
     values = config.values["report"].items()
-    chosen: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values}
-    return ReportOptions(**chosen, planned=count_planned_jobs(config.values["study"]))
+    options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values}
+    return ReportOptions(**options, planned=count_planned_jobs(config.values["study"]))
 
 
 def _write_page(config: JobConfig) -> Path:
@@ -115,8 +115,8 @@ def _report_all(words: list[str]) -> None:
         print(f"claims: {write_claims_page(words).resolve()}")
     if failed:
         raise ValueError(
-            f"{len(failed)} of {len(studies)} reports failed: {', '.join(failed)}. "
-            "The messages above give the reasons."
+            f"all {len(studies)} reports must be written, got {len(failed)} failures: "
+            f"{', '.join(failed)}. The messages above give the reasons."
         )
 
 

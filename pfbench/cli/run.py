@@ -98,8 +98,8 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
                 raise
             if not remaining:
                 raise RuntimeError(
-                    f"a process of the sweep was killed {_RETRIES + 1} times, usually because "
-                    "memory ran out. Finished jobs are kept. Use fewer processes "
+                    "memory must be enough for all processes of the sweep, got a process that was "
+                    f"killed {_RETRIES + 1} times. Finished jobs are kept. Use fewer processes "
                     "(hydra.launcher.n_jobs=2) or limit each job by memory_limit_gib=... (GiB)."
                 ) from error
             message = "warning run: a process of the sweep was killed. Running the remaining jobs"

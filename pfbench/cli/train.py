@@ -40,7 +40,8 @@ def train_network(words: Sequence[str]) -> None:
     job.apply_global_settings(values)
     if values["oracle_noise"]:
         raise ValueError(
-            "oracle_noise must be false for training, got true. Set oracle_noise=true when the filter runs."
+            "oracle_noise must be false for training, got true. Set oracle_noise=true when the "
+            "filter runs."
         )
     names = list(values["train"]["noise_regimes"]) or [choices["noise"]]
     regimes = {

@@ -161,7 +161,7 @@ def max_runs_in_memory(plan: JobPlan, episodes: EpisodeSource) -> int:
             size = memory.runs_within_limit(estimate, runs, limit, is_whole=True)
             if episodes.joint is None:
                 episodes.draw_all()
-        except ValueError:  # does not fit beside the episodes of all runs
+        except ValueError:  # does not fit in addition to the episodes of all runs
             episodes.joint = None
     else:
         episodes.joint = None

@@ -34,14 +34,19 @@ class BudgetAllocation(NamedTuple):
     Attributes:
         particles: Particles of the filter.
         costs: Measured cost of a step with them: seconds of all runs, or evaluations per run.
-        price: Target cost: SIR with `asked` particles.
-        asked: Particles of SIR that define the target.
+        price: Target cost: that of SIR with `sir_particles`.
+        sir_particles: Particles of SIR that define the target.
     """
 
     particles: int
     costs: float
     price: float
-    asked: int
+    sir_particles: int
+
+    def to_metadata(self) -> dict[str, float]:
+        """Return the values under the names of a result file."""
+        names = ("particles", "costs", "price", "asked")
+        return dict(zip(names, self, strict=True))
 
 
 @dataclass(frozen=True)
@@ -91,29 +96,31 @@ class CostTrial:
         return self.clock() - start_time
 
 
-def allocate_budget(kind: str, method: Any, asked: int, trial: CostTrial) -> BudgetAllocation:
+def allocate_budget(
+    kind: str, method: Any, sir_particles: int, trial: CostTrial
+) -> BudgetAllocation:
     """Determine the number of particles at the cost of SIR.
 
     Args:
         kind: Unit of cost, one of `store.BUDGETS` except the first.
         method: Filter, a dataclass with the field `particles`.
-        asked: Particles of SIR that define the cost.
+        sir_particles: Particles of SIR that define the cost.
         trial: Trial on the job's episode.
 
     Returns:
         The allocation.
     """
     measure = trial.seconds if kind == SAME_TIME else trial.likelihoods
-    sir = ParticleFilter(asked)
+    sir = ParticleFilter(sir_particles)
     price = measure(sir)
     if method == sir:
-        return BudgetAllocation(asked, price, price, asked)
+        return BudgetAllocation(sir_particles, price, price, sir_particles)
 
     def cost(particles: int) -> float:
         return measure(replace(method, particles=particles))
 
-    particles, costs = solve_particle_count(cost, price, max(MIN_PARTICLES, asked // 4))
-    return BudgetAllocation(particles, costs, price, asked)
+    particles, costs = solve_particle_count(cost, price, max(MIN_PARTICLES, sir_particles // 4))
+    return BudgetAllocation(particles, costs, price, sir_particles)
 
 
 def solve_particle_count(

@@ -21,13 +21,13 @@ from pfbench.results import store
 from pfbench.scenario.oracle_noise import RecordingRegime
 
 RUNS = 20  # default: spreads to a sixth, in seconds [ours]
-_PARTS = ("scenario", "model", "noise", "seed", "first_run", "runs", "pcrb")
+_CONFIG_KEYS = ("scenario", "model", "noise", "seed", "first_run", "runs", "pcrb")
 
 
 def build_datasheet(config: JobConfig, about: str = "") -> Path:
-    """Write the data of a scenario's datasheet, unless the file exists or with `fresh`.
+    """Write the data of a scenario's datasheet, unless the file exists or with `overwrite`.
 
-    The arrays are those of a job and of `compute_datasheet`. `error` is the true state minus its
+    The file has the arrays of a job and those of `compute_datasheet`. `error` is the true state minus its
     mean over runs. `sd`, `nees` and `log_evidence` are NaN.
 
     Args:
@@ -41,15 +41,15 @@ def build_datasheet(config: JobConfig, about: str = "") -> Path:
         ValueError: If a value of the configuration is invalid.
     """
     values, choices = config.values, config.choices
-    parts = {name: values[name] for name in _PARTS}
-    key = store.config_key(parts, IGNORED_IN_KEY)
+    selected = {name: values[name] for name in _CONFIG_KEYS}
+    key = store.config_key(selected, IGNORED_IN_KEY)
     path = Path(values["results_dir"]) / DATASHEETS / f"{key}.npz"
     if path.exists() and not values["overwrite"]:
         return path
-    meta, arrays = compute_datasheet(values)
+    meta, outputs = compute_datasheet(values)
     names = {group: choices[group] for group in ("scenario", "noise", "model")} | {"filter": "none"}
     head = {"key": key, "study": DATASHEETS, "label": "datasheet", "choices": names}
-    return store.write_result(path, {**head, "config": parts, "about": about, **meta}, arrays)
+    return store.write_result(path, {**head, "config": selected, "about": about, **meta}, outputs)
 
 
 def compute_datasheet(
@@ -57,10 +57,12 @@ def compute_datasheet(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Draw episodes and compute the data of the datasheet.
 
-    Besides the arrays of a job: `seen` [T, Dy], the share of runs in which a component is measured;
-    `residual` [R, T, Dy], see `compute_residuals`; and where they exist `track` [R, T, 3] (m),
-    `force` [T, 3] (m/s^2), `rate` [T, 3] (rad/s), `azimuth` and `elevation` [T, S] (rad), `range`
-    [T] (m) and `bound` [T, d].
+    These arrays are added to those of a job:
+
+    - `seen` [T, Dy], share of runs in which a component is measured.
+    - `residual` [R, T, Dy], see `compute_residuals`.
+    - `track` [R, T, 3] in m, `force` [T, 3] in m/s^2 and `rate` [T, 3] in rad/s, if they exist.
+    - `azimuth` and `elevation` [T, S] in rad, `range` [T] in m, and `bound` [T, d], if they exist.
 
     Args:
         values: Resolved configuration.
@@ -74,13 +76,13 @@ def compute_datasheet(
     apply_global_settings(values)
     model, scenario, noise = instantiate_parts(values, ("model", "scenario", "noise"))
     runs = torch.arange(values["first_run"], values["first_run"] + values["runs"])
-    start_time, witness = time.perf_counter(), RecordingRegime(noise)
+    start_time, recording_regime = time.perf_counter(), RecordingRegime(noise)
     with torch.no_grad():
-        episode: Episode = scenario.draw(witness, runs, values["seed"])
+        episode: Episode = scenario.draw(recording_regime, runs, values["seed"])
         drawn_time = time.perf_counter()
-        pcrb, pcrb_text = compute_pcrb(values, model, witness, episode, runs)
+        pcrb, pcrb_text = compute_pcrb(values, model, recording_regime, episode, runs)
         truth = model.assemble(episode.truth)
-        arrays = {
+        outputs = {
             "time": episode.time,
             **_unfiltered_arrays(model, compute_deviations(model, truth)),
             "residual": compute_residuals(model, truth, episode).float(),
@@ -89,13 +91,13 @@ def compute_datasheet(
         }
     for name, value in (("track", episode.track), ("bound", pcrb)):
         if value is not None:
-            arrays[name] = value.float()
+            outputs[name] = value.float()
     seconds = {"world": drawn_time - start_time, "measures": time.perf_counter() - drawn_time}
-    meta = _make_metadata(values, model, episode, witness) | {
+    meta = _make_metadata(values, model, episode, recording_regime) | {
         "bound": pcrb_text,
         "seconds": seconds,
     }
-    return meta, {name: value.cpu().numpy() for name, value in arrays.items()}
+    return meta, {name: value.cpu().numpy() for name, value in outputs.items()}
 
 
 def compute_deviations(model: StateSpaceModel, truth: Tensor) -> Tensor:
@@ -109,10 +111,9 @@ def compute_deviations(model: StateSpaceModel, truth: Tensor) -> Tensor:
         Deviations, [R, T, d]. NaN where the truth is unknown.
     """
     has_truth = ~torch.isnan(truth)
-    first = has_truth.int().argmax(
-        0, keepdim=True
-    )  # a state near the others: differences are small
-    deviation = model.error(truth, truth.gather(0, first).expand_as(truth))
+    # the first run with truth: its state is near the others, so that differences are small
+    first = truth.gather(0, has_truth.int().argmax(0, keepdim=True))
+    deviation = model.error(truth, first.expand_as(truth))
     return deviation - deviation.nanmean(0)
 
 
@@ -137,10 +138,14 @@ def compute_residuals(model: StateSpaceModel, truth: Tensor, episode: Episode) -
     for t, _, step in iterate_steps(model, record):
         is_unknown = torch.isnan(truth[:, t])
         states = (torch.where(is_unknown, fill, truth[:, t]) for fill in (origin, shifted))
-        law, other = (model.observation(x.unsqueeze(1), step.u) for x in states)
-        expected = law.mean[:, 0]
-        is_dependent = (other.mean[:, 0] != expected) & is_unknown.any(1, keepdim=True)
-        z = model.residual(step.y, expected) / law.variance[:, 0].sqrt()
+        distribution, shifted_distribution = (
+            model.observation(x.unsqueeze(1), step.u) for x in states
+        )
+        expected = distribution.mean[:, 0]
+        is_dependent = (shifted_distribution.mean[:, 0] != expected) & is_unknown.any(
+            1, keepdim=True
+        )
+        z = model.residual(step.y, expected) / distribution.variance[:, 0].sqrt()
         residuals.append(torch.where(is_dependent, torch.nan, z))
     return torch.stack(residuals, 1)
 
@@ -158,11 +163,14 @@ def _unfiltered_arrays(model: StateSpaceModel, deviation: Tensor) -> dict[str, T
 
 
 def _make_metadata(
-    values: Mapping[str, Any], model: StateSpaceModel, episode: Episode, witness: RecordingRegime
+    values: Mapping[str, Any],
+    model: StateSpaceModel,
+    episode: Episode,
+    recording_regime: RecordingRegime,
 ) -> dict[str, Any]:
     """Collect the metadata of the episodes."""
     runs, steps, size = episode.record.y.shape
-    channels = witness.channels
+    channels = recording_regime.channels
     has_kinds = channels is not None and len(channels.kind) == size
     satellites = episode.datasheet["elevation"].shape[1] if "elevation" in episode.datasheet else 0
     receiver = values["scenario"].get("receiver")

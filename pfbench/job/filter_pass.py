@@ -16,7 +16,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
 from pfbench.filter.belief import ParticleBelief, StepInfo, gather_ancestors
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.loop import FilterResult, Watch, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.plan import JobPlan
@@ -27,9 +27,8 @@ from pfbench.model.base import StateSpaceModel
 
 log = logging.getLogger("pfbench")
 
-_COMPILE_FROM = (
-    5e8  # normal numbers: compiling costs seconds and saves 15 ms per million [measured]
-)
+# in normal numbers: compiling costs seconds and saves 15 ms per million [measured]
+_COMPILE_FROM = 5e8
 
 
 class TimedFilterPass(NamedTuple):
@@ -62,7 +61,7 @@ class TimedFilterPass(NamedTuple):
         estimate, trace = self.estimate, dict(self.estimate.trace)
         is_lost = torch.isnan(estimate.mean).any(-1, keepdim=True)
         sd = estimate.variance.clamp(min=0).sqrt()
-        arrays = {
+        outputs = {
             "time": episode.time,
             "error": torch.where(is_lost, torch.nan, trace.pop("error")).float(),
             "sd": torch.where(is_lost, torch.nan, sd).float(),
@@ -72,10 +71,10 @@ class TimedFilterPass(NamedTuple):
             **{name: a if a.dtype == torch.bool else a.float() for name, a in trace.items()},
         }
         scores = self.recorder.arrays()
-        arrays |= {name: a.float() if a.is_floating_point() else a for name, a in scores.items()}
-        others = {"track": episode.track, "bound": pcrb, "range": episode.datasheet.get("range")}
-        arrays |= {name: a.float() for name, a in others.items() if a is not None}
-        return {name: a.cpu().numpy() for name, a in arrays.items()}
+        outputs |= {name: a.float() if a.is_floating_point() else a for name, a in scores.items()}
+        optional = {"track": episode.track, "bound": pcrb, "range": episode.datasheet.get("range")}
+        outputs |= {name: a.float() for name, a in optional.items() if a is not None}
+        return {name: a.cpu().numpy() for name, a in outputs.items()}
 
 
 def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> TimedFilterPass:
@@ -90,12 +89,10 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     Returns:
         The results.
     """
-    values, method = plan.values, plan.method
-    device, engine, clock = values["device"], values["engine"], plan.choose_timer()
+    values, method, clock = plan.values, plan.method, plan.choose_timer()
+    device, engine = values["device"], values["engine"]
     model, steps = plan.make_filter_model(episode), episode.record.y.shape[1]
     truth = model.assemble(episode.truth).to(device, plan.dtype)
-    draws = PhiloxStream(values["seed"], runs.to(device), plan.dtype)
-    batch = plan.choose_run_batch(method, len(runs))
     recorder = ScoreRecorder(model, truth, values["score_steps"], clock)
     counter = LikelihoodCounter(model)
 
@@ -107,21 +104,10 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     uses_kernels = should_compile(engine, method, model, len(runs) * steps)
     compile_seconds = time.perf_counter() - compile_start
     step = _compile_step(engine, uses_kernels, method, counter, clock)
-    baseline, trim = start_peak_measurement(device), MemoryTrimmer()
-
-    def tick() -> None:
-        bar.update()
-        trim()
-
+    baseline = start_peak_measurement(device)
     start_time = clock()
-    with (
-        compilation.use_compiled(uses_kernels),
-        torch.no_grad(),
-        tqdm(total=steps, desc=label, unit="step", delay=2, disable=None, leave=False) as bar,
-    ):
-        estimate = run_filter(step or method, model, episode.record, draws, watch, tick, batch)
-        if device != "cpu":
-            torch.cuda.synchronize()
+    with compilation.use_compiled(uses_kernels):
+        estimate = _filter_episode(plan, step or method, model, episode, runs, watch, label)
     step_compile_seconds = step.seconds if step else 0.0
     filter_seconds = clock() - start_time - recorder.seconds - step_compile_seconds
     seconds = {
@@ -138,10 +124,41 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     return TimedFilterPass(model, estimate, recorder, seconds, cost)
 
 
+def _filter_episode(
+    plan: JobPlan,
+    method: Any,
+    model: StateSpaceModel,
+    episode: Episode,
+    runs: Tensor,
+    watch: Watch,
+    label: str,
+) -> FilterResult:
+    """Run a filter over an episode, with a progress bar."""
+    device, trim = plan.values["device"], MemoryTrimmer()
+    draws = PhiloxStream(plan.values["seed"], runs.to(device), plan.dtype)
+    batch = plan.choose_run_batch(plan.method, len(runs))
+
+    def tick() -> None:
+        bar.update()
+        trim()
+
+    with (
+        torch.no_grad(),
+        tqdm(
+            total=episode.record.y.shape[1], desc=label, unit="step", delay=2, disable=None,
+            leave=False,
+        ) as bar,
+    ):  # fmt: skip
+        estimate = run_filter(method, model, episode.record, draws, watch, tick, batch)
+        if device != "cpu":
+            torch.cuda.synchronize()
+    return estimate
+
+
 def should_compile(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> bool:
     """Decide whether inner loops are compiled, and compile them.
 
-    They are if the engine requires it, or if the job is large enough to repay the compilation.
+    They are if the engine requires it, or if the job is large enough for the compilation to pay.
     Compiled code is stored on disk for later jobs.
 
     Args:

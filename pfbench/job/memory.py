@@ -1,6 +1,6 @@
 """Memory of a job, estimated before it starts, and the number of runs that fit at a time.
 
-The estimate comes from a trial: the filter runs over a few steps of one and of two runs with few
+The estimate comes from a trial. The filter runs over a few steps of one and of two runs with few
 particles, and the bytes of all live tensors are counted. The result is extrapolated to all
 particles and runs.
 """
@@ -85,13 +85,13 @@ def runs_within_limit(
     """
     if estimate.peak(1, runs, is_whole) > limit:
         if estimate.peak(1) > limit:
-            what, remedy = "a single run", "Use fewer particles or dtype=float32"
+            workload, remedy = "a single run", "Use fewer particles or dtype=float32"
         else:
-            what = f"the results of {runs} runs"
+            workload = f"the results of {runs} runs"
             remedy = f"Split the job (runs={runs // 2}, then first_run={runs // 2})"
         size = estimate.peak(1, runs, is_whole) / GIB
         raise ValueError(
-            f"memory must be at least {size:.3g} GiB for {what}, got {limit / GIB:.3g} GiB. "
+            f"memory must be at least {size:.3g} GiB for {workload}, got {limit / GIB:.3g} GiB. "
             f"{remedy}, or set memory_limit_gib=... (GiB) if more is free."
         )
     low, high = 1, runs
@@ -104,12 +104,23 @@ def runs_within_limit(
 
 
 def fits_undrawn(runs: int, limit: float | None) -> bool:
-    """Return whether the episodes of all runs fit in any scenario, before one is drawn."""
+    """Return whether the episodes of all runs fit in any scenario, before one is drawn.
+
+    Args:
+        runs: Runs of the job.
+        limit: Bytes that the job may use. None if unknown.
+    """
     return limit is None or _BASE + runs * _MAX_EPISODE <= limit
 
 
 def fits_drawn(estimate: MemoryEstimate, runs: int, limit: float) -> bool:
-    """Return whether the episodes of all runs fit while they are drawn together."""
+    """Return whether the episodes of all runs fit while they are drawn together.
+
+    Args:
+        estimate: Bytes of the job.
+        runs: Runs of the job.
+        limit: Bytes that the job may use.
+    """
     return _BASE + runs * _SIMULATION_FACTOR * estimate.episode <= limit
 
 
@@ -147,14 +158,14 @@ def estimate_memory(
     """
     record = model.prepare(episode.record)
     runs, steps = record.y.shape[:2]
-    drawn = [*tree_leaves(tuple(episode.record[:4])), *episode.truth.values(), episode.track]
+    simulated = [*tree_leaves(tuple(episode.record[:4])), *episode.truth.values(), episode.track]
     prepared = tree_leaves(tuple(record[:4]))
     n, trial_steps = _particles(method), min(_TRIAL_STEPS, steps)
     sizes = [n] if n <= 4 * _TRIAL_PARTICLES else [_TRIAL_PARTICLES * k for k in (1, 2, 4)]
     rows, output, single_output = [], 0.0, 0.0
     for size in sizes:
         small = method if n == size else replace(method, particles=size)
-        one, joint, separate = (
+        single, joint, separate = (
             _measure(
                 small,
                 model,
@@ -165,13 +176,13 @@ def estimate_memory(
             for r, batch in ((1, 1), (min(2, runs), 2), (min(2, runs), 1))
         )
         # all bytes, those of each run in a step, those of each run outside of it
-        rows.append((one[0], joint[0] - separate[0], separate[0] - one[0]))
-        output, single_output = one[1] / trial_steps, one[2] / trial_steps
+        rows.append((single[0], joint[0] - separate[0], separate[0] - single[0]))
+        output, single_output = single[1] / trial_steps, single[2] / trial_steps
     columns = zip(*rows, strict=True)
     total, stepped, waiting = (_OVERHEAD * _extrapolate(sizes, column, n) for column in columns)
     if runs == 1:
         waiting = total
-    episode_bytes = _run_bytes(drawn, runs)
+    episode_bytes = _run_bytes(simulated, runs)
     simulation = _SIMULATION_FACTOR * episode_bytes + 2 * _run_bytes(prepared, runs)
     return MemoryEstimate(
         base=_BASE + max(0.0, total - stepped - waiting),
@@ -201,7 +212,7 @@ def first_steps(record: Record, steps: int) -> Record:
 def _measure(
     method: Any, model: StateSpaceModel, record: Record, run_batch: int, watch: Any
 ) -> tuple[int, float, float]:
-    """Measure the peak bytes of a filter, and of its output as it is and in single precision."""
+    """Measure the bytes of a filter at its peak, of its output, and of its output in single precision."""
     runs, steps = record.y.shape[:2]
     draws = PhiloxStream(0, torch.arange(runs, device=model.anchor.device), model.anchor.dtype)
     recorder = watch(runs, steps) if watch else None

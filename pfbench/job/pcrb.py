@@ -53,7 +53,8 @@ def compute_posterior_bound(
         truth: True states, [R, T, D], or [R, T + 1, D] with the initial states first. Without them
             a nonlinear map is first differentiated at the centre of the initial distribution. A
             linear model does not use the truth.
-        record: Inputs, and measurements of which only the missing components matter.
+        record: Inputs and measurements. Of the measurements only the pattern of missing components
+            is used.
         initial: Covariance of the initial distribution in the chart, [d, d] or [R, d, d]. None for
             the covariance that filters use (the record's spread, else the model's initial
             distribution).
@@ -66,9 +67,9 @@ def compute_posterior_bound(
         Lower bound of the error covariance at each step, [T, d, d].
 
     Raises:
-        ValueError: If a distribution is not normal, the process noise is not additive, the truth is
-            unknown or has another shape, the initial covariance is not positive definite, or the
-            Jacobians do not have a common bound.
+        ValueError: If a distribution is not normal or the process noise not additive. If the truth
+            is unknown or has another shape. If the initial covariance is not positive definite, or
+            the Jacobians do not have a common bound.
     """
     converted = record.to(model.anchor)
     runs = len(record.y)
@@ -113,14 +114,14 @@ def _initial_covariance(model: StateSpaceModel, record: Record, initial: Tensor 
     """Return the initial covariance."""
     if initial is not None:
         return initial.to(model.anchor)
-    law: Any = initial_law(model, record.y.shape[0], record.spread)
-    if isinstance(law, MultivariateNormal):
-        return law.covariance_matrix
-    if isinstance(law, Independent) and isinstance(law.base_dist, Normal):
-        return torch.diag_embed(law.variance)
+    distribution: Any = initial_law(model, record.y.shape[0], record.spread)
+    if isinstance(distribution, MultivariateNormal):
+        return distribution.covariance_matrix
+    if isinstance(distribution, Independent) and isinstance(distribution.base_dist, Normal):
+        return torch.diag_embed(distribution.variance)
     raise ValueError(
         f"{type(model).__name__}.initial must be a normal distribution, got "
-        f"{type(law).__name__}. Give an initial covariance."
+        f"{type(distribution).__name__}. Give an initial covariance."
     )
 
 
@@ -142,31 +143,31 @@ def _initial_root(covariance: Tensor, runs: int, separate: bool) -> Tensor:
 
 def _predict(model: StateSpaceModel, root: Tensor, x: Tensor, u: Any) -> Tensor:
     """Return the root of the predicted bound [G, d, d] of G groups of runs, at states [R, D]."""
-    chart, law = model.chart, cast(Any, model.noise)
+    chart, noise = model.chart, cast(Any, model.noise)
     gain = model.noise_gain(u)
-    if gain is None or not isinstance(law.base_dist, Normal):
+    if gain is None or not isinstance(noise.base_dist, Normal):
         raise ValueError(
             f"{type(model).__name__}: process noise must be additive and normal, got another. "
             "The bound does not support this model."
         )
-    gain = gain * law.stddev
+    gain = gain * noise.stddev
 
     def propagate(d: Tensor) -> Tensor:
-        return model.propagate(chart.add(x.unsqueeze(1), d), u, law.mean.expand(*d.shape[:2], -1))
+        return model.propagate(chart.add(x.unsqueeze(1), d), u, noise.mean.expand(*d.shape[:2], -1))
 
     f = _jacobian(propagate, x, chart.dimension, chart.subtract)
-    mean, noise = (
+    mean, mean_gain = (
         (f, gain) if len(root) == len(f) else (f.mean(0, keepdim=True), gain.mean(0, keepdim=True))
     )
-    predicted = _root_of(torch.cat([mean @ root, noise.expand(len(root), -1, -1)], -1))
+    predicted = _root_of(torch.cat([mean @ root, mean_gain.expand(len(root), -1, -1)], -1))
     if len(root) == len(f):
         return predicted
     sd = predicted.norm(dim=-1, keepdim=True)
     deviation = (f - mean) @ root / sd  # [R, d, d] in predicted standard deviations
-    inverse = torch.linalg.pinv(noise / sd)
-    unreached = deviation - (noise / sd) @ (inverse @ deviation)
+    inverse = torch.linalg.pinv(mean_gain / sd)
+    unreached = deviation - (mean_gain / sd) @ (inverse @ deviation)
     if bool((unreached.abs() > _TOLERANCE).any()) or bool(
-        (((gain - noise) / sd).abs() > _TOLERANCE).any()
+        (((gain - mean_gain) / sd).abs() > _TOLERANCE).any()
     ):
         raise ValueError(
             f"{type(model).__name__}: Jacobians must differ between runs only where the noise "
@@ -174,7 +175,7 @@ def _predict(model: StateSpaceModel, root: Tensor, x: Tensor, u: Any) -> Tensor:
         )
     if bool((deviation.abs() > _TOLERANCE).any()):
         root = _add_information(root, _pool(inverse @ ((f - mean) / sd), False))
-        predicted = _root_of(torch.cat([mean @ root, noise], -1))
+        predicted = _root_of(torch.cat([mean @ root, mean_gain], -1))
     return predicted
 
 
@@ -188,19 +189,20 @@ def _information_rows(model: StateSpaceModel, x: Tensor, record: Record) -> Tens
     observed = ~torch.isnan(record.y)
     h = _jacobian(lambda d: at(d).mean, x, chart.dimension, residual)
     h = torch.where(observed.unsqueeze(-1), h, 0.0)
-    law = at(x.new_zeros(len(x), 1, chart.dimension))
-    if isinstance(law, Independent) and isinstance(law.base_dist, Normal):
+    distribution = at(x.new_zeros(len(x), 1, chart.dimension))
+    if isinstance(distribution, Independent) and isinstance(distribution.base_dist, Normal):
         change = _jacobian(lambda d: at(d).base_dist.scale, x, chart.dimension, torch.sub)
         change = torch.where(observed.unsqueeze(-1), change, 0.0)
-        return torch.cat([h, 2.0**0.5 * change], -2) / torch.cat([law.base_dist.scale] * 2, -1).mT
-    if isinstance(law, MultivariateNormal):
+        scale = torch.cat([distribution.base_dist.scale] * 2, -1).mT
+        return torch.cat([h, 2.0**0.5 * change], -2) / scale
+    if isinstance(distribution, MultivariateNormal):
         change = _jacobian(
             lambda d: at(d).covariance_matrix.flatten(-2), x, chart.dimension, torch.sub
         )
-        return _dense_information_rows(h, law.covariance_matrix[:, 0], change, observed)
+        return _dense_information_rows(h, distribution.covariance_matrix[:, 0], change, observed)
     raise ValueError(
         f"{type(model).__name__}: measurement distribution must be normal, got "
-        f"{type(law).__name__} (heavy tails, a mixture). The bound does not support this model."
+        f"{type(distribution).__name__} (heavy tails, a mixture). The bound does not support this model."
     )
 
 

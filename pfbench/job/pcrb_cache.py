@@ -1,4 +1,4 @@
-"""PCRB of a job's episodes, stored beside them and shared by all filters of a study."""
+"""PCRB of a job's episodes, stored with them and shared by all filters of a study."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pfbench.scenario.oracle_noise import RecordingRegime
 def compute_pcrb(
     values: Mapping[str, Any],
     model: StateSpaceModel,
-    witness: RecordingRegime,
+    recording_regime: RecordingRegime,
     episode: Episode,
     runs: Tensor,
 ) -> tuple[Tensor | None, str]:
@@ -37,7 +37,7 @@ def compute_pcrb(
     Args:
         values: Resolved configuration of the job.
         model: Model of the filter, on the CPU in double precision, without oracle noise.
-        witness: Noise regime, after the episode was drawn.
+        recording_regime: Noise regime, after the episode was drawn.
         episode: Episode of the runs.
         runs: Numbers of the runs, [R].
 
@@ -48,9 +48,9 @@ def compute_pcrb(
     reason = _missing_reason(values, episode)
     if reason:
         return None, reason
-    is_nominal = isinstance(witness.regime, NominalNoise)
+    is_nominal = isinstance(recording_regime.regime, NominalNoise)
     try:
-        oracle = model if is_nominal else witness.to_oracle_model(model, episode.time)
+        oracle = model if is_nominal else recording_regime.to_oracle_model(model, episode.time)
     except ValueError:
         return None, "no bound: the errors of this noise regime have no distribution per step"
     is_replaced = episode.record.spread is not None
@@ -84,8 +84,8 @@ def _recipe(values: Mapping[str, Any], model: StateSpaceModel, runs: Tensor) -> 
     scenario = {**values["scenario"], "root": None, "cache_dir": None}
     source = Path(inspect.getfile(type(model))).read_bytes()
     source_hash = hashlib.sha256(source).hexdigest()
-    drawn = values["noise"], values["seed"], int(runs[0]), len(runs)
-    return ("bound 1", source_hash, values["model"], scenario, *drawn)
+    episodes = values["noise"], values["seed"], int(runs[0]), len(runs)
+    return ("bound 1", source_hash, values["model"], scenario, *episodes)
 
 
 def _missing_reason(values: Mapping[str, Any], episode: Episode) -> str:

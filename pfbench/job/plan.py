@@ -59,7 +59,7 @@ class JobPlan:
         config: Resolved configuration.
         model: Model of the filter, on the CPU in double precision.
         scenario: Source of episodes.
-        witness: Noise regime that records the measurement channels of the scenario.
+        recording_regime: Noise regime that records the measurement channels of the scenario.
         method: Filter.
         runs: Numbers of the Monte Carlo runs, [R].
     """
@@ -67,7 +67,7 @@ class JobPlan:
     config: JobConfig
     model: StateSpaceModel
     scenario: Scenario
-    witness: RecordingRegime
+    recording_regime: RecordingRegime
     method: Any
     runs: Tensor
 
@@ -91,7 +91,7 @@ class JobPlan:
         Returns:
             Their measurements, inputs and truth.
         """
-        return self.scenario.draw(self.witness, runs, self.values["seed"])
+        return self.scenario.draw(self.recording_regime, runs, self.values["seed"])
 
     def make_filter_model(self, episode: Episode) -> StateSpaceModel:
         """Copy the model to the device and precision of the job.
@@ -104,7 +104,7 @@ class JobPlan:
         """
         model = copy.deepcopy(self.model)
         if self.values["oracle_noise"]:
-            model = self.witness.to_oracle_model(model, episode.time)
+            model = self.recording_regime.to_oracle_model(model, episode.time)
         return model.to(self.values["device"], self.dtype)
 
     def choose_run_batch(self, method: Any, runs: int) -> int:

@@ -64,13 +64,14 @@ def run(
 
     Raises:
         ValueError: If a value of the configuration is invalid.
-        Exception: If the job fails. `<key>.failed.json` beside the results holds the traceback.
+        Exception: If the job fails. The traceback is written to `<key>.failed.json` in the folder of
+            the results.
     """
     config = resolve_config(config, choices)
     values = config.values
     path = _result_path(values)
-    named = {group: config.choices[group] for group in CHOICES}
-    name = " / ".join(named[group] for group in ("scenario", "noise", "filter"))
+    job_choices = {group: config.choices[group] for group in CHOICES}
+    name = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
     if path.exists() and not values["overwrite"]:
         outcome = JobOutcome(
             path, "skipped", _main_rmse(store.read_result(path).arrays, store.read_metadata(path))
@@ -79,15 +80,17 @@ def run(
         log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
         return outcome
     try:
-        meta, arrays = compute_job(config, name)
+        meta, outputs = compute_job(config, name)
     except Exception as error:
-        note = store.write_failure(path, named, error)
-        kept = f"traceback: {note}" if note else f"previous result kept: {path}"
-        log.error("%sfailed    %s   %s: %s   %s", counter, name, type(error).__name__, error, kept)
+        note = store.write_failure(path, job_choices, error)
+        remark = f"traceback: {note}" if note else f"previous result kept: {path}"
+        log.error(
+            "%sfailed    %s   %s: %s   %s", counter, name, type(error).__name__, error, remark
+        )
         raise
-    head = {"key": path.stem, "study": values["study"], "choices": named, "config": values}
-    store.write_result(path, {**head, **meta}, arrays)
-    outcome = JobOutcome(path, "finished", _main_rmse(arrays, meta))
+    head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
+    store.write_result(path, {**head, **meta}, outputs)
+    outcome = JobOutcome(path, "finished", _main_rmse(outputs, meta))
     seconds = meta["seconds"]
     log.info(
         "%sfinished  t=%.1f s  %s   %s   lost %d/%d   %.3g ms/step",
@@ -95,7 +98,7 @@ def run(
         seconds["world"] + seconds["filter"],
         name,
         _format_rmse(outcome.rmse, meta),
-        int(arrays["lost"].sum()),
+        int(outputs["lost"].sum()),
         meta["runs"],
         1e3 * seconds["per_step"],
     )
@@ -128,23 +131,23 @@ def compute_job(config: JobConfig, label: str) -> tuple[dict[str, Any], dict[str
     plan, allocation = apply_budget(plan, episodes)
     size = max_runs_in_memory(plan, episodes)
     pcrb = _timed_pcrb(plan, episodes.joint, plan.runs) if episodes.joint else None
-    metas, parts = [], []
+    batch_metadata, batch_outputs = [], []
     for first in range(0, total, size):
         runs, episode = plan.runs[first : first + size], episodes.batch(first, size)
         batch_pcrb = pcrb or _timed_pcrb(plan, episode, runs)
         title = label if size == total else f"{label}, runs from {int(runs[0])}"
         result = pass_filter(plan, episode, runs, title)
-        metas.append(_batch_metadata(plan, episode, result, batch_pcrb))
-        parts.append(result.arrays(episode, batch_pcrb[0]))
-    meta, arrays = _join_batches(metas, parts, total)
+        batch_metadata.append(_batch_metadata(plan, episode, result, batch_pcrb))
+        batch_outputs.append(result.arrays(episode, batch_pcrb[0]))
+    meta, outputs = _join_batches(batch_metadata, batch_outputs, total)
     if pcrb:  # the batches share it
-        arrays |= {"bound": parts[0]["bound"]} if "bound" in arrays else {}
+        outputs |= {"bound": batch_outputs[0]["bound"]} if "bound" in outputs else {}
         meta["seconds"]["bound"] = pcrb[2]
     meta["seconds"] = {"world": episodes.seconds, **meta["seconds"]}
     if allocation:
         meta["particles"] = allocation.particles
-    bought = allocation._asdict() if allocation else None
-    return {**meta, "bought": bought, "trained": trained}, arrays
+    bought = allocation.to_metadata() if allocation else None
+    return {**meta, "bought": bought, "trained": trained}, outputs
 
 
 def _result_path(values: Mapping[str, Any]) -> Path:
@@ -166,7 +169,7 @@ def _result_path(values: Mapping[str, Any]) -> Path:
 def _timed_pcrb(plan: JobPlan, episode: Episode, runs: Tensor) -> tuple[Tensor | None, str, float]:
     """Compute the bound, its description and the seconds."""
     start_time = time.perf_counter()
-    sd, text = compute_pcrb(plan.values, plan.model, plan.witness, episode, runs)
+    sd, text = compute_pcrb(plan.values, plan.model, plan.recording_regime, episode, runs)
     return sd, text, time.perf_counter() - start_time
 
 
@@ -183,37 +186,39 @@ def _batch_metadata(
 
 
 def _join_batches(
-    metas: Sequence[dict[str, Any]], parts: Sequence[dict[str, np.ndarray]], total: int
+    metadata: Sequence[dict[str, Any]], outputs: Sequence[dict[str, np.ndarray]], total: int
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Join the batches of a job. A PCRB of the batches becomes its root mean square."""
-    if len(parts) == 1:
-        return metas[0], parts[0]
-    if any(part["time"].shape != parts[0]["time"].shape for part in parts):
-        size = metas[0]["runs"]
+    if len(outputs) == 1:
+        return metadata[0], outputs[0]
+    if any(batch["time"].shape != outputs[0]["time"].shape for batch in outputs):
+        size = metadata[0]["runs"]
         raise ValueError(
             "memory must be enough for all runs together, since they have different durations, got "
             f"enough for {size} runs. Split the job (runs={size}, first_run=...)."
         )
-    arrays = {
-        name: first if name in _SHARED else np.concatenate([part[name] for part in parts])
-        for name, first in parts[0].items()
+    joint = {
+        name: first if name in _SHARED else np.concatenate([batch[name] for batch in outputs])
+        for name, first in outputs[0].items()
     }
-    weights = np.array([meta["runs"] for meta in metas]) / total
-    if "bound" in arrays:
-        variances = (part["bound"].astype(float) ** 2 for part in parts)
+    weights = np.array([meta["runs"] for meta in metadata]) / total
+    if "bound" in joint:
+        variances = (batch["bound"].astype(float) ** 2 for batch in outputs)
         mean = sum(weight * v for weight, v in zip(weights, variances, strict=True))
-        arrays["bound"] = np.sqrt(mean).astype(np.float32)
-    memory = [meta["memory"] for meta in metas]
-    times = [meta["seconds"] for meta in metas]
+        joint["bound"] = np.sqrt(mean).astype(np.float32)
+    memory = [meta["memory"] for meta in metadata]
+    times = [meta["seconds"] for meta in metadata]
     meta = {
-        **metas[0],
+        **metadata[0],
         "runs": total,
-        "parts": len(parts),
+        "parts": len(outputs),
         "seconds": {name: sum(batch[name] for batch in times) for name in times[0]},
         "memory": None if None in memory else max(memory),
-        "likelihoods_per_step": float(weights @ [meta["likelihoods_per_step"] for meta in metas]),
+        "likelihoods_per_step": float(
+            weights @ [meta["likelihoods_per_step"] for meta in metadata]
+        ),
     }
-    return meta, arrays
+    return meta, joint
 
 
 def _main_group(meta: Mapping[str, Any]) -> str:
@@ -222,11 +227,11 @@ def _main_group(meta: Mapping[str, Any]) -> str:
     return "position" if "position" in groups else next(iter(groups))
 
 
-def _main_rmse(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> float:
+def _main_rmse(outputs: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> float:
     """Compute the root mean square of the error norm of the main group over all valid runs."""
     components = meta["state"]["groups"][_main_group(meta)]
-    errors = arrays["error"][..., components].astype(float)
-    square = (errors**2).sum(-1)[~arrays["lost"]]
+    errors = outputs["error"][..., components].astype(float)
+    square = (errors**2).sum(-1)[~outputs["lost"]]
     return math.sqrt(np.nanmean(square)) if np.isfinite(square).any() else math.inf
 
 

@@ -84,8 +84,8 @@ class ScoreRecorder:
         clock: Clock that measures the time of scoring, in seconds.
 
     Attributes:
-        at: Indices of the scored steps, [S].
-        scores: Scores of the steps passed so far.
+        at_step: Indices of the scored steps.
+        scores: Scores of the steps so far.
         innovations: NIS and number of observed components per scored step, each [R], for filters
             that provide them.
         seconds: Time of scoring.

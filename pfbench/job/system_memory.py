@@ -97,9 +97,9 @@ class AllocationCounter(TorchDispatchMode):
 class MemoryTrimmer:
     """Callable that returns freed memory to the system at a time step, if there is much of it.
 
-    `native.keep_memory` makes the C library keep freed memory. Small objects then lie between holes
-    that the next step's tensors do not fit into: a job with 60 MB of live tensors grew to 850 MB
-    within a hundred steps [measured]. A release takes milliseconds, so it happens only if the
+    `cpp.keep_freed_memory` makes the C library keep freed memory. Small objects then lie between
+    holes that are too small for the tensors of the next step. A job with 60 MB of live tensors
+    grew to 850 MB within a hundred steps [measured]. A release takes milliseconds, so it happens only if the
     resident memory is 50 % and 256 MiB above the first step after the last release. A query takes
     as long as a small step, so it happens at every tenth step.
     """

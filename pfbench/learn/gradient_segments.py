@@ -25,7 +25,7 @@ def iterate_segments(
     segment: int | None,
     method: ParticleFilter,
     model: StateSpaceModel,
-    worlds: TrainingData,
+    data: TrainingData,
     draws: RandomStream,
     scale: Tensor,
 ) -> Iterator[tuple[Tensor, Tensor]]:
@@ -36,35 +36,35 @@ def iterate_segments(
         segment: Steps of a segment. None for all.
         method: The filter.
         model: State-space model.
-        worlds: Training data of R runs.
+        data: Training data of R runs.
         draws: Random stream of the filter.
         scale: Standard deviations of the initial distribution, [R or 1, d].
 
     Yields:
         Losses and ESS / N of a segment's S steps, [S, R] each.
     """
-    steps = worlds.record.y.shape[1]
+    steps = data.record.y.shape[1]
     recording = torch.is_grad_enabled() and objective.needs_filter_gradient
-    filter_pass = FilterPass(_GradientMode(method, recording), model, worlds.record, draws)
-    losses, shares, before = [], [], filter_pass.belief
+    filter_pass = FilterPass(_GradientMode(method, recording), model, data.record, draws)
+    losses, ess_fractions, before = [], [], filter_pass.belief
     for t, step_model, record, info, step_draws in filter_pass:
-        parent, noise = (None if a is None else a[:, t] for a in (worlds.parents, worlds.noises))
-        lesson = TrainingStep(
+        parent, noise = (None if a is None else a[:, t] for a in (data.parents, data.noises))
+        training_step = TrainingStep(
             method, step_model, before, filter_pass.belief, info, record,
-            worlds.states[:, t], parent, noise, scale, relabel(step_draws, "lesson."),
+            data.states[:, t], parent, noise, scale, relabel(step_draws, "lesson."),
         )  # fmt: skip
-        losses.append(objective(lesson))
-        shares.append(info.trace["ess"].detach() / method.particles)
+        losses.append(objective(training_step))
+        ess_fractions.append(info.trace["ess"].detach() / method.particles)
         if t + 1 == steps or (segment is not None and (t + 1) % segment == 0):
-            yield torch.stack(losses), torch.stack(shares)
-            losses, shares = [], []
+            yield torch.stack(losses), torch.stack(ess_fractions)
+            losses, ess_fractions = [], []
             filter_pass.belief = _detach(filter_pass.belief)
         before = filter_pass.belief
 
 
 @dataclass(frozen=True)
 class _GradientMode:
-    """A filter whose steps record gradients, or do not."""
+    """A filter whose steps record gradients if enabled."""
 
     method: Filter
     enabled: bool

@@ -32,6 +32,16 @@ from pfbench.model.base import StateSpaceModel, initial_law
 
 logger = logging.getLogger("pfbench")
 
+# a resumed training must have the same values of these
+_RESUMED_SETTINGS = (
+    "particles",
+    "seed",
+    "gradient_steps",
+    "batch_size",
+    "learning_rate",
+    "max_grad_norm",
+)
+
 
 class TrainingState:
     """The networks of a filter and their optimiser.
@@ -40,7 +50,7 @@ class TrainingState:
         training: Settings.
         method: The filter.
         model: State-space model.
-        worlds: Training data. The first run gives the sizes of the networks.
+        data: Training data. The first run gives the sizes of the networks.
 
     Attributes:
         method: The filter with resampler and number of particles of the training.
@@ -53,43 +63,43 @@ class TrainingState:
         training: Training,
         method: ParticleFilter,
         model: StateSpaceModel,
-        worlds: TrainingData,
+        data: TrainingData,
     ) -> None:
         self.training, self.model = training, model
         self.method = replace(method, particles=training.particles, resampler=training.resampler)
         self.parts = find_learned_parts(self.method)
-        self._build_networks(worlds.select_runs(torch.arange(1)).record)
-        self.weights = [p for part in self.parts.values() for p in part.parameters()]
+        self._build_networks(data.select_runs(torch.arange(1)).record)
+        self.weights = [p for module in self.parts.values() for p in module.parameters()]
         self._optimiser = torch.optim.Adam(self.weights, training.learning_rate)
-        initial: Any = initial_law(model, 1, worlds.record.spread)
+        initial: Any = initial_law(model, 1, data.record.spread)
         self._scale = initial.stddev
-        self._settings = self._describe(worlds)
+        self._settings = self._describe(data)
 
     def run_epoch(
-        self, progress: Progress, worlds: TrainingData, validation: TrainingData
+        self, progress: Progress, data: TrainingData, validation: TrainingData
     ) -> dict[str, float]:
         """Train one epoch, then compute the validation loss.
 
         Args:
             progress: Progress of the training. It is updated.
-            worlds: Training data.
+            data: Training data.
             validation: Validation data.
 
         Returns:
-            Log line of the epoch.
+            Values of the log line of the epoch, by name.
         """
         start_time = time.perf_counter()
-        batches = self._batches(len(worlds.record.y), progress.epoch)
-        results = [self._batch(worlds.select_runs(rows), rows, progress) for rows in batches]
+        batches = self._batches(len(data.record.y), progress.epoch)
+        results = [self._batch(data.select_runs(rows), rows, progress) for rows in batches]
         value, ess = self.validate(validation)
         progress.epoch += 1
         progress.epochs_since_best += 1
         if value < progress.best:
             progress.best, progress.epochs_since_best = value, 0
-            networks = {
-                name: flatten_parameters(_networks(part)) for name, part in self.parts.items()
+            progress.best_weights = {
+                name: {key: value.detach().clone() for key, value in weights.items()}
+                for name, weights in self._network_weights().items()
             }
-            progress.best_weights = {name: _copy(weights) for name, weights in networks.items()}
         progress.seconds += time.perf_counter() - start_time
         loss, gradient, skipped = (sum(result[k] for result in results) for k in range(3))
         line = {
@@ -104,13 +114,13 @@ class TrainingState:
         progress.losses.append(line)
         return line
 
-    def validate(self, worlds: TrainingData) -> tuple[float, float]:
+    def validate(self, data: TrainingData) -> tuple[float, float]:
         """Return the mean loss per step on validation data, and the mean ESS / N.
 
         The random numbers are the same in each call.
         """
-        rows = torch.arange(len(worlds.record.y))
-        data, draws = self._data(worlds, rows, "validation"), self._draws("validation", rows)
+        rows = torch.arange(len(data.record.y))
+        data, draws = self._loss_data(data, rows, "validation"), self._draws("validation", rows)
         with torch.no_grad():
             segments = list(self._segments(data, draws))
         loss, ess = (torch.cat([segment[k] for segment in segments]).mean() for k in range(2))
@@ -124,9 +134,7 @@ class TrainingState:
             progress: Progress of the training.
         """
         content = {
-            "networks": {
-                name: flatten_parameters(_networks(part)) for name, part in self.parts.items()
-            },
+            "networks": self._network_weights(),
             "optimiser": self._optimiser.state_dict(),
             "progress": vars(progress),
             "settings": self._settings,
@@ -153,10 +161,11 @@ class TrainingState:
             if stored != value:
                 raise ValueError(
                     f"{name} must be {stored} to resume the training stopped at {path}, got "
-                    f"{value}. Use its settings, another train.checkpoint_path, or overwrite=true to remove it."
+                    f"{value}. Use its settings, another train.checkpoint_path, or overwrite=true."
                 )
-        for name, part in self.parts.items():
-            checkpoint.load_parameters(str(path), content["networks"][name], _networks(part))
+        for name, module in self.parts.items():
+            networks = dict(module.named_children())
+            checkpoint.load_parameters(str(path), content["networks"][name], networks)
         self._optimiser.load_state_dict(content["optimiser"])
         logger.info("training resumes from epoch %d of %s", content["progress"]["epoch"], path)
         return Progress(**content["progress"])
@@ -164,41 +173,40 @@ class TrainingState:
     def _build_networks(self, record: Record) -> None:
         """Build the networks for the sizes of a record of one run."""
         draws = self._draws("sizes", torch.arange(1))
-        cloud = self.method.init(self.model, 1, draws, record.start, record.spread)
-        for part in self.parts.values():
-            is_new = part.learnable.checkpoint is None
-            if isinstance(part, LearnedProposal):
-                part.build(self.model, cloud, record.at_step(0), is_new)
+        belief = self.method.init(self.model, 1, draws, record.start, record.spread)
+        for module in self.parts.values():
+            is_new = module.learnable.checkpoint is None
+            if isinstance(module, LearnedProposal):
+                module.build(self.model, belief, record.at_step(0), is_new)
             else:
-                part.build(self.model, record.y.shape[-1], is_new)
+                module.build(self.model, record.y.shape[-1], is_new)
 
-    def _describe(self, worlds: TrainingData) -> dict[str, Any]:
+    def _network_weights(self) -> dict[str, checkpoint.Weights]:
+        """Return the weights of the networks of each trained part."""
+        return {
+            name: flatten_parameters(dict(module.named_children()))
+            for name, module in self.parts.items()
+        }
+
+    def _describe(self, data: TrainingData) -> dict[str, Any]:
         """Return the settings that a resumed training must share."""
         training = self.training
-        names = (
-            "particles",
-            "seed",
-            "gradient_steps",
-            "batch_size",
-            "learning_rate",
-            "max_grad_norm",
-        )
-        parts = [f"{part.learnable.frame} {part.sizes}" for part in self.parts.values()]
-        data = {"worlds": {"y": worlds.record.y, "states": worlds.states}}
+        parts = [f"{module.learnable.frame} {module.sizes}" for module in self.parts.values()]
+        tensors = {"training_data": {"y": data.record.y, "states": data.states}}
         return {
             "objective": type(training.objective).__name__,
             "resampler": type(training.resampler).__name__,
-            **{name: getattr(training, name) for name in names},
+            **{name: getattr(training, name) for name in _RESUMED_SETTINGS},
             "proposal": ", ".join(parts),
-            "worlds": checkpoint.hash_weights(data),
+            "training_data": checkpoint.hash_weights(tensors),
         }
 
     def _batch(
-        self, worlds: TrainingData, rows: Tensor, progress: Progress
+        self, data: TrainingData, rows: Tensor, progress: Progress
     ) -> tuple[float, float, float]:
         """Return mean loss, mean norm of the gradient and number of updates skipped as not finite."""
         name, losses, norms, skipped = f"epoch {progress.epoch}", [], [], 0
-        data, draws = self._data(worlds, rows, name), self._draws(name, rows)
+        data, draws = self._loss_data(data, rows, name), self._draws(name, rows)
         for loss, _ in self._segments(data, draws):
             self._optimiser.zero_grad()
             if loss.requires_grad:
@@ -214,28 +222,18 @@ class TrainingState:
         mean_norm = sum(norms) / max(1, len(norms))
         return float(torch.stack(losses).mean()), mean_norm, float(skipped)
 
-    def _segments(
-        self, worlds: TrainingData, draws: PhiloxStream
-    ) -> Iterator[tuple[Tensor, Tensor]]:
+    def _segments(self, data: TrainingData, draws: PhiloxStream) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield losses and ESS / N [S, R] of each segment."""
-        training = self.training
-        return iterate_segments(
-            training.objective,
-            training.gradient_steps,
-            self.method,
-            self.model,
-            worlds,
-            draws,
-            self._scale,
-        )
+        objective, steps = self.training.objective, self.training.gradient_steps
+        return iterate_segments(objective, steps, self.method, self.model, data, draws, self._scale)
 
-    def _data(self, worlds: TrainingData, rows: Tensor, name: str) -> TrainingData:
+    def _loss_data(self, data: TrainingData, rows: Tensor, name: str) -> TrainingData:
         """Return the data, or data simulated from the model if the objective requires it."""
         if not self.training.objective.needs_simulated_data:
-            return worlds
+            return data
         with torch.no_grad():
             draws = relabel(self._draws(name, rows), "imagined.")
-            record, states, noises = simulate_from_model(self.model, worlds.record, draws)
+            record, states, noises = simulate_from_model(self.model, data.record, draws)
         return TrainingData(record, states[:, 1:], states[:, :-1], noises)
 
     def _draws(self, name: str, rows: Tensor) -> PhiloxStream:
@@ -248,13 +246,3 @@ class TrainingState:
         draws = self._draws(f"order {epoch}", torch.arange(1))
         order = draws.uniform("order", runs, 1)[0, :, 0].argsort()
         return order.split(self.training.batch_size)
-
-
-def _networks(part: nn.Module) -> dict[str, nn.Module]:
-    """Return the networks of a trained part by name."""
-    return dict(part.named_children())
-
-
-def _copy(weights: checkpoint.Weights) -> checkpoint.Weights:
-    """Copy weights."""
-    return {name: value.detach().clone() for name, value in weights.items()}

@@ -26,8 +26,8 @@ class Training:
         seed: Seed of the training runs and of all other random numbers. The validation runs use
             the next one.
         max_steps: Number of steps of each record to use. None for all.
-        gradient_steps: Number of steps through which a gradient passes before it is cut and the weights
-            are updated. None for all.
+        gradient_steps: Number of steps through which a gradient passes before it is cut and the
+            weights are updated. None for all.
         epochs: Maximum number of epochs.
         batch_size: Number of runs per update, drawn again in each epoch from all regimes.
         learning_rate: Learning rate of Adam (Kingma and Ba 2015).
@@ -80,11 +80,11 @@ class Progress:
     Attributes:
         epoch: Number of finished epochs.
         best: Lowest validation loss.
-        since: Number of epochs since the lowest validation loss.
+        epochs_since_best: Number of epochs since the lowest validation loss.
         updates: Number of weight updates.
         seconds: Training time, s.
         losses: Log line of each epoch.
-        kept: Weights of the best epoch, by trained part.
+        best_weights: Weights of the best epoch, by trained part.
     """
 
     epoch: int = 0

@@ -60,7 +60,7 @@ def draw_training_data(
         model: Model that prepares the records; its dtype and device are used.
         runs: Runs of each regime; run numbers continue from regime to regime.
         seed: Seed.
-        steps: Steps that are kept; None keeps all.
+        steps: Number of steps of each record to use. None for all.
 
     Returns:
         Training data of all regimes in turn.

@@ -41,11 +41,11 @@ def train(
         training: Settings.
         method: The filter. Resampler and number of particles are those of the settings.
         model: State-space model, on its device and in its precision.
-        worlds: Training data (`draw_worlds`).
+        data: Training data (`draw_training_data`).
         validation: Validation data.
         path: Path of the checkpoint.
-        about: More content of the checkpoint: config, choices, split. Numbers, strings, lists and
-            dicts.
+        metadata: Further content of the checkpoint: config, choices, split. Numbers, strings,
+            lists and dicts.
         tell: Function that receives the log line of each epoch.
 
     Returns:
@@ -56,9 +56,9 @@ def train(
             training with other settings was stopped at this path.
     """
     path = Path(path)
-    part = path.with_name(path.name + ".part")
-    pupil = TrainingState(training, method, model, data)
-    progress = pupil.restore(part)
+    resume_file = path.with_name(path.name + ".part")
+    state = TrainingState(training, method, model, data)
+    progress = state.restore(resume_file)
     write_board = open_tensorboard(path)
     with tqdm(
         total=training.epochs, initial=progress.epoch, desc="training", unit="epoch",
@@ -68,17 +68,17 @@ def train(
             progress.epoch < training.epochs
             and progress.epochs_since_best < training.patience_epochs
         ):
-            line = pupil.run_epoch(progress, data, validation)
+            line = state.run_epoch(progress, data, validation)
             bar.set_postfix({name: f"{line[name]:.4g}" for name in ("loss", "validation")})
             bar.update()
             write_board(line)
             if tell:
                 with tqdm.external_write_mode():
                     tell(" ".join(f"{name} {value:.5g}" for name, value in line.items()))
-            pupil.save(part, progress)
+            state.save(resume_file, progress)
             write_losses(path.with_suffix(".csv"), progress.losses)
-    checkpoint.write_checkpoint(path, _checkpoint_content(pupil, progress, metadata or {}))
-    part.unlink(missing_ok=True)
+    checkpoint.write_checkpoint(path, _checkpoint_content(state, progress, metadata or {}))
+    resume_file.unlink(missing_ok=True)
     return path
 
 
@@ -97,7 +97,7 @@ def fit(
         choices: Name chosen in each configuration group.
         regimes: Noise regimes of the mixture, by name.
         build: Function that instantiates a node of the configuration.
-        about: More content of the checkpoint.
+        metadata: Further content of the checkpoint.
         tell: Function that prints the log line of an epoch.
 
     Returns:
@@ -119,12 +119,12 @@ def fit(
     seeds = {"train": training.seed, "validation": training.seed + 1}
     data, validation = (
         draw_training_data(
-            scenario, [*regimes.values()], model, runs[part], seeds[part], training.max_steps
+            scenario, [*regimes.values()], model, runs[name], seeds[name], training.max_steps
         )
-        for part in runs
+        for name in runs
     )
     split: dict[str, Any] = {"scenario": choices["scenario"]}
-    split |= {part: {"seed": seeds[part], "runs": runs[part] * len(regimes)} for part in runs}
+    split |= {name: {"seed": seeds[name], "runs": runs[name] * len(regimes)} for name in runs}
     selection = {group: choices[group] for group in ("scenario", "model", "filter", "train")}
     selection["noise"] = "+".join(regimes)
     content = {"config": cfg, "choices": selection, "split": split, **metadata}
@@ -149,15 +149,15 @@ def _checkpoint_path(
 
 
 def _checkpoint_content(
-    pupil: TrainingState, progress: Progress, about: Mapping[str, Any]
+    state: TrainingState, progress: Progress, metadata: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return weights of the best epoch, losses, cost and description."""
     cost = {
         "seconds": progress.seconds,
         "epochs": progress.epoch,
         "updates": progress.updates,
-        "particles": pupil.training.particles,
-        "device": str(pupil.model.anchor.device),
+        "particles": state.training.particles,
+        "device": str(state.model.anchor.device),
         "threads": torch.get_num_threads(),
     }
     networks = {
@@ -166,11 +166,11 @@ def _checkpoint_content(
     }
     return {
         "choices": {},
-        **json.loads(json.dumps(about)),
+        **json.loads(json.dumps(metadata)),
         "networks": networks,
-        "sizes": {name: list(part.sizes) for name, part in pupil.parts.items()},
-        "frames": {name: part.learnable.frame for name, part in pupil.parts.items()},
-        "model": {"class": type(pupil.model).__name__, "names": list(pupil.model.names)},
+        "sizes": {name: list(module.sizes) for name, module in state.parts.items()},
+        "frames": {name: module.learnable.frame for name, module in state.parts.items()},
+        "model": {"class": type(state.model).__name__, "names": list(state.model.names)},
         "losses": progress.losses,
         "best": progress.best,
         "cost": cost,

@@ -16,10 +16,10 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing.reference import (
     FilterMoments,
-    default_case,
+    case_or_default,
     reference_moments,
     run_kalman_filter,
 )
@@ -37,7 +37,7 @@ def filter_record(
         method: Filter to run.
         model: State-space model.
         y: One record [T, Dy], or one per run [R, T, Dy].
-        seed: Of the random stream.
+        seed: Seed of the random stream.
         **options: `runs` (number of runs of one record), `u` (inputs), `start` [R, D], and options
             of `run_filter`.
 
@@ -61,13 +61,13 @@ def check_evidence(
 ) -> LawCheck:
     """Check E[Z_hat f_hat] = Z E[f | y] for f = 1, x and x^2 [Del Moral 2004].
 
-    It holds for any number of particles, so there is no bias to allow for.
+    It holds for any number of particles.
 
     Args:
         method: Particle filter that is asymptotically exact.
         model: Model with a known answer. A walk with constant velocity by default.
         y: One record, [T, Dy]. Required with `model`.
-        exact: The answer. That of the Kalman filter by default, for linear-Gaussian models.
+        exact: Exact answer. The answer of the Kalman filter by default, for linear-Gaussian models.
         runs: Number of independent runs.
         limit: Largest number of standard errors.
 
@@ -77,7 +77,7 @@ def check_evidence(
     Raises:
         AssertionError: If the law does not hold.
     """
-    model, y = _case(model, y)
+    model, y = case_or_default(model, y)
     answer = reference_moments(model, y) if exact is None else exact  # type: ignore[arg-type]
     estimate = filter_record(method, model, y, runs=runs)
     ratio = torch.exp(estimate.log_evidence - answer.log_evidence).numpy()
@@ -133,12 +133,12 @@ def check_convergence(
         errors.append(0.5 * squares.std() / squares.mean() / math.sqrt(runs))
     x = np.log(sizes) - np.log(sizes).mean()
     slope, error = float(x @ logs / (x @ x)), float(math.sqrt((x**2) @ np.square(errors)) / (x @ x))
-    law = "errors fall with the root of the number of particles"
+    statement = "errors fall with the root of the number of particles"
     excess = slope + 0.5 if faster else abs(slope + 0.5)
     assert excess < limit * error, (
-        f"{law}: the slope must be -0.5, got {slope:.3f} +- {error:.3f}. The limit is {limit:g} errors"
+        f"{statement}: the slope must be -0.5, got {slope:.3f} +- {error:.3f}. The limit is {limit:g} errors"
     )
-    return LawCheck(law, slope, limit, error)
+    return LawCheck(statement, slope, limit, error)
 
 
 def check_causality(
@@ -162,20 +162,20 @@ def check_causality(
         AssertionError: If a change of y after step t changes an estimate up to t.
     """
     model, y = _records(model, y)
-    law, before = "an estimate uses no later measurement", run(method, model, y)
+    statement, before = "an estimate uses no later measurement", run(method, model, y)
     for t in range(1, y.shape[1]):
-        other = y.clone()
-        other[:, t:] = other[:, t:] + 0.7
-        other[:, t + 1 :: 2] = torch.nan
-        after = run(method, model, other)
+        changed_y = y.clone()
+        changed_y[:, t:] = changed_y[:, t:] + 0.7
+        changed_y[:, t + 1 :: 2] = torch.nan
+        after = run(method, model, changed_y)
         for name in ("mean", "variance"):
             old, new = (getattr(estimate, name)[:, :t] for estimate in (before, after))
             difference = float((new - old).abs().nan_to_num().max())
             same = torch.equal(old.nan_to_num(), new.nan_to_num())
             assert same, (
-                f"{law}: the {name} up to step {t} must not change, got {difference:.3g}. The limit is 0"
+                f"{statement}: the {name} up to step {t} must not change, got {difference:.3g}. The limit is 0"
             )
-    return LawCheck(law, 0.0, 0.0)
+    return LawCheck(statement, 0.0, 0.0)
 
 
 def check_independence(
@@ -190,7 +190,7 @@ def check_independence(
         method: Filter to test.
         model: State-space model. A walk with constant velocity by default.
         y: Records, [R, T, Dy]. Required with `model`.
-        tolerance: Relative and absolute.
+        tolerance: Relative and absolute tolerance.
 
     Returns:
         The largest difference.
@@ -199,7 +199,7 @@ def check_independence(
         AssertionError: If a run alone differs from the same run in its batch.
     """
     model, y = _records(model, y)
-    law, last = "a run does not depend on others", y.shape[0] - 1
+    statement, last = "a run does not depend on others", y.shape[0] - 1
     joint = filter_record(method, model, y)
     alone = run_filter(
         method, model, Record(y[last:]), PhiloxStream(1, torch.tensor([last]), model.anchor.dtype)
@@ -209,9 +209,9 @@ def check_independence(
         a, b = getattr(alone, name)[0], getattr(joint, name)[last]
         difference = float((a - b).abs().nan_to_num().max())
         same = torch.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True)
-        assert same, f"{law}: {name} differs by {difference:.3g}. The limit is {tolerance:g}"
+        assert same, f"{statement}: {name} differs by {difference:.3g}. The limit is {tolerance:g}"
         largest = max(largest, difference)
-    return LawCheck(law, largest, tolerance)
+    return LawCheck(statement, largest, tolerance)
 
 
 def check_filter(method: Any, runs: int = 1000) -> dict[str, LawCheck]:
@@ -238,20 +238,9 @@ def check_filter(method: Any, runs: int = 1000) -> dict[str, LawCheck]:
     return results
 
 
-def _case(model: StateSpaceModel | None, y: Tensor | None) -> tuple[StateSpaceModel, Tensor]:
-    """Return the given model and record, or the default."""
-    if (model is None) != (y is None):
-        raise ValueError(
-            "check: model and y must be given together, got one of them. Give both or none"
-        )
-    return default_case() if model is None or y is None else (model, y)
-
-
 def _records(model: StateSpaceModel | None, y: Tensor | None) -> tuple[StateSpaceModel, Tensor]:
     """Return the given model and records [R, T, Dy], or four of the default model."""
-    chosen, record = _case(model, y)
+    case_model, record = case_or_default(model, y)
     if y is None:
-        noise = PhiloxStream(8, torch.arange(4)).normal("y", *record.shape)
-        record = record + noise
-    assert isinstance(chosen, LinearGaussian) or y is not None
-    return chosen, record
+        record = record + PhiloxStream(8, torch.arange(4)).normal("y", *record.shape)
+    return case_model, record

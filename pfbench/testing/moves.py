@@ -1,4 +1,4 @@
-"""Test of moves: they leave the joint distribution of the whole path given the measurements as it is."""
+"""Test of moves: they leave the distribution of the path given the measurements invariant."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ SIZE = 2 * (STEPS + 1)
 
 
 class PathPosterior(NamedTuple):
-    """Exact draws of x_0:k given y_1:k, and what whitens them.
+    """Exact draws of x_0:k given y_1:k, with their mean and covariance factor.
 
     Attributes:
         model: Walk with constant velocity.
         y: Measurements, [k, 1].
         paths: Draws, [M, SIZE].
-        mean: Of the paths, [SIZE].
-        root: Factor of their covariance, [SIZE, SIZE].
+        mean: Mean of the paths, [SIZE].
+        root: Factor of the covariance of the paths, [SIZE, SIZE].
     """
 
     model: LinearGaussian
@@ -42,10 +42,10 @@ class PathPosterior(NamedTuple):
     root: Array
 
     def belief(self, history: PathHistory | None) -> ParticleBelief:
-        """Return the paths as particles of one run, with what `history` stores of their past.
+        """Return the paths as particles of one run, with the past states that `history` stores.
 
         Args:
-            history: What the move requires, its `required_history`. None stores nothing.
+            history: Attribute `required_history` of the move. None stores nothing.
 
         Returns:
             Particles x_k [1, M, 2] of equal weight.
@@ -76,7 +76,7 @@ class PathPosterior(NamedTuple):
 
         Args:
             paths: Paths, [M, SIZE].
-            components: Of the path. All by default.
+            components: Components of the path. All by default.
 
         Returns:
             p-value of a chi-square test.
@@ -91,8 +91,8 @@ class PathPosterior(NamedTuple):
     def log_density_p_value(self, paths: Array) -> float:
         """Return the p-value of the mean change of each log density that makes up the path's.
 
-        Paths before and after are paired, so what has not moved adds no noise: the power is many
-        times that of `moments_p_value`.
+        Paths before and after are paired, so that paths that did not move add no noise. The power
+        is many times that of `moments_p_value`.
         """
         change = self.log_densities(paths) - self.log_densities(self.paths)
         change = change[:, change.std(0) > 1e-9]
@@ -150,7 +150,7 @@ def check_move(
     noise_sd: float = 1.0,
     paths: int = 1500,
     mcmc_steps: int = 8,
-    moved: float = 0.05,
+    min_moved_share: float = 0.05,
     limit: float = 1e-4,
 ) -> LawCheck:
     """Check that a move leaves p(x_0:k | y_1:k) of a linear-Gaussian model invariant.
@@ -164,7 +164,7 @@ def check_move(
         noise_sd: Standard deviation of the process noise.
         paths: Number of particles.
         mcmc_steps: Metropolis-Hastings steps of a kernel.
-        moved: Fraction of the particles that must move, for the test to have power.
+        min_moved_share: Share of the particles that must move, for the test to have power.
         limit: Smallest p-value.
 
     Returns:
@@ -175,27 +175,29 @@ def check_move(
     """
     kernel: Any = move
     chain: Any = MetropolisHastings(kernel, mcmc_steps) if hasattr(move, "propose") else move
-    case, law = (
-        simulate_path_posterior(noise_sd, paths),
-        "a move leaves the distribution of the path as it is",
-    )
-    touched = torch.ones(1, dtype=torch.bool)
+    case = simulate_path_posterior(noise_sd, paths)
+    statement = "a move leaves the distribution of the path invariant"
+    moved_runs = torch.ones(1, dtype=torch.bool)
     after, rate = chain(
-        case.model, case.belief(chain.required_history), touched, PhiloxStream(1, torch.arange(1))
+        case.model,
+        case.belief(chain.required_history),
+        moved_runs,
+        PhiloxStream(1, torch.arange(1)),
     )
     result = case.paths_after(after)
     share = float((result != case.paths).any(1).mean())
-    assert share >= moved, (
-        f"{law}: at least {moved:.0%} of the particles must move to decide, got {share:.1%}. Use more steps"
+    assert share >= min_moved_share, (
+        f"{statement}: at least {min_moved_share:.0%} of the particles must move to decide, "
+        f"got {share:.1%}. Use more steps"
     )
     details = {"accepted": float(rate), "moved": share}
     if "states" not in after.window:
         newest = {
             "moments of the newest state": case.moments_p_value(result, slice(SIZE - 2, SIZE))
         }
-        return check_p_values(law, newest, limit, **details)
+        return check_p_values(statement, newest, limit, **details)
     p_values = {
         "moments of the path": case.moments_p_value(result),
         "mean log densities": case.log_density_p_value(result),
     }
-    return check_p_values(law, p_values, limit, **details)
+    return check_p_values(statement, p_values, limit, **details)

@@ -1,4 +1,4 @@
-"""Test of proposals: their density ratio turns averages over the proposal into averages over the model."""
+"""Test of proposals: weighted averages over the proposal equal averages over the model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def check_proposal(
         proposal: Proposal to test.
         particles: Number of particles in a run.
         runs: Number of independent repetitions.
-        seed: Of the random stream.
+        seed: Seed of the random stream.
         limit: Largest number of standard errors.
 
     Returns:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 
 Array = np.ndarray
@@ -40,7 +41,7 @@ class FilterMoments(NamedTuple):
     Attributes:
         mean: E[x_T | y_1:T], [D].
         square: E[x_T^2 | y_1:T] per component, [D].
-        log_z: log p(y_1:T).
+        log_evidence: log p(y_1:T).
     """
 
     mean: Array
@@ -147,7 +148,26 @@ def reference_moments(model: LinearGaussian, y: Tensor) -> FilterMoments:
     )
 
 
-def default_case() -> tuple[LinearGaussian, Tensor]:
-    """Return a walk with constant velocity, and a record [6, 1] with a missing measurement."""
-    y = [[0.8], [2.9], [1.2], [np.nan], [3.0], [6.5]]
-    return linear_walk(1.0, 0.5, 1.0), torch.tensor(y, dtype=torch.float64)
+def case_or_default(
+    model: StateSpaceModel | None, y: Tensor | None
+) -> tuple[StateSpaceModel, Tensor]:
+    """Return a given model with its records, or a default case.
+
+    The default is a walk with constant velocity and a record [6, 1] with a missing measurement.
+
+    Args:
+        model: State-space model, or None.
+        y: Its records, or None.
+
+    Returns:
+        Model and records.
+
+    Raises:
+        ValueError: If only one of them is given.
+    """
+    if model is None and y is None:
+        record = [[0.8], [2.9], [1.2], [np.nan], [3.0], [6.5]]
+        return linear_walk(1.0, 0.5, 1.0), torch.tensor(record, dtype=torch.float64)
+    if model is None or y is None:
+        raise ValueError("check: model and y must be given together, got one. Give both or none.")
+    return model, y

@@ -1,4 +1,4 @@
-"""Test of resamplers and schemes: expected counts N w, and everything of a particle is copied together."""
+"""Test of resamplers and schemes: expected counts N w, and copies of whole particles."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LAW = "a resampler gives each particle its weight on average"
 def check_resampling(
     stage: Resampler | ResamplingScheme,
     particles: int = 24,
-    wanted: int | None = None,
+    slots: int | None = None,
     runs: int = 20_000,
     seed: int = 1,
 ) -> LawCheck:
@@ -37,9 +37,9 @@ def check_resampling(
     Args:
         stage: Resampler, or scheme to be used in every run.
         particles: Number of particles before resampling.
-        wanted: Number of particles after it. The same by default.
+        slots: Number of particles after resampling. The same by default.
         runs: Number of independent repetitions.
-        seed: Of the random stream.
+        seed: Seed of the random stream.
 
     Returns:
         The smaller of the p-values.
@@ -47,7 +47,7 @@ def check_resampling(
     Raises:
         AssertionError: If the law does not hold.
     """
-    count = particles if wanted is None else wanted
+    count = particles if slots is None else slots
     resampler: Any = EssResampler(stage, 1.0) if _is_scheme(stage) else stage  # type: ignore[arg-type]
     a = _uneven_weights(particles, np.random.default_rng(0))
     log_w = torch.log(torch.tensor(a))
@@ -94,7 +94,7 @@ def _shares(resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int)
         "window": number[..., None, None],
         "memory": number.unsqueeze(2),
     }
-    parts = {name: part.clone() for name, part in parts.items()}
+    parts = {name: value.clone() for name, value in parts.items()}
     belief = ParticleBelief(
         parts["state"],
         log_w,
@@ -103,13 +103,13 @@ def _shares(resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int)
         {"m": parts["memory"]},
     )
     same = torch.equal(log_a, log_w[0])  # by identity: nothing to correct
-    wanted = torch.full((runs, 1), float(count), dtype=torch.float64)
+    slots = torch.full((runs, 1), float(count), dtype=torch.float64)
     draws = PhiloxStream(seed, torch.arange(runs)).at_step(3)
     after, _ = resampler(
         local_level(1.0, 1.0, 0.0, 1.0),
         belief,
         log_w if same else log_a.expand(runs, -1),
-        wanted,
+        slots,
         draws,
     )
     live = torch.isfinite(after.log_w)
@@ -117,16 +117,16 @@ def _shares(resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int)
         f"{_LAW}: at most {count} slots must be active, got {int(live.sum(1).max())}"
     )
     w, m = after.window["w"][..., 0, 0], after.memory["m"][..., 0]
-    whole = (after.x[..., 0] == places[w.long()]) & (w == m)
+    is_consistent = (after.x[..., 0] == places[w.long()]) & (w == m)
     if after.ancestors is not None:  # ancestors may be numbered in another order, but one to one
         first = torch.full((runs, n), -1.0, dtype=torch.float64).scatter(1, after.ancestors, w)
         back = torch.full((runs, n), -1, dtype=torch.long).scatter(1, w.long(), after.ancestors)
-        whole = (
-            whole
+        is_consistent = (
+            is_consistent
             & (first.gather(1, after.ancestors) == w)
             & (back.gather(1, w.long()) == after.ancestors)
         )
-    assert bool(whole[live].all()), (
+    assert bool(is_consistent[live].all()), (
         f"{_LAW}: state, window, memory and ancestor of a slot must be of one particle"
     )
     weight = torch.where(live, after.log_w.exp(), 0.0)

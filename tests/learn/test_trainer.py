@@ -327,7 +327,7 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(tmp_path: Pat
             {"objective": InferenceCompilation()},
             "objective must be EvidenceLowerBound .* got InferenceCompilation",
         ),
-        ({"training_runs": 17}, "worlds must be"),
+        ({"training_runs": 17}, "training_data must be"),
         ({"memory": 2}, "proposal must be"),
         (
             {"guide_filter": GuidedNoiseProposal(GaussianFilter(TaylorLinearisation()))},

@@ -479,7 +479,7 @@ def test_pmmh_says_what_it_cannot_do() -> None:
 
 def test_online_learning_says_what_it_cannot_do() -> None:
     impossible = Record(torch.tensor([[[0.5], [1e200]]], dtype=torch.float64))
-    with pytest.raises(ValueError, match="valid at step 1, got none"):
+    with pytest.raises(ValueError, match="valid filter at step 1, got none"):
         smc2(LEVELS, ParticleFilter(5), impossible, 4)
     with pytest.raises(ValueError, match="threshold must be from 0 to 1, got 2"):
         smc2(LEVELS, EKF, impossible, 4, threshold=2.0)

@@ -70,7 +70,7 @@ def test_average_copies(scheme: ResamplingScheme) -> None:
 @resizing
 @pytest.mark.parametrize("wanted", [1, 2, 17])
 def test_average_copies_of_a_smaller_cloud(scheme: ResamplingScheme, wanted: int) -> None:
-    check_resampling(scheme, wanted=wanted)
+    check_resampling(scheme, slots=wanted)
 
 
 @every_scheme
