@@ -76,13 +76,8 @@ def proposal(name: str, random: bool, **options: Any) -> LearnedProposal:
 # the target stays
 
 
-@pytest.mark.parametrize("guide", [None, GuidedNoiseProposal(CKF)], ids=["prior", "guided"])
-@pytest.mark.parametrize("random", [False, True], ids=["untrained", "random"])
-@pytest.mark.parametrize("name", NETWORKS)
-def test_the_ratio_is_one_on_average(
-    name: str, random: bool, guide: GuidedNoiseProposal | None
-) -> None:
-    """E_q[p / q] = 1, and E_q[p / q w] = E_p[w] = 0, for each particle with its own parent."""
+def ratio_errors(name: str, random: bool, guide: GuidedNoiseProposal | None) -> list[float]:
+    """Means of p / q - 1 and of p / q w in standard errors, for each particle with its own parent."""
     model, n = WALK, 20_000
     method = proposal(name, random, guide_filter=guide)
     x = torch.tensor([[[0.4, -0.2], [2.0, 1.0]]], dtype=torch.float64).repeat_interleave(n // 2, 1)
@@ -99,9 +94,18 @@ def test_the_ratio_is_one_on_average(
             PhiloxStream(3, torch.arange(1)),
         )
     ratio = told.log_ratio.exp()[0]
-    for value in (ratio - 1.0, *(ratio[:, None] * told.w[0]).T):
-        assert abs(value.mean()) < 4.5 * value.std() / math.sqrt(n) + 1e-9
-        assert value.std() < 12.0
+    values = torch.stack([ratio - 1.0, *(ratio[:, None] * told.w[0]).T])
+    assert values.std(1).max() < 12.0
+    return (values.mean(1).abs() / (values.std(1) / math.sqrt(n) + 1e-9)).tolist()
+
+
+@pytest.mark.parametrize("guide", [None, GuidedNoiseProposal(CKF)], ids=["prior", "guided"])
+@pytest.mark.parametrize("random", [False, True], ids=["untrained", "random"])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_ratio_is_one_on_average(
+    name: str, random: bool, guide: GuidedNoiseProposal | None
+) -> None:
+    assert max(ratio_errors(name, random, guide)) < 4.5
 
 
 @pytest.mark.slow
@@ -245,17 +249,22 @@ def test_the_kept_share_bounds_every_weight() -> None:
     assert largest[1] <= math.log(10.0) + 1e-9
 
 
-@pytest.mark.parametrize("name", NETWORKS)
-def test_gradients_reach_every_weight(name: str) -> None:
+def weights_without_gradient(name: str) -> list[str]:
     method = ParticleFilter(20, ALWAYS, proposal=proposal(name, True, memory=2))
     filter_record(method, WALK, WALK_Y, runs=4).log_evidence.mean().backward()
     assert isinstance(method.proposal, LearnedProposal)
     weights = dict(method.proposal.named_parameters())
     assert len(weights) > 4
-    for key, weight in weights.items():
-        assert weight.grad is not None, key
-        assert torch.isfinite(weight.grad).all(), key
-        assert weight.grad.abs().max() > 0.0, key
+    return [
+        key
+        for key, weight in weights.items()
+        if weight.grad is None or not 0.0 < weight.grad.abs().max() < math.inf
+    ]
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_gradients_reach_every_weight(name: str) -> None:
+    assert weights_without_gradient(name) == []
 
 
 @pytest.mark.parametrize("flow", ["NSF", "MAF", "NICE"])
@@ -266,8 +275,8 @@ def test_flows_of_the_library_zuko_leave_the_target_too(
     monkeypatch.setitem(
         NETWORKS, "zuko", partial(ZukoFlowHead, flow=getattr(zuko.flows, flow), hidden=SMALL)
     )
-    test_the_ratio_is_one_on_average("zuko", True, None)
-    test_gradients_reach_every_weight("zuko")
+    assert max(ratio_errors("zuko", True, None)) < 4.5
+    assert weights_without_gradient("zuko") == []
 
 
 class Lying(ZukoFlowHead):
@@ -284,8 +293,7 @@ class Lying(ZukoFlowHead):
 def test_a_flow_of_zuko_s_with_a_wrong_determinant_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     zuko = pytest.importorskip("zuko", reason="needs the extra zuko")
     monkeypatch.setitem(NETWORKS, "lying", partial(Lying, flow=zuko.flows.NSF, hidden=SMALL))
-    with pytest.raises(AssertionError):
-        test_the_ratio_is_one_on_average("lying", True, None)
+    assert max(ratio_errors("lying", True, None)) > 4.5
 
 
 def test_a_run_cannot_feel_its_neighbours() -> None:
