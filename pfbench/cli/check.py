@@ -59,7 +59,7 @@ def _compose_all() -> Iterator[tuple[str, str]]:
 
 
 def _matching_scenario(group: str, name: str) -> list[str]:
-    """Return the scenario of a model, or of the model that it extends, which sets its values."""
+    """Return the scenario of a model, or of the model that it extends."""
     if group != "model":
         return []
     parts = name.split("_")

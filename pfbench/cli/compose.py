@@ -1,4 +1,4 @@
-"""Configurations of commands: sweeps, experiments of studies, and descriptions of files."""
+"""Configurations of commands: sweeps, experiments and descriptions of files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pfbench.job.configuration import JobConfig, compose, experiments_dir
 
 
 def compose_study(words: Sequence[str]) -> JobConfig:
-    """Compose the configuration of a study. The options of its experiment apply, if there is one.
+    """Compose the configuration of a study, with its experiment if it exists.
 
     Args:
         words: Overrides, `study=NAME` among them.
@@ -56,7 +56,9 @@ def read_sweep(experiment: str) -> list[str]:
 
 
 def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
-    """Expand overrides as Hydra's sweeper does. A later override replaces an earlier one.
+    """Expand overrides as Hydra's sweeper does.
+
+    A later override replaces an earlier one.
 
     Args:
         overrides: Overrides, some with several values.

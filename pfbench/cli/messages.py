@@ -1,4 +1,4 @@
-"""Error messages of the command line: the key and the value given, and what to give instead."""
+"""Error messages of the command line: key, value and remedy."""
 
 from __future__ import annotations
 

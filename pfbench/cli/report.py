@@ -85,7 +85,7 @@ def _write_page(config: JobConfig) -> Path:
 
 
 def _report_all(words: list[str]) -> None:
-    """Write the reports of all studies with results, and the claims if all their studies exist."""
+    """Write the reports of all studies with results, and of the claims."""
     values = compose(words).values
     results, reports = Path(values["results_dir"]), Path(values["reports_dir"])
     studies = {path.parent.name for path in results.glob("*/*.npz")} - {"datasheets"}

@@ -81,7 +81,7 @@ def run_task(cfg: Any) -> float:
 
 
 def run_with_retries(sweep: Callable[[], Any]) -> None:
-    """Run a sweep, and repeat it if joblib lost one of its processes. Finished jobs are skipped.
+    """Run a sweep, and repeat it if joblib lost one of its processes.
 
     Args:
         sweep: Runs all jobs.
@@ -108,7 +108,9 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
 
 @dataclass
 class SweepProgress:
-    """Counts of a sweep, from the files that its jobs write. Any launcher can run the jobs.
+    """Counts of a sweep, from the files that its jobs write.
+
+    Any launcher can run the jobs.
 
     Attributes:
         jobs: Number of jobs, or None if unknown.

@@ -1,4 +1,4 @@
-"""Episodes of a plan, its particles under a budget and its runs under a memory limit."""
+"""Episodes of a job, particles under a budget, runs under a memory limit."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def apply_budget(plan: JobPlan, episodes: EpisodeSource) -> tuple[JobPlan, Budge
 
 
 def max_runs_in_memory(plan: JobPlan, episodes: EpisodeSource) -> int:
-    """Determine how many runs fit into memory at a time, and draw all runs together if they fit.
+    """Determine the runs that fit into memory at a time, and draw all if they fit.
 
     Args:
         plan: Plan of the job, with the number of particles of the budget.

@@ -1,4 +1,4 @@
-"""Equal budgets: the number of particles that costs as much per step as SIR with `particles`.
+"""Equal budgets: number of particles at the cost of SIR with `particles`.
 
 The cost is time or evaluations of the likelihood. The number is solved for by trials of the filter
 on the first steps of the job's own episode.
@@ -151,7 +151,7 @@ def solve_particle_count(
 
 
 def _next_trial(costs: dict[int, float], price: float) -> int:
-    """Interpolate between the trials around the target, or extend the line through the nearest."""
+    """Interpolate between the nearest trials, or extrapolate from them."""
     below, above = ([n for n in costs if (costs[n] < price) == is_low] for is_low in (True, False))
     if below and above and max(below) < min(above):
         near = [max(below), min(above)]

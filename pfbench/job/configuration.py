@@ -1,4 +1,4 @@
-"""Configuration of a job: composed from conf/ and experiments/, resolved, with plain values.
+"""Configuration of a job, composed from conf/ and experiments/ and resolved.
 
 This module imports Hydra only on use and never imports torch, so that the command line starts fast.
 """
@@ -100,12 +100,12 @@ def resolve_config(
 
 
 def conf_dir() -> Path:
-    """Return the folder of configurations, of the installed package or of the checkout."""
+    """Return the folder of configurations, in the package or the checkout."""
     return _find_folder("conf", "config.yaml")
 
 
 def experiments_dir() -> Path:
-    """Return the folder of experiments, of the installed package or of the checkout."""
+    """Return the folder of experiments, in the package or the checkout."""
     return _find_folder("experiments", "quickstart.yaml")
 
 

@@ -1,4 +1,4 @@
-"""Data of a scenario's datasheet: its episodes before any filter, in one file for the report."""
+"""Data of a scenario's datasheet: its episodes before any filter, in one file."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _CONFIG_KEYS = ("scenario", "model", "noise", "seed", "first_run", "runs", "pcrb
 
 
 def build_datasheet(config: JobConfig, about: str = "") -> Path:
-    """Write the data of a scenario's datasheet, unless the file exists or with `overwrite`.
+    """Write the data of a scenario's datasheet, unless the file exists.
 
-    The file has the arrays of a job and those of `compute_datasheet`. `error` is the true state minus its
-    mean over runs. `sd`, `nees` and `log_evidence` are NaN.
+    The file has the arrays of a job and those of `compute_datasheet`. `error` is the true state
+    minus its mean over runs. `sd`, `nees` and `log_evidence` are NaN.
 
     Args:
         config: Resolved configuration, as for a job.

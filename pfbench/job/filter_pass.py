@@ -49,7 +49,9 @@ class TimedFilterPass(NamedTuple):
     cost: dict[str, Any]
 
     def arrays(self, episode: Episode, pcrb: Tensor | None) -> dict[str, np.ndarray]:
-        """Collect the arrays of a result. They are NaN from the step at which a run is lost.
+        """Collect the arrays of a result.
+
+        They are NaN from the step at which a run is lost.
 
         Args:
             episode: Episode of the runs.

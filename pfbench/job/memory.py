@@ -1,4 +1,4 @@
-"""Memory of a job, estimated before it starts, and the number of runs that fit at a time.
+"""Memory of a job before it starts, and the number of runs that fit at a time.
 
 The estimate comes from a trial. The filter runs over a few steps of one and of two runs with few
 particles, and the bytes of all live tensors are counted. The result is extrapolated to all
@@ -104,7 +104,9 @@ def runs_within_limit(
 
 
 def fits_undrawn(runs: int, limit: float | None) -> bool:
-    """Return whether the episodes of all runs fit in any scenario, before one is drawn.
+    """Return whether the episodes of all runs fit, before one is drawn.
+
+    It holds for any scenario.
 
     Args:
         runs: Runs of the job.
@@ -125,7 +127,9 @@ def fits_drawn(estimate: MemoryEstimate, runs: int, limit: float) -> bool:
 
 
 def needs_memory_trial(method: Any, model: StateSpaceModel, runs: int, limit: float) -> bool:
-    """Return whether a job may exceed the limit. Most jobs are small enough to skip the trial.
+    """Return whether a job may exceed the limit.
+
+    Most jobs are small enough to skip the trial.
 
     Args:
         method: Filter.
@@ -212,7 +216,7 @@ def first_steps(record: Record, steps: int) -> Record:
 def _measure(
     method: Any, model: StateSpaceModel, record: Record, run_batch: int, watch: Any
 ) -> tuple[int, float, float]:
-    """Measure the bytes of a filter at its peak, of its output, and of its output in single precision."""
+    """Measure the bytes at the peak, of the output, and of a single-precision output."""
     runs, steps = record.y.shape[:2]
     draws = PhiloxStream(0, torch.arange(runs, device=model.anchor.device), model.anchor.dtype)
     recorder = watch(runs, steps) if watch else None

@@ -69,7 +69,10 @@ def make_provenance() -> dict[str, Any]:
 
 
 def read_versions() -> dict[str, str]:
-    """Return the versions that decide the numbers. `commit` is empty outside a checkout."""
+    """Return the versions that affect the numbers.
+
+    `commit` is empty outside a checkout.
+    """
     folder = Path(pfbench.__file__).resolve().parent
     command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude", "*"]
     try:

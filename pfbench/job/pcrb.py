@@ -40,7 +40,7 @@ def compute_posterior_bound(
     initial: Tensor | None = None,
     run_by_run: bool = False,
 ) -> Tensor:
-    """Compute the lower bound on the error covariance of any filter, in the chart at the truth.
+    """Compute the PCRB: a bound on the error covariance, in the chart at the truth.
 
     Expectations are means over the runs, with exact Jacobians along their true states. A component
     that is missing in some runs contributes its mean information. A state-dependent measurement
@@ -142,7 +142,7 @@ def _initial_root(covariance: Tensor, runs: int, separate: bool) -> Tensor:
 
 
 def _predict(model: StateSpaceModel, root: Tensor, x: Tensor, u: Any) -> Tensor:
-    """Return the root of the predicted bound [G, d, d] of G groups of runs, at states [R, D]."""
+    """Return the root of the predicted bound [G, d, d], at states [R, D]."""
     chart, noise = model.chart, cast(Any, model.noise)
     gain = model.noise_gain(u)
     if gain is None or not isinstance(noise.base_dist, Normal):
@@ -233,17 +233,17 @@ def _jacobian(
 
 
 def _pool(rows: Tensor, separate: bool) -> Tensor:
-    """Return the rows [R, k, d] unchanged, or pooled with the weight of a mean, [1, R k, d]."""
+    """Return rows [R, k, d] unchanged, or pooled as a mean, [1, R k, d]."""
     return rows if separate else rows.flatten(0, 1).unsqueeze(0) / len(rows) ** 0.5
 
 
 def _add_information(root: Tensor, rows: Tensor) -> Tensor:
-    """Return the root of (P^-1 + A' A)^-1 from the root of P [G, d, d] and rows A [G, k, d]."""
+    """Return the root of (P^-1 + A' A)^-1 [G, d, d] from the root of P and rows A."""
     eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device).expand_as(root)
     triangle = torch.linalg.qr(torch.cat([rows @ root, eye], -2), mode="r")[1]
     return torch.linalg.solve_triangular(triangle, root, upper=True, left=False)
 
 
 def _root_of(wide: Tensor) -> Tensor:
-    """Return the square root A [G, d, d] with A A' = B B' of a wide matrix B [G, d, k]."""
+    """Return a root A [G, d, d] with A A' = B B' of a wide matrix B [G, d, k]."""
     return torch.linalg.qr(wide.mT, mode="r")[1].mT

@@ -1,4 +1,4 @@
-"""Plan of a job: a checked configuration and the objects that it describes, each built once."""
+"""Plan of a job: a checked configuration and its objects, each built once."""
 
 from __future__ import annotations
 
@@ -53,7 +53,9 @@ DEFAULTS_NOT_IN_KEY: Mapping[str, Any] = {"budget": store.SAME_N}
 
 @dataclass(frozen=True, eq=False)
 class JobPlan:
-    """Objects of a job. Budget and memory are applied to them, never to the configuration.
+    """Objects of a job.
+
+    Budget and memory limit are applied to them, never to the configuration.
 
     Attributes:
         config: Resolved configuration.
@@ -150,14 +152,14 @@ def build_plan(config: JobConfig) -> JobPlan:
 
 
 def job_key(values: Mapping[str, Any]) -> str:
-    """Compute the key of a job from what it computes and from settings that are not default."""
+    """Compute the key of a job from all settings that affect its results."""
     values = {**values, "filter": replace_checkpoint_by_hash(values.get("filter"))}
     defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
     return store.config_key(values, (*IGNORED_IN_KEY, *defaults))
 
 
 def instantiate(node: Any) -> Any:
-    """Build the object that a node names by `_target_`. Lists and dicts become plain ones."""
+    """Build the object that a node names by `_target_`, with plain lists and dicts."""
     return hydra.utils.instantiate(node, _convert_="all")
 
 
@@ -215,7 +217,7 @@ def check_settings(values: Mapping[str, Any]) -> None:
 
 
 def apply_global_settings(values: Mapping[str, Any]) -> None:
-    """Check the settings of a job and set the process-wide ones: threads and memory allocator.
+    """Check the settings of a job, and set threads and memory allocator.
 
     Args:
         values: Configuration.

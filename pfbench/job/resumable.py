@@ -1,4 +1,4 @@
-"""Results of a study of several parts in one file, so that an interrupted study resumes."""
+"""Results of the parts of a study in one file, from which a study resumes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class ResumableResults:
-    """Finished parts of a study by name, each a JSON value, written as soon as it exists.
+    """Finished parts of a study by name, JSON values that are written at once.
 
     A file of another request, or one that is cut off, is replaced.
 

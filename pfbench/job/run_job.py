@@ -1,4 +1,4 @@
-"""Run of a job: one filter in one condition with all its Monte Carlo runs, from plan to file."""
+"""Run of a job: one filter in one condition with all its runs, from plan to file."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def run(
 
     Raises:
         ValueError: If a value of the configuration is invalid.
-        Exception: If the job fails. The traceback is written to `<key>.failed.json` in the folder of
-            the results.
+        Exception: If the job fails. The traceback is written to `<key>.failed.json` in the folder
+            of the results.
     """
     config = resolve_config(config, choices)
     values = config.values
@@ -228,7 +228,7 @@ def _main_group(meta: Mapping[str, Any]) -> str:
 
 
 def _main_rmse(outputs: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> float:
-    """Compute the root mean square of the error norm of the main group over all valid runs."""
+    """Compute the RMSE of the main group over all valid runs."""
     components = meta["state"]["groups"][_main_group(meta)]
     errors = outputs["error"][..., components].astype(float)
     square = (errors**2).sum(-1)[~outputs["lost"]]

@@ -1,4 +1,4 @@
-"""Scores of a filter's estimates against the truth, which the filter never receives.
+"""Scores of a filter's estimates against the truth.
 
 Errors and NEES are computed at every step. Scores of the whole distribution are computed at some
 steps only, since they cost more than a filter step: CRPS and energy scores [Gneiting, Raftery 2007]
@@ -118,7 +118,7 @@ class ScoreRecorder:
         self.seconds = 0.0
 
     def __call__(self, t: int, info: StepInfo) -> dict[str, Tensor]:
-        """Compute the error and the NEES of one step, and the scores if the step is scored.
+        """Compute error and NEES of one step, and scores if the step is scored.
 
         A filter without spread (all particles equal) has an infinite NEES, not an unknown one.
 
@@ -215,7 +215,7 @@ def score_normal(error: Tensor, covariance: Tensor, z: Tensor, groups: Groups) -
 
 
 def _separate_marginals(error: Tensor, deviation: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute CRPS and the probability below the truth, [R, d], with library operations."""
+    """Compute CRPS and probability below the truth, [R, d], by library operations."""
     off = (error.unsqueeze(1) + deviation).permute(0, 2, 1)  # particles minus truth [R, d, N]
     shared = w.unsqueeze(1).expand_as(off)
     crps = scoringrules.crps_ensemble(
@@ -225,7 +225,7 @@ def _separate_marginals(error: Tensor, deviation: Tensor, w: Tensor) -> tuple[Te
 
 
 def _separate_energy(points: Tensor) -> Tensor:
-    """Compute the energy score of points [R, n, s] against 0, [R], with library operations."""
+    """Compute the energy score [R] of points [R, n, s] by library operations."""
     return scoringrules.es_ensemble(points.new_zeros(points[:, 0].shape), points, backend="torch")
 
 
@@ -241,7 +241,7 @@ _energy_score = compilable(
 def _make_scores(
     error: Tensor, crps: Tensor, pit: Tensor, points: Tensor, groups: Groups
 ) -> ProperScores:
-    """Add the energy scores of `points` minus truth [R, n, d], and NaN where the truth is."""
+    """Add the energy scores of points minus truth [R, n, d], and NaN of the truth."""
     has_truth = ~torch.isnan(error)
     energy = [_energy_score(points[:, :, components]) for components in map(list, groups)]
     crps, pit = (torch.where(has_truth, values, torch.nan) for values in (crps, pit))

@@ -38,12 +38,12 @@ def memory_limit(requested: float | None, device: str) -> float | None:
 
 
 def available_memory() -> float | None:
-    """Return the free bytes of this machine or control group. None if they are unknown."""
+    """Return the free bytes of this machine or control group, or None if unknown."""
     return min([*_machine_memory(), *_group_memory()], default=None)
 
 
 def resident_bytes() -> int | None:
-    """Return the resident bytes of this process. None if the system does not report them."""
+    """Return the resident bytes of this process, or None if unknown."""
     file = Path("/proc/self/statm")
     return int(file.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if file.exists() else None
 
@@ -95,13 +95,13 @@ class AllocationCounter(TorchDispatchMode):
 
 
 class MemoryTrimmer:
-    """Callable that returns freed memory to the system at a time step, if there is much of it.
+    """Callable that returns large amounts of freed memory to the system.
 
     `cpp.keep_freed_memory` makes the C library keep freed memory. Small objects then lie between
-    holes that are too small for the tensors of the next step. A job with 60 MB of live tensors
-    grew to 850 MB within a hundred steps [measured]. A release takes milliseconds, so it happens only if the
-    resident memory is 50 % and 256 MiB above the first step after the last release. A query takes
-    as long as a small step, so it happens at every tenth step.
+    holes that are too small for the tensors of the next step. A job with 60 MB of live tensors grew
+    to 850 MB within a hundred steps [measured]. A release takes milliseconds, so it happens only if
+    the resident memory is 50 % and 256 MiB above the first step after the last release. A query
+    takes as long as a small step, so it happens at every tenth step.
     """
 
     def __init__(self) -> None:
@@ -161,7 +161,7 @@ def _read_number(file: Path) -> float | None:
 
 
 def _reclaimable(file: Path) -> float:
-    """Read the bytes of inactive file pages, which count as used and are freed on demand."""
+    """Read the bytes of inactive file pages, which are freed on demand."""
     words = file.read_text().split() if file.exists() else []
     values = dict(zip(words[::2], words[1::2], strict=True))
     return float(values.get("total_inactive_file", values.get("inactive_file", 0)))

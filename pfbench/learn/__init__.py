@@ -1,4 +1,4 @@
-"""Training of learned proposals: the public names of this folder, imported on first use."""
+"""Training of learned proposals: public names, imported on first use."""
 
 from pfbench.core.lazy_import import lazy_attributes
 

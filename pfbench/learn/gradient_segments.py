@@ -1,4 +1,4 @@
-"""Pass of a filter through training data, with the gradient cut between segments of steps."""
+"""Pass of a filter through training data, with gradients cut between segments."""
 
 from __future__ import annotations
 

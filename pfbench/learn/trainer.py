@@ -1,4 +1,4 @@
-"""Training of the networks in a filter, for any network, objective and gradient of resampling.
+"""Training of the networks in a filter, for any network and objective.
 
 All random numbers come from counters (seed, epoch, batch, run, step). A resumed training therefore
 gives the bits of an uninterrupted one, and batch size and machine do not change the training runs.
@@ -204,7 +204,7 @@ class TrainingState:
     def _batch(
         self, data: TrainingData, rows: Tensor, progress: Progress
     ) -> tuple[float, float, float]:
-        """Return mean loss, mean norm of the gradient and number of updates skipped as not finite."""
+        """Return mean loss, mean gradient norm and the number of skipped updates."""
         name, losses, norms, skipped = f"epoch {progress.epoch}", [], [], 0
         data, draws = self._loss_data(data, rows, name), self._draws(name, rows)
         for loss, _ in self._segments(data, draws):

@@ -75,7 +75,9 @@ class Training:
 
 @dataclass
 class Progress:
-    """Progress of a training. With networks and optimiser it is all that resuming needs.
+    """Progress of a training.
+
+    With networks and optimiser it is sufficient to resume the training.
 
     Attributes:
         epoch: Number of finished epochs.

@@ -1,4 +1,4 @@
-"""Training data: records of a scenario under several noise regimes, with true states."""
+"""Training data: records under several noise regimes, with true states."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ def draw_training_data(
         episode = scenario.draw(regime, torch.arange(i * runs, (i + 1) * runs), seed)
         if episode.record.feedback is not None:
             raise ValueError(
-                "scenario.closed_loop must be false for training, because a closed loop depends on the "
-                "filter, got true. Set scenario.closed_loop=false."
+                "scenario.closed_loop must be false for training, got true. A closed loop "
+                "depends on the filter. Set scenario.closed_loop=false."
             )
         converted = episode.record.to(model.anchor)
         record = model.prepare(episode.record).to(model.anchor)

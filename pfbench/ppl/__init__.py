@@ -1,4 +1,4 @@
-"""Parameter inference with models as probabilistic programs: the public names of this folder, imported on first use."""
+"""Parameter inference with probabilistic programs: names imported on first use."""
 
 from pfbench.core.lazy_import import lazy_attributes
 

@@ -1,4 +1,4 @@
-"""Random numbers that are correlated between iterations, and a resampler that preserves it."""
+"""Random numbers that are correlated between iterations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sequential inference of model parameters: iterated batch importance sampling and SMC^2.
+"""Sequential inference of parameters: IBIS and SMC^2.
 
 Each parameter particle has a filter of its own, which is a run of one batch.
 """
@@ -57,12 +57,13 @@ def smc2(
 ) -> Smc2Result:
     """Infer the parameters of a model after each measurement.
 
-    With a Gaussian filter this is IBIS on its likelihood, with a particle filter SMC^2. It converges
-    to the exact posterior of each step as the number of parameter particles grows. Weights are
-    multiplied by the evidence of each step. If the effective sample size falls below the threshold,
-    parameter particles are resampled with their filters. Metropolis-Hastings steps then move them,
-    each with a new filter from the first step. The proposal is a Gaussian random walk on the
-    unconstrained parameters, with 2.38 / sqrt(P) times the standard deviation of the particles.
+    With a Gaussian filter this is IBIS on its likelihood, with a particle filter SMC^2. It
+    converges to the exact posterior of each step as the number of parameter particles grows.
+    Weights are multiplied by the evidence of each step. If the effective sample size falls below
+    the threshold, parameter particles are resampled with their filters. Metropolis-Hastings steps
+    then move them, each with a new filter from the first step. The proposal is a Gaussian random
+    walk on the unconstrained parameters, with 2.38 / sqrt(P) times the standard deviation of the
+    particles.
 
     Args:
         unknown: Model and prior of its P parameters.
@@ -85,12 +86,12 @@ def smc2(
     """
     if particles < 2 or moves < 0:
         raise ValueError(
-            f"smc2.particles must be at least 2 and smc2.moves at least 0, got particles={particles} "
-            f"and moves={moves}. Change these values."
+            f"smc2.particles must be at least 2 and smc2.moves at least 0, got "
+            f"particles={particles} and moves={moves}. Change these values."
         )
     if not 0.0 <= threshold <= 1.0:
         raise ValueError(
-            f"smc2.threshold must be from 0 to 1, got {threshold}. Give a fraction of the particles."
+            f"smc2.threshold must be from 0 to 1, got {threshold}. Give a fraction of M."
         )
     with torch.no_grad():
         sampler = _ParameterSampler(unknown, method, record, particles, seed)
@@ -180,7 +181,7 @@ class _ParameterSampler:
         return _map_belief(lambda a: a[rows], belief)
 
     def _run_filters(self, z: Tensor, t: int, draws: RandomStream) -> tuple[Any, Tensor]:
-        """Filter y_1:t with these parameters; return beliefs and log p(z) + log p(y_1:t | z) [M]."""
+        """Return beliefs given y_1:t, and log p(z) + log p(y_1:t | z) [M]."""
         values, log_prior = self.unknown.constrained(z)
         valid = self.unknown.in_support(values) & torch.isfinite(log_prior)
         z = torch.where(valid.unsqueeze(-1), z, self.z)  # rejected below
@@ -228,7 +229,7 @@ def _select_by_run(mask: Tensor, new: Any, old: Any) -> Any:
 
 
 def _map_belief(function: Callable[..., Tensor], *beliefs: Any) -> Any:
-    """Apply a function to the tensors of beliefs, in dicts too; other fields keep their value."""
+    """Apply a function to the tensors of beliefs, including those in dicts."""
     fields: list[Any] = []
     for values in zip(*beliefs, strict=True):
         if isinstance(values[0], Tensor):

@@ -39,7 +39,7 @@ class MarginalLikelihood(Protocol):
 
 @dataclass(frozen=True)
 class FilterLikelihood(MarginalLikelihood):
-    """The marginal likelihood computed by a filter, exact or approximate as the filter is.
+    """Marginal likelihood computed by a filter, exact if the filter is.
 
     Through a Gaussian filter it is differentiable. A particle filter gives an unbiased estimate
     with fixed random numbers. Its gradient is not that of the likelihood: use it in `pmmh`, which
@@ -61,7 +61,7 @@ class FilterLikelihood(MarginalLikelihood):
 
 @dataclass(frozen=True)
 class GaussianHmmLikelihood(MarginalLikelihood):
-    """The marginal likelihood of a linear-Gaussian model by Pyro's GaussianHMM, parallel over time.
+    """Marginal likelihood of a linear-Gaussian model by Pyro's GaussianHMM.
 
     A call raises ValueError for models that are not linear, have singular noise, observe their
     initial state or need inputs, and for records with missing measurements.

@@ -1,4 +1,4 @@
-"""One model for each run, so that chains and parameter particles share one filter pass."""
+"""Batch of models, so that chains or parameter particles share a filter pass."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class ModelBatch(ModelWrapper):
         return torch.vmap(call_run)(self._buffers_by_run, *expanded)
 
     def _map_distribution(self, f: Callable[..., Any], *args: Any) -> Distribution:
-        """Map a distribution over the runs: its parameters are mapped, then it is built again."""
+        """Map the parameters of a distribution over the runs and build it again."""
         kinds: list[Any] = []
 
         def parameters(model: StateSpaceModel, *run_args: Any) -> dict[str, Tensor]:

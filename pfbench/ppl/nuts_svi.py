@@ -1,4 +1,4 @@
-"""Gradient-based inference of parameters with Pyro: NUTS and variational inference.
+"""Gradient-based inference of parameters with Pyro: NUTS and SVI.
 
 Pyro's samplers use torch's global random state. It is seeded and restored here (`fork_rng`).
 """
@@ -118,7 +118,7 @@ def svi(
 def normal_guide(
     unknown: ParameterisedModel, separate_parameters: bool = False, spread: float = 0.3
 ) -> Callable[[Record], Values]:
-    """Build a variational guide: a normal distribution of the unconstrained parameters.
+    """Build a variational guide: a normal distribution of unconstrained parameters.
 
     It has all covariances and starts at the medians of the prior.
 

@@ -1,4 +1,4 @@
-"""Proposals of particle marginal Metropolis-Hastings, with moments learned from the chains."""
+"""Proposals of particle marginal Metropolis-Hastings, adapted to the chains."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Particle marginal Metropolis-Hastings: a random walk of parameters with a filter run per step.
+"""Particle marginal Metropolis-Hastings: chains of parameters with a filter each.
 
 All chains move at once, as runs of one batch. `ModelBatch` maps the model of each chain over them.
 """
@@ -150,7 +150,7 @@ def _run_chains(
 def _metropolis_step(
     target: PosteriorEstimator, proposal: _Proposal, z: Tensor, log_p: Tensor, iteration: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return new states and log densities, the probabilities of acceptance and the outcomes."""
+    """Return states, log densities, acceptance probabilities and outcomes."""
     stream = PhiloxStream(target.seed, torch.arange(log_p.numel())).at_step(iteration)
     proposed_z, log_back = proposal(z, stream)
     proposed_log_p, numbers = target(proposed_z, iteration)

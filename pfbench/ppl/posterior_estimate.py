@@ -1,4 +1,4 @@
-"""Estimates of the posterior density of parameters by a filter, for several chains at once."""
+"""Estimates of the posterior density of parameters by a filter."""
 
 from __future__ import annotations
 

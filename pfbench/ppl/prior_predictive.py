@@ -1,4 +1,4 @@
-"""Simulation of measurements from a model, for draws from the prior predictive distribution."""
+"""Simulation of measurements from a model, for prior predictive draws."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from pfbench.model.base import StateSpaceModel, initial_law
 def simulate(model: StateSpaceModel, record: Record, seed: int) -> tuple[Record, Tensor]:
     """Simulate measurements of a model with the runs and inputs of a record.
 
-    With a model whose parameters come from the prior these are draws from the prior predictive distribution. The
-    random numbers are those of the scenario `ModelSimulation`. Run i does not depend on the number
-    of runs.
+    With a model whose parameters come from the prior these are draws from the prior predictive
+    distribution. The random numbers are those of the scenario `ModelSimulation`. Run i does not
+    depend on the number of runs.
 
     Args:
         model: State-space model.

@@ -1,6 +1,7 @@
 """Pyro programs of models with unknown parameters.
 
-The marginal likelihood enters a program as one factor, or the program samples the path of the states.
+The marginal likelihood enters a program as one factor, or the program samples the path of the
+states.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from pfbench.ppl.parameterised_model import ParameterisedModel, Values
 def program(
     unknown: ParameterisedModel, likelihood: MarginalLikelihood, separate_parameters: bool = False
 ) -> Callable[[Record], Values]:
-    """Build a Pyro program of a record: a site per parameter and the factor `evidence`.
+    """Build a Pyro program with a site per parameter and the factor `evidence`.
 
     Args:
         unknown: Model and prior.

@@ -1,4 +1,4 @@
-"""Noise levels that switch by a Markov chain, inferred exactly with Pyro's DiscreteHMM."""
+"""Noise levels that switch by a Markov chain, by Pyro's DiscreteHMM."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pfbench.ppl.parameterised_model import Prior, Values
 
 @dataclass(frozen=True)
 class SwitchingNoise:
-    """Independent normal errors of two sizes, nominal and surge, switched by a Markov chain.
+    """Independent normal errors of two sizes, switched by a Markov chain.
 
     It fits errors that are independent from step to step given the regime: errors of a sensor at
     rest or against a reference, or innovations of a filter. The sum over the chain is exact, so

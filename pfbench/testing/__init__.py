@@ -5,7 +5,7 @@
     check_filter(ParticleFilter(100, EssResampler(MyScheme())))
 
 Each check simulates, compares with an independent reference and returns a `LawCheck`. It raises an
-AssertionError with the statistic, its standard error and the limit if the law does not hold.
+AssertionError with the statistic, its standard error and the limit if the statement does not hold.
 """
 
 from pfbench.core.lazy_import import lazy_attributes

@@ -1,4 +1,4 @@
-"""Tests of whole filters: evidence, rate of convergence, causality, independence of runs."""
+"""Tests of filters: evidence, convergence, causality, independence of runs."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def check_evidence(
         The average with the most standard errors.
 
     Raises:
-        AssertionError: If the law does not hold.
+        AssertionError: If the statement does not hold.
     """
     model, y = case_or_default(model, y)
     answer = reference_moments(model, y) if exact is None else exact  # type: ignore[arg-type]
@@ -136,7 +136,8 @@ def check_convergence(
     statement = "errors fall with the root of the number of particles"
     excess = slope + 0.5 if faster else abs(slope + 0.5)
     assert excess < limit * error, (
-        f"{statement}: the slope must be -0.5, got {slope:.3f} +- {error:.3f}. The limit is {limit:g} errors"
+        f"{statement}: the slope must be -0.5, got {slope:.3f} +- {error:.3f}. "
+        f"The limit is {limit:g} errors"
     )
     return LawCheck(statement, slope, limit, error)
 
@@ -173,7 +174,8 @@ def check_causality(
             difference = float((new - old).abs().nan_to_num().max())
             same = torch.equal(old.nan_to_num(), new.nan_to_num())
             assert same, (
-                f"{statement}: the {name} up to step {t} must not change, got {difference:.3g}. The limit is 0"
+                f"{statement}: the {name} up to step {t} must not change, got {difference:.3g}. "
+                "The limit is 0"
             )
     return LawCheck(statement, 0.0, 0.0)
 
@@ -228,7 +230,7 @@ def check_filter(method: Any, runs: int = 1000) -> dict[str, LawCheck]:
         Results by the name of the check.
 
     Raises:
-        AssertionError: If a law does not hold.
+        AssertionError: If a statement does not hold.
     """
     results = {"causality": check_causality(method), "independence": check_independence(method)}
     has_particles = is_dataclass(method) and "particles" in {field.name for field in fields(method)}

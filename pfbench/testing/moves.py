@@ -1,4 +1,4 @@
-"""Test of moves: they leave the distribution of the path given the measurements invariant."""
+"""Test of moves: they leave the distribution of the path invariant."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PathPosterior(NamedTuple):
     root: Array
 
     def belief(self, history: PathHistory | None) -> ParticleBelief:
-        """Return the paths as particles of one run, with the past states that `history` stores.
+        """Return the paths as particles of one run, with the stored past states.
 
         Args:
             history: Attribute `required_history` of the move. None stores nothing.
@@ -72,7 +72,7 @@ class PathPosterior(NamedTuple):
         return paths
 
     def moments_p_value(self, paths: Array, components: slice = slice(None)) -> float:
-        """Return the p-value of means, variances and covariances of whitened components together.
+        """Return the p-value of all moments of the whitened components.
 
         Args:
             paths: Paths, [M, SIZE].
@@ -89,7 +89,7 @@ class PathPosterior(NamedTuple):
         return float(stats.chi2(2 * d + d * (d - 1) / 2).sf(statistic))
 
     def log_density_p_value(self, paths: Array) -> float:
-        """Return the p-value of the mean change of each log density that makes up the path's.
+        """Return the p-value of the mean changes of the log densities.
 
         Paths before and after are paired, so that paths that did not move add no noise. The power
         is many times that of `moments_p_value`.
@@ -103,7 +103,10 @@ class PathPosterior(NamedTuple):
         return float(stats.f(k, m - k).sf(t2 * (m - k) / (k * (m - 1))))
 
     def log_densities(self, paths: Array) -> Array:
-        """Return log p(x_0), log p(x_j | x_j-1) and log p(y_j | x_j) less constants, [M, 2 STEPS + 1]."""
+        """Return the log densities of a path's factors, [M, 2 STEPS + 1].
+
+        These are log p(x_0), log p(x_j | x_j-1) and log p(y_j | x_j) without constants.
+        """
         x, (f, g, h, l0) = (
             paths.reshape(-1, STEPS + 1, 2),
             (getattr(self.model, k).numpy() for k in ("f", "g", "h", "l0")),
@@ -117,7 +120,7 @@ class PathPosterior(NamedTuple):
 
 
 def simulate_path_posterior(noise_sd: float, paths: int) -> PathPosterior:
-    """Draw paths from the joint normal distribution of x_0 and all noises given simulated measurements.
+    """Draw paths of a linear-Gaussian model given simulated measurements.
 
     Args:
         noise_sd: Standard deviation of the process noise of a walk with constant velocity.
@@ -171,7 +174,7 @@ def check_move(
         The smaller p-value, with the acceptance rate and the fraction moved as details.
 
     Raises:
-        AssertionError: If the law does not hold, or too few particles moved.
+        AssertionError: If the statement does not hold, or too few particles moved.
     """
     kernel: Any = move
     chain: Any = MetropolisHastings(kernel, mcmc_steps) if hasattr(move, "propose") else move

@@ -1,4 +1,4 @@
-"""Test of proposals: weighted averages over the proposal equal averages over the model."""
+"""Test of proposals: their weighted averages equal averages over the model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pfbench.filter.particle.proposals import Proposal
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing.results import LawCheck, check_means
 
-_LAW = "a proposal returns log p(w) - log q(w)"
+_STATEMENT = "a proposal returns log p(w) - log q(w)"
 
 
 def check_proposal(
@@ -21,8 +21,8 @@ def check_proposal(
 ) -> LawCheck:
     """Check E_q[exp(log_ratio) f(x)] = E_p[f(x)] for f = 1, x and x^2.
 
-    The model is a walk with constant velocity, whose predicted moments are known. Its measurement is
-    weak, so that a proposal that uses it stays close to the model and the ratio has a variance.
+    The model is a walk with constant velocity, whose predicted moments are known. Its measurement
+    is weak, so that a proposal that uses it stays close to the model and the ratio has a variance.
 
     Args:
         proposal: Proposal to test.
@@ -35,7 +35,7 @@ def check_proposal(
         The average with the most standard errors.
 
     Raises:
-        AssertionError: If the law does not hold.
+        AssertionError: If the statement does not hold.
     """
     model = linear_walk(1.0, 0.5, 2.0)
     streams = PhiloxStream(seed, torch.arange(runs))
@@ -59,4 +59,4 @@ def check_proposal(
         for name, value in averages.items()
         for i in range(value.shape[-1])
     }
-    return check_means(_LAW, deviations, limit)
+    return check_means(_STATEMENT, deviations, limit)

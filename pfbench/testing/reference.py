@@ -1,4 +1,6 @@
-"""Reference solutions of linear-Gaussian models in NumPy. They share no code with the filters.
+"""Reference solutions of linear-Gaussian models in NumPy.
+
+They share no code with the filters.
 
 The Kalman filter uses the covariance form and picks out the observed components of one run.
 """

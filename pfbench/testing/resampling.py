@@ -1,4 +1,4 @@
-"""Test of resamplers and schemes: expected counts N w, and copies of whole particles."""
+"""Test of resamplers and schemes: expected counts, copies of whole particles."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pfbench.filter.particle.resampling import EssResampler, Resampler, Resampli
 from pfbench.model.linear_gaussian import local_level
 from pfbench.testing.results import LawCheck, check_p_values
 
-_LAW = "a resampler gives each particle its weight on average"
+_STATEMENT = "a resampler gives each particle its weight on average"
 
 
 def check_resampling(
@@ -27,12 +27,12 @@ def check_resampling(
     runs: int = 20_000,
     seed: int = 1,
 ) -> LawCheck:
-    """Check that a resampler or a scheme is unbiased and copies each particle as a whole.
+    """Check that a resampler or a scheme is unbiased and copies whole particles.
 
     The weights are uneven, some are 0. The total weight of the copies of each particle must average
-    to its weight, by Hotelling's test over runs. States, stored past, memory and ancestors of a slot
-    must belong to one particle. A resampler is tested with the weights as resampling probabilities,
-    and with others, for which its weights must correct.
+    to its weight, by Hotelling's test over runs. States, stored past, memory and ancestors of a
+    slot must belong to one particle. A resampler is tested with the weights as resampling
+    probabilities, and with others, for which its weights must correct.
 
     Args:
         stage: Resampler, or scheme to be used in every run.
@@ -45,7 +45,7 @@ def check_resampling(
         The smaller of the p-values.
 
     Raises:
-        AssertionError: If the law does not hold.
+        AssertionError: If the statement does not hold.
     """
     count = particles if slots is None else slots
     resampler: Any = EssResampler(stage, 1.0) if _is_scheme(stage) else stage  # type: ignore[arg-type]
@@ -60,11 +60,11 @@ def check_resampling(
     for name, log_a in probabilities.items():
         shares = _shares(resampler, log_w.expand(runs, -1), log_a, count, seed)
         assert not shares[:, a == 0.0].any(), (
-            f"{_LAW}: with {name}, a particle of weight 0 was copied"
+            f"{_STATEMENT}: with {name}, a particle of weight 0 was copied"
         )
         p_values[name], deviations[name] = _hotelling(count * (shares - a))
     return check_p_values(
-        _LAW, p_values, 1e-4, largest_deviation_in_copies=max(deviations.values())
+        _STATEMENT, p_values, 1e-4, largest_deviation_in_copies=max(deviations.values())
     )
 
 
@@ -74,7 +74,7 @@ def _is_scheme(stage: object) -> bool:
 
 
 def _uneven_weights(n: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw weights of all sizes [N], with zeros at both ends and inside, and an exact multiple of 1/N."""
+    """Draw weights of all sizes [N], with zeros and an exact multiple of 1/N."""
     a = rng.gamma(0.5, size=n)
     a[[0, n // 2, 3, -1]] = 0.0
     a *= (1 - 2 / n) / a.sum()
@@ -83,7 +83,7 @@ def _uneven_weights(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _shares(resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int) -> np.ndarray:
-    """Resample particles that are numbered, and return the weight of all copies of each [runs, N]."""
+    """Resample numbered particles, and return the weight of their copies [runs, N]."""
     runs, n = log_w.shape
     number = torch.arange(n, dtype=torch.float64).expand(runs, -1)
     places = torch.tensor(
@@ -114,7 +114,7 @@ def _shares(resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int)
     )
     live = torch.isfinite(after.log_w)
     assert int(live.sum(1).max()) <= count, (
-        f"{_LAW}: at most {count} slots must be active, got {int(live.sum(1).max())}"
+        f"{_STATEMENT}: at most {count} slots must be active, got {int(live.sum(1).max())}"
     )
     w, m = after.window["w"][..., 0, 0], after.memory["m"][..., 0]
     is_consistent = (after.x[..., 0] == places[w.long()]) & (w == m)
@@ -127,14 +127,14 @@ def _shares(resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int)
             & (back.gather(1, w.long()) == after.ancestors)
         )
     assert bool(is_consistent[live].all()), (
-        f"{_LAW}: state, window, memory and ancestor of a slot must be of one particle"
+        f"{_STATEMENT}: state, window, memory and ancestor of a slot must be of one particle"
     )
     weight = torch.where(live, after.log_w.exp(), 0.0)
     return torch.zeros(runs, n, dtype=torch.float64).scatter_add(1, w.long(), weight).numpy()
 
 
 def _hotelling(deviations: np.ndarray) -> tuple[float, float]:
-    """Return the p-value of a mean of 0 and the largest mean; directions without spread must be exact."""
+    """Return the p-value of a mean of 0, and the largest mean."""
     runs, mean = len(deviations), deviations.mean(0)
     spread, axes = np.linalg.eigh(np.cov(deviations.T))
     free = spread > 1e-9

@@ -1,4 +1,4 @@
-"""The result of a statistical test, and the comparison of averages with their expectations."""
+"""Result of a statistical test, and comparison of averages with expectations."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def check_means(
         statistic = abs(mean) / max(error, 1e-12)
         text = f"{mean:.4g} +- {error:.2g}"
         assert abs(mean) < limit * error + 1e-9, (
-            f"{statement}: {name} must average to 0, got {text}, {statistic:.1f} standard errors. The limit is {limit:g}"
+            f"{statement}: {name} must average to 0, got {text}, {statistic:.1f} standard errors. "
+            f"The limit is {limit:g}"
         )
         assert error < max_error, (
             f"{statement}: {name} is {text}, too uncertain to decide. Use more runs or particles"
