@@ -104,9 +104,7 @@ def runs_within_limit(
 
 
 def fits_undrawn(runs: int, limit: float | None) -> bool:
-    """Return whether the episodes of all runs fit, before one is drawn.
-
-    It holds for any scenario.
+    """Return whether the undrawn episodes of all runs of any scenario fit.
 
     Args:
         runs: Runs of the job.
