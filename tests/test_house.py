@@ -212,7 +212,7 @@ def test_files_and_functions_are_short() -> None:
 
 
 def test_the_doors_list_what_they_export() -> None:
-    for folder in ("nav", "model", "noise", "scenario", "filter", "learn", "ppl"):
+    for folder in ("nav", "model", "noise", "scenario", "filter", "job", "learn", "ppl", "testing"):
         door = importlib.import_module(f"pfbench.{folder}")
         assert sorted(door.__all__) == dir(door)
         assert all(hasattr(door, name) for name in door.__all__)

@@ -32,7 +32,7 @@ def train_network(words: Sequence[str]) -> None:
 
     if {"-m", "--multirun"} & set(words):
         raise ValueError(
-            "pfbench train must be run without -m: it trains one network. "
+            "pfbench train must be run without -m, got a sweep: it trains one network. "
             "Set train.noise_regimes=[a,b] to train on several noise regimes."
         )
     config = compose(words)

@@ -208,7 +208,7 @@ def check_settings(values: Mapping[str, Any]) -> None:
     }
     for key, requirement in requirements.items():
         if not valid[key]:
-            raise ValueError(f"{key} must be {requirement}, got {values[key]}.")
+            raise ValueError(f"{key} must be {requirement}, got {values[key]}. Change this value.")
     device, count = values["device"], torch.cuda.device_count()
     if device != "cpu" and (torch.device(device).index or 0) >= count:
         raise ValueError(

@@ -156,7 +156,7 @@ def _result_path(values: Mapping[str, Any]) -> Path:
     if not re.fullmatch(r"\w[\w.-]*", str(study)):
         raise ValueError(
             "study must be the name of a results folder (letters, digits, points, dashes and "
-            f"underscores), got {study}."
+            f"underscores), got {study}. Choose another name."
         )
     if study in _RESERVED:
         raise ValueError(

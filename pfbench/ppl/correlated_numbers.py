@@ -53,8 +53,8 @@ class CorrelatedStream(BatchRandomStream):
     @override
     def select_runs(self, runs: slice) -> RandomStream:
         raise ValueError(
-            "pmmh.rho must be 0 for a filter that splits the runs, because correlated numbers "
-            "belong to all of them. Set rho=0."
+            "pmmh.rho must be 0 for a filter that splits the runs, got a correlated stream, whose "
+            "numbers belong to all of them. Set rho=0."
         )
 
     @override

@@ -164,8 +164,8 @@ def _differing(models: Sequence[StateSpaceModel]) -> dict[str, Tensor]:
         changed = list_non_buffers(first, model)
         if changed:
             raise ValueError(
-                f"{kind} must register {changed[0]} as a buffer, because the models of a batch may "
-                "differ in buffers only. Call register_buffer in its constructor."
+                f"{kind} must register {changed[0]} as a buffer, got models that differ in it. Call "
+                "register_buffer in its constructor."
             )
         if not torch.equal(first.origin, model.origin):
             raise ValueError(

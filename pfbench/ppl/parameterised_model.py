@@ -55,8 +55,8 @@ class ParameterisedModel:
             same = all(map(torch.equal, first.buffers(), second.buffers()))
             if same and not list_non_buffers(first, second):
                 raise ValueError(
-                    f"prior[{name}] must change the model, but no buffer of {type(first).__name__} "
-                    f"depends on it. Check that `make` uses `{name}`."
+                    f"prior[{name}] must change the model, got a {type(first).__name__} whose buffers "
+                    f"do not depend on it. Check that `make` uses `{name}`."
                 )
 
     @property

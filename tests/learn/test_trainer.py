@@ -563,7 +563,7 @@ def test_train_and_run_at_the_command_line(tmp_path: Path) -> None:
     ("words", "said"),
     [
         (("run", "runs=2"), "checkpoint must be a file .*got null.*`pfbench train`"),
-        (("train", "-m"), "must be run without -m: it trains one network"),
+        (("train", "-m"), "must be run without -m, got a sweep: it trains one network"),
         (("train", "train.epoch=3"), "Similar: train.epochs"),
         (("train", "oracle_noise=true"), "oracle_noise must be false for training, got true"),
         (
