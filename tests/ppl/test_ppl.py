@@ -358,9 +358,7 @@ def test_the_states_of_a_simulation_are_those_that_its_noise_makes() -> None:
 
 
 def test_what_is_unknown_must_matter() -> None:
-    with pytest.raises(
-        ValueError, match=r"prior\[c\] must change the model, got a LinearGaussian"
-    ):
+    with pytest.raises(ValueError, match=r"prior\[c\] must change the model, got a LinearGaussian"):
         ParameterisedModel(
             lambda a, c: walk(a, 1.0), {"a": LogNormal(0.0, 1.0), "c": LogNormal(0.0, 1.0)}
         )
