@@ -16,7 +16,7 @@ class ResumableResults:
 
     Args:
         path: File of the results. Its folder is created.
-        request: What the caller computes, as far as the parts depend on it.
+        request: Description of the computation on which the parts depend.
 
     Attributes:
         path: File of the results.

@@ -66,7 +66,7 @@ def draw_training_data(
         Training data of all regimes in turn.
 
     Raises:
-        ValueError: if the filter's estimates change the data (closed loop).
+        ValueError: If the filter's estimates change the data (closed loop).
     """
     records, states = [], []
     for i, regime in enumerate(regimes):

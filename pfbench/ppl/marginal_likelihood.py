@@ -83,7 +83,7 @@ def gaussian_hmm(model: StateSpaceModel, record: Record) -> GaussianHMM:
         Distribution with batch [R].
 
     Raises:
-        ValueError: if the model or the record is not supported, see `GaussianHmmLikelihood`.
+        ValueError: If the model or the record is not supported, see `GaussianHmmLikelihood`.
     """
     kind = type(model.model if isinstance(model, ModelBatch) else model).__name__
     gain = model.noise_gain(()) if model.linear else None

@@ -28,7 +28,7 @@ class ModelBatch(ModelWrapper):
         runs_per_model: Number of consecutive runs that share a model.
 
     Raises:
-        ValueError: if models differ in something other than a buffer, in their origin, or in their
+        ValueError: If models differ in something other than a buffer, in their origin, or in their
             noise distribution.
     """
 

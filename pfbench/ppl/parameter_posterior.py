@@ -74,7 +74,7 @@ class ParameterPosterior:
             Table with the parameters as index.
 
         Raises:
-            ValueError: if runs have their own parameters.
+            ValueError: If runs have their own parameters.
         """
         rows = {}
         for name, a in self.draws.items():

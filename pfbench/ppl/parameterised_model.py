@@ -32,7 +32,7 @@ class ParameterisedModel:
         prior: Distribution of each parameter by name, scalar and from pyro.distributions.
 
     Raises:
-        ValueError: if `prior` is empty, a distribution is not scalar or not from Pyro, or a
+        ValueError: If `prior` is empty, a distribution is not scalar or not from Pyro, or a
             parameter does not change the model.
     """
 
@@ -81,7 +81,7 @@ class ParameterisedModel:
             Model of G `runs_per_model` runs.
 
         Raises:
-            ValueError: if the model stores a parameter outside its buffers.
+            ValueError: If the model stores a parameter outside its buffers.
         """
         rows = zip(*(values[name].unbind(0) for name in self.prior), strict=True)
         models = [self.model(dict(zip(self.prior, row, strict=True))) for row in rows]
@@ -98,7 +98,7 @@ class ParameterisedModel:
             Values by name, [count].
 
         Raises:
-            ValueError: if a prior cannot be drawn, see `draw_values`.
+            ValueError: If a prior cannot be drawn, see `draw_values`.
         """
         stream = PhiloxStream(seed, torch.arange(count))
         return {

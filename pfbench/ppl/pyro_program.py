@@ -70,7 +70,7 @@ def latent_program(unknown: ParameterisedModel) -> Callable[[Record], Values]:
         Program that takes a record and returns the parameters.
 
     Raises:
-        ValueError: if a parameter has the name of a site.
+        ValueError: If a parameter has the name of a site.
     """
     reserved = {"initial_state", "driving_noise", "path", "seen"} & set(unknown.prior)
     if reserved:

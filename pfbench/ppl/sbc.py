@@ -49,7 +49,7 @@ class SbcRanks(NamedTuple):
             The p-value.
 
         Raises:
-            ValueError: if the bins do not divide the ranks evenly.
+            ValueError: If the bins do not divide the ranks evenly.
         """
         return float(chisquare(self.counts(name, bins)).pvalue)
 
@@ -64,7 +64,7 @@ class SbcRanks(NamedTuple):
             Counts, [bins].
 
         Raises:
-            ValueError: if the bins do not divide the ranks evenly.
+            ValueError: If the bins do not divide the ranks evenly.
         """
         ranks = self.draws + 1
         if ranks % bins:
