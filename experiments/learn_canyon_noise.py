@@ -70,7 +70,7 @@ from pfbench.report.plots.plotting import (
     line_styles,
     render_palette_png,
 )
-from pfbench.results.statistics import holm, wilcoxon_signed_rank
+from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
 from pfbench.scenario.recorded.drive import find_dataset
 from pfbench.scenario.recorded.urban_drive import UrbanDrive, read_drive
 from pfbench.scenario.recorded.urban_drive import select_stretch as cut

@@ -57,7 +57,7 @@ from pfbench.model.base import StateSpaceModel
 from pfbench.model.textbook import StochasticVolatility
 from pfbench.noise.white import NominalNoise
 from pfbench.report.plots.plotting import COLUMN, RC, add_legend, line_styles, render_palette_png
-from pfbench.results.statistics import holm, wilcoxon_signed_rank
+from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
 from pfbench.scenario.base import Scenario
 from pfbench.scenario.model_simulation import ModelSimulation
 

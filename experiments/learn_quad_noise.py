@@ -52,7 +52,7 @@ from pfbench.report.markdown import (
     markdown_row,
 )
 from pfbench.report.plots.plotting import COLUMN, RC, add_legend, line_styles, render_palette_png
-from pfbench.results.statistics import holm, wilcoxon_signed_rank
+from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
 from pfbench.scenario.recorded.drive import RecordedFlights
 
 LEARNED_ON, TRIED_ON = (1, 2, 3, 4, 5), tuple(range(6, 21))

@@ -23,7 +23,7 @@ def load(
     Args:
         study: Name of the study.
         results: Folder of all results.
-        mixed: Whether results of different versions may be mixed.
+        allow_mixed_versions: Whether results of several versions are accepted.
 
     Returns:
         A row per run, component and metric, see `pfbench.results.frame.load_frame`.

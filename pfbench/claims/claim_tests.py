@@ -21,8 +21,9 @@ from scipy import stats
 
 from pfbench.claims.schema import LOST, NO_POWER, NOT_RUN, ClaimTest
 from pfbench.results.error_measures import Array
-from pfbench.results.intervals import order_statistic_interval
-from pfbench.results.statistics import beyond_finite, log_ratio, wilcoxon_signed_rank
+from pfbench.results.statistics.effect_sizes import beyond_finite, log_ratio
+from pfbench.results.statistics.intervals import order_statistic_interval
+from pfbench.results.statistics.signed_rank import wilcoxon_signed_rank
 
 HOLDS, FAILS, OPEN = "holds", "fails", "open"
 EFFECT_FACTOR = 2.0  # between measured and printed effect, on the logarithmic scale

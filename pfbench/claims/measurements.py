@@ -10,9 +10,10 @@ import numpy as np
 import pandas as pd
 
 from pfbench.claims.schema import SCALED, Claim, ClaimTest
-from pfbench.results import metrics, status, store
+from pfbench.results import metric_values, metrics, status, store
+from pfbench.results.conditions import Condition, JobFile, load_conditions
 from pfbench.results.error_measures import convergence_time, mean_per_run, rmse_per_run
-from pfbench.results.frame import Condition, JobFile, drop_before, load_conditions, select_steps
+from pfbench.results.frame import drop_before, select_steps
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
 Side = tuple[str, str, str]  # study, condition, label
@@ -86,7 +87,7 @@ def measure_claim_test(result: store.JobResult, test: ClaimTest) -> np.ndarray:
         dofs = [len(parts) for parts in groups.values()]
         severe = status.is_severely_overconfident(result.arrays["nees"], dofs, lost)
         return (severe | lost).astype(np.float64)
-    data = metrics.MetricInput(result)
+    data = metric_values.MetricInput(result)
     if test.metric == "nees":
         if test.group not in groups:
             key, options = result.meta["key"], ", ".join(groups)
@@ -164,7 +165,7 @@ def _canonical(value: Any) -> str:
 def _measure_errors(result: store.JobResult, test: ClaimTest) -> np.ndarray:
     """Measure a metric of the errors of a group or of one component."""
     group = _select_group(result, test)
-    data = metrics.MetricInput(result, group, group.whole)
+    data = metric_values.MetricInput(result, group, group.whole)
     error, lost, time = data.select("error"), result.arrays["lost"], result.arrays["time"]
     if test.metric == "settled":
         return convergence_time(time, error, lost, test.settled)

@@ -19,10 +19,9 @@ from pfbench.claims.measurements import Side, claim_job_metadata, load_claim_mea
 from pfbench.claims.schema import PAPERS, Claim, ClaimTest, read_claims
 from pfbench.claims.verdicts import VERDICTS, ClaimVerdict, decide_claims
 from pfbench.report import cost, table_formats, writers
-from pfbench.results.frame import natural_sort_key
+from pfbench.results.conditions import natural_sort_key
 
 Jobs = Mapping[Side, Mapping[str, Any]]
-
 STUDY = "claims"  # folder of the page among the reports
 _TEXT_COLUMNS = ("form", "test", "a", "b", "measure", "condition", "unit", "outcome")
 

@@ -27,8 +27,8 @@ from pfbench.claims.claim_tests import (
     run_claim_test,
 )
 from pfbench.claims.schema import NO_POWER, Claim, ClaimTest
-from pfbench.results import power
-from pfbench.results.statistics import holm
+from pfbench.results.statistics import power
+from pfbench.results.statistics.signed_rank import holm
 
 UNDECIDED = "undecided"
 VERDICTS = (

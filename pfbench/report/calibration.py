@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 
 from pfbench.report.plots.condition_figures import FigureSpec
 from pfbench.report.plots.plotting import LineStyle, add_legend, stacked_axes
-from pfbench.results import consistency, intervals, store
+from pfbench.results import consistency, store
 from pfbench.results.state_groups import component_groups
+from pfbench.results.statistics import intervals
 
 _BINS = 10
 

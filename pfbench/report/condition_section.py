@@ -15,8 +15,10 @@ from pfbench.report.plots import comparison_figures, condition_figures
 from pfbench.report.plots.plotting import format_slug
 from pfbench.report.provenance import distinct_values
 from pfbench.results import coverage, status, store
-from pfbench.results.frame import Condition, differing_settings, drop_before, to_long_rows
-from pfbench.results.pairwise_tests import INCONCLUSIVE, PairwiseTest, compare_pairs
+from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
+from pfbench.results.comparison.pairwise_tests import compare_pairs
+from pfbench.results.conditions import Condition, differing_settings
+from pfbench.results.frame import drop_before, to_long_rows
 from pfbench.results.state_groups import component_groups
 
 PAIRS = 60  # pairs of a table at most

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pfbench.report.plots.plotting import LineStyle, line_styles, mute_others
-from pfbench.results.frame import Condition, natural_sort_key
+from pfbench.results.conditions import Condition, natural_sort_key
 
 _PLENTY = 50  # filters times conditions above which a report is brief [ours]
 _NAMED = 7  # coloured filters at most; with more than eight filters the others are grey [ours]

@@ -21,17 +21,15 @@ from pfbench.report.options import (
 )
 from pfbench.report.plots import comparison_figures, paper_figures, summary_figures
 from pfbench.report.plots.plotting import format_slug, line_styles
-from pfbench.results import condition_blocks, rankings, store
-from pfbench.results.frame import Condition, load_conditions, natural_sort_key
+from pfbench.results import store
+from pfbench.results.comparison import condition_blocks, rankings
+from pfbench.results.comparison.lost_run_rules import LOST_RUN_RULES
+from pfbench.results.comparison.lost_run_sensitivity import lost_rule_sensitivity
+from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
+from pfbench.results.comparison.pairwise_tests import correct_over_report
+from pfbench.results.comparison.ranking_results import RankingResult
+from pfbench.results.conditions import Condition, load_conditions, natural_sort_key
 from pfbench.results.metrics import metric_definitions
-from pfbench.results.pairwise_tests import (
-    INCONCLUSIVE,
-    LOST_RUN_RULES,
-    PairwiseTest,
-    correct_over_report,
-    lost_rule_sensitivity,
-)
-from pfbench.results.rankings import RankingResult
 from pfbench.results.state_groups import component_groups
 
 _ROWS = 2000  # rows of the table of all comparisons at most
@@ -116,14 +114,14 @@ def write_report(
         "shown": sum(v.winner != INCONCLUSIVE for v in decided),
         "family_sizes": sorted({v.family for v in decided}),
         "budget": note,
-        "across": _across(
+        "across": write_across_section(
             table,
             over_cells,
             [*of_mains, *decided] if scored[0] == summary.MAIN else decided,
             view,
             note,
         ),
-        "headline": _headline(table, over_cells[0], of_mains, mains, sections, view, note)
+        "headline": write_headline(table, over_cells[0], of_mains, mains, sections, view, note)
         if view.brief and over_cells
         else None,
         "metric_definitions": metric_definitions(),
@@ -143,7 +141,7 @@ def write_report(
     return writers.render_template("page", folder, context)
 
 
-def _across(
+def write_across_section(
     table: pd.DataFrame,
     found: Sequence[RankingResult],
     decided: Sequence[PairwiseTest],
@@ -209,7 +207,7 @@ def _across(
     }
 
 
-def _headline(
+def write_headline(
     table: pd.DataFrame,
     one: RankingResult,
     decided: Sequence[PairwiseTest],

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from pfbench.results.frame import Condition, natural_sort_key
+from pfbench.results.conditions import Condition, natural_sort_key
 
 _SHARED = (
     ("pfbench", "versions.pfbench"),

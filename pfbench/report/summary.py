@@ -16,13 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from pfbench.results import power
-from pfbench.results.condition_blocks import RankingBlocks, list_scenarios
+from pfbench.results.comparison.condition_blocks import RankingBlocks, list_scenarios
+from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
+from pfbench.results.comparison.ranking_results import RankingResult
+from pfbench.results.conditions import natural_sort_key
 from pfbench.results.error_measures import Array
-from pfbench.results.frame import natural_sort_key
-from pfbench.results.pairwise_tests import INCONCLUSIVE, PairwiseTest
-from pfbench.results.rankings import RankingResult
-from pfbench.results.statistics import holm, log_ratio, rank_biserial, wilcoxon_signed_rank
+from pfbench.results.statistics import power
+from pfbench.results.statistics.effect_sizes import log_ratio, rank_biserial
+from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
 from pfbench.results.status import StatusCounts
 
 MAIN = "main group"

@@ -11,13 +11,10 @@ import pandas as pd
 from pfbench.report.summary import BaselineComparison
 from pfbench.report.table_formats import format_number
 from pfbench.results import consistency, error_measures, metrics, status, store
-from pfbench.results.pairwise_tests import (
-    INCONCLUSIVE,
-    LOST_RUN_RULES,
-    LostRunSensitivity,
-    PairwiseTest,
-)
-from pfbench.results.rankings import RankingResult
+from pfbench.results.comparison.lost_run_rules import LOST_RUN_RULES
+from pfbench.results.comparison.lost_run_sensitivity import LostRunSensitivity
+from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
+from pfbench.results.comparison.ranking_results import RankingResult
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
 Results = Mapping[str, store.JobResult]

@@ -59,7 +59,7 @@ def write_json(folder: Path, name: str, typed: Sequence[Any]) -> str:
         File name.
     """
     many = len(typed) > _MANY
-    rows = [_to_json(asdict(row), 9 if many else None) for row in typed]
+    rows = [to_json_types(asdict(row), 9 if many else None) for row in typed]
     text = json.dumps(rows, indent=None if many else 1, allow_nan=False)
     for old in (folder / f"{name}.json", folder / f"{name}.json.gz"):
         old.unlink(missing_ok=True)
@@ -126,12 +126,12 @@ def _data_address(path: Path) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
 
 
-def _to_json(value: Any, digits: int | None = None) -> Any:
+def to_json_types(value: Any, digits: int | None = None) -> Any:
     """Convert a value to JSON types, with infinity as text and an optional number of digits."""
     if isinstance(value, Mapping):
-        return {name: _to_json(item, digits) for name, item in value.items()}
+        return {name: to_json_types(item, digits) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_to_json(item, digits) for item in value]
+        return [to_json_types(item, digits) for item in value]
     if not isinstance(value, float):
         return value
     if not math.isfinite(value):

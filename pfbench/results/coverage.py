@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from pfbench.results.intervals import proportion_interval
+from pfbench.results.statistics.intervals import proportion_interval
 
 LEVEL = 90  # percent
 UNDER_COVERAGE, OVER_COVERAGE = "under-coverage", "over-coverage"

@@ -7,70 +7,36 @@ array in the scoring of jobs as well, and name it under `arrays` if it exists at
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
 from pfbench.results import store
-from pfbench.results.consistency import coverage_per_run
-from pfbench.results.error_measures import (
-    Array,
-    Flags,
-    finite_mean,
-    max_error,
-    mean_per_run,
-    mean_score_per_run,
-    rmse_per_run,
+from pfbench.results.error_measures import Array, Flags, finite_mean
+from pfbench.results.metric_values import (
+    ByComponent,
+    MetricInput,
+    average_trace,
+    compute_acceptance,
+    compute_crps,
+    compute_energy_score,
+    compute_interval_coverage,
+    compute_log_evidence,
+    compute_max_error,
+    compute_mean_nees,
+    compute_mean_nis,
+    compute_rmse,
+    compute_seconds_per_step,
 )
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
 COVERAGE_LEVELS = (50, 90, 99)  # percent
 GROUP_UNIT = "unit of the group"
-_PARTICLE_COUNTS = ("ess", "ancestors", "unique")  # divided by the number of particles
-
 Scope = Literal["components", "group", "job"]
 Direction = Literal["lower", "higher", "target"]
-
-
-class MetricInput(NamedTuple):
-    """Data from which a metric is computed.
-
-    Attributes:
-        result: Arrays and metadata of a job.
-        group: Components of one unit; None unless the scope is "components".
-        state_group: Name of a group of the state; empty for the scope "job".
-    """
-
-    result: store.JobResult
-    group: ComponentGroup | None = None
-    state_group: str = ""
-
-    @property
-    def arrays(self) -> Mapping[str, Array]:
-        """Stored arrays."""
-        return self.result.arrays
-
-    @property
-    def lost(self) -> Flags:
-        """Lost runs, [R]."""
-        return self.result.arrays["lost"]
-
-    @property
-    def group_index(self) -> int:
-        """Index of the group in arrays with one entry per group of the state."""
-        return list(self.result.meta["state"]["groups"]).index(self.state_group)
-
-    def select(self, name: str) -> Array:
-        """Return the components of the group of an array [..., D], in displayed units."""
-        if self.group is None:
-            raise ValueError(f"metric of {name} must have the scope 'components', got none.")
-        return self.arrays[name][..., self.group.places].astype(np.float64) * self.group.scale
-
-
-ByComponent = Mapping[str, Array]
 
 
 @dataclass(frozen=True)
@@ -109,45 +75,6 @@ class Metric:
         unit = group_unit if self.unit == GROUP_UNIT else self.unit
         shown = {100.0: "%"}.get(self.factor, unit)
         return f"{self.head} [{shown}]" if shown and "[" not in self.head else self.head
-
-
-def particles_in_use(result: store.JobResult) -> Array | int:
-    """Return the number of particles: [R, T] if the filter changes it."""
-    arrays = result.arrays
-    return arrays["particles"] if "particles" in arrays else int(result.meta["particles"])
-
-
-def mean_trace(result: store.JobResult, name: str) -> Array:
-    """Average a trace over time, as a share of the particles if it counts particles.
-
-    Ancestors and unique particles are counted where a run was resampled. Without moves their
-    numbers are equal.
-
-    Args:
-        result: Job.
-        name: Name of the trace.
-
-    Returns:
-        Mean of each run, [R]; NaN without the trace.
-    """
-    arrays, lost, particles = result.arrays, result.arrays["lost"], result.meta.get("particles")
-    is_count = name in _PARTICLE_COUNTS
-    stored = "ancestors" if name == "unique" and "unique" not in arrays else name
-    trace = arrays.get(stored)
-    if trace is None or (is_count and not particles):
-        return np.full(lost.size, np.nan)
-    if name in ("ancestors", "unique") and "resampled" in arrays:
-        trace = np.where(arrays["resampled"], trace, np.nan)
-    return mean_per_run(trace / particles_in_use(result) if is_count else trace, lost)
-
-
-def mean_acceptance(result: store.JobResult) -> Array:
-    """Average the MCMC acceptance over resampled steps; [R], NaN without moves."""
-    arrays, lost = result.arrays, result.arrays["lost"]
-    if "accepted_0" not in arrays:
-        return np.full(lost.size, np.nan)
-    accepted = np.where(arrays.get("resampled", True), arrays["accepted_0"], np.nan)
-    return mean_per_run(accepted, lost)
 
 
 def compute_metric(name: str, data: MetricInput) -> ByComponent:
@@ -198,78 +125,6 @@ def _mean_of_valid(values: Array, lost: Flags) -> float:
     return float(finite_mean(np.asarray(values)[~lost], axis=0))
 
 
-def _rmse(data: MetricInput) -> ByComponent:
-    """Compute the RMSE of each component and of the norm."""
-    error, names = data.select("error"), data.group.components if data.group else []
-    single = {name: rmse_per_run(error[..., [k]], data.lost) for k, name in enumerate(names)}
-    return {**single, "norm": rmse_per_run(error, data.lost)}
-
-
-def _max_error(data: MetricInput) -> ByComponent:
-    """Compute the maximum error of the norm."""
-    return {"norm": max_error(data.select("error"), data.lost)}
-
-
-def _crps(data: MetricInput) -> ByComponent:
-    """Compute the CRPS of each component and its mean."""
-    if "crps" not in data.arrays or data.group is None:
-        return {}
-    crps, names = data.select("crps"), data.group.components
-    single = {name: mean_score_per_run(crps[..., k], data.lost) for k, name in enumerate(names)}
-    return {**single, "mean": mean_score_per_run(crps, data.lost)}
-
-
-def _energy(data: MetricInput) -> ByComponent:
-    """Compute the energy score; a group of mixed units has none."""
-    group = data.group
-    if "energy" not in data.arrays or group is None or group.group != group.whole:
-        return {}
-    energy = data.arrays["energy"][..., data.group_index].astype(np.float64) * group.scale
-    return {"norm": mean_score_per_run(energy, data.lost)}
-
-
-def _coverage(data: MetricInput, level: int) -> ByComponent:
-    """Compute the coverage of the central interval of `level` percent."""
-    if "pit" not in data.arrays or data.group is None:
-        return {}
-    pit = data.arrays["pit"][..., data.group.places]
-    return {"mean": coverage_per_run(pit, data.lost, level / 100)}
-
-
-def _nees(data: MetricInput) -> ByComponent:
-    """Compute the mean NEES of a group."""
-    return {"norm": mean_per_run(data.arrays["nees"][..., data.group_index], data.lost)}
-
-
-def _nis(data: MetricInput) -> ByComponent:
-    """Compute the mean NIS per observed component."""
-    if "nis" not in data.arrays:
-        return {}
-    nis, dof = (mean_per_run(data.arrays[name], data.lost) for name in ("nis", "nis_dof"))
-    return {"": np.divide(nis, dof, out=np.full(data.lost.size, np.nan), where=dof > 0)}
-
-
-def _job_value(data: MetricInput, compute: Callable[[store.JobResult], Array]) -> ByComponent:
-    """Compute a value of the job; empty if all runs are NaN."""
-    values = compute(data.result)
-    return {} if np.isnan(values).all() else {"": values}
-
-
-def _trace(name: str) -> Callable[[MetricInput], ByComponent]:
-    """Return the function that averages a trace."""
-    return partial(_job_value, compute=partial(mean_trace, name=name))
-
-
-def _log_evidence(data: MetricInput) -> ByComponent:
-    """Return the log evidence of each run."""
-    return {"": np.where(data.lost, np.nan, data.arrays["log_evidence"])}
-
-
-def _seconds_per_step(data: MetricInput) -> ByComponent:
-    """Return the time per step of the job, equal for all runs."""
-    return {"": np.full(data.lost.size, data.result.meta["seconds"]["per_step"])}
-
-
 _INTERVAL = (
     "Share of truths between the {low} and {high} % quantiles of the filter's distribution, over "
     "valid runs, components and scored steps. Its nominal value is {level} %."
@@ -277,28 +132,28 @@ _INTERVAL = (
 
 METRICS: tuple[Metric, ...] = (
     Metric(
-        "rmse", _rmse, "components", GROUP_UNIT, "lower",
+        "rmse", compute_rmse, "components", GROUP_UNIT, "lower",
         "Root mean square over time of the error of a component, or of the norm of a group.",
     ),
     Metric(
-        "max_error", _max_error, "components", GROUP_UNIT, "lower",
+        "max_error", compute_max_error, "components", GROUP_UNIT, "lower",
         "Maximum over time of the norm of the error of a group.",
     ),
     Metric(
-        "crps", _crps, "components", GROUP_UNIT, "lower",
+        "crps", compute_crps, "components", GROUP_UNIT, "lower",
         "Continuous ranked probability score, mean over valid runs, components and scored steps. "
         "It equals the absolute error for a distribution without spread.",
         head="CRPS", component="mean", arrays=("crps",),
     ),
     Metric(
-        "energy", _energy, "components", GROUP_UNIT, "lower",
+        "energy", compute_energy_score, "components", GROUP_UNIT, "lower",
         "Generalisation of the CRPS to the vector of a group, mean over valid runs and scored "
         "steps.",
         head="energy score", arrays=("energy",),
     ),
     *(
         Metric(
-            f"coverage_{level}", partial(_coverage, level=level), "components", "", "target",
+            f"coverage_{level}", partial(compute_interval_coverage, level=level), "components", "", "target",
             _INTERVAL.format(low=f"{50 - level / 2:g}", high=f"{50 + level / 2:g}", level=level),
             head=f"coverage of the {level} % interval", component="mean", factor=100.0,
             arrays=("pit",),
@@ -306,45 +161,45 @@ METRICS: tuple[Metric, ...] = (
         for level in COVERAGE_LEVELS
     ),
     Metric(
-        "nees", _nees, "group", "", "target",
+        "nees", compute_mean_nees, "group", "", "target",
         "Normalised estimation error squared of a group, mean over time. Its expectation is the "
         "number of components.",
     ),
     Metric(
-        "ess", _trace("ess"), "job", "", "higher",
+        "ess", average_trace("ess"), "job", "", "higher",
         "Effective sample size, mean over time.",
         head="ESS [% of particles]", factor=100.0,
     ),
     Metric(
-        "ancestors", _trace("ancestors"), "job", "", "higher",
+        "ancestors", average_trace("ancestors"), "job", "", "higher",
         "Share of particles that are ancestors of others, mean over resampled steps.",
         head="distinct ancestors", factor=100.0,
     ),
     Metric(
-        "unique", _trace("unique"), "job", "", "higher",
+        "unique", average_trace("unique"), "job", "", "higher",
         "Share of particles that differ after resampling and moves, mean over resampled steps.",
         head="unique particles after moves", factor=100.0, requires="unique",
     ),
     Metric(
-        "accepted", partial(_job_value, compute=mean_acceptance), "job", "", "target",
+        "accepted", compute_acceptance, "job", "", "target",
         "Share of accepted MCMC proposals, mean over resampled steps.",
         head="MCMC acceptance", factor=100.0,
     ),
     Metric(
-        "iterations", _trace("iterations"), "job", "", "lower",
+        "iterations", average_trace("iterations"), "job", "", "lower",
         "Iterations of a particle swarm, mean over time.",
     ),
     Metric(
-        "nis", _nis, "job", "", "target",
+        "nis", compute_mean_nis, "job", "", "target",
         "Normalised innovation squared per observed component. Its expectation is 1.",
         arrays=("nis", "nis_dof"),
     ),
     Metric(
-        "log_evidence", _log_evidence, "job", "", "higher",
+        "log_evidence", compute_log_evidence, "job", "", "higher",
         "Logarithm of the estimated marginal likelihood of a run.",
     ),
     Metric(
-        "seconds_per_step", _seconds_per_step, "job", "s", "lower",
+        "seconds_per_step", compute_seconds_per_step, "job", "s", "lower",
         "Time per step of one job, all its runs together.",
     ),
 )  # fmt: skip

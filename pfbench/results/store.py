@@ -22,32 +22,14 @@ from uuid import uuid4
 
 import numpy as np
 
-FORMAT = 1
+from pfbench.results.result_format import FORMAT, check_arrays, check_metadata
+
 # values of the key `budget`
 SAME_N, SAME_TIME, SAME_LIKELIHOODS = BUDGETS = (
     "particles",
     "time",
     "likelihoods",
 )
-
-# Axes that must agree across arrays: R runs, T steps, D components, G groups, S scored steps.
-_AXES = {
-    "time": "T",
-    "error": "RTD",
-    "sd": "RTD",
-    "nees": "RTG",
-    "log_evidence": "R",
-    "lost": "R",
-}
-_OPTIONAL = {
-    "scored": "S",
-    "crps": "RSD",
-    "pit": "RSD",
-    "energy": "RSG",
-    "bound": "TD",
-    "range": "T",
-}
-_META = ("key", "study", "choices", "config", "label", "seed", "runs", "state")
 
 
 class JobResult(NamedTuple):
@@ -108,8 +90,8 @@ def write_result(path: str | Path, meta: Mapping[str, Any], arrays: Mapping[str,
     path = Path(path)
     full = {"format": FORMAT, **meta}
     plain: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
-    _check_meta(path, full)
-    _check_arrays(path, full, plain)
+    check_metadata(path, full)
+    check_arrays(path, full, plain)
     # Unsorted, since the order of the groups is that of the last axis of nees.
     text = np.array(json.dumps(full))
     _write(path, lambda file: np.savez_compressed(file, meta=text, **plain))
@@ -130,7 +112,7 @@ def read_result(path: str | Path) -> JobResult:
     with _opened(path) as file:
         meta = _meta(path, file)
         arrays = {name: _member(path, file, name) for name in file.files if name != "meta"}
-    _check_arrays(path, meta, arrays)
+    check_arrays(path, meta, arrays)
     return JobResult(meta, arrays)
 
 
@@ -262,7 +244,7 @@ def _meta(path: Path, file: np.lib.npyio.NpzFile) -> dict[str, Any]:
         raise ValueError(
             f"{path}: 'meta' must be JSON ({error}). This is not a result of pfbench: move it away"
         ) from error
-    _check_meta(path, meta)
+    check_metadata(path, meta)
     return meta
 
 
@@ -276,43 +258,3 @@ def _rank(path: Path) -> tuple[str, str, str, int, str]:
         int(meta["seed"]),
         str(meta["key"]),
     )
-
-
-def _check_meta(path: Path, meta: Any) -> None:
-    """Raise ValueError if required metadata are missing."""
-    version = meta.get("format") if isinstance(meta, dict) else None
-    if version != FORMAT:
-        raise ValueError(f"{path} must have format {FORMAT}, got {version}. Run the job again.")
-    missing = [name for name in _META if name not in meta]
-    if missing:
-        raise ValueError(f"{path}: metadata must contain {', '.join(missing)}")
-
-
-def _check_arrays(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Raise ValueError if arrays are missing, pickled, or inconsistent in R, T, D, G or S."""
-    missing = [name for name in _AXES if name not in arrays]
-    if missing:
-        raise ValueError(f"{path}: a result must contain the arrays {', '.join(missing)}")
-    for name, value in arrays.items():
-        # the first three are arguments of numpy's savez
-        if name in ("file", "args", "allow_pickle", "meta"):
-            raise ValueError(f"{path}: the array name {name!r} is reserved. Use another name")
-        if value.dtype.hasobject:
-            raise ValueError(
-                f"{path}: {name} must be numbers, booleans or texts, got Python objects"
-            )
-    size: dict[str, int] = {
-        "R": int(meta["runs"]),
-        "D": len(meta["state"]["names"]),
-        "G": len(meta["state"]["groups"]),
-        "T": arrays["time"].size,
-        "S": arrays["scored"].size if "scored" in arrays else 0,
-    }
-    for name, axes in (
-        _AXES | {name: axes for name, axes in _OPTIONAL.items() if name in arrays}
-    ).items():
-        expected = tuple(size[axis] for axis in axes)
-        if arrays[name].shape != expected:
-            raise ValueError(
-                f"{path}: {name} must have shape {list(axes)} = {expected}, got {arrays[name].shape}"
-            )

@@ -21,7 +21,8 @@ from pfbench.report.plots.axis_ticks import format_ticks
 from pfbench.report.plots.paper_figures import FIGURES
 from pfbench.report.plots.plotting import line_styles, mute_others, render_palette_png
 from pfbench.results import error_measures, store
-from pfbench.results.frame import load_conditions, load_frame
+from pfbench.results.conditions import load_conditions
+from pfbench.results.frame import load_frame
 
 SIR = synthetic.Method("sir", 1.3, 0.8, 200, 4.0, (7,))
 SWARM = synthetic.Method("cpso_escape", 1.0, 1.0, 200, 9.0)

@@ -9,7 +9,8 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from pfbench.report import page, writers
-from pfbench.results import condition_blocks, pairwise_tests, rank_tests, rankings, statistics
+from pfbench.results.comparison import condition_blocks, lost_run_rules, rankings
+from pfbench.results.statistics import rank_tests, signed_rank
 
 # Demsar 2006, table 6: AUC of C4.5, C4.5+m, C4.5+cf, C4.5+m+cf; the rounded tie of "voting" in its published order.
 DEMSAR = np.array([
@@ -116,12 +117,12 @@ def test_the_bayesian_signed_rank_is_baycomps(rope):
     rng = np.random.default_rng(2)
     a, b = rng.standard_normal((2, 9))
     theirs = baycomp.SignedRankTest.probs(a, b + 0.3, rope, nsamples=4000, random_state=1)
-    ours = statistics.bayesian_signed_rank(b + 0.3 - a, rope, seed=3)
+    ours = signed_rank.bayesian_signed_rank(b + 0.3 - a, rope, seed=3)
     # both are shares of draws: of 4000 and of 20 000
     assert ours == pytest.approx(theirs, abs=4 * np.sqrt(0.25 / 4000 + 0.25 / 20_000))
     assert sum(ours) == pytest.approx(1)
-    assert statistics.bayesian_signed_rank(np.full(8, -1.0), 0.05, 1)[0] > 0.99
-    assert statistics.bayesian_signed_rank(np.zeros(8), 0.05, 1)[1] > 0.99
+    assert signed_rank.bayesian_signed_rank(np.full(8, -1.0), 0.05, 1)[0] > 0.99
+    assert signed_rank.bayesian_signed_rank(np.zeros(8), 0.05, 1)[1] > 0.99
 
 
 def test_the_better_filter_is_on_the_right_side_of_every_number():
@@ -305,7 +306,7 @@ def test_a_filter_lost_in_most_runs_is_last_and_nothing_breaks():
     found = rankings.rank_filters(table(cells), "position")
     assert found.ranks[2] == 3.0
     assert next(p for p in found.pairs if (p.a, p.b) == ("a", "c")).ratio == 0.0
-    for rule, rank in ((pairwise_tests.LEFT_OUT, 1.0), (pairwise_tests.LARGEST_ERROR, 3.0)):
+    for rule, rank in ((lost_run_rules.LEFT_OUT, 1.0), (lost_run_rules.LARGEST_ERROR, 3.0)):
         other = rankings.rank_filters(table(cells), "position", rule=rule)
         assert (other.ranks[2], other.rule) == (rank, rule.name)
 

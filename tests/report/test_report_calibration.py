@@ -9,7 +9,8 @@ from scipy import stats
 from pfbench.report import calibration, tables
 from pfbench.report.plots import condition_figures
 from pfbench.report.plots.plotting import line_styles
-from pfbench.results import consistency, coverage, frame, intervals, store
+from pfbench.results import conditions, consistency, coverage, frame, store
+from pfbench.results.statistics import intervals
 
 ARCMIN = 180 * 60 / np.pi
 METHODS = (
@@ -30,7 +31,7 @@ def study(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def loaded(study):
-    (cell,) = frame.load_conditions("demo", study)
+    (cell,) = conditions.load_conditions("demo", study)
     return {job.label: job.load() for job in cell.jobs}
 
 

@@ -32,9 +32,11 @@ from pfbench.report.plots import (
     summary_figures,
 )
 from pfbench.report.plots.condition_figures import FigureSpec, write_figure
-from pfbench.results import condition_blocks, rankings, store
-from pfbench.results.frame import load_conditions, to_long_rows
-from pfbench.results.pairwise_tests import compare_pairs
+from pfbench.results import store
+from pfbench.results.comparison import condition_blocks, rankings
+from pfbench.results.comparison.pairwise_tests import compare_pairs
+from pfbench.results.conditions import load_conditions
+from pfbench.results.frame import to_long_rows
 
 BASES = (
     "sir",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.results import frame, state_groups, store
+from pfbench.results import conditions, frame, state_groups, store
 
 SMALL = {"runs": 6, "steps": 20}
 
@@ -105,7 +105,7 @@ def test_labels_tell_configurations_of_one_filter_apart(tmp_path):
     for particles in (400, 100, 1600):
         synthetic.write(tmp_path / "demo", synthetic.Method("sir", 1.0, 1.0, particles), **SMALL)
     synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), **SMALL)
-    (cell,) = frame.load_conditions("demo", tmp_path)
+    (cell,) = conditions.load_conditions("demo", tmp_path)
     assert [job.label for job in cell.jobs] == [
         "ekf", "sir[particles=100]", "sir[particles=400]", "sir[particles=1600]",
     ]  # fmt: skip
@@ -116,7 +116,7 @@ def test_labels_name_only_what_differs(tmp_path):
     for threshold in (0.5, 1.0):
         config = {"resampler": {"threshold": threshold, "kind": "systematic"}}
         synthetic.write(tmp_path / "demo", method, config=config, **SMALL)
-    (cell,) = frame.load_conditions("demo", tmp_path)
+    (cell,) = conditions.load_conditions("demo", tmp_path)
     assert [job.label for job in cell.jobs] == [
         "sir[resampler.threshold=0.5]",
         "sir[resampler.threshold=1.0]",
@@ -126,7 +126,7 @@ def test_labels_name_only_what_differs(tmp_path):
 def test_noise_regimes_are_cells(tmp_path):
     for noise in ("surge", "nominal"):
         synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), noise=noise, **SMALL)
-    found = frame.load_conditions("demo", tmp_path)
+    found = conditions.load_conditions("demo", tmp_path)
     assert [(cell.noise, [job.label for job in cell.jobs]) for cell in found] == [
         ("nominal", ["ekf"]),
         ("surge", ["ekf"]),
@@ -174,8 +174,8 @@ def test_filters_of_one_cell_met_the_same_worlds(tmp_path, first, second, named)
             synthetic.write(tmp_path / "demo", synthetic.Method(name, 1.0), **SMALL), **settings
         )
     with pytest.raises(ValueError, match=rf"differ in {named} "):
-        frame.load_conditions("demo", tmp_path)
-    assert len(frame.load_conditions("demo", tmp_path, allow_mixed_versions=True)) == 1
+        conditions.load_conditions("demo", tmp_path)
+    assert len(conditions.load_conditions("demo", tmp_path, allow_mixed_versions=True)) == 1
 
 
 def test_worlds_may_differ_where_every_label_tells_in_what(tmp_path):
@@ -190,11 +190,11 @@ def test_worlds_may_differ_where_every_label_tells_in_what(tmp_path):
                 "scenario": {"gps_sd": sd, "cache_dir": f"place{k}"},
             }
             store.write_result(path, {**meta, "config": settings}, arrays)
-    (cell,) = frame.load_conditions("demo", tmp_path)
+    (cell,) = conditions.load_conditions("demo", tmp_path)
     assert [job.label for job in cell.jobs] == [
         "ekf[scenario.gps_sd=1.0]", "ekf[scenario.gps_sd=10.0]", "ukf[scenario.gps_sd=1.0]", "ukf[scenario.gps_sd=10.0]",
     ]  # fmt: skip
-    assert frame.differing_settings(cell.jobs) == ["scenario.gps_sd"]
+    assert conditions.differing_settings(cell.jobs) == ["scenario.gps_sd"]
 
 
 def test_shares_are_of_the_particles_in_use(tmp_path):

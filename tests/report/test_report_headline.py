@@ -9,9 +9,11 @@ from scipy import stats
 
 from pfbench.report import page, summary, writers
 from pfbench.report.plots import comparison_figures, plotting, summary_figures
-from pfbench.results import condition_blocks, frame, rankings
-from pfbench.results.pairwise_tests import INCONCLUSIVE, compare_pairs
-from pfbench.results.statistics import holm
+from pfbench.results import conditions
+from pfbench.results.comparison import condition_blocks, rankings
+from pfbench.results.comparison.pairwise_results import INCONCLUSIVE
+from pfbench.results.comparison.pairwise_tests import compare_pairs
+from pfbench.results.statistics.signed_rank import holm
 from pfbench.results.status import StatusCounts
 
 WORLDS, REGIMES = ("plain", "hill", "lake"), ("nominal", "outliers")
@@ -214,7 +216,7 @@ def test_many_filters_of_which_none_has_a_colour_have_no_legend_and_an_order():
     assert order[-2:] == ["rpf", "sir"]
     assert not drawn["profile_position"].legends
     labels = [f"{k}" for k in range(12)]
-    assert frame.natural_sort_key("2") < frame.natural_sort_key("10")
+    assert conditions.natural_sort_key("2") < conditions.natural_sort_key("10")
     assert (
         plotting.mute_others(plotting.line_styles(labels), ["3"])["4"].instants
         < plotting.line_styles(labels)["4"].instants

@@ -9,8 +9,9 @@ from scipy import stats
 
 from pfbench.claims import schema
 from pfbench.report import tables
-from pfbench.results import frame, metrics, statistics, status, store
+from pfbench.results import conditions, frame, metrics, status, store
 from pfbench.results.consistency import compute_consistency
+from pfbench.results.statistics import signed_rank
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def test_one_entry_adds_a_metric_to_the_frame_the_tables_and_the_definitions(res
     assert set(rows.group) == {"attitude", "velocity", "position"}
     assert set(rows[rows.group == "attitude"].unit) == {"arcmin"}
     assert np.isinf(rows.value[rows.lost]).all()
-    (condition,) = frame.load_conditions("demo", results)
+    (condition,) = conditions.load_conditions("demo", results)
     table = tables.accuracy_table(
         {job.label: job.load() for job in condition.jobs}, "position"
     ).set_index("filter")
@@ -64,22 +65,22 @@ def test_signed_rank_tests_of_many_pairs_are_those_of_scipy(n, alternative):
     d = rng.normal(0.3, 1, (9, n))
     d[3:6] = np.round(d[3:6], 1)  # some ties and zeros
     d[6:] = np.round(d[6:])  # many
-    statistic, p = statistics.wilcoxon_signed_rank_rows(d, alternative)
+    statistic, p = signed_rank.wilcoxon_signed_rank_rows(d, alternative)
     for row, t, value in zip(d, statistic, p, strict=True):
         if row.any():
             expected = stats.wilcoxon(row, alternative=alternative, zero_method="zsplit")
             assert (t, value) == pytest.approx((expected.statistic, expected.pvalue), rel=1e-11)
-        assert statistics.wilcoxon_signed_rank(row, alternative) == (
+        assert signed_rank.wilcoxon_signed_rank(row, alternative) == (
             t,
             value,
         )  # alone as among others
-    assert statistics.wilcoxon_signed_rank(np.zeros(n)).p == 1
+    assert signed_rank.wilcoxon_signed_rank(np.zeros(n)).p == 1
 
 
 def test_equivalence_of_many_pairs_is_that_of_each():
     d = np.random.default_rng(0).normal(0.0, 0.1, (5, 20))
-    each = [statistics.equivalence_p_value(row, 0.05) for row in d]
-    assert statistics.equivalence_p_values(d, 0.05).tolist() == each
+    each = [signed_rank.equivalence_p_value(row, 0.05) for row in d]
+    assert signed_rank.equivalence_p_values(d, 0.05).tolist() == each
 
 
 def test_a_run_is_diverged_if_its_last_error_exceeds_the_threshold():
@@ -94,7 +95,7 @@ def test_a_run_is_diverged_if_its_last_error_exceeds_the_threshold():
 
 
 def test_a_scenario_without_a_threshold_has_no_diverged_runs_but_a_dash(results):
-    (condition,) = frame.load_conditions("demo", results)
+    (condition,) = conditions.load_conditions("demo", results)
     result = condition.jobs[0].load()
     assert status.count_statuses(result).diverged is None
     assert tables.overview_table({"ekf": result})["diverged runs"].tolist() == ["–"]

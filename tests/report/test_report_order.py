@@ -13,7 +13,8 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.report import page, writers
-from pfbench.results import frame, pairwise_tests, rankings, store
+from pfbench.results import frame, store
+from pfbench.results.comparison import lost_run_sensitivity, pairwise_tests, rankings
 
 NOISES = ("nominal", "surge", "heavy", "outage", "jam")
 METHODS = synthetic.METHODS[1:]
@@ -83,11 +84,11 @@ def test_the_order_of_rows_changes_no_verdict(table: pd.DataFrame) -> None:
     assert alike(between(table), between(mixed))
     known = {
         (s.cell, s.group, frozenset((s.a, s.b))): s.winners
-        for s in pairwise_tests.lost_rule_sensitivity(table)
+        for s in lost_run_sensitivity.lost_rule_sensitivity(table)
     }
     assert known == {
         (s.cell, s.group, frozenset((s.a, s.b))): s.winners
-        for s in pairwise_tests.lost_rule_sensitivity(mixed)
+        for s in lost_run_sensitivity.lost_rule_sensitivity(mixed)
     }
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from pfbench.report import tables
-from pfbench.results.metrics import mean_trace
+from pfbench.results.metric_values import mean_trace
 from pfbench.results.store import JobResult
 
 NAN = np.nan

@@ -19,7 +19,7 @@ from pfbench.report.plots import error_plots
 from pfbench.report.plots.axis_ticks import limit_to_late_values
 from pfbench.report.plots.plotting import line_styles
 from pfbench.results import store
-from pfbench.results.frame import load_conditions
+from pfbench.results.conditions import load_conditions
 
 QUICK = page.ReportOptions(figure_formats=("svg",), groups=("position",))
 

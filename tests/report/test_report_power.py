@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from statsmodels.stats.power import TTestPower
 
-from pfbench.results import intervals, power, statistics
+from pfbench.results.statistics import effect_sizes, intervals, power, signed_rank
 
 
 def _p(d):
@@ -81,22 +81,22 @@ def test_the_runs_of_a_share_find_it_as_often_as_said(share, limit, alpha):
 
 def test_equivalence_is_shown_within_the_margin_only():
     d = np.linspace(-0.02, 0.02, 21)
-    assert statistics.equivalence_p_value(d, 0.05) < 1e-4
-    assert statistics.equivalence_p_value(d + 0.1, 0.05) > 0.99
-    assert statistics.equivalence_p_value(d, 0.05) == statistics.equivalence_p_value(-d, 0.05)
-    assert statistics.equivalence_p_value(np.zeros(20), 0.05) < 0.001
+    assert signed_rank.equivalence_p_value(d, 0.05) < 1e-4
+    assert signed_rank.equivalence_p_value(d + 0.1, 0.05) > 0.99
+    assert signed_rank.equivalence_p_value(d, 0.05) == signed_rank.equivalence_p_value(-d, 0.05)
+    assert signed_rank.equivalence_p_value(np.zeros(20), 0.05) < 0.001
     assert (
-        statistics.equivalence_p_value(d[:3], 0.05) > 0.05
+        signed_rank.equivalence_p_value(d[:3], 0.05) > 0.05
     )  # an inconclusive test shows no equivalence
     with pytest.raises(ValueError, match="margin must be positive"):
-        statistics.equivalence_p_value(d, 0.0)
+        signed_rank.equivalence_p_value(d, 0.0)
 
 
 def test_equivalence_is_claimed_wrongly_as_rarely_as_alpha():
     rng, n, alpha = np.random.default_rng(2), 600, 0.05
     for side in (-1, 1):
         p = [
-            statistics.equivalence_p_value(0.1 * side + 0.05 * rng.standard_normal(20), 0.1)
+            signed_rank.equivalence_p_value(0.1 * side + 0.05 * rng.standard_normal(20), 0.1)
             for _ in range(n // 2)
         ]
         assert np.mean(np.array(p) <= alpha) == pytest.approx(
@@ -115,8 +115,8 @@ def test_intervals_of_the_effects_hold_the_truth():
         a, b = np.exp(0.3 * rng.standard_normal(runs) + 0.2 * rng.standard_normal((2, runs)))
         b = b * np.exp(shift)
         shares = (
-            statistics.probability_of_improvement(a, b),
-            statistics.rank_biserial_proportion(statistics.log_ratio(a, b)),
+            effect_sizes.probability_of_improvement(a, b),
+            effect_sizes.rank_biserial_proportion(effect_sizes.log_ratio(a, b)),
         )
         for k, (share, truth) in enumerate(zip(shares, (better, smaller), strict=True)):
             low, high, _ = intervals.proportion_interval(
@@ -130,14 +130,14 @@ def test_intervals_of_the_effects_hold_the_truth():
 def test_probability_of_improvement_by_counting():
     a, b = np.array([1.0, 2.0, np.inf, 4.0]), np.array([2.0, 2.0, 3.0, np.inf])
     won = [(x < y) + 0.5 * (x == y) for x in a for y in b]
-    assert statistics.probability_of_improvement(a, b).value == np.mean(won)
-    assert statistics.probability_of_improvement(b, a).value == 1 - np.mean(won)
-    assert statistics.probability_of_improvement(a, a).value == 0.5
-    share = statistics.probability_of_improvement(a, b)
+    assert effect_sizes.probability_of_improvement(a, b).value == np.mean(won)
+    assert effect_sizes.probability_of_improvement(b, a).value == 1 - np.mean(won)
+    assert effect_sizes.probability_of_improvement(a, a).value == 0.5
+    share = effect_sizes.probability_of_improvement(a, b)
     assert share.parts.mean() == pytest.approx(share.value)
-    d = statistics.log_ratio(a, b)
-    effect = statistics.rank_biserial_proportion(d)
-    assert 2 * effect.value - 1 == pytest.approx(statistics.rank_biserial(d))
+    d = effect_sizes.log_ratio(a, b)
+    effect = effect_sizes.rank_biserial_proportion(d)
+    assert 2 * effect.value - 1 == pytest.approx(effect_sizes.rank_biserial(d))
     low, high, how = intervals.proportion_interval(1.0, 0.0, 20, 0.95)
     assert (how, high) == ("exact", 1.0)
     assert low == pytest.approx(stats.beta.ppf(0.025, 20, 1))  # Clopper and Pearson
@@ -149,9 +149,9 @@ def test_the_signed_rank_test_is_scipys(n, digits):
     d = np.round(np.random.default_rng(n).normal(0.3, 1, n), digits)
     for side in ("two-sided", "greater"):
         expected = stats.wilcoxon(d, alternative=side, zero_method="zsplit")
-        assert statistics.wilcoxon_signed_rank(d, side) == pytest.approx(
+        assert signed_rank.wilcoxon_signed_rank(d, side) == pytest.approx(
             (expected.statistic, expected.pvalue), rel=1e-11
         )
-    ranks, ties = statistics.rank_with_ties(d)
+    ranks, ties = effect_sizes.rank_with_ties(d)
     np.testing.assert_array_equal(ranks, stats.rankdata(d))
     assert ties.sum() == n

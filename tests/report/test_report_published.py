@@ -11,7 +11,7 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.noise.white import NominalNoise
-from pfbench.results import rank_tests, statistics
+from pfbench.results.statistics import effect_sizes, rank_tests, signed_rank
 from pfbench.scenario.model_simulation import ModelSimulation
 
 # R 4, ?friedman.test: 22 players round first base in three ways [Hollander, Wolfe 1973, p. 140]
@@ -35,7 +35,7 @@ def test_friedmans_test_is_that_of_r() -> None:
 
 def test_wilcoxons_test_is_that_of_r() -> None:
     """wilcox.test(x, y, paired = TRUE, alternative = "greater"): V = 40, p-value = 0.01953, which is exact."""
-    statistic, p = statistics.wilcoxon_signed_rank(FIRST - SECOND)
+    statistic, p = signed_rank.wilcoxon_signed_rank(FIRST - SECOND)
     assert statistic in (40.0, 45.0 - 40.0)
     assert p / 2 == pytest.approx(0.01953, abs=5e-6)
 
@@ -60,7 +60,10 @@ def test_a_filter_under_two_names_beats_itself_as_seldom_as_alpha() -> None:
     def share_of_wins(a: np.ndarray, b: np.ndarray) -> float:
         return float(
             np.mean(
-                [statistics.wilcoxon_signed_rank(d)[1] <= alpha for d in statistics.log_ratio(a, b)]
+                [
+                    signed_rank.wilcoxon_signed_rank(d)[1] <= alpha
+                    for d in effect_sizes.log_ratio(a, b)
+                ]
             )
         )
 

@@ -8,7 +8,8 @@ import pytest
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from pfbench.results import intervals, pairwise_tests, statistics
+from pfbench.results.comparison import pairwise_results, pairwise_tests
+from pfbench.results.statistics import effect_sizes, intervals, signed_rank
 
 
 def table(losses, group="position", seed=1):
@@ -52,7 +53,7 @@ def _winners_alone(monkeypatch):
     none = intervals.ConfidenceInterval(0.0, 0.0, "none")
     monkeypatch.setattr(pairwise_tests, "bootstrap_median_interval", lambda *_: none)
     monkeypatch.setattr(
-        pairwise_tests, "_equivalence", lambda differences, _: np.full(len(differences), np.nan)
+        pairwise_tests, "equivalence_samples", lambda differences, _: np.full(len(differences), np.nan)
     )
     monkeypatch.setattr(pairwise_tests, "_sample_sizes", lambda *_: (np.nan, np.nan))
 
@@ -111,7 +112,7 @@ def test_demsar_example():
         0.981,
         0.978,
     ]
-    statistic, _ = statistics.wilcoxon_signed_rank(np.round(np.array(plain) - np.array(other), 3))
+    statistic, _ = signed_rank.wilcoxon_signed_rank(np.round(np.array(plain) - np.array(other), 3))
     assert statistic == 12.0
 
 
@@ -150,7 +151,7 @@ def test_rank_biserial_by_counting_walsh_averages(seed):
     d = rng.normal(0.3, 1, 12)
     # The positive rank sum is the number of Walsh averages (i <= j) above zero [Tukey 1949].
     walsh = np.add.outer(d, d)[np.triu_indices(d.size)]
-    assert statistics.rank_biserial(d) == pytest.approx(
+    assert effect_sizes.rank_biserial(d) == pytest.approx(
         ((walsh < 0).sum() - (walsh > 0).sum()) / walsh.size
     )
 
@@ -173,14 +174,14 @@ def test_swapping_the_filters_mirrors_the_verdict():
     assert forth.p == pytest.approx(back.p)
     assert forth.effect == pytest.approx(-back.effect)
     assert forth.ratio == pytest.approx(1 / back.ratio)
-    assert (forth.winner, back.winner) in {("a", "b"), (pairwise_tests.INCONCLUSIVE,) * 2}
+    assert (forth.winner, back.winner) in {("a", "b"), (pairwise_results.INCONCLUSIVE,) * 2}
 
 
 def test_a_filter_does_not_beat_itself():
     a, _ = skill(np.random.default_rng(5), 20, 1)
     found = one(a, a)
     assert (found.p, found.effect, found.ratio, found.low, found.high) == (1.0, 0.0, 1.0, 1.0, 1.0)
-    assert found.winner == pairwise_tests.INCONCLUSIVE
+    assert found.winner == pairwise_results.INCONCLUSIVE
     assert found.interval == "percentile"  # the bootstrap of a constant has no BCa, and says so
 
 
@@ -210,7 +211,7 @@ def test_losing_runs_moves_the_verdict_against_the_loser():
         winners.append(found.winner)
     assert effects == sorted(effects, reverse=True)
     assert len(set(effects)) == 5
-    assert winners[0] == pairwise_tests.INCONCLUSIVE
+    assert winners[0] == pairwise_results.INCONCLUSIVE
     assert winners[-1] == "b"
 
 
@@ -226,7 +227,7 @@ def test_two_lost_runs_are_a_tie():
         np.array([1.0, 2.0, np.inf, 4.0, 5.0, 6.0]),
         np.array([2.0, 4.0, np.inf, 8.0, 10.0, 12.0]),
     )
-    d = statistics.log_ratio(a, b)
+    d = effect_sizes.log_ratio(a, b)
     assert d[2] == 0
     assert one(a, b).effect == pytest.approx(20 / 21)  # the tie holds rank 1, split evenly
 
@@ -236,7 +237,7 @@ def test_rounding_decides_nothing():
     found = one(
         a, a * (1 + 1e-7)
     )  # in every run the same way, but less than single precision tells
-    assert (found.p, found.effect, found.winner) == (1.0, 0.0, pairwise_tests.INCONCLUSIVE)
+    assert (found.p, found.effect, found.winner) == (1.0, 0.0, pairwise_results.INCONCLUSIVE)
     assert one(a, a * (1 + 1e-5)).winner == "a"
 
 
@@ -263,7 +264,7 @@ def test_runs_without_truth_and_unpaired_runs_are_left_out():
 
 def test_a_single_run_decides_nothing():
     found = one([1.0], [2.0])
-    assert found.winner == pairwise_tests.INCONCLUSIVE
+    assert found.winner == pairwise_results.INCONCLUSIVE
     assert found.interval == "none"
 
 
@@ -292,7 +293,7 @@ def test_false_winners_are_as_rare_as_alpha(monkeypatch):
     losses = {name: world * np.exp(0.2 * rng.standard_normal((n, 30))) for name in "abc"}
     found = families(losses, alpha)
     won = np.mean(
-        [any(v.winner != pairwise_tests.INCONCLUSIVE for v in family) for family in found]
+        [any(v.winner != pairwise_results.INCONCLUSIVE for v in family) for family in found]
     )
     first = np.mean([family[0].p <= alpha for family in found])
     error = 4 * np.sqrt(alpha * (1 - alpha) / n)

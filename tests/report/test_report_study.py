@@ -14,7 +14,14 @@ from pfbench.report import condition_section, cost, options, page, writers
 from pfbench.report.plots import comparison_figures
 from pfbench.report.plots.plotting import line_styles
 from pfbench.report.table_formats import format_number
-from pfbench.results import condition_blocks, frame, pairwise_tests, rankings, store
+from pfbench.results import frame, store
+from pfbench.results.comparison import (
+    condition_blocks,
+    lost_run_sensitivity,
+    pairwise_results,
+    pairwise_tests,
+    rankings,
+)
 
 METHODS = (
     synthetic.Method("ekf", 2.0, 0.7, None, 0.4),
@@ -70,7 +77,7 @@ def test_the_text_is_that_of_the_verdicts(report, name):
         f"Iman-Davenport F {format_number(float(one['f']))}, p = {format_number(one['p_f'])}"
         in text
     )
-    shown = [p for p in one["pairs"] if p["winner"] != pairwise_tests.INCONCLUSIVE]
+    shown = [p for p in one["pairs"] if p["winner"] != pairwise_results.INCONCLUSIVE]
     assert f"{len(shown)} of 3 pairs differ significantly" in text
     beaten = {p["a"] if p["winner"] == p["b"] else p["b"] for p in shown}
     assert f"Top group: {', '.join(f for f in one['filters'] if f not in beaten)}." in text
@@ -223,9 +230,9 @@ def test_rules_for_lost_runs_that_decide_otherwise_are_listed():
         metric="rmse",
         unit="m",
     )
-    (found,) = pairwise_tests.lost_rule_sensitivity(rows)
-    assert found.winners == ("b", "a", pairwise_tests.INCONCLUSIVE)
-    assert pairwise_tests.lost_rule_sensitivity(rows[~rows.lost]) == []
+    (found,) = lost_run_sensitivity.lost_rule_sensitivity(rows)
+    assert found.winners == ("b", "a", pairwise_results.INCONCLUSIVE)
+    assert lost_run_sensitivity.lost_rule_sensitivity(rows[~rows.lost]) == []
     (verdict,) = pairwise_tests.compare_pairs(rows)
     assert verdict.winner == "b"
 

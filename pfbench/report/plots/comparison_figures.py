@@ -25,13 +25,13 @@ from pfbench.report.plots.plotting import (
     format_slug,
 )
 from pfbench.report.plots.rank_plots import plot_critical_difference, plot_profiles
-from pfbench.results.condition_blocks import RankingBlocks
-from pfbench.results.pairwise_tests import INCONCLUSIVE, PairwiseTest
-from pfbench.results.rankings import RankingResult
+from pfbench.results.comparison.condition_blocks import RankingBlocks
+from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
+from pfbench.results.comparison.ranking_results import RankingResult
 
 _PAIRS = 28  # pairs of a forest plot at most
 _LONG = 34  # letters of a pair on one line
-_SIDE = 10  # filters of a matrix at most
+MATRIX_FILTERS = 10  # filters of a matrix at most
 _BETTER, _WORSE = "#0072B2", "#E69F00"  # dark and light, distinct in grey
 
 
@@ -107,22 +107,22 @@ def study_figures(
                 f"{one.group}: number of conditions in which the row filter is better than the column filter, and in which it is "
                 "worse, with Holm's correction within each condition."
             )
-            labels = _by_rank(own, one)
+            labels = order_by_rank(own, one)
             named = (
-                [label for label in labels if not style[label].quiet][:_SIDE]
-                if len(labels) > _SIDE
+                [label for label in labels if not style[label].quiet][:MATRIX_FILTERS]
+                if len(labels) > MATRIX_FILTERS
                 else []
             )
-            if len(labels) > _SIDE:
+            if len(labels) > MATRIX_FILTERS:
                 best = (
                     "best mean ranks"
                     if one.ranks
                     else "largest numbers of better minus worse comparisons"
                 )
                 rows = (
-                    f"the coloured filters, and of the others the {_SIDE - len(named)}"
+                    f"the coloured filters, and of the others the {MATRIX_FILTERS - len(named)}"
                     if named
-                    else f"the {_SIDE}"
+                    else f"the {MATRIX_FILTERS}"
                 )
                 text += f" Shown of {len(labels)} filters: {rows} with the {best}."
             drawings.append(
@@ -152,9 +152,9 @@ def plot_matrix(
         one: Ranking of the group.
         named: Filters that are always included; the best others fill the matrix.
     """
-    ranked = _by_rank(tests, ranking)
+    ranked = order_by_rank(tests, ranking)
     others = [label for label in ranked if label not in required_labels][
-        : _SIDE - len(required_labels)
+        : MATRIX_FILTERS - len(required_labels)
     ]
     labels = [label for label in ranked if label in required_labels or label in others]
     tests = [v for v in tests if v.a in labels and v.b in labels]
@@ -261,7 +261,7 @@ def _starred(one: RankingResult) -> str:
     )
 
 
-def _by_rank(own: Sequence[PairwiseTest], one: RankingResult) -> list[str]:
+def order_by_rank(own: Sequence[PairwiseTest], one: RankingResult) -> list[str]:
     """Order labels by mean rank, or by better minus worse comparisons."""
     labels = dict.fromkeys(label for v in own for label in (v.a, v.b))
     lost = {

@@ -25,7 +25,7 @@ from pfbench.report.plots.plotting import (
     stacked_axes,
 )
 from pfbench.results import consistency
-from pfbench.results.metrics import particles_in_use
+from pfbench.results.metric_values import particles_in_use
 
 MANY_FILTERS = 12  # filters of a box plot at most; more have a row each, ordered by median
 TRACES = {  # quantity, unit, and whether the trace is a fraction of the particles

@@ -19,7 +19,7 @@ from pfbench.report.plots import paper_plots as plots
 from pfbench.report.plots.condition_figures import FigureSpec
 from pfbench.report.plots.plotting import LineStyle, format_slug
 from pfbench.results import store
-from pfbench.results.frame import Condition
+from pfbench.results.conditions import Condition
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
 _BAND = "median and 5 to 95 %"
@@ -137,7 +137,7 @@ def _sources(
     return sources
 
 
-def _errors(
+def make_error_figures(
     figure: PaperFigure,
     sources: Sequence[PaperFigureData],
     style: Mapping[str, LineStyle],
@@ -161,7 +161,7 @@ def _errors(
     return figures
 
 
-def _trace(
+def make_trace_figures(
     name: str,
     words: str,
     unit: str,
@@ -182,7 +182,7 @@ def _trace(
     return figures
 
 
-def _escape(
+def make_escape_figure(
     figure: PaperFigure, sources: Sequence[PaperFigureData], style: Mapping[str, LineStyle]
 ) -> list[FigureSpec]:
     """Return the figure of the escape factor over the iterations of a step."""
@@ -198,7 +198,7 @@ def _escape(
     return [FigureSpec("", text, partial(plots.plot_escape, own, style))]
 
 
-def _relative(
+def make_relative_error_figures(
     figure: PaperFigure, sources: Sequence[PaperFigureData], style: Mapping[str, LineStyle]
 ) -> list[FigureSpec]:
     """Return figures of Err by experiment, over time and its mean."""
@@ -222,7 +222,7 @@ def _relative(
     ]
 
 
-def _effective(
+def make_ess_figure(
     figure: PaperFigure, sources: Sequence[PaperFigureData], style: Mapping[str, LineStyle]
 ) -> list[FigureSpec]:
     """Return the figure of the mean effective number of particles by experiment."""
@@ -241,7 +241,7 @@ def _effective(
     return [FigureSpec("", text, partial(plots.plot_against, values, style, "mean Neff"))]
 
 
-def _seconds(
+def make_time_figure(
     figure: PaperFigure, sources: Sequence[PaperFigureData], style: Mapping[str, LineStyle]
 ) -> list[FigureSpec]:
     """Return the figure of the time per step by experiment."""
@@ -261,7 +261,7 @@ def _seconds(
     return [FigureSpec("", text, partial(plots.plot_against, values, style, "time per step [ms]"))]
 
 
-def _maxima(
+def make_maximum_figures(
     figure: PaperFigure, sources: Sequence[PaperFigureData], style: Mapping[str, LineStyle]
 ) -> list[FigureSpec]:
     """Return figures of maximum error and RMSE, with the values of the paper."""
@@ -307,7 +307,7 @@ def _of(*sources: PaperFigureData) -> str:
     )
 
 
-_BEFORE = partial(_errors, before=True)
+_BEFORE = partial(make_error_figures, before=True)
 _YAN, _PU, _COFM, _DMC, _TIAN = (
     "Yan et al. 2016", "Pu and Qin", "COFM-AMSSRCPF 2024", "The DMC particle filter", "Tian et al."
 )  # fmt: skip
@@ -324,44 +324,44 @@ _PRINTED_MAXIMA = {  # North, East, Up
     "cpf": (8.9, 7.4, 16.4), "fmcpf": (6.8, 5.75, 10.5), "cofm_amssrcpf_printed": (4.02, 4.4, 5.2),
     "cofm_amssrcpf": (4.02, 4.4, 5.2),
 }  # fmt: skip
-_SIZE = partial(_trace, "particles", "number of particles", "particles")
-_NEFF = partial(_trace, "ess", "effective number of particles", "Neff")
-_FLOWN = partial(_trace, "iterations", "iterations until the swarm stops", "iterations")
+_SIZE = partial(make_trace_figures, "particles", "number of particles", "particles")
+_NEFF = partial(make_trace_figures, "ess", "effective number of particles", "Neff")
+_FLOWN = partial(make_trace_figures, "iterations", "iterations until the swarm stops", "iterations")
 FIGURES: Mapping[str, PaperFigure] = {
-    "000-2": PaperFigure(f"{_YAN}, figure 2", _MODIFIED, _errors, groups=("attitude",)),
-    "000-3": PaperFigure(f"{_YAN}, figure 3", _MODIFIED, _errors, groups=("position",)),
-    "001-2": PaperFigure(f"{_PU}, figure 2", _PASSIVE, _relative),
-    "001-3": PaperFigure(f"{_PU}, figure 3", _PASSIVE, _seconds),
-    "001-4": PaperFigure(f"{_PU}, figure 4", _PASSIVE, _effective),
-    "001-position": PaperFigure(f"{_PU}, position behind figure 2", _PASSIVE, _errors, groups=("position",)),
+    "000-2": PaperFigure(f"{_YAN}, figure 2", _MODIFIED, make_error_figures, groups=("attitude",)),
+    "000-3": PaperFigure(f"{_YAN}, figure 3", _MODIFIED, make_error_figures, groups=("position",)),
+    "001-2": PaperFigure(f"{_PU}, figure 2", _PASSIVE, make_relative_error_figures),
+    "001-3": PaperFigure(f"{_PU}, figure 3", _PASSIVE, make_time_figure),
+    "001-4": PaperFigure(f"{_PU}, figure 4", _PASSIVE, make_ess_figure),
+    "001-position": PaperFigure(f"{_PU}, position behind figure 2", _PASSIVE, make_error_figures, groups=("position",)),
     "002-6": PaperFigure(
         f"{_COFM}, figures 6 to 9", ("mssrckf",), _BEFORE, "nominal", ("gyro_bias", "accelerometer_bias")
     ),
-    "002-10": PaperFigure(f"{_COFM}, figures 10 and 11", _RULES, _errors, "nominal", ("position",)),
-    "002-12": PaperFigure(f"{_COFM}, figures 12 to 14", _CUBATURE, _errors, "paper_bursts", ("position",)),
-    "002-velocity": PaperFigure(f"{_COFM}, velocity behind figures 12 to 14", _CUBATURE, _errors, "paper_bursts", ("velocity",)),
+    "002-10": PaperFigure(f"{_COFM}, figures 10 and 11", _RULES, make_error_figures, "nominal", ("position",)),
+    "002-12": PaperFigure(f"{_COFM}, figures 12 to 14", _CUBATURE, make_error_figures, "paper_bursts", ("position",)),
+    "002-velocity": PaperFigure(f"{_COFM}, velocity behind figures 12 to 14", _CUBATURE, make_error_figures, "paper_bursts", ("velocity",)),
     "002-maxima": PaperFigure(
-        f"{_COFM}, section on simulation 2", _CUBATURE, _maxima, "paper_bursts", ("position",), _PRINTED_MAXIMA
+        f"{_COFM}, section on simulation 2", _CUBATURE, make_maximum_figures, "paper_bursts", ("position",), _PRINTED_MAXIMA
     ),
     "002-number": PaperFigure(f"{_COFM}, section on simulation 2", _CUBATURE, _SIZE, "paper_bursts"),
     "002-neff": PaperFigure(
         f"{_COFM}, section on simulation 2", _CUBATURE, _NEFF, "paper_bursts", printed={"": (110.0, 180.0)}
     ),
-    "003-3": PaperFigure(f"{_DMC}, figure 3", _CORRECTED, _errors, groups=("attitude",)),
-    "003-4": PaperFigure(f"{_DMC}, figure 4", _CORRECTED, _errors, groups=("velocity",)),
-    "003-5": PaperFigure(f"{_DMC}, figure 5", _CORRECTED, _errors, groups=("position",)),
-    "004-1": PaperFigure(f"{_TIAN}, figure 1", ("cpso_escape_printed", "cpso_escape_stopped", "cpso_escape"), _escape),
+    "003-3": PaperFigure(f"{_DMC}, figure 3", _CORRECTED, make_error_figures, groups=("attitude",)),
+    "003-4": PaperFigure(f"{_DMC}, figure 4", _CORRECTED, make_error_figures, groups=("velocity",)),
+    "003-5": PaperFigure(f"{_DMC}, figure 5", _CORRECTED, make_error_figures, groups=("position",)),
+    "004-1": PaperFigure(f"{_TIAN}, figure 1", ("cpso_escape_printed", "cpso_escape_stopped", "cpso_escape"), make_escape_figure),
     "004-3": PaperFigure(
         f"{_TIAN}, figure 3", ("ekf", "cpso_escape_printed", "cpso_escape"), _BEFORE, "nominal",
         ("gyro_constant", "gyro_bias", "accelerometer_bias"),
     ),
-    "004-4": PaperFigure(f"{_TIAN}, figure 4", _SWARMS, _errors, "nominal", ("position",)),
-    "004-5": PaperFigure(f"{_TIAN}, figure 5", _SWARMS, _errors, "nominal", ("velocity",)),
+    "004-4": PaperFigure(f"{_TIAN}, figure 4", _SWARMS, make_error_figures, "nominal", ("position",)),
+    "004-5": PaperFigure(f"{_TIAN}, figure 5", _SWARMS, make_error_figures, "nominal", ("velocity",)),
     "004-iterations": PaperFigure(
         f"{_TIAN}, sections 4 and 5", ("pso_pf", "cpso_pf", "cpso_escape_printed", "cpso_escape_stopped", "cpso_escape"),
         _FLOWN, "nominal",
     ),
     "004-before": PaperFigure(
-        f"{_TIAN}, figures 2, 4 and 5 before correction", ("ekf",), _errors, "outage", ("position", "velocity")
+        f"{_TIAN}, figures 2, 4 and 5 before correction", ("ekf",), make_error_figures, "outage", ("position", "velocity")
     ),
 }  # fmt: skip

@@ -126,7 +126,7 @@ def plot_relative_errors(
     for (name, results), axis in zip(own.items(), panels, strict=True):
         lines = []
         for label, result in results.items():
-            time, values = _valid_runs(result, _relative(result))
+            time, values = _valid_runs(result, relative_error_percent(result))
             band = compute_run_quantiles(values, _BAND)
             _banded(axis, time, band, style[label], label, len(results))
             lines += list(band)
@@ -229,7 +229,7 @@ def plot_maxima(
 
 def relative_axes(result: store.JobResult) -> np.ndarray:
     """Compute the mean over time of Err of each valid run, %."""
-    valid = _relative(result)[~result.arrays["lost"]]
+    valid = relative_error_percent(result)[~result.arrays["lost"]]
     return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
 
 
@@ -244,7 +244,7 @@ def mean_trace_per_run(result: store.JobResult, name: str) -> np.ndarray:
     return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
 
 
-def _relative(result: store.JobResult) -> np.ndarray:
+def relative_error_percent(result: store.JobResult) -> np.ndarray:
     """Return the horizontal error in % of the range, [R, T]."""
     horizontal = result.meta["state"]["groups"]["position"][:2]  # as in the tables
     error = result.arrays["error"][..., horizontal].astype(np.float64)

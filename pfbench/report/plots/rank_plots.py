@@ -19,9 +19,9 @@ from pfbench.report.plots.plotting import (
     build_padded_layout,
     stacked_axes,
 )
-from pfbench.results import condition_blocks
-from pfbench.results.condition_blocks import RankingBlocks
-from pfbench.results.rankings import RankingResult
+from pfbench.results.comparison import condition_blocks
+from pfbench.results.comparison.condition_blocks import RankingBlocks
+from pfbench.results.comparison.ranking_results import RankingResult
 
 MANY_RANKS = 12  # filters up to which each rank has a tick
 

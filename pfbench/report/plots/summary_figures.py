@@ -16,9 +16,9 @@ from pfbench.report.plots.condition_figures import FigureSpec
 from pfbench.report.plots.label_placement import wrap_label
 from pfbench.report.plots.plotting import COLUMN, SHADES, SMALL, build_padded_layout, format_slug
 from pfbench.report.summary import BaselineComparison
-from pfbench.results.condition_blocks import RankingBlocks
-from pfbench.results.pairwise_tests import INCONCLUSIVE
-from pfbench.results.rankings import RankingResult
+from pfbench.results.comparison.condition_blocks import RankingBlocks
+from pfbench.results.comparison.pairwise_results import INCONCLUSIVE
+from pfbench.results.comparison.ranking_results import RankingResult
 
 _BETTER, _WORSE, _OPEN = "#0072B2", "#E69F00", "0.72"  # dark, light and a ring, distinct in grey
 _STEPS = (1.05, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)  # limits between the shades of the map

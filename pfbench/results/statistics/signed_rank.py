@@ -1,12 +1,11 @@
-"""Paired tests and effect sizes: Wilcoxon, equivalence, Holm, Bayesian signed rank, improvement.
+"""Wilcoxon's signed-rank test, its equivalence and Bayesian versions, and Holm's correction.
 
-Each procedure is defined once in the package. Tests across conditions that need ranks of all
-filters are in `rank_tests`, intervals in `intervals`, sample sizes in `power`.
+Tests across conditions that need ranks of all filters are in `rank_tests`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache, lru_cache
 from itertools import product
 from typing import Literal, NamedTuple
@@ -17,14 +16,10 @@ from scipy.special import ndtr
 
 from pfbench.results.error_measures import Array
 
-# Errors are stored in single precision: smaller differences of a logarithm are rounding. Without
-# the tolerance, EKF and UKF of a linear model would differ by how they round.
-LOG_TOLERANCE = 1e-6
 _SIGNS_ENUMERATED = 13  # tied differences up to which all signs are enumerated, as in scipy
 _EXACT = 50  # untied differences up to which the distribution is exact, as in scipy
 _DIRICHLET_DRAWS = 20_000
 _PRIOR_STRENGTH = 0.5  # pseudo-observation at zero [Benavoli et al. 2014], as in baycomp
-
 Alternative = Literal["two-sided", "greater", "less"]
 
 
@@ -38,43 +33,6 @@ class SignedRankResult(NamedTuple):
 
     statistic: float
     p: float
-
-
-class ProportionEstimate(NamedTuple):
-    """Probability estimated from n runs.
-
-    Attributes:
-        value: Estimate, 0 to 1.
-        parts: Contribution of each run, [n]. Their mean is the value, and their variance divided
-            by n is the variance of the value.
-    """
-
-    value: float
-    parts: Array
-
-
-def log_ratio(a: Array, b: Array) -> Array:
-    """Compute finite log ratios of the losses of two filters.
-
-    Where one of the two is lost, the result lies beyond all others. Where both are lost, or the
-    ratio differs from 1 by less than the stored precision, it is 0.
-
-    Args:
-        a: Losses of the first filter, [n], non-negative, infinite where lost.
-        b: Losses of the second filter, [n].
-
-    Returns:
-        log(a / b), [n].
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        d = np.log(a) - np.log(b)
-    d = np.where((a == b) | (np.abs(d) <= LOG_TOLERANCE), 0.0, d)
-    return np.where(np.isfinite(d), d, np.sign(d) * beyond_finite(d))
-
-
-def beyond_finite(d: Array) -> float:
-    """Return a number so large that its mean with any finite difference exceeds them all."""
-    return 4 * float(np.abs(d[np.isfinite(d)]).max(initial=0.0)) + 1
 
 
 def holm(p: Sequence[float] | Array) -> Array:
@@ -167,48 +125,28 @@ def equivalence_p_values(d: Array, margin: float) -> Array:
     return np.maximum(*sides)
 
 
-def rank_with_ties(values: Array) -> tuple[Array, Array]:
-    """Return ranks of values [n] from 1, ties averaged, and the number of values in each tie."""
-    _, index, count = np.unique(values, return_inverse=True, return_counts=True)
-    return (np.cumsum(count) - (count - 1) / 2)[index], count.astype(np.float64)
+def wilcoxon_samples(differences: Sequence[Array]) -> tuple[Array, Array]:
+    """Test several samples of paired differences, those of equal length at once."""
+    statistic, p = np.empty((2, len(differences)))
+    for index, d in _by_length(differences):
+        statistic[index], p[index] = wilcoxon_signed_rank_rows(d)
+    return statistic, p
 
 
-def rank_biserial(d: Array) -> float:
-    """Compute the matched-pairs rank-biserial correlation [Kerby 2014] of d = log(a / b).
-
-    Positive if a has the smaller losses, 1 if it always has.
-    """
-    rank, _ = rank_with_ties(np.abs(d))
-    return float((rank[d < 0].sum() - rank[d > 0].sum()) / rank.sum())
-
-
-def rank_biserial_proportion(d: Array) -> ProportionEstimate:
-    """Express the rank-biserial correlation r of differences as the probability (1 + r) / 2.
-
-    It is the probability that the mean of two differences is below zero.
-    """
-    value = (1 + rank_biserial(d)) / 2
-    return ProportionEstimate(value, 1 - np.sign(d[:, None] + d).mean(1) - value)
-
-
-def probability_of_improvement(a: Array, b: Array) -> ProportionEstimate:
-    """Estimate the probability that a run of a has a smaller loss than a run of b.
-
-    All pairs of runs count, ties half [Vargha, Delaney 2000].
+def equivalence_samples(differences: Sequence[Array], margin: float) -> Array:
+    """Test the equivalence of several samples, those of equal length at once.
 
     Args:
-        a: Losses of the first filter, [n], infinite where lost.
-        b: Losses of the second filter in the same runs, [n].
+        differences: Samples, [n] each.
+        margin: Half width of the region of equivalence.
 
     Returns:
-        The probability and the contribution of each run.
+        p-values, [K].
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        d = np.log(a)[:, None] - np.log(b)
-    is_tie = np.isnan(d) | (np.abs(d) <= LOG_TOLERANCE)
-    won = (1 - np.where(is_tie, 0.0, np.sign(d))) / 2
-    value = float(won.mean())
-    return ProportionEstimate(value, won.mean(1) + won.mean(0) - value)
+    p = np.empty(len(differences))
+    for index, d in _by_length(differences):
+        p[index] = equivalence_p_values(d, margin)
+    return p
 
 
 def bayesian_signed_rank(d: Array, rope: float, seed: int = 0) -> tuple[float, float, float]:
@@ -275,3 +213,10 @@ def _dirichlet_weights(n: int, seed: int) -> Array:
     """Draw Dirichlet weights of n differences and the pseudo-observation; shared by all pairs."""
     concentration = np.concatenate([[_PRIOR_STRENGTH], np.ones(n)])
     return np.random.default_rng([n, seed]).dirichlet(concentration, _DIRICHLET_DRAWS)
+
+
+def _by_length(differences: Sequence[Array]) -> Iterator[tuple[list[int], Array]]:
+    """Yield the indices and the stack [K, n] of the samples of each length."""
+    for n in sorted({d.size for d in differences}):
+        index = [k for k, d in enumerate(differences) if d.size == n]
+        yield index, np.stack([differences[k] for k in index])

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from pfbench.results.comparison.lost_run_rules import WORST_RANK, LostRunRule, rmse_by_run
+from pfbench.results.conditions import natural_sort_key
 from pfbench.results.error_measures import Array
-from pfbench.results.frame import natural_sort_key
-from pfbench.results.pairwise_tests import WORST_RANK, LostRunRule, rmse_by_run
-from pfbench.results.statistics import LOG_TOLERANCE
+from pfbench.results.statistics.effect_sizes import LOG_TOLERANCE
 
 MIN_CONDITIONS, MIN_FILTERS = 5, 3  # required by a test across conditions [ours]
 

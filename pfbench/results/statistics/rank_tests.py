@@ -11,7 +11,8 @@ import scikit_posthocs as posthocs
 from scipy import stats
 
 from pfbench.results.error_measures import Array
-from pfbench.results.statistics import LOG_TOLERANCE, holm, log_ratio, wilcoxon_signed_rank_rows
+from pfbench.results.statistics.effect_sizes import LOG_TOLERANCE, log_ratio
+from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank_rows
 
 
 class FriedmanResult(NamedTuple):

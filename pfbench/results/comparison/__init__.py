@@ -1,0 +1,1 @@
+"""Comparisons of filters: pairs within a condition, rankings across conditions, lost runs."""

@@ -1,0 +1,203 @@
+"""Conditions of a study: the result files that were computed on the same data, and their labels."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pfbench.results import store
+
+_SHARED_SETTINGS = ("scenario", "noise", "dtype")  # settings that decide the data of a filter
+_LOCATION_SETTINGS = ("scenario.cache_dir", "scenario.root")  # settings that do not
+_Described = tuple[Path, dict[str, Any]]
+
+
+class JobFile(NamedTuple):
+    """Result file of a job; its arrays are read on demand.
+
+    Attributes:
+        path: File.
+        label: Name of the filter, with the settings that distinguish it within its condition.
+        meta: Metadata, see `store.Result`.
+    """
+
+    path: Path
+    label: str
+    meta: dict[str, Any]
+
+    def load(self) -> store.JobResult:
+        """Read the arrays and metadata."""
+        return store.read_result(self.path)
+
+
+class Condition(NamedTuple):
+    """Jobs of all filters on the same data.
+
+    Attributes:
+        scenario: Scenario.
+        noise: Noise regime.
+        model: Model.
+        jobs: Result files.
+    """
+
+    scenario: str
+    noise: str
+    model: str
+    jobs: tuple[JobFile, ...]
+
+    @property
+    def name(self) -> str:
+        """Name as scenario / noise / model."""
+        return f"{self.scenario} / {self.noise} / {self.model}"
+
+
+def load_conditions(
+    study: str, results: str | Path = "results", *, allow_mixed_versions: bool = False
+) -> list[Condition]:
+    """List the conditions of a study; arguments and errors as `load_frame`.
+
+    Args:
+        study: Name of the folder in `results`.
+        results: Folder of all studies.
+        allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a
+            condition.
+
+    Returns:
+        Conditions sorted by scenario, noise and model.
+    """
+    files = sorted((Path(results) / study).glob("*.npz"))
+    items = [(path, store.read_metadata(path)) for path in files]
+    if not items:
+        raise FileNotFoundError(_no_results_message(study, Path(results)))
+    if not allow_mixed_versions:
+        _check_equal(items, ("versions.pfbench", "versions.commit"), "the study")
+    items.sort(key=lambda item: (_condition_key(item[1]), *_job_order(item[1])))
+    conditions = []
+    for key, group in groupby(items, key=lambda item: _condition_key(item[1])):
+        members = list(group)
+        jobs = _label_jobs(members)
+        if not allow_mixed_versions:
+            where = f"the condition {' / '.join(key)}"
+            _check_equal(members, ("seed", "first_run", "runs", "steps"), where)
+            settings = [f"config.{name}" for name in unlabelled_settings(jobs)]
+            _check_equal(members, settings, where)
+        conditions.append(Condition(*key, jobs))
+    return conditions
+
+
+def differing_settings(jobs: Sequence[JobFile]) -> list[str]:
+    """List settings of scenario, noise and number type in which jobs of a condition differ."""
+    configs = [job.meta["config"] for job in jobs]
+    flat = [_flatten({name: c.get(name) for name in _SHARED_SETTINGS}) for c in configs]
+    return _differing(flat)
+
+
+def unlabelled_settings(jobs: Sequence[JobFile]) -> list[str]:
+    """List the differing settings that are not in every label."""
+    differing = differing_settings(jobs)
+    return [name for name in differing if not all(f"{name}=" in job.label for job in jobs)]
+
+
+def natural_sort_key(text: str) -> list[tuple[int, int, str]]:
+    """Return a sorting key that puts 400 before 1600."""
+    parts = re.split(r"(\d+)", text)
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+
+
+def _condition_key(meta: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return scenario, noise and model of a job."""
+    choices = meta["choices"]
+    return str(choices["scenario"]), str(choices["noise"]), str(choices.get("model", ""))
+
+
+def _job_order(meta: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the sorting key of a job within its condition."""
+    return meta["label"], meta["seed"], meta["key"]
+
+
+def _label_jobs(items: Sequence[_Described]) -> tuple[JobFile, ...]:
+    """Give each job of a condition a label of its own."""
+    names = [str(meta["label"]) for _, meta in items]
+    jobs = []
+    for (path, meta), name in zip(items, names, strict=True):
+        twins = [other for (_, other), label in zip(items, names, strict=True) if label == name]
+        jobs.append(JobFile(path, _distinct_label(meta, twins), meta))
+    return tuple(sorted(jobs, key=lambda job: natural_sort_key(job.label)))
+
+
+def _distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> str:
+    """Extend a label by the settings in which jobs of that label differ.
+
+    Settings of the filter alone are used if they suffice.
+    """
+    if len(twins) == 1:
+        return str(meta["label"])
+    flat = [_flatten(twin["config"]) for twin in twins]
+    names = _differing(flat)
+    of_filter = [name for name in names if name.startswith("filter.")]
+    if len({tuple(repr(config.get(name)) for name in of_filter) for config in flat}) == len(flat):
+        names = of_filter
+    config = _flatten(meta["config"])
+    settings = [_setting(name.removeprefix("filter."), config.get(name, "-")) for name in names]
+    return f"{meta['label']}[{','.join(settings) or meta['key']}]"
+
+
+def _setting(name: str, value: Any) -> str:
+    """Format a setting of a label; a class is written without its module."""
+    if name.endswith("._target_"):
+        return f"{name.removesuffix('._target_')}={str(value).rpartition('.')[2]}"
+    return f"{name}={value}"
+
+
+def _differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """List the settings in which flat configurations differ, without locations."""
+    names = sorted(set().union(*configs) - set(_LOCATION_SETTINGS))
+    return [name for name in names if len({repr(config.get(name)) for config in configs}) > 1]
+
+
+def _flatten(config: Any, path: str = "") -> dict[str, Any]:
+    """Flatten a configuration to dotted names; stages of a filter are numbered."""
+    if isinstance(config, list) and any(isinstance(part, Mapping) for part in config):
+        config = dict(enumerate(config))
+    if not isinstance(config, Mapping):
+        return {path: config}
+    return {
+        key: value
+        for name, below in config.items()
+        for key, value in _flatten(below, f"{path}.{name}" if path else name).items()
+    }
+
+
+def _check_equal(items: Sequence[_Described], names: Sequence[str], where: str) -> None:
+    """Raise ValueError if jobs that are compared differ in one of `names`."""
+    for name in names:
+        by_value: dict[str, list[str]] = {}
+        for path, meta in items:
+            by_value.setdefault(str(_flatten(meta).get(name)), []).append(path.name)
+        if len(by_value) > 1:
+            listed = "; ".join(
+                f"{value}: {_list_files(files)}" for value, files in sorted(by_value.items())
+            )
+            raise ValueError(
+                f"{name} must be equal in {where}, but its results differ in {name} ({listed}). "
+                "Delete the files that do not belong and repeat their jobs, or pass mixed=True."
+            )
+
+
+def _list_files(files: Sequence[str]) -> str:
+    """Format up to three names of files."""
+    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
+    return f"{', '.join(files[:3])}{more}"
+
+
+def _no_results_message(study: str, results: Path) -> str:
+    """State which studies have results, and the command that makes these."""
+    folder = results / study
+    others = sorted({path.parent.name for path in results.glob("*/*.npz")})
+    notes = store.list_failures(folder)
+    failed = f" ({len(notes)} jobs failed, the first with {notes[0]['message']})" if notes else ""
+    available = f"Studies with results in {results}: {', '.join(others) or 'none'}."
+    return f"No results in {folder}{failed}. {available} Run: pfbench run -m +experiment={study}"

@@ -1,0 +1,177 @@
+"""Values of the metrics, one function each, from the arrays of a job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from pfbench.results import store
+from pfbench.results.consistency import coverage_per_run
+from pfbench.results.error_measures import (
+    Array,
+    Flags,
+    max_error,
+    mean_per_run,
+    mean_score_per_run,
+    rmse_per_run,
+)
+from pfbench.results.state_groups import ComponentGroup
+
+_PARTICLE_COUNTS = ("ess", "ancestors", "unique")  # divided by the number of particles
+
+
+class MetricInput(NamedTuple):
+    """Data from which a metric is computed.
+
+    Attributes:
+        result: Arrays and metadata of a job.
+        group: Components of one unit; None unless the scope is "components".
+        state_group: Name of a group of the state; empty for the scope "job".
+    """
+
+    result: store.JobResult
+    group: ComponentGroup | None = None
+    state_group: str = ""
+
+    @property
+    def arrays(self) -> Mapping[str, Array]:
+        """Stored arrays."""
+        return self.result.arrays
+
+    @property
+    def lost(self) -> Flags:
+        """Lost runs, [R]."""
+        return self.result.arrays["lost"]
+
+    @property
+    def group_index(self) -> int:
+        """Index of the group in arrays with one entry per group of the state."""
+        return list(self.result.meta["state"]["groups"]).index(self.state_group)
+
+    def select(self, name: str) -> Array:
+        """Return the components of the group of an array [..., D], in displayed units."""
+        if self.group is None:
+            raise ValueError(f"metric of {name} must have the scope 'components', got none.")
+        return self.arrays[name][..., self.group.places].astype(np.float64) * self.group.scale
+
+
+ByComponent = Mapping[str, Array]
+
+
+def particles_in_use(result: store.JobResult) -> Array | int:
+    """Return the number of particles: [R, T] if the filter changes it."""
+    arrays = result.arrays
+    return arrays["particles"] if "particles" in arrays else int(result.meta["particles"])
+
+
+def mean_trace(result: store.JobResult, name: str) -> Array:
+    """Average a trace over time, as a share of the particles if it counts particles.
+
+    Ancestors and unique particles are counted where a run was resampled. Without moves their
+    numbers are equal.
+
+    Args:
+        result: Job.
+        name: Name of the trace.
+
+    Returns:
+        Mean of each run, [R]; NaN without the trace.
+    """
+    arrays, lost, particles = result.arrays, result.arrays["lost"], result.meta.get("particles")
+    is_count = name in _PARTICLE_COUNTS
+    stored = "ancestors" if name == "unique" and "unique" not in arrays else name
+    trace = arrays.get(stored)
+    if trace is None or (is_count and not particles):
+        return np.full(lost.size, np.nan)
+    if name in ("ancestors", "unique") and "resampled" in arrays:
+        trace = np.where(arrays["resampled"], trace, np.nan)
+    return mean_per_run(trace / particles_in_use(result) if is_count else trace, lost)
+
+
+def mean_acceptance(result: store.JobResult) -> Array:
+    """Average the MCMC acceptance over resampled steps; [R], NaN without moves."""
+    arrays, lost = result.arrays, result.arrays["lost"]
+    if "accepted_0" not in arrays:
+        return np.full(lost.size, np.nan)
+    accepted = np.where(arrays.get("resampled", True), arrays["accepted_0"], np.nan)
+    return mean_per_run(accepted, lost)
+
+
+def compute_rmse(data: MetricInput) -> ByComponent:
+    """Compute the RMSE of each component and of the norm."""
+    error, names = data.select("error"), data.group.components if data.group else []
+    single = {name: rmse_per_run(error[..., [k]], data.lost) for k, name in enumerate(names)}
+    return {**single, "norm": rmse_per_run(error, data.lost)}
+
+
+def compute_max_error(data: MetricInput) -> ByComponent:
+    """Compute the maximum error of the norm."""
+    return {"norm": max_error(data.select("error"), data.lost)}
+
+
+def compute_crps(data: MetricInput) -> ByComponent:
+    """Compute the CRPS of each component and its mean."""
+    if "crps" not in data.arrays or data.group is None:
+        return {}
+    crps, names = data.select("crps"), data.group.components
+    single = {name: mean_score_per_run(crps[..., k], data.lost) for k, name in enumerate(names)}
+    return {**single, "mean": mean_score_per_run(crps, data.lost)}
+
+
+def compute_energy_score(data: MetricInput) -> ByComponent:
+    """Compute the energy score; a group of mixed units has none."""
+    group = data.group
+    if "energy" not in data.arrays or group is None or group.group != group.whole:
+        return {}
+    energy = data.arrays["energy"][..., data.group_index].astype(np.float64) * group.scale
+    return {"norm": mean_score_per_run(energy, data.lost)}
+
+
+def compute_interval_coverage(data: MetricInput, level: int) -> ByComponent:
+    """Compute the coverage of the central interval of `level` percent."""
+    if "pit" not in data.arrays or data.group is None:
+        return {}
+    pit = data.arrays["pit"][..., data.group.places]
+    return {"mean": coverage_per_run(pit, data.lost, level / 100)}
+
+
+def compute_mean_nees(data: MetricInput) -> ByComponent:
+    """Compute the mean NEES of a group."""
+    return {"norm": mean_per_run(data.arrays["nees"][..., data.group_index], data.lost)}
+
+
+def compute_mean_nis(data: MetricInput) -> ByComponent:
+    """Compute the mean NIS per observed component."""
+    if "nis" not in data.arrays:
+        return {}
+    nis, dof = (mean_per_run(data.arrays[name], data.lost) for name in ("nis", "nis_dof"))
+    return {"": np.divide(nis, dof, out=np.full(data.lost.size, np.nan), where=dof > 0)}
+
+
+def _job_value(data: MetricInput, compute: Callable[[store.JobResult], Array]) -> ByComponent:
+    """Compute a value of the job; empty if all runs are NaN."""
+    values = compute(data.result)
+    return {} if np.isnan(values).all() else {"": values}
+
+
+def average_trace(name: str) -> Callable[[MetricInput], ByComponent]:
+    """Return the function that averages a trace."""
+    return partial(_job_value, compute=partial(mean_trace, name=name))
+
+
+def compute_acceptance(data: MetricInput) -> ByComponent:
+    """Compute the mean MCMC acceptance."""
+    return _job_value(data, mean_acceptance)
+
+
+def compute_log_evidence(data: MetricInput) -> ByComponent:
+    """Return the log evidence of each run."""
+    return {"": np.where(data.lost, np.nan, data.arrays["log_evidence"])}
+
+
+def compute_seconds_per_step(data: MetricInput) -> ByComponent:
+    """Return the time per step of the job, equal for all runs."""
+    return {"": np.full(data.lost.size, data.result.meta["seconds"]["per_step"])}
