@@ -108,7 +108,7 @@ def test_the_metric_appears_in_the_table(
 def test_the_figure_is_written(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pfbench.report.plots.condition_figures import write_figure
+    from pfbench.report.plots.figure_files import write_figure
     from pfbench.report.plots.plotting import line_styles
 
     scope = follow("Add a figure to the report", folder)

@@ -14,8 +14,8 @@ from pfbench.claims.claim_tests import FAILS, HOLDS, ClaimTestResult
 from pfbench.claims.schema import Claim, ClaimTest
 from pfbench.claims.verdicts import ClaimVerdict
 from pfbench.report.plots.axis_ticks import set_plain_ticks
-from pfbench.report.plots.condition_figures import FigureSpec
-from pfbench.report.plots.paper_figures import FIGURES
+from pfbench.report.plots.figure_files import FigureSpec
+from pfbench.report.plots.paper.paper_catalogue import FIGURES
 from pfbench.report.plots.plotting import COLUMN, SMALL, format_slug
 
 _COLOURS = {HOLDS: "#0072B2", FAILS: "#D55E00"}  # open results are grey
@@ -52,7 +52,7 @@ def figure_link(claim: Claim, test: ClaimTest, anchors: Collection[str]) -> tupl
     condition = format_slug(test.cell.replace("/", "_"))
     for name, figure in FIGURES.items():
         if name.startswith(claim.paper) and figure_numbers(claim.source) & figure_numbers(
-            figure.said
+            figure.title
         ):
             start = format_slug(f"paper_{name}")
             starts = (f"{start}_{condition}", f"{start}_over_time")

@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from pfbench.claims import figures as claims_figures
+from pfbench.claims.claim_records import read_claims
+from pfbench.claims.claim_tables import (
+    Jobs,
+    claims_table,
+    count_verdicts,
+    describe_jobs,
+    jobs_table,
+    list_commits,
+)
 from pfbench.claims.claim_tests import OPEN, ClaimTestResult
-from pfbench.claims.measurements import Side, claim_job_metadata, load_claim_measurements
-from pfbench.claims.schema import PAPERS, Claim, ClaimTest, read_claims
+from pfbench.claims.measurements import claim_job_metadata, load_claim_measurements
+from pfbench.claims.schema import PAPERS, Claim, ClaimTest
 from pfbench.claims.verdicts import VERDICTS, ClaimVerdict, decide_claims
-from pfbench.report import cost, table_formats, writers
-from pfbench.results.conditions import natural_sort_key
+from pfbench.report import table_formats, writers
 
-Jobs = Mapping[Side, Mapping[str, Any]]
 STUDY = "claims"  # folder of the page among the reports
-_TEXT_COLUMNS = ("form", "test", "a", "b", "measure", "condition", "unit", "outcome")
 
 
 def write_claims(
@@ -120,61 +124,9 @@ def rows_by_paper(
     ]
 
 
-def jobs_table(jobs: Jobs) -> pd.DataFrame:
-    """Tabulate runs, budget and commit of each study, of the jobs that claims use."""
-    rows = []
-    for study, metas in _by_study(jobs).items():
-        text = cost.format_budget(metas).removeprefix("Budget: ").removesuffix(".")
-        row = {"study": study, "jobs": len(metas), "runs": _runs(metas), "budget": text}
-        rows.append({**row, "commit": ", ".join(list_commits(metas))})
-    return pd.DataFrame(rows)
-
-
-def list_commits(metas: Iterable[Mapping[str, Any]]) -> list[str]:
-    """List the distinct commits of jobs."""
-    versions = (meta.get("versions", {}) for meta in metas)
-    return _distinct(str(version.get("commit") or "not stated") for version in versions)
-
-
-def describe_jobs(claim: Claim, jobs: Jobs) -> list[str]:
-    """Describe runs and budget of a claim's jobs, and their commit if the page has several."""
-    sides = [side for tests in claim.tests.values() for test in tests for side in test.sides]
-    used = {side: jobs[side] for side in sides if side in jobs}
-    has_several = len(list_commits(jobs.values())) > 1
-    lines = []
-    for study, metas in _by_study(used).items():
-        commit = f" Commit {', '.join(list_commits(metas))}." if has_several else ""
-        lines.append(
-            f"{study}: {_runs(metas)} runs per filter. {cost.format_budget(metas)}{commit}"
-        )
-    return lines
-
-
 def claims_of_study(verdicts: Sequence[ClaimVerdict], study: str) -> list[ClaimVerdict]:
     """Select the verdicts that use a study."""
     return [verdict for verdict in verdicts if study in verdict.claim.studies]
-
-
-def count_verdicts(verdicts: Sequence[ClaimVerdict]) -> pd.DataFrame:
-    """Count the claims of each paper by verdict."""
-    rows = []
-    for key, title in [*PAPERS.items(), ("", "all")]:
-        count = Counter(v.verdict for v in verdicts if key in ("", v.claim.paper))
-        by_verdict = {verdict: count[verdict] for verdict in VERDICTS}
-        rows.append({"paper": title, **by_verdict, "claims": count.total()})
-    return pd.DataFrame(rows)
-
-
-def claims_table(verdicts: Sequence[ClaimVerdict]) -> pd.DataFrame:
-    """Tabulate one row per test, and one per claim without tests."""
-    rows: list[dict[str, Any]] = []
-    for v in verdicts:
-        head = {"claim": v.claim.id, "paper value": v.claim.printed}
-        head |= {"verdict": v.verdict, "reason": v.reason}
-        results = [(form, r) for form, values in v.findings.items() for r in values]
-        rows += [{**head, **_test_row(form, r)} for form, r in results] or [head]
-    table = pd.DataFrame(rows)
-    return table.fillna({name: "" for name in _TEXT_COLUMNS if name in table})
 
 
 def format_result(result: ClaimTestResult) -> str:
@@ -196,26 +148,6 @@ def format_required_runs(result: ClaimTestResult) -> str:
     if np.isinf(result.needed):
         return "no number of runs decides an effect of this size"
     return f"{result.needed:.0f} runs per condition required for power 0.8 at this effect"
-
-
-def _by_study(jobs: Jobs) -> dict[str, list[Mapping[str, Any]]]:
-    """Group metadata by study, each job once."""
-    studies: dict[str, dict[str, Mapping[str, Any]]] = {}
-    for (study, _, _), meta in sorted(
-        jobs.items(), key=lambda item: natural_sort_key("/".join(item[0]))
-    ):
-        studies.setdefault(study, {})[meta["key"]] = meta
-    return {study: list(metas.values()) for study, metas in studies.items()}
-
-
-def _runs(metas: Iterable[Mapping[str, Any]]) -> str:
-    """Format the numbers of runs of jobs."""
-    return " or ".join(_distinct(str(meta["runs"]) for meta in metas))
-
-
-def _distinct(values: Iterable[str]) -> list[str]:
-    """Sort the distinct values."""
-    return sorted(set(values), key=natural_sort_key)
 
 
 def _claim_row(
@@ -271,29 +203,6 @@ def _format_sides(test: ClaimTest) -> str:
         return test.a
     elsewhere = f" in {test.b_cell.rsplit('/', 1)[0]}" if test.b_cell else ""
     return f"{test.a} {'minus' if test.statistic == 'close' else 'to'} {test.b}{elsewhere}"
-
-
-def _test_row(form: str, result: ClaimTestResult) -> dict[str, Any]:
-    """Collect the row of a test in the table of claims."""
-    test = result.comparison
-    return {
-        "form": form,
-        "test": test.statistic,
-        "a": test.a,
-        "b": test.b,
-        "measure": test.measure,
-        "condition": test.cell,
-        "unit": result.unit,
-        "outcome": result.outcome,
-        "printed effect": test.printed,
-        "our value": result.effect,
-        "lower": result.low,
-        "upper": result.high,
-        "p": result.p,
-        "adjusted p (Holm)": result.p_holm,
-        "runs": result.pairs,
-        "runs required": result.needed,
-    }
 
 
 def _to_json(verdict: ClaimVerdict) -> dict[str, Any]:

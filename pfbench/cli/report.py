@@ -122,6 +122,6 @@ def _report_all(words: list[str]) -> None:
 
 def _claimed_studies() -> set[str]:
     """Return the studies that the claims refer to."""
-    from pfbench.claims import schema
+    from pfbench.claims import claim_records
 
-    return {study for claim in schema.read_claims() for study in claim.studies}
+    return {study for claim in claim_records.read_claims() for study in claim.studies}

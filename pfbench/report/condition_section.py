@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from pfbench.report import calibration, cost, summary, tables, writers
+from pfbench.report import comparison_tables, cost, summary, tables, writers
 from pfbench.report.options import ReportContext, select_line_styles
-from pfbench.report.plots import comparison_figures, condition_figures
+from pfbench.report.plots import calibration_plots, comparison_figures, condition_figures
+from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.plotting import format_slug
 from pfbench.report.provenance import distinct_values
 from pfbench.results import coverage, status, store
@@ -24,110 +25,189 @@ from pfbench.results.state_groups import component_groups
 PAIRS = 60  # pairs of a table at most
 
 
+class _ConditionData(NamedTuple):
+    """Results of a condition and what was computed from them.
+
+    Attributes:
+        full_results: Results by label, with all times.
+        results: Results by label, from the start time on.
+        runs: Rows of the runs, of the groups with truth.
+        fronts: Accuracy and time of each group with truth.
+        tests: Pairwise tests.
+        main: Main group.
+    """
+
+    full_results: Mapping[str, store.JobResult]
+    results: Mapping[str, store.JobResult]
+    runs: pd.DataFrame
+    fronts: Sequence[cost.ParetoFront]
+    tests: Sequence[PairwiseTest]
+    main: str
+
+
 def write_condition_section(
-    cell: Condition, view: ReportContext
+    condition: Condition, context: ReportContext
 ) -> tuple[dict[str, Any], list[PairwiseTest], pd.DataFrame]:
     """Write the figures and tables of a condition.
 
     Args:
-        cell: Condition.
-        view: Context of the report.
+        condition: Condition.
+        context: Context of the report.
 
     Returns:
         Template variables, pairwise tests, and rows of the runs.
     """
-    options, folder = view.options, view.folder
-    whole = {job.label: job.load() for job in cell.jobs}
-    used = {label: drop_before(result, options.start_time_s) for label, result in whole.items()}
-    runs = pd.concat(
-        [
-            to_long_rows(
-                cell, job, whole[job.label], options.start_time_s, options.convergence_threshold
-            )
-            for job in cell.jobs
-        ]
-    )
-    known = [group for group in view.groups if _scored(used, group)]
-    fronts = [cost.pareto_front(cell.name, runs, group) for group in known]
-    runs = runs[runs.group.isin(known)]
-    decided = compare_pairs(runs, options.alpha, options.equivalence_margin, options.target_effect)
-    regions = coverage.compute_coverage(runs, options.alpha)
-    note = cost.format_budget([job.meta for job in cell.jobs])
-    if apart := differing_settings(cell.jobs):
-        note += f" Jobs of this condition differ in {', '.join(apart)}: their runs share random numbers, but not the data."
-    prefix = format_slug(f"{cell.scenario}_{cell.noise}_{cell.model}")
-    main = summary.select_main_group(known)
-    parts = []
-    for group, front in zip(known, fronts, strict=True):
-        own = [v for v in decided if v.group == group]
-        accuracy = tables.accuracy_table(
-            used, group, own, options.alpha, options.convergence_threshold.get(group), whole
-        )
-        if len(accuracy):
-            chosen = _with_best(own, front) if len(own) > PAIRS else own
-            writers.write_table(folder, f"{prefix}_{format_slug(group)}", accuracy, note)
-            pairs, effects = tables.decision_table(chosen), tables.effect_table(chosen)
-            if chosen and (group == main or not view.brief):
-                writers.write_table(folder, f"{prefix}_{format_slug(group)}_pairs", pairs, note)
-                writers.write_table(folder, f"{prefix}_{format_slug(group)}_effects", effects, note)
-            short = (
-                tables.short_accuracy_table(accuracy) if view.brief and group != main else accuracy
-            )
-            shown = {
-                "accuracy": short,
-                "pairs": pairs,
-                "effects": effects,
-                "regions": coverage.format_coverage(regions, group),
-            }
-            best = _best_first([front], group)[0]
-            parts.append(
-                {
-                    "name": group,
-                    "main": group == main,
-                    "chosen": chosen,
-                    "best": best,
-                    **shown,
-                    **_said(own, front),
-                }
-            )
-    ran = tables.overview_table(used, options.alpha)
-    writers.write_table(folder, f"{prefix}_overview", ran, note)
-    seen = known if not view.brief else [main] if main else []
-    look, who = select_line_styles(
-        view, list(whole), _best_first(fronts, main), f"the smallest median RMSE of {main}"
-    )
-    drawings = [
-        *condition_figures.condition_figures(whole, runs, look, seen, options.alpha, brief=view.brief, note=who),
-        *calibration.calibration_figures(used, seen, look, options.alpha, who),
-        *comparison_figures.comparison_figures_of_condition([v for v in decided if v.group in seen], [f for f in fronts if f.group in seen], look, who),
-    ]  # fmt: skip
-    pictures = [
-        writers.render_figure(drawing, prefix, folder, options.figure_formats)
-        for drawing in drawings
-    ]
-    section: dict[str, Any] = {"budget": note, "name": cell.name, "anchor": prefix, "main": main}
-    section["fates"] = [(label, status.count_statuses(result)) for label, result in used.items()]
-    section |= {"overview": ran, "parts": parts, "drawings": pictures}
-    there = {
-        block.group for result in used.values() for block in component_groups(result.meta["state"])
+    options, folder = context.options, context.folder
+    data = _load_condition(condition, context)
+    key = (condition.scenario, condition.noise, condition.model)
+    prefix, note = format_slug("_".join(key)), _format_note(condition)
+    regions = coverage.compute_coverage(data.runs, options.alpha)
+    parts = [_write_group(data, front, context, prefix, note) for front in data.fronts]
+    overview = tables.overview_table(data.results, options.alpha)
+    writers.write_table(folder, f"{prefix}_overview", overview, note)
+    section = {
+        "key": key,
+        "budget": note,
+        "name": condition.name,
+        "anchor": prefix,
+        "main": data.main,
+        "overview": overview,
+        "parts": [
+            part | {"regions": coverage.format_coverage(regions, part["name"])}
+            for part in parts
+            if part
+        ],
+        "drawings": writers.render_figures(
+            _list_figures(data, context), prefix, folder, options.figure_formats
+        ),
+        "unscored": _list_unscored(data, context.groups),
+        "bounds": distinct_values(
+            result.meta["bound"] for result in data.full_results.values() if "bound" in result.meta
+        ),
+        **_count_statuses(data.results),
     }
-    section["unscored"] = [group for group in view.groups if group in there and group not in known]
-    section["bounds"] = distinct_values(
-        result.meta["bound"] for result in whole.values() if "bound" in result.meta
+    return section, list(data.tests), data.runs
+
+
+def _load_condition(condition: Condition, context: ReportContext) -> _ConditionData:
+    """Read the results of a condition and compare its filters."""
+    options = context.options
+    full_results = {job.label: job.load() for job in condition.jobs}
+    results = {
+        label: drop_before(result, options.start_time_s) for label, result in full_results.items()
+    }
+    rows = [
+        to_long_rows(
+            condition,
+            job,
+            full_results[job.label],
+            options.start_time_s,
+            options.convergence_threshold,
+        )
+        for job in condition.jobs
+    ]
+    runs = pd.concat(rows)
+    groups = [group for group in context.groups if _has_scores(results, group)]
+    fronts = [cost.pareto_front(condition.name, runs, group) for group in groups]
+    runs = runs[runs.group.isin(groups)]
+    tests = compare_pairs(runs, options.alpha, options.equivalence_margin, options.target_effect)
+    main = summary.select_main_group(groups)
+    return _ConditionData(full_results, results, runs, fronts, tests, main)
+
+
+def _format_note(condition: Condition) -> str:
+    """Format the budget of the jobs, and the settings in which their data differ."""
+    note = cost.format_budget([job.meta for job in condition.jobs])
+    if settings := differing_settings(condition.jobs):
+        note += (
+            f" Jobs of this condition differ in {', '.join(settings)}: "
+            "their runs share random numbers, but not the data."
+        )
+    return note
+
+
+def _write_group(
+    data: _ConditionData, front: cost.ParetoFront, context: ReportContext, prefix: str, note: str
+) -> dict[str, Any]:
+    """Write the tables of a group; return their template variables, none without results."""
+    options, group = context.options, front.group
+    tests = [v for v in data.tests if v.group == group]
+    bound = options.convergence_threshold.get(group)
+    accuracy = tables.accuracy_table(
+        data.results, group, tests, options.alpha, bound, data.full_results
     )
-    section["lost"] = [(label, n.lost, n.runs) for label, n in section["fates"] if n.lost]
-    section["diverged"] = [
-        (label, n.diverged, n.runs) for label, n in section["fates"] if n.diverged
-    ]
-    section["overconfident"] = [
-        (label, n.severely_overconfident, n.runs)
-        for label, n in section["fates"]
-        if n.severely_overconfident
-    ]
-    return section, decided, runs
+    if not len(accuracy):
+        return {}
+    best = _order_by_rmse([front], group)[0]
+    selection = [v for v in tests if best in (v.a, v.b)] if len(tests) > PAIRS else tests
+    pairs = comparison_tables.decision_table(selection)
+    effects = comparison_tables.effect_table(selection)
+    is_full = group == data.main or not context.brief
+    files = {"": accuracy, "_pairs": pairs, "_effects": effects}
+    for suffix, table in files.items() if selection and is_full else [("", accuracy)]:
+        name = f"{prefix}_{format_slug(group)}{suffix}"
+        writers.write_table(context.folder, name, table, note)
+    return {
+        "name": group,
+        "main": group == data.main,
+        "chosen": selection,
+        "best": best,
+        "accuracy": accuracy if is_full else tables.short_accuracy_table(accuracy),
+        "pairs": pairs,
+        "effects": effects,
+        **_summarise_tests(tests),
+        "front": [
+            label for label, on_front in zip(front.filters, front.on_front, strict=True) if on_front
+        ],
+    }
 
 
-def _best_first(fronts: Sequence[cost.ParetoFront], group: str) -> list[str]:
+def _list_figures(data: _ConditionData, context: ReportContext) -> list[FigureSpec]:
+    """List the figures of a condition, of the main group only in a brief report."""
+    alpha, labels = context.options.alpha, list(data.full_results)
+    fronts = [f for f in data.fronts if not context.brief or f.group == data.main]
+    groups = [front.group for front in fronts]
+    tests = [v for v in data.tests if v.group in groups]
+    best_first = _order_by_rmse(data.fronts, data.main)
+    style, note = select_line_styles(
+        context, labels, best_first, f"the smallest median RMSE of {data.main}"
+    )
+    return [
+        *condition_figures.condition_figures(
+            data.full_results, data.runs, style, groups, alpha, brief=context.brief, note=note
+        ),
+        *calibration_plots.calibration_figures(data.results, groups, style, alpha, note),
+        *comparison_figures.comparison_figures_of_condition(tests, fronts, style, note),
+    ]
+
+
+def _list_unscored(data: _ConditionData, groups: Sequence[str]) -> list[str]:
+    """List the groups of the results without truth."""
+    available = {
+        block.group
+        for result in data.results.values()
+        for block in component_groups(result.meta["state"])
+    }
+    scored = {front.group for front in data.fronts}
+    return [group for group in groups if group in available - scored]
+
+
+def _count_statuses(results: Mapping[str, store.JobResult]) -> dict[str, Any]:
+    """Count the runs of each filter by status."""
+    counts = [(label, status.count_statuses(result)) for label, result in results.items()]
+    return {
+        "status_counts": counts,
+        "lost": [(label, n.lost, n.runs) for label, n in counts if n.lost],
+        "diverged": [(label, n.diverged, n.runs) for label, n in counts if n.diverged],
+        "overconfident": [
+            (label, n.severely_overconfident, n.runs)
+            for label, n in counts
+            if n.severely_overconfident
+        ],
+    }
+
+
+def _order_by_rmse(fronts: Sequence[cost.ParetoFront], group: str) -> list[str]:
     """Order the filters of a group by median RMSE."""
     return [
         label
@@ -137,38 +217,32 @@ def _best_first(fronts: Sequence[cost.ParetoFront], group: str) -> list[str]:
     ]
 
 
-def _with_best(own: Sequence[PairwiseTest], front: cost.ParetoFront) -> list[PairwiseTest]:
-    """Select the comparisons with the filter of the smallest median RMSE."""
-    best = _best_first([front], front.group)[0]
-    return [v for v in own if best in (v.a, v.b)]
-
-
-def _said(own: Sequence[PairwiseTest], front: cost.ParetoFront) -> dict[str, Any]:
+def _summarise_tests(tests: Sequence[PairwiseTest]) -> dict[str, Any]:
     """Summarise the comparisons of a group for the text."""
-    runs = [v.needed for v in own if math.isfinite(v.needed)]
-    least = [v.detectable for v in own if math.isfinite(v.detectable)]
+    runs = [v.needed for v in tests if math.isfinite(v.needed)]
+    effects = [v.detectable for v in tests if math.isfinite(v.detectable)]
+    pairs = [v.pairs for v in tests]
     return {
-        "unbeaten": summary.list_top_group(own),
-        "shown": sum(v.winner != INCONCLUSIVE for v in own),
-        "equal": sum(v.equivalent for v in own),
-        "n": len(own),
+        "unbeaten": summary.list_top_group(tests),
+        "shown": sum(v.winner != INCONCLUSIVE for v in tests),
+        "equal": sum(v.equivalent for v in tests),
+        "n": len(tests),
         "needed": (int(min(runs)), int(max(runs))) if runs else None,
-        "detectable": (100 * min(least), 100 * max(least)) if least else None,
-        "had": (min(v.pairs for v in own), max(v.pairs for v in own)) if own else None,
-        "front": [label for label, kept in zip(front.filters, front.kept, strict=True) if kept],
+        "detectable": (100 * min(effects), 100 * max(effects)) if effects else None,
+        "had": (min(pairs), max(pairs)) if pairs else None,
     }
 
 
-def _scored(results: Mapping[str, store.JobResult], group: str) -> bool:
+def _has_scores(results: Mapping[str, store.JobResult], group: str) -> bool:
     """Return whether a valid run has a truth for the group, or all runs are lost."""
     for result in results.values():
         error = result.arrays["error"][~result.arrays["lost"]]
-        places = [
-            place
+        indices = [
+            index
             for block in component_groups(result.meta["state"])
             if block.group == group
-            for place in block.places
+            for index in block.places
         ]
-        if places and (not len(error) or not np.isnan(error[..., places]).all()):
+        if indices and (not len(error) or not np.isnan(error[..., indices]).all()):
             return True
     return False

@@ -32,7 +32,7 @@ class ParetoFront:
         filters: Labels, ordered by time.
         seconds: Time per step, s.
         rmse: Median over runs of the RMSE; a lost run counts as infinite.
-        kept: Whether the filter is on the Pareto front.
+        on_front: Whether the filter is on the Pareto front.
     """
 
     cell: str
@@ -41,7 +41,7 @@ class ParetoFront:
     filters: tuple[str, ...]
     seconds: tuple[float, ...]
     rmse: tuple[float, ...]
-    kept: tuple[bool, ...]
+    on_front: tuple[bool, ...]
 
 
 def format_budget(metas: Sequence[Mapping[str, Any]]) -> str:
@@ -76,7 +76,6 @@ def pareto_front(cell: str, rows: pd.DataFrame, group: str) -> ParetoFront:
     order = sorted(error.index, key=lambda label: (time[label], error[label], label))
     seconds, rmse = time[order].to_numpy(dtype=np.float64), error[order].to_numpy(dtype=np.float64)
     unit = str(group_rows.unit.iloc[0]) if len(group_rows) else ""
-    kept = tuple(map(bool, pareto_mask(seconds, rmse)))
     return ParetoFront(
         cell,
         group,
@@ -84,7 +83,7 @@ def pareto_front(cell: str, rows: pd.DataFrame, group: str) -> ParetoFront:
         tuple(map(str, order)),
         tuple(map(float, seconds)),
         tuple(map(float, rmse)),
-        kept,
+        tuple(map(bool, pareto_mask(seconds, rmse))),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,13 @@ from matplotlib.figure import Figure
 
 from pfbench.report import scenario_data, writers
 from pfbench.report.plots import scenario_figures
-from pfbench.report.plots.condition_figures import FigureSpec
+from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.plotting import format_slug
 from pfbench.report.table_formats import format_number
 from pfbench.results import consistency, store
 from pfbench.results.state_groups import component_groups
+
+_Figure = tuple[str, str, Callable[[store.JobResult], Figure]]  # name, caption, plot
 
 
 def write_datasheet(
@@ -49,10 +51,7 @@ def write_datasheet(
     name = format_slug(f"{choices['scenario']}_{choices['noise']}")
     folder = Path(out) / "datasheets" / name
     writers.remove_old_files(folder)
-    figures = [
-        writers.render_figure(drawing, name, folder, formats)
-        for drawing in datasheet_figures(sheet)
-    ]
+    figures = writers.render_figures(datasheet_figures(sheet), name, folder, formats)
     residuals, spreads = whiteness_table(sheet), spread_table(sheet)
     for name, table in (("residuals", residuals), ("spread", spreads)):
         if len(table):
@@ -72,104 +71,101 @@ def write_datasheet(
 
 def datasheet_figures(sheet: store.JobResult) -> list[FigureSpec]:
     """List the figures that the data of the scenario allow."""
-    rows: list[tuple[str, str, Callable[[store.JobResult], Figure]]] = []
-    data, runs = sheet.arrays, sheet.meta["runs"]
-    if "track" in data:
-        others = (
-            " and of the other runs (grey)"
-            if len(scenario_data.select_tracks(data["track"])) > 1
-            else ""
-        )
-        text = f"True track of the first run{others}: plan view and height above the start."
-        rows.append(("track", text, scenario_figures.plot_scenario_track))
-    if "range" in data:
-        rows.append(
-            (
-                "range",
-                "Horizontal range from the observer to the target.",
-                scenario_figures.plot_distance,
-            )
-        )
-    if "force" in data and "rate" in data:
-        text = (
-            "Specific force and angular rate in body axes, mean over each step. Simulated scenarios show true values, recorded "
-            "scenarios the IMU of the first run."
-        )
-        rows.append(("sensors", text, scenario_figures.plot_sensors))
-    if "azimuth" in data:
-        text = "Satellites above the horizon of the first run, zenith in the centre. Arrows show the direction of motion."
-        rows.append(("sky", text, scenario_figures.plot_sky))
-    if "azimuth" in data or not (data["seen"] == 1).all():
-        text = (
-            "Number of satellites and of observed measurement components over time, mean over runs."
-        )
-        rows.append(
-            (
-                "seen",
-                text if "azimuth" in data else text.replace("satellites and of ", ""),
-                scenario_figures.plot_measurements,
-            )
-        )
-    if scenario_data.group_residuals(sheet):
-        text = "Residuals at the true state, in standard deviations of the model, and the standard normal density"
-        rows.append(
-            (
-                "residuals",
-                f"{text}. The outermost bins include all larger values.",
-                scenario_figures.plot_residuals,
-            )
-        )
-        text = "Residuals of the first run over time, with lines at two standard deviations."
-        rows.append(("residuals_time", text, scenario_figures.plot_over_time))
-    if runs > 1 and scenario_data.compute_spreads(sheet):
-        text = "Spread of the true states over the runs (standard deviation of the norm)"
-        extra = (
-            (
-                ", and the posterior Cramér-Rao bound (PCRB), a lower bound of the root mean square error. The bound exceeds "
-                "the spread if the initial distribution of the filters is wider than that of the scenario"
-            )
-            if "bound" in data
-            else ""
-        )
-        rows.append(("spread", f"{text}{extra}.", scenario_figures.plot_error_spread))
+    rows = (*_truth_figures(sheet), *_measurement_figures(sheet), *_statistics_figures(sheet))
     return [FigureSpec(name, caption, partial(make, sheet)) for name, caption, make in rows]
+
+
+def _truth_figures(sheet: store.JobResult) -> Iterator[_Figure]:
+    """Yield the figures of track, range and inertial sensors."""
+    arrays = sheet.arrays
+    if "track" in arrays:
+        has_others = len(scenario_data.select_tracks(arrays["track"])) > 1
+        others = " and of the other runs (grey)" if has_others else ""
+        text = f"True track of the first run{others}: plan view and height above the start."
+        yield "track", text, scenario_figures.plot_scenario_track
+    if "range" in arrays:
+        text = "Horizontal range from the observer to the target."
+        yield "range", text, scenario_figures.plot_distance
+    if "force" in arrays and "rate" in arrays:
+        text = (
+            "Specific force and angular rate in body axes, mean over each step. "
+            "Simulated scenarios show true values, recorded scenarios the IMU of the first run."
+        )
+        yield "sensors", text, scenario_figures.plot_sensors
+
+
+def _measurement_figures(sheet: store.JobResult) -> Iterator[_Figure]:
+    """Yield the figures of the satellites and of the number of measurements."""
+    has_satellites = "azimuth" in sheet.arrays
+    if has_satellites:
+        text = (
+            "Satellites above the horizon of the first run, zenith in the centre. "
+            "Arrows show the direction of motion."
+        )
+        yield "sky", text, scenario_figures.plot_sky
+    if has_satellites or not (sheet.arrays["seen"] == 1).all():
+        text = (
+            f"Number of {'satellites and of ' if has_satellites else ''}observed measurement "
+            "components over time, mean over runs."
+        )
+        yield "seen", text, scenario_figures.plot_measurements
+
+
+def _statistics_figures(sheet: store.JobResult) -> Iterator[_Figure]:
+    """Yield the figures of the residuals and of the spread of the runs."""
+    if scenario_data.group_residuals(sheet):
+        text = (
+            "Residuals at the true state, in standard deviations of the model, and the standard "
+            "normal density. The outermost bins include all larger values."
+        )
+        yield "residuals", text, scenario_figures.plot_residuals
+        text = "Residuals of the first run over time, with lines at two standard deviations."
+        yield "residuals_time", text, scenario_figures.plot_over_time
+    if sheet.meta["runs"] > 1 and scenario_data.compute_spreads(sheet):
+        text = "Spread of the true states over the runs (standard deviation of the norm)"
+        if "bound" in sheet.arrays:
+            text += (
+                ", and the posterior Cramér-Rao bound (PCRB), a lower bound of the root mean "
+                "square error. The bound exceeds the spread if the initial distribution of the "
+                "filters is wider than that of the scenario"
+            )
+        yield "spread", f"{text}.", scenario_figures.plot_error_spread
 
 
 def list_facts(sheet: store.JobResult) -> list[str]:
     """Describe the scenario in sentences."""
-    a, meta = sheet.arrays, sheet.meta
-    time, steps = a["time"], meta["steps"]
-    gaps = np.diff(time)
-    pace = f" of {np.median(gaps):.3g} s" if steps > 1 else ""
-    text = [
-        f"{steps} steps{pace}, {time[0]:.4g} to {time[-1]:.5g} s. {meta['runs']} runs, seed {meta['seed']}."
-    ]
-    if "track" in a:
-        steps_m = np.diff(a["track"][0].astype(np.float64), axis=0)
-        steps_m = steps_m[~np.isnan(steps_m).any(-1)]
-        length, height = np.linalg.norm(steps_m, axis=-1).sum(), a["track"][0, :, 2]
-        low, high = np.nanmin(height), np.nanmax(height)
-        text.append(
-            f"Track of the first run: {length / 1e3:.4g} km, height {low:.4g} to {high:.4g} m above its start."
-        )
-    kinds = meta["kinds"]
+    arrays, meta = sheet.arrays, sheet.meta
+    time, steps, kinds = arrays["time"], meta["steps"], meta["kinds"]
+    pace = f" of {np.median(np.diff(time)):.3g} s" if steps > 1 else ""
+    span = f"{time[0]:.4g} to {time[-1]:.5g} s"
+    texts = [f"{steps} steps{pace}, {span}. {meta['runs']} runs, seed {meta['seed']}."]
+    if "track" in arrays:
+        texts.append(_describe_track(arrays["track"][0]))
     counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
-    text.append(
-        f"Measurement of {len(kinds)} components: {counts}. Observed: {100 * a['seen'].mean():.3g} %."
+    observed = f"{100 * arrays['seen'].mean():.3g}"
+    texts.append(f"Measurement of {len(kinds)} components: {counts}. Observed: {observed} %.")
+    if "azimuth" in arrays:
+        visible = scenario_data.visible_satellites(sheet)
+        is_sparse = scenario_data.has_sparse_counts(visible)
+        least = visible[visible > 0].min() if is_sparse else visible.min()
+        total = arrays["elevation"].shape[1]
+        texts.append(f"Satellites above the horizon: {least} to {visible.max()} of {total}.")
+    residual = arrays["residual"]
+    is_equal = scenario_data.distinct_tracks(residual).shape[0] == 1
+    if is_equal and meta["runs"] > 1 and not np.isnan(residual).all():
+        texts.append("All runs have equal residuals, which are counted once.")
+    return [*texts, f"{meta['bound'][0].upper()}{meta['bound'][1:]}."]
+
+
+def _describe_track(track: np.ndarray) -> str:
+    """Describe length and height of a track [T, 3]."""
+    moves = np.diff(track.astype(np.float64), axis=0)
+    length = np.linalg.norm(moves[~np.isnan(moves).any(-1)], axis=-1).sum()
+    low, high = np.nanmin(track[:, 2]), np.nanmax(track[:, 2])
+    return (
+        f"Track of the first run: {length / 1e3:.4g} km, "
+        f"height {low:.4g} to {high:.4g} m above its start."
     )
-    if "azimuth" in a:
-        up = scenario_data.visible_satellites(sheet)
-        least = up[up > 0].min() if scenario_data.has_sparse_counts(up) else up.min()
-        text.append(
-            f"Satellites above the horizon: {least} to {up.max()} of {a['elevation'].shape[1]}."
-        )
-    if (
-        (scenario_data.distinct_tracks(a["residual"]).shape[0] == 1)
-        and meta["runs"] > 1
-        and not np.isnan(a["residual"]).all()
-    ):
-        text.append("All runs have equal residuals, which are counted once.")
-    return [*text, f"{meta['bound'][0].upper()}{meta['bound'][1:]}."]
 
 
 def list_missing_figures(sheet: store.JobResult) -> list[str]:
@@ -215,15 +211,15 @@ def whiteness_table(sheet: store.JobResult) -> pd.DataFrame:
     """Tabulate mean, variance and lag-1 autocorrelation of residuals with 95 % intervals."""
     rows = []
     for kind, z in scenario_data.group_residuals(sheet).items():
-        law = consistency.compute_whiteness(z)
+        moments = consistency.compute_whiteness(z)
         rows.append({
             "measurement": kind,
             "components": z.shape[-1],
-            "residuals": law.numbers,
-            "mean": law.mean, "95 % interval of 0": f"± {format_number(law.mean_band)}",
-            "variance": law.variance, "95 % interval of 1": f"± {format_number(law.variance_band)}",
-            "lag-1 autocorrelation": law.lag, "95 % interval of no correlation": f"± {format_number(law.lag_band)}",
-            "outside 3 sd [%]": 100 * law.beyond,
+            "residuals": moments.numbers,
+            "mean": moments.mean, "95 % interval of 0": f"± {format_number(moments.mean_band)}",
+            "variance": moments.variance, "95 % interval of 1": f"± {format_number(moments.variance_band)}",
+            "lag-1 autocorrelation": moments.lag, "95 % interval of no correlation": f"± {format_number(moments.lag_band)}",
+            "outside 3 sd [%]": 100 * moments.outside_share,
         })  # fmt: skip
     return pd.DataFrame(rows)
 

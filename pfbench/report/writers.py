@@ -15,7 +15,7 @@ import jinja2
 import pandas as pd
 
 from pfbench.report import table_formats
-from pfbench.report.plots import condition_figures
+from pfbench.report.plots.figure_files import FigureSpec, write_figure
 from pfbench.report.plots.plotting import format_slug
 
 _HERE = Path(__file__).parent
@@ -71,7 +71,7 @@ def write_json(folder: Path, name: str, typed: Sequence[Any]) -> str:
 
 
 def render_figure(
-    drawing: condition_figures.FigureSpec, prefix: str, folder: Path, formats: Sequence[str]
+    drawing: FigureSpec, prefix: str, folder: Path, formats: Sequence[str]
 ) -> dict[str, Any]:
     """Write the files of a figure and return its template variables.
 
@@ -81,7 +81,7 @@ def render_figure(
         folder: Folder of the report.
         formats: Formats of the figure.
     """
-    paths = condition_figures.write_figure(
+    paths = write_figure(
         drawing._replace(name=f"{prefix}_{drawing.name}"), folder / "figures", formats
     )
     first = max(paths, key=lambda path: path.suffix)  # svg if available
@@ -93,6 +93,20 @@ def render_figure(
         "anchor": format_slug(f"{prefix}_{drawing.name}"),
         "broad": drawing.name.startswith("spread_"),
     }
+
+
+def render_figures(
+    drawings: Sequence[FigureSpec], prefix: str, folder: Path, formats: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Write the files of figures and return their template variables.
+
+    Args:
+        drawings: Figures.
+        prefix: Prefix of the file names.
+        folder: Folder of the report.
+        formats: Formats of the figures.
+    """
+    return [render_figure(drawing, prefix, folder, formats) for drawing in drawings]
 
 
 def write_table(folder: Path, name: str, table: pd.DataFrame, note: str = "") -> None:

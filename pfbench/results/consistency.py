@@ -43,7 +43,7 @@ class WhitenessResult(NamedTuple):
         variance_band: Limit of the absolute difference of the mean square from 1.
         lag: Autocorrelation at lag 1.
         lag_band: Limit of the absolute autocorrelation.
-        beyond: Share beyond three standard deviations; 0.0027 for a normal distribution.
+        outside_share: Share beyond three standard deviations; 0.0027 for a normal distribution.
         numbers: Sample size.
     """
 
@@ -53,7 +53,7 @@ class WhitenessResult(NamedTuple):
     variance_band: float
     lag: float
     lag_band: float
-    beyond: float
+    outside_share: float
     numbers: int
 
 
@@ -124,7 +124,7 @@ def compute_whiteness(z: Array) -> WhitenessResult:
         variance_band=float(np.sqrt(2) * root),
         lag=covariance / square if pairs and square > 0 else np.nan,
         lag_band=float(1.96 / np.sqrt(pairs)) if pairs else np.nan,
-        beyond=float(finite_mean((np.abs(values) > 3).astype(np.float64), axis=0)),
+        outside_share=float(finite_mean((np.abs(values) > 3).astype(np.float64), axis=0)),
         numbers=values.size,
     )
 

@@ -15,10 +15,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from pfbench import job
-from pfbench.report import condition_section, page
-from pfbench.report.plots import filter_plots, paper_figures, paper_plots
+from pfbench.report import across_section, condition_section, page
+from pfbench.report.plots import filter_plots
 from pfbench.report.plots.axis_ticks import format_ticks
-from pfbench.report.plots.paper_figures import FIGURES
+from pfbench.report.plots.paper import experiment_plots, paper_figures, time_plots
+from pfbench.report.plots.paper.paper_catalogue import FIGURES
 from pfbench.report.plots.plotting import line_styles, mute_others, render_palette_png
 from pfbench.results import error_measures, store
 from pfbench.results.conditions import load_conditions
@@ -78,7 +79,7 @@ def test_every_figure_is_of_filters_and_studies_that_there_are() -> None:
             set(str(one["hydra"]["sweeper"]["params"].get("filter", "")).split(",")) for one in ran
         ]
         assert any(set(figure.filters) & filters for filters in swept), name
-        assert any(char.isdigit() for char in figure.said) or "section" in figure.said
+        assert any(char.isdigit() for char in figure.title) or "section" in figure.title
 
 
 def test_a_study_shows_the_figures_of_its_own_paper(results: Path) -> None:
@@ -125,7 +126,7 @@ def test_nothing_lies_beyond_the_axes(results: Path) -> None:
         b for b in paper_figures.component_groups(result.meta["state"]) if b.group == "position"
     )
     own = {"cpso_escape": (store.JobResult(result.meta, {**result.arrays, "error": wild}), block)}
-    panel = paper_plots.plot_errors(own, line_styles(["cpso_escape"])).axes[0]
+    panel = time_plots.plot_errors(own, line_styles(["cpso_escape"])).axes[0]
     assert panel.get_yscale() == "symlog"
     assert panel.get_ylim()[1] >= np.quantile(wild[:, 0, 6], 0.95)
     ticks = list(panel.get_yticks())
@@ -146,7 +147,7 @@ def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float)
     bad = loaded(results, "cofm_amssrcpf")
     bad = store.JobResult(bad.meta, {**bad.arrays, "error": wild * bad.arrays["error"]})
     own = {label: (result, block) for label, result in (*good.items(), ("cofm_amssrcpf", bad))}
-    figure = paper_plots.plot_errors(own, line_styles(list(own)))
+    figure = time_plots.plot_errors(own, line_styles(list(own)))
     figure.draw_without_rendering()
     for component, axis in enumerate(figure.axes):
         assert axis.get_yscale() == "symlog"
@@ -169,7 +170,7 @@ def test_a_bias_stands_beside_itself_before_correction(results: Path) -> None:
     block = next(
         b for b in paper_figures.component_groups(result.meta["state"]) if b.group == "attitude"
     )
-    figure = paper_plots.plot_errors(
+    figure = time_plots.plot_errors(
         {"cpso_escape": (result, block)}, line_styles(["cpso_escape"]), before=True
     )
     first = np.quantile(block.scale * result.arrays["error"][:, 0, 0].astype(float), [0.05, 0.95])
@@ -196,7 +197,7 @@ def test_traces_are_drawn_with_what_is_printed_of_them(results: Path) -> None:
 def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
     for label in ("sir", "cpso_escape"):
         result = loaded(results, label)
-        each = paper_plots.relative_axes(result)
+        each = experiment_plots.relative_axes(result)
         assert each.size == (~result.arrays["lost"]).sum()
         error = result.arrays["error"][..., [6, 7]]
         mean = error_measures.relative_error(error, result.arrays["lost"], result.arrays["range"])
@@ -205,7 +206,7 @@ def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
         "first": {"sir": np.arange(101.0), "gpf": np.array([5.0])},
         "second": {"sir": np.full(3, 7.0)},
     }
-    axis = paper_plots.plot_against(values, line_styles(["gpf", "sir"]), "Err").axes[0]
+    axis = experiment_plots.plot_against(values, line_styles(["gpf", "sir"]), "Err").axes[0]
     lines = [(np.asarray(one.get_xdata()), np.asarray(one.get_ydata())) for one in axis.lines]
     assert sorted((round(x[0]), y[0]) for x, y in lines if len(y) == 1) == [
         (0, 5.0),
@@ -213,7 +214,7 @@ def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
         (1, 7.0),
     ]
     assert [tuple(y) for _, y in lines if len(y) == 2 and y[1] > y[0]] == [(5.0, 95.0)]
-    wide = paper_plots.plot_against(
+    wide = experiment_plots.plot_against(
         {"first": {"sir": np.array([0.1]), "gpf": np.array([90.0])}},
         line_styles(["gpf", "sir"]),
         "",
@@ -291,11 +292,11 @@ def test_the_page_links_to_each_of_them(results: Path, tmp_path: Path) -> None:
     )
     with pytest.MonkeyPatch.context() as patch:  # what else is on a page is tested elsewhere
         patch.setattr(condition_section.condition_figures, "condition_figures", lambda *_, **__: [])
-        patch.setattr(condition_section.calibration, "calibration_figures", lambda *_: [])
+        patch.setattr(condition_section.calibration_plots, "calibration_figures", lambda *_: [])
         patch.setattr(
             condition_section.comparison_figures, "comparison_figures_of_condition", lambda *_: []
         )
-        patch.setattr(page.comparison_figures, "study_figures", lambda *_: [])
+        patch.setattr(across_section.comparison_figures, "study_figures", lambda *_: [])
         made = page.write_report("paper_004", results, tmp_path, options)
     text = made.read_text()
     assert '<figure id="paper_004_iterations_flight_nominal_ins_gnss_iterations">' in text

@@ -8,7 +8,7 @@ import scikit_posthocs as posthocs
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from pfbench.report import page, writers
+from pfbench.report import options, writers
 from pfbench.results.comparison import condition_blocks, lost_run_rules, rankings
 from pfbench.results.statistics import rank_tests, signed_rank
 
@@ -207,7 +207,7 @@ def said(found):
     text = (
         writers._environment(False)
         .get_template("text.jinja")
-        .make_module({"options": page.ReportOptions()})
+        .make_module({"options": options.ReportOptions()})
     )
     return [
         line

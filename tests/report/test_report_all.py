@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from command_line import pfbench
 
+from pfbench.claims import claim_records
 from pfbench.claims import page as claims_page
-from pfbench.claims import schema
 from pfbench.report import page
 
 
@@ -67,7 +67,7 @@ def test_what_has_results_is_made_again_and_what_has_none_stays(
     assert {options.alpha for options in made.values()} == {0.01}
     assert "paper_001: the published report is unchanged" in said.out
     assert "pfbench run -m +experiment=paper_001" in said.out
-    studies = sorted({study for claim in schema.read_claims() for study in claim.studies})
+    studies = sorted({study for claim in claim_records.read_claims() for study in claim.studies})
     assert (
         f"claims: the page is unchanged, since results of {', '.join(studies)} are missing"
         in said.out

@@ -6,8 +6,8 @@ import pytest
 import synthetic_results as synthetic
 from scipy import stats
 
-from pfbench.report import calibration, tables
-from pfbench.report.plots import condition_figures
+from pfbench.report import tables
+from pfbench.report.plots import calibration_plots, condition_figures
 from pfbench.report.plots.plotting import line_styles
 from pfbench.results import conditions, consistency, coverage, frame, store
 from pfbench.results.statistics import intervals
@@ -71,7 +71,9 @@ def test_scores_are_cut_with_the_instants(loaded):
     early = frame.select_steps(whole, whole.arrays["time"] < 10.0)
     assert not {"scored", "crps", "pit", "energy"} & early.arrays.keys()
     assert (
-        calibration.calibration_figures({"honest": early}, ["position"], line_styles(["honest"]))
+        calibration_plots.calibration_figures(
+            {"honest": early}, ["position"], line_styles(["honest"])
+        )
         == []
     )
 
@@ -142,7 +144,7 @@ def test_columns_and_lines(loaded):
     assert table.loc["lossy", "energy score [arcmin]"] == pytest.approx(energy)
     coverage = table["coverage of the 90 % interval [%]"]
     assert coverage["narrow"] < 70 < coverage["honest"]
-    figure = calibration.plot_rank_histograms(loaded, ["position"], line_styles(list(loaded)))
+    figure = calibration_plots.plot_rank_histograms(loaded, ["position"], line_styles(list(loaded)))
     lines = {line.get_label(): np.asarray(line.get_ydata()) for line in figure.axes[0].lines}
     assert lines["narrow"][[0, -1]].min() > 15 > 7 > lines["wide"][[0, -1]].max()
     assert lines["honest"].sum() == pytest.approx(100)

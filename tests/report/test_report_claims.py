@@ -17,7 +17,14 @@ from statsmodels.stats.multitest import multipletests
 from synthetic_results import METHODS, STATE, VERSIONS, Method, write
 
 from pfbench import job
-from pfbench.claims import claim_tests, measurements, schema, verdicts
+from pfbench.claims import (
+    claim_records,
+    claim_samples,
+    claim_tables,
+    measurements,
+    schema,
+    verdicts,
+)
 from pfbench.claims import figures as claims_figures
 from pfbench.claims import page as claims_page
 from pfbench.claims.schema import Claim, ClaimTest
@@ -35,7 +42,7 @@ IDS = [
     *(f"004-C{k}" for k in range(1, 12)),
 ]
 CONF, STUDIES = job.conf_dir(), job.experiments_dir()
-ALL = schema.read_claims(CONF, STUDIES)
+ALL = claim_records.read_claims(CONF, STUDIES)
 CELL = "flight/surge/ins_gnss"
 LESS = ClaimTest("less", "s", CELL, "rmse", "a", "b", group="position")
 
@@ -215,23 +222,23 @@ def test_a_wrong_record_is_told_by_name(case: str, tmp_path: Path) -> None:
     old, new, message = WRONG[case]
     assert old in RECORD
     (tmp_path / "good.yaml").write_text(RECORD)
-    schema.read_claims(CONF, STUDIES, tmp_path / "good.yaml")
+    claim_records.read_claims(CONF, STUDIES, tmp_path / "good.yaml")
     (tmp_path / "bad.yaml").write_text(RECORD.replace(old, new))
     with pytest.raises(ValueError, match=message):
-        schema.read_claims(CONF, STUDIES, tmp_path / "bad.yaml")
+        claim_records.read_claims(CONF, STUDIES, tmp_path / "bad.yaml")
 
 
 def test_an_id_stands_once(tmp_path: Path) -> None:
     (tmp_path / "twice.yaml").write_text(RECORD + RECORD)
     with pytest.raises(ValueError, match="id must be unique, got X-1 more than once"):
-        schema.read_claims(path=tmp_path / "twice.yaml")
+        claim_records.read_claims(path=tmp_path / "twice.yaml")
 
 
 def test_lists_stand_side_by_side_and_method_for_each_form(tmp_path: Path) -> None:
     text = RECORD.replace("  tests:", "  forms: {printed: rpf, repaired: apf}\n  tests:")
     text = text.replace("a: sir, b: ekf", "a: 'method[particles=9]', b: [ekf, ukf], from: [0, 5]")
     (tmp_path / "lists.yaml").write_text(text)
-    (claim,) = schema.read_claims(CONF, STUDIES, tmp_path / "lists.yaml")
+    (claim,) = claim_records.read_claims(CONF, STUDIES, tmp_path / "lists.yaml")
     seen = {form: [(t.a, t.b, t.start) for t in tests] for form, tests in claim.tests.items()}
     assert seen == {
         "printed": [("rpf[particles=9]", "ekf", 0.0), ("rpf[particles=9]", "ukf", 5.0)],
@@ -478,7 +485,7 @@ def test_a_share_is_tested_from_one_side() -> None:
         (result,) = ruled(share, a=np.arange(20) < count).findings[""]
         assert result.p == pytest.approx(stats.binom.sf(count - 1, 20, 0.5))
     open_one = ruled(LESS, **normal(-0.1, 0.5, 20))
-    assert claims_page.claims_table([open_one])["runs required"].iloc[0] > 20
+    assert claim_tables.claims_table([open_one])["runs required"].iloc[0] > 20
     assert (
         "required for power 0.8 at this effect"
         in claims_page.rows_by_paper([open_one])[0]["rows"][0]["lines"][0]["more"]
@@ -638,7 +645,7 @@ def test_false_claims_are_as_rare_as_the_level() -> None:
     rng, n, alpha = np.random.default_rng(19), 500, 0.05
     drawn = (np.exp(rng.standard_normal((2, 25))) for _ in range(n))
     wrong = sum(
-        claim_tests.region_p_value(claim_tests.sample_claim_test(LESS, a, b)) <= alpha
+        claim_samples.region_p_value(claim_samples.sample_claim_test(LESS, a, b)) <= alpha
         for a, b in drawn
     )
     assert wrong / n == pytest.approx(alpha, abs=4 * np.sqrt(alpha * (1 - alpha) / n))
@@ -798,7 +805,7 @@ def test_the_page_has_the_numbers_and_a_link_to_the_cell(study: Path) -> None:
     assert (
         claims_page.rows_by_paper(found)[0]["rows"][0]["lines"][0]["link"] == ""
     )  # no page, no link
-    assert claims_page.count_verdicts(found).set_index("paper").loc["all", "claims"] == 1
+    assert claim_tables.count_verdicts(found).set_index("paper").loc["all", "claims"] == 1
     assert claims_page.claims_of_study(found, "s") == found
     assert claims_page.claims_of_study(found, "t") == []
 
@@ -845,7 +852,7 @@ def test_the_page_says_which_commit_each_study_ran_at_where_they_differ(
             in text
         )
     both = measurements.claim_job_metadata([claim(one, replace(one, study="t"))], study)
-    (line,) = claims_page.describe_jobs(claim(one), both)  # of its own studies alone
+    (line,) = claim_tables.describe_jobs(claim(one), both)  # of its own studies alone
     assert line.startswith("s: 20 runs")
 
 

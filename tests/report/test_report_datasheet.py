@@ -12,9 +12,10 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.report import datasheet, scenario_data
-from pfbench.report.plots import condition_figures, error_plots, filter_plots, scenario_figures
+from pfbench.report.plots import error_plots, filter_plots, scenario_figures
 from pfbench.report.plots.plotting import RC, LineStyle
 from pfbench.results import consistency, error_measures, store
+from pfbench.results.state_groups import component_groups
 
 STEPS, RUNS, SLOTS = 30, 6, 4
 META: dict[str, Any] = {
@@ -270,9 +271,7 @@ def test_steps_with_rare_truth_are_not_thinned_away(tmp_path: Path) -> None:
     error[:, ~rare, 6:] = nees[:, ~rare, 2] = np.nan
     result = changed(file, error=error, nees=nees)
     style = {"ekf": LineStyle("black", "-", "o", 1.0)}
-    block = next(
-        b for b in condition_figures.component_groups(result.meta["state"]) if b.group == "position"
-    )
+    block = next(b for b in component_groups(result.meta["state"]) if b.group == "position")
     for line in error_plots.plot_error({"ekf": result}, block, style).axes[0].lines:
         np.testing.assert_array_equal(line.get_xdata(), result.arrays["time"][rare])
         assert np.isfinite(np.asarray(line.get_ydata())).all()
@@ -298,7 +297,7 @@ def test_one_instant_with_truth_is_a_dot(tmp_path: Path) -> None:
     error = store.read_result(file).arrays["error"].copy()
     error[:, np.arange(50) != 17] = np.nan
     result = changed(file, error=error)
-    block = condition_figures.component_groups(result.meta["state"])[0]
+    block = component_groups(result.meta["state"])[0]
     (line,) = (
         error_plots.plot_error({"ekf": result}, block, {"ekf": LineStyle("black", "-", "o", 1.0)})
         .axes[0]
@@ -317,9 +316,7 @@ def test_the_bound_and_the_range_are_drawn_and_tabled_where_there_are_any(tmp_pa
     bound = np.linspace(1.0, 2.0, 40)[:, None] * np.ones(9)
     result = changed(file, bound=bound, range=np.linspace(1000.0, 2000.0, 40))
     style = {"ekf": LineStyle("blue", "-", "o", 1.0)}
-    block = next(
-        b for b in condition_figures.component_groups(result.meta["state"]) if b.group == "position"
-    )
+    block = next(b for b in component_groups(result.meta["state"]) if b.group == "position")
     line = error_plots.plot_error({"ekf": result}, block, style).axes[0].lines[-1]
     assert (line.get_label(), line.get_color()) == ("PCRB", "black")
     np.testing.assert_allclose(

@@ -18,11 +18,11 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from pfbench.report import cost, summary
+from pfbench.report import baselines, cost, summary
 from pfbench.report.cost import ParetoFront
 from pfbench.report.plots import (
     axis_ticks,
-    comparison_figures,
+    comparison_plots,
     condition_figures,
     cost_plots,
     filter_plots,
@@ -31,7 +31,7 @@ from pfbench.report.plots import (
     rank_plots,
     summary_figures,
 )
-from pfbench.report.plots.condition_figures import FigureSpec, write_figure
+from pfbench.report.plots.figure_files import FigureSpec, write_figure
 from pfbench.results import store
 from pfbench.results.comparison import condition_blocks, rankings
 from pfbench.results.comparison.pairwise_tests import compare_pairs
@@ -112,16 +112,16 @@ def test_letters_of_figures_of_many_filters_can_be_read_and_are_not_cut(
     source = condition_blocks.ranking_blocks(table, name)
     one, pairs = (
         rankings.rank_filters(table, name),
-        summary.compare_with_baselines(condition_blocks.ranking_blocks(own, name), decided, 0.05),
+        baselines.compare_with_baselines(condition_blocks.ranking_blocks(own, name), decided, 0.05),
     )
     assert len(pairs) > 4
     style = plotting.mute_others(plotting.line_styles(sorted(set(table.label))), BASES[:3])
     made = {
         "map": lambda: summary_figures.plot_ratio_map(one, source),
         "proposed": lambda: summary_figures.proposed_filters(pairs),
-        "matrix": lambda: comparison_figures.plot_matrix(decided, one),
+        "matrix": lambda: comparison_plots.plot_matrix(decided, one),
         "rank": lambda: rank_plots.plot_critical_difference(one, style),
-        "forest": lambda: comparison_figures.plot_forest(
+        "forest": lambda: comparison_plots.plot_forest(
             [v for v in decided if v.noise == "student"][:12]
         ),
     }
@@ -177,7 +177,7 @@ def test_a_track_is_shown_where_somebody_estimated_it(tmp_path: Path) -> None:
 def test_numbers_of_a_matrix_stay_in_their_squares(tmp_path: Path) -> None:
     table = rows(3, (*BASES, "dmc_reconstructed_printed"), runs=16)
     figure = drawn(
-        lambda: comparison_figures.plot_matrix(
+        lambda: comparison_plots.plot_matrix(
             compare_pairs(table), rankings.rank_filters(table, "position")
         ),
         tmp_path,
@@ -323,10 +323,10 @@ def test_points_on_the_front_and_those_in_colour_are_named(piled: int, tmp_path:
     (axis,) = figure.axes
     wanted = {
         label
-        for label, kept in zip(one.filters, one.kept, strict=True)
+        for label, kept in zip(one.filters, one.on_front, strict=True)
         if kept or not style[label].quiet
     }
-    assert sum(one.kept) == piled + 1
+    assert sum(one.on_front) == piled + 1
     names = {text.get_text(): text for text in axis.texts}
     assert set(names) == wanted
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["other filters"]
@@ -342,7 +342,7 @@ def test_points_on_the_front_and_those_in_colour_are_named(piled: int, tmp_path:
         assert (
             text.arrow_patch is not None or off < 12
         )  # a name that is not beside its mark has a line to it
-        for other, ring in zip(one.filters, one.kept, strict=True):  # marks and rings stay free
+        for other, ring in zip(one.filters, one.on_front, strict=True):  # marks and rings stay free
             k = one.filters.index(other)
             if np.isfinite(one.rmse[k]):
                 at = axis.transData.transform((1e3 * one.seconds[k], one.rmse[k]))

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from pfbench.report import page, summary, writers
+from pfbench.report import baselines, options, summary, writers
 from pfbench.report.plots import comparison_figures, plotting, summary_figures
 from pfbench.results import conditions
 from pfbench.results.comparison import condition_blocks, rankings
@@ -49,7 +49,7 @@ def found(table, of=None):
         table, compare_pairs(table[table.group != "velocity"]), of or mains()
     )
     source = condition_blocks.ranking_blocks(own, name)
-    return own, decided, name, source, summary.compare_with_baselines(source, decided, 0.05)
+    return own, decided, name, source, baselines.compare_with_baselines(source, decided, 0.05)
 
 
 def test_planned_pairs_are_tested_as_scipy_does_and_corrected_over_themselves():
@@ -91,7 +91,7 @@ def words():
     return (
         writers._environment(False)
         .get_template("text.jinja")
-        .make_module({"options": page.ReportOptions()})
+        .make_module({"options": options.ReportOptions()})
     )
 
 

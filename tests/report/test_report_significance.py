@@ -53,7 +53,9 @@ def _winners_alone(monkeypatch):
     none = intervals.ConfidenceInterval(0.0, 0.0, "none")
     monkeypatch.setattr(pairwise_tests, "bootstrap_median_interval", lambda *_: none)
     monkeypatch.setattr(
-        pairwise_tests, "equivalence_samples", lambda differences, _: np.full(len(differences), np.nan)
+        pairwise_tests,
+        "equivalence_samples",
+        lambda differences, _: np.full(len(differences), np.nan),
     )
     monkeypatch.setattr(pairwise_tests, "_sample_sizes", lambda *_: (np.nan, np.nan))
 

@@ -10,7 +10,7 @@ import pytest
 import synthetic_results as synthetic
 from matplotlib.figure import Figure
 
-from pfbench.report import condition_section, cost, options, page, writers
+from pfbench.report import across_section, condition_section, cost, options, page, writers
 from pfbench.report.plots import comparison_figures
 from pfbench.report.plots.plotting import line_styles
 from pfbench.report.table_formats import format_number
@@ -254,7 +254,7 @@ def test_a_study_too_large_to_show_all_says_what_it_shows(results, tmp_path):
 
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
-            (writers, "render_figure", stub), (page, "PAIRS", 2), (condition_section, "PAIRS", 2),
+            (writers, "render_figure", stub), (across_section, "PAIRS", 2), (condition_section, "PAIRS", 2),
             (page, "_ROWS", 30), (writers, "_MANY", 30), (options, "_NAMED", 1), (options, "_PLENTY", 17),
         ):  # fmt: skip
             patch.setattr(module, name, value)

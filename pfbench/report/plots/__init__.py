@@ -1,0 +1,1 @@
+"""Plots of results and the figures that reports are made of."""

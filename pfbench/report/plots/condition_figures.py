@@ -2,38 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from pfbench.report.plots import cost_plots, error_plots, filter_plots
 from pfbench.report.plots.curves import Results, east_north_up, pcrb_sd, sum_nis
+from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.filter_plots import MANY_FILTERS, TRACES
-from pfbench.report.plots.plotting import RC, LineStyle, format_slug, render_palette_png
+from pfbench.report.plots.plotting import LineStyle, format_slug
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
 _SPREAD_FILTERS = 4  # with more filters, only those of `worth_a_spread` have a spread figure [ours]
 _VALID = "valid runs"
-
-
-class FigureSpec(NamedTuple):
-    """A figure that is drawn on request.
-
-    Attributes:
-        name: File name without folder and suffix.
-        caption: Caption.
-        make: Function that draws the figure.
-    """
-
-    name: str
-    caption: str
-    make: Callable[[], Figure]
 
 
 def condition_figures(
@@ -124,30 +108,6 @@ def has_spread(results: Results, runs: pd.DataFrame, groups: Sequence[str]) -> d
             first = f", of {len(drawable)} filters the one with {text}"
             selection[label] = f"{selection[label]} and {text}" if label in selection else first
     return selection
-
-
-def write_figure(drawing: FigureSpec, folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Draw a figure and write a file per format. Equal figures give equal bytes.
-
-    Args:
-        drawing: Figure.
-        folder: Target folder.
-        formats: File formats, svg or png.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with matplotlib.rc_context(RC):
-        figure = drawing.make()
-        engine = figure.get_layout_engine()
-        if engine is not None:  # lay out once, because each format would repeat this costly step
-            engine.execute(figure)
-            figure.set_layout_engine(None)
-        paths = [folder / f"{drawing.name}.{suffix}" for suffix in formats]
-        for path, suffix in zip(paths, formats, strict=True):
-            if suffix == "png":
-                path.write_bytes(render_palette_png(figure))
-            else:
-                figure.savefig(path, format="svg", metadata={"Date": None})  # equal bytes
-    return paths
 
 
 def _track_figures(

@@ -35,58 +35,16 @@ def plot_pareto_fronts(fronts: Sequence[ParetoFront], style: Mapping[str, LineSt
         fronts: Accuracy and time by group.
         style: Line styles by label.
     """
-    many = max(
-        sum(kept or not style[label].quiet for label, kept in zip(f.filters, f.kept, strict=True))
+    label_count = max(
+        sum(
+            on_front or not style[label].quiet
+            for label, on_front in zip(f.filters, f.on_front, strict=True)
+        )
         for f in fronts
     )
-    figure, panels = stacked_axes(len(fronts), 1.5 + 0.06 * many)
+    figure, panels = stacked_axes(len(fronts), 1.5 + 0.06 * label_count)
     for front, axis in zip(fronts, panels, strict=True):
-        best = [i for i, kept in enumerate(front.kept) if kept]
-        milliseconds = [1e3 * s for s in front.seconds]
-        corner: Any = {"drawstyle": "steps-post", "color": "0.55", "lw": 0.9, "zorder": 1}
-        axis.plot([milliseconds[i] for i in best], [front.rmse[i] for i in best], **corner)
-        for label, time, error, kept in zip(
-            front.filters, milliseconds, front.rmse, front.kept, strict=True
-        ):
-            look = style[label]
-            if not np.isfinite(error):
-                continue
-            if look.quiet:
-                axis.scatter(
-                    time,
-                    error,
-                    s=9,
-                    color="0.45" if kept else look.colour,
-                    marker="o",
-                    zorder=2.5,
-                    lw=0,
-                )
-            else:  # white edges separate overlapping marks
-                axis.scatter(
-                    time,
-                    error,
-                    s=26,
-                    color=look.colour,
-                    marker=look.marker,
-                    zorder=3,
-                    lw=0.4,
-                    edgecolors="white",
-                )
-            if kept:
-                axis.scatter(
-                    time, error, s=80, facecolors="none", edgecolors="0.2", lw=0.9, zorder=2
-                )
-        finite = [e for e in front.rmse if np.isfinite(e)]
-        axis.margins(0.15)
-        if any(e > 0 for e in finite):
-            axis.set(xscale="log", yscale="log")
-            set_plain_ticks(axis.yaxis, finite)
-            set_plain_ticks(axis.xaxis, milliseconds)
-        lost = [label for label, e in zip(front.filters, front.rmse, strict=True) if np.isinf(e)]
-        note = f" (not shown, half of the runs lost: {', '.join(lost)})" if lost else ""
-        axis.set(
-            title=fill(front.group + note, _TITLE), ylabel=format_axis_label("RMSE", front.unit)
-        )
+        _plot_front(axis, front, style)
     panels[-1].set_xlabel("time per step [ms]")
     if any(style[label].quiet for front in fronts for label in front.filters):
         panels[0].scatter([], [], s=9, color="0.78", marker="o", lw=0, label="other filters")
@@ -99,6 +57,40 @@ def plot_pareto_fronts(fronts: Sequence[ParetoFront], style: Mapping[str, LineSt
     return figure
 
 
+def _plot_front(axis: Axes, front: ParetoFront, style: Mapping[str, LineStyle]) -> None:
+    """Plot the filters of a group and their Pareto front."""
+    milliseconds = [1e3 * s for s in front.seconds]
+    best = [i for i, on_front in enumerate(front.on_front) if on_front]
+    corner: Any = {"drawstyle": "steps-post", "color": "0.55", "lw": 0.9, "zorder": 1}
+    axis.plot([milliseconds[i] for i in best], [front.rmse[i] for i in best], **corner)
+    for i, label in enumerate(front.filters):
+        if np.isfinite(front.rmse[i]):
+            _plot_filter(axis, (milliseconds[i], front.rmse[i]), style[label], front.on_front[i])
+    finite = [e for e in front.rmse if np.isfinite(e)]
+    axis.margins(0.15)
+    if any(e > 0 for e in finite):
+        axis.set(xscale="log", yscale="log")
+        set_plain_ticks(axis.yaxis, finite)
+        set_plain_ticks(axis.xaxis, milliseconds)
+    lost = [label for label, e in zip(front.filters, front.rmse, strict=True) if np.isinf(e)]
+    note = f" (not shown, half of the runs lost: {', '.join(lost)})" if lost else ""
+    title = fill(front.group + note, _TITLE)
+    axis.set(title=title, ylabel=format_axis_label("RMSE", front.unit))
+
+
+def _plot_filter(axis: Axes, point: tuple[float, float], look: LineStyle, on_front: bool) -> None:
+    """Plot the mark of a filter, with a ring if it is on the front."""
+    if look.quiet:
+        colour = "0.45" if on_front else look.colour
+        mark: Any = {"s": 9, "color": colour, "marker": "o", "zorder": 2.5, "lw": 0}
+    else:  # white edges separate overlapping marks
+        mark = {"s": 26, "color": look.colour, "marker": look.marker, "zorder": 3, "lw": 0.4}
+        mark["edgecolors"] = "white"
+    axis.scatter(*point, **mark)
+    if on_front:
+        axis.scatter(*point, s=80, facecolors="none", edgecolors="0.2", lw=0.9, zorder=2)
+
+
 def _label_points(axis: Axes, front: ParetoFront, style: Mapping[str, LineStyle]) -> None:
     """Label the points on the front and of coloured filters."""
     finite = [i for i, error in enumerate(front.rmse) if np.isfinite(error)]
@@ -106,12 +98,12 @@ def _label_points(axis: Axes, front: ParetoFront, style: Mapping[str, LineStyle]
     names = {
         k: front.filters[i]
         for k, i in enumerate(finite)
-        if front.kept[i] or not style[front.filters[i]].quiet
+        if front.on_front[i] or not style[front.filters[i]].quiet
     }
     reach = np.array(
-        [6.0 if front.kept[i] else 4.0 if k in names else 2.0 for k, i in enumerate(finite)]
+        [6.0 if front.on_front[i] else 4.0 if k in names else 2.0 for k, i in enumerate(finite)]
     )
-    best = points[[k for k, i in enumerate(finite) if front.kept[i]]]
+    best = points[[k for k, i in enumerate(finite) if front.on_front[i]]]
     best = best[np.lexsort((-best[:, 1], best[:, 0]))]
     corners = np.repeat(best, 2, axis=0)[1:]
     corners[1::2, 1] = best[:-1, 1]  # steps: constant error until the next time

@@ -39,12 +39,8 @@ def plot_scenario_track(sheet: store.JobResult) -> Figure:
     plan.plot(first[:, 0] * scale, first[:, 1] * scale, color="#0072B2", lw=1.3, label="first run")
     height.plot(time[thin], paths[0, thin, 2], color="#0072B2", lw=1.3)
     for label, point, fill in (("start", first[0], "white"), ("end", first[-1], "#0072B2")):
-        shape: Any = {
-            "marker": "o" if label == "start" else "s",
-            "ms": 5,
-            "ls": "none",
-            "zorder": 5,
-        }
+        marker = "o" if label == "start" else "s"
+        shape: Any = {"marker": marker, "ms": 5, "ls": "none", "zorder": 5}
         plan.plot(*(point[:2] * scale), mfc=fill, color="#0072B2", label=label, **shape)
     plan.set(xlabel=f"east [{unit}]", ylabel=f"north [{unit}]")
     plan.set_aspect("equal", adjustable="datalim")
@@ -87,56 +83,32 @@ def plot_sky(sheet: store.JobResult) -> Figure:
     axis.set_theta_direction(-1)
     axis.set_rlim(0, 90)
     axis.set_thetagrids(range(0, 360, 45), labels=["N", "NE", "E", "SE", "S", "SW", "W", "NW"])
-    azimuth, zenith = (
-        sheet.arrays["azimuth"].astype(float),
-        90 - np.degrees(sheet.arrays["elevation"].astype(float)),
-    )
-    axis.set_rgrids(
-        [30, 60],
-        labels=["60°", "30°"],
-        angle=_free_direction(azimuth, zenith),
-        color="0.4",
-        fontsize=6.5,
-    )
-    paths = [
-        (name, azimuth[:, s], zenith[:, s])
-        for s, name in enumerate(scenario_data.count_satellites(sheet))
-    ]
-    for look, (name, theta, r) in zip(
-        line_styles([path[0] for path in paths]).values(), paths, strict=True
-    ):
-        steps = np.flatnonzero(~np.isnan(theta) & ~np.isnan(r))
-        if not steps.size:
-            continue
-        axis.plot(theta[steps], r[steps], color=look.colour, lw=1.6, solid_capstyle="round")
-        tip, before = steps[-1], steps[max(0, steps.size - 1 - max(1, steps.size // 10))]
-        if (
-            tip != before
-            and np.hypot(r[tip] * (theta[tip] - theta[before]), r[tip] - r[before]) > 0.05
-        ):
-            arrow: Any = {
-                "arrowstyle": "-|>",
-                "color": look.colour,
-                "lw": 0.8,
-                "mutation_scale": 9,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            }
-            axis.annotate("", (theta[tip], r[tip]), (theta[before], r[before]), arrowprops=arrow)
-        offset: Any = {
-            "textcoords": "offset points",
-            "fontsize": 7,
-            "color": look.colour,
-            "ha": "center",
-            "va": "center",
-        }
-        axis.annotate(
-            str(name),
-            (theta[steps[0]], r[steps[0]]),
-            _label_offset(theta[steps], r[steps]),
-            **offset,
-        )
+    azimuth = sheet.arrays["azimuth"].astype(float)
+    zenith = 90 - np.degrees(sheet.arrays["elevation"].astype(float))
+    angle = _free_direction(azimuth, zenith)
+    axis.set_rgrids([30, 60], labels=["60°", "30°"], angle=angle, color="0.4", fontsize=6.5)
+    names = scenario_data.count_satellites(sheet)
+    looks = line_styles(names)
+    for k, name in enumerate(names):
+        steps = np.flatnonzero(~np.isnan(azimuth[:, k]) & ~np.isnan(zenith[:, k]))
+        if steps.size:
+            path = azimuth[steps, k], zenith[steps, k]
+            _plot_satellite(axis, *path, str(name), looks[name].colour)
     return figure
+
+
+def _plot_satellite(axis: Any, theta: np.ndarray, r: np.ndarray, name: str, colour: str) -> None:
+    """Plot the path of a satellite, with an arrow if it moves and its name."""
+    axis.plot(theta, r, color=colour, lw=1.6, solid_capstyle="round")
+    before = max(0, len(r) - 1 - max(1, len(r) // 10))
+    turn, climb = r[-1] * (theta[-1] - theta[before]), r[-1] - r[before]
+    if before < len(r) - 1 and np.hypot(turn, climb) > 0.05:
+        arrow: Any = {"arrowstyle": "-|>", "color": colour, "lw": 0.8, "mutation_scale": 9}
+        arrow |= {"shrinkA": 0, "shrinkB": 0}
+        axis.annotate("", (theta[-1], r[-1]), (theta[before], r[before]), arrowprops=arrow)
+    font: Any = {"fontsize": 7, "color": colour, "ha": "center", "va": "center"}
+    offset = _label_offset(theta, r)
+    axis.annotate(name, (theta[0], r[0]), offset, textcoords="offset points", **font)
 
 
 def plot_measurements(sheet: store.JobResult) -> Figure:
@@ -148,13 +120,11 @@ def plot_measurements(sheet: store.JobResult) -> Figure:
     figure, panels = stacked_axes(len(counts), 1.3)
     for axis, (name, (count, colour)) in zip(panels, counts.items(), strict=True):
         sparse = scenario_data.has_sparse_counts(count)
-        shown = count > 0 if sparse else np.ones_like(count, dtype=bool)
-        line: Any = (
-            {"ls": "none", "marker": ".", "ms": 2.5}
-            if sparse
-            else {"ls": "-", "lw": 1.1, "drawstyle": "steps-mid"}
-        )
-        axis.plot(a["time"][shown], count[shown], color=colour, **line)
+        mask = count > 0 if sparse else np.ones_like(count, dtype=bool)
+        line: Any = {"ls": "-", "lw": 1.1, "drawstyle": "steps-mid"}
+        if sparse:
+            line = {"ls": "none", "marker": ".", "ms": 2.5}
+        axis.plot(a["time"][mask], count[mask], color=colour, **line)
         axis.set(ylabel=name)
         axis.set_ylim(bottom=0)
     panels[-1].set_xlabel("time [s]")
@@ -166,28 +136,16 @@ def plot_residuals(sheet: store.JobResult) -> Figure:
     kinds = scenario_data.group_residuals(sheet)
     figure, panels = stacked_axes(len(kinds), 1.5)
     x = np.linspace(-_LIMIT, _LIMIT, 201)
+    density = np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi)
+    bars: Any = {"density": True, "color": "#56B4E9", "alpha": 0.75, "label": "residuals"}
     for axis, (kind, z) in zip(panels, kinds.items(), strict=True):
-        law = consistency.compute_whiteness(z)
+        moments = consistency.compute_whiteness(z)
         values = np.clip(z[~np.isnan(z)], -_LIMIT, _LIMIT)
         bins = int(np.clip(2 * np.sqrt(values.size), 11, 61))
-        axis.hist(
-            values,
-            bins=bins,
-            range=(-_LIMIT, _LIMIT),
-            density=True,
-            color="#56B4E9",
-            alpha=0.75,
-            label="residuals",
-        )
-        axis.plot(
-            x,
-            np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi),
-            color="black",
-            lw=1,
-            label="standard normal",
-        )
-        title = f"{kind}: variance {law.variance:.3g} (1 ± {law.variance_band:.2g}), "
-        axis.set_title(f"{title}lag-1 {law.lag:+.2g} (± {law.lag_band:.2g})", fontsize=7)
+        axis.hist(values, bins=bins, range=(-_LIMIT, _LIMIT), **bars)
+        axis.plot(x, density, color="black", lw=1, label="standard normal")
+        title = f"{kind}: variance {moments.variance:.3g} (1 ± {moments.variance_band:.2g}), "
+        axis.set_title(f"{title}lag-1 {moments.lag:+.2g} (± {moments.lag_band:.2g})", fontsize=7)
         axis.set_ylabel("density")
     panels[-1].set_xlabel("residual [sd]")
     add_legend(figure, panels[0])
@@ -202,16 +160,8 @@ def plot_over_time(sheet: store.JobResult) -> Figure:
         first = z[0]
         time = np.broadcast_to(sheet.arrays["time"][:, None], first.shape)
         finite_mask = ~np.isnan(first)
-        axis.plot(
-            time[finite_mask],
-            first[finite_mask],
-            ls="none",
-            marker=".",
-            ms=3,
-            color="#0072B2",
-            alpha=0.8,
-            mew=0,
-        )
+        dots: Any = {"ls": "none", "marker": ".", "ms": 3, "alpha": 0.8, "mew": 0}
+        axis.plot(time[finite_mask], first[finite_mask], color="#0072B2", **dots)
         for edge in (-2, 2):
             axis.axhline(edge, color="black", lw=0.7, ls=(0, (4, 2)))
         axis.set(title=kind, ylabel="residual [sd]")

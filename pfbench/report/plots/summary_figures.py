@@ -8,14 +8,15 @@ from itertools import groupby, pairwise
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
 
+from pfbench.report.baselines import BaselineComparison
 from pfbench.report.plots.axis_ticks import set_plain_ticks
-from pfbench.report.plots.condition_figures import FigureSpec
+from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.label_placement import wrap_label
 from pfbench.report.plots.plotting import COLUMN, SHADES, SMALL, build_padded_layout, format_slug
-from pfbench.report.summary import BaselineComparison
 from pfbench.results.comparison.condition_blocks import RankingBlocks
 from pfbench.results.comparison.pairwise_results import INCONCLUSIVE
 from pfbench.results.comparison.ranking_results import RankingResult
@@ -37,11 +38,11 @@ def summary_figures(
     """List the figures of the summary that the data allow.
 
     Args:
-        one: Ranking of the main groups.
+        ranking: Ranking of the main groups.
         source: Blocks of the ranking.
         pairs: Proposed methods against baselines.
         alpha: Level of the tests.
-        said: Compared quantity, as text.
+        quantity: Compared quantity, as text.
     """
     figures = []
     if pairs:
@@ -78,29 +79,7 @@ def proposed_filters(pairs: Sequence[BaselineComparison]) -> Figure:
     low, high = min(low / 1.1, 0.8), max(1.1 * high, 1.25)
     axis.axvline(1, color="0.4", lw=0.8, zorder=1)
     for row, pair in enumerate(pairs):
-        for k, (ratio, shown) in enumerate(zip(pair.ratios, pair.shown, strict=True)):
-            open_ = shown == INCONCLUSIVE
-            colour = _OPEN if open_ else _BETTER if shown == pair.method else _WORSE
-            marker = "<" if ratio < low else ">" if ratio > high else "o"
-            y = row + 0.3 * ((k * 0.6180339887) % 1 - 0.5)
-            face: Any = {"mfc": "white", "mec": "0.55"} if open_ else {"mfc": colour, "mec": colour}
-            face |= {
-                "ls": "none",
-                "marker": marker,
-                "ms": 2.6,
-                "mew": 0.6,
-                "zorder": 2,
-                "clip_on": False,
-            }
-            axis.plot(float(np.clip(ratio, low, high)), y, **face)
-        width = 0.9 if pair.winner == INCONCLUSIVE else 2.4
-        axis.plot(
-            [float(np.clip(pair.ratio, low, high))] * 2,
-            [row - 0.38, row + 0.38],
-            color="black",
-            lw=width,
-            zorder=3,
-        )
+        _plot_pair(axis, row, pair, (low, high))
     names = [f"{pair.method} / {pair.baseline}" for pair in pairs]
     axis.set_yticks(range(len(pairs)), names, fontsize=SMALL)
     axis.set_ylim(len(pairs) - 0.4, -0.6)
@@ -114,11 +93,27 @@ def proposed_filters(pairs: Sequence[BaselineComparison]) -> Figure:
     return figure
 
 
+def _plot_pair(axis: Axes, row: int, pair: BaselineComparison, limits: tuple[float, float]) -> None:
+    """Plot the ratio of a pair in each condition, and the median as a bar."""
+    low, high = limits
+    dot: Any = {"ls": "none", "ms": 2.6, "mew": 0.6, "zorder": 2, "clip_on": False}
+    for k, (ratio, winner) in enumerate(zip(pair.ratios, pair.shown, strict=True)):
+        is_open = winner == INCONCLUSIVE
+        colour = _OPEN if is_open else _BETTER if winner == pair.method else _WORSE
+        face = {"mfc": "white", "mec": "0.55"} if is_open else {"mfc": colour, "mec": colour}
+        marker = "<" if ratio < low else ">" if ratio > high else "o"
+        y = row + 0.3 * ((k * 0.6180339887) % 1 - 0.5)
+        axis.plot(float(np.clip(ratio, low, high)), y, marker=marker, **face, **dot)
+    width = 0.9 if pair.winner == INCONCLUSIVE else 2.4
+    x = float(np.clip(pair.ratio, low, high))
+    axis.plot([x, x], [row - 0.38, row + 0.38], color="black", lw=width, zorder=3)
+
+
 def plot_ratio_map(ranking: RankingResult, source: RankingBlocks) -> Figure:
     """Plot filters by conditions, shaded by the ratio to the best RMSE of the condition.
 
     Args:
-        one: Ranking of the main groups.
+        ranking: Ranking of the main groups.
         source: Blocks of the ranking.
     """
     with np.errstate(invalid="ignore"):
@@ -126,7 +121,7 @@ def plot_ratio_map(ranking: RankingResult, source: RankingBlocks) -> Figure:
     ratio = np.where(np.isfinite(source.values), ratio, np.inf)
     by = ranking.ranks or np.median(ratio, axis=0)
     order = sorted(range(len(source.filters)), key=lambda i: (by[i], source.filters[i]))
-    shown = ratio[:, order].T
+    ordered = ratio[:, order].T
     wide = COLUMN + max(0, len(source.cells) - _HELD) * SMALL / 72
     names = [wrap_label(source.filters[i]) for i in order]
     lines = max(
@@ -137,10 +132,12 @@ def plot_ratio_map(ranking: RankingResult, source: RankingBlocks) -> Figure:
     )
     axis = figure.subplots()
     shades = to_rgba_array(SHADES)
-    image = shades[np.searchsorted(_STEPS, np.where(np.isfinite(shown), shown, 1.0), side="right")]
-    image[~np.isfinite(shown)] = (1, 1, 1, 1)
+    image = shades[
+        np.searchsorted(_STEPS, np.where(np.isfinite(ordered), ordered, 1.0), side="right")
+    ]
+    image[~np.isfinite(ordered)] = (1, 1, 1, 1)
     axis.imshow(image, aspect="auto", interpolation="nearest")
-    rows, columns = np.nonzero(~np.isfinite(shown))
+    rows, columns = np.nonzero(~np.isfinite(ordered))
     axis.plot(columns, rows, ls="none", marker="x", ms=2.5, color="0.4", mew=0.6)
     axis.set_yticks(range(len(order)), names, fontsize=SMALL, linespacing=1.0)
     _label_columns(axis, source.cells)

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import Figure
 
-from pfbench.report.plots.condition_figures import FigureSpec
+from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.plotting import LineStyle, add_legend, stacked_axes
 from pfbench.results import consistency, store
 from pfbench.results.state_groups import component_groups

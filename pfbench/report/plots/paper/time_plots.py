@@ -1,9 +1,8 @@
-"""Plots of the paper figures: quantities over time with bands over runs, or by experiment."""
+"""Plots of the paper figures over time, with bands over runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,20 +17,22 @@ from pfbench.report.plots.plotting import (
     select_indices,
     stacked_axes,
 )
-from pfbench.results import error_measures, store
+from pfbench.results import store
 from pfbench.results.state_groups import ComponentGroup
 
 SYMLOG = " Outside the grey lines, if any, the scale is logarithmic."
-_BAND = (0.05, 0.5, 0.95)
+BAND_QUANTILES = (0.05, 0.5, 0.95)
 _SIDE = 3  # ticks on each side of 0 at most
-Shown = Mapping[str, tuple[store.JobResult, ComponentGroup]]
+ResultsWithGroup = Mapping[str, tuple[store.JobResult, ComponentGroup]]
 
 
-def plot_errors(results: Shown, style: Mapping[str, LineStyle], before: bool = False) -> Figure:
+def plot_errors(
+    results: ResultsWithGroup, style: Mapping[str, LineStyle], before: bool = False
+) -> Figure:
     """Plot the signed error over time, 5 to 95 % and median of the runs, a panel per component.
 
     Args:
-        own: Result and component group by label.
+        results: Result and component group by label.
         style: Line styles by label.
         before: Whether to add the band of the error at the first step.
     """
@@ -44,9 +45,9 @@ def plot_errors(results: Shown, style: Mapping[str, LineStyle], before: bool = F
         for label, (result, block) in results.items():
             if component not in block.components:
                 continue
-            place = block.places[block.components.index(component)]
-            time, values = _valid_runs(result, result.arrays["error"][..., place])
-            band = compute_run_quantiles(values * block.scale, _BAND)
+            index = block.places[block.components.index(component)]
+            time, values = _valid_runs(result, result.arrays["error"][..., index])
+            band = compute_run_quantiles(values * block.scale, BAND_QUANTILES)
             _banded(axis, time, band, style[label], label, len(results))
             curves.append(band)
             if before and len(curves) == 1:  # equal for all filters, which share the data
@@ -70,7 +71,7 @@ def plot_paper_trace(
     """Plot a trace over time, and the limits that the paper prints.
 
     Args:
-        own: Results by label.
+        results: Results by label.
         name: Name of the trace.
         unit: Label of the y axis.
         style: Line styles by label.
@@ -79,7 +80,8 @@ def plot_paper_trace(
     figure, (axis,) = stacked_axes(1, 2.0)
     for label, result in results.items():
         time, values = _valid_runs(result, result.arrays[name])
-        _banded(axis, time, compute_run_quantiles(values, _BAND), style[label], label, len(results))
+        band = compute_run_quantiles(values, BAND_QUANTILES)
+        _banded(axis, time, band, style[label], label, len(results))
     if np.isfinite(printed).all():
         axis.axhspan(*printed, color="0.88", lw=0, zorder=0)
     axis.set(xlabel="time [s]", ylabel=unit)
@@ -92,21 +94,16 @@ def plot_escape(factors: Mapping[str, tuple[float, int]], style: Mapping[str, Li
     """Plot escape factors over the iterations, as repaired and as printed.
 
     Args:
-        own: Size of the factor and number of iterations by label.
+        factors: Size of the factor and number of iterations by label.
         style: Line styles by label.
     """
     figure, (axis,) = stacked_axes(1, 2.0)
     for label, (size, most) in factors.items():
         k = np.arange(most + 1)
-        axis.plot(
-            k,
-            size * (1.0 - np.cos(np.pi * k / most)),
-            marker="." if most < 10 else "",
-            **style[label].line(label),
-        )
-        axis.plot(
-            k, size - size * np.cos(np.pi * k) / most, color=style[label].colour, ls=":", lw=0.8
-        )
+        repaired = size * (1.0 - np.cos(np.pi * k / most))
+        printed = size - size * np.cos(np.pi * k) / most
+        axis.plot(k, repaired, marker="." if most < 10 else "", **style[label].line(label))
+        axis.plot(k, printed, color=style[label].colour, ls=":", lw=0.8)
     axis.set(xlabel="iteration", ylabel="c3")
     axis.set_ylim(bottom=0)
     add_legend(figure, axis)
@@ -114,20 +111,20 @@ def plot_escape(factors: Mapping[str, tuple[float, int]], style: Mapping[str, Li
 
 
 def plot_relative_errors(
-    own: Mapping[str, Mapping[str, store.JobResult]], style: Mapping[str, LineStyle]
+    experiments: Mapping[str, Mapping[str, store.JobResult]], style: Mapping[str, LineStyle]
 ) -> Figure:
     """Plot the horizontal error in % of the range over time, a panel per experiment.
 
     Args:
-        own: Results by experiment and label.
+        experiments: Results by experiment and label.
         style: Line styles by label.
     """
-    figure, panels = stacked_axes(len(own), 1.6)
-    for (name, results), axis in zip(own.items(), panels, strict=True):
+    figure, panels = stacked_axes(len(experiments), 1.6)
+    for (name, results), axis in zip(experiments.items(), panels, strict=True):
         lines = []
         for label, result in results.items():
             time, values = _valid_runs(result, relative_error_percent(result))
-            band = compute_run_quantiles(values, _BAND)
+            band = compute_run_quantiles(values, BAND_QUANTILES)
             _banded(axis, time, band, style[label], label, len(results))
             lines += list(band)
         axis.set(title=name, ylabel="Err [%]")
@@ -135,113 +132,6 @@ def plot_relative_errors(
     panels[-1].set_xlabel("time [s]")
     add_legend(figure, panels[0])
     return figure
-
-
-def plot_against(
-    values: Mapping[str, Mapping[str, np.ndarray]], style: Mapping[str, LineStyle], ylabel: str
-) -> Figure:
-    """Plot the median and the band over runs by experiment.
-
-    Args:
-        values: Values of the runs [n] by experiment and label.
-        style: Line styles by label.
-        what: Label of the y axis.
-    """
-    labels = list(dict.fromkeys(label for own in values.values() for label in own))
-    figure, (axis,) = stacked_axes(1, 2.1)
-    for i, label in enumerate(labels):
-        offset = 0.7 * ((i + 0.5) / len(labels) - 0.5)
-        points = [(x + offset, own[label]) for x, own in enumerate(values.values()) if label in own]
-        _dots(axis, points, style[label], label)
-    axis.set_xticks(range(len(values)), list(values))
-    axis.set(ylabel=ylabel, xlim=(-0.6, len(values) - 0.4))
-    axis.grid(False, axis="x")
-    use_log_if_wide(axis, axis.yaxis, [runs for own in values.values() for runs in own.values()])
-    if axis.get_yscale() == "linear":
-        axis.set_ylim(bottom=0)
-    add_legend(figure, axis)
-    return figure
-
-
-def plot_maxima(
-    results: Shown,
-    style: Mapping[str, LineStyle],
-    start: float,
-    printed: Mapping[str, Sequence[float]],
-) -> Figure:
-    """Plot maximum error and RMSE by component, with crosses at values of the paper.
-
-    Args:
-        own: Result and component group by label.
-        style: Line styles by label.
-        start: Start time of the measures, s.
-        printed: Maximum errors of the paper by label.
-    """
-    components = list(
-        dict.fromkeys(name for _, block in results.values() for name in block.components)
-    )
-    places = sorted(
-        components, key=lambda name: "NEU".find(name[-1])
-    )  # order of the printed values
-    figure, (axis,) = stacked_axes(1, 2.3)
-    values_shown = []
-    for i, (label, (result, block)) in enumerate(results.items()):
-        offset = 0.75 * ((i + 0.5) / len(results) - 0.5)
-        kept, late = ~result.arrays["lost"], result.arrays["time"] >= start
-        peaks, sizes = [], []
-        for x, component in enumerate(places):
-            error = result.arrays["error"][kept][:, late][
-                ..., [block.places[block.components.index(component)]]
-            ]
-            none = np.zeros(len(error), dtype=bool)
-            peaks.append((x + offset - 0.05, block.scale * error_measures.max_error(error, none)))
-            sizes.append(
-                (x + offset + 0.05, block.scale * error_measures.rmse_per_run(error, none))
-            )
-        _dots(axis, peaks, style[label], label)
-        _dots(axis, sizes, style[label], "", open_=True)
-        values_shown += [value for _, value in (*peaks, *sizes)]
-        if label in printed:
-            crosses: Any = {
-                "ls": "none",
-                "marker": "x",
-                "ms": 6,
-                "mew": 1.3,
-                "color": "black",
-                "zorder": 5,
-            }
-            axis.plot(
-                [x + offset - 0.05 for x in range(len(places))],
-                printed[label][: len(places)],
-                **crosses,
-            )
-            values_shown.append(np.asarray(printed[label]))
-    axis.set_xticks(range(len(places)), places)
-    axis.set(
-        ylabel=format_axis_label("error", next(block.unit for _, block in results.values())),
-        xlim=(-0.6, len(places) - 0.4),
-    )
-    axis.grid(False, axis="x")
-    use_log_if_wide(axis, axis.yaxis, values_shown)
-    add_legend(figure, axis)
-    return figure
-
-
-def relative_axes(result: store.JobResult) -> np.ndarray:
-    """Compute the mean over time of Err of each valid run, %."""
-    valid = relative_error_percent(result)[~result.arrays["lost"]]
-    return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
-
-
-def mean_trace_per_run(result: store.JobResult, name: str) -> np.ndarray:
-    """Compute the mean over time of a trace of each valid run.
-
-    Args:
-        result: Result of a filter.
-        name: Name of the trace.
-    """
-    valid = result.arrays[name][~result.arrays["lost"]]
-    return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
 
 
 def relative_error_percent(result: store.JobResult) -> np.ndarray:
@@ -276,26 +166,6 @@ def _banded(
         label=label,
         marker="." if time.size == 1 else "",
     )
-
-
-def _dots(
-    axis: Axes,
-    points: Sequence[tuple[float, np.ndarray]],
-    look: LineStyle,
-    label: str,
-    open_: bool = False,
-) -> None:
-    """Draw the medians and bands of points (x, values [n])."""
-    for k, (x, values) in enumerate(points):
-        finite = values[np.isfinite(values)]
-        if not finite.size:
-            continue
-        low, middle, high = np.quantile(finite, _BAND)
-        axis.plot([x, x], [low, high], color=look.colour, lw=1.0, zorder=2)
-        axis.plot(
-            x, middle, ls="none", marker=look.marker, ms=4.5, color=look.colour, mfc="white" if open_ else look.colour,
-            label=label if k == 0 and label else "", zorder=3,
-        )  # fmt: skip
 
 
 def _late(curve: np.ndarray) -> float:
