@@ -83,7 +83,7 @@ def test_a_recipe_runs(
     paths = list((folder / "results" / study).glob("*.npz"))
     assert len(paths) == jobs
     for path in paths:
-        arrays = store.read_result(path).arrays
+        arrays = store.read_result(path).data
         assert arrays["error"].shape[1] == 5  # steps
         assert np.isfinite(arrays["error"]).all()
         assert not arrays["lost"].any()
@@ -98,7 +98,7 @@ def test_the_metric_appears_in_the_table(
     table = package.load("small", tmp_path / "results")
     rows = table[(table.metric == "median_error") & (table.component == "norm")]
     (job,) = [job for job in results(tmp_path, "small").values() if "sir" in job.meta["label"]]
-    error = np.linalg.norm(job.arrays["error"].astype(float), axis=-1)
+    error = np.linalg.norm(job.data["error"].astype(float), axis=-1)
     group_rows = rows[rows.label == job.meta["label"]]
     assert len(group_rows) == 3 * group_rows.group.nunique()
     if group_rows.group.nunique() == 1:

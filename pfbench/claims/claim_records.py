@@ -66,27 +66,37 @@ def _parse_claim(row: Mapping[str, Any]) -> Claim:
     missing = _REQUIRED_KEYS - set(row)
     unknown = set(row) - _REQUIRED_KEYS - _OPTIONAL_KEYS
     if missing or unknown:
-        raise ValueError(f"{name}: lacks {sorted(missing)}, unknown keys {sorted(unknown)}.")
+        raise ValueError(
+            f"{name}: keys must be {sorted(_REQUIRED_KEYS)} and some of {sorted(_OPTIONAL_KEYS)}, "
+            f"got {sorted(unknown)} too and {sorted(missing)} not. Correct them."
+        )
     _check_option(name, "paper", row["paper"], PAPERS)
-    why, shown = (
+    reasons, evidence = (
         {form: _parse_reason(name, key, text, options) for form, text in _by_form(row, key).items()}
         for key, options in (("why", REASONS), ("shown", SHOWN))
     )
-    if shown and (why or row.get("tests")):
+    if evidence and (reasons or row.get("tests")):
         raise ValueError(f"{name}: a record with `shown` must not have `tests` or `why`.")
-    forms: Mapping[str, str] = {} if shown else row.get("forms", {"": ""})
-    testable = {form: method for form, method in forms.items() if not {form, ""} & set(why)}
+    forms: Mapping[str, str] = {} if evidence else row.get("forms", {"": ""})
+    testable = {form: method for form, method in forms.items() if not {form, ""} & set(reasons)}
     tests = {form: tuple(_parse_tests(row, form, method)) for form, method in testable.items()}
-    if not why and not shown and not any(tests.values()):
+    if not reasons and not evidence and not any(tests.values()):
         raise ValueError(f"{name}: a record must have `tests`, or a reason `why` it has none.")
-    for form in sorted(set(forms) | set(why) | set(shown)):
+    for form in sorted(set(forms) | set(reasons) | set(evidence)):
         _check_option(name, "form", form, (*FORMS, ""))
     # Values that are reported without a decision are measured too.
-    reported = {"": tuple(_parse_tests(row, "", ""))} if "" in why and row.get("tests") else {}
+    reported = {"": tuple(_parse_tests(row, "", ""))} if "" in reasons and row.get("tests") else {}
     texts = {key: str(row[key]).strip() for key in ("id", "paper", "claim", "source")}
     printed = "" if row.get("printed") is None else str(row["printed"])
     note = str(row.get("note", "")).strip()
-    return Claim(**texts, printed=printed, tests=tests or reported, why=why, note=note, shown=shown)
+    return Claim(
+        **texts,
+        printed=printed,
+        tests=tests or reported,
+        reasons=reasons,
+        note=note,
+        evidence=evidence,
+    )
 
 
 def _by_form(row: Mapping[str, Any], key: str) -> dict[str, str]:
@@ -99,24 +109,28 @@ def _parse_reason(name: str, key: str, text: str, options: Sequence[str]) -> tup
     """Divide a text at its first colon into one of the options and its explanation."""
     reason, _, explanation = text.strip().partition(": ")
     if reason not in options or not explanation:
-        start = f"{key} must begin with one of {', '.join(options)} and a colon"
-        raise ValueError(f"{name}: {start}, got {key}={text!r}. Add an explanation after it.")
+        raise ValueError(
+            f"{name}: {key} must begin with one of {', '.join(options)} and a colon, "
+            f"got {key}={text!r}. Add an explanation after it."
+        )
     return reason, explanation
 
 
 def _parse_tests(row: Mapping[str, Any], form: str, method: str) -> Iterator[ClaimTest]:
     """Parse the tests of one form; lists of equal length are taken side by side."""
-    options = {part.name for part in fields(ClaimTest)}
+    options = {item.name for item in fields(ClaimTest)}
     for entry in row.get("tests", ()):
         keys = {**row.get("all", {}), **entry}
         if keys.pop("form", form) != form:
             continue
         values = {_FIELD_OF_KEY.get(key, key): value for key, value in keys.items()}
         if unknown := set(values) - options:
-            found = f"a test has unknown keys {sorted(unknown)}"
-            raise ValueError(f"{row['id']}: {found}. Choose from {sorted(options)}.")
+            raise ValueError(
+                f"{row['id']}: keys of a test must be fields of a test, got {sorted(unknown)}. "
+                f"Choose from {sorted(options)}."
+            )
         if missing := {"statistic", "study", "cell", "metric", "a"} - set(values):
-            raise ValueError(f"{row['id']}: a test lacks {sorted(missing)}.")
+            raise ValueError(f"{row['id']}: a test must have {sorted(missing)}. Add them.")
         lengths = {len(value) for value in values.values() if isinstance(value, list)}
         if len(lengths) > 1:
             raise ValueError(

@@ -25,7 +25,7 @@ class ClaimSample:
         high: Upper border of the region.
         worth: Distance from a border that a sufficient effect exceeds.
         logs: Whether d are logarithms.
-        beyond: Largest number of a valid run; larger ones represent lost runs.
+        largest: Largest number of a valid run; larger ones represent lost runs.
     """
 
     d: Array
@@ -33,7 +33,7 @@ class ClaimSample:
     high: float
     worth: float
     logs: bool
-    beyond: float
+    largest: float
 
 
 def sample_claim_test(test: ClaimTest, a: Array, b: Array | None) -> ClaimSample:

@@ -22,29 +22,39 @@ _TEXT_COLUMNS = ("form", "test", "a", "b", "measure", "condition", "unit", "outc
 def jobs_table(jobs: Jobs) -> pd.DataFrame:
     """Tabulate runs, budget and commit of each study, of the jobs that claims use."""
     rows = []
-    for study, metas in _by_study(jobs).items():
-        text = cost.format_budget(metas).removeprefix("Budget: ").removesuffix(".")
-        row = {"study": study, "jobs": len(metas), "runs": _runs(metas), "budget": text}
-        rows.append({**row, "commit": ", ".join(list_commits(metas))})
+    for study, jobs_metadata in _by_study(jobs).items():
+        text = cost.format_budget(jobs_metadata).removeprefix("Budget: ").removesuffix(".")
+        row = {
+            "study": study,
+            "jobs": len(jobs_metadata),
+            "runs": _runs(jobs_metadata),
+            "budget": text,
+        }
+        rows.append({**row, "commit": ", ".join(list_commits(jobs_metadata))})
     return pd.DataFrame(rows)
 
 
-def list_commits(metas: Iterable[Mapping[str, Any]]) -> list[str]:
+def list_commits(jobs_metadata: Iterable[Mapping[str, Any]]) -> list[str]:
     """List the distinct commits of jobs."""
-    versions = (meta.get("versions", {}) for meta in metas)
+    versions = (meta.get("versions", {}) for meta in jobs_metadata)
     return _distinct(str(version.get("commit") or "not stated") for version in versions)
 
 
 def describe_jobs(claim: Claim, jobs: Jobs) -> list[str]:
-    """Describe runs and budget of a claim's jobs, and their commit if the page has several."""
+    """Describe runs and budget of a claim's jobs, and their commit if the page has several.
+
+    Args:
+        claim: Claim.
+        jobs: Metadata of all jobs, from `claim_job_metadata`.
+    """
     sides = [side for tests in claim.tests.values() for test in tests for side in test.sides]
     used = {side: jobs[side] for side in sides if side in jobs}
     has_several = len(list_commits(jobs.values())) > 1
     lines = []
-    for study, metas in _by_study(used).items():
-        commit = f" Commit {', '.join(list_commits(metas))}." if has_several else ""
+    for study, jobs_metadata in _by_study(used).items():
+        commit = f" Commit {', '.join(list_commits(jobs_metadata))}." if has_several else ""
         lines.append(
-            f"{study}: {_runs(metas)} runs per filter. {cost.format_budget(metas)}{commit}"
+            f"{study}: {_runs(jobs_metadata)} runs per filter. {cost.format_budget(jobs_metadata)}{commit}"
         )
     return lines
 
@@ -78,12 +88,12 @@ def _by_study(jobs: Jobs) -> dict[str, list[Mapping[str, Any]]]:
         jobs.items(), key=lambda item: natural_sort_key("/".join(item[0]))
     ):
         studies.setdefault(study, {})[meta["key"]] = meta
-    return {study: list(metas.values()) for study, metas in studies.items()}
+    return {study: list(jobs_metadata.values()) for study, jobs_metadata in studies.items()}
 
 
-def _runs(metas: Iterable[Mapping[str, Any]]) -> str:
+def _runs(jobs_metadata: Iterable[Mapping[str, Any]]) -> str:
     """Format the numbers of runs of jobs."""
-    return " or ".join(_distinct(str(meta["runs"]) for meta in metas))
+    return " or ".join(_distinct(str(meta["runs"]) for meta in jobs_metadata))
 
 
 def _distinct(values: Iterable[str]) -> list[str]:

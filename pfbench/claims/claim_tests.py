@@ -123,8 +123,8 @@ def check_effect_size(result: ClaimTestResult) -> ClaimTestResult:
         share = float(np.log(result.effect) / np.log(printed))
     if 1 / EFFECT_FACTOR <= share <= EFFECT_FACTOR:
         return result
-    why = f"the direction holds, the effect is {share:.2g} of the printed effect"
-    return replace(result, outcome=FAILS, why=why)
+    reason = f"the direction holds, the effect is {share:.2g} of the printed effect"
+    return replace(result, outcome=FAILS, why=reason)
 
 
 def _test_median(result: ClaimTestResult, s: ClaimSample, alpha: float) -> ClaimTestResult:
@@ -139,23 +139,23 @@ def _test_median(result: ClaimTestResult, s: ClaimSample, alpha: float) -> Claim
     result = replace(result, effect=effect, low=shown_low, high=shown_high)
     if result.comparison.statistic == "report":
         return result
-    within, beyond = _depth(s)
-    result = replace(result, within=within, beyond=beyond, p=region_p_value(s))
+    inside, outside = _measure_depth(s)
+    result = replace(result, within=inside, beyond=outside, p=region_p_value(s))
     is_above = low >= s.high - s.worth if s.worth else low > s.high
     is_below = high <= s.low + s.worth if s.worth else high < s.low
     return replace(result, outcome=FAILS) if is_above or is_below else replace(result, why=NO_POWER)
 
 
-def _depth(s: ClaimSample) -> tuple[float, float]:
+def _measure_depth(s: ClaimSample) -> tuple[float, float]:
     """Compute `within` and `beyond` of a result."""
-    valid, median = s.d[np.abs(s.d) <= s.beyond], float(np.median(s.d))
-    if valid.size < 2 or abs(median) > s.beyond:
+    valid, median = s.d[np.abs(s.d) <= s.largest], float(np.median(s.d))
+    if valid.size < 2 or abs(median) > s.largest:
         return np.nan, np.nan
     inside = min(s.high - median, median - s.low)
     outside = max(median - s.high, s.low - median) + s.worth
     with np.errstate(divide="ignore", invalid="ignore"):  # equal runs: infinite
-        within, beyond = np.array([inside, outside]) / valid.std(ddof=1)
-    return float(within), float(beyond)
+        depths = np.array([inside, outside]) / valid.std(ddof=1)
+    return float(depths[0]), float(depths[1])
 
 
 def _test_share(result: ClaimTestResult, hits: Array, alpha: float) -> ClaimTestResult:
@@ -190,6 +190,6 @@ def _test_cost(result: ClaimTestResult, seconds: Array) -> ClaimTestResult:
 
 def _display(value: float, s: ClaimSample) -> float:
     """Invert the logarithm; values beyond every valid number represent lost runs."""
-    if np.isinf(value) or abs(value) > s.beyond:
+    if np.isinf(value) or abs(value) > s.largest:
         return 0.0 if s.logs and value < 0 else float(np.sign(value) * np.inf)
     return float(np.exp(value)) if s.logs else value

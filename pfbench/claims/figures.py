@@ -56,10 +56,10 @@ def figure_link(claim: Claim, test: ClaimTest, anchors: Collection[str]) -> tupl
         ):
             start = format_slug(f"paper_{name}")
             starts = (f"{start}_{condition}", f"{start}_over_time")
-            own = sorted(a for a in anchors if a == start or a.startswith(starts))
+            candidates = sorted(a for a in anchors if a == start or a.startswith(starts))
             any_group = not test.group or not figure.groups
             suffix = f"_{format_slug(test.group)}"
-            if matches := [a for a in own if any_group or a.endswith(suffix)]:
+            if matches := [a for a in candidates if any_group or a.endswith(suffix)]:
                 return matches[0], True
     metric = _FIGURE_OF_METRIC.get(test.metric, test.metric)
     target = f"{condition}_{metric.format(format_slug(test.group))}"
@@ -71,8 +71,8 @@ def figure_link(claim: Claim, test: ClaimTest, anchors: Collection[str]) -> tupl
 def figure_numbers(source: str) -> set[int]:
     """Extract figure numbers from texts such as "figures 2, 4 and 5" or "figures 12 to 14"."""
     numbers: set[int] = set()
-    for part in re.findall(r"figures? (\d+(?:(?:, | and | to )\d+)*)", source):
-        for low, high in re.findall(r"(\d+)(?: to (\d+))?", part):
+    for text in re.findall(r"figures? (\d+(?:(?:, | and | to )\d+)*)", source):
+        for low, high in re.findall(r"(\d+)(?: to (\d+))?", text):
             numbers |= set(range(int(low), int(high or low) + 1))
     return numbers
 

@@ -28,7 +28,7 @@ def load_claim_measurements(
     Args:
         claims: Records.
         results: Folder of all studies. Jobs without results are left out.
-        mixed: Accept several versions, and several seeds, runs or lengths within a condition.
+        allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a condition.
 
     Returns:
         Columns study, cell, label, measure, seed, run, lost, unit, value; infinite or NaN if lost.
@@ -78,14 +78,14 @@ def measure_claim_test(result: store.JobResult, test: ClaimTest) -> np.ndarray:
         ValueError: if the job lacks the group, component or time of the test.
     """
     result = _drop_after(drop_before(result, test.start), test.end)
-    lost, groups = result.arrays["lost"], result.meta["state"]["groups"]
+    lost, groups = result.data["lost"], result.meta["state"]["groups"]
     if test.metric in SCALED:
         return _measure_errors(result, test)
     if test.metric == "effective":
-        return mean_per_run(result.arrays.get("ess", np.full((lost.size, 1), np.nan)), lost)
+        return mean_per_run(result.data.get("ess", np.full((lost.size, 1), np.nan)), lost)
     if test.metric == "severely_overconfident":
         dofs = [len(parts) for parts in groups.values()]
-        severe = status.is_severely_overconfident(result.arrays["nees"], dofs, lost)
+        severe = status.is_severely_overconfident(result.data["nees"], dofs, lost)
         return (severe | lost).astype(np.float64)
     data = metric_values.MetricInput(result)
     if test.metric == "nees":
@@ -144,11 +144,11 @@ def _setting(config: Any, key: str) -> str:
     """Return the value at a dotted path of a configuration or of its filter."""
     for path in (f"filter.{key}", key):
         node: Any = config
-        for part in path.split("."):
-            if isinstance(node, list) and part.isdigit() and int(part) < len(node):
-                node = node[int(part)]
+        for name in path.split("."):
+            if isinstance(node, list) and name.isdigit() and int(name) < len(node):
+                node = node[int(name)]
             else:
-                node = node.get(part) if isinstance(node, Mapping) else None
+                node = node.get(name) if isinstance(node, Mapping) else None
         if node is not None:
             return _canonical(node)
     return ""
@@ -165,8 +165,8 @@ def _canonical(value: Any) -> str:
 def _measure_errors(result: store.JobResult, test: ClaimTest) -> np.ndarray:
     """Measure a metric of the errors of a group or of one component."""
     group = _select_group(result, test)
-    data = metric_values.MetricInput(result, group, group.whole)
-    error, lost, time = data.select("error"), result.arrays["lost"], result.arrays["time"]
+    data = metric_values.MetricInput(result, group, group.state_group)
+    error, lost, time = data.select("error"), result.data["lost"], result.data["time"]
     if test.metric == "settled":
         return convergence_time(time, error, lost, test.settled)
     if test.metric == "growth":
@@ -207,7 +207,7 @@ def _log_growth(time: np.ndarray, error: np.ndarray, lost: np.ndarray) -> np.nda
 
 def _drop_after(result: store.JobResult, end: float) -> store.JobResult:
     """Remove the steps after a time in seconds."""
-    mask = result.arrays["time"] <= end
+    mask = result.data["time"] <= end
     return select_steps(result, mask) if mask.any() else result
 
 
@@ -215,7 +215,7 @@ def _measure_job(
     result: store.JobResult, head: Mapping[str, str], tests: Mapping[str, ClaimTest]
 ) -> Iterator[pd.DataFrame]:
     """Yield the rows of each test of a job."""
-    lost, first = result.arrays["lost"], result.meta.get("first_run", 0)
+    lost, first = result.data["lost"], result.meta.get("first_run", 0)
     runs = np.arange(first, first + lost.size)
     shared = {**head, "seed": result.meta["seed"], "run": runs, "lost": lost}
     for name, test in tests.items():

@@ -45,12 +45,12 @@ def write_claims(
     Equal results give equal bytes.
 
     Args:
-        results: Folder of all studies. Claims whose studies have no results are not run.
+        results: Folder of all studies. Claims are not run if results of their studies are missing.
         out: Folder of all reports, which the page links to.
         alpha: Level after correction.
         conf: Folder of configurations, as in `read_claims`.
         experiments: Folder of experiments, as in `read_claims`.
-        mixed: Accept several versions, and several seeds, runs or lengths within a condition.
+        allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a condition.
         formats: File formats of the figures.
 
     Returns:
@@ -72,13 +72,13 @@ def write_claims(
     (folder / "verdicts.json").write_text(text + "\n", encoding="utf-8")
     studies = {study for claim in claims for study in claim.studies}
     jobs = claim_job_metadata(claims, results, mixed=allow_mixed_versions)
-    made = jobs_table(jobs)
-    if len(made):
-        writers.write_table(folder, "studies", made)
+    study_jobs = jobs_table(jobs)
+    if len(study_jobs):
+        writers.write_table(folder, "studies", study_jobs)
     drawings = claims_figures.claim_figures(verdicts)
     context = {
         "papers": rows_by_paper(verdicts, report_anchors(studies, out), jobs),
-        "made": made,
+        "made": study_jobs,
         "commits": list_commits(jobs.values()),
         "verdicts": VERDICTS,
         "count": count_verdicts(verdicts),
@@ -92,7 +92,12 @@ def write_claims(
 
 
 def report_anchors(studies: Iterable[str], out: str | Path) -> dict[str, set[str]]:
-    """Read the anchors of the pages of studies that have a page."""
+    """Read the anchors of the pages of studies that have a page.
+
+    Args:
+        studies: Names of the studies.
+        out: Folder of all reports.
+    """
     pages = {study: Path(out) / study / "index.html" for study in sorted(studies)}
     pattern = r'<(?:section|figure|h3) id="([^"]+)"'
     return {
@@ -125,7 +130,12 @@ def rows_by_paper(
 
 
 def claims_of_study(verdicts: Sequence[ClaimVerdict], study: str) -> list[ClaimVerdict]:
-    """Select the verdicts that use a study."""
+    """Select the verdicts that use a study.
+
+    Args:
+        verdicts: Verdicts of all claims.
+        study: Name of the study.
+    """
     return [verdict for verdict in verdicts if study in verdict.claim.studies]
 
 
@@ -206,19 +216,10 @@ def _format_sides(test: ClaimTest) -> str:
 
 
 def _to_json(verdict: ClaimVerdict) -> dict[str, Any]:
-    """Convert a verdict for JSON, which has no infinity."""
+    """Convert a verdict to JSON types."""
     fields = ("id", "paper", "claim", "source", "printed")
     claim = {key: getattr(verdict.claim, key) for key in fields}
     results = {form: [asdict(r) for r in values] for form, values in verdict.findings.items()}
     decision = {"verdict": verdict.verdict, "reason": verdict.reason, "note": verdict.note}
     reading = {"reading": verdict.claim.note}
-    return {**claim, **reading, **decision, "findings": _finite_numbers(results)}
-
-
-def _finite_numbers(value: Any) -> Any:
-    """Replace numbers that are not finite by their names, at all levels."""
-    if isinstance(value, Mapping):
-        return {key: _finite_numbers(below) for key, below in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite_numbers(below) for below in value]
-    return str(value) if isinstance(value, float) and not np.isfinite(value) else value
+    return {**claim, **reading, **decision, "findings": writers.to_json_types(results)}

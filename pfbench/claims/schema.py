@@ -1,9 +1,9 @@
 """Records of the papers' claims: conditions, metrics and tests that decide each of them.
 
-The records are in claims.yaml. Values of `all` hold for every test of a claim, lists within a test
-stand for as many tests, and `method` stands in turn for the filter as printed and as repaired. A
-claim that a test of this repository decides without runs has `shown`, "holds" or "fails", and the
-name of that test.
+The records are in claims.yaml. Values of `all` hold for every test of a claim. Lists within a test
+represent as many tests, and `method` represents the filter as printed and as repaired. A claim that
+a test of this repository decides without runs has `shown`, "holds" or "fails", and the name of that
+test.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class ClaimTest:
         printed: Printed ratio of a to b, or the printed number of "near".
         low: Lower limit claimed, in displayed units. For "cost", of the ratio of two times or of
             one time in seconds.
-        high: Upper limit claimed, likewise.
+        high: Upper limit claimed, as `low`.
         margin: Relative margin; in displayed units for "close", of the logarithm for "flat".
     """
 
@@ -127,11 +127,11 @@ class ClaimTest:
         names = {"effective": "effective particles", "seconds_per_step": "time per step"}
         name = names.get(self.metric, self.metric).replace("_", " ")
         bound = f" at {self.settled:g}" if self.metric == "settled" else ""
-        part = self.group if self.component == "norm" else self.component
+        target = self.group if self.component == "norm" else self.component
         has_all_time = self.start == 0 and np.isinf(self.end)
         span = "" if has_all_time else f", {self.start:g} to {self.end:g} s"
         span = span.replace(" to inf s", " s to the end")
-        words = (name + bound, part if self.metric in GROUPED else "")
+        words = (name + bound, target if self.metric in GROUPED else "")
         return " ".join(word for word in words if word) + span
 
     @property
@@ -153,9 +153,9 @@ class Claim:
         printed: Printed numbers as text; empty without numbers.
         tests: Tests by form, "printed" or "repaired", or "" if the claim is about no method of
             the paper.
-        why: By form, or "", a reason and its explanation why that form cannot be decided.
+        reasons: By form, or "", a reason and its explanation why that form cannot be decided.
         note: Interpretation of the words [ours].
-        shown: By form, or "", "holds" or "fails" and the evidence, if no runs are needed.
+        evidence: By form, or "", "holds" or "fails" and the evidence, if no runs are needed.
     """
 
     id: str
@@ -164,9 +164,9 @@ class Claim:
     source: str
     printed: str
     tests: Mapping[str, tuple[ClaimTest, ...]]
-    why: Mapping[str, tuple[str, str]]
+    reasons: Mapping[str, tuple[str, str]]
     note: str = ""
-    shown: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    evidence: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     @property
     def studies(self) -> list[str]:

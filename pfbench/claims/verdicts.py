@@ -5,8 +5,8 @@ printed, the measured effect must also be within a factor of 2 of it on the loga
 [ours].
 
 For a test with too few runs, the required runs are computed: those that show the measured effect
-with power 0.8, inside the region by the signed-rank test at the level of the first step of Holm's
-correction, or outside by the interval of the median. That interval equals the t test of 2/pi as
+with power 0.8. Inside the region, the signed-rank test shows it at the level of the first step of
+Holm's correction. Outside, the interval of the median shows it, which equals the t test of 2/pi as
 many normal differences. The smaller number counts [ours].
 """
 
@@ -77,7 +77,7 @@ def decide_claims(
     """
     columns = ["study", "cell", "label", "measure"]
     groups = frame.groupby(columns, sort=False)
-    series = {tuple(map(str, key)): part for key, part in groups}
+    series = {tuple(map(str, key)): rows for key, rows in groups}
     raw = [
         {
             form: tuple(run_claim_test(test, series, alpha) for test in tests)
@@ -122,8 +122,8 @@ def _decide_corrected(result: ClaimTestResult, alpha: float) -> ClaimTestResult:
         needed = _required_runs(result, alpha) if result.why == NO_POWER else result.needed
         return replace(result, needed=needed)
     if result.outcome == FAILS:
-        why = result.why or "the direction holds, the effect is below the claimed effect"
-        return replace(result, why=why)
+        default = "the direction holds, the effect is below the claimed effect"
+        return replace(result, why=result.why or default)
     return check_effect_size(replace(result, outcome=HOLDS, why=""))
 
 
@@ -148,13 +148,13 @@ def _required_runs(result: ClaimTestResult, alpha: float) -> float:
 
 def _decide(claim: Claim, results: Mapping[str, _Results]) -> ClaimVerdict:
     """Decide a claim from the results of each form of the method."""
-    if "" in claim.why:
-        return ClaimVerdict(claim, UNDECIDED, *claim.why[""], results)
+    if "" in claim.reasons:
+        return ClaimVerdict(claim, UNDECIDED, *claim.reasons[""], results)
     outcomes = {form: _combine(values) for form, values in results.items()}
-    outcomes |= {form: (OPEN, reason) for form, (reason, _) in claim.why.items()}
-    outcomes |= {form: (outcome, "") for form, (outcome, _) in claim.shown.items()}
+    outcomes |= {form: (OPEN, reason) for form, (reason, _) in claim.reasons.items()}
+    outcomes |= {form: (outcome, "") for form, (outcome, _) in claim.evidence.items()}
     notes = _notes(claim, results, outcomes)
-    tested = {form: outcome for form, outcome in outcomes.items() if form not in claim.why}
+    tested = {form: outcome for form, outcome in outcomes.items() if form not in claim.reasons}
     holding = [form for form, (state, _) in tested.items() if state == HOLDS]
     reasons = [reason for state, reason in tested.values() if state == OPEN]
     if reasons:
@@ -171,10 +171,14 @@ def _notes(
     claim: Claim, results: Mapping[str, _Results], outcomes: Mapping[str, tuple[str, str]]
 ) -> list[str]:
     """List the remarks on a verdict: explanations, timings, and reasons of failures."""
-    explained = [(form, text) for form, (_, text) in [*claim.why.items(), *claim.shown.items()]]
-    failed = [(form, why) for form, (state, why) in outcomes.items() if state == FAILS and why]
+    explained = [
+        (form, text) for form, (_, text) in [*claim.reasons.items(), *claim.evidence.items()]
+    ]
+    failed = [
+        (form, reason) for form, (state, reason) in outcomes.items() if state == FAILS and reason
+    ]
     notes = [f"{_prefix(form)}{text}" for form, text in explained]
-    return [*notes, *_timings(results), *(f"{_prefix(form)}{why}" for form, why in failed)]
+    return [*notes, *_timings(results), *(f"{_prefix(form)}{reason}" for form, reason in failed)]
 
 
 def _prefix(form: str) -> str:
@@ -204,6 +208,6 @@ def _combine(results: Sequence[ClaimTestResult]) -> tuple[str, str]:
     """Combine tests of one form: all must hold, and one failure decides."""
     reasons = [r.why for r in results if r.outcome == FAILS]
     if reasons:
-        return FAILS, "; ".join(dict.fromkeys(why for why in reasons if why))
+        return FAILS, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
     reasons = [r.why for r in results if r.outcome == OPEN]
     return (OPEN, reasons[0]) if reasons else (HOLDS, "")

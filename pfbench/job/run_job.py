@@ -74,7 +74,7 @@ def run(
     name = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
     if path.exists() and not values["overwrite"]:
         outcome = JobOutcome(
-            path, "skipped", _main_rmse(store.read_result(path).arrays, store.read_metadata(path))
+            path, "skipped", _main_rmse(store.read_result(path).data, store.read_metadata(path))
         )
         repeat = "(overwrite=true to repeat)"
         log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)

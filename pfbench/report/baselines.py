@@ -63,7 +63,7 @@ class BaselineComparison:
 
     @property
     def possible(self) -> bool:
-        """Whether the number of conditions suffices for a significant result."""
+        """Possibility of a significant result with this number of conditions."""
         return len(self.cells) >= self.least
 
     @property
@@ -104,7 +104,7 @@ def compare_with_baselines(
     winners = {
         (f"{v.scenario} / {v.noise} / {v.model}", frozenset((v.a, v.b))): v.winner for v in decided
     }
-    found = []
+    comparisons = []
     for method, baselines in BASELINES.items():
         for baseline in baselines:
             if (
@@ -116,32 +116,35 @@ def compare_with_baselines(
                     np.exp(source.values[:, source.filters.index(label)])
                     for label in (method, baseline)
                 )
-                shown = tuple(
+                winners_by_condition = tuple(
                     winners.get((cell, frozenset((method, baseline))), INCONCLUSIVE)
                     for cell in source.cells
                 )
-                found.append(_compared(method, baseline, source.cells, a, b, shown))
-    corrected = holm([one.p for one in found])
+                comparisons.append(
+                    _compared(method, baseline, source.cells, a, b, winners_by_condition)
+                )
+    corrected = holm([pair.p for pair in comparisons])
     return [
-        _decided(one, float(p), len(found), alpha) for one, p in zip(found, corrected, strict=True)
+        _decided(pair, float(p), len(comparisons), alpha)
+        for pair, p in zip(comparisons, corrected, strict=True)
     ]
 
 
 def _compared(
-    method: str, baseline: str, cells: tuple[str, ...], a: Array, b: Array, shown: tuple[str, ...]
+    method: str, baseline: str, cells: tuple[str, ...], a: Array, b: Array, winners: tuple[str, ...]
 ) -> BaselineComparison:
     d = log_ratio(a, b)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = np.where(np.isinf(a) & np.isinf(b), 1.0, a / b)
     return BaselineComparison(
-        method, baseline, cells, tuple(map(float, ratios)), shown, float(np.median(ratios)), rank_biserial(d),
+        method, baseline, cells, tuple(map(float, ratios)), winners, float(np.median(ratios)), rank_biserial(d),
         wilcoxon_signed_rank(d).p, math.nan, 0, INCONCLUSIVE,
     )  # fmt: skip
 
 
-def _decided(one: BaselineComparison, p: float, family: int, alpha: float) -> BaselineComparison:
-    better = one.method if one.effect > 0 else one.baseline
-    winner = better if p <= alpha and one.effect else INCONCLUSIVE
+def _decided(pair: BaselineComparison, p: float, family: int, alpha: float) -> BaselineComparison:
+    better = pair.method if pair.effect > 0 else pair.baseline
+    winner = better if p <= alpha and pair.effect else INCONCLUSIVE
     return replace(
-        one, p_holm=p, family=family, winner=winner, least=power.min_pairs(alpha / family)
+        pair, p_holm=p, family=family, winner=winner, least=power.min_pairs(alpha / family)
     )

@@ -86,14 +86,15 @@ def all_comparisons_table(verdicts: Sequence[PairwiseTest]) -> pd.DataFrame:
 
 def rank_table(rankings: Sequence[RankingResult]) -> pd.DataFrame:
     """Build the table of mean ranks over conditions, a column per group."""
-    made = [one for one in rankings if not one.refused]
-    labels = list(dict.fromkeys(label for one in made for label in one.filters))
+    tested = [ranking for ranking in rankings if not ranking.refused]
+    labels = list(dict.fromkeys(label for ranking in tested for label in ranking.filters))
     by_group = {
-        f"rank, {one.group}": dict(zip(one.filters, one.ranks, strict=True)) for one in made
+        f"rank, {ranking.group}": dict(zip(ranking.filters, ranking.ranks, strict=True))
+        for ranking in tested
     }
     return pd.DataFrame(
         [
-            {"filter": label, **{k: own.get(label, np.nan) for k, own in by_group.items()}}
+            {"filter": label, **{k: ranks.get(label, np.nan) for k, ranks in by_group.items()}}
             for label in labels
         ]
     )

@@ -62,7 +62,7 @@ def write_condition_section(
     key = (condition.scenario, condition.noise, condition.model)
     prefix, note = format_slug("_".join(key)), _format_note(condition)
     regions = coverage.compute_coverage(data.runs, options.alpha)
-    parts = [_write_group(data, front, context, prefix, note) for front in data.fronts]
+    groups = [_write_group(data, front, context, prefix, note) for front in data.fronts]
     overview = tables.overview_table(data.results, options.alpha)
     writers.write_table(folder, f"{prefix}_overview", overview, note)
     section = {
@@ -73,9 +73,9 @@ def write_condition_section(
         "main": data.main,
         "overview": overview,
         "parts": [
-            part | {"regions": coverage.format_coverage(regions, part["name"])}
-            for part in parts
-            if part
+            group | {"regions": coverage.format_coverage(regions, group["name"])}
+            for group in groups
+            if group
         ],
         "drawings": writers.render_figures(
             _list_figures(data, context), prefix, folder, options.figure_formats
@@ -236,7 +236,7 @@ def _summarise_tests(tests: Sequence[PairwiseTest]) -> dict[str, Any]:
 def _has_scores(results: Mapping[str, store.JobResult], group: str) -> bool:
     """Return whether a valid run has a truth for the group, or all runs are lost."""
     for result in results.values():
-        error = result.arrays["error"][~result.arrays["lost"]]
+        error = result.data["error"][~result.data["lost"]]
         indices = [
             index
             for block in component_groups(result.meta["state"])

@@ -44,20 +44,20 @@ class ParetoFront:
     on_front: tuple[bool, ...]
 
 
-def format_budget(metas: Sequence[Mapping[str, Any]]) -> str:
+def format_budget(metadata: Sequence[Mapping[str, Any]]) -> str:
     """Format the budget of compared jobs and its measured values as a table note.
 
     Args:
-        metas: Metadata of the jobs.
+        metadata: Metadata of the jobs.
 
     Raises:
         ValueError: If the budget of a job is not in `store.BUDGETS`.
     """
-    kinds = list(dict.fromkeys(_kind(meta) for meta in metas))
+    kinds = list(dict.fromkeys(_kind(meta) for meta in metadata))
     if len(kinds) > 1:
         return f"Budget: differs between jobs ({', '.join(kinds)})."
     (kind,) = kinds
-    return f"Budget: {kind}{_measured(kind, metas)}."
+    return f"Budget: {kind}{_measured(kind, metadata)}."
 
 
 def pareto_front(cell: str, rows: pd.DataFrame, group: str) -> ParetoFront:
@@ -118,11 +118,11 @@ def _kind(meta: Mapping[str, Any]) -> str:
     return kind
 
 
-def _numbers(metas: Sequence[Mapping[str, Any]]) -> str:
+def _numbers(metadata: Sequence[Mapping[str, Any]]) -> str:
     """Format the most frequent number of particles and the filters with other numbers."""
     by_label = [
         (int(meta["particles"]), str(meta.get("label", "")))
-        for meta in metas
+        for meta in metadata
         if meta.get("particles")
     ]
     count = Counter(number for number, _ in by_label)
@@ -133,13 +133,13 @@ def _numbers(metas: Sequence[Mapping[str, Any]]) -> str:
         texts.append(
             f"{number} of {', '.join(labels)}" if 0 < len(labels) <= _NAMED else str(number)
         )
-    return f"N = {', '.join([str(most), *texts])}{_changing(metas)}"
+    return f"N = {', '.join([str(most), *texts])}{_changing(metadata)}"
 
 
-def _changing(metas: Sequence[Mapping[str, Any]]) -> str:
+def _changing(metadata: Sequence[Mapping[str, Any]]) -> str:
     """Format the particle counts of filters that adapt them."""
     used: dict[str, list[Mapping[str, float]]] = {}
-    for meta in metas:
+    for meta in metadata:
         if "particles_used" in meta:
             used.setdefault(str(meta.get("label", "")), []).append(meta["particles_used"])
     texts = [
@@ -150,9 +150,9 @@ def _changing(metas: Sequence[Mapping[str, Any]]) -> str:
     return "".join(f", {text}" for text in texts)
 
 
-def _measured(kind: str, metas: Sequence[Mapping[str, Any]]) -> str:
+def _measured(kind: str, metadata: Sequence[Mapping[str, Any]]) -> str:
     """Format the measured budget of the particle filters."""
-    jobs = [meta for meta in metas if meta.get("particles")]
+    jobs = [meta for meta in metadata if meta.get("particles")]
     if not jobs:
         return " (without particle filters)"
     if kind == SAME_N:
@@ -160,31 +160,33 @@ def _measured(kind: str, metas: Sequence[Mapping[str, Any]]) -> str:
         return (
             f" (N = {numbers[0]} in each particle filter)"
             if len(numbers) == 1
-            else f" not met ({_numbers(metas)})"
+            else f" not met ({_numbers(metadata)})"
         )
     if kind == SAME_TIME:
-        return _kept(
+        return _format_costs(
             [float(meta["seconds"]["per_step"]) for meta in jobs], 1e3, "ms per step", jobs
         )
     if any(meta.get("likelihoods_per_step") is None for meta in jobs):
         return " (as configured; the jobs do not count them)"
-    return _kept([float(meta["likelihoods_per_step"]) for meta in jobs], 1.0, "per step", jobs)
+    return _format_costs(
+        [float(meta["likelihoods_per_step"]) for meta in jobs], 1.0, "per step", jobs
+    )
 
 
-def _kept(
-    costs: Sequence[float], scale: float, unit: str, metas: Sequence[Mapping[str, Any]]
+def _format_costs(
+    costs: Sequence[float], scale: float, unit: str, metadata: Sequence[Mapping[str, Any]]
 ) -> str:
     """Format the cost of a step, and the filters that miss the target cost.
 
     The target is the price of the job, which differs between conditions, or else the median cost.
     """
     middle = float(np.median(costs))
-    prices = [(meta.get("bought") or {}).get("price", middle) for meta in metas]
+    prices = [(meta.get("bought") or {}).get("price", middle) for meta in metadata]
     far: dict[str, list[float]] = {}
-    for meta, cost, price in zip(metas, costs, prices, strict=True):
+    for meta, cost, price in zip(metadata, costs, prices, strict=True):
         if not price / _CLOSE <= cost <= price * _CLOSE:
             far.setdefault(str(meta.get("label", "")), []).append(cost / price)
-    text = f"{scale * min(costs):.3g} to {scale * max(costs):.3g} {unit}, particle filters only, {_numbers(metas)}"
+    text = f"{scale * min(costs):.3g} to {scale * max(costs):.3g} {unit}, particle filters only, {_numbers(metadata)}"
     missed = [f"{label} ({_range(ratios)} times the target)" for label, ratios in far.items()]
     return f" not met by {', '.join(missed)} ({text})" if missed else f" ({text})"
 

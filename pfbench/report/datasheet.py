@@ -43,7 +43,7 @@ def write_datasheet(
         ValueError: If the file contains a job instead of a datasheet.
     """
     sheet = store.read_result(file)
-    if "residual" not in sheet.arrays:
+    if "residual" not in sheet.data:
         raise ValueError(
             f"file must be a datasheet, got the job {file}. Create one with: pfbench report scenario=NAME"
         )
@@ -77,16 +77,16 @@ def datasheet_figures(sheet: store.JobResult) -> list[FigureSpec]:
 
 def _truth_figures(sheet: store.JobResult) -> Iterator[_Figure]:
     """Yield the figures of track, range and inertial sensors."""
-    arrays = sheet.arrays
-    if "track" in arrays:
-        has_others = len(scenario_data.select_tracks(arrays["track"])) > 1
+    data = sheet.data
+    if "track" in data:
+        has_others = len(scenario_data.select_tracks(data["track"])) > 1
         others = " and of the other runs (grey)" if has_others else ""
         text = f"True track of the first run{others}: plan view and height above the start."
         yield "track", text, scenario_figures.plot_scenario_track
-    if "range" in arrays:
+    if "range" in data:
         text = "Horizontal range from the observer to the target."
         yield "range", text, scenario_figures.plot_distance
-    if "force" in arrays and "rate" in arrays:
+    if "force" in data and "rate" in data:
         text = (
             "Specific force and angular rate in body axes, mean over each step. "
             "Simulated scenarios show true values, recorded scenarios the IMU of the first run."
@@ -96,14 +96,14 @@ def _truth_figures(sheet: store.JobResult) -> Iterator[_Figure]:
 
 def _measurement_figures(sheet: store.JobResult) -> Iterator[_Figure]:
     """Yield the figures of the satellites and of the number of measurements."""
-    has_satellites = "azimuth" in sheet.arrays
+    has_satellites = "azimuth" in sheet.data
     if has_satellites:
         text = (
             "Satellites above the horizon of the first run, zenith in the centre. "
             "Arrows show the direction of motion."
         )
         yield "sky", text, scenario_figures.plot_sky
-    if has_satellites or not (sheet.arrays["seen"] == 1).all():
+    if has_satellites or not (sheet.data["seen"] == 1).all():
         text = (
             f"Number of {'satellites and of ' if has_satellites else ''}observed measurement "
             "components over time, mean over runs."
@@ -123,7 +123,7 @@ def _statistics_figures(sheet: store.JobResult) -> Iterator[_Figure]:
         yield "residuals_time", text, scenario_figures.plot_over_time
     if sheet.meta["runs"] > 1 and scenario_data.compute_spreads(sheet):
         text = "Spread of the true states over the runs (standard deviation of the norm)"
-        if "bound" in sheet.arrays:
+        if "bound" in sheet.data:
             text += (
                 ", and the posterior Cramér-Rao bound (PCRB), a lower bound of the root mean "
                 "square error. The bound exceeds the spread if the initial distribution of the "
@@ -134,23 +134,23 @@ def _statistics_figures(sheet: store.JobResult) -> Iterator[_Figure]:
 
 def list_facts(sheet: store.JobResult) -> list[str]:
     """Describe the scenario in sentences."""
-    arrays, meta = sheet.arrays, sheet.meta
-    time, steps, kinds = arrays["time"], meta["steps"], meta["kinds"]
+    data, meta = sheet.data, sheet.meta
+    time, steps, kinds = data["time"], meta["steps"], meta["kinds"]
     pace = f" of {np.median(np.diff(time)):.3g} s" if steps > 1 else ""
     span = f"{time[0]:.4g} to {time[-1]:.5g} s"
     texts = [f"{steps} steps{pace}, {span}. {meta['runs']} runs, seed {meta['seed']}."]
-    if "track" in arrays:
-        texts.append(_describe_track(arrays["track"][0]))
+    if "track" in data:
+        texts.append(_describe_track(data["track"][0]))
     counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
-    observed = f"{100 * arrays['seen'].mean():.3g}"
+    observed = f"{100 * data['seen'].mean():.3g}"
     texts.append(f"Measurement of {len(kinds)} components: {counts}. Observed: {observed} %.")
-    if "azimuth" in arrays:
+    if "azimuth" in data:
         visible = scenario_data.visible_satellites(sheet)
         is_sparse = scenario_data.has_sparse_counts(visible)
         least = visible[visible > 0].min() if is_sparse else visible.min()
-        total = arrays["elevation"].shape[1]
+        total = data["elevation"].shape[1]
         texts.append(f"Satellites above the horizon: {least} to {visible.max()} of {total}.")
-    residual = arrays["residual"]
+    residual = data["residual"]
     is_equal = scenario_data.distinct_tracks(residual).shape[0] == 1
     if is_equal and meta["runs"] > 1 and not np.isnan(residual).all():
         texts.append("All runs have equal residuals, which are counted once.")
@@ -170,7 +170,7 @@ def _describe_track(track: np.ndarray) -> str:
 
 def list_missing_figures(sheet: store.JobResult) -> list[str]:
     """List the missing figures with their reasons."""
-    a, meta = sheet.arrays, sheet.meta
+    a, meta = sheet.data, sheet.meta
     reasons = []
     if "track" not in a:
         reasons.append("Track: the scenario does not use map coordinates.")

@@ -93,7 +93,7 @@ def order_by_highlight(labels: Sequence[str], highlight: Sequence[str] | None) -
         highlight: Labels of the highlighted filters.
 
     Raises:
-        ValueError: If a highlighted filter has no results.
+        ValueError: If results of a highlighted filter are missing.
     """
     unknown = sorted(set(highlight or ()) - set(labels))
     if unknown:
@@ -108,7 +108,7 @@ def is_brief(conditions: Sequence[Condition], options: ReportOptions) -> bool:
     """Return whether the report is brief.
 
     Args:
-        found: Conditions of the study.
+        conditions: Conditions of the study.
         options: Options of the report.
     """
     most = max(len(cell.jobs) for cell in conditions) * len(conditions)

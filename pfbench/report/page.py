@@ -47,7 +47,7 @@ def write_report(
         Path of index.html.
 
     Raises:
-        FileNotFoundError: If the study has no results.
+        FileNotFoundError: If results of the study are missing.
         ValueError: If results do not belong together, or no result has a selected group, filter or figure.
     """
     options = options or ReportOptions()
@@ -143,9 +143,9 @@ def _select_tests(
     selection = {
         _key(v)
         for section in sections
-        for part in section["parts"]
-        if part["main"]
-        for v in part["chosen"]
+        for group in section["parts"]
+        if group["main"]
+        for v in group["chosen"]
     }
     return [v for v in tests if _key(v) in selection]
 

@@ -52,7 +52,7 @@ def compute_cost(conditions: Sequence[Condition], planned: int | None) -> list[t
     """Count the jobs and sum their time by phase.
 
     Args:
-        found: Conditions of the study.
+        conditions: Conditions of the study.
         planned: Number of jobs of the experiment, if known.
     """
     parts: Counter[str] = Counter()
@@ -96,14 +96,14 @@ def modelling_choices(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
 
 def format_bibtex(conditions: Sequence[Condition]) -> str:
     """Format a BibTeX entry with the versions and the year of the results."""
-    metas = [job.meta for cell in conditions for job in cell.jobs]
-    version = ", ".join(distinct_values(str(_at(meta, "versions.pfbench")) for meta in metas))
+    metadata = [job.meta for cell in conditions for job in cell.jobs]
+    version = ", ".join(distinct_values(str(_at(meta, "versions.pfbench")) for meta in metadata))
     commit = ", ".join(
         distinct_values(
-            str(_at(meta, "versions.commit")) for meta in metas if _at(meta, "versions.commit")
+            str(_at(meta, "versions.commit")) for meta in metadata if _at(meta, "versions.commit")
         )
     )
-    years = [str(meta["created"])[:4] for meta in metas if meta.get("created")]
+    years = [str(meta["created"])[:4] for meta in metadata if meta.get("created")]
     note = f"  note    = {{Commit {commit}}},\n" if commit else ""
     return (
         "@software{pfbench,\n"

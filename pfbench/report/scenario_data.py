@@ -12,17 +12,16 @@ from pfbench.results.state_groups import component_groups
 
 def count_satellites(sheet: store.JobResult) -> list[str]:
     """Return the names of the satellites, from the scenario, its receiver, or as numbers."""
-    if "satellites" in sheet.arrays:
+    if "satellites" in sheet.data:
         return [
-            "".join(chr(int(letter)) for letter in row).strip()
-            for row in sheet.arrays["satellites"]
+            "".join(chr(int(letter)) for letter in row).strip() for row in sheet.data["satellites"]
         ]
     return [str(name) for name in sheet.meta["satellites"]]
 
 
 def visible_satellites(sheet: store.JobResult) -> np.ndarray:
     """Count the visible satellites at each step [T]."""
-    count: np.ndarray = (~np.isnan(sheet.arrays["elevation"])).sum(1)
+    count: np.ndarray = (~np.isnan(sheet.data["elevation"])).sum(1)
     return count
 
 
@@ -43,37 +42,35 @@ def compute_spreads(
     """
     rows = []
     for block in component_groups(sheet.meta["state"]):
-        value = compute_deviation(sheet.arrays, block.places) * block.scale
+        value = compute_deviation(sheet.data, block.places) * block.scale
         finite_mask = ~np.isnan(value)
         if finite_mask.any() and (value[finite_mask] > _ROUNDING * block.scale).any():
             bound = None
-            if "bound" in sheet.arrays:
-                variance = (
-                    sheet.arrays["bound"][finite_mask][:, block.places].astype(np.float64) ** 2
-                )
+            if "bound" in sheet.data:
+                variance = sheet.data["bound"][finite_mask][:, block.places].astype(np.float64) ** 2
                 bound = np.sqrt(variance.sum(-1)) * block.scale
-            rows.append((block, sheet.arrays["time"][finite_mask], value[finite_mask], bound))
+            rows.append((block, sheet.data["time"][finite_mask], value[finite_mask], bound))
     return rows
 
 
-def compute_deviation(arrays: dict[str, np.ndarray], indices: list[int]) -> np.ndarray:
+def compute_deviation(data: dict[str, np.ndarray], indices: list[int]) -> np.ndarray:
     """Compute the standard deviation over runs of the norm of components.
 
     Args:
-        arrays: Arrays of the datasheet.
-        places: Indices of the components.
+        data: Arrays of the datasheet.
+        indices: Indices of the components.
 
     Returns:
         Standard deviation, [T]. NaN where fewer than two runs have a truth.
     """
-    square = (arrays["error"][..., indices].astype(np.float64) ** 2).sum(-1)
+    square = (data["error"][..., indices].astype(np.float64) ** 2).sum(-1)
     count = (~np.isnan(square)).sum(0)
     return np.sqrt(np.where(count > 1, np.nansum(square, 0) / np.maximum(count - 1, 1), np.nan))
 
 
 def group_residuals(sheet: store.JobResult) -> dict[str, np.ndarray]:
     """Group the residuals [R or 1, T, k] by kind of measurement, without missing components."""
-    z = distinct_tracks(sheet.arrays["residual"].astype(np.float64))
+    z = distinct_tracks(sheet.data["residual"].astype(np.float64))
     finite_mask = ~np.isnan(z).all((0, 1))
     kinds = np.array(sheet.meta["kinds"])
     groups = {

@@ -1,7 +1,7 @@
 """Summary of a large study: the main group of each condition, and proposed methods against baselines.
 
 The main group of a condition is the position or, without a position, the first group of the state. If scenarios differ in it, the
-main groups are ranked together, because ranks have no unit. A proposed method is compared with the baselines of its paper:
+main groups are ranked together, because ranks are dimensionless. A proposed method is compared with the baselines of its paper:
 Wilcoxon's test with conditions as blocks and Holm's correction over these pairs alone. The papers define the pairs, not the
 results [ours]. Conditions of a scenario share geometry and random numbers and are dependent blocks.
 """
@@ -37,7 +37,7 @@ class StudySummary:
         incomplete: Conditions with missing filters, and the number of these filters.
         group: Compared group, with the groups by scenario if they differ.
         ranked: Filters and mean ranks, best first; empty without a test across conditions.
-        apart: Number of pairs with a significant difference across conditions.
+        decided: Number of pairs with a significant difference across conditions.
         pairs: Number of pairs across conditions.
         unbeaten: Top group across conditions.
         often: Filters and the number of conditions in which they are in the top group, most first.
@@ -56,7 +56,7 @@ class StudySummary:
     incomplete: tuple[tuple[str, int], ...]
     group: str
     ranked: tuple[tuple[str, float], ...]
-    apart: int
+    decided: int
     pairs: int
     unbeaten: tuple[str, ...]
     often: tuple[tuple[str, int], ...]
@@ -90,18 +90,18 @@ def merge(
     """
     names = {group for group in mains.values() if group}
     name = names.pop() if len(names) == 1 else MAIN
-    own = pd.Series(
+    main_groups = pd.Series(
         list(zip(table.scenario, table.noise, table.model, strict=True)), index=table.index
     ).map(mains)
     rows = table[
-        (table.group == own) & (table.metric == "rmse") & (table.component == "norm")
+        (table.group == main_groups) & (table.metric == "rmse") & (table.component == "norm")
     ].assign(group=name)
-    kept = [
+    main_tests = [
         replace(v, group=name)
         for v in decided
         if v.group == mains.get((v.scenario, v.noise, v.model))
     ]
-    return rows, kept, name
+    return rows, main_tests, name
 
 
 def summarise_study(
@@ -115,37 +115,37 @@ def summarise_study(
     """Build the summary of a study.
 
     Args:
-        one: Ranking of the main groups.
+        ranking: Ranking of the main groups.
         decided: Pairwise tests of the main groups.
-        pairs: Result of `planned`.
+        pairs: Result of `compare_with_baselines`.
         table: Rows of the main groups.
         mains: Main group by condition.
-        fates: Filter and number of runs by status of each job.
+        status_counts: Filter and number of runs by status of each job.
     """
     labels = {
-        " / ".join(map(str, cell)): set(own.label)
-        for cell, own in table.groupby(["scenario", "noise", "model"])
+        " / ".join(map(str, cell)): set(rows.label)
+        for cell, rows in table.groupby(["scenario", "noise", "model"])
     }
     everyone = set().union(*labels.values()) if labels else set()
     by_name = sorted(labels.items(), key=lambda item: natural_sort_key(item[0]))
-    lacking = [(cell, len(everyone - own)) for cell, own in by_name]
+    lacking = [(cell, len(everyone - filters)) for cell, filters in by_name]
     often, compared = _unbeaten(decided)
-    made: Counter[str] = Counter()
-    gone: Counter[str] = Counter()
-    off: Counter[str] = Counter()
+    runs: Counter[str] = Counter()
+    lost: Counter[str] = Counter()
+    diverged: Counter[str] = Counter()
     severe: Counter[str] = Counter()
     for label, n in status_counts:
-        made[label] += n.runs
-        gone[label] += n.lost
-        off[label] += n.diverged or 0
+        runs[label] += n.runs
+        lost[label] += n.lost
+        diverged[label] += n.diverged or 0
         severe[label] += n.severely_overconfident
     return StudySummary(
         filters=len(everyone), cells=len(labels), worlds=len({name for name, _, _ in mains}),
-        regimes=len({noise for _, noise, _ in mains}), runs=made.total(),
+        regimes=len({noise for _, noise, _ in mains}), runs=runs.total(),
         incomplete=tuple(item for item in lacking if item[1]), group=_named(ranking.group, mains),
         ranked=tuple(sorted(zip(ranking.filters, ranking.ranks, strict=False), key=lambda item: (item[1], natural_sort_key(item[0])))),
-        apart=ranking.shown, pairs=len(ranking.pairs), unbeaten=tuple(ranking.unbeaten) if ranking.pairs else (), often=often,
-        compared=compared, lost=_most(gone, made), diverged=_most(off, made), overconfident=_most(severe, made),
+        decided=ranking.shown, pairs=len(ranking.pairs), unbeaten=tuple(ranking.unbeaten) if ranking.pairs else (), often=often,
+        compared=compared, lost=_most(lost, runs), diverged=_most(diverged, runs), overconfident=_most(severe, runs),
         planned=tuple(pairs),
     )  # fmt: skip
 
@@ -163,15 +163,15 @@ def _unbeaten(decided: Sequence[PairwiseTest]) -> tuple[tuple[tuple[str, int], .
     for v in decided:
         cells.setdefault((v.scenario, v.noise, v.model), []).append(v)
     count: Counter[str] = Counter()
-    for own in cells.values():
-        count.update(list_top_group(own))
+    for tests in cells.values():
+        count.update(list_top_group(tests))
     return tuple(
         sorted(count.items(), key=lambda item: (-item[1], natural_sort_key(item[0])))
     ), len(cells)
 
 
-def _most(count: Mapping[str, int], made: Mapping[str, int]) -> tuple[tuple[str, int, int], ...]:
-    rows = [(label, n, made[label]) for label, n in count.items() if n]
+def _most(count: Mapping[str, int], runs: Mapping[str, int]) -> tuple[tuple[str, int, int], ...]:
+    rows = [(label, n, runs[label]) for label, n in count.items() if n]
     return tuple(sorted(rows, key=lambda row: (-row[1] / row[2], natural_sort_key(row[0]))))
 
 
@@ -184,7 +184,7 @@ def _named(group: str, mains: Mapping[CellName, str]) -> str:
     texts = []
     for name, _ in others:
         worlds = sorted(
-            {cell[0] for cell, own in mains.items() if own == name}, key=natural_sort_key
+            {cell[0] for cell, group in mains.items() if group == name}, key=natural_sort_key
         )
         texts += [f"{name} in {', '.join(worlds)}"] if name else []
     return f"{most}, and {', '.join(texts)}"

@@ -58,7 +58,7 @@ def accuracy_table(
         verdicts: Pairwise tests of the group, which add the columns better than and worse than.
         alpha: Probability outside the NEES interval.
         bound: Error limit in the displayed unit, which adds the median convergence time.
-        whole: Results by label with all times, for the convergence time.
+        full_results: Results by label with all times, for the convergence time.
     """
     rows = []
     for label, result in results.items():
@@ -87,8 +87,8 @@ def short_accuracy_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _ran(label: str, result: store.JobResult, alpha: float) -> dict[str, Any]:
-    meta, arrays = result.meta, result.arrays
-    lost, particles = arrays["lost"], meta.get("particles")
+    meta, data = result.meta, result.data
+    lost, particles = data["lost"], meta.get("particles")
     count = status.count_statuses(result)
     nis, band = _nis(result, alpha)
     return {
@@ -107,17 +107,17 @@ def _ran(label: str, result: store.JobResult, alpha: float) -> dict[str, Any]:
         **metrics.table_columns(result, "job"),
         "mean NIS per component (expected 1)": nis,
         "NIS 95 % interval": band,
-        "log evidence": _mean(arrays["log_evidence"][~lost]),
+        "log evidence": _mean(data["log_evidence"][~lost]),
     }
 
 
 def _nis(result: store.JobResult, alpha: float) -> tuple[float, str]:
     """Normalised innovation squared per component seen, over the runs that were not lost, and its band."""
-    if "nis" not in result.arrays:
+    if "nis" not in result.data:
         return np.nan, ""
-    kept = ~result.arrays["lost"]
+    valid = ~result.data["lost"]
     nis, dof = (
-        np.asarray(result.arrays[name], dtype=np.float64)[kept] for name in ("nis", "nis_dof")
+        np.asarray(result.data[name], dtype=np.float64)[valid] for name in ("nis", "nis_dof")
     )
     count = int(np.nansum(dof))
     if not count:
@@ -127,26 +127,22 @@ def _nis(result: store.JobResult, alpha: float) -> tuple[float, str]:
 
 
 def _settled(result: store.JobResult, block: ComponentGroup, bound: float) -> dict[str, Any]:
-    error = result.arrays["error"][..., block.places].astype(np.float64) * block.scale
-    when = error_measures.convergence_time(
-        result.arrays["time"], error, result.arrays["lost"], bound
-    )
+    error = result.data["error"][..., block.places].astype(np.float64) * block.scale
+    when = error_measures.convergence_time(result.data["time"], error, result.data["lost"], bound)
     return {f"median time to {bound:g} {block.unit} [s]": float(np.median(when[~np.isnan(when)]))}
 
 
 def _accuracy(result: store.JobResult, block: ComponentGroup, alpha: float) -> dict[str, Any]:
-    arrays, lost, groups = result.arrays, result.arrays["lost"], result.meta["state"]["groups"]
-    error = arrays["error"][..., block.places].astype(np.float64) * block.scale
-    norm, each = (
-        error_measures.rmse_norm(error, lost),
-        error_measures.rmse_component(error, lost).value,
-    )
+    data, lost, groups = result.data, result.data["lost"], result.meta["state"]["groups"]
+    error = data["error"][..., block.places].astype(np.float64) * block.scale
+    norm = error_measures.rmse_norm(error, lost)
+    by_component = error_measures.rmse_component(error, lost).value
     largest = error_measures.max_error(error, lost)[~lost]
-    dof = len(groups[block.whole])
-    found = consistency.compute_consistency(
-        arrays["nees"][..., list(groups).index(block.whole)], lost, dof, alpha
+    dof = len(groups[block.state_group])
+    nees = consistency.compute_consistency(
+        data["nees"][..., list(groups).index(block.state_group)], lost, dof, alpha
     )
-    low, high = consistency.nees_band(dof, found.runs, alpha)
+    low, high = consistency.nees_band(dof, nees.runs, alpha)
     unit = f" [{block.unit}]" if block.unit else ""
     row: dict[str, Any] = {
         "valid runs": norm.runs,
@@ -154,22 +150,22 @@ def _accuracy(result: store.JobResult, block: ComponentGroup, alpha: float) -> d
         f"mean run RMSE{unit}": float(error_measures.rmse_run_mean(error, lost).value),
         **{
             f"RMSE {name.removeprefix(f'{block.group}_')}{unit}": float(value)
-            for name, value in zip(block.components, each, strict=True)
+            for name, value in zip(block.components, by_component, strict=True)
         },
         f"maximum error{unit}": float(np.max(largest[~np.isnan(largest)])) if norm.runs else np.nan,
-        f"mean NEES (expected {dof})": found.mean,
-        "NEES consistency": status.classify_consistency(found, dof, alpha),
+        f"mean NEES (expected {dof})": nees.mean,
+        "NEES consistency": status.classify_consistency(nees, dof, alpha),
         "95 % interval at one step": f"{format_number(float(low))} to {format_number(float(high))}",
-        "steps inside the interval [%]": 100 * found.inside,
+        "steps inside the interval [%]": 100 * nees.inside,
     }
     row |= metrics.table_columns(result, "components", block)
-    if "bound" in arrays:
-        floor = arrays["bound"][:, block.places].astype(np.float64) * block.scale
+    if "bound" in data:
+        floor = data["bound"][:, block.places].astype(np.float64) * block.scale
         row["RMSE / PCRB"] = error_measures.rmse_to_pcrb(error, lost, floor)
-    if "range" in arrays and block.whole == "position":
+    if "range" in data and block.state_group == "position":
         for name, last in (("", None), (f", last {_LAST} steps", _LAST)):
             share = error_measures.relative_error(
-                error[..., :2] / block.scale, lost, arrays["range"], last
+                error[..., :2] / block.scale, lost, data["range"], last
             )
             row[f"horizontal error [% of range]{name}"] = 100 * float(share.value)
     return row

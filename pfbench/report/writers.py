@@ -141,7 +141,12 @@ def _data_address(path: Path) -> str:
 
 
 def to_json_types(value: Any, digits: int | None = None) -> Any:
-    """Convert a value to JSON types, with infinity as text and an optional number of digits."""
+    """Convert a value to JSON types, with infinity as text.
+
+    Args:
+        value: Value, list or mapping.
+        digits: Number of significant digits, None for all.
+    """
     if isinstance(value, Mapping):
         return {name: to_json_types(item, digits) for name, item in value.items()}
     if isinstance(value, list | tuple):

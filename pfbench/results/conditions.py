@@ -21,7 +21,7 @@ class JobFile(NamedTuple):
     Attributes:
         path: File.
         label: Name of the filter, with the settings that distinguish it within its condition.
-        meta: Metadata, see `store.Result`.
+        meta: Metadata, see `store.JobResult`.
     """
 
     path: Path
@@ -104,7 +104,7 @@ def unlabelled_settings(jobs: Sequence[JobFile]) -> list[str]:
 def natural_sort_key(text: str) -> list[tuple[int, int, str]]:
     """Return a sorting key that puts 400 before 1600."""
     parts = re.split(r"(\d+)", text)
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+    return [(0, int(text), "") if text.isdigit() else (1, 0, text) for text in parts]
 
 
 def _condition_key(meta: Mapping[str, Any]) -> tuple[str, str, str]:
@@ -123,7 +123,7 @@ def _label_jobs(items: Sequence[_Described]) -> tuple[JobFile, ...]:
     names = [str(meta["label"]) for _, meta in items]
     jobs = []
     for (path, meta), name in zip(items, names, strict=True):
-        twins = [other for (_, other), label in zip(items, names, strict=True) if label == name]
+        twins = [twin for (_, twin), label in zip(items, names, strict=True) if label == name]
         jobs.append(JobFile(path, _distinct_label(meta, twins), meta))
     return tuple(sorted(jobs, key=lambda job: natural_sort_key(job.label)))
 
@@ -160,7 +160,7 @@ def _differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _flatten(config: Any, path: str = "") -> dict[str, Any]:
     """Flatten a configuration to dotted names; stages of a filter are numbered."""
-    if isinstance(config, list) and any(isinstance(part, Mapping) for part in config):
+    if isinstance(config, list) and any(isinstance(stage, Mapping) for stage in config):
         config = dict(enumerate(config))
     if not isinstance(config, Mapping):
         return {path: config}

@@ -34,7 +34,7 @@ class CoverageResult:
         high: Upper end of that interval.
         runs: Number of runs included.
         family: Number of groups and filters of the condition.
-        seen: "under-coverage", "over-coverage" or "consistent with 90 %".
+        decision: "under-coverage", "over-coverage" or "consistent with 90 %".
     """
 
     scenario: str
@@ -47,7 +47,7 @@ class CoverageResult:
     high: float
     runs: int
     family: int
-    seen: str
+    decision: str
 
 
 def compute_coverage(runs: pd.DataFrame, alpha: float = 0.05) -> list[CoverageResult]:
@@ -70,14 +70,21 @@ def compute_coverage(runs: pd.DataFrame, alpha: float = 0.05) -> list[CoverageRe
 
 
 def format_coverage(results: Sequence[CoverageResult], group: str) -> str:
-    """Describe the coverage of one group in a sentence; empty if nothing was scored."""
+    """Describe the coverage of one group in a sentence; empty without scores.
+
+    Args:
+        results: Coverage of all groups and filters.
+        group: Group of the state.
+    """
     rows = [row for row in results if row.group == group]
     parts = []
     for decision in (UNDER_COVERAGE, OVER_COVERAGE):
-        names = [f"{row.label} ({100 * row.share:.0f} %)" for row in rows if row.seen == decision]
+        names = [
+            f"{row.label} ({100 * row.share:.0f} %)" for row in rows if row.decision == decision
+        ]
         if names:
             parts.append(f"{decision} for {', '.join(names)}")
-    rest = [row.label for row in rows if row.seen == CONSISTENT]
+    rest = [row.label for row in rows if row.decision == CONSISTENT]
     if rest:
         parts.append(f"{CONSISTENT} for {', '.join(rest)}")
     return f"Coverage of the central {LEVEL} % interval: {', '.join(parts)}." if parts else ""
@@ -106,5 +113,5 @@ def _judge(key: tuple[str, ...], values: np.ndarray, alpha: float, family: int) 
         high=interval.high,
         runs=runs,
         family=family,
-        seen=decision,
+        decision=decision,
     )

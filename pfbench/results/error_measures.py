@@ -1,7 +1,7 @@
 """Error measures of a filter on arrays with leading axes [R, T]: R runs, T time steps.
 
 Three quantities are called RMSE in the literature, and each has its own name here. Errors are
-estimate minus truth, NaN where there is no truth (runs of unequal length are padded with NaN). A
+estimate minus truth, NaN without truth (runs of unequal length are padded with NaN). A
 step at which any component is NaN is left out. Averages exclude lost runs and state how many runs
 they include. The error of a lost run is infinite.
 """
@@ -22,7 +22,7 @@ class RunMean(NamedTuple):
 
     Attributes:
         value: Average, or one per component [K]; NaN without runs.
-        runs: Number of runs included. The others are lost or have no truth.
+        runs: Number of runs included. The others are lost or without truth.
     """
 
     value: Array
@@ -43,14 +43,24 @@ def rmse_per_run(error: Array, lost: Flags) -> Array:
 
 
 def rmse_run_mean(error: Array, lost: Flags) -> RunMean:
-    """Average the RMSE of each run over runs; arguments as `rmse_per_run`."""
+    """Average the RMSE of each run over runs.
+
+    Args:
+        error: Components of one group, [R, T, K].
+        lost: Lost runs, [R].
+    """
     by_run = rmse_per_run(error, lost)
     used = ~np.isnan(by_run) & ~np.asarray(lost, dtype=bool)
     return RunMean(finite_mean(by_run[used], axis=0), int(used.sum()))
 
 
 def rmse_norm(error: Array, lost: Flags) -> RunMean:
-    """Compute the root mean square over runs and time of the norm; arguments as `rmse_per_run`."""
+    """Compute the root mean square over runs and time of the norm.
+
+    Args:
+        error: Components of one group, [R, T, K].
+        lost: Lost runs, [R].
+    """
     square = _squared_norm(error)[~lost]
     return RunMean(np.sqrt(finite_mean(square.ravel(), axis=0)), count_runs(square))
 
@@ -58,7 +68,9 @@ def rmse_norm(error: Array, lost: Flags) -> RunMean:
 def rmse_component(error: Array, lost: Flags) -> RunMean:
     """Compute the root mean square over runs and time of each component, value [K].
 
-    Arguments as `rmse_per_run`.
+    Args:
+        error: Components of one group, [R, T, K].
+        lost: Lost runs, [R].
     """
     valid = np.asarray(error, dtype=np.float64)[~lost]
     square = np.where(np.isnan(_squared_norm(valid))[..., None], np.nan, valid**2)
@@ -69,7 +81,9 @@ def rmse_component(error: Array, lost: Flags) -> RunMean:
 def max_error(error: Array, lost: Flags) -> Array:
     """Compute the maximum norm over time of each run [R], infinite if lost.
 
-    Arguments as `rmse_per_run`.
+    Args:
+        error: Components of one group, [R, T, K].
+        lost: Lost runs, [R].
     """
     square = _squared_norm(error)
     largest = np.max(np.where(np.isnan(square), -np.inf, square), axis=1, initial=-np.inf)
@@ -77,7 +91,15 @@ def max_error(error: Array, lost: Flags) -> Array:
 
 
 def mean_per_run(trace: Array, lost: Flags) -> Array:
-    """Average a trace [R, T], such as ESS or NEES, over time; [R], NaN for a lost run."""
+    """Average a trace, such as ESS or NEES, over time.
+
+    Args:
+        trace: Values, [R, T].
+        lost: Lost runs, [R].
+
+    Returns:
+        Means, [R]; NaN for a lost run.
+    """
     return np.where(lost, np.nan, finite_mean(np.asarray(trace, dtype=np.float64), axis=1))
 
 
@@ -154,7 +176,12 @@ def convergence_time(time: Array, error: Array, lost: Flags, bound: float) -> Ar
 
 
 def finite_mean(values: Array, axis: int) -> Array:
-    """Average the values that are not NaN; NaN without values, where nanmean would warn."""
+    """Average the values that are not NaN; NaN without values, where nanmean would warn.
+
+    Args:
+        values: Values of any shape.
+        axis: Axis of the average.
+    """
     valid = ~np.isnan(values)
     count = valid.sum(axis=axis)
     total = np.where(valid, values, 0.0).sum(axis=axis)

@@ -42,7 +42,7 @@ def load_frame(
         infinite errors and scores, and NaN elsewhere.
 
     Raises:
-        FileNotFoundError: if the study has no results. The message lists the studies that have.
+        FileNotFoundError: If results of the study are missing. The message lists other studies.
         ValueError: if files do not belong together. The message lists them.
     """
     rows = [
@@ -66,7 +66,7 @@ def drop_before(result: store.JobResult, start_time_s: float) -> store.JobResult
     Raises:
         ValueError: if no step remains.
     """
-    time = result.arrays["time"]
+    time = result.data["time"]
     mask = time >= start_time_s
     if not mask.any():
         raise ValueError(
@@ -77,17 +77,22 @@ def drop_before(result: store.JobResult, start_time_s: float) -> store.JobResult
 
 
 def select_steps(result: store.JobResult, mask: np.ndarray) -> store.JobResult:
-    """Select steps by a mask [T]; scores without a selected step are removed."""
+    """Select steps; scores without a selected step are removed.
+
+    Args:
+        result: Job.
+        mask: Mask of the selected steps, [T].
+    """
     if mask.all():
         return result
     skipped = (*_WHOLE_RUN_ARRAYS, "scored", *metrics.scored_arrays())
     selected = {
         name: array[mask] if name in _SHARED_ARRAYS else array[:, mask]
-        for name, array in result.arrays.items()
+        for name, array in result.data.items()
         if name not in skipped
     }
-    shared = {name: result.arrays[name] for name in _WHOLE_RUN_ARRAYS}
-    scores = _select_scores(result.arrays, mask)
+    shared = {name: result.data[name] for name in _WHOLE_RUN_ARRAYS}
+    scores = _select_scores(result.data, mask)
     return store.JobResult(result.meta, {**selected, **shared, **scores})
 
 
@@ -110,7 +115,7 @@ def to_long_rows(
     Returns:
         The rows of the job.
     """
-    lost = result.arrays["lost"]
+    lost = result.data["lost"]
     columns = [*_metric_rows(drop_before(result, start_time_s)), *_convergence(result, converged)]
     rows = pd.concat(columns, ignore_index=True)
     first, runs = job.meta.get("first_run", 0), lost.size
@@ -131,13 +136,13 @@ def to_long_rows(
     return pd.concat([pd.DataFrame(head, index=rows.index), rows], axis=1)
 
 
-def _select_scores(arrays: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
+def _select_scores(data: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
     """Select scores at the steps of a mask [T], with their new step numbers."""
-    if "scored" not in arrays or not (remaining := mask[arrays["scored"]]).any():
+    if "scored" not in data or not (remaining := mask[data["scored"]]).any():
         return {}
-    names = [name for name in metrics.scored_arrays() if name in arrays]
-    scores = {name: arrays[name][:, remaining] for name in names}
-    return {"scored": (np.cumsum(mask) - 1)[arrays["scored"][remaining]], **scores}
+    names = [name for name in metrics.scored_arrays() if name in data]
+    scores = {name: data[name][:, remaining] for name in names}
+    return {"scored": (np.cumsum(mask) - 1)[data["scored"][remaining]], **scores}
 
 
 def _metric_rows(result: store.JobResult) -> Iterator[pd.DataFrame]:
@@ -158,8 +163,8 @@ def _convergence(result: store.JobResult, converged: Mapping[str, float]) -> Ite
     """Yield the convergence time of each group with a bound, from the start of the record."""
     for group in component_groups(result.meta["state"]):
         if group.group in converged:
-            error = result.arrays["error"][..., group.places].astype(np.float64) * group.scale
-            time, lost = result.arrays["time"], result.arrays["lost"]
+            error = result.data["error"][..., group.places].astype(np.float64) * group.scale
+            time, lost = result.data["time"], result.data["lost"]
             when = convergence_time(time, error, lost, converged[group.group])
             yield _column("converged", when, group.group, "norm", "s")
 

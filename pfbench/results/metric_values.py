@@ -37,14 +37,9 @@ class MetricInput(NamedTuple):
     state_group: str = ""
 
     @property
-    def arrays(self) -> Mapping[str, Array]:
-        """Stored arrays."""
-        return self.result.arrays
-
-    @property
     def lost(self) -> Flags:
         """Lost runs, [R]."""
-        return self.result.arrays["lost"]
+        return self.result.data["lost"]
 
     @property
     def group_index(self) -> int:
@@ -55,7 +50,7 @@ class MetricInput(NamedTuple):
         """Return the components of the group of an array [..., D], in displayed units."""
         if self.group is None:
             raise ValueError(f"metric of {name} must have the scope 'components', got none.")
-        return self.arrays[name][..., self.group.places].astype(np.float64) * self.group.scale
+        return self.result.data[name][..., self.group.places].astype(np.float64) * self.group.scale
 
 
 ByComponent = Mapping[str, Array]
@@ -63,8 +58,8 @@ ByComponent = Mapping[str, Array]
 
 def particles_in_use(result: store.JobResult) -> Array | int:
     """Return the number of particles: [R, T] if the filter changes it."""
-    arrays = result.arrays
-    return arrays["particles"] if "particles" in arrays else int(result.meta["particles"])
+    data = result.data
+    return data["particles"] if "particles" in data else int(result.meta["particles"])
 
 
 def mean_trace(result: store.JobResult, name: str) -> Array:
@@ -80,23 +75,23 @@ def mean_trace(result: store.JobResult, name: str) -> Array:
     Returns:
         Mean of each run, [R]; NaN without the trace.
     """
-    arrays, lost, particles = result.arrays, result.arrays["lost"], result.meta.get("particles")
+    data, lost, particles = result.data, result.data["lost"], result.meta.get("particles")
     is_count = name in _PARTICLE_COUNTS
-    stored = "ancestors" if name == "unique" and "unique" not in arrays else name
-    trace = arrays.get(stored)
+    stored = "ancestors" if name == "unique" and "unique" not in data else name
+    trace = data.get(stored)
     if trace is None or (is_count and not particles):
         return np.full(lost.size, np.nan)
-    if name in ("ancestors", "unique") and "resampled" in arrays:
-        trace = np.where(arrays["resampled"], trace, np.nan)
+    if name in ("ancestors", "unique") and "resampled" in data:
+        trace = np.where(data["resampled"], trace, np.nan)
     return mean_per_run(trace / particles_in_use(result) if is_count else trace, lost)
 
 
 def mean_acceptance(result: store.JobResult) -> Array:
     """Average the MCMC acceptance over resampled steps; [R], NaN without moves."""
-    arrays, lost = result.arrays, result.arrays["lost"]
-    if "accepted_0" not in arrays:
+    data, lost = result.data, result.data["lost"]
+    if "accepted_0" not in data:
         return np.full(lost.size, np.nan)
-    accepted = np.where(arrays.get("resampled", True), arrays["accepted_0"], np.nan)
+    accepted = np.where(data.get("resampled", True), data["accepted_0"], np.nan)
     return mean_per_run(accepted, lost)
 
 
@@ -114,7 +109,7 @@ def compute_max_error(data: MetricInput) -> ByComponent:
 
 def compute_crps(data: MetricInput) -> ByComponent:
     """Compute the CRPS of each component and its mean."""
-    if "crps" not in data.arrays or data.group is None:
+    if "crps" not in data.result.data or data.group is None:
         return {}
     crps, names = data.select("crps"), data.group.components
     single = {name: mean_score_per_run(crps[..., k], data.lost) for k, name in enumerate(names)}
@@ -124,30 +119,35 @@ def compute_crps(data: MetricInput) -> ByComponent:
 def compute_energy_score(data: MetricInput) -> ByComponent:
     """Compute the energy score; a group of mixed units has none."""
     group = data.group
-    if "energy" not in data.arrays or group is None or group.group != group.whole:
+    if "energy" not in data.result.data or group is None or group.group != group.state_group:
         return {}
-    energy = data.arrays["energy"][..., data.group_index].astype(np.float64) * group.scale
+    energy = data.result.data["energy"][..., data.group_index].astype(np.float64) * group.scale
     return {"norm": mean_score_per_run(energy, data.lost)}
 
 
 def compute_interval_coverage(data: MetricInput, level: int) -> ByComponent:
-    """Compute the coverage of the central interval of `level` percent."""
-    if "pit" not in data.arrays or data.group is None:
+    """Compute the coverage of a central interval.
+
+    Args:
+        data: Data of a group.
+        level: Probability of the interval, percent.
+    """
+    if "pit" not in data.result.data or data.group is None:
         return {}
-    pit = data.arrays["pit"][..., data.group.places]
+    pit = data.result.data["pit"][..., data.group.places]
     return {"mean": coverage_per_run(pit, data.lost, level / 100)}
 
 
 def compute_mean_nees(data: MetricInput) -> ByComponent:
     """Compute the mean NEES of a group."""
-    return {"norm": mean_per_run(data.arrays["nees"][..., data.group_index], data.lost)}
+    return {"norm": mean_per_run(data.result.data["nees"][..., data.group_index], data.lost)}
 
 
 def compute_mean_nis(data: MetricInput) -> ByComponent:
     """Compute the mean NIS per observed component."""
-    if "nis" not in data.arrays:
+    if "nis" not in data.result.data:
         return {}
-    nis, dof = (mean_per_run(data.arrays[name], data.lost) for name in ("nis", "nis_dof"))
+    nis, dof = (mean_per_run(data.result.data[name], data.lost) for name in ("nis", "nis_dof"))
     return {"": np.divide(nis, dof, out=np.full(data.lost.size, np.nan), where=dof > 0)}
 
 
@@ -169,7 +169,7 @@ def compute_acceptance(data: MetricInput) -> ByComponent:
 
 def compute_log_evidence(data: MetricInput) -> ByComponent:
     """Return the log evidence of each run."""
-    return {"": np.where(data.lost, np.nan, data.arrays["log_evidence"])}
+    return {"": np.where(data.lost, np.nan, data.result.data["log_evidence"])}
 
 
 def compute_seconds_per_step(data: MetricInput) -> ByComponent:

@@ -1,8 +1,8 @@
 """Table of metrics: name, function, unit, direction and caption of each, defined once.
 
 The table of a study (`frame`), the tables of a report with their definitions, and the claims read
-`METRICS`. To add a metric, add one entry. If it needs an array that no job stores yet, record that
-array in the scoring of jobs as well, and name it under `arrays` if it exists at scored steps only.
+`METRICS`. To add a metric, add one entry. If it needs an array that no job stores yet, record
+that array in the scoring of jobs too. Name it under `scored_names` if it exists at scored steps only.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Metric:
         head: Column head in tables, without unit; empty for no column.
         component: Component shown in that column.
         factor: Factor of the shown value, 100 for percent.
-        arrays: Arrays that exist at scored steps only.
+        scored_names: Arrays that exist at scored steps only.
         requires: Array without which the column is empty, though the value has a substitute.
     """
 
@@ -67,24 +67,32 @@ class Metric:
     head: str = ""
     component: str = "norm"
     factor: float = 1.0
-    arrays: tuple[str, ...] = ()
+    scored_names: tuple[str, ...] = ()
     requires: str = ""
 
     def column_head(self, group_unit: str = "") -> str:
         """Return the column head with its unit."""
         unit = group_unit if self.unit == GROUP_UNIT else self.unit
-        shown = {100.0: "%"}.get(self.factor, unit)
-        return f"{self.head} [{shown}]" if shown and "[" not in self.head else self.head
+        unit = {100.0: "%"}.get(self.factor, unit)
+        return f"{self.head} [{unit}]" if unit and "[" not in self.head else self.head
 
 
 def compute_metric(name: str, data: MetricInput) -> ByComponent:
-    """Compute one metric of the table; values [R] by component."""
+    """Compute one metric of the table.
+
+    Args:
+        name: Name of the metric.
+        data: Data of the job.
+
+    Returns:
+        Values [R] by component.
+    """
     return {metric.name: metric for metric in METRICS}[name].compute(data)
 
 
 def scored_arrays() -> tuple[str, ...]:
     """List the arrays of scored steps that metrics read."""
-    return tuple(dict.fromkeys(name for metric in METRICS for name in metric.arrays))
+    return tuple(dict.fromkeys(name for metric in METRICS for name in metric.scored_names))
 
 
 def table_columns(
@@ -100,14 +108,14 @@ def table_columns(
     Returns:
         Values by column head, NaN without data.
     """
-    data = MetricInput(result, group, group.whole if group else "")
+    data = MetricInput(result, group, group.state_group if group else "")
     columns = {}
     for metric in METRICS:
         if metric.scope == scope and metric.head:
             values = metric.compute(data).get(metric.component if scope != "job" else "")
             if values is None and scope != "job":
                 continue
-            if values is None or (metric.requires and metric.requires not in data.arrays):
+            if values is None or (metric.requires and metric.requires not in data.result.data):
                 value = np.nan
             else:
                 value = _mean_of_valid(values, data.lost)
@@ -143,20 +151,20 @@ METRICS: tuple[Metric, ...] = (
         "crps", compute_crps, "components", GROUP_UNIT, "lower",
         "Continuous ranked probability score, mean over valid runs, components and scored steps. "
         "It equals the absolute error for a distribution without spread.",
-        head="CRPS", component="mean", arrays=("crps",),
+        head="CRPS", component="mean", scored_names=("crps",),
     ),
     Metric(
         "energy", compute_energy_score, "components", GROUP_UNIT, "lower",
         "Generalisation of the CRPS to the vector of a group, mean over valid runs and scored "
         "steps.",
-        head="energy score", arrays=("energy",),
+        head="energy score", scored_names=("energy",),
     ),
     *(
         Metric(
             f"coverage_{level}", partial(compute_interval_coverage, level=level), "components", "", "target",
             _INTERVAL.format(low=f"{50 - level / 2:g}", high=f"{50 + level / 2:g}", level=level),
             head=f"coverage of the {level} % interval", component="mean", factor=100.0,
-            arrays=("pit",),
+            scored_names=("pit",),
         )
         for level in COVERAGE_LEVELS
     ),
@@ -192,7 +200,7 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "nis", compute_mean_nis, "job", "", "target",
         "Normalised innovation squared per observed component. Its expectation is 1.",
-        arrays=("nis", "nis_dof"),
+        scored_names=("nis", "nis_dof"),
     ),
     Metric(
         "log_evidence", compute_log_evidence, "job", "", "higher",
@@ -218,7 +226,7 @@ def data_by_scope(result: store.JobResult, scope: Scope) -> list[MetricInput]:
     state = result.meta["state"]
     if scope == "components":
         groups = component_groups(state)
-        return [MetricInput(result, group, group.whole) for group in groups]
+        return [MetricInput(result, group, group.state_group) for group in groups]
     if scope == "group":
         return [MetricInput(result, None, name) for name in state["groups"]]
     return [MetricInput(result)]

@@ -33,40 +33,59 @@ _META = ("key", "study", "choices", "config", "label", "seed", "runs", "state")
 
 
 def check_metadata(path: Path, meta: Any) -> None:
-    """Raise ValueError if required metadata are missing."""
+    """Check that the metadata have the format and all required keys.
+
+    Args:
+        path: File, for the message.
+        meta: Metadata.
+
+    Raises:
+        ValueError: If the format differs or a key is missing.
+    """
     version = meta.get("format") if isinstance(meta, dict) else None
     if version != FORMAT:
         raise ValueError(f"{path} must have format {FORMAT}, got {version}. Run the job again.")
     missing = [name for name in _META if name not in meta]
     if missing:
-        raise ValueError(f"{path}: metadata must contain {', '.join(missing)}")
+        raise ValueError(f"{path}: metadata must contain {', '.join(missing)}. Run the job again.")
 
 
-def check_arrays(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Raise ValueError if arrays are missing, pickled, or inconsistent in R, T, D, G or S."""
-    missing = [name for name in _AXES if name not in arrays]
+def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndarray]) -> None:
+    """Check the names, types and shapes of the arrays of a result.
+
+    Args:
+        path: File, for the message.
+        meta: Metadata.
+        data: Arrays by name.
+
+    Raises:
+        ValueError: If an array is missing, is pickled, or has an inconsistent shape.
+    """
+    missing = [name for name in _AXES if name not in data]
     if missing:
-        raise ValueError(f"{path}: a result must contain the arrays {', '.join(missing)}")
-    for name, value in arrays.items():
+        raise ValueError(f"{path}: arrays must contain {', '.join(missing)}. Run the job again.")
+    for name, value in data.items():
         # the first three are arguments of numpy's savez
         if name in ("file", "args", "allow_pickle", "meta"):
-            raise ValueError(f"{path}: the array name {name!r} is reserved. Use another name")
+            raise ValueError(
+                f"{path}: name of an array must not be reserved, got {name!r}. Use another name."
+            )
         if value.dtype.hasobject:
             raise ValueError(
-                f"{path}: {name} must be numbers, booleans or texts, got Python objects"
+                f"{path}: {name} must be numbers, booleans or texts, got Python objects. Convert them."
             )
     size: dict[str, int] = {
         "R": int(meta["runs"]),
         "D": len(meta["state"]["names"]),
         "G": len(meta["state"]["groups"]),
-        "T": arrays["time"].size,
-        "S": arrays["scored"].size if "scored" in arrays else 0,
+        "T": data["time"].size,
+        "S": data["scored"].size if "scored" in data else 0,
     }
     for name, axes in (
-        _AXES | {name: axes for name, axes in _OPTIONAL.items() if name in arrays}
+        _AXES | {name: axes for name, axes in _OPTIONAL.items() if name in data}
     ).items():
         expected = tuple(size[axis] for axis in axes)
-        if arrays[name].shape != expected:
+        if data[name].shape != expected:
             raise ValueError(
-                f"{path}: {name} must have shape {list(axes)} = {expected}, got {arrays[name].shape}"
+                f"{path}: {name} must have shape {list(axes)} = {expected}, got {data[name].shape}"
             )

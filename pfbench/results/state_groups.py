@@ -20,7 +20,7 @@ class ComponentGroup(NamedTuple):
 
     Attributes:
         group: Name. A group of mixed units is divided by unit, as "clock [m]" and "clock [m/s]".
-        whole: Group of the state that it is or belongs to; NEES refers to it.
+        state_group: Group of the state that it is or belongs to; NEES refers to it.
         places: Indices of the components in the state.
         components: Names of the components.
         unit: Displayed unit.
@@ -28,7 +28,7 @@ class ComponentGroup(NamedTuple):
     """
 
     group: str
-    whole: str
+    state_group: str
     places: list[int]
     components: list[str]
     unit: str

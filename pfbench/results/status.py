@@ -114,12 +114,12 @@ def divergence_threshold(meta: Mapping[str, Any]) -> float | None:
 
 def count_statuses(result: store.JobResult) -> StatusCounts:
     """Count the runs of a job by status."""
-    lost, groups = result.arrays["lost"], result.meta["state"]["groups"]
+    lost, groups = result.data["lost"], result.meta["state"]["groups"]
     dofs = [len(components) for components in groups.values()]
-    severe = is_severely_overconfident(result.arrays["nees"], dofs, lost)
+    severe = is_severely_overconfident(result.data["nees"], dofs, lost)
     threshold = divergence_threshold(result.meta)
     diverged = None
     if threshold is not None and POSITION in groups:
-        error = result.arrays["error"][..., list(groups[POSITION])]
+        error = result.data["error"][..., list(groups[POSITION])]
         diverged = int(is_diverged(error, lost, threshold).sum())
     return StatusCounts(int(lost.sum()), diverged, int(severe.sum()), int(lost.size))

@@ -38,13 +38,13 @@ class JobResult(NamedTuple):
     Attributes:
         meta: Metadata: key, study, choices, config, label, seed, versions, seconds, and state
             (names, units, groups).
-        arrays: `time` [T] (s), `error` and `sd` [R, T, D], `nees` [R, T, G], `log_evidence` and
+        data: `time` [T] (s), `error` and `sd` [R, T, D], `nees` [R, T, G], `log_evidence` and
             `lost` [R]. Optional: traces [R, T], `track` [R, T, 3] (m; East, North, Up), and the
             scored steps [S] with `crps`, `pit` [R, S, D] and `energy` [R, S, G].
     """
 
     meta: dict[str, Any]
-    arrays: dict[str, np.ndarray]
+    data: dict[str, np.ndarray]
 
 
 def config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) -> str:
@@ -71,7 +71,7 @@ def config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def write_result(path: str | Path, meta: Mapping[str, Any], arrays: Mapping[str, Any]) -> Path:
+def write_result(path: str | Path, meta: Mapping[str, Any], data: Mapping[str, Any]) -> Path:
     """Write a finished job. An interruption leaves the old or the new file, never a partial one.
 
     The failure note of the same key and temporary files of interrupted writes are removed.
@@ -79,7 +79,7 @@ def write_result(path: str | Path, meta: Mapping[str, Any], arrays: Mapping[str,
     Args:
         path: `<folder>/<key>.npz`. The folder is created.
         meta: See `JobResult`. `format` is added.
-        arrays: See `JobResult`. Tensors must be converted first.
+        data: See `JobResult`. Tensors must be converted first.
 
     Returns:
         The path.
@@ -89,7 +89,7 @@ def write_result(path: str | Path, meta: Mapping[str, Any], arrays: Mapping[str,
     """
     path = Path(path)
     full = {"format": FORMAT, **meta}
-    plain: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
+    plain: dict[str, Any] = {name: np.asarray(value) for name, value in data.items()}
     check_metadata(path, full)
     check_arrays(path, full, plain)
     # Unsorted, since the order of the groups is that of the last axis of nees.
@@ -111,13 +111,13 @@ def read_result(path: str | Path) -> JobResult:
     path = Path(path)
     with _opened(path) as file:
         meta = _meta(path, file)
-        arrays = {name: _member(path, file, name) for name in file.files if name != "meta"}
-    check_arrays(path, meta, arrays)
-    return JobResult(meta, arrays)
+        data = {name: _member(path, file, name) for name in file.files if name != "meta"}
+    check_arrays(path, meta, data)
+    return JobResult(meta, data)
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
-    """Read the metadata of a job without its arrays. Errors as in `load`."""
+    """Read the metadata of a job without its arrays. Errors as in `read_result`."""
     path = Path(path)
     with _opened(path) as file:
         return _meta(path, file)
@@ -157,7 +157,7 @@ def list_results(folder: str | Path) -> Iterator[JobResult]:
     Arrays are read one job at a time.
 
     Raises:
-        ValueError: If a file cannot be read, see `load`.
+        ValueError: If a file cannot be read, see `read_result`.
     """
     paths = sorted(Path(folder).glob("*.npz"), key=_rank)
     return map(read_result, paths)
@@ -207,18 +207,18 @@ def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
 @contextmanager
 def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
     if not path.exists():
-        raise FileNotFoundError(f"result {path} does not exist")
+        raise FileNotFoundError(f"result {path} does not exist. Run the job.")
     # opened here, since numpy leaves a damaged file open
     with path.open("rb") as raw:
         try:
             file = np.load(raw, allow_pickle=False)
         except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
             raise ValueError(
-                f"{path} is damaged or not an npz file ({error}). Delete it and run the job again"
+                f"{path} is damaged: it must be an npz file ({error}). Delete it and run the job again."
             ) from error
         if not isinstance(file, np.lib.npyio.NpzFile):
             raise ValueError(
-                f"{path} must be a result of pfbench, got a single array. Move it away"
+                f"{path} must be a result of pfbench, got a single array. Move it away."
             )
         yield file
 
@@ -228,11 +228,12 @@ def _member(path: Path, file: np.lib.npyio.NpzFile, name: str) -> np.ndarray:
         return file[name]
     except KeyError as error:
         raise ValueError(
-            f"{path} must be a result of pfbench, got a file without {name!r}. Move it away"
+            f"{path} must be a result of pfbench, got a file without {name!r}. Move it away."
         ) from error
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(
-            f"{path} is damaged at {name!r} ({error}). Delete it and run the job again"
+            f"{path} is damaged: {name!r} must be readable ({error}). "
+            "Delete it and run the job again."
         ) from error
 
 
@@ -242,7 +243,7 @@ def _meta(path: Path, file: np.lib.npyio.NpzFile) -> dict[str, Any]:
         meta = json.loads(text)
     except ValueError as error:
         raise ValueError(
-            f"{path}: 'meta' must be JSON ({error}). This is not a result of pfbench: move it away"
+            f"{path}: 'meta' must be JSON ({error}). This is not a result of pfbench: move it away."
         ) from error
     check_metadata(path, meta)
     return meta

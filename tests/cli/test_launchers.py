@@ -46,7 +46,7 @@ def launcher(name: str, *words: str) -> Any:
 def numbers(home: Path) -> dict[str, dict[str, np.ndarray]]:
     """The arrays of all finished cells, by filter."""
     found = map(store.read_result, sorted((home / "results" / "adhoc").glob("*.npz")))
-    return {result.meta["label"]: result.arrays for result in found}
+    return {result.meta["label"]: result.data for result in found}
 
 
 def assert_same(

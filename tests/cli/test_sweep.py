@@ -38,7 +38,7 @@ def files(home: Path) -> list[Path]:
 
 def arrays(home: Path) -> dict[str, dict[str, np.ndarray]]:
     """The arrays of all cells, by filter."""
-    return {found.meta["label"]: found.arrays for found in map(store.read_result, files(home))}
+    return {found.meta["label"]: found.data for found in map(store.read_result, files(home))}
 
 
 def same(a: dict[str, dict[str, np.ndarray]], b: dict[str, dict[str, np.ndarray]]) -> bool:

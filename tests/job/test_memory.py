@@ -177,7 +177,7 @@ def test_something_is_free_here() -> None:
 def stored(home: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     (file,) = (home / "results" / "adhoc").glob("*.npz")
     found = store.read_result(file)
-    return found.meta, found.arrays
+    return found.meta, found.data
 
 
 @pytest.mark.parametrize("is_joint", [True, False])

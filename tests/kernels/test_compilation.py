@@ -511,7 +511,7 @@ def test_a_compiled_job_gives_the_numbers_of_an_eager_one(tmp_path: Path, dtype:
         found[engine] = store.read_result(file)
         assert found[engine].meta["engine"] == engine
     # the same draws, to 1e-5; a particle in a few thousand falls to a neighbouring slot
-    eager, compiled = (found[engine].arrays for engine in ("eager", "kernels"))
+    eager, compiled = (found[engine].data for engine in ("eager", "kernels"))
     for name in ("error", "sd", "log_evidence"):
         assert np.allclose(compiled[name], eager[name], rtol=0, atol=2e-2), name
 

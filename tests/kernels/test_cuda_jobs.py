@@ -180,7 +180,7 @@ def test_a_job_gives_the_same_numbers(engine: str, tmp_path: Path) -> None:
         )
         assert said.code == 0, said.err
         (path,) = (tmp_path / device / "results").rglob("*.npz")
-        arrays[device] = store.read_result(path).arrays
+        arrays[device] = store.read_result(path).data
         assert store.read_metadata(path)["engine"] == ("eager" if device == "cpu" else engine)
     here, there = (torch.as_tensor(arrays[device]["error"]).double() for device in ("cpu", "cuda"))
     assert (here - there)[:, :2].abs().max() < OFF * here.std()

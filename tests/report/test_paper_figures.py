@@ -104,7 +104,7 @@ def test_bands_are_the_quantiles_of_the_runs_that_were_not_lost(results: Path) -
     caption, figure = drawn(results)["004-4_flight_nominal_ins_gnss_position"]
     assert "of 20 runs (lost runs excluded: sir 1)" in caption
     for label, component in product(("sir", "cpso_escape"), range(3)):
-        kept = loaded(results, label).arrays
+        kept = loaded(results, label).data
         values = kept["error"][~kept["lost"]][..., 6 + component].astype(float)
         time, middle = line(figure, component, label)
         np.testing.assert_array_equal(time, kept["time"])
@@ -120,12 +120,12 @@ def test_bands_are_the_quantiles_of_the_runs_that_were_not_lost(results: Path) -
 
 def test_nothing_lies_beyond_the_axes(results: Path) -> None:
     result = loaded(results, "cpso_escape")
-    wild = result.arrays["error"].copy()
+    wild = result.data["error"].copy()
     wild[..., 6] *= 1 + 1e4 * np.exp(-np.arange(30) / 2)
     block = next(
         b for b in paper_figures.component_groups(result.meta["state"]) if b.group == "position"
     )
-    own = {"cpso_escape": (store.JobResult(result.meta, {**result.arrays, "error": wild}), block)}
+    own = {"cpso_escape": (store.JobResult(result.meta, {**result.data, "error": wild}), block)}
     panel = time_plots.plot_errors(own, line_styles(["cpso_escape"])).axes[0]
     assert panel.get_yscale() == "symlog"
     assert panel.get_ylim()[1] >= np.quantile(wild[:, 0, 6], 0.95)
@@ -145,7 +145,7 @@ def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float)
     )
     good = {label: loaded(results, label) for label in ("cpf", "cpso_escape")}
     bad = loaded(results, "cofm_amssrcpf")
-    bad = store.JobResult(bad.meta, {**bad.arrays, "error": wild * bad.arrays["error"]})
+    bad = store.JobResult(bad.meta, {**bad.data, "error": wild * bad.data["error"]})
     own = {label: (result, block) for label, result in (*good.items(), ("cofm_amssrcpf", bad))}
     figure = time_plots.plot_errors(own, line_styles(list(own)))
     figure.draw_without_rendering()
@@ -161,7 +161,7 @@ def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float)
         assert 3 <= len(ticks) <= 7
         assert not any("e" in text for text in ticks)
         assert axis.get_ylim()[1] >= np.quantile(
-            block.scale * bad.arrays["error"][:, 0, component], 0.95
+            block.scale * bad.data["error"][:, 0, component], 0.95
         )
 
 
@@ -173,7 +173,7 @@ def test_a_bias_stands_beside_itself_before_correction(results: Path) -> None:
     figure = time_plots.plot_errors(
         {"cpso_escape": (result, block)}, line_styles(["cpso_escape"]), before=True
     )
-    first = np.quantile(block.scale * result.arrays["error"][:, 0, 0].astype(float), [0.05, 0.95])
+    first = np.quantile(block.scale * result.data["error"][:, 0, 0].astype(float), [0.05, 0.95])
     levels = [one.get_ydata()[0] for one in figure.axes[0].lines if len(one.get_xdata()) == 2]
     np.testing.assert_allclose(sorted(levels), first, rtol=1e-6)
     assert "before correction" in FIGURES["004-3"].draw.keywords or FIGURES[
@@ -198,9 +198,9 @@ def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
     for label in ("sir", "cpso_escape"):
         result = loaded(results, label)
         each = experiment_plots.relative_axes(result)
-        assert each.size == (~result.arrays["lost"]).sum()
-        error = result.arrays["error"][..., [6, 7]]
-        mean = error_measures.relative_error(error, result.arrays["lost"], result.arrays["range"])
+        assert each.size == (~result.data["lost"]).sum()
+        error = result.data["error"][..., [6, 7]]
+        mean = error_measures.relative_error(error, result.data["lost"], result.data["range"])
         assert each.mean() == pytest.approx(100 * float(mean.value), rel=1e-5)
     values = {
         "first": {"sir": np.arange(101.0), "gpf": np.array([5.0])},
@@ -259,7 +259,7 @@ def test_largest_errors_stand_beside_the_printed_ones(results: Path) -> None:
     ]
     crosses = [tuple(one.get_ydata()) for one in axis.lines if one.get_marker() == "x"]
     assert crosses == [(8.9, 7.4, 16.4), (4.02, 4.4, 5.2)]
-    arrays = loaded(results, "cpf", "paper_bursts").arrays
+    arrays = loaded(results, "cpf", "paper_bursts").data
     north = np.abs(arrays["error"][:, arrays["time"] >= 10, 7]).max(1)
     assert any(
         np.allclose(one.get_ydata(), [np.median(north)])

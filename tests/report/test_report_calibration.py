@@ -40,7 +40,7 @@ def test_scores_in_units_by_hand(study, loaded):
     own = rows[(rows.label == "lossy") & (rows.run == 5)].set_index(
         ["metric", "group", "component"]
     )
-    arrays = loaded["lossy"].arrays
+    arrays = loaded["lossy"].data
     kept = arrays["time"][arrays["scored"]] >= 15.0
     assert kept.tolist() == [False, True, True, True]
     crps = arrays["crps"][5, kept].astype(float)
@@ -65,11 +65,11 @@ def test_scores_in_units_by_hand(study, loaded):
 def test_scores_are_cut_with_the_instants(loaded):
     whole = loaded["honest"]
     late = frame.drop_before(whole, 15.0)
-    np.testing.assert_array_equal(late.arrays["time"][late.arrays["scored"]], [20.0, 30.0, 40.0])
-    np.testing.assert_array_equal(late.arrays["pit"], whole.arrays["pit"][:, 1:])
-    assert frame.drop_before(whole, 40.0).arrays["scored"].tolist() == [0]
-    early = frame.select_steps(whole, whole.arrays["time"] < 10.0)
-    assert not {"scored", "crps", "pit", "energy"} & early.arrays.keys()
+    np.testing.assert_array_equal(late.data["time"][late.data["scored"]], [20.0, 30.0, 40.0])
+    np.testing.assert_array_equal(late.data["pit"], whole.data["pit"][:, 1:])
+    assert frame.drop_before(whole, 40.0).data["scored"].tolist() == [0]
+    early = frame.select_steps(whole, whole.data["time"] < 10.0)
+    assert not {"scored", "crps", "pit", "energy"} & early.data.keys()
     assert (
         calibration_plots.calibration_figures(
             {"honest": early}, ["position"], line_styles(["honest"])
@@ -81,7 +81,7 @@ def test_scores_are_cut_with_the_instants(loaded):
 def test_narrow_and_wide_are_told_and_lost_runs_are_not_counted(study):
     rows = frame.load_frame("demo", study)
     found = coverage.compute_coverage(rows[rows.group == "position"])
-    assert {one.label: one.seen for one in found} == {
+    assert {one.label: one.decision for one in found} == {
         "honest": coverage.CONSISTENT, "lossy": coverage.CONSISTENT,
         "narrow": coverage.UNDER_COVERAGE, "wide": coverage.OVER_COVERAGE,
     }  # fmt: skip
@@ -102,7 +102,8 @@ def test_a_calibrated_filter_is_rarely_called_otherwise():
         z = np.sqrt(0.5) * (rng.standard_normal((runs, 1, 1)) + rng.standard_normal((runs, 3, 2)))
         value = consistency.coverage_per_run(stats.norm.cdf(z), np.zeros(runs, bool), 0.9)
         false += (
-            coverage._judge(("s", "n", "m", "g", "f"), value, 0.05, 1).seen != coverage.CONSISTENT
+            coverage._judge(("s", "n", "m", "g", "f"), value, 0.05, 1).decision
+            != coverage.CONSISTENT
         )
     assert false <= stats.binom.ppf(0.999, studies, 0.08)
 
@@ -135,7 +136,7 @@ def test_the_band_holds_for_numbers_that_hang_together():
 
 def test_columns_and_lines(loaded):
     table = tables.accuracy_table(loaded, "attitude").set_index("filter")
-    arrays = loaded["lossy"].arrays
+    arrays = loaded["lossy"].data
     kept = ~arrays["lost"]
     assert table.loc["lossy", "CRPS [arcmin]"] == pytest.approx(
         arrays["crps"][kept][..., :3].astype(float).mean() * ARCMIN

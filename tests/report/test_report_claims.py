@@ -58,13 +58,13 @@ def test_each_of_the_71_claims_has_one_record() -> None:
 
 def test_each_claim_can_be_decided_or_says_why_not() -> None:
     for claim in ALL:
-        assert any(claim.tests.values()) or claim.why or claim.shown, claim.id
+        assert any(claim.tests.values()) or claim.reasons or claim.evidence, claim.id
         assert claim.claim[0].isupper() or claim.claim[0].isdigit(), claim.id
         assert not claim.claim.endswith("."), claim.id
 
 
 def test_nothing_is_left_open_for_a_reason_of_our_own() -> None:
-    assert {reason for claim in ALL for reason, _ in claim.why.values()} <= {
+    assert {reason for claim in ALL for reason, _ in claim.reasons.values()} <= {
         "not specified in the paper",
         "not run",
     }
@@ -77,12 +77,12 @@ def test_nothing_is_left_open_for_a_reason_of_our_own() -> None:
 
 
 def test_what_a_test_decides_names_a_test_that_is_there() -> None:
-    shown = {claim.id: text for claim in ALL for _, text in claim.shown.values()}
+    shown = {claim.id: text for claim in ALL for _, text in claim.evidence.values()}
     assert set(shown) == {"002-01", "002-02"}
     for text in shown.values():
         ((path, name),) = re.findall(r'(tests/[\w/]+\.py), "([^"]+)"', text)
         assert f"def test_{name.replace(' ', '_')}(" in (STUDIES.parent / path).read_text()
-    for _, text in next(claim for claim in ALL if claim.id == "C001-10").why.values():
+    for _, text in next(claim for claim in ALL if claim.id == "C001-10").reasons.values():
         (path,) = re.findall(r"tests/[\w/]+\.py", text)
         assert (STUDIES.parent / path).is_file()
 
@@ -181,7 +181,11 @@ WRONG = {
         "is: better",
         r"X-1: is must be one of less.*got is='better'",
     ),
-    "unknown key": ("b: ekf}", "b: ekf, margn: 1}", r"X-1: a test has unknown keys \['margn'\]"),
+    "unknown key": (
+        "b: ekf}",
+        "b: ekf, margn: 1}",
+        r"X-1: keys of a test must be fields of a test, got \['margn'\]",
+    ),
     "no other side": (", b: ekf}", "}", r"X-1: b must be given for a test with is=less"),
     "half a cell": (
         "flight_500s/nominal/ins_gnss",
@@ -425,7 +429,7 @@ def test_a_claim_that_a_test_shows_is_decided_without_runs() -> None:
     record = replace(
         claim(LESS),
         tests={},
-        shown={"": ("holds", "tests/filter/gaussian/test_linearisation_rules.py counts it")},
+        evidence={"": ("holds", "tests/filter/gaussian/test_linearisation_rules.py counts it")},
     )
     (found,) = verdicts.decide_claims([record], nothing)
     assert (found.verdict, found.reason, found.note) == (
@@ -434,10 +438,11 @@ def test_a_claim_that_a_test_shows_is_decided_without_runs() -> None:
         "tests/filter/gaussian/test_linearisation_rules.py counts it",
     )
     against = replace(
-        record, shown={"": ("fails", "tests/filter/gaussian/test_linearisation_rules.py counts it")}
+        record,
+        evidence={"": ("fails", "tests/filter/gaussian/test_linearisation_rules.py counts it")},
     )
     assert verdicts.decide_claims([against], nothing)[0].verdict == NO
-    forms = replace(record, shown={"printed": ("fails", "one"), "repaired": ("holds", "two")})
+    forms = replace(record, evidence={"printed": ("fails", "one"), "repaired": ("holds", "two")})
     (found,) = verdicts.decide_claims([forms], nothing)
     assert (found.verdict, found.note) == (
         "reproduced only as repaired",
@@ -597,7 +602,7 @@ def test_forms_are_told_apart() -> None:
     assert verdict(1.5, 1.5) == (NO, "")
     assert verdict(1.5, 0.6, runs=3) == verdict(0.6, 0.6, runs=3) == (OPEN, "too few runs")
     stated = replace(
-        both, tests={"repaired": (repaired,)}, why={"printed": ("not run", "it has no density")}
+        both, tests={"repaired": (repaired,)}, reasons={"printed": ("not run", "it has no density")}
     )
     rows = frame([printed, repaired], **losses(16, 1.0), c=losses(16, 0.6)["a"])
     (found,) = verdicts.decide_claims([stated], rows)
@@ -617,7 +622,7 @@ def test_one_comparison_that_fails_decides_against_the_claim() -> None:
 
 def test_what_is_not_stated_is_measured_all_the_same() -> None:
     test = alone("report")
-    record = replace(claim(test), why={"": ("not specified in the paper", "lost table")})
+    record = replace(claim(test), reasons={"": ("not specified in the paper", "lost table")})
     (found,) = verdicts.decide_claims([record], frame(test, **only(18, 3.0)))
     assert (found.verdict, found.reason, found.note) == (
         OPEN,
@@ -678,7 +683,7 @@ def test_measures_are_of_the_seconds_asked_for(study: Path) -> None:
         end=30,
     )
     found = result(study, "ukf")
-    error, time = found.arrays["error"][..., 7].astype(float), found.arrays["time"]
+    error, time = found.data["error"][..., 7].astype(float), found.data["time"]
     inside = (time >= 20) & (time <= 30)
     assert inside.sum() == 11
     assert measurements.measure_claim_test(found, test) == pytest.approx(
@@ -698,7 +703,7 @@ def test_measures_are_of_the_seconds_asked_for(study: Path) -> None:
 def test_measures_are_in_the_unit_shown_and_lost_runs_stay(study: Path) -> None:
     test = ClaimTest("report", "s", CELL, "rmse", "sir", group="attitude")
     found = result(study, "sir")
-    error = found.arrays["error"][..., :3].astype(float)
+    error = found.data["error"][..., :3].astype(float)
     value = measurements.measure_claim_test(found, test)
     assert value[7] == np.inf
     kept = np.arange(20) != 7
@@ -726,10 +731,10 @@ def test_measures_are_in_the_unit_shown_and_lost_runs_stay(study: Path) -> None:
 
 def test_growth_is_that_of_an_exponential(study: Path) -> None:
     found = result(study, "ekf")
-    time = found.arrays["time"]
-    error = np.zeros_like(found.arrays["error"])
+    time = found.data["time"]
+    error = np.zeros_like(found.data["error"])
     error[..., 6:] = np.exp(-0.01 * time)[None, :, None]
-    made = store.JobResult(found.meta, {**found.arrays, "error": error})
+    made = store.JobResult(found.meta, {**found.data, "error": error})
     test = ClaimTest("falls", "s", CELL, "growth", "ekf", group="position", start=20)
     assert measurements.measure_claim_test(made, test) == pytest.approx(
         np.full(20, -0.01 * 40), rel=1e-5
@@ -738,8 +743,8 @@ def test_growth_is_that_of_an_exponential(study: Path) -> None:
 
 def test_accepted_is_a_mean_over_the_steps_with_moves(study: Path) -> None:
     found = result(study, "sir")
-    hit = found.arrays["resampled"].astype(bool)
-    made = store.JobResult(found.meta, {**found.arrays, "accepted_0": np.where(hit, 0.25, 0.0)})
+    hit = found.data["resampled"].astype(bool)
+    made = store.JobResult(found.meta, {**found.data, "accepted_0": np.where(hit, 0.25, 0.0)})
     test = ClaimTest("report", "s", CELL, "accepted", "sir")
     value = measurements.measure_claim_test(made, test)
     assert value[~np.isnan(value)] == pytest.approx(0.25)

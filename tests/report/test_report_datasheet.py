@@ -59,7 +59,7 @@ def whole() -> store.JobResult:
 
 def without(sheet: store.JobResult, *names: str, **more: Any) -> store.JobResult:
     return store.JobResult(
-        {**sheet.meta, **more}, {k: v for k, v in sheet.arrays.items() if k not in names}
+        {**sheet.meta, **more}, {k: v for k, v in sheet.data.items() if k not in names}
     )
 
 
@@ -68,9 +68,7 @@ def names(sheet: store.JobResult) -> list[str]:
 
 
 def test_every_figure_is_drawn_where_there_are_data(whole: store.JobResult, tmp_path: Path) -> None:
-    file = store.write_result(
-        tmp_path / "results" / "0123456789abcdef.npz", whole.meta, whole.arrays
-    )
+    file = store.write_result(tmp_path / "results" / "0123456789abcdef.npz", whole.meta, whole.data)
     page = datasheet.write_datasheet(file, tmp_path / "reports")
     assert page == tmp_path / "reports" / "datasheets" / "flight_nominal" / "index.html"
     drawn = {path.name for path in (page.parent / "figures").iterdir()}
@@ -99,15 +97,15 @@ def test_what_is_missing_is_said_and_not_drawn(whole: store.JobResult) -> None:
     for part in ("Track:", "Specific force", "Satellites:"):
         assert part in said
     assert any(fact == "No bound: recorded." for fact in datasheet.list_facts(none))
-    still = none.arrays | {"error": 0 * none.arrays["error"], "seen": np.ones((STEPS, SLOTS + 1))}
+    still = none.data | {"error": 0 * none.data["error"], "seen": np.ones((STEPS, SLOTS + 1))}
     assert names(store.JobResult(none.meta, still)) == ["residuals", "residuals_time"]
     assert (
         "Spread of attitude, velocity, position: equal in all runs."
         in datasheet.list_missing_figures(store.JobResult(none.meta, still))
     )
-    blind = none.arrays | {
-        "error": none.arrays["error"] * np.nan,
-        "residual": none.arrays["residual"].copy(),
+    blind = none.data | {
+        "error": none.data["error"] * np.nan,
+        "residual": none.data["residual"].copy(),
     }
     blind["residual"][..., :3] = np.nan
     said = " ".join(datasheet.list_missing_figures(store.JobResult(none.meta, blind)))
@@ -122,9 +120,9 @@ def test_old_or_other_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_spread_is_the_deviation_over_runs_beside_the_bound(whole: store.JobResult) -> None:
-    whole.arrays["error"][:, 7] = np.nan  # an instant without truth is no gap
+    whole.data["error"][:, 7] = np.nan  # an instant without truth is no gap
     panels = scenario_figures.plot_error_spread(whole).axes
-    error = np.delete(whole.arrays["error"].astype(float), 7, axis=1)
+    error = np.delete(whole.data["error"].astype(float), 7, axis=1)
     assert [axis.get_title() for axis in panels] == ["attitude", "velocity", "position"]
     for axis, first, scale in zip(panels, (0, 3, 6), (60 * np.degrees(1), 1.0, 1.0), strict=True):
         value, bound = axis.lines
@@ -147,9 +145,7 @@ def test_the_sky_has_north_up_and_east_to_the_right_and_names(whole: store.JobRe
     assert east[0] - centre[0] > 10 > abs(east[1] - centre[1])
     assert {text.get_text() for text in axis.texts} >= {"G01", "G02", "G07", "G30"}
     lines = [line for line in axis.lines if len(np.asarray(line.get_xdata())) > 2]
-    np.testing.assert_allclose(
-        lines[0].get_ydata(), 90 - np.degrees(whole.arrays["elevation"][:, 0])
-    )
+    np.testing.assert_allclose(lines[0].get_ydata(), 90 - np.degrees(whole.data["elevation"][:, 0]))
     assert [len(np.asarray(line.get_xdata())) for line in lines] == [
         STEPS,
         STEPS,
@@ -165,7 +161,7 @@ def test_a_scene_may_spell_its_satellites_and_show_them_at_some_steps_alone(
 ) -> None:
     assert scenario_data.count_satellites(whole) == ["G01", "G02", "G07", "G30"]
     codes = [[ord(letter) for letter in name] for name in ("E1 ", "R24", "G05", "C06")]
-    spelled = whole.arrays | {"satellites": np.array(codes, np.float32)}
+    spelled = whole.data | {"satellites": np.array(codes, np.float32)}
     for name in ("azimuth", "elevation"):
         spelled[name] = np.where(np.arange(STEPS)[:, None] % 3 == 0, spelled[name], np.nan)
     sheet = store.JobResult(whole.meta, spelled)
@@ -187,7 +183,7 @@ def test_a_scene_may_spell_its_satellites_and_show_them_at_some_steps_alone(
 def test_runs_with_the_same_residuals_count_once(whole: store.JobResult) -> None:
     table = datasheet.whiteness_table(whole)
     assert table["residuals"].tolist() == [RUNS * STEPS * SLOTS, RUNS * STEPS]
-    whole.arrays["residual"][:] = whole.arrays["residual"][:1]
+    whole.data["residual"][:] = whole.data["residual"][:1]
     assert datasheet.whiteness_table(whole)["residuals"].tolist() == [STEPS * SLOTS, STEPS]
     assert any("counted once" in fact for fact in datasheet.list_facts(whole))
 
@@ -257,7 +253,7 @@ def changed(file: Path, **more: Any) -> store.JobResult:
     store.write_result(
         file,
         {**found.meta, "bound": "posterior Cramer-Rao bound of the model"},
-        {**found.arrays, **more},
+        {**found.data, **more},
     )
     return store.read_result(file)
 
@@ -265,7 +261,7 @@ def changed(file: Path, **more: Any) -> store.JobResult:
 def test_steps_with_rare_truth_are_not_thinned_away(tmp_path: Path) -> None:
     file = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=4, steps=1000)
     found = store.read_result(file)
-    error, nees = (found.arrays[name].copy() for name in ("error", "nees"))
+    error, nees = (found.data[name].copy() for name in ("error", "nees"))
     rare = np.zeros(1000, bool)
     rare[[101, 355, 612, 990]] = True  # none of which a stride of three or so meets
     error[:, ~rare, 6:] = nees[:, ~rare, 2] = np.nan
@@ -273,13 +269,13 @@ def test_steps_with_rare_truth_are_not_thinned_away(tmp_path: Path) -> None:
     style = {"ekf": LineStyle("black", "-", "o", 1.0)}
     block = next(b for b in component_groups(result.meta["state"]) if b.group == "position")
     for line in error_plots.plot_error({"ekf": result}, block, style).axes[0].lines:
-        np.testing.assert_array_equal(line.get_xdata(), result.arrays["time"][rare])
+        np.testing.assert_array_equal(line.get_xdata(), result.data["time"][rare])
         assert np.isfinite(np.asarray(line.get_ydata())).all()
     middle = np.median(np.abs(error[:, rare, 6].astype(float)), axis=0)
     line = error_plots.plot_error({"ekf": result}, block, style).axes[0].lines[0]
     np.testing.assert_allclose(line.get_ydata(), middle, rtol=1e-6)
     line = filter_plots.plot_nees({"ekf": result}, ["position"], style).axes[0].lines[0]
-    np.testing.assert_array_equal(line.get_xdata(), result.arrays["time"][rare])
+    np.testing.assert_array_equal(line.get_xdata(), result.data["time"][rare])
     panels = {
         axis.get_title(): axis
         for axis in error_plots.plot_spread(result, ["attitude", "position"], style["ekf"]).axes
@@ -294,7 +290,7 @@ def test_steps_with_rare_truth_are_not_thinned_away(tmp_path: Path) -> None:
 
 def test_one_instant_with_truth_is_a_dot(tmp_path: Path) -> None:
     file = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=4, steps=50)
-    error = store.read_result(file).arrays["error"].copy()
+    error = store.read_result(file).data["error"].copy()
     error[:, np.arange(50) != 17] = np.nan
     result = changed(file, error=error)
     block = component_groups(result.meta["state"])[0]
@@ -332,10 +328,10 @@ def test_the_bound_and_the_range_are_drawn_and_tabled_where_there_are_any(tmp_pa
     options = page.ReportOptions(figure_formats=("svg",), groups=("position",), start_time_s=21.0)
     made = page.write_report("demo", tmp_path, tmp_path / "reports", options)
     (table,) = (pd.read_csv(path) for path in (made.parent / "tables").glob("*_position.csv"))
-    error = result.arrays["error"][:, 20:, 6:].astype(float)
+    error = result.data["error"][:, 20:, 6:].astype(float)
     share = np.sqrt((error**2).sum(-1).mean() / (3 * (bound[20:, 0] ** 2).mean()))
     assert table["RMSE / PCRB"][0] == pytest.approx(share)
-    flat = np.hypot(error[..., 0], error[..., 1]) / result.arrays["range"][20:]
+    flat = np.hypot(error[..., 0], error[..., 1]) / result.data["range"][20:]
     assert table["horizontal error [% of range]"][0] == pytest.approx(100 * flat.mean())
     assert table["horizontal error [% of range], last 20 steps"][0] == pytest.approx(
         100 * flat[:, -20:].mean()

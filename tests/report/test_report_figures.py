@@ -136,10 +136,9 @@ def test_the_longest_name_beside_a_trace_is_not_cut(tmp_path: Path) -> None:
     synthetic.study(tmp_path / "demo", runs=6, steps=12)
     (cell,) = load_conditions("demo", tmp_path)
     loaded = {job.label: job.load() for job in cell.jobs}
-    swarms = {name: r for name, r in loaded.items() if "ess" in r.arrays}
+    swarms = {name: r for name, r in loaded.items() if "ess" in r.data}
     loaded = {
-        name: r._replace(arrays={**r.arrays, "ancestors": r.arrays["ess"]})
-        for name, r in swarms.items()
+        name: r._replace(data={**r.data, "ancestors": r.data["ess"]}) for name, r in swarms.items()
     }
     style = plotting.line_styles(list(loaded))
     figure = drawn(lambda: filter_plots.plot_trace(loaded, "ancestors", style), tmp_path)

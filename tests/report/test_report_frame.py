@@ -35,8 +35,8 @@ def test_one_row_per_run_and_figure(results):
 def test_numbers_and_units_by_hand(results):
     table = frame.load_frame("demo", results, start_time_s=10.0)
     (raw,) = [r for r in store.list_results(results / "demo") if r.meta["label"] == "ekf"]
-    late = raw.arrays["time"] >= 10.0
-    error = raw.arrays["error"][3, late].astype(float)
+    late = raw.data["time"] >= 10.0
+    error = raw.data["error"][3, late].astype(float)
     rows = table[(table.label == "ekf") & (table.run == 3)].set_index(
         ["metric", "group", "component"]
     )
@@ -52,7 +52,7 @@ def test_numbers_and_units_by_hand(results):
         np.linalg.norm(error[:, 3:6], axis=1).max()
     )
     assert rows.loc[("nees", "position", "norm"), "value"] == pytest.approx(
-        raw.arrays["nees"][3, late, 2].mean(), rel=1e-5
+        raw.data["nees"][3, late, 2].mean(), rel=1e-5
     )
     assert rows.loc[("seconds_per_step", "", ""), "value"] == pytest.approx(0.4e-3)
 
@@ -79,7 +79,7 @@ def test_units_shown():
         },
     }
     shown = {
-        block.group: (block.unit, block.scale, block.whole)
+        block.group: (block.unit, block.scale, block.state_group)
         for block in state_groups.component_groups(state)
     }
     assert shown["gyro"] == ("deg/h", pytest.approx(206264.806), "gyro")

@@ -27,7 +27,7 @@ def results(tmp_path):
         own["nis"][2, 0] = np.nan  # nothing was seen there
         own["nis"][0] = 1e9  # of the lost run
         made[method.name] = store.JobResult(
-            {**found.meta, "memory": (k + 1) * 2**20}, {**found.arrays, **own}
+            {**found.meta, "memory": (k + 1) * 2**20}, {**found.data, **own}
         )
     return made
 
@@ -35,7 +35,7 @@ def results(tmp_path):
 def test_nis_is_pooled_over_runs_with_the_band_of_as_many_components(results):
     axis = filter_plots.plot_nis(results, line_styles(list(results)), 0.05).axes[0]
     for label, line in zip(results, axis.lines, strict=False):
-        arrays = results[label].arrays
+        arrays = results[label].data
         np.testing.assert_array_equal(line.get_xdata(), arrays["time"][[4, 9, 19]])
         kept = arrays["nis"][1:]
         np.testing.assert_allclose(
@@ -56,7 +56,7 @@ def test_cost_shows_time_and_memory_and_neither_where_it_is_not_known(results):
         1e3 * results[k].meta["seconds"]["per_step"] for k in labels
     ]
     assert [tick.get_text() for tick in time.get_yticklabels()] == labels
-    bare = {k: store.JobResult({**r.meta, "memory": None}, r.arrays) for k, r in results.items()}
+    bare = {k: store.JobResult({**r.meta, "memory": None}, r.data) for k, r in results.items()}
     assert len(cost_plots.plot_cost(bare, line_styles(labels)).axes) == 1
 
 

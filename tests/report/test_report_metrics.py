@@ -99,7 +99,7 @@ def test_a_scenario_without_a_threshold_has_no_diverged_runs_but_a_dash(results)
     result = condition.jobs[0].load()
     assert status.count_statuses(result).diverged is None
     assert tables.overview_table({"ekf": result})["diverged runs"].tolist() == ["–"]
-    arrays = {**result.arrays, "error": result.arrays["error"].copy()}
+    arrays = {**result.data, "error": result.data["error"].copy()}
     arrays["error"][:3, -4:, 6:] = 1e4
     config = {**result.meta["config"], "scenario": {"divergence_threshold_m": 1e3}}
     far = store.JobResult({**result.meta, "config": config}, arrays)

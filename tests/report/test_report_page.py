@@ -312,7 +312,7 @@ def test_estimated_track_is_truth_plus_error(results):
     style = line_styles(list(loaded))
     plan, height = error_plots.plot_track(loaded, 2, style).axes
     line = next(line for line in plan.lines if line.get_label() == "ekf")
-    arrays = loaded["ekf"].arrays
+    arrays = loaded["ekf"].data
     np.testing.assert_allclose(
         line.get_xdata(), arrays["track"][2, :, 0] + arrays["error"][2, :, 6], rtol=1e-5
     )

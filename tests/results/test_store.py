@@ -110,10 +110,10 @@ def test_what_is_read_is_what_was_written(tmp_path):
         "position",
         "b_velocity",
     ]  # the order of the last axis of nees
-    assert result.arrays.keys() == arrays().keys()
+    assert result.data.keys() == arrays().keys()
     for name, value in arrays(1 / 3).items():
-        assert result.arrays[name].dtype == value.dtype
-        np.testing.assert_array_equal(result.arrays[name], value)
+        assert result.data[name].dtype == value.dtype
+        np.testing.assert_array_equal(result.data[name], value)
 
 
 def test_numpy_alone_reads_it(tmp_path):
@@ -135,7 +135,7 @@ def test_an_exception_in_the_middle_leaves_the_folder_as_it_was(tmp_path, monkey
         with pytest.raises(OSError, match="disk full"):
             store.write_result(tmp_path / name, meta(), arrays(2.0))
     assert [path.name for path in tmp_path.iterdir()] == ["old.npz"]
-    assert store.read_result(tmp_path / "old.npz").arrays["error"][0, 0, 0] == 1.0
+    assert store.read_result(tmp_path / "old.npz").data["error"][0, 0, 0] == 1.0
 
 
 def test_a_kill_in_the_middle_leaves_no_result_and_the_next_save_sweeps_up(tmp_path):

@@ -1,8 +1,8 @@
-"""Whether filters know how wrong they are: how often the truth lies in the regions that they give, decided once per cell.
+"""Rank histograms: share of truths in each bin of the filters' distribution functions.
 
-The measure is the probability that a filter gives to values below the truth, which is uniform for one that knows what it knows.
-Components and instants of one run hang together, so that runs alone are counted: intervals rest on the scatter between runs, and
-the band of the rank histogram is that of as many numbers as there are runs, wide enough whatever hangs together in them [ours].
+The probability integral transform is the probability that a filter assigns to values below the
+truth. It is uniform for a calibrated filter. Components and steps of a run are dependent, so runs
+are the sample: the band is that of as many numbers as runs [ours].
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ def calibration_figures(
     alpha: float = 0.05,
     note: str = "",
 ) -> list[FigureSpec]:
-    """The rank histograms of a cell, where anything was scored.
+    """List the rank histograms of a condition, none without scores.
 
     Args:
-        results: by label, without the instants that are left out.
-        groups: names of the blocks shown.
-        style: from `looks`.
-        alpha: probability outside the band, for one bin.
-        note: on who is drawn how.
+        results: Results by label, from the start time on.
+        groups: Names of the component groups.
+        style: Line styles by label.
+        alpha: Probability outside the band of one bin.
+        note: Sentence about grey filters for captions.
     """
-    shown = [group for group in groups if _numbers(results, group)]
-    if not shown:
+    scored = [group for group in groups if _select_pit(results, group)]
+    if not scored:
         return []
     text = (
         "Rank histograms: how often the truth lay where a filter gives values below it so much probability; flat when it knows "
@@ -48,7 +48,9 @@ def calibration_figures(
         f"one run hang together.{note}"
     )
     return [
-        FigureSpec("calibration", text, partial(plot_rank_histograms, results, shown, style, alpha))
+        FigureSpec(
+            "calibration", text, partial(plot_rank_histograms, results, scored, style, alpha)
+        )
     ]
 
 
@@ -58,22 +60,24 @@ def plot_rank_histograms(
     style: Mapping[str, LineStyle],
     alpha: float = 0.05,
 ) -> Figure:
-    """Rank histograms as lines, one panel per group, all filters."""
+    """Plot rank histograms as lines, a panel per group.
+
+    Args:
+        results: Results by label.
+        groups: Names of the component groups.
+        style: Line styles by label.
+        alpha: Probability outside the band of one bin.
+    """
     figure, panels = stacked_axes(len(groups), 1.35)
     centres = 100 * (np.arange(_BINS) + 0.5) / _BINS
     for group, axis in zip(groups, panels, strict=True):
         runs = []
-        for label, (pit, lost) in _numbers(results, group).items():
-            found = consistency.rank_histogram(pit, lost, _BINS)
+        for label, (pit, lost) in _select_pit(results, group).items():
+            histogram = consistency.rank_histogram(pit, lost, _BINS)
             look = style[label]
-            axis.plot(
-                centres,
-                100 * found.value,
-                marker="" if look.quiet else look.marker,
-                ms=2.5,
-                **look.line(label),
-            )
-            runs.append(found.runs)
+            marker = "" if look.quiet else look.marker
+            axis.plot(centres, 100 * histogram.value, marker=marker, ms=2.5, **look.line(label))
+            runs.append(histogram.runs)
         low, high = intervals.binomial_interval(1 / _BINS, max(runs), alpha)
         axis.axhspan(100 * low, 100 * high, color="0.88", lw=0, zorder=0)
         axis.axhline(100 / _BINS, color="0.4", lw=0.8, zorder=1)
@@ -83,15 +87,15 @@ def plot_rank_histograms(
     return figure
 
 
-def _numbers(
+def _select_pit(
     results: Mapping[str, store.JobResult], group: str
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Probabilities below the truth [R, S, K] and lost runs [R] of each filter that has any of the group."""
-    found = {}
+    """Return the probability integral transform [R, S, K] and lost runs [R] of each filter."""
+    selection = {}
     for label, result in results.items():
         for block in component_groups(result.meta["state"]):
-            if block.group == group and "pit" in result.arrays:
-                pit, lost = result.arrays["pit"][..., block.places], result.arrays["lost"]
+            if block.group == group and "pit" in result.data:
+                pit, lost = result.data["pit"][..., block.places], result.data["lost"]
                 if not np.isnan(pit[~lost]).all():
-                    found[label] = pit, lost
-    return found
+                    selection[label] = pit, lost
+    return selection

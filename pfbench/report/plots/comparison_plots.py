@@ -107,8 +107,8 @@ def plot_forest(pairs: Sequence[PairwiseTest]) -> Figure:
         is_decided = v.winner != INCONCLUSIVE
         colour = "0.35" if not is_decided else _BETTER if v.winner == v.a else "#B35900"
         # Limits decided by lost runs are infinite: the line ends at the edge.
-        left, right = (float(np.clip(x, *edges)) for x in (v.low, v.high))
-        axis.plot([left, right], [row, row], color=colour, lw=1.1, zorder=2)
+        start, end = (float(np.clip(x, *edges)) for x in (v.low, v.high))
+        axis.plot([start, end], [row, row], color=colour, lw=1.1, zorder=2)
         axis.plot(
             float(np.clip(v.ratio, *edges)), row, ls="none", marker="s" if v.equivalent else "o", ms=4, mec=colour,
             mfc=colour if is_decided else "white", mew=0.9, zorder=3,

@@ -41,16 +41,18 @@ def condition_figures(
         brief: Whether to leave out the track, NIS, cost, the traces and the spread figures.
         note: Sentence about grey filters, for captions of figures with a line per filter.
     """
-    shown = [block for block in _all_blocks(results) if block.group in groups]
-    if not shown:
+    blocks = [block for block in _all_blocks(results) if block.group in groups]
+    if not blocks:
         return []
     figures = [] if brief else list(_track_figures(results, style, note))
-    figures += _error_figures(results, runs, style, shown, note)
-    wholes = list(dict.fromkeys(block.whole for block in shown))
+    figures += _error_figures(results, runs, style, blocks, note)
+    state_groups = list(dict.fromkeys(block.state_group for block in blocks))
     interval = f"two-sided {100 * (1 - alpha):g} % chi-square interval"
     text = f"NEES averaged over the {_VALID}, with its {interval}.{note}"
     figures.append(
-        FigureSpec("nees", text, partial(filter_plots.plot_nees, results, wholes, style, alpha))
+        FigureSpec(
+            "nees", text, partial(filter_plots.plot_nees, results, state_groups, style, alpha)
+        )
     )
     if not brief and any(sum_nis(result) is not None for result in results.values()):
         text = (
@@ -68,8 +70,8 @@ def condition_figures(
 def has_spread(results: Results, runs: pd.DataFrame, groups: Sequence[str]) -> dict[str, str]:
     """Select the filters that have a spread figure [ours].
 
-    Up to four filters all have one. Of more filters two have one: the filter with the smallest
-    median RMSE of the main group, and the filter with the largest ratio between median NEES and its
+    Up to four filters all have one. Of more filters, two have one. The first has the smallest
+    median RMSE of the main group. The second has the largest ratio between median NEES and its
     degrees of freedom in any group.
 
     Args:
@@ -83,7 +85,7 @@ def has_spread(results: Results, runs: pd.DataFrame, groups: Sequence[str]) -> d
     drawable = {
         label: block
         for label, result in results.items()
-        if not result.arrays["lost"].all()
+        if not result.data["lost"].all()
         and (block := _main(result.meta["state"], groups)) is not None
     }
     if len(drawable) <= _SPREAD_FILTERS:
@@ -116,7 +118,7 @@ def _track_figures(
     """Yield the track of the first run that all filters completed."""
     row = _common_run(results)
     has_track = any(
-        "track" in result.arrays and east_north_up(result.meta["state"])
+        "track" in result.data and east_north_up(result.meta["state"])
         for result in results.values()
     )
     if row is not None and has_track:
@@ -132,12 +134,12 @@ def _error_figures(
     results: Results,
     runs: pd.DataFrame,
     style: Mapping[str, LineStyle],
-    shown: Sequence[ComponentGroup],
+    blocks: Sequence[ComponentGroup],
     note: str,
 ) -> Iterator[FigureSpec]:
     """Yield the error over time of each group, and the RMSE of the runs."""
     has_pcrb = any(pcrb_sd(result) is not None for result in results.values())
-    for block in shown:
+    for block in blocks:
         text = f"Absolute error of {block.group} over time, median of the {_VALID}."
         if has_pcrb:
             text += (
@@ -156,7 +158,7 @@ def _error_figures(
             "RMSE of each run: quartiles, whiskers to 1.5 quartile ranges, a point for each of the "
             f"{_VALID}."
         )
-    groups = [block.group for block in shown]
+    groups = [block.group for block in blocks]
     yield FigureSpec("rmse", text, partial(filter_plots.plot_rmse, runs, groups, style))
 
 
@@ -171,7 +173,7 @@ def _cost_and_trace_figures(
         )
         yield FigureSpec("cost", text, partial(cost_plots.plot_cost, results, style))
     for name, (quantity, _, _) in TRACES.items():
-        if any(name in result.arrays for result in results.values()):
+        if any(name in result.data for result in results.values()):
             title = f"{quantity[0].upper()}{quantity[1:]}"
             text = f"{title}, median and 5 to 95 % of the {_VALID}.{note}"
             yield FigureSpec(name, text, partial(filter_plots.plot_trace, results, name, style))
@@ -204,19 +206,19 @@ def _all_blocks(results: Results) -> list[ComponentGroup]:
 
 
 def _main(state: Mapping[str, Any], groups: Sequence[str]) -> ComponentGroup | None:
-    """Return the position if it is shown, else the first group that is."""
-    shown = [block for block in component_groups(state) if block.group in groups]
-    position = (block for block in shown if block.group == "position")
-    return next(position, shown[0] if shown else None)
+    """Return the position if it is among the groups, else the first of them."""
+    blocks = [block for block in component_groups(state) if block.group in groups]
+    position = (block for block in blocks if block.group == "position")
+    return next(position, blocks[0] if blocks else None)
 
 
 def _nees_distance(nees: pd.DataFrame, state: Mapping[str, Any], groups: Sequence[str]) -> float:
     """Return the largest log ratio of median NEES to its degrees of freedom over groups."""
-    wholes = {block.whole for block in component_groups(state) if block.group in groups}
+    state_groups = {block.state_group for block in component_groups(state) if block.group in groups}
     with np.errstate(divide="ignore"):
         distances = [
-            abs(np.log(_median(nees[nees.group == whole]) / len(state["groups"][whole])))
-            for whole in sorted(wholes)
+            abs(np.log(_median(nees[nees.group == group]) / len(state["groups"][group])))
+            for group in sorted(state_groups)
         ]
     finite = [value for value in distances if not np.isnan(value)]
     return float(max(finite)) if finite else np.nan
@@ -230,7 +232,7 @@ def _median(rows: pd.DataFrame) -> float:
 
 def _common_run(results: Results) -> int | None:
     """Return the row of the first run that no filter lost, or None."""
-    lost = [result.arrays["lost"] for result in results.values()]
+    lost = [result.data["lost"] for result in results.values()]
     if len({flags.size for flags in lost}) > 1 or np.any(lost, axis=0).all():
         return None
     return int(np.argmin(np.any(lost, axis=0)))

@@ -30,11 +30,11 @@ def select_valid_runs(
     Returns:
         Times [T] and arrays [R, T].
     """
-    arrays = [result.arrays[name][~result.arrays["lost"]] for name in names]
+    series = [result.data[name][~result.data["lost"]] for name in names]
     if index is not None:
-        arrays = [values[..., index] for values in arrays]
-    shown = thin_mask(~np.isnan(arrays[0]).all(0), most)
-    return result.arrays["time"][shown], [values[:, shown].astype(np.float64) for values in arrays]
+        series = [values[..., index] for values in series]
+    steps = thin_mask(~np.isnan(series[0]).all(0), most)
+    return result.data["time"][steps], [values[:, steps].astype(np.float64) for values in series]
 
 
 def thin_mask(finite_mask: np.ndarray, most: int = INSTANTS) -> np.ndarray:
@@ -55,7 +55,7 @@ def point_marker(time: np.ndarray) -> str:
 
 def pcrb_sd(result: store.JobResult) -> np.ndarray | None:
     """Return the standard deviations [T, d] of the PCRB, or None if the job has none."""
-    return result.arrays.get("bound")
+    return result.data.get("bound")
 
 
 def component_pcrb(results: Results, component: str) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -71,8 +71,8 @@ def component_pcrb(results: Results, component: str) -> list[tuple[np.ndarray, n
         sd, names = pcrb_sd(result), result.meta["state"]["names"]
         if sd is not None and component in names:
             index = names.index(component)
-            shown = thin_mask(~np.isnan(result.arrays["error"][..., index]).all(0))
-            return [(result.arrays["time"][shown], sd[shown, index].astype(np.float64))]
+            steps = thin_mask(~np.isnan(result.data["error"][..., index]).all(0))
+            return [(result.data["time"][steps], sd[steps, index].astype(np.float64))]
     return []
 
 
@@ -80,21 +80,21 @@ def sum_nis(result: store.JobResult) -> tuple[np.ndarray, np.ndarray, np.ndarray
     """Sum the NIS over valid runs.
 
     Returns:
-        Scored times [S], sum of NIS [S] and number of observed components [S], or None if the
-        result has no innovations.
+        Scored times [S], sum of NIS [S] and number of observed components [S], or None without
+        innovations.
     """
-    arrays = result.arrays
-    if "nis" not in arrays or "scored" not in arrays:
+    data = result.data
+    if "nis" not in data or "scored" not in data:
         return None
-    valid_mask = ~arrays["lost"]
-    nis = np.asarray(arrays["nis"], dtype=np.float64)[valid_mask]
-    dof = np.asarray(arrays["nis_dof"], dtype=np.float64)[valid_mask]
+    valid_mask = ~data["lost"]
+    nis = np.asarray(data["nis"], dtype=np.float64)[valid_mask]
+    dof = np.asarray(data["nis_dof"], dtype=np.float64)[valid_mask]
     finite_mask = ~(np.isnan(nis) | np.isnan(dof))
     nis, dof = np.where(finite_mask, nis, 0.0).sum(0), np.where(finite_mask, dof, 0.0).sum(0)
     observed_mask = dof > 0
     if not observed_mask.any():
         return None
-    time = arrays["time"][arrays["scored"][observed_mask]]
+    time = data["time"][data["scored"][observed_mask]]
     return time, nis[observed_mask], dof[observed_mask]
 
 

@@ -50,8 +50,8 @@ def plot_track(results: Results, row: int, style: Mapping[str, LineStyle]) -> Fi
     """
     figure = Figure(figsize=(COLUMN, 4.8), layout="constrained")
     plan, height = figure.subplots(2, 1, height_ratios=(2.2, 1))
-    first = next(result for result in results.values() if "track" in result.arrays)
-    time, truth = first.arrays["time"], first.arrays["track"][row].astype(np.float64)
+    first = next(result for result in results.values() if "track" in result.data)
+    time, truth = first.data["time"], first.data["track"][row].astype(np.float64)
     line: Any = {"color": "0.75", "lw": 4, "solid_capstyle": "round"}
     plan.plot(truth[:, 0], truth[:, 1], label="truth", **line)
     height.plot(time, truth[:, 2], **line)
@@ -59,14 +59,14 @@ def plot_track(results: Results, row: int, style: Mapping[str, LineStyle]) -> Fi
     plan.plot(*truth[0, :2], label="start", **start)
     for label, result in results.items():
         axes = east_north_up(result.meta["state"])
-        if axes is None or "track" not in result.arrays:
+        if axes is None or "track" not in result.data:
             continue
-        error = result.arrays["error"][row][:, axes[0]].astype(np.float64) * axes[1]
-        estimate = result.arrays["track"][row] + error
+        error = result.data["error"][row][:, axes[0]].astype(np.float64) * axes[1]
+        estimate = result.data["track"][row] + error
         finite_mask = ~np.isnan(estimate).any(-1)  # gaps would hide a line of few steps
         estimate = estimate[finite_mask]
         plan.plot(estimate[:, 0], estimate[:, 1], **style[label].line(label))
-        height.plot(result.arrays["time"][finite_mask], estimate[:, 2], **style[label].line())
+        height.plot(result.data["time"][finite_mask], estimate[:, 2], **style[label].line())
     plan.set(xlabel="east [m]", ylabel="north [m]")
     plan.set_aspect("equal", adjustable="datalim")
     plan.locator_params(axis="x", nbins=4)

@@ -62,7 +62,7 @@ def plot_rmse(runs: pd.DataFrame, groups: Sequence[str], style: Mapping[str, Lin
         draw: Callable[..., None] = _draw_rows if is_large else _draw_boxes
         draw(axis, valid, order, style)
         _write_lost_counts(axis, group_runs, order, SMALL if is_large else 7)
-        # Repeated, because a filter without valid runs has no box but keeps its row.
+        # Repeated, because a filter without valid runs keeps its row without a box.
         names = list(map(break_settings, order))
         axis.set_yticks(range(len(order)), names, fontsize=SMALL if is_large else None)
         axis.set_ylim(len(order) - 0.5, -0.5)
@@ -138,15 +138,15 @@ def plot_nees(
             components = result.meta["state"]["groups"]
             if group in components:
                 dof = len(components[group])
-                values = result.arrays["nees"][..., list(components).index(group)]
-                nees = consistency.compute_consistency(values, result.arrays["lost"], dof, alpha)
-                shown = thin_mask(nees.runs_at > 0, style[label].instants)
-                time = result.arrays["time"][shown]
+                values = result.data["nees"][..., list(components).index(group)]
+                nees = consistency.compute_consistency(values, result.data["lost"], dof, alpha)
+                steps = thin_mask(nees.runs_at > 0, style[label].instants)
+                time = result.data["time"][steps]
                 look = style[label]._replace(width=0.8 * style[label].width)
                 marker = point_marker(time)
-                axis.plot(time, nees.average[shown], marker=marker, **look.line(label))
+                axis.plot(time, nees.average[steps], marker=marker, **look.line(label))
                 lines.append(nees.average)
-                bands.append((nees.runs, time, nees.low[shown], nees.high[shown], dof))
+                bands.append((nees.runs, time, nees.low[steps], nees.high[steps], dof))
         _, time, low, high, dof = max(bands, key=lambda band: band[0])
         _draw_interval(axis, time, low, high)
         axis.set(title=f"{group}, {dof} degrees of freedom", ylabel="mean NEES")
@@ -203,11 +203,11 @@ def plot_trace(results: Results, name: str, style: Mapping[str, LineStyle]) -> F
     figure, (axis,) = stacked_axes(1, 2.2)
     for label, result in results.items():
         look = style[label]
-        if name in result.arrays and (result.meta.get("particles") or not is_fraction):
+        if name in result.data and (result.meta.get("particles") or not is_fraction):
             scaled = result
             if is_fraction:
-                percent = 100 * result.arrays[name] / particles_in_use(result)
-                scaled = result._replace(arrays={**result.arrays, name: percent})
+                percent = 100 * result.data[name] / particles_in_use(result)
+                scaled = result._replace(data={**result.data, name: percent})
             time, (values,) = select_valid_runs(scaled, None, name, most=look.instants)
             low, middle, high = compute_run_quantiles(values, [0.05, 0.5, 0.95])
             if not look.quiet:

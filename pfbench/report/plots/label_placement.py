@@ -75,7 +75,12 @@ def place_labels(
 
 
 def break_settings(label: str, width: int = 26) -> str:
-    """Break a long filter label before its settings in brackets."""
+    """Break a long filter label before its settings in brackets.
+
+    Args:
+        label: Label.
+        width: Letters of a label on one line.
+    """
     if len(label) <= width or "[" not in label:
         return label
     name, _, settings = label.partition("[")
@@ -83,7 +88,12 @@ def break_settings(label: str, width: int = 26) -> str:
 
 
 def wrap_label(label: str, width: int = 18) -> str:
-    """Break a filter label after "_" or "." and before "[", to lines of at most `width` letters."""
+    """Break a filter label after "_" or "." and before "[".
+
+    Args:
+        label: Label.
+        width: Letters of a line at most.
+    """
     lines = [""]
     for piece in re.findall(r"\[?[^_.\[]+[_.]*|\[", label):
         if lines[-1] and len(lines[-1]) + len(piece) > width:
@@ -142,16 +152,18 @@ def _overlap_cost(
     return np.asarray(cost)
 
 
-def _write(axis: Axes, text: str, point: np.ndarray, place: _Placement, with_line: bool) -> None:
+def _write(
+    axis: Axes, text: str, point: np.ndarray, placement: _Placement, with_line: bool
+) -> None:
     """Write one label at its position."""
     line: Any = {"arrowstyle": "-", "lw": 0.4, "color": "0.35", "shrinkA": 0, "shrinkB": 0}
-    anchor = (place.end - place.corner) / place.size
+    anchor = (placement.end - placement.corner) / placement.size
     # The end near the mark is fixed, because letter widths are estimates.
     side = 0.0 if anchor[0] < 0.1 else 1.0 if anchor[0] > 0.9 else 0.5
     axis.annotate(
         text,
         tuple(point),
-        tuple(place.corner + (side, 0.5) * place.size - place.mark),
+        tuple(placement.corner + (side, 0.5) * placement.size - placement.mark),
         textcoords="offset points",
         fontsize=SMALL,
         ha={0.0: "left", 0.5: "center", 1.0: "right"}[side],

@@ -188,9 +188,14 @@ def _palette() -> Image.Image:
     return palette
 
 
-def format_axis_label(what: str, unit: str) -> str:
-    """Format an axis label as `quantity [unit]`."""
-    return f"{what} [{unit}]" if unit else what
+def format_axis_label(quantity: str, unit: str) -> str:
+    """Format an axis label as `quantity [unit]`.
+
+    Args:
+        quantity: Quantity.
+        unit: Unit, empty without one.
+    """
+    return f"{quantity} [{unit}]" if unit else quantity
 
 
 def format_slug(text: str) -> str:

@@ -28,7 +28,7 @@ def plot_scenario_track(sheet: store.JobResult) -> Figure:
     """Plot the plan view and the height over time."""
     figure = Figure(figsize=(COLUMN, 4.8), layout="constrained")
     plan, height = figure.subplots(2, 1, height_ratios=(2.2, 1))
-    paths, time = scenario_data.select_tracks(sheet.arrays["track"]), sheet.arrays["time"]
+    paths, time = scenario_data.select_tracks(sheet.data["track"]), sheet.data["time"]
     reach = np.nanmax(np.abs(paths[..., :2]))
     unit, scale = ("km", 1e-3) if reach > 5e3 else ("m", 1.0)
     thin = select_indices(time.size)
@@ -53,7 +53,7 @@ def plot_scenario_track(sheet: store.JobResult) -> Figure:
 def plot_distance(sheet: store.JobResult) -> Figure:
     """Plot the horizontal range over time."""
     figure, (axis,) = stacked_axes(1, 1.6)
-    axis.plot(sheet.arrays["time"], sheet.arrays["range"] / 1e3, color="#0072B2")
+    axis.plot(sheet.data["time"], sheet.data["range"] / 1e3, color="#0072B2")
     axis.set(xlabel="time [s]", ylabel="horizontal range [km]")
     return figure
 
@@ -62,8 +62,8 @@ def plot_sensors(sheet: store.JobResult) -> Figure:
     """Plot specific force and angular rate over time, a line per body axis."""
     figure, panels = stacked_axes(2, 1.7)
     lines = list(line_styles(_AXES).values())
-    time, rate = sheet.arrays["time"], sheet.arrays["rate"] * np.degrees(1)
-    rows = (sheet.arrays["force"], "specific force [m/s²]"), (rate, "rate [deg/s]")
+    time, rate = sheet.data["time"], sheet.data["rate"] * np.degrees(1)
+    rows = (sheet.data["force"], "specific force [m/s²]"), (rate, "rate [deg/s]")
     for axis, (values, ylabel) in zip(panels, rows, strict=True):
         for k, name in enumerate(_AXES):
             axis.plot(
@@ -83,8 +83,8 @@ def plot_sky(sheet: store.JobResult) -> Figure:
     axis.set_theta_direction(-1)
     axis.set_rlim(0, 90)
     axis.set_thetagrids(range(0, 360, 45), labels=["N", "NE", "E", "SE", "S", "SW", "W", "NW"])
-    azimuth = sheet.arrays["azimuth"].astype(float)
-    zenith = 90 - np.degrees(sheet.arrays["elevation"].astype(float))
+    azimuth = sheet.data["azimuth"].astype(float)
+    zenith = 90 - np.degrees(sheet.data["elevation"].astype(float))
     angle = _free_direction(azimuth, zenith)
     axis.set_rgrids([30, 60], labels=["60°", "30°"], angle=angle, color="0.4", fontsize=6.5)
     names = scenario_data.count_satellites(sheet)
@@ -113,7 +113,7 @@ def _plot_satellite(axis: Any, theta: np.ndarray, r: np.ndarray, name: str, colo
 
 def plot_measurements(sheet: store.JobResult) -> Figure:
     """Plot the number of satellites and of observed components over time."""
-    a = sheet.arrays
+    a = sheet.data
     counts = {"components": (a["seen"].astype(float).sum(1), "#D55E00")}
     if "azimuth" in a:
         counts = {"satellites": (scenario_data.visible_satellites(sheet), "#0072B2"), **counts}
@@ -158,7 +158,7 @@ def plot_over_time(sheet: store.JobResult) -> Figure:
     figure, panels = stacked_axes(len(kinds), 1.3)
     for axis, (kind, z) in zip(panels, kinds.items(), strict=True):
         first = z[0]
-        time = np.broadcast_to(sheet.arrays["time"][:, None], first.shape)
+        time = np.broadcast_to(sheet.data["time"][:, None], first.shape)
         finite_mask = ~np.isnan(first)
         dots: Any = {"ls": "none", "marker": ".", "ms": 3, "alpha": 0.8, "mew": 0}
         axis.plot(time[finite_mask], first[finite_mask], color="#0072B2", **dots)

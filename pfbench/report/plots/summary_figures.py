@@ -100,7 +100,7 @@ def _plot_pair(axis: Axes, row: int, pair: BaselineComparison, limits: tuple[flo
     for k, (ratio, winner) in enumerate(zip(pair.ratios, pair.shown, strict=True)):
         is_open = winner == INCONCLUSIVE
         colour = _OPEN if is_open else _BETTER if winner == pair.method else _WORSE
-        face = {"mfc": "white", "mec": "0.55"} if is_open else {"mfc": colour, "mec": colour}
+        face: Any = {"mfc": "white", "mec": "0.55"} if is_open else {"mfc": colour, "mec": colour}
         marker = "<" if ratio < low else ">" if ratio > high else "o"
         y = row + 0.3 * ((k * 0.6180339887) % 1 - 0.5)
         axis.plot(float(np.clip(ratio, low, high)), y, marker=marker, **face, **dot)

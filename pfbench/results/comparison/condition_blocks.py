@@ -57,7 +57,7 @@ def ranking_blocks(
     """
     by_condition = sorted(
         rmse_by_run(table[table.group == group], rule),
-        key=lambda item: [natural_sort_key(part) for part in item[0]],
+        key=lambda item: [natural_sort_key(text) for text in item[0]],
     )
     errors = {" / ".join(key[:3]): wide.dropna(axis=1, how="all") for key, wide in by_condition}
     present = {name: set(map(str, wide.columns)) for name, wide in errors.items()}
@@ -118,7 +118,7 @@ def _select_complete(present: Mapping[str, set[str]]) -> tuple[tuple[str, ...], 
     labels.sort(key=lambda label: -sum(label in names for names in present.values()))
     choices = []
     for k in range(1, len(labels) + 1):
-        complete = {name for name, own in present.items() if own.issuperset(labels[:k])}
+        complete = {name for name, names in present.items() if names.issuperset(labels[:k])}
         is_testable = k >= MIN_FILTERS and len(complete) >= MIN_CONDITIONS
         choices.append((is_testable, k * len(complete), k, complete))
     if not choices:

@@ -57,10 +57,10 @@ def rmse_by_run(
     """
     rows = table[(table.metric == "rmse") & (table.component == "norm")]
     keys = ["scenario", "noise", "model", "group"]
-    for (scenario, noise, model, group), part in rows.groupby(keys, sort=False):
-        wide = part.pivot(index=["seed", "run"], columns="label", values="value").sort_index()
+    for (scenario, noise, model, group), group_rows in rows.groupby(keys, sort=False):
+        wide = group_rows.pivot(index=["seed", "run"], columns="label", values="value").sort_index()
         condition = str(scenario), str(noise), str(model), str(group)
-        yield condition, rule.apply(wide[part.label.unique()])
+        yield condition, rule.apply(wide[group_rows.label.unique()])
 
 
 def pair_errors(wide: pd.DataFrame) -> Iterator[PairErrors]:

@@ -89,7 +89,15 @@ class PairwiseTest:
 
 
 def decide_winner(a: str, b: str, effect: float, p: float, alpha: float) -> str:
-    """Return the better filter, or "inconclusive"."""
+    """Return the better filter, or "inconclusive".
+
+    Args:
+        a: Label of the first filter.
+        b: Label of the second filter.
+        effect: Effect size, positive if a is better.
+        p: Corrected p-value.
+        alpha: Level.
+    """
     if not p <= alpha or effect == 0:
         return INCONCLUSIVE
     return a if effect > 0 else b

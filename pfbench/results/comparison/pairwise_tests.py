@@ -1,10 +1,10 @@
 """Pairwise tests of filters within one condition: one `PairwiseTest` per pair.
 
 Filters of a condition share the same episodes, so they are compared run by run (same seed and run)
-on the log ratio of their RMSE: Wilcoxon's signed-rank test with ranks of zeros split evenly
-[Demsar 2006], Holm's correction over all pairs of one group of one condition [Holm 1979], the
-rank-biserial correlation and the probability of improvement as effect sizes, a bootstrap interval
-of the median ratio, and two one-sided tests of equivalence.
+on the log ratio of their RMSE. The test is Wilcoxon's signed-rank test with ranks of zeros split
+evenly [Demsar 2006], with Holm's correction over all pairs of one group of one condition [Holm
+1979]. Effect sizes are the rank-biserial correlation and the probability of improvement. The median
+ratio has a bootstrap interval, and two one-sided tests show equivalence.
 
 A lost run takes the largest rank. Two lost runs are a tie, and so are two runs whose RMSE agree to
 the stored precision [ours]. `lost_rule_sensitivity` repeats the decisions with other rules.
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -136,13 +137,13 @@ def _describe(
     errors: Array,
     d: Array,
     level: float,
-    **p_values: float,
+    **p_values: Any,
 ) -> PairwiseTest:
     """Add effect sizes and intervals of a pair to its p-values."""
     a, b = errors.T
     finite = np.isfinite(errors).all(axis=1) & (errors > 0).all(axis=1)
     largest = np.abs(d[finite]).max(initial=0.0)
-    # One run has no interval, only a median.
+    # One run gives a median without an interval.
     none = ConfidenceInterval(-np.inf, np.inf, "none")
     interval = bootstrap_median_interval(d, level) if d.size > 1 else none
     median = float(np.median(d))

@@ -153,6 +153,11 @@ class RankingResult:
 
 
 def best_ranked(filters: Sequence[str], rank: Sequence[float] | Array) -> tuple[str, ...]:
-    """List the filters of the smallest mean rank, up to rounding."""
+    """List the filters of the smallest mean rank, up to rounding.
+
+    Args:
+        filters: Labels, [K].
+        rank: Mean ranks, [K].
+    """
     pairs = zip(filters, rank, strict=False)
     return tuple(label for label, value in pairs if value <= min(rank) + LOG_TOLERANCE)

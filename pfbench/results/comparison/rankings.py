@@ -1,11 +1,11 @@
 """Rankings of filters across the conditions of a study: conditions are blocks [Demsar 2006].
 
 The value of a block is the median over runs of log RMSE. Runs of one condition share scenario and
-noise regime and are never blocks. Differences of logarithms have no unit, so conditions of
-different scenarios are comparable.
+noise regime and are never blocks. Differences of logarithms are dimensionless, so
+conditions of different scenarios are comparable.
 
-An omnibus test (Friedman, corrected for ties, in the form of Iman and Davenport 1980) comes first,
-then every pair of filters by Nemenyi's test, Conover's with Holm's correction and Wilcoxon's with
+An omnibus test comes first: Friedman's, corrected for ties, in the form of Iman and Davenport 1980.
+Then each pair of filters is compared by Nemenyi's test, and by Conover's and Wilcoxon's tests with
 Holm's correction. A filter is better if the omnibus test and Nemenyi's test both show it [ours], as
 in a critical-difference diagram. The Bayesian signed-rank test gives the probability that a filter
 is better, or equal within a margin [Benavoli et al. 2014].
@@ -194,7 +194,7 @@ def _rank_by_scenario(blocks: RankingBlocks) -> ScenarioRanking | None:
         return None
     rank = rank_within_blocks(blocks.values)
     rows = [[name.split(" / ")[0] == scenario for name in blocks.cells] for scenario in names]
-    # Ranks, since errors of different noise regimes have no common scale for a median.
+    # Ranks, since errors of different noise regimes differ too much in scale for a median.
     medians = np.array([np.median(rank[mask], axis=0) for mask in rows])
     test = friedman(rank_within_blocks(medians))
     return ScenarioRanking(len(names), test.p, test.p_f, best_ranked(blocks.filters, test.ranks))

@@ -49,7 +49,7 @@ def bootstrap_median_interval(d: Array, level: float, seed: int = 0) -> Confiden
     median = np.median(d)
     alpha = (1 - level) / 2
     z = np.array([ndtri(alpha), -ndtri(alpha)])
-    with np.errstate(all="ignore"):  # a constant sample has no BCa interval
+    with np.errstate(all="ignore"):  # NaN for a constant sample
         count = np.count_nonzero(medians < median) + np.count_nonzero(medians <= median)
         bias = ndtri(count / (2 * medians.size))
         levels = ndtr(bias + (bias + z) / (1 - _acceleration(ordered) * (bias + z)))

@@ -73,7 +73,12 @@ def friedman(rank: Array, alpha: float = 0.05) -> FriedmanResult:
 
 
 def rank_standard_error(blocks: int, filters: int) -> float:
-    """Compute the standard error of a difference of mean ranks if all filters are equal."""
+    """Compute the standard error of a difference of mean ranks if all filters are equal.
+
+    Args:
+        blocks: Number of blocks.
+        filters: Number of filters.
+    """
     return math.sqrt(filters * (filters + 1) / (6 * blocks))
 
 
@@ -103,5 +108,11 @@ def wilcoxon_pairs(values: Array) -> dict[tuple[int, int], float]:
 
 
 def log_difference(values: Array, i: int, j: int) -> Array:
-    """Return finite differences of two columns of log values [B, K], as `log_ratio`."""
+    """Return finite differences of two columns, as `log_ratio`.
+
+    Args:
+        values: Log values, [B, K].
+        i: First column.
+        j: Second column.
+    """
     return log_ratio(np.exp(values[:, i]), np.exp(values[:, j]))

@@ -49,7 +49,12 @@ def holm(p: Sequence[float] | Array) -> Array:
 
 
 def wilcoxon_signed_rank(d: Array, alternative: Alternative = "two-sided") -> SignedRankResult:
-    """Test whether paired differences are centred at zero; see `wilcoxon_signed_rank_rows`."""
+    """Test whether paired differences are centred at zero.
+
+    Args:
+        d: Differences, [n].
+        alternative: As in `wilcoxon_signed_rank_rows`.
+    """
     statistic, p = wilcoxon_signed_rank_rows(np.asarray(d, dtype=np.float64)[None], alternative)
     return SignedRankResult(float(statistic[0]), float(p[0]))
 
@@ -99,7 +104,12 @@ def wilcoxon_signed_rank_rows(
 
 
 def equivalence_p_value(d: Array, margin: float) -> float:
-    """Test whether differences are centred within a margin; see `equivalence_p_values`."""
+    """Test whether differences are centred within a margin.
+
+    Args:
+        d: Differences, [n].
+        margin: As in `equivalence_p_values`.
+    """
     return float(equivalence_p_values(np.asarray(d, dtype=np.float64)[None], margin)[0])
 
 

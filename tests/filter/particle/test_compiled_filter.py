@@ -393,4 +393,4 @@ def test_a_job_says_that_its_step_was_compiled(tmp_path: Path) -> None:
     assert whole.meta["seconds"]["compile"] > 0.0
     assert whole.meta["likelihoods_per_step"] == loops.meta["likelihoods_per_step"] == 200.0
     for name in ("error", "sd", "log_evidence", "nees"):
-        assert np.allclose(whole.arrays[name], loops.arrays[name], rtol=1e-5, atol=1e-6), name
+        assert np.allclose(whole.data[name], loops.data[name], rtol=1e-5, atol=1e-6), name

@@ -62,8 +62,9 @@ def plot_maxima(
         start: Start time of the measures, s.
         printed: Maximum errors of the paper by label.
     """
-    names = dict.fromkeys(name for _, block in results.values() for name in block.components)
-    names = sorted(names, key=lambda name: "NEU".find(name[-1]))  # order of the printed values
+    components = dict.fromkeys(name for _, block in results.values() for name in block.components)
+    # In the order of the printed values.
+    names = sorted(components, key=lambda name: "NEU".find(name[-1]))
     figure, (axis,) = stacked_axes(1, 2.3)
     values: list[np.ndarray] = []
     for i, (label, (result, block)) in enumerate(results.items()):
@@ -92,8 +93,8 @@ def _error_measures(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the maximum error and the RMSE of a component for each valid run, [n]."""
     index = block.places[block.components.index(component)]
-    late = result.arrays["time"] >= start
-    error = result.arrays["error"][~result.arrays["lost"]][:, late][..., [index]]
+    late = result.data["time"] >= start
+    error = result.data["error"][~result.data["lost"]][:, late][..., [index]]
     no_run_lost = np.zeros(len(error), dtype=bool)
     peak = error_measures.max_error(error, no_run_lost)
     return block.scale * peak, block.scale * error_measures.rmse_per_run(error, no_run_lost)
@@ -101,7 +102,7 @@ def _error_measures(
 
 def relative_axes(result: store.JobResult) -> np.ndarray:
     """Compute the mean over time of Err of each valid run, %."""
-    valid = relative_error_percent(result)[~result.arrays["lost"]]
+    valid = relative_error_percent(result)[~result.data["lost"]]
     return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
 
 
@@ -112,7 +113,7 @@ def mean_trace_per_run(result: store.JobResult, name: str) -> np.ndarray:
         result: Result of a filter.
         name: Name of the trace.
     """
-    valid = result.arrays[name][~result.arrays["lost"]]
+    valid = result.data[name][~result.data["lost"]]
     return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
 
 

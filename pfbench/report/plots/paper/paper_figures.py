@@ -72,6 +72,6 @@ def _read_conditions(
         if figure.noise in ("", condition.noise):
             paths = {job.label: job.path for job in condition.jobs}
             results = {label: read(paths[label]) for label in figure.filters if label in paths}
-            valid = {label: r for label, r in results.items() if not r.arrays["lost"].all()}
+            valid = {label: r for label, r in results.items() if not r.data["lost"].all()}
             if valid:
                 yield PaperFigureData(condition, valid, start_time_s)

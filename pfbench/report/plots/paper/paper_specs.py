@@ -127,7 +127,7 @@ def make_trace_figures(
     figures = []
     low, high = source.figure.printed.get("", (np.nan, np.nan))
     for data in source.data:
-        results = {label: r for label, r in data.results.items() if name in r.arrays}
+        results = {label: r for label, r in data.results.items() if name in r.data}
         if results:
             text = f"{source.format_head(data)}: {words} over time, {_format_runs(data)}."
             text += f" Grey: {low:g} to {high:g}, as printed." if np.isfinite(low) else ""
@@ -159,7 +159,7 @@ def make_relative_error_figures(source: PaperFigureInput) -> list[FigureSpec]:
     experiments = {
         data.condition.scenario: data.results
         for data in source.data
-        if all("range" in r.arrays for r in data.results.values())
+        if all("range" in r.data for r in data.results.values())
     }
     if not experiments:
         return []
@@ -189,7 +189,7 @@ def make_ess_figure(source: PaperFigureInput) -> list[FigureSpec]:
         data.condition.scenario: {
             label: experiment_plots.mean_trace_per_run(r, "ess")
             for label, r in data.results.items()
-            if "ess" in r.arrays
+            if "ess" in r.data
         }
         for data in source.data
     }
@@ -244,7 +244,7 @@ def _format_runs(*conditions: PaperFigureData) -> str:
     runs = sorted({int(r.meta["runs"]) for _, _, r in results})
     lost = [
         f"{label} {n}{f' in {data.condition.scenario}' if len(conditions) > 1 else ''}"
-        for data, label, r in results if (n := int(r.arrays["lost"].sum()))
+        for data, label, r in results if (n := int(r.data["lost"].sum()))
     ]  # fmt: skip
     note = f" (lost runs excluded: {', '.join(lost)})" if lost else ""
     return f"{_BAND} of {' or '.join(map(str, runs))} runs{note}"

@@ -46,7 +46,7 @@ def plot_errors(
             if component not in block.components:
                 continue
             index = block.places[block.components.index(component)]
-            time, values = _valid_runs(result, result.arrays["error"][..., index])
+            time, values = _valid_runs(result, result.data["error"][..., index])
             band = compute_run_quantiles(values * block.scale, BAND_QUANTILES)
             _banded(axis, time, band, style[label], label, len(results))
             curves.append(band)
@@ -79,7 +79,7 @@ def plot_paper_trace(
     """
     figure, (axis,) = stacked_axes(1, 2.0)
     for label, result in results.items():
-        time, values = _valid_runs(result, result.arrays[name])
+        time, values = _valid_runs(result, result.data[name])
         band = compute_run_quantiles(values, BAND_QUANTILES)
         _banded(axis, time, band, style[label], label, len(results))
     if np.isfinite(printed).all():
@@ -137,16 +137,16 @@ def plot_relative_errors(
 def relative_error_percent(result: store.JobResult) -> np.ndarray:
     """Return the horizontal error in % of the range, [R, T]."""
     horizontal = result.meta["state"]["groups"]["position"][:2]  # as in the tables
-    error = result.arrays["error"][..., horizontal].astype(np.float64)
-    return np.asarray(100 * np.sqrt((error**2).sum(-1)) / result.arrays["range"])
+    error = result.data["error"][..., horizontal].astype(np.float64)
+    return np.asarray(100 * np.sqrt((error**2).sum(-1)) / result.data["range"])
 
 
 def _valid_runs(result: store.JobResult, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return thinned times and values [R, T] of the valid runs."""
-    valid = values[~result.arrays["lost"]].astype(np.float64)
+    valid = values[~result.data["lost"]].astype(np.float64)
     steps = np.flatnonzero(~np.isnan(valid).all(0))
-    shown = steps[select_indices(steps.size)]
-    return result.arrays["time"][shown], valid[:, shown]
+    steps = steps[select_indices(steps.size)]
+    return result.data["time"][steps], valid[:, steps]
 
 
 def _banded(
