@@ -13,6 +13,7 @@ from pfbench.claims.measurements import Side
 from pfbench.claims.schema import PAPERS, Claim
 from pfbench.claims.verdicts import VERDICTS, ClaimVerdict
 from pfbench.report import cost
+from pfbench.report.provenance import distinct_values
 from pfbench.results.conditions import natural_sort_key
 
 Jobs = Mapping[Side, Mapping[str, Any]]
@@ -37,7 +38,7 @@ def jobs_table(jobs: Jobs) -> pd.DataFrame:
 def list_commits(jobs_metadata: Iterable[Mapping[str, Any]]) -> list[str]:
     """List the distinct commits of jobs."""
     versions = (meta.get("versions", {}) for meta in jobs_metadata)
-    return _distinct(str(version.get("commit") or "not stated") for version in versions)
+    return distinct_values(str(version.get("commit") or "not stated") for version in versions)
 
 
 def describe_jobs(claim: Claim, jobs: Jobs) -> list[str]:
@@ -93,12 +94,7 @@ def _by_study(jobs: Jobs) -> dict[str, list[Mapping[str, Any]]]:
 
 def _runs(jobs_metadata: Iterable[Mapping[str, Any]]) -> str:
     """Format the numbers of runs of jobs."""
-    return " or ".join(_distinct(str(meta["runs"]) for meta in jobs_metadata))
-
-
-def _distinct(values: Iterable[str]) -> list[str]:
-    """Sort the distinct values."""
-    return sorted(set(values), key=natural_sort_key)
+    return " or ".join(distinct_values(str(meta["runs"]) for meta in jobs_metadata))
 
 
 def _test_row(form: str, result: ClaimTestResult) -> dict[str, Any]:

@@ -129,16 +129,6 @@ def rows_by_paper(
     ]
 
 
-def claims_of_study(verdicts: Sequence[ClaimVerdict], study: str) -> list[ClaimVerdict]:
-    """Select the verdicts that use a study.
-
-    Args:
-        verdicts: Verdicts of all claims.
-        study: Name of the study.
-    """
-    return [verdict for verdict in verdicts if study in verdict.claim.studies]
-
-
 def format_result(result: ClaimTestResult) -> str:
     """Format the measured value with its interval, and the printed value."""
     if np.isnan(result.effect):

@@ -11,14 +11,7 @@ import numpy as np
 FORMAT = 1
 
 # Axes that must agree across arrays: R runs, T steps, D components, G groups, S scored steps.
-_AXES = {
-    "time": "T",
-    "error": "RTD",
-    "sd": "RTD",
-    "nees": "RTG",
-    "log_evidence": "R",
-    "lost": "R",
-}
+_AXES = {"time": "T", "error": "RTD", "sd": "RTD", "nees": "RTG", "log_evidence": "R", "lost": "R"}
 
 _OPTIONAL = {
     "scored": "S",
@@ -63,7 +56,9 @@ def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndar
     """
     missing = [name for name in _AXES if name not in data]
     if missing:
-        raise ValueError(f"{path}: arrays must contain {', '.join(missing)}. Run the job again.")
+        raise ValueError(
+            f"{path}: a result must contain the arrays {', '.join(missing)}. Run the job again."
+        )
     for name, value in data.items():
         # the first three are arguments of numpy's savez
         if name in ("file", "args", "allow_pickle", "meta"):

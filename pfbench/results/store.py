@@ -1,8 +1,7 @@
 """Results on disk: one `<key>.npz` per job, readable with numpy alone, written atomically.
 
 A file holds `meta`, a JSON text, and plain arrays without pickles. A failed job leaves
-`<key>.failed.json` in the same folder. Longer than 250 lines, since reading and writing share one
-check of the format.
+`<key>.failed.json` in the same folder.
 """
 
 from __future__ import annotations
@@ -25,11 +24,7 @@ import numpy as np
 from pfbench.results.result_format import FORMAT, check_arrays, check_metadata
 
 # values of the key `budget`
-SAME_N, SAME_TIME, SAME_LIKELIHOODS = BUDGETS = (
-    "particles",
-    "time",
-    "likelihoods",
-)
+SAME_N, SAME_TIME, SAME_LIKELIHOODS = BUDGETS = ("particles", "time", "likelihoods")
 
 
 class JobResult(NamedTuple):
@@ -252,10 +247,5 @@ def _meta(path: Path, file: np.lib.npyio.NpzFile) -> dict[str, Any]:
 def _rank(path: Path) -> tuple[str, str, str, int, str]:
     meta = read_metadata(path)
     choices = meta["choices"]
-    return (
-        str(choices["scenario"]),
-        str(choices["noise"]),
-        str(meta["label"]),
-        int(meta["seed"]),
-        str(meta["key"]),
-    )
+    names = str(choices["scenario"]), str(choices["noise"]), str(meta["label"])
+    return *names, int(meta["seed"]), str(meta["key"])

@@ -24,6 +24,7 @@ from pfbench.report.plots.plotting import line_styles, mute_others, render_palet
 from pfbench.results import error_measures, store
 from pfbench.results.conditions import load_conditions
 from pfbench.results.frame import load_frame
+from pfbench.results.state_groups import component_groups
 
 SIR = synthetic.Method("sir", 1.3, 0.8, 200, 4.0, (7,))
 SWARM = synthetic.Method("cpso_escape", 1.0, 1.0, 200, 9.0)
@@ -122,9 +123,7 @@ def test_nothing_lies_beyond_the_axes(results: Path) -> None:
     result = loaded(results, "cpso_escape")
     wild = result.data["error"].copy()
     wild[..., 6] *= 1 + 1e4 * np.exp(-np.arange(30) / 2)
-    block = next(
-        b for b in paper_figures.component_groups(result.meta["state"]) if b.group == "position"
-    )
+    block = next(b for b in component_groups(result.meta["state"]) if b.group == "position")
     own = {"cpso_escape": (store.JobResult(result.meta, {**result.data, "error": wild}), block)}
     panel = time_plots.plot_errors(own, line_styles(["cpso_escape"])).axes[0]
     assert panel.get_yscale() == "symlog"
@@ -139,9 +138,7 @@ def test_nothing_lies_beyond_the_axes(results: Path) -> None:
 def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float) -> None:
     """The axis is linear for the good ones, in no small part of it, and its few ticks have one style."""
     block = next(
-        b
-        for b in paper_figures.component_groups(loaded(results, "sir").meta["state"])
-        if b.group == "attitude"
+        b for b in component_groups(loaded(results, "sir").meta["state"]) if b.group == "attitude"
     )
     good = {label: loaded(results, label) for label in ("cpf", "cpso_escape")}
     bad = loaded(results, "cofm_amssrcpf")
@@ -167,9 +164,7 @@ def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float)
 
 def test_a_bias_stands_beside_itself_before_correction(results: Path) -> None:
     result = loaded(results, "cpso_escape")
-    block = next(
-        b for b in paper_figures.component_groups(result.meta["state"]) if b.group == "attitude"
-    )
+    block = next(b for b in component_groups(result.meta["state"]) if b.group == "attitude")
     figure = time_plots.plot_errors(
         {"cpso_escape": (result, block)}, line_styles(["cpso_escape"]), before=True
     )

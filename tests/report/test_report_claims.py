@@ -811,8 +811,6 @@ def test_the_page_has_the_numbers_and_a_link_to_the_cell(study: Path) -> None:
         claims_page.rows_by_paper(found)[0]["rows"][0]["lines"][0]["link"] == ""
     )  # no page, no link
     assert claim_tables.count_verdicts(found).set_index("paper").loc["all", "claims"] == 1
-    assert claims_page.claims_of_study(found, "s") == found
-    assert claims_page.claims_of_study(found, "t") == []
 
 
 def page_of(folder: Path, out: Path, *tests: ClaimTest) -> tuple[str, str]:

@@ -34,11 +34,7 @@ class _Obstacles(NamedTuple):
 
 
 def place_labels(
-    axis: Axes,
-    points: np.ndarray,
-    labels: Mapping[int, str],
-    reach: np.ndarray,
-    path: np.ndarray,
+    axis: Axes, points: np.ndarray, labels: Mapping[int, str], reach: np.ndarray, path: np.ndarray
 ) -> None:
     """Write small labels near points where they cover nothing, with a line if they are not close.
 

@@ -91,11 +91,7 @@ def required_runs_proportion(
 
 
 def detectable_effect(
-    sd: float,
-    pairs: int,
-    alpha: float = 0.05,
-    power: float = POWER,
-    efficiency: float = EFFICIENCY,
+    sd: float, pairs: int, alpha: float = 0.05, power: float = POWER, efficiency: float = EFFICIENCY
 ) -> float:
     """Compute the smallest mean difference shown with a given power.
 
