@@ -220,7 +220,7 @@ def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
 def test_the_escape_factor_is_that_of_the_settings_that_ran(results: Path, tmp_path: Path) -> None:
     for label, escape, most in (("cpso_escape", 0.12, 5), ("cpso_escape_printed", 0.3, 30)):
         method = synthetic.Method(label, 1.0, particles=100)
-        settings = {"proposal": {"velocity": {"escape": escape}, "iterations": most}}
+        settings = {"proposal": {"velocity": {"escape_coefficient": escape}, "iterations": most}}
         synthetic.write(
             tmp_path / "paper_004", method, noise="nominal", runs=6, steps=8, config=settings
         )

@@ -143,7 +143,7 @@ def make_escape_figure(source: PaperFigureInput) -> list[FigureSpec]:
     factors: dict[str, tuple[float, int]] = {}
     for label, result in (item for data in source.data for item in data.results.items()):
         proposal = result.meta["config"].get("filter", {}).get("proposal") or {}
-        if escape := (proposal.get("velocity") or {}).get("escape"):
+        if escape := (proposal.get("velocity") or {}).get("escape_coefficient"):
             factors[label] = float(escape), int(proposal["iterations"])
     if not factors:
         return []
