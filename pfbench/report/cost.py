@@ -65,7 +65,7 @@ def pareto_front(cell: str, rows: pd.DataFrame, group: str) -> ParetoFront:
 
     Args:
         cell: Name of the condition.
-        rows: Rows of `frame` of the condition.
+        rows: Rows of `load_frame` of the condition.
         group: Name of the component group.
     """
     group_rows = rows[(rows.metric == "rmse") & (rows.component == "norm") & (rows.group == group)]

@@ -31,7 +31,7 @@ def write_datasheet(
     The target folder is `<out>/datasheets/<scenario>_<noise>/`.
 
     Args:
-        file: File written by `survey`.
+        file: File written by `pfbench datasheet`.
         out: Folder of all reports.
         formats: Formats of the figures, svg or png.
 
@@ -45,7 +45,8 @@ def write_datasheet(
     sheet = store.read_result(file)
     if "residual" not in sheet.data:
         raise ValueError(
-            f"file must be a datasheet, got the job {file}. Create one with: pfbench report scenario=NAME"
+            f"file must be a datasheet, got the job {file}. "
+            "Create one with: pfbench datasheet scenario=NAME"
         )
     choices = sheet.meta["choices"]
     name = format_slug(f"{choices['scenario']}_{choices['noise']}")

@@ -84,7 +84,7 @@ def merge(
     """Select the rows and pairwise tests of the main groups, under a common name.
 
     Args:
-        table: Rows of `frame`.
+        table: Rows of `load_frame`.
         decided: All pairwise tests.
         mains: Main group by condition.
     """

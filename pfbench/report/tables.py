@@ -72,7 +72,7 @@ def accuracy_table(
 
 
 def short_accuracy_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Select the columns of `accuracy` that a brief report shows for groups except the main group."""
+    """Select the columns of `accuracy_table` that a brief report shows for groups except the main group."""
     heads = (
         "filter",
         "valid runs",

@@ -146,7 +146,9 @@ def test_noise_regimes_are_cells(tmp_path):
 def test_what_does_not_belong_together_is_refused_by_name(tmp_path, change, named):
     synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), **SMALL)
     odd = synthetic.write(tmp_path / "demo", synthetic.Method("ukf", 1.0), **{**SMALL, **change})
-    with pytest.raises(ValueError, match=rf"differ in {named} .*mixed=True") as refusal:
+    with pytest.raises(
+        ValueError, match=rf"differ in {named} .*allow_mixed_versions=true"
+    ) as refusal:
         frame.load_frame("demo", tmp_path)
     assert odd.name in str(refusal.value)
     assert set(frame.load_frame("demo", tmp_path, allow_mixed_versions=True).label) == {

@@ -16,7 +16,7 @@ from pfbench.report.plots.filter_plots import MANY_FILTERS, TRACES
 from pfbench.report.plots.plotting import LineStyle, format_slug
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
-_SPREAD_FILTERS = 4  # with more filters, only those of `worth_a_spread` have a spread figure [ours]
+_SPREAD_FILTERS = 4  # with more filters, only those of `has_spread` have a spread figure [ours]
 _VALID = "valid runs"
 
 
@@ -34,8 +34,8 @@ def condition_figures(
 
     Args:
         results: Results by label, with all times.
-        runs: Rows of `frame` of this condition.
-        style: Line styles from `looks` or `dimmed`.
+        runs: Rows of `load_frame` of this condition.
+        style: Line styles by label.
         groups: Names of the component groups.
         alpha: Probability outside the NEES and NIS intervals.
         brief: Whether to leave out the track, NIS, cost, the traces and the spread figures.
@@ -76,7 +76,7 @@ def has_spread(results: Results, runs: pd.DataFrame, groups: Sequence[str]) -> d
 
     Args:
         results: Results by label.
-        runs: Rows of `frame` of this condition.
+        runs: Rows of `load_frame` of this condition.
         groups: Names of the component groups.
 
     Returns:

@@ -43,7 +43,7 @@ def plot_rmse(runs: pd.DataFrame, groups: Sequence[str], style: Mapping[str, Lin
     """Plot the RMSE of the norm of each run, as boxes, or as rows for many filters.
 
     Args:
-        runs: Rows of `frame` of a condition.
+        runs: Rows of `load_frame` of a condition.
         groups: Names of the component groups.
         style: Line styles by label.
     """
