@@ -42,10 +42,10 @@ def calibration_figures(
     if not scored:
         return []
     text = (
-        "Rank histograms: how often the truth lay where a filter gives values below it so much probability; flat when it knows "
-        "what it knows, high at both ends when its regions are too narrow, high in the middle when they are too wide. "
-        f"Shaded: {100 * (1 - alpha):g} % binomial band of one bin, of as many numbers as runs, for components and instants of "
-        f"one run hang together.{note}"
+        "Rank histograms: share of truths by the probability that a filter gives to values below "
+        "the truth. Flat: calibrated. High at both ends: overconfident. High in the middle: "
+        f"underconfident. Shaded: {100 * (1 - alpha):g} % binomial band of one bin for as many "
+        f"numbers as runs, because components and steps of a run are dependent.{note}"
     )
     return [
         FigureSpec(
