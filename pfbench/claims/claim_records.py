@@ -63,13 +63,11 @@ def read_claims(
 def _parse_claim(row: Mapping[str, Any]) -> Claim:
     """Parse one record."""
     name = row.get("id", "a record without id")
-    missing = _REQUIRED_KEYS - set(row)
-    unknown = set(row) - _REQUIRED_KEYS - _OPTIONAL_KEYS
-    if missing or unknown:
-        raise ValueError(
-            f"{name}: keys must be {sorted(_REQUIRED_KEYS)} and some of {sorted(_OPTIONAL_KEYS)}, "
-            f"got {sorted(unknown)} too and {sorted(missing)} not. Correct them."
-        )
+    if missing := _REQUIRED_KEYS - set(row):
+        raise ValueError(f"{name}: a record must have {sorted(missing)}. Add them.")
+    if unknown := set(row) - _REQUIRED_KEYS - _OPTIONAL_KEYS:
+        options = sorted(_REQUIRED_KEYS | _OPTIONAL_KEYS)
+        raise ValueError(f"{name}: keys must be among {options}, got {sorted(unknown)}.")
     _check_option(name, "paper", row["paper"], PAPERS)
     reasons, evidence = (
         {form: _parse_reason(name, key, text, options) for form, text in _by_form(row, key).items()}

@@ -40,7 +40,7 @@ def write_comparison(
     """
     options = context.options
     mains = {section["key"]: section["main"] for section in sections}
-    rows, main_tests, name = summary.merge(table, tests, mains)
+    rows, main_tests, name = summary.select_main_rows(table, tests, mains)
     if context.brief and name == summary.MAIN:
         table = pd.concat([rows, table], ignore_index=True)
     scored = [group for group in (name, *context.groups) if (table.group == group).any()]

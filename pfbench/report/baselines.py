@@ -121,16 +121,16 @@ def compare_with_baselines(
                     for cell in source.cells
                 )
                 comparisons.append(
-                    _compared(method, baseline, source.cells, a, b, winners_by_condition)
+                    _compare_pair(method, baseline, source.cells, a, b, winners_by_condition)
                 )
     corrected = holm([pair.p for pair in comparisons])
     return [
-        _decided(pair, float(p), len(comparisons), alpha)
+        _decide_pair(pair, float(p), len(comparisons), alpha)
         for pair, p in zip(comparisons, corrected, strict=True)
     ]
 
 
-def _compared(
+def _compare_pair(
     method: str, baseline: str, cells: tuple[str, ...], a: Array, b: Array, winners: tuple[str, ...]
 ) -> BaselineComparison:
     d = log_ratio(a, b)
@@ -142,7 +142,9 @@ def _compared(
     )  # fmt: skip
 
 
-def _decided(pair: BaselineComparison, p: float, family: int, alpha: float) -> BaselineComparison:
+def _decide_pair(
+    pair: BaselineComparison, p: float, family: int, alpha: float
+) -> BaselineComparison:
     better = pair.method if pair.effect > 0 else pair.baseline
     winner = better if p <= alpha and pair.effect else INCONCLUSIVE
     return replace(

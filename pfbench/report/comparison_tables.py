@@ -33,7 +33,7 @@ def decision_table(verdicts: Sequence[PairwiseTest]) -> pd.DataFrame:
                 "T": v.statistic,
                 "p": v.p,
                 f"adjusted p (Holm, {v.family} tests)": v.p_holm,
-                "decision": _decision(v),
+                "decision": _format_decision(v),
             }
             for v in verdicts
         ]
@@ -56,7 +56,7 @@ def effect_table(verdicts: Sequence[PairwiseTest]) -> pd.DataFrame:
                 f"adjusted equivalence p (±{100 * v.margin:g} %, {v.family} tests)": v.p_equivalent,
                 "equivalent": v.equivalent,
                 "SD of log RMSE ratio [%]": 100 * v.scatter,
-                f"runs required for ±{100 * v.wanted:g} % (power 0.8)": _whole(v.needed),
+                f"runs required for ±{100 * v.wanted:g} % (power 0.8)": _format_count(v.needed),
                 "smallest detectable change [%]": 100 * v.detectable,
             }
             for v in verdicts
@@ -77,7 +77,7 @@ def all_comparisons_table(verdicts: Sequence[PairwiseTest]) -> pd.DataFrame:
                 "P(error a < error b)": v.better,
                 "adjusted p (Holm, condition)": v.p_holm,
                 f"adjusted p (Holm, {v.page} tests)": v.p_page,
-                "decision": _decision(v),
+                "decision": _format_decision(v),
             }
             for v in verdicts
         ]
@@ -165,13 +165,13 @@ def lost_rule_table(sensitivities: Sequence[LostRunSensitivity]) -> pd.DataFrame
     )
 
 
-def _decision(v: PairwiseTest) -> str:
+def _format_decision(v: PairwiseTest) -> str:
     """Format the decision of a comparison."""
     if v.winner in (v.a, v.b):
         return f"{v.winner} better"
     return "equivalent" if v.equivalent else "inconclusive"
 
 
-def _whole(value: float) -> str:
+def _format_count(value: float) -> str:
     """Format a count that may be infinite or NaN."""
     return f"{value:.0f}" if np.isfinite(value) else format_number(float(value))

@@ -53,11 +53,11 @@ def format_budget(metadata: Sequence[Mapping[str, Any]]) -> str:
     Raises:
         ValueError: If the budget of a job is not in `store.BUDGETS`.
     """
-    kinds = list(dict.fromkeys(_kind(meta) for meta in metadata))
+    kinds = list(dict.fromkeys(_budget_kind(meta) for meta in metadata))
     if len(kinds) > 1:
         return f"Budget: differs between jobs ({', '.join(kinds)})."
     (kind,) = kinds
-    return f"Budget: {kind}{_measured(kind, metadata)}."
+    return f"Budget: {kind}{_format_measured(kind, metadata)}."
 
 
 def pareto_front(cell: str, rows: pd.DataFrame, group: str) -> ParetoFront:
@@ -102,7 +102,7 @@ def pareto_mask(cost: Array, loss: Array) -> np.ndarray:
     return ~(no_worse & less).any(axis=0) & np.isfinite(loss)
 
 
-def _kind(meta: Mapping[str, Any]) -> str:
+def _budget_kind(meta: Mapping[str, Any]) -> str:
     """Return the budget of a job."""
     config = meta.get("config")
     kind = str(
@@ -118,7 +118,7 @@ def _kind(meta: Mapping[str, Any]) -> str:
     return kind
 
 
-def _numbers(metadata: Sequence[Mapping[str, Any]]) -> str:
+def _format_counts(metadata: Sequence[Mapping[str, Any]]) -> str:
     """Format the most frequent number of particles and the filters with other numbers."""
     by_label = [
         (int(meta["particles"]), str(meta.get("label", "")))
@@ -133,10 +133,10 @@ def _numbers(metadata: Sequence[Mapping[str, Any]]) -> str:
         texts.append(
             f"{number} of {', '.join(labels)}" if 0 < len(labels) <= _NAMED else str(number)
         )
-    return f"N = {', '.join([str(most), *texts])}{_changing(metadata)}"
+    return f"N = {', '.join([str(most), *texts])}{_format_adaptive_counts(metadata)}"
 
 
-def _changing(metadata: Sequence[Mapping[str, Any]]) -> str:
+def _format_adaptive_counts(metadata: Sequence[Mapping[str, Any]]) -> str:
     """Format the particle counts of filters that adapt them."""
     used: dict[str, list[Mapping[str, float]]] = {}
     for meta in metadata:
@@ -150,7 +150,7 @@ def _changing(metadata: Sequence[Mapping[str, Any]]) -> str:
     return "".join(f", {text}" for text in texts)
 
 
-def _measured(kind: str, metadata: Sequence[Mapping[str, Any]]) -> str:
+def _format_measured(kind: str, metadata: Sequence[Mapping[str, Any]]) -> str:
     """Format the measured budget of the particle filters."""
     jobs = [meta for meta in metadata if meta.get("particles")]
     if not jobs:
@@ -160,7 +160,7 @@ def _measured(kind: str, metadata: Sequence[Mapping[str, Any]]) -> str:
         return (
             f" (N = {numbers[0]} in each particle filter)"
             if len(numbers) == 1
-            else f" not met ({_numbers(metadata)})"
+            else f" not met ({_format_counts(metadata)})"
         )
     if kind == SAME_TIME:
         return _format_costs(
@@ -186,12 +186,14 @@ def _format_costs(
     for meta, cost, price in zip(metadata, costs, prices, strict=True):
         if not price / _CLOSE <= cost <= price * _CLOSE:
             far.setdefault(str(meta.get("label", "")), []).append(cost / price)
-    text = f"{scale * min(costs):.3g} to {scale * max(costs):.3g} {unit}, particle filters only, {_numbers(metadata)}"
-    missed = [f"{label} ({_range(ratios)} times the target)" for label, ratios in far.items()]
+    text = f"{scale * min(costs):.3g} to {scale * max(costs):.3g} {unit}, particle filters only, {_format_counts(metadata)}"
+    missed = [
+        f"{label} ({_format_range(ratios)} times the target)" for label, ratios in far.items()
+    ]
     return f" not met by {', '.join(missed)} ({text})" if missed else f" ({text})"
 
 
-def _range(values: Sequence[float]) -> str:
+def _format_range(values: Sequence[float]) -> str:
     """Format the range of values."""
     low, high = (f"{value:.2g}" for value in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"

@@ -121,7 +121,7 @@ def _statistics_figures(sheet: store.JobResult) -> Iterator[_Figure]:
         )
         yield "residuals", text, scenario_figures.plot_residuals
         text = "Residuals of the first run over time, with lines at two standard deviations."
-        yield "residuals_time", text, scenario_figures.plot_over_time
+        yield "residuals_time", text, scenario_figures.plot_residuals_over_time
     if sheet.meta["runs"] > 1 and scenario_data.compute_spreads(sheet):
         text = "Spread of the true states over the runs (standard deviation of the norm)"
         if "bound" in sheet.data:
@@ -152,7 +152,7 @@ def list_facts(sheet: store.JobResult) -> list[str]:
         total = data["elevation"].shape[1]
         texts.append(f"Satellites above the horizon: {least} to {visible.max()} of {total}.")
     residual = data["residual"]
-    is_equal = scenario_data.distinct_tracks(residual).shape[0] == 1
+    is_equal = scenario_data.drop_equal_runs(residual).shape[0] == 1
     if is_equal and meta["runs"] > 1 and not np.isnan(residual).all():
         texts.append("All runs have equal residuals, which are counted once.")
     return [*texts, f"{meta['bound'][0].upper()}{meta['bound'][1:]}."]
@@ -183,7 +183,7 @@ def list_missing_figures(sheet: store.JobResult) -> list[str]:
     if unknown.any():
         kinds = ", ".join(
             f"{kind} ({n} of {meta['kinds'].count(kind)})"
-            for kind, n in _counted(meta["kinds"], unknown).items()
+            for kind, n in _count_kinds(meta["kinds"], unknown).items()
         )
         reasons.append(f"Residuals of {kinds}: they depend on states without truth.")
     if meta["runs"] < 2:
@@ -238,7 +238,7 @@ def spread_table(sheet: store.JobResult) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _counted(kinds: Sequence[str], flags: np.ndarray) -> dict[str, int]:
+def _count_kinds(kinds: Sequence[str], flags: np.ndarray) -> dict[str, int]:
     """Count the flagged components of each kind."""
     flagged = [kind for kind, flag in zip(kinds, flags, strict=True) if flag]
     return {kind: flagged.count(kind) for kind in dict.fromkeys(flagged)}

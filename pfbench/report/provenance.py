@@ -37,7 +37,7 @@ def list_shared_settings(conditions: Sequence[Condition]) -> list[tuple[str, str
     """List the settings of all jobs; a mixed report has several values."""
     rows = []
     for name, path in _SHARED:
-        values = [_at(job.meta, path) for cell in conditions for job in cell.jobs]
+        values = [_value_at(job.meta, path) for cell in conditions for job in cell.jobs]
         rows.append(
             (
                 name,
@@ -65,7 +65,7 @@ def compute_cost(conditions: Sequence[Condition], planned: int | None) -> list[t
         if parts[name]
     )
     target = f" of {planned} in the experiment" if planned else ""
-    elapsed = f"{_duration(parts.total())} ({shares})" if shares else "not recorded"
+    elapsed = f"{_format_duration(parts.total())} ({shares})" if shares else "not recorded"
     return [("jobs", f"{len(jobs)}{target}"), ("time of all jobs", elapsed)]
 
 
@@ -97,10 +97,14 @@ def modelling_choices(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
 def format_bibtex(conditions: Sequence[Condition]) -> str:
     """Format a BibTeX entry with the versions and the year of the results."""
     metadata = [job.meta for cell in conditions for job in cell.jobs]
-    version = ", ".join(distinct_values(str(_at(meta, "versions.pfbench")) for meta in metadata))
+    version = ", ".join(
+        distinct_values(str(_value_at(meta, "versions.pfbench")) for meta in metadata)
+    )
     commit = ", ".join(
         distinct_values(
-            str(_at(meta, "versions.commit")) for meta in metadata if _at(meta, "versions.commit")
+            str(_value_at(meta, "versions.commit"))
+            for meta in metadata
+            if _value_at(meta, "versions.commit")
         )
     )
     years = [str(meta["created"])[:4] for meta in metadata if meta.get("created")]
@@ -115,7 +119,7 @@ def format_bibtex(conditions: Sequence[Condition]) -> str:
     )
 
 
-def _duration(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     """Format a duration in s, min or h."""
     if seconds < 120:
         return f"{seconds:.0f} s"
@@ -127,7 +131,7 @@ def distinct_values(values: Iterable[str]) -> list[str]:
     return sorted(set(values), key=natural_sort_key)
 
 
-def _at(meta: Any, path: str) -> Any:
+def _value_at(meta: Any, path: str) -> Any:
     """Return the value at a dotted path, or None."""
     for name in path.split("."):
         meta = meta.get(name) if isinstance(meta, Mapping) else None

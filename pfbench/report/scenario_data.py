@@ -10,7 +10,7 @@ from pfbench.results import store
 from pfbench.results.state_groups import component_groups
 
 
-def count_satellites(sheet: store.JobResult) -> list[str]:
+def list_satellites(sheet: store.JobResult) -> list[str]:
     """Return the names of the satellites, from the scenario, its receiver, or as numbers."""
     if "satellites" in sheet.data:
         return [
@@ -70,7 +70,7 @@ def compute_deviation(data: dict[str, np.ndarray], indices: list[int]) -> np.nda
 
 def group_residuals(sheet: store.JobResult) -> dict[str, np.ndarray]:
     """Group the residuals [R or 1, T, k] by kind of measurement, without missing components."""
-    z = distinct_tracks(sheet.data["residual"].astype(np.float64))
+    z = drop_equal_runs(sheet.data["residual"].astype(np.float64))
     finite_mask = ~np.isnan(z).all((0, 1))
     kinds = np.array(sheet.meta["kinds"])
     groups = {
@@ -79,7 +79,7 @@ def group_residuals(sheet: store.JobResult) -> dict[str, np.ndarray]:
     return {str(kind): values for kind, values in groups.items() if values.shape[-1]}
 
 
-def distinct_tracks(z: np.ndarray) -> np.ndarray:
+def drop_equal_runs(z: np.ndarray) -> np.ndarray:
     """Return a single run if all runs have equal residuals, else all runs."""
     return z[:1] if np.allclose(z, z[:1], rtol=0, atol=1e-4, equal_nan=True) else z
 

@@ -37,7 +37,7 @@ class StudySummary:
         incomplete: Conditions with missing filters, and the number of these filters.
         group: Compared group, with the groups by scenario if they differ.
         ranked: Filters and mean ranks, best first; empty without a test across conditions.
-        decided: Number of pairs with a significant difference across conditions.
+        decisions: Number of pairs with a significant difference across conditions.
         pairs: Number of pairs across conditions.
         unbeaten: Top group across conditions.
         often: Filters and the number of conditions in which they are in the top group, most first.
@@ -56,7 +56,7 @@ class StudySummary:
     incomplete: tuple[tuple[str, int], ...]
     group: str
     ranked: tuple[tuple[str, float], ...]
-    decided: int
+    decisions: int
     pairs: int
     unbeaten: tuple[str, ...]
     often: tuple[tuple[str, int], ...]
@@ -78,7 +78,7 @@ def select_main_group(groups: Sequence[str]) -> str:
     return "position" if "position" in groups else groups[0] if groups else ""
 
 
-def merge(
+def select_main_rows(
     table: pd.DataFrame, decided: Sequence[PairwiseTest], mains: Mapping[CellName, str]
 ) -> tuple[pd.DataFrame, list[PairwiseTest], str]:
     """Select the rows and pairwise tests of the main groups, under a common name.
@@ -129,7 +129,7 @@ def summarise_study(
     everyone = set().union(*labels.values()) if labels else set()
     by_name = sorted(labels.items(), key=lambda item: natural_sort_key(item[0]))
     lacking = [(cell, len(everyone - filters)) for cell, filters in by_name]
-    often, compared = _unbeaten(decided)
+    often, compared = _count_top_groups(decided)
     runs: Counter[str] = Counter()
     lost: Counter[str] = Counter()
     diverged: Counter[str] = Counter()
@@ -142,10 +142,10 @@ def summarise_study(
     return StudySummary(
         filters=len(everyone), cells=len(labels), worlds=len({name for name, _, _ in mains}),
         regimes=len({noise for _, noise, _ in mains}), runs=runs.total(),
-        incomplete=tuple(item for item in lacking if item[1]), group=_named(ranking.group, mains),
+        incomplete=tuple(item for item in lacking if item[1]), group=_format_group(ranking.group, mains),
         ranked=tuple(sorted(zip(ranking.filters, ranking.ranks, strict=False), key=lambda item: (item[1], natural_sort_key(item[0])))),
-        decided=ranking.shown, pairs=len(ranking.pairs), unbeaten=tuple(ranking.unbeaten) if ranking.pairs else (), often=often,
-        compared=compared, lost=_most(lost, runs), diverged=_most(diverged, runs), overconfident=_most(severe, runs),
+        decisions=ranking.shown, pairs=len(ranking.pairs), unbeaten=tuple(ranking.unbeaten) if ranking.pairs else (), often=often,
+        compared=compared, lost=_order_by_share(lost, runs), diverged=_order_by_share(diverged, runs), overconfident=_order_by_share(severe, runs),
         planned=tuple(pairs),
     )  # fmt: skip
 
@@ -157,7 +157,7 @@ def list_top_group(decided: Sequence[PairwiseTest]) -> list[str]:
     return [label for label in labels if label not in worse]
 
 
-def _unbeaten(decided: Sequence[PairwiseTest]) -> tuple[tuple[tuple[str, int], ...], int]:
+def _count_top_groups(decided: Sequence[PairwiseTest]) -> tuple[tuple[tuple[str, int], ...], int]:
     """Count the conditions in which each filter is in the top group, and all conditions."""
     cells: dict[CellName, list[PairwiseTest]] = {}
     for v in decided:
@@ -170,12 +170,14 @@ def _unbeaten(decided: Sequence[PairwiseTest]) -> tuple[tuple[tuple[str, int], .
     ), len(cells)
 
 
-def _most(count: Mapping[str, int], runs: Mapping[str, int]) -> tuple[tuple[str, int, int], ...]:
+def _order_by_share(
+    count: Mapping[str, int], runs: Mapping[str, int]
+) -> tuple[tuple[str, int, int], ...]:
     rows = [(label, n, runs[label]) for label, n in count.items() if n]
     return tuple(sorted(rows, key=lambda row: (-row[1] / row[2], natural_sort_key(row[0]))))
 
 
-def _named(group: str, mains: Mapping[CellName, str]) -> str:
+def _format_group(group: str, mains: Mapping[CellName, str]) -> str:
     """Format the main group, or the main groups by scenario, the most frequent first."""
     if group != MAIN:
         return group

@@ -32,7 +32,7 @@ def overview_table(results: Results, alpha: float = 0.05) -> pd.DataFrame:
         results: Results by label, from the start time on.
         alpha: Probability outside the NIS interval.
     """
-    rows = pd.DataFrame([_ran(label, result, alpha) for label, result in results.items()])
+    rows = pd.DataFrame([_overview_row(label, result, alpha) for label, result in results.items()])
     heads = [
         metric.column_head() for metric in metrics.METRICS if metric.scope == "job" and metric.head
     ]
@@ -64,10 +64,10 @@ def accuracy_table(
     for label, result in results.items():
         for block in component_groups(result.meta["state"]):
             if block.group == group:
-                row = {"filter": label, **_accuracy(result, block, alpha)}
+                row = {"filter": label, **_accuracy_row(result, block, alpha)}
                 if bound is not None:
-                    row |= _settled((full_results or results)[label], block, bound)
-                rows.append({**row, **_standing(label, verdicts)} if verdicts else row)
+                    row |= _convergence_column((full_results or results)[label], block, bound)
+                rows.append({**row, **_count_decisions(label, verdicts)} if verdicts else row)
     return pd.DataFrame(rows)
 
 
@@ -86,11 +86,11 @@ def short_accuracy_table(table: pd.DataFrame) -> pd.DataFrame:
     return table[[name for name in table if str(name).startswith(heads)]]
 
 
-def _ran(label: str, result: store.JobResult, alpha: float) -> dict[str, Any]:
+def _overview_row(label: str, result: store.JobResult, alpha: float) -> dict[str, Any]:
     meta, data = result.meta, result.data
     lost, particles = data["lost"], meta.get("particles")
     count = status.count_statuses(result)
-    nis, band = _nis(result, alpha)
+    nis, band = _mean_nis(result, alpha)
     return {
         "filter": label,
         "asymptotically exact": bool(meta.get("exact")),
@@ -111,7 +111,7 @@ def _ran(label: str, result: store.JobResult, alpha: float) -> dict[str, Any]:
     }
 
 
-def _nis(result: store.JobResult, alpha: float) -> tuple[float, str]:
+def _mean_nis(result: store.JobResult, alpha: float) -> tuple[float, str]:
     """Normalised innovation squared per component seen, over the runs that were not lost, and its band."""
     if "nis" not in result.data:
         return np.nan, ""
@@ -126,13 +126,15 @@ def _nis(result: store.JobResult, alpha: float) -> tuple[float, str]:
     return float(np.nansum(nis) / count), f"{float(low) / count:.3g} to {float(high) / count:.3g}"
 
 
-def _settled(result: store.JobResult, block: ComponentGroup, bound: float) -> dict[str, Any]:
+def _convergence_column(
+    result: store.JobResult, block: ComponentGroup, bound: float
+) -> dict[str, Any]:
     error = result.data["error"][..., block.places].astype(np.float64) * block.scale
     when = error_measures.convergence_time(result.data["time"], error, result.data["lost"], bound)
     return {f"median time to {bound:g} {block.unit} [s]": float(np.median(when[~np.isnan(when)]))}
 
 
-def _accuracy(result: store.JobResult, block: ComponentGroup, alpha: float) -> dict[str, Any]:
+def _accuracy_row(result: store.JobResult, block: ComponentGroup, alpha: float) -> dict[str, Any]:
     data, lost, groups = result.data, result.data["lost"], result.meta["state"]["groups"]
     error = data["error"][..., block.places].astype(np.float64) * block.scale
     norm = error_measures.rmse_norm(error, lost)
@@ -171,7 +173,7 @@ def _accuracy(result: store.JobResult, block: ComponentGroup, alpha: float) -> d
     return row
 
 
-def _standing(label: str, verdicts: Sequence[PairwiseTest]) -> dict[str, Any]:
+def _count_decisions(label: str, verdicts: Sequence[PairwiseTest]) -> dict[str, Any]:
     """Count the filters that are worse and better than a filter."""
     met = [v for v in verdicts if label in (v.a, v.b)]
     beaten = sum(v.winner not in (label, INCONCLUSIVE) for v in met)

@@ -192,7 +192,7 @@ def test_traces_are_drawn_with_what_is_printed_of_them(results: Path) -> None:
 def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
     for label in ("sir", "cpso_escape"):
         result = loaded(results, label)
-        each = experiment_plots.relative_axes(result)
+        each = experiment_plots.mean_relative_error(result)
         assert each.size == (~result.data["lost"]).sum()
         error = result.data["error"][..., [6, 7]]
         mean = error_measures.relative_error(error, result.data["lost"], result.data["range"])

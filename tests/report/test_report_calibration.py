@@ -154,11 +154,11 @@ def test_columns_and_lines(loaded):
 def test_of_many_filters_the_best_and_the_least_believable_are_drawn(study, loaded):
     rows = frame.load_frame("demo", study)
     groups = ["velocity", "position"]
-    assert list(condition_figures.has_spread(loaded, rows, groups)) == list(loaded)
+    assert list(condition_figures.select_spread_filters(loaded, rows, groups)) == list(loaded)
     more = {**loaded, "twin": loaded["honest"]}
     again = rows[rows.label == "honest"].assign(label="twin")
     again.loc[again.metric == "rmse", "value"] *= 0.5
-    chosen = condition_figures.has_spread(more, pd.concat([rows, again]), groups)
+    chosen = condition_figures.select_spread_filters(more, pd.concat([rows, again]), groups)
     assert set(chosen) == {"twin", "narrow"}
     assert "of 5 filters the one with the smallest median RMSE of position" in chosen["twin"]
     assert "largest distance of NEES" in chosen["narrow"]

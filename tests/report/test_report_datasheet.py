@@ -159,13 +159,13 @@ def test_the_sky_has_north_up_and_east_to_the_right_and_names(whole: store.JobRe
 def test_a_scene_may_spell_its_satellites_and_show_them_at_some_steps_alone(
     whole: store.JobResult,
 ) -> None:
-    assert scenario_data.count_satellites(whole) == ["G01", "G02", "G07", "G30"]
+    assert scenario_data.list_satellites(whole) == ["G01", "G02", "G07", "G30"]
     codes = [[ord(letter) for letter in name] for name in ("E1 ", "R24", "G05", "C06")]
     spelled = whole.data | {"satellites": np.array(codes, np.float32)}
     for name in ("azimuth", "elevation"):
         spelled[name] = np.where(np.arange(STEPS)[:, None] % 3 == 0, spelled[name], np.nan)
     sheet = store.JobResult(whole.meta, spelled)
-    assert scenario_data.count_satellites(sheet) == ["E1", "R24", "G05", "C06"]
+    assert scenario_data.list_satellites(sheet) == ["E1", "R24", "G05", "C06"]
     assert any(
         fact == "Satellites above the horizon: 3 to 4 of 4." for fact in datasheet.list_facts(sheet)
     )

@@ -108,7 +108,7 @@ def test_letters_of_figures_of_many_filters_can_be_read_and_are_not_cut(
         for k, noise in product(range(worlds), table.noise.unique())
     }
     some = table[table.label.isin([*BASES, "dmc_reconstructed_printed"])]
-    own, decided, name = summary.merge(some, compare_pairs(some), of)
+    own, decided, name = summary.select_main_rows(some, compare_pairs(some), of)
     source = condition_blocks.ranking_blocks(table, name)
     one, pairs = (
         rankings.rank_filters(table, name),
@@ -118,7 +118,7 @@ def test_letters_of_figures_of_many_filters_can_be_read_and_are_not_cut(
     style = plotting.mute_others(plotting.line_styles(sorted(set(table.label))), BASES[:3])
     made = {
         "map": lambda: summary_figures.plot_ratio_map(one, source),
-        "proposed": lambda: summary_figures.proposed_filters(pairs),
+        "proposed": lambda: summary_figures.plot_baseline_ratios(pairs),
         "matrix": lambda: comparison_plots.plot_matrix(decided, one),
         "rank": lambda: rank_plots.plot_critical_difference(one, style),
         "forest": lambda: comparison_plots.plot_forest(

@@ -45,7 +45,7 @@ def mains(group_of=lambda world: "position"):
 
 
 def found(table, of=None):
-    own, decided, name = summary.merge(
+    own, decided, name = summary.select_main_rows(
         table, compare_pairs(table[table.group != "velocity"]), of or mains()
     )
     source = condition_blocks.ranking_blocks(own, name)

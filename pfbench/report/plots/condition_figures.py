@@ -16,7 +16,9 @@ from pfbench.report.plots.filter_plots import MANY_FILTERS, TRACES
 from pfbench.report.plots.plotting import LineStyle, format_slug
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
-_SPREAD_FILTERS = 4  # with more filters, only those of `has_spread` have a spread figure [ours]
+_SPREAD_FILTERS = (
+    4  # with more filters, only those of `select_spread_filters` have a spread figure [ours]
+)
 _VALID = "valid runs"
 
 
@@ -67,7 +69,9 @@ def condition_figures(
     return figures
 
 
-def has_spread(results: Results, runs: pd.DataFrame, groups: Sequence[str]) -> dict[str, str]:
+def select_spread_filters(
+    results: Results, runs: pd.DataFrame, groups: Sequence[str]
+) -> dict[str, str]:
     """Select the filters that have a spread figure [ours].
 
     Up to four filters all have one. Of more filters, two have one. The first has the smallest
@@ -183,7 +187,7 @@ def _spread_figures(
     results: Results, runs: pd.DataFrame, style: Mapping[str, LineStyle], groups: Sequence[str]
 ) -> Iterator[FigureSpec]:
     """Yield the error and the estimated standard deviation of single filters."""
-    for label, reason in has_spread(results, runs, groups).items():
+    for label, reason in select_spread_filters(results, runs, groups).items():
         result = results[label]
         text = (
             f"{label}{reason}: error over time, median and 5 to 95 % of the {_VALID} (shaded), and "

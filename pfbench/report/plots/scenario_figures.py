@@ -87,7 +87,7 @@ def plot_sky(sheet: store.JobResult) -> Figure:
     zenith = 90 - np.degrees(sheet.data["elevation"].astype(float))
     angle = _free_direction(azimuth, zenith)
     axis.set_rgrids([30, 60], labels=["60°", "30°"], angle=angle, color="0.4", fontsize=6.5)
-    names = scenario_data.count_satellites(sheet)
+    names = scenario_data.list_satellites(sheet)
     looks = line_styles(names)
     for k, name in enumerate(names):
         steps = np.flatnonzero(~np.isnan(azimuth[:, k]) & ~np.isnan(zenith[:, k]))
@@ -152,7 +152,7 @@ def plot_residuals(sheet: store.JobResult) -> Figure:
     return figure
 
 
-def plot_over_time(sheet: store.JobResult) -> Figure:
+def plot_residuals_over_time(sheet: store.JobResult) -> Figure:
     """Plot the residuals of the first run over time."""
     kinds = scenario_data.group_residuals(sheet)
     figure, panels = stacked_axes(len(kinds), 1.3)

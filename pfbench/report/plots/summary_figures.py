@@ -54,7 +54,7 @@ def summary_figures(
         )
         figures.append(
             FigureSpec(
-                f"proposed_{format_slug(ranking.group)}", text, partial(proposed_filters, pairs)
+                f"proposed_{format_slug(ranking.group)}", text, partial(plot_baseline_ratios, pairs)
             )
         )
     if len(source.filters) > 2 and 2 < len(source.cells) <= _WIDE:
@@ -70,7 +70,7 @@ def summary_figures(
     return figures
 
 
-def proposed_filters(pairs: Sequence[BaselineComparison]) -> Figure:
+def plot_baseline_ratios(pairs: Sequence[BaselineComparison]) -> Figure:
     """Plot the RMSE ratios, a row per pair and a dot per condition."""
     figure = Figure(figsize=(COLUMN, 0.7 + 0.21 * len(pairs)), layout=build_padded_layout())
     axis = figure.subplots()

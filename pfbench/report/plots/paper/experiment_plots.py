@@ -37,7 +37,7 @@ def plot_against(
         points = [
             (x + offset, runs[label]) for x, runs in enumerate(values.values()) if label in runs
         ]
-        _dots(axis, points, style[label], label)
+        _draw_points(axis, points, style[label], label)
     axis.set_xticks(range(len(values)), list(values))
     axis.set(ylabel=ylabel, xlim=(-0.6, len(values) - 0.4))
     axis.grid(False, axis="x")
@@ -72,8 +72,8 @@ def plot_maxima(
         measures = [_error_measures(result, block, name, start) for name in names]
         peaks = [(x + offset - 0.05, peak) for x, (peak, _) in enumerate(measures)]
         sizes = [(x + offset + 0.05, rmse) for x, (_, rmse) in enumerate(measures)]
-        _dots(axis, peaks, style[label], label)
-        _dots(axis, sizes, style[label], "", open_=True)
+        _draw_points(axis, peaks, style[label], label)
+        _draw_points(axis, sizes, style[label], "", open_=True)
         values += [value for _, value in (*peaks, *sizes)]
         if label in printed:
             cross: Any = {"ls": "none", "marker": "x", "ms": 6, "mew": 1.3, "zorder": 5}
@@ -100,7 +100,7 @@ def _error_measures(
     return block.scale * peak, block.scale * error_measures.rmse_per_run(error, no_run_lost)
 
 
-def relative_axes(result: store.JobResult) -> np.ndarray:
+def mean_relative_error(result: store.JobResult) -> np.ndarray:
     """Compute the mean over time of Err of each valid run, %."""
     valid = relative_error_percent(result)[~result.data["lost"]]
     return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
@@ -117,7 +117,7 @@ def mean_trace_per_run(result: store.JobResult, name: str) -> np.ndarray:
     return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
 
 
-def _dots(
+def _draw_points(
     axis: Axes,
     points: Sequence[tuple[float, np.ndarray]],
     look: LineStyle,

@@ -48,7 +48,7 @@ def plot_errors(
             index = block.places[block.components.index(component)]
             time, values = _valid_runs(result, result.data["error"][..., index])
             band = compute_run_quantiles(values * block.scale, BAND_QUANTILES)
-            _banded(axis, time, band, style[label], label, len(results))
+            _draw_band(axis, time, band, style[label], label, len(results))
             curves.append(band)
             if before and len(curves) == 1:  # equal for all filters, which share the data
                 for edge in band[::2, 0]:
@@ -81,7 +81,7 @@ def plot_paper_trace(
     for label, result in results.items():
         time, values = _valid_runs(result, result.data[name])
         band = compute_run_quantiles(values, BAND_QUANTILES)
-        _banded(axis, time, band, style[label], label, len(results))
+        _draw_band(axis, time, band, style[label], label, len(results))
     if np.isfinite(printed).all():
         axis.axhspan(*printed, color="0.88", lw=0, zorder=0)
     axis.set(xlabel="time [s]", ylabel=unit)
@@ -125,7 +125,7 @@ def plot_relative_errors(
         for label, result in results.items():
             time, values = _valid_runs(result, relative_error_percent(result))
             band = compute_run_quantiles(values, BAND_QUANTILES)
-            _banded(axis, time, band, style[label], label, len(results))
+            _draw_band(axis, time, band, style[label], label, len(results))
             lines += list(band)
         axis.set(title=name, ylabel="Err [%]")
         use_log_if_wide(axis, axis.yaxis, lines)
@@ -149,7 +149,7 @@ def _valid_runs(result: store.JobResult, values: np.ndarray) -> tuple[np.ndarray
     return result.data["time"][steps], valid[:, steps]
 
 
-def _banded(
+def _draw_band(
     axis: Axes, time: np.ndarray, band: np.ndarray, look: LineStyle, label: str, among: int
 ) -> None:
     """Draw a median with its band, whose edges are lines so that overlapping bands stay distinct."""
@@ -168,7 +168,7 @@ def _banded(
     )
 
 
-def _late(curve: np.ndarray) -> float:
+def _late_level(curve: np.ndarray) -> float:
     """Return the 90 % quantile of absolute values [q, T] after the first third, 0 without values."""
     sizes = np.abs(curve[:, curve.shape[1] // 3 :])
     finite = sizes[np.isfinite(sizes)]
@@ -182,7 +182,7 @@ def _symlog_if_wide(axis: Axes, curves: Sequence[np.ndarray]) -> None:
     """
     sizes = np.concatenate([np.abs(curve).ravel() for curve in curves]) if curves else np.empty(0)
     sizes = sizes[np.isfinite(sizes)]
-    late = [_late(curve) for curve in curves]
+    late = [_late_level(curve) for curve in curves]
     level = min((size for size in late if size > 0), default=0.0)
     if sizes.max(initial=0.0) > 8 * level > 0:
         decades = float(np.log10(sizes.max() / level))
