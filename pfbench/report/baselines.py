@@ -92,17 +92,17 @@ class BaselineComparison:
 
 
 def compare_with_baselines(
-    source: RankingBlocks, decided: Sequence[PairwiseTest], alpha: float
+    source: RankingBlocks, tests: Sequence[PairwiseTest], alpha: float
 ) -> list[BaselineComparison]:
     """Compare all pairs of `BASELINES` with results in at least five conditions.
 
     Args:
         source: Blocks of the main groups.
-        decided: Pairwise tests of the main groups.
+        tests: Pairwise tests of the main groups.
         alpha: Level after Holm's correction.
     """
     winners = {
-        (f"{v.scenario} / {v.noise} / {v.model}", frozenset((v.a, v.b))): v.winner for v in decided
+        (f"{v.scenario} / {v.noise} / {v.model}", frozenset((v.a, v.b))): v.winner for v in tests
     }
     comparisons = []
     for method, baselines in BASELINES.items():

@@ -79,13 +79,13 @@ def select_main_group(groups: Sequence[str]) -> str:
 
 
 def select_main_rows(
-    table: pd.DataFrame, decided: Sequence[PairwiseTest], mains: Mapping[CellName, str]
+    table: pd.DataFrame, tests: Sequence[PairwiseTest], mains: Mapping[CellName, str]
 ) -> tuple[pd.DataFrame, list[PairwiseTest], str]:
     """Select the rows and pairwise tests of the main groups, under a common name.
 
     Args:
         table: Rows of `load_frame`.
-        decided: All pairwise tests.
+        tests: All pairwise tests.
         mains: Main group by condition.
     """
     names = {group for group in mains.values() if group}
@@ -98,7 +98,7 @@ def select_main_rows(
     ].assign(group=name)
     main_tests = [
         replace(v, group=name)
-        for v in decided
+        for v in tests
         if v.group == mains.get((v.scenario, v.noise, v.model))
     ]
     return rows, main_tests, name
@@ -106,7 +106,7 @@ def select_main_rows(
 
 def summarise_study(
     ranking: RankingResult,
-    decided: Sequence[PairwiseTest],
+    tests: Sequence[PairwiseTest],
     pairs: Sequence[BaselineComparison],
     table: pd.DataFrame,
     mains: Mapping[CellName, str],
@@ -116,7 +116,7 @@ def summarise_study(
 
     Args:
         ranking: Ranking of the main groups.
-        decided: Pairwise tests of the main groups.
+        tests: Pairwise tests of the main groups.
         pairs: Result of `compare_with_baselines`.
         table: Rows of the main groups.
         mains: Main group by condition.
@@ -129,7 +129,7 @@ def summarise_study(
     everyone = set().union(*labels.values()) if labels else set()
     by_name = sorted(labels.items(), key=lambda item: natural_sort_key(item[0]))
     lacking = [(cell, len(everyone - filters)) for cell, filters in by_name]
-    often, compared = _count_top_groups(decided)
+    often, compared = _count_top_groups(tests)
     runs: Counter[str] = Counter()
     lost: Counter[str] = Counter()
     diverged: Counter[str] = Counter()
@@ -150,21 +150,21 @@ def summarise_study(
     )  # fmt: skip
 
 
-def list_top_group(decided: Sequence[PairwiseTest]) -> list[str]:
+def list_top_group(tests: Sequence[PairwiseTest]) -> list[str]:
     """List the filters that no other filter is better than, in the order of the comparisons."""
-    labels = dict.fromkeys(label for v in decided for label in (v.a, v.b))
-    worse = {v.b if v.winner == v.a else v.a for v in decided if v.winner != INCONCLUSIVE}
+    labels = dict.fromkeys(label for v in tests for label in (v.a, v.b))
+    worse = {v.b if v.winner == v.a else v.a for v in tests if v.winner != INCONCLUSIVE}
     return [label for label in labels if label not in worse]
 
 
-def _count_top_groups(decided: Sequence[PairwiseTest]) -> tuple[tuple[tuple[str, int], ...], int]:
+def _count_top_groups(tests: Sequence[PairwiseTest]) -> tuple[tuple[tuple[str, int], ...], int]:
     """Count the conditions in which each filter is in the top group, and all conditions."""
     cells: dict[CellName, list[PairwiseTest]] = {}
-    for v in decided:
+    for v in tests:
         cells.setdefault((v.scenario, v.noise, v.model), []).append(v)
     count: Counter[str] = Counter()
-    for tests in cells.values():
-        count.update(list_top_group(tests))
+    for condition_tests in cells.values():
+        count.update(list_top_group(condition_tests))
     return tuple(
         sorted(count.items(), key=lambda item: (-item[1], natural_sort_key(item[0])))
     ), len(cells)

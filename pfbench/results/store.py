@@ -161,10 +161,9 @@ def list_results(folder: str | Path) -> Iterator[JobResult]:
 def list_failures(folder: str | Path) -> list[dict[str, Any]]:
     """Read the failure notes of a folder, by key, of jobs without a result."""
     notes = sorted(Path(folder).glob("*.failed.json"))
-    open_notes = (
-        n for n in notes if not n.with_name(n.name.replace(".failed.json", ".npz")).exists()
-    )
-    return [json.loads(note.read_text()) for note in open_notes]
+    results = (note.with_name(note.name.replace(".failed.json", ".npz")) for note in notes)
+    pairs = zip(notes, results, strict=True)
+    return [json.loads(note.read_text()) for note, result in pairs if not result.exists()]
 
 
 def _without(config: Any, paths: set[tuple[str, ...]]) -> Any:

@@ -166,9 +166,7 @@ def make_relative_error_figures(source: PaperFigureInput) -> list[FigureSpec]:
     quantity = "Err, the horizontal error in % of the horizontal range [eq. 20 as repaired]"
     head, runs = f"{source.figure.title}: {quantity}", _format_runs(*source.data)
     values = {
-        name: {
-            label: experiment_plots.mean_relative_error(result) for label, result in results.items()
-        }
+        name: {label: experiment_plots.mean_relative_error(r) for label, r in results.items()}
         for name, results in experiments.items()
     }
     return [
