@@ -107,7 +107,7 @@ def test_one_report_that_fails_stops_no_other(made: dict[str, Any], tmp_path: Pa
     assert said.code == 1
     assert "mine" in made
     assert "broken: failed: the cell holds results that differ" in said.err
-    assert "1 of 2 reports failed: broken" in said.err
+    assert "all 2 reports must be written, got 1 failures: broken" in said.err
 
 
 def test_without_any_results_everything_stays(made: dict[str, Any], tmp_path: Path) -> None:
