@@ -26,7 +26,8 @@ from pfbench.filter.belief import (
 from pfbench.filter.gaussian.covariance_matching import MatrixNoiseAdaptation
 from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter, EnsembleTransformUpdate
 from pfbench.filter.gaussian.gain_adaptation import AdaptiveFactorGain, BoundedRatioGain
-from pfbench.filter.gaussian.gaussian_filter import GainAdaptation, GaussianFilter, NoiseAdaptation
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.innovation import GainAdaptation, NoiseAdaptation
 from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation, TaylorLinearisation
 from pfbench.filter.gaussian.noise_adaptation import ConstrainedNoiseAdaptation, FadingMemory
 from pfbench.filter.gaussian.spherical_radial import (

@@ -16,7 +16,7 @@ from torch import Tensor
 from pfbench.core import covariance, density
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.belief import ParticleBelief, gather_ancestors
-from pfbench.filter.gaussian import gaussian_filter, linearisation_rules
+from pfbench.filter.gaussian import gaussian_filter, kalman_update, linearisation_rules
 from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, UnscentedPoints
 from pfbench.filter.gaussian.spherical_radial import (
     RadialDegree5,
@@ -201,7 +201,7 @@ def test_an_update_by_hand_solves_the_least_squares(
     size = information.diagonal(dim1=-2, dim2=-1).sqrt()
     for shift, root, least, scales, ok in (
         cpp.kalman_update(m, r, omega),
-        gaussian_filter._separate_update(m, r, omega),
+        kalman_update._separate_update(m, r, omega),
     ):
         assert torch.equal(ok, rooted)
         assert torch.equal(

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.gaussian_filter import Innovation, kalman_gain_update
+from pfbench.filter.gaussian.innovation import Innovation
+from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.gaussian.noise_adaptation import scale_columns
 from pfbench.filter.gaussian.principal_axes import (

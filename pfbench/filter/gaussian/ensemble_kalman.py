@@ -19,7 +19,7 @@ from pfbench.core.covariance import factor, shared_distribution_covariance
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo
-from pfbench.filter.gaussian.gaussian_filter import around_first
+from pfbench.filter.gaussian.linearisation_rules import around_first
 from pfbench.filter.linearisation import check_moments, mask_covariance
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.particle_moments import summarise

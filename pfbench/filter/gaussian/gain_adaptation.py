@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pfbench.filter.gaussian.gaussian_filter import Innovation
+from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.principal_axes import (
     axes_by_group,
     check_weight,

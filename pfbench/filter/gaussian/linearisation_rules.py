@@ -35,6 +35,17 @@ class DifferenceSpace(NamedTuple):
     mean: Callable[[Tensor, Tensor], Tensor]
 
 
+def around_first(
+    residual: Callable[[Tensor, Tensor], Tensor],
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """Make the weighted mean of values that may wrap: the mean of residuals to the first value."""
+
+    def mean(y: Tensor, w: Tensor) -> Tensor:
+        return y[:, 0] + (w.unsqueeze(-1) * residual(y, y[:, :1])).sum(1)
+
+    return mean
+
+
 class AffineApproximation(NamedTuple):
     """Affine approximation of a map in whitened coordinates.
 

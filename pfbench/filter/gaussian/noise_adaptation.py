@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.gaussian_filter import Innovation
+from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.gaussian.principal_axes import PrincipalAxes, check_weight, principal_axes
 

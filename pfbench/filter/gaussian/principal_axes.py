@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.covariance import factor
-from pfbench.filter.gaussian.gaussian_filter import Innovation
+from pfbench.filter.gaussian.innovation import Innovation
 
 
 class PrincipalAxes(NamedTuple):

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.gaussian_filter import GaussianStep
+from pfbench.filter.gaussian.kalman_update import GaussianStep
 from pfbench.filter.linearisation import unwrap_independent
 from pfbench.filter.whitening import compute_half_square
 from pfbench.model.base import StandardNormal

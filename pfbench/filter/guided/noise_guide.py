@@ -14,8 +14,12 @@ from pfbench.core.covariance import distribution_covariance, factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter, around_first
-from pfbench.filter.gaussian.linearisation_rules import AffineApproximation, DifferenceSpace
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import (
+    AffineApproximation,
+    DifferenceSpace,
+    around_first,
+)
 from pfbench.filter.guided.guide_memory import (
     check_covariance_factor,
     compute_log_ratio,

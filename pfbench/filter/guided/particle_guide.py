@@ -15,7 +15,8 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter, kalman_gain_update
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.guided.guide_memory import (
     COVARIANCE,
     check_covariance_factor,

@@ -18,12 +18,9 @@ from pfbench.core.covariance import factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, ParticleBelief, weighted_mean_cov
-from pfbench.filter.gaussian.gaussian_filter import (
-    GaussianFilter,
-    GaussianStep,
-    Innovation,
-    kalman_gain_update,
-)
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.innovation import Innovation
+from pfbench.filter.gaussian.kalman_update import GaussianStep, kalman_gain_update
 from pfbench.filter.guided.guide_memory import (
     COVARIANCE,
     MEAN,

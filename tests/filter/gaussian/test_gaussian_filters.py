@@ -20,7 +20,9 @@ from pfbench.core.covariance import factor
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter, Innovation, kalman_gain_update
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.innovation import Innovation
+from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.gaussian.linearisation_rules import (
     AffineApproximation,
     CubaturePoints,

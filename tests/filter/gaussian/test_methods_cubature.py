@@ -14,7 +14,8 @@ from torch import Tensor
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record, map_inputs
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter, GaussianStep
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.kalman_update import GaussianStep
 from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation, TaylorLinearisation
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.sins_gnss_tight import SinsGnssTight

@@ -21,7 +21,8 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.covariance_matching import MatrixNoiseAdaptation, ScalarNoiseAdaptation
 from pfbench.filter.gaussian.gain_adaptation import AdaptiveFactorGain, BoundedRatioGain
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter, Innovation
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.linearisation_rules import (
     LinearisationRule,
     SigmaPointLinearisation,

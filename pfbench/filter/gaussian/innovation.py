@@ -1,0 +1,178 @@
+"""Innovation of a Gaussian filter, and the adaptations that change it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from pfbench.core.covariance import shared_distribution_covariance, squared_length
+from pfbench.core.record import Record
+from pfbench.filter.belief import GaussianBelief
+from pfbench.filter.gaussian.linearisation_rules import (
+    AffineApproximation,
+    DifferenceSpace,
+    LinearisationRule,
+    around_first,
+)
+from pfbench.filter.linearisation import check_moments
+from pfbench.model.base import StateSpaceModel
+
+
+class Innovation(NamedTuple):
+    """Innovation r = M xi + e with unknown xi ~ N(0, I), Cov e = Omega.
+
+    Attributes:
+        r: y - y_hat, [R, k]; 0 for missing components.
+        observed_mask: Observed components, bool [R, k].
+        m: M, [R, k, d].
+        omega: Omega, [R, k, k]: measurement noise in use and linearisation error.
+        noise: Measurement noise in use, [R, k, k]; 1 for missing components.
+        nominal: Measurement noise of the model, all components, [R, k, k].
+        root: Root of the predicted covariance that whitens xi, [R, d, d].
+    """
+
+    r: Tensor
+    observed_mask: Tensor
+    m: Tensor
+    omega: Tensor
+    noise: Tensor = torch.zeros(())
+    nominal: Tensor = torch.zeros(())
+    root: Tensor = torch.zeros(())
+
+    @property
+    def predicted_covariance(self) -> Tensor:
+        """Covariance of y_hat due to the predicted state, [R, k, k]."""
+        return self.m @ self.m.mT + (self.omega - self.noise)
+
+    def nis(self) -> tuple[Tensor, Tensor]:
+        """Compute the normalised innovation squared and the number of observed components, [R]."""
+        return squared_length(self.r, self.m @ self.m.mT + self.omega), self.observed_mask.sum(1)
+
+    def with_noise(self, noise: Tensor) -> Innovation:
+        """Replace the measurement noise [R, k, k]; missing components keep 1."""
+        noise = torch.where(
+            self.observed_mask.unsqueeze(-1) & self.observed_mask.unsqueeze(-2), noise, self.noise
+        )
+        return self._replace(omega=self.omega + (noise - self.noise), noise=noise)
+
+    def inflate(self, factor: Tensor) -> Innovation:
+        """Multiply the predicted covariance by `factor` [R]."""
+        f = factor[:, None, None]
+        omega = self.omega + (f - 1.0) * (self.omega - self.noise)
+        return self._replace(m=self.m * f.sqrt(), omega=omega, root=self.root * f.sqrt())
+
+
+class NoiseAdaptation(Protocol):
+    """A change of the filter's noise covariances; both hooks may be the identity."""
+
+    def predict_scale(
+        self, predicted: AffineApproximation, belief: GaussianBelief
+    ) -> AffineApproximation:
+        """Scale the linearised prediction.
+
+        Args:
+            predicted: Prediction. Its Omega contains the process noise `noise`. If the noise passed
+                through the rule, the columns of M after the state's contain it.
+            belief: Belief at t-1.
+
+        Returns:
+            The scaled prediction.
+        """
+
+    def noise_adapt(
+        self, innovation: Innovation, belief: GaussianBelief
+    ) -> tuple[Innovation, dict[str, Tensor]]:
+        """Replace the noise covariance of the innovation.
+
+        Args:
+            innovation: Innovation of the step.
+            belief: Belief at t-1, with the values that the adaptation returned in step t-1.
+
+        Returns:
+            The innovation with another noise covariance, and values for the next step by name,
+            [R, ...].
+        """
+
+
+class GainAdaptation(Protocol):
+    """A change of the gain: it maps the factor on the predicted covariance [R] to a new one."""
+
+    def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:
+        """Return the new factor [R].
+
+        Args:
+            innovation: Innovation of the step.
+            factor: Factor so far, [R].
+        """
+
+
+def compute_innovation(
+    linearisation: LinearisationRule,
+    model: StateSpaceModel,
+    state_at: Callable[[Tensor], Tensor],
+    template: Tensor,
+    record: Record,
+) -> Innovation:
+    """Compute the innovation by statistical linearisation.
+
+    Args:
+        linearisation: Linearisation rule.
+        model: State-space model of the step.
+        state_at: Map of whitened coordinates xi [R, P, d] to states [R, P, D].
+        template: Tensor of the runs and dtype, [R, ...].
+        record: Measurement and inputs of the step.
+
+    Returns:
+        The innovation, without the root of the predicted covariance.
+    """
+
+    def observe_points(xi: Tensor) -> tuple[Tensor, Tensor]:
+        distribution: Any = model.observation(state_at(xi), record.u)
+        check_moments(model, "observation", distribution)
+        return distribution.mean, shared_distribution_covariance(distribution)
+
+    space = DifferenceSpace(model.residual, around_first(model.residual))
+    y_hat, m, omega, noise = linearisation(observe_points, template, model.chart.dimension, space)
+    observed_mask = ~torch.isnan(record.y)
+    r = torch.where(observed_mask, model.residual(record.y, y_hat), 0.0)
+    pair_mask = observed_mask.unsqueeze(-1) & observed_mask.unsqueeze(-2)
+    eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
+    m = torch.where(observed_mask.unsqueeze(-1), m, 0.0)
+    omega, noise_in_use = (torch.where(pair_mask, a, eye) for a in (omega, noise))
+    return Innovation(r, observed_mask, m, omega, noise_in_use, noise)
+
+
+def linearise_about_posterior(
+    linearisation: LinearisationRule,
+    model: StateSpaceModel,
+    mean: Tensor,
+    root: Tensor,
+    shift: Tensor,
+    updated: Tensor,
+    record: Record,
+) -> Innovation:
+    """Compute the innovation about the updated distribution, in the coordinates of the prior.
+
+    Args:
+        linearisation: Linearisation rule.
+        model: State-space model of the step.
+        mean: Predicted mean, [R, D].
+        root: Root of the predicted covariance, [R, d, d].
+        shift: Updated mean of xi, [R, d].
+        updated: Upper triangular root of the updated covariance of xi, [R, d, d].
+        record: Measurement and inputs of the step.
+
+    Returns:
+        The innovation.
+    """
+
+    def state_at(xi: Tensor) -> Tensor:
+        whitened = shift.unsqueeze(1) + xi @ updated.mT
+        return model.chart.add(mean.unsqueeze(1), whitened @ root.mT)
+
+    new = compute_innovation(linearisation, model, state_at, mean, record)
+    m = torch.linalg.solve_triangular(updated, new.m, upper=True, left=False)
+    return new._replace(m=m, r=new.r + (m @ shift.unsqueeze(-1)).squeeze(-1), root=root)

@@ -1,0 +1,131 @@
+"""Kalman update in whitened coordinates by triangular factorisation, and the results of a step."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pfbench.core.covariance import factor
+from pfbench.filter.gaussian.innovation import Innovation
+from pfbench.filter.whitening import LOG_2PI
+from pfbench.kernels import cpp
+from pfbench.kernels.compilation import compilable
+
+
+class GaussianStep(NamedTuple):
+    """All results of one step, for stages that use a Gaussian filter.
+
+    Attributes:
+        prior: Predicted mean, [R, D].
+        prior_root: Square root of the predicted covariance after adaptation, [R, d, d].
+        mean: Updated mean, [R, D].
+        root: Square root of the updated covariance, [R, d, d], not triangular.
+        innovation: Innovation after adaptation; `noise` is the measurement noise in use.
+        log_likelihood: Log evidence of the step, [R]; -inf where a covariance does not have a root.
+        memory: Values that adaptations use in the next step.
+        trace: Diagnostics by name, [R].
+    """
+
+    prior: Tensor
+    prior_root: Tensor
+    mean: Tensor
+    root: Tensor
+    innovation: Innovation
+    log_likelihood: Tensor
+    memory: dict[str, Tensor]
+    trace: dict[str, Tensor]
+
+
+def kalman_gain_update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the whitened posterior.
+
+    Args:
+        innovation: Innovation of the step.
+
+    Returns:
+        Mean [R, d], square root [R, d, d] and log evidence of the step [R], NaN without a root.
+    """
+    r, observed_mask, m, omega, *_ = innovation
+    shift, root, distance, scales, ok = _updated(m, r, omega)
+    count = observed_mask.sum(-1, dtype=r.dtype)  # int64 times a float would be float32
+    log_like = -0.5 * distance - scales.abs().log().sum(-1) - 0.5 * LOG_2PI * count
+    return shift, root, torch.where(ok, log_like, torch.nan)
+
+
+def _separate_update(
+    m: Tensor, r: Tensor, omega: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Compute the results of `cpp.kalman_update` by separate operations."""
+    root, ok = factor(omega)
+    columns = torch.cat([m, r.unsqueeze(-1)], -1)
+    white = torch.linalg.solve_triangular(root, columns, upper=False)  # Omega^-1/2 [M r]
+    d = m.shape[-1]
+    eye = torch.eye(d, dtype=m.dtype, device=m.device).expand(m.shape[0], -1, -1)
+    information, score, distance = _least_squares(white, eye)
+    back = torch.linalg.solve_triangular(information, torch.cat([score, eye], -1), upper=True)
+    scales = torch.cat([a.diagonal(dim1=-2, dim2=-1) for a in (root, information)], -1)
+    return back[..., 0], back[..., 1:], distance, scales, ok
+
+
+_updated = compilable(_separate_update, operator=cpp.kalman_update, use_torch_compiler=False)
+
+
+def _least_squares(white: Tensor, eye: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Minimise |A x - b|^2 + |x|^2, [A b] = `white`: R of I + A' A, R'^-1 A' b, the minimum [R].
+
+    By QR: I + A' A would lose the 1 if the prior is 1e8 times as wide as the measurement noise.
+    """
+    d = eye.shape[-1]
+    if not (white.requires_grad and torch.is_grad_enabled()):
+        upper, least = _triangle(white)
+        return upper[..., :d], upper[..., d:], least
+    # a gradient needs Q, and a triangle without zeros on its diagonal, where y may equal y_hat
+    a, b = white[..., :d], white[..., d:]
+    q, information = torch.linalg.qr(torch.cat([a, eye], -2))
+    score = q[:, : a.shape[-2]].mT @ b
+    diagonal = information.diagonal(dim1=-2, dim2=-1)
+    sign = torch.where(diagonal < 0, -1, 1).to(information).unsqueeze(-1)
+    information, score = sign * information, sign * score
+    x = torch.linalg.solve_triangular(information, score, upper=True)
+    return information, score, (a @ x - b).square().sum((1, 2)) + x.square().sum((1, 2))
+
+
+def _triangle(white: Tensor) -> tuple[Tensor, Tensor]:
+    """Reduce [A b] [R, K, D + 1] over [I 0] to a triangle [R, D, D + 1], and the rest of b^2."""
+    d = white.shape[-1] - 1
+    eye = torch.eye(d, d + 1, dtype=white.dtype, device=white.device)
+    rows = torch.cat([white, eye.expand(white.shape[0], -1, -1)], -2)
+    triangle = torch.linalg.qr(rows, mode="r")[1]
+    # QR leaves row signs to rounding: draws by such a root would depend on the batch
+    diagonal = triangle.diagonal(dim1=-2, dim2=-1)[:, :d]
+    sign = torch.where(diagonal < 0, -1, 1).to(triangle).unsqueeze(-1)
+    return sign * triangle[:, :d], triangle[:, d, d].square()
+
+
+def remove_negative_eigenvalues(
+    omega: Tensor, noise: Tensor, addend: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Remove negative eigenvalues from Omega - noise where Omega + addend has no root.
+
+    Args:
+        omega: Omega, [R, k, k].
+        noise: Noise covariance in Omega, [R, k, k].
+        addend: Covariance that is added to Omega before the root is taken, [R, k, k].
+
+    Returns:
+        Omega, [R, k, k], and the runs that were changed, bool [R].
+    """
+    bad = ~factor(addend + omega)[1]
+    if not bad.is_cuda and not bool(bad.any()):  # the check costs next to nothing on the CPU
+        return omega, bad
+    variance = omega.diagonal(dim1=-2, dim2=-1).abs() + addend.diagonal(dim1=-2, dim2=-1)
+    size = torch.sqrt(variance.clamp(min=1e-300))
+    scale = size.unsqueeze(-1) * size.unsqueeze(-2)
+    excess = (omega - noise) / scale
+    # eigh raises for all runs if the numbers of one run are not finite
+    finite_mask = torch.isfinite(excess).all(-1).all(-1)[:, None, None]
+    values, vectors = torch.linalg.eigh(torch.where(finite_mask, excess, 0.0))
+    excess = (vectors * values.clamp(min=0.0).unsqueeze(-2)) @ vectors.mT
+    return torch.where(bad[:, None, None] & finite_mask, noise + excess * scale, omega), bad
