@@ -7,105 +7,59 @@ alone and in any batch, and no global random state is read or written.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import torch
-from pyro.distributions import Delta
 from torch import Tensor
-from torch.distributions import (
-    Beta,
-    Distribution,
-    Gamma,
-    Independent,
-    LowRankMultivariateNormal,
-    MixtureSameFamily,
-    MultivariateNormal,
-    Normal,
-    StudentT,
-    TransformedDistribution,
-    biject_to,
-)
+from torch.distributions import Distribution, Independent, Normal
 
 from pfbench.core.chart import Chart
+from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record, iterate_steps
-
-_CHUNK, _LARGEST_COUNT = 256, 1_000_000  # search range of unbounded discrete distributions
-_BISECTIONS = 64  # halve the largest bracket in the unconstrained value, 1400, to below 1e-15
-_LARGEST_LOG = 700.0  # exp(700) is finite in float64
-
-
-@runtime_checkable
-class CounterBasedDistribution(Protocol):
-    """A distribution class that states how it is drawn from a number source.
-
-    Define `draw_from` on a distribution without `icdf` and `cdf` to use it in a model. The result
-    has the distribution's batch and event shape, broadcast against the numbers of the source.
-    """
-
-    def draw_from(self, source: NumberSource) -> Tensor: ...
-
-
-@dataclass(frozen=True)
-class NumberSource:
-    """Normal and uniform numbers for one draw of a distribution.
-
-    Arrays broadcast against the batch and event shape of the distribution. Each independent array
-    needs a label of its own: `normal` and `uniform` of one label share their random words.
-
-    Attributes:
-        stream: Random stream of one time step.
-        purpose: Name of the draw; labels are appended to it.
-        n: Number of particles.
-        width: Event dimension k.
-        particles_first: Arrays are [n, R, k] instead of [R, n, k], for batch shape [R].
-        component_axes: Positions at which axes of mixture components are inserted.
-    """
-
-    stream: RandomStream
-    purpose: str
-    n: int
-    width: int
-    particles_first: bool = False
-    component_axes: tuple[int, ...] = ()
-
-    def normal(self, label: str = "", width: int | None = None) -> Tensor:
-        """Return standard normal numbers; `width` replaces the event dimension."""
-        return self._arranged(self.stream.normal(self.purpose + label, self.n, width or self.width))
-
-    def uniform(self, label: str = "", width: int | None = None) -> Tensor:
-        """Return float64 numbers in the open interval (0, 1), arranged as in `normal`."""
-        width = width or self.width
-        return self._arranged(self.stream.uniform(self.purpose + label, self.n, width))
-
-    def _arranged(self, values: Tensor) -> Tensor:
-        """Order the axes and insert those of mixture components."""
-        values = values.transpose(0, 1) if self.particles_first else values
-        for axis in self.component_axes:
-            values = values.unsqueeze(axis)
-        return values
 
 
 class SimulatedModel(Protocol):
     """The part of a state-space model that a simulation uses."""
 
     @property
-    def chart(self) -> Chart: ...
+    def chart(self) -> Chart:
+        """Addition, subtraction and mean of states."""
 
     @property
-    def origin(self) -> Tensor: ...
+    def origin(self) -> Tensor:
+        """State about which the initial distribution is defined, [D]."""
 
     @property
-    def noise(self) -> Distribution: ...
+    def noise(self) -> Distribution:
+        """Distribution of the driving noise, event [W]."""
 
-    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor: ...
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        """Propagate states by one step.
 
-    def observation(self, x: Tensor, u: Any) -> Distribution: ...
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+            w: Driving noise, [R, N, W].
 
-    def at_step(self, t: int) -> Any: ...
+        Returns:
+            States, [R, N, D].
+        """
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        """Return the distribution of the measurement.
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+
+        Returns:
+            Distribution with batch [R, N], event [Dy].
+        """
+
+    def at_step(self, t: int) -> Any:
+        """Return the model of step t."""
 
 
 class SimulatedStep(NamedTuple):
@@ -126,38 +80,6 @@ class SimulatedStep(NamedTuple):
     distribution: Distribution
 
 
-def draw_values(distribution: Any, stream: RandomStream, purpose: str, n: int) -> Tensor:
-    """Draw a distribution from a counter-based stream.
-
-    Normal distributions shift and scale normal numbers. Other distributions use, in this order:
-    their method `draw_from`, the construction of mixtures, Student's t and transformed
-    distributions, a search in discrete supports, `icdf`, and numerical inversion of `cdf`.
-
-    Args:
-        distribution: Batch [], [R] or [R, n], event [k].
-        stream: Random stream of one time step, with R runs.
-        purpose: Name of the draw.
-        n: Number of values per run.
-
-    Returns:
-        Values, [R, n, k].
-
-    Raises:
-        ValueError: if the distribution offers none of these ways.
-    """
-    base = distribution.base_dist if isinstance(distribution, Independent) else distribution
-    per_run, width = len(distribution.batch_shape) == 1, distribution.event_shape[0]
-    if isinstance(base, Normal):
-        z = stream.normal(purpose, n, width)
-        loc, scale = (a.unsqueeze(1) if per_run else a for a in (base.loc, base.scale))
-        return loc + scale * z
-    if isinstance(base, MultivariateNormal) and len(base.batch_shape) < 2:
-        z = stream.normal(purpose, n, width)
-        return (base.loc.unsqueeze(1) if per_run else base.loc) + z @ base.scale_tril.mT
-    values = _draw(base, NumberSource(stream, purpose, n, width, per_run)).to(stream.dtype)
-    return values.transpose(0, 1) if per_run else values
-
-
 def draw_noise_values(
     distribution: Any, stream: RandomStream, purpose: str, n: int, scale: Tensor | None = None
 ) -> Tensor:
@@ -174,7 +96,7 @@ def draw_noise_values(
         Noise, [R, n, W].
 
     Raises:
-        ValueError: if a distribution without a finite mean is to be scaled.
+        ValueError: If a distribution without a finite mean is to be scaled.
     """
     base = distribution.base_dist if isinstance(distribution, Independent) else distribution
     if isinstance(base, Normal):
@@ -275,134 +197,3 @@ def draw_measurements(
 def is_independent_normal(distribution: Any) -> bool:
     """Return whether a distribution is normal with independent components."""
     return isinstance(distribution, Independent) and isinstance(distribution.base_dist, Normal)
-
-
-def _draw(distribution: Any, source: NumberSource) -> Tensor:
-    """Draw a distribution whose batch and event shape the source's numbers broadcast against."""
-    if isinstance(distribution, CounterBasedDistribution):
-        return distribution.draw_from(source)
-    if isinstance(distribution, Independent):
-        return _draw(distribution.base_dist, source)
-    if isinstance(distribution, Normal):
-        return distribution.loc + distribution.scale * source.normal()
-    if isinstance(distribution, MultivariateNormal):
-        return distribution.loc + _times(distribution.scale_tril, source.normal())
-    if isinstance(distribution, LowRankMultivariateNormal):
-        low: Tensor = distribution.cov_factor
-        shared = _times(low, source.normal(".factor", low.shape[-1]))
-        return distribution.loc + distribution.cov_diag.sqrt() * source.normal() + shared
-    if isinstance(distribution, MixtureSameFamily):
-        return _draw_mixture(distribution, source)
-    if isinstance(distribution, TransformedDistribution):
-        values = _draw(distribution.base_dist, source)
-        for transform in distribution.transforms:
-            values = transform(values)
-        return values
-    if isinstance(distribution, StudentT):
-        return _draw_student_t(distribution, source)
-    if isinstance(distribution, Beta):
-        a, b = distribution.concentration1, distribution.concentration0
-        first = _invert_cdf(Gamma(a, torch.ones_like(a)), source.uniform())
-        second = _invert_cdf(Gamma(b, torch.ones_like(b)), source.uniform(".second"))
-        return first / (first + second)
-    if isinstance(distribution, Delta):
-        return distribution.v + torch.zeros_like(source.uniform())
-    return _invert(distribution, source.uniform())
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Multiply matrices [..., k, l] by vectors [..., l]."""
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
-
-def _draw_mixture(distribution: MixtureSameFamily, source: NumberSource) -> Tensor:
-    """Choose a component by one uniform number and draw it."""
-    joint = len(distribution.event_shape)
-    cdf = distribution.mixture_distribution.probs.cumsum(-1)
-    u = source.uniform(".component", 1) if joint else source.uniform(".component").unsqueeze(-1)
-    index = (u > cdf).sum(-1, keepdim=True).clamp(max=cdf.shape[-1] - 1)
-    axis = -1 - joint
-    inner = replace(
-        source,
-        purpose=source.purpose + ".of",
-        component_axes=(*source.component_axes, axis),
-    )
-    values = _draw(distribution.component_distribution, inner)
-    shape = torch.broadcast_shapes(values.shape, (*cdf.shape, *distribution.event_shape))
-    index = index.unsqueeze(-1) if joint else index
-    return torch.take_along_dim(values.expand(shape), index, axis).squeeze(axis)
-
-
-def _draw_student_t(distribution: StudentT, source: NumberSource) -> Tensor:
-    """Draw Student's t by the polar method, exact for every positive df [Bailey 1994]."""
-    df, log_u = distribution.df, torch.log(source.uniform())
-    radius = torch.sqrt(df * torch.expm1(-2.0 / df * log_u))
-    angle = 2.0 * math.pi * source.uniform(".angle")
-    return distribution.loc + distribution.scale * radius * torch.cos(angle)
-
-
-def _invert(distribution: Any, u: Tensor) -> Tensor:
-    """Return the quantile of a univariate distribution at u."""
-    try:
-        if distribution.support.is_discrete:
-            return _invert_pmf(distribution, u)
-        try:
-            return distribution.icdf(u)
-        except NotImplementedError:
-            return _invert_cdf(distribution, u)
-    except NotImplementedError:
-        name = type(distribution).__name__
-        raise ValueError(
-            f"model: a distribution must have icdf, cdf or draw_from to be simulated, got {name}. "
-            "Add a method draw_from(source) to its class (pfbench.core.simulate.CounterBasedDistribution)."
-        ) from None
-
-
-def _invert_pmf(distribution: Any, u: Tensor) -> Tensor:
-    """Return the smallest value whose cumulative probability reaches u."""
-    if distribution.has_enumerate_support:
-        values = distribution.enumerate_support(expand=False)
-        values = values.reshape(-1, *[1] * u.dim())
-        cdf = distribution.log_prob(values).exp().cumsum(0)
-        return values.flatten()[(cdf < u).sum(0).clamp(max=len(values) - 1)]
-    if getattr(distribution.support, "upper_bound", None) is not None:
-        raise NotImplementedError
-    count, total = torch.zeros_like(u), torch.zeros_like(u)
-    for first in range(0, _LARGEST_COUNT, _CHUNK):
-        values = torch.arange(first, first + _CHUNK, dtype=u.dtype, device=u.device)
-        values = values.reshape(-1, *[1] * u.dim())
-        cdf = total + distribution.log_prob(values).exp().cumsum(0)
-        count, total = count + (cdf < u).sum(0), cdf[-1]
-        if bool((total >= u).all()):
-            return count
-    raise ValueError(
-        f"model: counts must be below {_LARGEST_COUNT} to be simulated, got "
-        f"{type(distribution).__name__} with larger ones. Use a normal approximation."
-    )
-
-
-def _invert_cdf(distribution: Any, u: Tensor) -> Tensor:
-    """Invert a continuous cdf by bisection on the unconstrained real line."""
-    to_support = biject_to(distribution.support)
-    sign = float(getattr(to_support, "sign", 1))
-
-    def place(z: Tensor) -> Tensor:
-        return to_support(sign * z)
-
-    low, high = (_bracket(distribution.cdf, place, u, side) for side in (-1.0, 1.0))
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        below = distribution.cdf(place(middle)) < u
-        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
-    return place(0.5 * (low + high))
-
-
-def _bracket(cdf: Any, place: Callable[[Tensor], Tensor], u: Tensor, side: float) -> Tensor:
-    """Return unconstrained values on one side of the quantiles at u."""
-    bound = torch.full_like(u, side)
-    while float(bound.abs().max()) < _LARGEST_LOG:
-        inside_mask = side * (cdf(place(bound)) - u) < 0.0
-        if not bool(inside_mask.any()):
-            break
-        bound = (bound * torch.where(inside_mask, 2.0, 1.0)).clamp(-_LARGEST_LOG, _LARGEST_LOG)
-    return bound

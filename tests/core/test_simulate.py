@@ -18,9 +18,9 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 import pfbench
+from pfbench.core.distribution_sampling import NumberSource, draw_values
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.core.simulate import NumberSource, draw_values
 from pfbench.filter.learned.objectives import simulate_from_model
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter

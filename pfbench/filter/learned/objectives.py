@@ -12,9 +12,10 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
-from pfbench.core.simulate import draw_initial_state, draw_values, simulate_steps
+from pfbench.core.simulate import draw_initial_state, simulate_steps
 from pfbench.filter.belief import ParticleBelief, StepInfo
 from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
 from pfbench.filter.learned.proposal import LearnedProposal

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
-from pfbench.core.simulate import draw_values
 from pfbench.filter.belief import ParticleBelief
 from pfbench.model.base import StandardNormal, StateSpaceModel
 

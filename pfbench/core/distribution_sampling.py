@@ -1,0 +1,211 @@
+"""Sampling of distributions by numbers of counter-based random streams."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from pyro.distributions import Delta
+from torch import Tensor
+from torch.distributions import (
+    Beta,
+    Gamma,
+    Independent,
+    LowRankMultivariateNormal,
+    MixtureSameFamily,
+    MultivariateNormal,
+    Normal,
+    StudentT,
+    TransformedDistribution,
+)
+
+from pfbench.core.quantile import invert_cdf, quantile
+from pfbench.core.random_stream import RandomStream
+
+
+@runtime_checkable
+class CounterBasedDistribution(Protocol):
+    """A distribution class that states how it is drawn from a number source.
+
+    Define `draw_from` on a distribution without `icdf` and `cdf` to use it in a model. The result
+    has the distribution's batch and event shape, broadcast against the numbers of the source.
+    """
+
+    def draw_from(self, source: NumberSource) -> Tensor:
+        """Draw values by numbers of a source."""
+
+
+@dataclass(frozen=True)
+class NumberSource:
+    """Normal and uniform numbers for one draw of a distribution.
+
+    Arrays broadcast against the batch and event shape of the distribution. Each independent array
+    needs a different label: `normal` and `uniform` of one label share their random words.
+
+    Attributes:
+        stream: Random stream of one time step.
+        purpose: Name of the draw; labels are appended to it.
+        n: Number of particles.
+        width: Event dimension k.
+        particles_first: Arrays are [n, R, k] instead of [R, n, k], for batch shape [R].
+        component_axes: Positions at which axes of mixture components are inserted.
+    """
+
+    stream: RandomStream
+    purpose: str
+    n: int
+    width: int
+    particles_first: bool = False
+    component_axes: tuple[int, ...] = ()
+
+    def normal(self, label: str = "", width: int | None = None) -> Tensor:
+        """Return standard normal numbers.
+
+        Args:
+            label: Label of this array.
+            width: Replacement of the event dimension.
+        """
+        return self._arranged(self.stream.normal(self.purpose + label, self.n, width or self.width))
+
+    def uniform(self, label: str = "", width: int | None = None) -> Tensor:
+        """Return float64 numbers in the open interval (0, 1), arranged as in `normal`.
+
+        Args:
+            label: Label of this array.
+            width: Replacement of the event dimension.
+        """
+        width = width or self.width
+        return self._arranged(self.stream.uniform(self.purpose + label, self.n, width))
+
+    def _arranged(self, values: Tensor) -> Tensor:
+        """Order the axes and insert those of mixture components."""
+        values = values.transpose(0, 1) if self.particles_first else values
+        for axis in self.component_axes:
+            values = values.unsqueeze(axis)
+        return values
+
+
+def draw_values(distribution: Any, stream: RandomStream, purpose: str, n: int) -> Tensor:
+    """Draw a distribution from a counter-based stream.
+
+    Normal distributions shift and scale normal numbers. Other distributions use, in this order:
+    their method `draw_from`, the construction of mixtures, Student's t and transformed
+    distributions, a search in discrete supports, `icdf`, and numerical inversion of `cdf`.
+
+    Args:
+        distribution: Batch [], [R] or [R, n], event [k].
+        stream: Random stream of one time step, with R runs.
+        purpose: Name of the draw.
+        n: Number of values per run.
+
+    Returns:
+        Values, [R, n, k].
+
+    Raises:
+        ValueError: If the distribution offers none of these methods.
+    """
+    base = distribution.base_dist if isinstance(distribution, Independent) else distribution
+    per_run, width = len(distribution.batch_shape) == 1, distribution.event_shape[0]
+    if isinstance(base, Normal):
+        z = stream.normal(purpose, n, width)
+        loc, scale = (a.unsqueeze(1) if per_run else a for a in (base.loc, base.scale))
+        return loc + scale * z
+    if isinstance(base, MultivariateNormal) and len(base.batch_shape) < 2:
+        z = stream.normal(purpose, n, width)
+        return (base.loc.unsqueeze(1) if per_run else base.loc) + z @ base.scale_tril.mT
+    values = _draw(base, NumberSource(stream, purpose, n, width, per_run)).to(stream.dtype)
+    return values.transpose(0, 1) if per_run else values
+
+
+def _draw(distribution: Any, source: NumberSource) -> Tensor:
+    """Draw a distribution whose batch and event shape the source's numbers broadcast against."""
+    if isinstance(distribution, CounterBasedDistribution):
+        return distribution.draw_from(source)
+    for kind, draw in _DRAW.items():
+        if isinstance(distribution, kind):
+            return draw(distribution, source)
+    return quantile(distribution, source.uniform())
+
+
+def _draw_independent(distribution: Any, source: NumberSource) -> Tensor:
+    return _draw(distribution.base_dist, source)
+
+
+def _draw_normal(distribution: Normal, source: NumberSource) -> Tensor:
+    return distribution.loc + distribution.scale * source.normal()
+
+
+def _draw_multivariate_normal(distribution: MultivariateNormal, source: NumberSource) -> Tensor:
+    return distribution.loc + _times(distribution.scale_tril, source.normal())
+
+
+def _draw_low_rank_normal(distribution: LowRankMultivariateNormal, source: NumberSource) -> Tensor:
+    low: Tensor = distribution.cov_factor
+    shared = _times(low, source.normal(".factor", low.shape[-1]))
+    return distribution.loc + distribution.cov_diag.sqrt() * source.normal() + shared
+
+
+def _draw_transformed(distribution: TransformedDistribution, source: NumberSource) -> Tensor:
+    values = _draw(distribution.base_dist, source)
+    for transform in distribution.transforms:
+        values = transform(values)
+    return values
+
+
+def _draw_beta(distribution: Beta, source: NumberSource) -> Tensor:
+    a, b = distribution.concentration1, distribution.concentration0
+    first = invert_cdf(Gamma(a, torch.ones_like(a)), source.uniform())
+    second = invert_cdf(Gamma(b, torch.ones_like(b)), source.uniform(".second"))
+    return first / (first + second)
+
+
+def _draw_point_mass(distribution: Delta, source: NumberSource) -> Tensor:
+    values: Tensor = distribution.v + torch.zeros_like(source.uniform())
+    return values
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Multiply matrices [..., k, l] by vectors [..., l]."""
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+
+
+def _draw_mixture(distribution: MixtureSameFamily, source: NumberSource) -> Tensor:
+    """Choose a component by one uniform number and draw it."""
+    joint = len(distribution.event_shape)
+    cdf = distribution.mixture_distribution.probs.cumsum(-1)
+    u = source.uniform(".component", 1) if joint else source.uniform(".component").unsqueeze(-1)
+    index = (u > cdf).sum(-1, keepdim=True).clamp(max=cdf.shape[-1] - 1)
+    axis = -1 - joint
+    inner = replace(
+        source,
+        purpose=source.purpose + ".of",
+        component_axes=(*source.component_axes, axis),
+    )
+    values = _draw(distribution.component_distribution, inner)
+    shape = torch.broadcast_shapes(values.shape, (*cdf.shape, *distribution.event_shape))
+    index = index.unsqueeze(-1) if joint else index
+    return torch.take_along_dim(values.expand(shape), index, axis).squeeze(axis)
+
+
+def _draw_student_t(distribution: StudentT, source: NumberSource) -> Tensor:
+    """Draw Student's t by the polar method, exact for every positive df [Bailey 1994]."""
+    df, log_u = distribution.df, torch.log(source.uniform())
+    radius = torch.sqrt(df * torch.expm1(-2.0 / df * log_u))
+    angle = 2.0 * math.pi * source.uniform(".angle")
+    return distribution.loc + distribution.scale * radius * torch.cos(angle)
+
+
+_DRAW: dict[type, Callable[[Any, NumberSource], Tensor]] = {
+    Independent: _draw_independent,
+    Normal: _draw_normal,
+    MultivariateNormal: _draw_multivariate_normal,
+    LowRankMultivariateNormal: _draw_low_rank_normal,
+    MixtureSameFamily: _draw_mixture,
+    TransformedDistribution: _draw_transformed,
+    StudentT: _draw_student_t,
+    Beta: _draw_beta,
+    Delta: _draw_point_mass,
+}
