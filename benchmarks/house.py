@@ -20,6 +20,8 @@ from worker import Filter, serve
 from workload import ins_model
 
 from pfbench import job
+from pfbench.core.affine_map import affine_map
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.loop import run_filter
@@ -29,7 +31,7 @@ from pfbench.filter.particle.resampling import EssResampler
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.run_batches import choose_run_batch
 from pfbench.kernels import compilation, cpp
-from pfbench.model.base import StateSpaceModel, affine_map, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.model.ins_gnss import LooseStep
 from pfbench.model.textbook import StochasticVolatility, UnivariateGrowth
 

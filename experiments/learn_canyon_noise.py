@@ -41,16 +41,15 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import instantiate
 from pfbench.job.resumable import ResumableResults
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.urban_gnss import (
+from pfbench.model.pseudorange_errors import (
     CN0_REFERENCE,
     LosNlosRangeError,
     NormalExponentialMixture,
     PseudorangeError,
-    UrbanGnss,
     UrbanInputs,
-    range_change,
 )
-from pfbench.model.urban_gnss import NormalRangeError as NormalRanges
+from pfbench.model.pseudorange_errors import NormalRangeError as NormalRanges
+from pfbench.model.urban_gnss import UrbanGnss, range_change
 from pfbench.noise.white import NominalNoise
 from pfbench.ppl.parameter_posterior import WELL_MIXED, ParameterPosterior, plot_posterior
 from pfbench.ppl.parameterised_model import ParameterisedModel

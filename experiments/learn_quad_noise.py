@@ -40,7 +40,8 @@ from pfbench.filter.gaussian.linearisation_rules import (
 from pfbench.filter.loop import run_filter
 from pfbench.job import instantiate
 from pfbench.job.resumable import ResumableResults
-from pfbench.model.strapdown_total import StrapdownTotal, StrapdownTuning
+from pfbench.model.strapdown.total import StrapdownTotal
+from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.noise.white import NominalNoise
 from pfbench.ppl.parameter_posterior import WELL_MIXED, ParameterPosterior, plot_posterior
 from pfbench.ppl.parameterised_model import ParameterisedModel

@@ -16,7 +16,8 @@ def lazy_attributes(
 
     Args:
         package: Name of the package.
-        modules: Public names by module, relative to the package.
+        modules: Public names by module, relative to the package: `base`, or `.core.normal` for a
+            module of the parent package.
 
     Returns:
         `__getattr__` and `__dir__` (PEP 562).
@@ -25,8 +26,10 @@ def lazy_attributes(
 
     def get_attribute(name: str) -> Any:
         if name not in homes:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
+            raise AttributeError(
+                f"{package} does not define {name!r}. Choose a name of dir({package})."
+            )
+        return getattr(importlib.import_module(f".{homes[name]}", package), name)
 
     def list_names() -> list[str]:
         return sorted(homes)

@@ -57,6 +57,8 @@ __getattr__, __dir__ = lazy_attributes(
             "StateSpaceModel",
             "ModelWrapper",
             "StaticModel",
+        ),
+        ".core.normal": (
             "independent_normal",
             "normal_batch",
         ),
@@ -71,6 +73,13 @@ __getattr__, __dir__ = lazy_attributes(
             "PassiveLocation",
             "compute_level_attitude",
         ),
+        "pseudorange_errors": (
+            "UrbanInputs",
+            "PseudorangeError",
+            "NormalRangeError",
+            "LosNlosRangeError",
+            "NormalExponentialMixture",
+        ),
         "sins_gnss_tight": ("SinsGnssTight",),
         "sins_gnss_tight_nl": ("SinsGnssTightNl",),
         "sins_gps_azimuth": (
@@ -79,18 +88,14 @@ __getattr__, __dir__ = lazy_attributes(
             "SinsGpsAzimuth",
         ),
         "sins_sar": ("SinsSar",),
-        "strapdown_aided": (
+        "strapdown.aided": ("StrapdownAided",),
+        "strapdown.tight": ("StrapdownTight",),
+        "strapdown.total": ("StrapdownTotal",),
+        "strapdown.tuning": (
             "AidedTuning",
-            "StrapdownAided",
-        ),
-        "strapdown_tight": (
             "RangeErrorModel",
-            "TightTuning",
-            "StrapdownTight",
-        ),
-        "strapdown_total": (
             "StrapdownTuning",
-            "StrapdownTotal",
+            "TightTuning",
         ),
         "textbook": (
             "UnivariateGrowth",
@@ -100,11 +105,6 @@ __getattr__, __dir__ = lazy_attributes(
             "Lorenz63",
         ),
         "urban_gnss": (
-            "UrbanInputs",
-            "PseudorangeError",
-            "NormalRangeError",
-            "LosNlosRangeError",
-            "NormalExponentialMixture",
             "UrbanTuning",
             "UrbanGnss",
         ),

@@ -1,29 +1,23 @@
-"""State-space models: propagation driven by noise, and a distribution of the measurement."""
+"""State-space models: propagation driven by noise, and a distribution of the measurement.
+
+The wrappers belong to this module because the first step of every model may be a `StaticModel`.
+"""
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
-from pyro.distributions import Independent, MultivariateNormal, Normal
 from torch import Tensor, nn
-from torch.distributions import Distribution
+from torch.distributions import Distribution, Independent
 from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock
 from pfbench.core.covariance import gaussian_log_density
 from pfbench.core.density import log_density, log_normal_density
+from pfbench.core.normal import StandardNormal, dense_normal
 from pfbench.core.record import Record
-from pfbench.kernels import cpp
-from pfbench.kernels.compilation import compilable
-
-HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
-
-
-class StandardNormal(Normal):
-    """Independent standard normal numbers; code that knows the type skips scale and shift."""
 
 
 class StateSpaceModel(nn.Module, ABC):
@@ -327,68 +321,6 @@ def _mean_of(distribution: Any, name: str) -> Tensor:
     return mean
 
 
-def affine_map(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
-    """Compute phi x + gain w.
-
-    The compiled version skips zero coefficients, which most are in error models of an INS.
-
-    Args:
-        phi: Transition matrix, [R or 1, D, D].
-        x: States, [R, N, D].
-        gain: Noise gain, [R or 1, D, W].
-        w: Noise, [R, N, W].
-
-    Returns:
-        States, [R, N, D].
-    """
-    return _affine(phi, x, gain, w).permute(1, 2, 0)
-
-
-def _dense_affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
-    runs = x.shape[0]
-    if len(phi) == len(gain) == 1:  # the same for all runs: one product, components first in memory
-        shifted = gain[0] @ w.permute(2, 0, 1).flatten(1)
-        return shifted.addmm_(phi[0], x.permute(2, 0, 1).flatten(1)).unflatten(1, x.shape[:2])
-    noise = gain.expand(runs, -1, -1) @ w.mT
-    return torch.baddbmm(noise, phi.expand(runs, -1, -1), x.mT).transpose(0, 1)
-
-
-_affine = compilable(_dense_affine, operator=cpp.propagate_affine)
-
-
-def independent_normal(mean: Tensor, sd: Tensor) -> Independent:
-    """Build a normal distribution with independent components.
-
-    Args:
-        mean: Means, [..., k].
-        sd: Standard deviations, broadcast against the mean.
-
-    Returns:
-        Distribution with event [k].
-    """
-    return Normal(mean, sd.expand_as(mean), validate_args=False).to_event(1)
-
-
-def normal_batch(runs: int, sd: Tensor, mean: Tensor | None = None) -> Independent:
-    """Build the same independent normal distribution for each run.
-
-    Args:
-        runs: Number of runs R.
-        sd: Standard deviations, [d].
-        mean: Means, [d]; None is zero.
-
-    Returns:
-        Distribution with batch [R], event [d].
-    """
-    centre = torch.zeros_like(sd) if mean is None else mean
-    return independent_normal(centre.expand(runs, -1), sd)
-
-
-def dense_normal(mean: Tensor, factor: Tensor) -> MultivariateNormal:
-    """Build a normal distribution from its mean and Cholesky factor, without checks."""
-    return MultivariateNormal(mean, scale_tril=factor, validate_args=False)
-
-
 def initial_law(model: StateSpaceModel, runs: int, spread: Tensor | None = None) -> Distribution:
     """Return the distribution of x_0 in the chart.
 
@@ -403,38 +335,3 @@ def initial_law(model: StateSpaceModel, runs: int, spread: Tensor | None = None)
     if spread is None:
         return model.initial(runs)
     return dense_normal(spread.new_zeros(spread.shape[:-1]), spread)
-
-
-def as_float64(values: Any) -> Tensor:
-    """Return a float64 tensor; tensors inside nested lists keep their gradient."""
-    if _holds_tensors(values):
-        return torch.stack([as_float64(value) for value in values])
-    return torch.as_tensor(values, dtype=torch.float64)
-
-
-def _holds_tensors(values: Any) -> bool:
-    if not isinstance(values, list | tuple):
-        return False
-    return any(isinstance(value, Tensor) or _holds_tensors(value) for value in values)
-
-
-def check_positive(name: str, values: Any) -> Tensor:
-    """Return a float64 tensor of strictly positive numbers.
-
-    Args:
-        name: Configuration key, for the message.
-        values: Numbers.
-
-    Returns:
-        The numbers.
-
-    Raises:
-        ValueError: if a number is not positive or not finite.
-    """
-    tensor = as_float64(values)
-    if not bool(((tensor > 0) & torch.isfinite(tensor)).all()):
-        raise ValueError(
-            f"{name} must be finite positive numbers, got {values}. "
-            "A standard deviation or variance cannot be 0 or negative."
-        )
-    return tensor

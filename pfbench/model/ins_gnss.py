@@ -9,9 +9,11 @@ from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 from typing_extensions import override
 
+from pfbench.core.affine_map import affine_map
 from pfbench.core.covariance import factor
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel, affine_map, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.nav import attitude, error_dynamics
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver, ProcessNoiseInflation
 from pfbench.nav.imu_errors import ImuErrors

@@ -9,9 +9,11 @@ from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 from typing_extensions import override
 
+from pfbench.core.affine_map import affine_map
 from pfbench.core.covariance import factor
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.record import Record, map_inputs
-from pfbench.model.base import StateSpaceModel, affine_map, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.model.tight_coupling import (
     GROUPS,
     NAMES,

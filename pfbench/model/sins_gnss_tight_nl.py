@@ -12,8 +12,9 @@ from typing_extensions import override
 
 from pfbench.core import quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.model.tight_coupling import (
     GROUPS,
     NAMES,

@@ -12,9 +12,10 @@ from torch.nn.functional import pad
 from typing_extensions import override
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.record import Record
 from pfbench.model.azimuth_errors import AzimuthStep, ErrorEquations
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.nav import attitude, earth, error_dynamics
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors

@@ -11,8 +11,9 @@ from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock, wrap_angle
 from pfbench.core.covariance import factor
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.nav import attitude
 from pfbench.nav.aiding import AlignmentErrors, ProcessNoiseInflation
 from pfbench.nav.component_major import (

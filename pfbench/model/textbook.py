@@ -1,6 +1,7 @@
 """Small nonlinear models from the literature, for tests and tutorials.
 
-Their posteriors can be computed in closed form or on a grid.
+Their posteriors can be computed in closed form or on a grid. The models share a module because each
+consists of a few equations.
 """
 
 from __future__ import annotations
@@ -15,15 +16,12 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
+from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.parameter_checks import as_float64, check_positive
 from pfbench.core.record import Record
-from pfbench.model.base import (
-    HALF_LOG_2PI,
-    StateSpaceModel,
-    as_float64,
-    check_positive,
-    independent_normal,
-    normal_batch,
-)
+from pfbench.model.base import StateSpaceModel
+
+_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class TimeIndexInputs(NamedTuple):
@@ -167,7 +165,7 @@ class StochasticVolatility(StateSpaceModel):
         return torch.where(
             torch.isnan(y),
             0.0,
-            -0.5 * (square * torch.exp(-log_variance) + log_variance) - HALF_LOG_2PI,
+            -0.5 * (square * torch.exp(-log_variance) + log_variance) - _HALF_LOG_2PI,
         )
 
     @override

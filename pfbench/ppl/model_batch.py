@@ -13,8 +13,9 @@ from torch.distributions import Distribution, MixtureSameFamily, MultivariateNor
 from torch.func import functional_call
 from typing_extensions import override
 
+from pfbench.core.normal import dense_normal, independent_normal
 from pfbench.core.record import Record, map_inputs
-from pfbench.model.base import ModelWrapper, StateSpaceModel, dense_normal, independent_normal
+from pfbench.model.base import ModelWrapper, StateSpaceModel
 
 
 class ModelBatch(ModelWrapper):

@@ -10,9 +10,10 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
 from typing_extensions import override
 
+from pfbench.core.normal import dense_normal, independent_normal
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels, Record
-from pfbench.model.base import ModelWrapper, StateSpaceModel, dense_normal, independent_normal
+from pfbench.model.base import ModelWrapper, StateSpaceModel
 from pfbench.noise import distributions
 from pfbench.noise.base import NoiseRegime, process_variance_factors
 from pfbench.noise.distributions import ErrorDistribution, MixtureDistribution

@@ -14,6 +14,7 @@ from torch.distributions import Distribution, Independent
 
 from pfbench.core.chart import wrap_angle
 from pfbench.core.density import has_finite_moments
+from pfbench.core.normal import normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter

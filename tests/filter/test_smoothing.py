@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.chart import Chart, QuaternionBlock
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -20,7 +21,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 from pfbench.filter.gaussian.noise_adaptation import FadingMemory
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.smoothing import sample_trajectories, smooth
-from pfbench.model.base import ModelWrapper, StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import ModelWrapper, StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.textbook import UnivariateGrowth
 from pfbench.noise.white import NominalNoise

@@ -13,7 +13,7 @@ import torch
 from command_line import pfbench
 from torch import Tensor
 
-from pfbench.core import covariance, density
+from pfbench.core import affine_map, covariance, density
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.belief import ParticleBelief, gather_ancestors
 from pfbench.filter.gaussian import gaussian_filter, kalman_update, linearisation_rules
@@ -28,7 +28,6 @@ from pfbench.filter.particle import particle_moments, resampling_schemes, weight
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import filter_pass, scoring
 from pfbench.kernels import compilation, cpp
-from pfbench.model import base
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.noise.white import NominalNoise
 from pfbench.results import store
@@ -465,7 +464,7 @@ def test_a_loop_by_hand_moves_by_the_coefficients_that_are_not_zero(
         parts = ((a, x), (b, noise))
         moved = sum(torch.einsum("rij,rnj->irn", by.expand(RUNS, -1, -1), of) for by, of in parts)
         torch.testing.assert_close(cpp.propagate_affine(a, x, b, noise), moved)
-        torch.testing.assert_close(base._dense_affine(a, x, b, noise), moved)
+        torch.testing.assert_close(affine_map._dense_affine(a, x, b, noise), moved)
 
 
 @compiler

@@ -14,12 +14,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from pfbench.core import random_stream
+from pfbench.core import affine_map, random_stream
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter import belief
 from pfbench.filter.particle import particle_moments, resampling_schemes
 from pfbench.kernels import cpp, cuda
-from pfbench.model import base
 
 COMPILER = next(
     (found for name in ("c++", "g++", "clang++") if (found := shutil.which(name))), None
@@ -226,7 +225,7 @@ def test_moving(
     phi = torch.where(phi.abs() < 0.7, 0.0, phi)
     product = loop("propagate_affine", phi, x, gain, w)
     torch.testing.assert_close(
-        product, base._dense_affine(phi, x, gain, w), rtol=FINE[dtype], atol=10 * FINE[dtype]
+        product, affine_map._dense_affine(phi, x, gain, w), rtol=FINE[dtype], atol=10 * FINE[dtype]
     )
     ancestors = (made.uniform("a", n, 1)[..., 0] * n).long()
     key = torch.tensor(4), 99, torch.tensor(3), torch.arange(3)

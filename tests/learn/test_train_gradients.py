@@ -14,6 +14,7 @@ from particle_cases import CASES
 from torch import Tensor
 from torch.distributions import Distribution
 
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov

@@ -20,15 +20,10 @@ from pfbench.core.covariance import (
     gaussian_log_density,
     shared_distribution_covariance,
 )
+from pfbench.core.normal import dense_normal, independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.model.base import (
-    StateSpaceModel,
-    StaticModel,
-    dense_normal,
-    independent_normal,
-    normal_batch,
-)
+from pfbench.model.base import StateSpaceModel, StaticModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
 

@@ -15,8 +15,8 @@ from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
-from pfbench.model.strapdown_aided import AidedTuning, StrapdownAided
-from pfbench.model.strapdown_total import StrapdownTuning
+from pfbench.model.strapdown.aided import StrapdownAided
+from pfbench.model.strapdown.tuning import AidedTuning, StrapdownTuning
 from pfbench.nav.preintegration import PreintegratedImu, preintegrate
 
 MOTION = StrapdownTuning(

@@ -17,7 +17,8 @@ from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, SigmaPointLinearisation
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.strapdown_total import StrapdownTotal, StrapdownTuning
+from pfbench.model.strapdown.total import StrapdownTotal
+from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.nav import attitude
 from pfbench.nav.preintegration import PreintegratedImu, preintegrate, rotate
 

@@ -15,16 +15,14 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from pfbench.core.record import Record
-from pfbench.model.urban_gnss import (
+from pfbench.model.pseudorange_errors import (
     LosNlosRangeError,
     NormalExponentialMixture,
     NormalRangeError,
     PseudorangeError,
-    UrbanGnss,
     UrbanInputs,
-    UrbanTuning,
-    range_change,
 )
+from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning, range_change
 
 BELIEVED = UrbanTuning(
     distance_density=0.2,

@@ -12,11 +12,11 @@ import math
 from torch import Tensor
 from torch.distributions import Distribution
 
+from pfbench.core.normal import StandardNormal
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.kalman_update import GaussianStep
 from pfbench.filter.linearisation import unwrap_independent
 from pfbench.filter.whitening import compute_half_square
-from pfbench.model.base import StandardNormal
 
 MEAN, COVARIANCE, _CARRIED = "guide.mean", "guide.covariance", "guide.carries."
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from pfbench.core.normal import dense_normal, independent_normal
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
@@ -29,13 +30,7 @@ from pfbench.filter.linearisation import mean_noise
 from pfbench.filter.particle.point_sets import IidPoints, PointSet
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
 from pfbench.filter.whitening import LOG_2PI, compute_half_square, log_determinant
-from pfbench.model.base import (
-    ModelWrapper,
-    StateSpaceModel,
-    StaticModel,
-    dense_normal,
-    independent_normal,
-)
+from pfbench.model.base import ModelWrapper, StateSpaceModel, StaticModel
 
 
 @dataclass(frozen=True)

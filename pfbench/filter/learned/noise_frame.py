@@ -11,12 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pfbench.core.normal import StandardNormal
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.learned.networks import log_standard_normal
 from pfbench.filter.linearisation import unwrap_independent
-from pfbench.model.base import StandardNormal, StateSpaceModel
+from pfbench.model.base import StateSpaceModel
 
 
 def describe_frame(guide: GuidedNoiseProposal | None) -> str:

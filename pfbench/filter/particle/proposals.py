@@ -10,10 +10,11 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.distribution_sampling import draw_values
+from pfbench.core.normal import StandardNormal
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
-from pfbench.model.base import StandardNormal, StateSpaceModel
+from pfbench.model.base import StateSpaceModel
 
 
 class ProposalSample(NamedTuple):

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels
-from pfbench.model.strapdown_aided import AidedTuning
+from pfbench.model.strapdown.tuning import AidedTuning
 from pfbench.noise.base import NoiseRegime, check_unit_process
 from pfbench.noise.white import NominalNoise
 from pfbench.scenario.base import check_divergence_threshold

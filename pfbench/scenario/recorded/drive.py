@@ -15,7 +15,8 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record, fix_channels
-from pfbench.model.strapdown_total import StrapdownTotal, StrapdownTuning
+from pfbench.model.strapdown.total import StrapdownTotal
+from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.nav.preintegration import PreintegratedImu, preintegrate
 from pfbench.noise.base import NoiseRegime, check_unit_process
 from pfbench.scenario.base import check_divergence_threshold

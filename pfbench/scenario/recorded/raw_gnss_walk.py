@@ -18,7 +18,8 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
-from pfbench.model.strapdown_tight import TightMemsInputs, TightTuning
+from pfbench.model.strapdown.tight import TightMemsInputs
+from pfbench.model.strapdown.tuning import TightTuning
 from pfbench.nav import earth
 from pfbench.nav.preintegration import PreintegratedImu
 from pfbench.noise.base import NoiseRegime, check_unit_process

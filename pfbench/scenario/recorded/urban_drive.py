@@ -18,7 +18,8 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
-from pfbench.model.urban_gnss import NormalRangeError, UrbanGnss, UrbanInputs, UrbanTuning
+from pfbench.model.pseudorange_errors import NormalRangeError, UrbanInputs
+from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning
 from pfbench.nav import earth
 from pfbench.nav.gnss.orbits import azimuth_elevation
 from pfbench.noise.base import NoiseRegime, check_unit_process

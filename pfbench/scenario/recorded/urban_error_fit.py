@@ -15,7 +15,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from pfbench.model.urban_gnss import (
+from pfbench.model.pseudorange_errors import (
     CN0_REFERENCE,
     LosNlosRangeError,
     NormalExponentialMixture,

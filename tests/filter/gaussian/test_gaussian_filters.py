@@ -17,6 +17,7 @@ from torch.distributions import Distribution, Independent, Normal
 
 from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
 from pfbench.core.covariance import factor
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief
@@ -39,7 +40,7 @@ from pfbench.filter.gaussian.spherical_radial import (
 )
 from pfbench.filter.linearisation import compute_additive_gain
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.textbook import Benes, Lorenz63, Pendulum, UnivariateGrowth
 from pfbench.noise.white import NominalNoise

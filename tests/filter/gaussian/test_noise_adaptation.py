@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 from pfbench.core.chart import wrap_angle
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief
@@ -40,7 +41,7 @@ from pfbench.filter.gaussian.spherical_radial import (
     SphericalRadialPoints,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 
 MIXED = SigmaPointLinearisation(SphericalRadialPoints(SimplexDegree3(), RadialDegree5()))

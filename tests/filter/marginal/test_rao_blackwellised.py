@@ -17,6 +17,7 @@ from torch.distributions import Distribution, Independent
 
 from pfbench import job
 from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record, map_inputs
 from pfbench.filter import linearisation
@@ -38,7 +39,7 @@ from pfbench.model.azimuth_errors import (
     PrintedErrorEquations,
 )
 from pfbench.model.azimuth_errors import ExactErrorEquations as ExactForm
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.model.ins_gnss import InsGnss
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.sins_gps_azimuth import SinsGpsAzimuth, TrapezoidDiscretisation

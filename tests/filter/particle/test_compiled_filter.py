@@ -13,6 +13,7 @@ from command_line import pfbench
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from pfbench.core.affine_map import affine_map
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
@@ -23,7 +24,7 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import Proposal
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels import compilation, cpp, step_compiler
-from pfbench.model.base import StateSpaceModel, affine_map
+from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import UnivariateGrowth
 from pfbench.noise.white import NominalNoise

@@ -25,7 +25,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     TaylorLinearisation,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.model.strapdown_total import StrapdownTotal
+from pfbench.model.strapdown.total import StrapdownTotal
 from pfbench.nav.preintegration import PreintegratedImu
 from pfbench.noise.white import MeasurementOutage, NominalNoise
 from pfbench.scenario.recorded.drive import (

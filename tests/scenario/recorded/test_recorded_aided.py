@@ -15,7 +15,8 @@ from synthetic_log import tables, write
 
 from pfbench import job
 from pfbench.job import conf_dir
-from pfbench.model.strapdown_aided import AidedTuning, StrapdownAided
+from pfbench.model.strapdown.aided import StrapdownAided
+from pfbench.model.strapdown.tuning import AidedTuning
 from pfbench.noise.time_varying import VarianceSurge
 from pfbench.noise.white import MeasurementOutage, NominalNoise
 from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime

@@ -22,13 +22,12 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.urban_gnss import (
+from pfbench.model.pseudorange_errors import (
     LosNlosRangeError,
     NormalExponentialMixture,
     NormalRangeError,
-    UrbanGnss,
-    UrbanTuning,
 )
+from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning
 from pfbench.noise.time_varying import VarianceSurge
 from pfbench.noise.white import MeasurementOutage, NominalNoise
 from pfbench.scenario.recorded.urban_drive import (

@@ -23,12 +23,8 @@ from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
-from pfbench.model.strapdown_tight import (
-    RangeErrorModel,
-    StrapdownTight,
-    TightMemsInputs,
-    TightTuning,
-)
+from pfbench.model.strapdown.tight import StrapdownTight, TightMemsInputs
+from pfbench.model.strapdown.tuning import RangeErrorModel, TightTuning
 from pfbench.nav import earth
 from pfbench.nav.gnss.orbits import WalkerConstellation, azimuth_elevation, receive_signals
 from pfbench.nav.gnss.receiver_clock import ReceiverClock

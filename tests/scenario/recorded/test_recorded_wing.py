@@ -21,7 +21,7 @@ from pfbench.core.record import Episode, Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.model.strapdown_total import StrapdownTotal
+from pfbench.model.strapdown.total import StrapdownTotal
 from pfbench.noise.white import MeasurementOutage, NominalNoise
 from pfbench.scenario.recorded.drive import FixReceiver, RecordedDrive
 from pfbench.scenario.recorded.fix_holdout import FixHoldout

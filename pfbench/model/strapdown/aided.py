@@ -9,7 +9,6 @@ heading: their errors are normal and need no attitude for levelling.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,61 +16,17 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.parameter_checks import check_positive
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel, check_positive, independent_normal, normal_batch
-from pfbench.model.strapdown_total import StrapdownTotal, StrapdownTuning, check_three_positive
+from pfbench.model.base import StateSpaceModel
+from pfbench.model.strapdown.total import StrapdownTotal
+from pfbench.model.strapdown.tuning import AidedTuning
 from pfbench.nav.preintegration import PreintegratedImu, rotate
 
 _MOTION, _BIASES = 16, 4
 _DRIVEN = StrapdownTotal.noise_dim
 _CHART = Chart((QuaternionBlock(), EuclideanBlock(_MOTION - 4 + _BIASES)))
-
-
-@dataclass(frozen=True)
-class AidedTuning:
-    """Parameters that filters assume.
-
-    Attributes: motion: Inertial sensors, receiver and start. height_sd: Standard deviation of a
-        pressure height, m. magnetic_sd: Standard deviation of the field about the forward, right
-        and down axis, gauss. field: The Earth's field, North, East, Down, gauss. height_bias_sd:
-        Initial standard deviation about the level that the record subtracts, m. height_bias_walk:
-        Random walk of the barometer bias, m/sqrt(s). magnetic_bias_sd: Initial standard deviation
-        of each axis about the hard iron that the record
-            subtracts, gauss.
-        magnetic_bias_walk: Random walk of each axis, gauss/sqrt(s).
-    """
-
-    motion: StrapdownTuning
-    height_sd: float
-    magnetic_sd: Sequence[float]
-    magnetic_field_gauss: Sequence[float]
-    height_bias_sd: float
-    height_bias_walk: float
-    magnetic_bias_sd: float
-    magnetic_bias_walk: float
-
-    @property
-    def bias_sd(self) -> Tensor:
-        """Initial standard deviation of barometer and magnetometer biases [4].
-
-        Raises:
-            ValueError: If one is not positive.
-        """
-        height = check_positive("believed.height_bias_sd", [self.height_bias_sd])
-        return torch.cat(
-            [height, check_positive("believed.magnetic_bias_sd", [self.magnetic_bias_sd] * 3)]
-        )
-
-    @property
-    def measurement_sd(self) -> Tensor:
-        """Standard deviation of fix, height and field (right, forward, up) [7 or 10].
-
-        Raises:
-            ValueError: If one is not positive.
-        """
-        height = check_positive("believed.height_sd", [self.height_sd])
-        magnetic = check_three_positive("believed.magnetic_sd", self.magnetic_sd)[[1, 0, 2]]
-        return torch.cat([self.motion.measurement_sd, height, magnetic])
 
 
 class StrapdownAided(StateSpaceModel):
@@ -88,7 +43,7 @@ class StrapdownAided(StateSpaceModel):
     of each run.
 
     Args:
-        believed: Standard deviations, densities and the field.
+        tuning: Standard deviations, densities and the field.
 
     Raises:
         ValueError: If a density or standard deviation is not positive, or the field is not three
@@ -108,8 +63,8 @@ class StrapdownAided(StateSpaceModel):
         self.register_buffer("p0", torch.cat([tuning.motion.initial_sd, tuning.bias_sd]))
         self.register_buffer("r", tuning.measurement_sd)
         self.register_buffer("magnetic_field_gauss", self.p0.new_tensor([east, north, -down]))
-        height = check_positive("believed.height_bias_walk", [tuning.height_bias_walk])
-        magnetic = check_positive("believed.magnetic_bias_walk", [tuning.magnetic_bias_walk] * 3)
+        height = check_positive("tuning.height_bias_walk", [tuning.height_bias_walk])
+        magnetic = check_positive("tuning.magnetic_bias_walk", [tuning.magnetic_bias_walk] * 3)
         self.register_buffer("walk", torch.cat([height, magnetic]))
         first = len(self.motion.names)
         self.names = (
@@ -151,7 +106,7 @@ class StrapdownAided(StateSpaceModel):
                 f"record must be PreintegratedImu with {len(self.r)} measured components "
                 f"(a fix, a height, a field) for StrapdownAided, got {type(record.u).__name__} with "
                 f"{record.y.shape[-1]}. Choose scenario=recorded_fixed_wing_aided, and set velocity_sd of "
-                "believed.motion and of the receiver both to three numbers or both to null."
+                "tuning.motion and of the receiver both to three numbers or both to null."
             )
         return record
 

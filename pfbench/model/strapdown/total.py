@@ -8,10 +8,6 @@ is then one inexpensive map for all particles at any IMU rate.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
@@ -19,85 +15,15 @@ from typing_extensions import override
 
 from pfbench.core import quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.parameter_checks import check_positive
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel, check_positive, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
+from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.nav.preintegration import PreintegratedImu, rotate
 
 _SIZES = (4, 3, 3, 3, 3)  # quaternion, velocity, position, gyro bias, accelerometer bias
 _CHART = Chart((QuaternionBlock(), EuclideanBlock(12)))
-
-
-@dataclass(frozen=True)
-class StrapdownTuning:
-    """Parameters that filters assume for the sensors, the receiver and the start.
-
-    Attributes:
-        gyro_density: Effective root density with vibration, rad/s/sqrt(Hz).
-        accelerometer_density: Effective root density with vibration, m/s^2/sqrt(Hz).
-        gyro_bias_walk: Random walk of the bias, rad/s/sqrt(s).
-        accelerometer_bias_walk: Random walk of the bias, m/s^2/sqrt(s).
-        position_sd: Standard deviation of a fix, East, North, Up, m.
-        velocity_sd: Standard deviation of velocity, East, North, Up, m/s. None if not measured.
-        attitude_sd_deg: Initial, about right (pitch), forward (roll), up (yaw) axis, deg.
-        initial_velocity_sd: East, North, Up, m/s.
-        initial_position_sd: East, North, Up, m.
-        gyro_bias_sd_deg_s: Initial standard deviation of each axis, deg/s.
-        accelerometer_bias_sd: Initial standard deviation of each axis, m/s^2.
-        gyro_bias_deg_s: Nominal bias in the axes of the files (forward, right, down), deg/s.
-        accelerometer_bias: Nominal bias in the axes of the files (forward, right, down), m/s^2.
-    """
-
-    gyro_density: float
-    accelerometer_density: float
-    gyro_bias_walk: float
-    accelerometer_bias_walk: float
-    position_sd: Sequence[float]
-    velocity_sd: Sequence[float] | None
-    attitude_sd_deg: Sequence[float]
-    initial_velocity_sd: Sequence[float]
-    initial_position_sd: Sequence[float]
-    gyro_bias_sd_deg_s: float
-    accelerometer_bias_sd: float
-    gyro_bias_deg_s: Sequence[float] = (0.0, 0.0, 0.0)
-    accelerometer_bias: Sequence[float] = (0.0, 0.0, 0.0)
-
-    @property
-    def initial_sd(self) -> Tensor:
-        """Standard deviations of the initial errors in the chart [15], SI.
-
-        Raises:
-            ValueError: If one is not positive, or not three numbers are given.
-        """
-        degree = math.pi / 180.0
-        blocks = [check_three_positive("believed.attitude_sd_deg", self.attitude_sd_deg) * degree]
-        blocks += [check_three_positive("believed.initial_velocity_sd", self.initial_velocity_sd)]
-        blocks += [check_three_positive("believed.initial_position_sd", self.initial_position_sd)]
-        blocks += [
-            check_positive("believed.gyro_bias_sd_deg_s", [self.gyro_bias_sd_deg_s] * 3) * degree
-        ]
-        blocks += [
-            check_positive("believed.accelerometer_bias_sd", [self.accelerometer_bias_sd] * 3)
-        ]
-        return torch.cat(blocks)
-
-    @property
-    def measurement_sd(self) -> Tensor:
-        """Standard deviations of a measurement [3 or 6], SI.
-
-        Raises:
-            ValueError: If one is not positive, or not three numbers are given.
-        """
-        position = check_three_positive("believed.position_sd", self.position_sd)
-        if self.velocity_sd is None:
-            return position
-        return torch.cat([position, check_three_positive("believed.velocity_sd", self.velocity_sd)])
-
-    @property
-    def bias(self) -> Tensor:
-        """Nominal gyro and accelerometer bias in model axes (right, forward, up) [6], SI."""
-        (gf, gr, gd), (af, ar, ad) = self.gyro_bias_deg_s, self.accelerometer_bias
-        gyro = torch.tensor([gr, gf, -gd], dtype=torch.float64) * (math.pi / 180.0)
-        return torch.cat([gyro, torch.tensor([ar, af, -ad], dtype=torch.float64)])
 
 
 class StrapdownTotal(StateSpaceModel):
@@ -119,7 +45,7 @@ class StrapdownTotal(StateSpaceModel):
     start of each run. In `assemble`, group `attitude` is a quaternion [R, T, 4].
 
     Args:
-        believed: Standard deviations and densities.
+        tuning: Standard deviations and densities.
 
     Raises:
         ValueError: If a density or standard deviation is not positive.
@@ -144,7 +70,7 @@ class StrapdownTotal(StateSpaceModel):
             "gyro_bias_walk": tuning.gyro_bias_walk,
             "accelerometer_bias_walk": tuning.accelerometer_bias_walk,
         }
-        roots = [check_positive(f"believed.{name}", [value] * 3) for name, value in density.items()]
+        roots = [check_positive(f"tuning.{name}", [value] * 3) for name, value in density.items()]
         self.register_buffer("density", torch.cat(roots))
         self.register_buffer("r", tuning.measurement_sd)
         self.register_buffer("p0", tuning.initial_sd)
@@ -186,8 +112,8 @@ class StrapdownTotal(StateSpaceModel):
             )
         if record.y.shape[-1] != len(self.r):
             raise ValueError(
-                f"the scenario must measure the {len(self.r)} components of believed.position_sd "
-                f"and velocity_sd, got {record.y.shape[-1]}. Set believed.velocity_sd and "
+                f"the scenario must measure the {len(self.r)} components of tuning.position_sd "
+                f"and velocity_sd, got {record.y.shape[-1]}. Set tuning.velocity_sd and "
                 "receiver.velocity_sd both to three numbers, or both to null."
             )
         return record
@@ -240,18 +166,3 @@ class StrapdownTotal(StateSpaceModel):
             for name, size in zip(self.groups, _SIZES, strict=True)
         ]
         return torch.cat(blocks, -1)
-
-
-def check_three_positive(name: str, values: Sequence[float]) -> Tensor:
-    """Check and return three positive numbers, [3].
-
-    Args:
-        name: Configuration key.
-        values: Numbers.
-
-    Raises:
-        ValueError: If there are not three positive numbers.
-    """
-    if len(values) != 3:
-        raise ValueError(f"{name} must be three numbers, got {list(values)}.")
-    return check_positive(name, list(values))

@@ -8,7 +8,6 @@ position exactly, and filters can use single precision.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -17,10 +16,12 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.parameter_checks import check_positive
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel, check_positive, independent_normal, normal_batch
-from pfbench.model.strapdown_total import StrapdownTotal, StrapdownTuning
-from pfbench.nav.gnss.receiver_clock import ReceiverClock
+from pfbench.model.base import StateSpaceModel
+from pfbench.model.strapdown.total import StrapdownTotal
+from pfbench.model.strapdown.tuning import TightTuning
 from pfbench.nav.preintegration import PreintegratedImu
 
 _MOTION, _CLOCK = 16, 3
@@ -69,71 +70,6 @@ class TightMemsInputs(NamedTuple):
         return PreintegratedImu(*self[: len(PreintegratedImu._fields)])
 
 
-@dataclass(frozen=True)
-class RangeErrorModel:
-    """Error model of one kind of measurement.
-
-    sd^2 = floor^2 + (factor stated)^2 + added^2. [ours]
-
-    Attributes:
-        floor: Errors unknown to the receiver (multipath, atmosphere), m or m/s.
-        factor: Factor on the stated standard deviation of each satellite.
-        added: Noise that a regime adds to the recorded measurements.
-
-    Raises:
-        ValueError: If `floor` is not positive, or `factor` or `added` is negative.
-    """
-
-    floor_sd: float
-    stated_sd_factor: float = 1.0
-    added_sd: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_positive("believed.floor", [self.floor_sd])
-        if not (self.stated_sd_factor >= 0.0 and self.added_sd >= 0.0):
-            raise ValueError(
-                "believed.factor and believed.added must not be negative, "
-                f"got {self.stated_sd_factor} and {self.added_sd}."
-            )
-
-    def sd(self, stated: Tensor) -> Tensor:
-        """Compute the standard deviation from stated standard deviations [...]."""
-        return torch.sqrt(
-            self.floor_sd**2 + self.added_sd**2 + (self.stated_sd_factor * stated) ** 2
-        )
-
-
-@dataclass(frozen=True)
-class TightTuning:
-    """Parameters that filters assume.
-
-    Attributes: motion: Sensors and start. Its parameters of fixes are not used. clock: Receiver
-        clock, relative to its nominal course. range: Error model of the ranges. rate: Error model
-        of the rates. inter_system_sd: Initial standard deviation of the other system's clock
-        relative to the first
-            one's, about its nominal value, m.
-        inter_system_walk: Random walk of the same, m/sqrt(s).
-    """
-
-    motion: StrapdownTuning
-    clock: ReceiverClock
-    range: RangeErrorModel
-    rate: RangeErrorModel
-    inter_system_sd: float = 3.0
-    inter_system_walk: float = 0.02
-
-    @property
-    def clock_sd(self) -> Tensor:
-        """Initial standard deviation of bias m, drift m/s and inter-system bias m [3].
-
-        Raises:
-            ValueError: If one is not positive.
-        """
-        inter_system = check_positive("believed.inter_system_sd", [self.inter_system_sd])
-        clock = inter_system.new_tensor([self.clock.bias_sd, self.clock.drift_sd])
-        return torch.cat([clock, inter_system])
-
-
 class StrapdownTight(StateSpaceModel):
     """StrapdownTotal with a receiver clock, measured by pseudoranges and range rates.
 
@@ -146,7 +82,7 @@ class StrapdownTight(StateSpaceModel):
     of each run.
 
     Args:
-        believed: Standard deviations and densities.
+        tuning: Standard deviations and densities.
 
     Raises:
         ValueError: If a density or standard deviation is not positive.
@@ -162,7 +98,7 @@ class StrapdownTight(StateSpaceModel):
         self.clock, self.range, self.rate = tuning.clock, tuning.range, tuning.rate
         self.register_buffer("p0", torch.cat([tuning.motion.initial_sd, tuning.clock_sd]))
         self.register_buffer(
-            "other_walk", check_positive("believed.inter_system_walk", [tuning.inter_system_walk])
+            "other_walk", check_positive("tuning.inter_system_walk", [tuning.inter_system_walk])
         )
         first = len(self.motion.names)
         self.names = (*self.motion.names, "clock_bias", "clock_drift", "inter_system_bias")

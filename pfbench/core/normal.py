@@ -1,0 +1,52 @@
+"""Normal distributions with independent or correlated components."""
+
+from __future__ import annotations
+
+import torch
+from pyro.distributions import Independent, MultivariateNormal, Normal
+from torch import Tensor
+
+
+class StandardNormal(Normal):
+    """Standard normal distribution; code that recognises the type skips scale and shift."""
+
+
+def independent_normal(mean: Tensor, sd: Tensor) -> Independent:
+    """Build a normal distribution with independent components.
+
+    Args:
+        mean: Means, [..., k].
+        sd: Standard deviations, broadcast against the mean.
+
+    Returns:
+        Distribution with event [k].
+    """
+    return Normal(mean, sd.expand_as(mean), validate_args=False).to_event(1)
+
+
+def normal_batch(runs: int, sd: Tensor, mean: Tensor | None = None) -> Independent:
+    """Build the same independent normal distribution for each run.
+
+    Args:
+        runs: Number of runs R.
+        sd: Standard deviations, [d].
+        mean: Means, [d]; None is zero.
+
+    Returns:
+        Distribution with batch [R], event [d].
+    """
+    centre = torch.zeros_like(sd) if mean is None else mean
+    return independent_normal(centre.expand(runs, -1), sd)
+
+
+def dense_normal(mean: Tensor, factor: Tensor) -> MultivariateNormal:
+    """Build a normal distribution from its mean and Cholesky factor, without checks.
+
+    Args:
+        mean: Means, [..., d].
+        factor: Lower triangular roots of the covariance, [..., d, d].
+
+    Returns:
+        Distribution with event [d].
+    """
+    return MultivariateNormal(mean, scale_tril=factor, validate_args=False)

@@ -1,0 +1,64 @@
+"""Conversion and checks of numerical parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def as_float64(values: Any) -> Tensor:
+    """Return a float64 tensor; tensors inside nested lists keep their gradient."""
+    if _holds_tensors(values):
+        return torch.stack([as_float64(value) for value in values])
+    return torch.as_tensor(values, dtype=torch.float64)
+
+
+def _holds_tensors(values: Any) -> bool:
+    if not isinstance(values, list | tuple):
+        return False
+    return any(isinstance(value, Tensor) or _holds_tensors(value) for value in values)
+
+
+def check_positive(name: str, values: Any) -> Tensor:
+    """Return a float64 tensor of strictly positive numbers.
+
+    Args:
+        name: Configuration key, for the message.
+        values: Numbers.
+
+    Returns:
+        The numbers.
+
+    Raises:
+        ValueError: if a number is not positive or not finite.
+    """
+    tensor = as_float64(values)
+    if not bool(((tensor > 0) & torch.isfinite(tensor)).all()):
+        raise ValueError(
+            f"{name} must be finite positive numbers, got {values}. "
+            "A standard deviation or variance cannot be 0 or negative."
+        )
+    return tensor
+
+
+def check_three_positive(name: str, values: Sequence[float]) -> Tensor:
+    """Check and return three positive numbers, [3].
+
+    Args:
+        name: Configuration key.
+        values: Numbers.
+
+    Returns:
+        The numbers, [3].
+
+    Raises:
+        ValueError: If there are not three positive numbers.
+    """
+    if len(values) != 3:
+        raise ValueError(
+            f"{name} must have 3 numbers, got {list(values)}. Set one number for each axis."
+        )
+    return check_positive(name, list(values))

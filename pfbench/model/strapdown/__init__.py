@@ -1,0 +1,1 @@
+"""Total-state models of inertial sensors with aiding."""
