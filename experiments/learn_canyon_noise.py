@@ -78,6 +78,8 @@ from pfbench.scenario.recorded.urban_error_fit import (
     estimate_normal,
     range_residuals,
 )
+from pfbench.scenario.recorded.urban_log import read_drive
+from pfbench.scenario.recorded.urban_log import select_stretch as cut
 
 STRETCHES = {"first": (0.0, 100.0), "second": (100.0, 283.0)}  # s
 PRIOR = {

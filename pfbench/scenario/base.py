@@ -41,3 +41,31 @@ def check_divergence_threshold(threshold: float | None) -> None:
             f"scenario.divergence_threshold_m must be finite and positive, got {threshold}. "
             "Use null for a scenario without this limit."
         )
+
+
+def check_duration(name: str, value: float) -> None:
+    """Check that a time is positive.
+
+    Args:
+        name: Configuration key.
+        value: Time, s.
+
+    Raises:
+        ValueError: If the time is not positive.
+    """
+    if not value > 0.0:
+        raise ValueError(f"{name} must be positive, got {value}. Set a time in seconds.")
+
+
+def check_added_sd(name: str, sd: float) -> None:
+    """Check the standard deviation of errors that are added to recorded measurements.
+
+    Args:
+        name: Configuration key.
+        sd: Standard deviation.
+
+    Raises:
+        ValueError: If the standard deviation is negative.
+    """
+    if not sd >= 0.0:
+        raise ValueError(f"{name} must be at least 0, got {sd}. Use 0 for no added errors.")

@@ -14,10 +14,11 @@ from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.model.strapdown.tuning import AidedTuning
 from pfbench.noise.base import NoiseRegime, check_unit_process
 from pfbench.noise.white import NominalNoise
-from pfbench.scenario.base import check_divergence_threshold
-from pfbench.scenario.recorded.drive import FixReceiver, RecordedDrive, find_dataset
-from pfbench.scenario.recorded.log_reader import swap_frd_rfu
-from pfbench.scenario.recorded.log_tables import Array, parse_numbers, read_table
+from pfbench.scenario.base import check_added_sd, check_divergence_threshold
+from pfbench.scenario.recorded.assembly import FixReceiver
+from pfbench.scenario.recorded.drive import RecordedDrive
+from pfbench.scenario.recorded.log_tables import Array, find_dataset, parse_numbers, read_table
+from pfbench.scenario.recorded.navigation_log import swap_frd_rfu
 
 _COLUMNS = ("t", "p_static_kpa", "mx", "my", "mz")
 
@@ -50,11 +51,7 @@ class BaroMagSensors:
                 f"got {list(self.hard_iron)}. Set forward, right and down in gauss."
             )
         for name, sd in (("height_sd", self.height_sd), ("magnetic_sd", self.magnetic_sd)):
-            if not sd >= 0.0:
-                raise ValueError(
-                    f"scenario.instruments.{name} must be at least 0, got {sd}. "
-                    "Use 0 for no added errors."
-                )
+            check_added_sd(f"scenario.instruments.{name}", sd)
 
     def make_measurements(self, fixes: MeasurementChannels) -> MeasurementChannels:
         """Append the channels of height and magnetic field to those of the fixes."""

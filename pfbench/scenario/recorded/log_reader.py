@@ -4,10 +4,12 @@ Files use the axes forward-right-down and North-East-Down, as public data sets d
 converts them to right-forward-up and East-North-Up. A log consists of three tables with named
 columns, each a Parquet or a CSV file:
 
-    imu        t [s], fx, fy, fz [m/s^2] (about -9.8 on z when level), wx, wy, wz [rad/s]
-    gnss       t, and lat_deg, lon_deg, h_m or pn, pe, pd [m]; optional vn, ve, vd [m/s];
-               optional fix (1: use the fix, other values: missing)
-    reference  t, pn, pe, pd (or lat_deg, lon_deg, h_m), vn, ve, vd, roll, pitch, yaw [rad]
+| table | columns |
+|---|---|
+| imu | t [s], fx, fy, fz [m/s^2] (about -9.8 on z when level), wx, wy, wz [rad/s] |
+| gnss | t, and lat_deg, lon_deg, h_m or pn, pe, pd [m] |
+| gnss, optional | vn, ve, vd [m/s]; fix (1: use the fix, other values: missing) |
+| reference | t, pn, pe, pd (or lat_deg, lon_deg, h_m), vn, ve, vd, roll, pitch, yaw [rad] |
 
 A table can contain several flights and sensors. The columns `path` and `imu` identify them.
 """
@@ -16,15 +18,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from pfbench.core import quaternion
 from pfbench.nav import attitude, earth
+from pfbench.scenario.recorded.log_checks import (
+    STANDARD_GRAVITY,
+    check_force,
+    check_overlap,
+    check_rate,
+    check_rotation,
+)
 from pfbench.scenario.recorded.log_tables import (
     Array,
     LogTable,
@@ -34,91 +40,19 @@ from pfbench.scenario.recorded.log_tables import (
     read_table,
     read_times,
 )
+from pfbench.scenario.recorded.navigation_log import (
+    GnssLog,
+    ImuLog,
+    LogFiles,
+    NavigationLog,
+    ReferenceLog,
+    swap_frd_rfu,
+)
 
-STANDARD_GRAVITY = 9.80665
 _DEGREE = math.pi / 180.0
 _GEODETIC, _LOCAL = ("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd")
 _VELOCITY, _DERIVED = ("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d")
-_MAX_RATE = 35.0  # rad/s: the range of the fastest common MEMS gyros, 2000 deg/s
 _MAX_GAP = 0.1  # s; longest interval between samples
-
-
-class ImuLog(NamedTuple):
-    """IMU samples in body axes right, forward, up.
-
-    Attributes:
-        time: Times, s, [n].
-        force: Specific force, m/s^2, [n, 3].
-        rate: Angular rate, rad/s, [n, 3].
-    """
-
-    time: Array
-    force: Array
-    rate: Array
-
-
-class GnssLog(NamedTuple):
-    """Fixes in East, North, Up. Missing values are NaN.
-
-    Attributes:
-        time: Times, s, [m].
-        position: Positions, m, [m, 3].
-        velocity: Velocities, m/s, [m, 3]. All NaN if not recorded.
-    """
-
-    time: Array
-    position: Array
-    velocity: Array
-
-
-class ReferenceLog(NamedTuple):
-    """Reference motion in East, North, Up.
-
-    Attributes:
-        time: Times, s, [k].
-        attitude: Quaternions from body to level axes, [k, 4].
-        velocity: Velocities, m/s, [k, 3].
-        position: Positions, m, [k, 3].
-    """
-
-    time: Array
-    attitude: Array
-    velocity: Array
-    position: Array
-
-
-@dataclass(frozen=True)
-class NavigationLog:
-    """Log that passed all checks.
-
-    Attributes:
-        imu: IMU samples.
-        fixes: Fixes.
-        reference: Reference motion.
-        gravity: Normal gravity at the origin, m/s^2.
-        notes: Corrections and assumptions of the reader, for the report.
-    """
-
-    imu: ImuLog
-    fixes: GnssLog
-    reference: ReferenceLog
-    gravity: float
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class LogFiles:
-    """Names of the three tables, without .parquet or .csv.
-
-    Attributes:
-        imu: Name of the IMU table.
-        gnss: Name of the table of fixes. It can be the reference.
-        reference: Name of the reference table.
-    """
-
-    imu: str = "imu"
-    gnss: str = "gnss"
-    reference: str = "reference"
 
 
 def read_log(
@@ -154,27 +88,19 @@ def read_log(
         parse_numbers(inertial, ("fx", "fy", "fz")),
         parse_numbers(inertial, ("wx", "wy", "wz")),
     )
-    _check_force(force, inertial.name)
-    _check_rate(rate, inertial.name)
+    check_force(force, inertial.name)
+    check_rate(rate, inertial.name)
     centre = _origin(origin, gnss, truth)
     fixes, reference = _fixes(gnss, centre), _motion(truth, centre)
-    _check_overlap(inertial.name, time, gnss.name, fixes.time)
-    _check_overlap(inertial.name, time, truth.name, reference.time)
+    check_overlap(inertial.name, time, gnss.name, fixes.time)
+    check_overlap(inertial.name, time, truth.name, reference.time)
     sensors = ImuLog(time, swap_frd_rfu(force), swap_frd_rfu(rate))
-    _check_turn(sensors, reference, inertial.name, truth.name)
+    check_rotation(sensors, reference, inertial.name, truth.name)
     if centre is None:
         notes = (*notes, f"gravity {STANDARD_GRAVITY} m/s^2: the log does not contain its location")
         return NavigationLog(sensors, fixes, reference, STANDARD_GRAVITY, notes)
     latitude, height = torch.tensor([centre[0] * _DEGREE, centre[2]], dtype=torch.float64)
     return NavigationLog(sensors, fixes, reference, float(earth.gravity(latitude, height)), notes)
-
-
-def swap_frd_rfu(a: Array) -> Array:
-    """Convert forward-right-down to right-forward-up vectors [..., 3].
-
-    The function also converts North-East-Down to East-North-Up. It is its own inverse.
-    """
-    return np.stack([a[..., 1], a[..., 0], -a[..., 2]], axis=-1)
 
 
 def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
@@ -199,84 +125,11 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
     i = int(step.argmax())
     if step[i] > max(_MAX_GAP, 3 * typical):
         raise ValueError(
-            f"{table.name}: a gap of {step[i]:.3f} s after {table.row(i)} (t = {time[i]}), with samples every {typical:.4f} s. "
-            "The motion in the gap is not recorded. Cut the log there and use the longer part."
+            f"{table.name} must not have gaps, got a gap of {step[i]:.3f} s after {table.row(i)} "
+            f"(t = {time[i]}), with samples every {typical:.4f} s. "
+            "Cut the log there and use the longer part."
         )
     return time, notes
-
-
-def _check_force(force: Array, name: str) -> None:
-    typical = float(np.median(np.linalg.norm(force, axis=1)))
-    if 0.8 < typical < 1.25:
-        raise ValueError(
-            f"{name}: fx, fy, fz have a median norm of {typical:.3f}: in g; multiply by {STANDARD_GRAVITY}"
-        )
-    if not 5.0 < typical < 20.0:
-        raise ValueError(
-            f"{name}: fx, fy, fz have a median norm of {typical:g}; gravity alone gives 9.8 m/s^2: check the unit"
-        )
-    down = float(np.median(force[:, 2]))
-    if down > 0.5 * typical:
-        raise ValueError(
-            f"{name}: fz has a median of {down:+.2f}, and forward-right-down axes show about -9.8 when level; "
-            "from forward-left-up negate fy, fz, wy, wz"
-        )
-
-
-def _check_rate(rate: Array, name: str) -> None:
-    largest = float(np.abs(rate).max())
-    if largest > _MAX_RATE:
-        raise ValueError(
-            f"{name}: wx, wy, wz reach {largest:.1f}, implausible in rad/s; if in deg/s, multiply by {_DEGREE:.10f}"
-        )
-
-
-def _check_overlap(name: str, time: Array, other_name: str, other_time: Array) -> None:
-    if min(time[-1], other_time[-1]) <= max(time[0], other_time[0]):
-        raise ValueError(
-            f"{name} covers t = {time[0]:.3f} to {time[-1]:.3f} and {other_name} t = {other_time[0]:.3f} to {other_time[-1]:.3f}: "
-            "no common time; give both the same clock (GPS seconds, or seconds from the same instant)"
-        )
-
-
-def _check_turn(imu: ImuLog, reference: ReferenceLog, name: str, other_name: str) -> None:
-    """Compare angular rates with the reference.
-
-    Rates of slow vehicles in deg/s pass all absolute limits.
-    """
-    # longer intervals reduce the effect of the reference noise
-    stride = max(1, round(0.25 / float(np.median(np.diff(reference.time)))))
-    inside = (reference.time >= imu.time[0]) & (reference.time <= imu.time[-1])
-    time, q = (
-        reference.time[inside][::stride],
-        torch.from_numpy(reference.attitude[inside][::stride]),
-    )
-    if len(time) < 10:
-        return
-    inverse = q[:-1] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
-    true = quaternion.rotation_vector_from_quaternion(
-        quaternion.quaternion_multiply(inverse, q[1:])
-    ).numpy()
-    summed = np.cumsum(0.5 * np.diff(imu.time)[:, None] * (imu.rate[1:] + imu.rate[:-1]), axis=0)
-    angle = np.vstack([np.zeros(3), summed])
-    measured = np.diff(
-        np.stack([np.interp(time, imu.time, column) for column in angle.T], axis=-1), axis=0
-    )
-    measured, true = (turn / np.diff(time)[:, None] for turn in (measured, true))
-    # the mean contains the gyro bias
-    measured, true = measured - measured.mean(axis=0), true - true.mean(axis=0)
-    if np.sqrt(np.mean(true**2)) < 0.02:
-        return  # at low angular rates the comparison contains mostly noise
-    slope = float((measured * true).sum() / (true * true).sum())
-    if slope > 20.0:
-        raise ValueError(
-            f"{name}: wx, wy, wz turn {slope:.0f} times as fast as {other_name}: in deg/s; multiply by {_DEGREE:.10f}"
-        )
-    if slope < 0.05:
-        raise ValueError(
-            f"{name} and {other_name} do not turn together (slope {slope:.3f}): check that roll, pitch, yaw are in rad (0.017: in "
-            "degrees), that axes are forward-right-down, yaw clockwise from North, and that both have the same clock"
-        )
 
 
 def _origin(
@@ -306,8 +159,9 @@ def _origin(
     if not any(local):
         return tuple(parse_numbers(truth, _GEODETIC)[0].tolist())
     raise ValueError(
-        f"{gnss.name} and {truth.name}: one has lat_deg, lon_deg, h_m, the other pn, pe, pd, and no "
-        "file contains the origin pn = pe = pd = 0. Set scenario.origin=[lat_deg, lon_deg, h_m]."
+        f"{gnss.name} and {truth.name} must both have pn, pe, pd or both lat_deg, lon_deg, h_m, "
+        "got one with each and no file with the origin pn = pe = pd = 0. "
+        "Set scenario.origin=[lat_deg, lon_deg, h_m]."
     )
 
 
@@ -320,7 +174,8 @@ def _positions(table: LogTable, origin: tuple[float, ...] | None) -> Array:
     if invalid.size:
         position = table.row(int(invalid[0]))
         raise ValueError(
-            f"{table.name}: column lat_deg, {position} is {pos[invalid[0], 0]}. Latitudes must be between -90 and 90 degrees."
+            f"{table.name}: column lat_deg must be between -90 and 90, got {pos[invalid[0], 0]} in "
+            f"{position}. Correct or remove this row."
         )
     scale = np.array([_DEGREE, _DEGREE, 1.0])
     return earth.local_enu(
@@ -348,8 +203,8 @@ def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
     max_pitch, max_roll = float(np.abs(pitch).max()), float(np.abs(roll).max())
     if max_pitch > 1.001 * math.pi / 2 or max_roll > 1.001 * math.pi:
         raise ValueError(
-            f"{table.name}: pitch reaches {max_pitch:g} and roll {max_roll:g}, above 90 and 180 degrees in rad; "
-            f"if in degrees, multiply roll, pitch, yaw by {_DEGREE:.10f}"
+            f"{table.name}: pitch and roll must be at most pi / 2 and pi rad, got {max_pitch:g} and "
+            f"{max_roll:g}. If in degrees, multiply roll, pitch, yaw by {_DEGREE:.10f}."
         )
     euler = torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1))
     q = attitude.quaternion_from_dcm(attitude.dcm_from_euler(euler)).numpy()

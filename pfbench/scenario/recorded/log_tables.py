@@ -16,6 +16,30 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+def find_dataset(root: str | None, folder: str) -> Path:
+    """Return the folder of a data set.
+
+    Args:
+        root: Folder of all data sets.
+        folder: Name of the data set.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ValueError: if data.root is not set, or does not contain the folder.
+    """
+    remedy = f"Set the environment variable PFBENCH_DATA or data.root to the folder with {folder}/."
+    if root is None:
+        raise ValueError(
+            f"data.root is not set. Recorded data are not part of the package. {remedy}"
+        )
+    path = Path(root) / folder
+    if not path.is_dir():
+        raise ValueError(f"data.root must contain the folder {folder}, got {root}. {remedy}")
+    return path
+
+
 class LogTable(NamedTuple):
     """Rows of a table file.
 
@@ -60,11 +84,12 @@ def read_table(folder: Path, name: str, select: dict[str, int | None]) -> LogTab
     ]
     if not files:
         raise ValueError(
-            f"{folder}: no {name}.parquet and no {name}.csv; a log is a folder with imu, gnss and reference"
+            f"{folder} must contain {name}.parquet or {name}.csv. "
+            "Store a log as a folder with imu, gnss and reference."
         )
     if len(files) > 1:
         raise ValueError(
-            f"{folder}: both {name}.parquet and {name}.csv; delete one of them, or name the files otherwise"
+            f"{folder} must not contain both {name}.parquet and {name}.csv. Delete one of them."
         )
     file = files[0]
     if file.suffix == ".csv":
@@ -77,7 +102,9 @@ def read_table(folder: Path, name: str, select: dict[str, int | None]) -> LogTab
         if column in table.rows:
             table = _selected(table, column, value)
     if len(table.rows) < 2:
-        raise ValueError(f"{file.name}: {len(table.rows)} rows; give at least 2")
+        raise ValueError(
+            f"{file.name} must have at least 2 rows, got {len(table.rows)}. Use a longer table."
+        )
     return table
 
 
@@ -86,7 +113,7 @@ def _parquet(file: Path) -> LogTable:
         from pyarrow import parquet  # required only for Parquet logs
     except ImportError as error:
         raise ValueError(
-            f"{file.name} needs pyarrow: pip install 'pfbench[data]', or store the log as CSV"
+            f"{file.name} needs pyarrow. Run pip install 'pfbench[data]', or store the log as CSV."
         ) from error
     table = parquet.read_table(file)
     stated = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
@@ -97,10 +124,13 @@ def _selected(table: LogTable, column: str, value: int | None) -> LogTable:
     values = sorted(set(table.rows[column].tolist()))
     if value is None and len(values) > 1:
         raise ValueError(
-            f"{table.name}: column {column} has values {values}. Select one of them with {column}=..."
+            f"{table.name}: column {column} must have one value, got {values}. "
+            f"Select one of them with {column}=..."
         )
     if value is not None and value not in values:
-        raise ValueError(f"{table.name}: {column}={value} is not in the file; it has {values}")
+        raise ValueError(
+            f"{table.name} must have rows with {column}={value}, got {values}. Select one of these."
+        )
     selected = values[0] if value is None else value
     rows = table.rows[table.rows[column] == selected].reset_index(drop=True)
     return table._replace(rows=rows, name=f"{table.name} ({column} {selected})")
@@ -124,8 +154,8 @@ def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
         available = ", ".join(map(str, table.rows.columns))
         pronoun = "it" if len(missing) == 1 else "them"
         raise ValueError(
-            f"{table.name}: no column {', '.join(missing)}; it has {available}. "
-            f"Rename or add {pronoun} (units: s, m, m/s, m/s^2, rad, rad/s)"
+            f"{table.name} must have a column {', '.join(missing)}, got {available}. "
+            f"Rename or add {pronoun} (units: s, m, m/s, m/s^2, rad, rad/s)."
         )
     out = np.empty((len(table.rows), len(columns)))
     for i, column in enumerate(columns):
@@ -133,8 +163,9 @@ def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise ValueError(
-                f"{table.name}: column {column}, {table.row(int(bad[0]))} is {table.rows[column].iloc[bad[0]]} "
-                f"({bad.size} such); give numbers, and leave out rows without data"
+                f"{table.name}: column {column} must have finite numbers, got "
+                f"{table.rows[column].iloc[bad[0]]} in {table.row(int(bad[0]))} ({bad.size} such rows). "
+                "Remove rows without data."
             )
         out[:, i] = values
     return out
@@ -174,8 +205,9 @@ def check_increasing(table: LogTable, time: Array) -> None:
         i = int(back[0]) + 1
         problem = "repeats the previous time" if time[i] == time[i - 1] else "goes back in time"
         raise ValueError(
-            f"{table.name}: column t, {table.row(i)} is {time[i]} after {time[i - 1]}: it {problem} ({back.size} such); "
-            "sort the rows by t and keep one row for each time"
+            f"{table.name}: column t must increase, got {time[i]} after {time[i - 1]} in "
+            f"{table.row(i)}, which {problem} ({back.size} such rows). "
+            "Sort the rows by t and keep one row for each time."
         )
 
 
@@ -196,5 +228,6 @@ def check_seconds(table: LogTable, time: Array, longest: float) -> None:
     units = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
     unit, scale = next(((u, s) for u, s in units if typical * s <= longest), units[-1])
     raise ValueError(
-        f"{table.name}: column t has a median interval of {typical:g}, too long for seconds; if in {unit}, multiply by {scale:g}"
+        f"{table.name}: column t must be in s, got a median interval of {typical:g}. "
+        f"If it is in {unit}, multiply by {scale:g}."
     )

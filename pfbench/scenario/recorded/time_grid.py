@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from pfbench.core import quaternion
-from pfbench.scenario.recorded.log_reader import ImuLog, NavigationLog, ReferenceLog
 from pfbench.scenario.recorded.log_tables import Array
+from pfbench.scenario.recorded.navigation_log import ImuLog, NavigationLog, ReferenceLog
 
 SAME_TIME = 1e-3  # s
 
@@ -98,8 +98,9 @@ def resample_log(
     selection = select_fixes(log.fixes.time, interval, low, high)
     if len(selection) < 2:
         raise ValueError(
-            f"{len(selection)} fixes between t = {low:.3f} and {high:.3f}, the time common to IMU, reference, start and end. "
-            "At least 2 are required. Use a longer log, an earlier start or a later end."
+            "IMU, reference, start and end must have at least 2 fixes in their common time, got "
+            f"{len(selection)} fixes between t = {low:.3f} and {high:.3f}. "
+            "Use a longer log, an earlier start or a later end."
         )
     if velocity and np.isnan(log.fixes.velocity).all():
         raise ValueError(

@@ -14,9 +14,8 @@ import torch
 from pfbench.nav import attitude, earth
 from pfbench.nav.motion_spline import MotionSpline, RecordedMotion
 from pfbench.nav.trajectory import TrajectoryData
-from pfbench.scenario.recorded.drive import find_dataset
-from pfbench.scenario.recorded.log_reader import swap_frd_rfu
-from pfbench.scenario.recorded.log_tables import parse_numbers, read_table, read_times
+from pfbench.scenario.recorded.log_tables import find_dataset, parse_numbers, read_table, read_times
+from pfbench.scenario.recorded.navigation_log import swap_frd_rfu
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,8 @@ def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> Recor
     roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
     if np.abs(pitch).max() > 1.001 * math.pi / 2:
         raise ValueError(
-            f"{table.name}: pitch reaches {np.abs(pitch).max():g} rad; if in degrees, multiply angles by pi / 180"
+            f"{table.name}: pitch must be at most pi / 2 rad, got {np.abs(pitch).max():g}. "
+            "If in degrees, multiply angles by pi / 180."
         )
     dcm = attitude.dcm_from_euler(torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1)))
     centre = torch.tensor(

@@ -1,119 +1,32 @@
 """Recorded city drive with raw pseudoranges and odometry.
 
-`urban_error_fit` estimates the distribution of the range errors. The log contains satellite
-positions in the Earth-fixed axes of transmission. They are rotated to the axes of reception at the
-start. A range is then a distance, accurate to a millimetre within a kilometre of the start.
+`urban_error_fit` estimates the distribution of the range errors.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
-from pfbench.model.pseudorange_errors import NormalRangeError, UrbanInputs
+from pfbench.model.pseudorange_errors import NormalRangeError
 from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning
-from pfbench.nav import earth
-from pfbench.nav.gnss.orbits import azimuth_elevation
 from pfbench.noise.base import NoiseRegime, check_unit_process
-from pfbench.scenario.base import check_divergence_threshold
-from pfbench.scenario.recorded.drive import encode_names, find_dataset
-from pfbench.scenario.recorded.log_tables import Array, parse_numbers, read_table, read_times
-
-LIGHT = 299792458.0  # m/s
-MOVING = 1.0  # m/s; smallest speed at which the velocity determines the heading
-_SAME_TIME = 1e-3  # s
-
-
-class UrbanLog(NamedTuple):
-    """Recorded drive with T epochs and S satellites. Missing values are NaN.
-
-    Attributes:
-        time: Times, s, [T].
-        speed: Wheel speed, m/s, [T].
-        yaw_rate: Yaw rate of the gyro, clockwise from above, rad/s, [T].
-        position: Reference latitude, longitude, height, rad and m, [T, 3].
-        velocity: Reference velocity East and North, m/s, [T, 2].
-        satellites: Names, such as G12.
-        range: Pseudorange, corrected for satellite clock, troposphere and ionosphere, m, [T, S].
-        sd: Standard deviation reported by the receiver, m, [T, S].
-        cn0: Carrier-to-noise density, dB-Hz, [T, S].
-        place: Satellite positions in the Earth-fixed axes of transmission, m, [T, S, 3].
-    """
-
-    time: Array
-    speed: Array
-    yaw_rate: Array
-    position: Array
-    velocity: Array
-    satellites: tuple[str, ...]
-    range: Array
-    sd: Array
-    cn0: Array
-    place: Array
-
-
-def read_drive(folder: Path) -> UrbanLog:
-    """Read the tables `pseudorange`, `odometry` and `truth` of a folder.
-
-    Raises:
-        ValueError: if a table or column is missing, or the tables have different epochs.
-    """
-    pseudoranges, wheels, truth = (
-        read_table(folder, name, {}) for name in ("pseudorange", "odometry", "truth")
-    )
-    time = read_times(wheels, 1.0)
-    reference = parse_numbers(truth, ("t", "lat_deg", "lon_deg", "h_m", "ve_d", "vn_d"))
-    if not np.array_equal(time, reference[:, 0]):
-        raise ValueError(
-            f"{folder}: {wheels.name} and {truth.name} must have equal times t. "
-            "Use the same epochs in both."
-        )
-    t, svid, value, variance, cn0, *positions = parse_numbers(
-        pseudoranges, ("t", "svid", "pr", "pr_var", "cn0", "sx", "sy", "sz")
-    ).T
-    row = np.searchsorted(time, t - _SAME_TIME).clip(max=len(time) - 1)
-    if np.abs(time[row] - t).max() > _SAME_TIME:
-        raise ValueError(
-            f"{folder}: {pseudoranges.name} must have only times t of {wheels.name}. "
-            "Use the same epochs in both."
-        )
-    names = [
-        f"{system}{int(number):02d}"
-        for system, number in zip(pseudoranges.rows["sys"], svid, strict=True)
-    ]
-    satellites, slot = np.unique(names, return_inverse=True)
-    columns = np.full((6, len(time), len(satellites)), np.nan)
-    columns[:, row, slot] = value, np.sqrt(variance), cn0, *positions
-    position = np.column_stack([np.radians(reference[:, 1:3]), reference[:, 3]])
-    speed, yaw_rate = parse_numbers(wheels, ("v_fwd", "yaw_rate_ned")).T
-    sky_columns = columns[0], columns[1], columns[2], np.moveaxis(columns[3:], 0, -1)
-    return UrbanLog(
-        time, speed, yaw_rate, position, reference[:, 4:], tuple(satellites.tolist()), *sky_columns
-    )
-
-
-def rotate_heading(place: Array, at: Array) -> Array:
-    """Rotate satellites from Earth-fixed axes at transmission to those at reception.
-
-    Args:
-        place: Satellite positions, m, [..., 3].
-        at: Position of the receiver, m, [..., 3].
-
-    Returns:
-        Satellite positions, m, [..., 3].
-    """
-    angle = earth.OMEGA / LIGHT * np.linalg.norm(place - at, axis=-1)
-    c, s = np.cos(angle), np.sin(angle)
-    x, y, z = np.moveaxis(place, -1, 0)
-    return np.stack([c * x + s * y, c * y - s * x, z], -1)
+from pfbench.scenario.base import check_added_sd, check_divergence_threshold, check_duration
+from pfbench.scenario.recorded.log_tables import find_dataset
+from pfbench.scenario.recorded.urban_log import (
+    UrbanLog,
+    interpolate_reference,
+    line_of_sight_directions,
+    read_drive,
+    reduce_ranges,
+    select_epochs,
+    select_stretch,
+)
 
 
 @dataclass(frozen=True)
@@ -135,16 +48,8 @@ class PseudorangeReceiver:
     clock_drift: float = -49.7
 
     def __post_init__(self) -> None:
-        if not self.fix_interval_s > 0.0:
-            raise ValueError(
-                "scenario.receiver.fix_interval_s must be positive, "
-                f"got {self.fix_interval_s}. Set a time in seconds."
-            )
-        if not self.range_sd >= 0.0:
-            raise ValueError(
-                f"scenario.receiver.range_sd must be at least 0, got {self.range_sd}. "
-                "Use 0 for no added errors."
-            )
+        check_duration("scenario.receiver.fix_interval_s", self.fix_interval_s)
+        check_added_sd("scenario.receiver.range_sd", self.range_sd)
 
 
 @dataclass(frozen=True)
@@ -236,108 +141,3 @@ class UrbanDrive:
         true = torch.cat([heading.new_zeros(3), heading, heading.new_zeros(5)])
         error = model.p0 * draws.at_step(0).normal("world.start", 1, len(model.p0))[:, 0]
         return model.chart.add(true.expand_as(error), -error)
-
-
-def select_stretch(drive: UrbanLog, start: float | None, end: float | None) -> UrbanLog:
-    """Select the epochs from start to end, both inclusive.
-
-    Args:
-        drive: Drive.
-        start: Start, s of the drive. None for the start of the drive.
-        end: End, s of the drive. None for the end of the drive.
-
-    Returns:
-        The selected part of the drive.
-
-    Raises:
-        ValueError: if it contains fewer than two epochs.
-    """
-    low, high = (-np.inf if start is None else start), (np.inf if end is None else end)
-    inside = (drive.time >= low) & (drive.time <= high)
-    if inside.sum() < 2:
-        raise ValueError(
-            "scenario.start_s and end_s must select at least 2 epochs, "
-            f"got {inside.sum()} between {start} and {end}. "
-            f"The drive covers {drive.time[0]} to {drive.time[-1]} s."
-        )
-    leaves = {
-        name: value[inside] for name, value in drive._asdict().items() if name != "satellites"
-    }
-    return drive._replace(**leaves)
-
-
-def select_epochs(time: Array, interval: float) -> NDArray[np.bool_]:
-    """Select epochs at intervals from the first one.
-
-    Args:
-        time: Times of the epochs, s, [T].
-        interval: Time between selected epochs, s.
-
-    Returns:
-        Mask [T] of the first epochs at or after 0, interval, 2 interval, ...
-    """
-    count = np.floor((time - time[0] + _SAME_TIME) / interval)
-    return np.diff(count, prepend=-1.0) > 0
-
-
-def interpolate_reference(drive: UrbanLog) -> dict[str, Tensor]:
-    """Return the reference of each component group of the model, [T, k].
-
-    The heading is NaN at speeds below `MOVING`.
-    """
-    position = torch.from_numpy(drive.position)
-    enu = earth.local_enu(position, position[0])
-    east, north = torch.from_numpy(drive.velocity).unbind(-1)
-    heading = torch.where(torch.hypot(east, north) > MOVING, torch.atan2(east, north), torch.nan)
-    return {"position": enu[:, :2], "height": enu[:, 2:], "heading": heading[:, None]}
-
-
-def line_of_sight_directions(drive: UrbanLog) -> dict[str, Tensor]:
-    """Compute azimuth and elevation from the start, for the datasheet.
-
-    Args:
-        drive: Drive.
-
-    Returns:
-        Azimuth and elevation, rad, [T - 1, S], without the first epoch, and encoded names.
-    """
-    origin = torch.from_numpy(drive.position[0])
-    place = torch.from_numpy(rotate_heading(drive.place[1:], earth.ecef(origin).numpy()))
-    azimuth, elevation = azimuth_elevation(origin, place)
-    return {
-        "azimuth": azimuth,
-        "elevation": elevation,
-        "satellites": encode_names(drive.satellites),
-    }
-
-
-def reduce_ranges(drive: UrbanLog, clock_drift: float) -> tuple[Tensor, UrbanInputs]:
-    """Subtract the ranges from the start and the nominal clock drift.
-
-    Args:
-        drive: Drive.
-        clock_drift: Nominal drift of the receiver clock, m/s.
-
-    Returns:
-        Reduced pseudoranges, m, [T, S], and the inputs of the T - 1 steps.
-    """
-    origin = torch.from_numpy(drive.position[0])
-    at = earth.ecef(origin).numpy()
-    direction = rotate_heading(drive.place, at) - at
-    reach = np.linalg.norm(direction, axis=-1)
-    reduced = drive.range - reach - (clock_drift * (drive.time - drive.time[0]))[:, None]
-    line = direction / reach[..., None] @ earth.local_axes(origin).numpy().T
-    step_means = [0.5 * (a[1:] + a[:-1]) for a in (drive.speed, drive.yaw_rate)]
-    glonass = np.broadcast_to(
-        [float(name.startswith("R")) for name in drive.satellites], reach.shape
-    )
-    # finite values replace missing inputs, since a NaN would propagate to gradients
-    line = np.where(np.isnan(line), [0.0, 0.0, 1.0], line)
-    filled = [
-        np.where(np.isnan(a), fill, a)
-        for a, fill in ((reach, 2e7), (glonass, 0.0), (drive.cn0, 40.0), (drive.sd, 1.0))
-    ]
-    leaves = [np.diff(drive.time), *step_means, *(a[1:] for a in (line, *filled))]
-    return torch.from_numpy(reduced), UrbanInputs(
-        *(torch.from_numpy(np.ascontiguousarray(leaf))[None] for leaf in leaves)
-    )

@@ -22,14 +22,8 @@ from pfbench.model.pseudorange_errors import (
     NormalRangeError,
 )
 from pfbench.nav import earth
-from pfbench.scenario.recorded.drive import find_dataset
-from pfbench.scenario.recorded.log_tables import Array
-from pfbench.scenario.recorded.urban_drive import (
-    UrbanLog,
-    read_drive,
-    rotate_heading,
-    select_stretch,
-)
+from pfbench.scenario.recorded.log_tables import Array, find_dataset
+from pfbench.scenario.recorded.urban_log import UrbanLog, read_drive, rotate_heading, select_stretch
 
 
 class RangeResiduals(NamedTuple):
@@ -64,7 +58,7 @@ def range_residuals(drive: UrbanLog, clock_drift: float = -49.7) -> RangeResidua
     """
     position = torch.from_numpy(drive.position)
     at = earth.ecef(position).numpy()[:, None]
-    direction = rotate_heading(drive.place, at) - at
+    direction = rotate_heading(drive.satellite_position, at) - at
     reach = np.linalg.norm(direction, axis=-1)
     up = np.einsum(
         "tsi,ti->ts", direction / reach[..., None], earth.local_axes(position)[:, 2].numpy()
@@ -134,7 +128,7 @@ def fit_clock(
     )
     if np.abs(solution.jac).max() > 1e-4:
         raise ValueError(
-            f"The maximum-likelihood search did not converge ({solution.message}). "
+            f"The maximum-likelihood search must converge, got {solution.message!r}. "
             "Use a longer part of the drive or a larger knot interval."
         )
     return solution.x[n + 1 :], PiecewiseLinearClock(knots, solution.x[:n], float(solution.x[n]))

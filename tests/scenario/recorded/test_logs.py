@@ -16,7 +16,9 @@ from pymap3d import ned2geodetic
 from scipy.spatial.transform import Rotation
 from synthetic_log import GRAVITY, ORIGIN, drive, tables, write
 
-from pfbench.scenario.recorded.log_reader import STANDARD_GRAVITY, LogFiles, read_log, swap_frd_rfu
+from pfbench.scenario.recorded.log_checks import STANDARD_GRAVITY
+from pfbench.scenario.recorded.log_reader import read_log
+from pfbench.scenario.recorded.navigation_log import LogFiles, swap_frd_rfu
 
 Log = dict[str, pd.DataFrame]
 TO_ENU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -119,10 +121,11 @@ def test_flights_and_sensors_of_one_table_are_told_apart(tmp_path: Path) -> None
     assert len(first.imu.time) == len(other.imu.time) == len(log["imu"])
     assert np.allclose(first.reference.position[:, 2] - other.reference.position[:, 2], 50.0)
     with pytest.raises(
-        ValueError, match=r"column path has values \[1, 2\]. Select one of them with path="
+        ValueError,
+        match=r"column path must have one value, got \[1, 2\]. Select one of them with path=",
     ):
         read_log(folder, imu=1)
-    with pytest.raises(ValueError, match=r"imu=2 is not in the file; it has \[1\]"):
+    with pytest.raises(ValueError, match=r"must have rows with imu=2, got \[1\]"):
         read_log(folder, path=2, imu=2)
 
 
@@ -202,70 +205,73 @@ def left_up(log: Log) -> None:
 
 
 BAD: dict[str, tuple[Callable[[Log], None], str]] = {
-    "missing column": (drop("imu", "fy"), r"imu\.csv: no column fy; it has t, fx, fz.*Rename"),
-    "no position": (drop("gnss", "pe"), r"gnss\.csv: no column pe"),
+    "missing column": (drop("imu", "fy"), r"imu\.csv must have a column fy, got t, fx, fz.*Rename"),
+    "no position": (drop("gnss", "pe"), r"gnss\.csv must have a column pe"),
     "NaN": (
         put("imu", 7, "wz", np.nan),
-        r"imu\.csv: column wz, line 9 is nan \(1 such\); give numbers",
+        r"imu\.csv: column wz must have finite numbers, got nan in line 9 \(1 such rows\)",
     ),
-    "text": (put("reference", 2, "roll", "n/a?"), r"reference\.csv: column roll, line 4 is n/a\?"),
-    "infinite": (put("gnss", 0, "pn", np.inf), r"gnss\.csv: column pn, line 2 is inf"),
+    "text": (
+        put("reference", 2, "roll", "n/a?"),
+        r"reference\.csv: column roll .*got n/a\? in line 4",
+    ),
+    "infinite": (put("gnss", 0, "pn", np.inf), r"gnss\.csv: column pn .*got inf in line 2"),
     "duplicate": (
         put("gnss", 4, "t", 0.6),
-        r"gnss\.csv: column t, line 6 is 0\.6 after 0\.6.*repeats the previous time",
+        r"gnss\.csv: column t .*got 0\.6 after 0\.6 in line 6, which repeats the previous time",
     ),
     "backwards": (
         put("imu", 50, "t", 0.1),
-        r"imu\.csv: column t, line 52 is 0\.1 after 0\.49.*goes back.*sort",
+        r"imu\.csv: column t .*got 0\.1 after 0\.49 in line 52.*goes back.*Sort",
     ),
     "imu in ms": (
         scale("imu", "t", 1e3),
-        r"imu\.csv: column t has a median interval of 10.*in ms, multiply by 0\.001",
+        r"imu\.csv: column t .*got a median interval of 10.*in ms, multiply by 0\.001",
     ),
     "imu in us": (scale("imu", "t", 1e6), r"in us, multiply by 1e-06"),
     "imu in ns": (scale("imu", "t", 1e9), r"in ns, multiply by 1e-09"),
     "gnss in ms": (scale("gnss", "t", 1e3), r"gnss\.csv: column t.*in ms"),
     "in g": (
         scale("imu", "fx fy fz", 1 / GRAVITY),
-        r"fx, fy, fz have a median norm of 1\.\d+: in g; multiply by 9\.80665",
+        r"got a median norm of 1\.\d+, which is in g. Multiply by 9\.80665",
     ),
     "odd force": (
         scale("imu", "fx fy fz", 100.0),
-        r"fx, fy, fz have a median norm of .*check the unit",
+        r"fx, fy, fz must have a median norm near .*Check the unit",
     ),
-    "z up": (left_up, r"fz has a median of \+9\.81.*negate fy, fz, wy, wz"),
+    "z up": (left_up, r"fz must be .*got a median of \+9\.81.*negate fy, fz, wy, wz"),
     "fast in deg/s": (
         scale("imu", "wx wy wz", 1e4),
-        r"wx, wy, wz reach 2400\.0, implausible.*in deg/s, multiply by 0\.01745",
+        r"wx, wy, wz must be .*got 2400\.0.*in deg/s, multiply by 0\.01745",
     ),
     "slow in deg/s": (
         scale("imu", "wx wy wz", 180 / np.pi),
-        r"turn 57 times as fast as reference\.csv: in deg/s",
+        r"got 57 times the rate of reference\.csv, so they are in deg/s",
     ),
     "other sense": (
         scale("imu", "wz", -1.0),
-        r"imu\.csv and reference\.csv do not turn together \(slope -1\.0",
+        r"imu\.csv and reference\.csv must turn together, got a slope of -1\.0",
     ),
-    "yaw in degrees": (scale("reference", "yaw", 180 / np.pi), r"do not turn together"),
+    "yaw in degrees": (scale("reference", "yaw", 180 / np.pi), r"must turn together"),
     "pitch in degrees": (
         edit("reference", "pitch", lambda p: p + 5.0),
-        r"pitch reaches 5 .*if in degrees, multiply",
+        r"pitch and roll .*got 5 .*If in degrees, multiply",
     ),
     "no overlap": (
         edit("gnss", "t", lambda t: t + 1e6),
-        r"imu\.csv covers t = 0\.000 to 20\.000 and gnss\.csv t = 10.*clock",
+        r"imu\.csv and gnss\.csv must overlap.*t = 0\.000 to 20\.000 and t = 10.*clock",
     ),
     "reference elsewhere": (
         edit("reference", "t", lambda t: t - 100),
-        r"imu\.csv covers .*reference\.csv.*no common time",
+        r"imu\.csv and reference\.csv must overlap in time",
     ),
-    "gap": (cut_out, r"imu\.csv: a gap of 0\.410 s after line 401 \(t = 3\.99\).*Cut the log"),
-    "one row": (no_rows, r"gnss\.csv: 1 rows; give at least 2"),
+    "gap": (cut_out, r"imu\.csv .*got a gap of 0\.410 s after line 401 \(t = 3\.99\).*Cut the log"),
+    "one row": (no_rows, r"gnss\.csv must have at least 2 rows, got 1"),
     "no origin": (
         one_geodetic,
-        r"gnss\.csv and reference\.csv: one has lat_deg.*Set scenario\.origin=",
+        r"gnss\.csv and reference\.csv must both have .*lat_deg.*Set scenario\.origin=",
     ),
-    "latitude": (far_north, r"column lat_deg, line 2 is 140"),
+    "latitude": (far_north, r"column lat_deg .*got 140\.\d+ in line 2"),
 }
 
 
@@ -281,16 +287,16 @@ def test_what_is_wrong_is_said_with_its_place_and_remedy(tmp_path: Path, name: s
 def test_rows_of_parquet_are_counted_from_0(tmp_path: Path) -> None:
     log = tables()
     log["imu"].loc[7, "wz"] = np.nan
-    with pytest.raises(ValueError, match=r"imu\.parquet: column wz, row 7 \(from 0\) is nan"):
+    with pytest.raises(ValueError, match=r"imu\.parquet: column wz .*got nan in row 7 \(from 0\)"):
         read_log(write(tmp_path, log, ".parquet"))
 
 
 def test_a_missing_or_doubled_table_is_named(tmp_path: Path) -> None:
     write(tmp_path, tables())
-    with pytest.raises(ValueError, match=r"no gps\.parquet and no gps\.csv; a log is a folder"):
+    with pytest.raises(ValueError, match=r"must contain gps\.parquet or gps\.csv.*as a folder"):
         read_log(tmp_path, LogFiles(gnss="gps"))
     write(tmp_path, tables(), ".parquet")
-    with pytest.raises(ValueError, match=r"both imu\.parquet and imu\.csv; delete one"):
+    with pytest.raises(ValueError, match=r"both imu\.parquet and imu\.csv. Delete one"):
         read_log(tmp_path)
 
 
@@ -300,7 +306,8 @@ def test_parquet_without_pyarrow_says_what_to_install(
     write(tmp_path, tables(), ".parquet")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(
-        ValueError, match=r"needs pyarrow: pip install 'pfbench\[data\]', or store the log as CSV"
+        ValueError,
+        match=r"needs pyarrow. Run pip install 'pfbench\[data\]', or store the log as CSV",
     ):
         read_log(tmp_path)
 
@@ -328,7 +335,7 @@ def test_the_page_use_your_data_runs(
             block(code, tmp_path)
     said = capsys.readouterr().out
     assert "3000 samples, 30 fixes" in said
-    assert "turn 57 times as fast as reference.csv" in said
+    assert "got 57 times the rate of reference.csv" in said
     assert len(list(tmp_path.glob("results/*/*.npz"))) == 1
     # 1 Hz fixes of 1.5, 1.5 and 3 m: no worse than the fixes
     assert (

@@ -28,13 +28,11 @@ from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.strapdown.total import StrapdownTotal
 from pfbench.nav.preintegration import PreintegratedImu
 from pfbench.noise.white import MeasurementOutage, NominalNoise
-from pfbench.scenario.recorded.drive import (
-    FixReceiver,
-    RecordedDrive,
-    RecordedFlights,
-    find_dataset,
-)
-from pfbench.scenario.recorded.log_reader import ImuLog, LogFiles, ReferenceLog, read_log
+from pfbench.scenario.recorded.assembly import FixReceiver
+from pfbench.scenario.recorded.drive import RecordedDrive, RecordedFlights
+from pfbench.scenario.recorded.log_reader import read_log
+from pfbench.scenario.recorded.log_tables import find_dataset
+from pfbench.scenario.recorded.navigation_log import ImuLog, LogFiles, ReferenceLog
 from pfbench.scenario.recorded.time_grid import (
     divide_interval,
     interpolate,
@@ -232,7 +230,9 @@ def test_start_and_end_bound_the_drive(root: Path) -> None:
     assert episode.time[[0, -1]].tolist() == pytest.approx(
         [4.85, 11.6]
     )  # fixes at 4.6, 5.6 ... 11.6
-    with pytest.raises(ValueError, match=r"1 fixes between t = 19\.500 and 20\.000.*earlier start"):
+    with pytest.raises(
+        ValueError, match=r"got 1 fixes between t = 19\.500 and 20\.000.*earlier start"
+    ):
         one_drive(root, start_s=19.5).draw(NominalNoise(), numbers(0), 1)
 
 

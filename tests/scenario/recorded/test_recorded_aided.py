@@ -25,7 +25,8 @@ from pfbench.scenario.recorded.aided_flight import (
     RecordedAidedFlight,
     pressure_height,
 )
-from pfbench.scenario.recorded.drive import FixReceiver, RecordedDrive
+from pfbench.scenario.recorded.assembly import FixReceiver
+from pfbench.scenario.recorded.drive import RecordedDrive
 from pfbench.scenario.recorded.fix_holdout import FixHoldout
 
 FIELD, IRON = [0.17, 0.01, 0.52], [0.4, -0.2, 0.3]  # North, East, Down; forward, right, down

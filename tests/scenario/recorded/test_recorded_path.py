@@ -123,7 +123,7 @@ def test_the_key_of_a_world_holds_the_file_and_the_options_but_not_the_place(
     [
         ({"root": None}, r"data\.root is not set.*PFBENCH_DATA.*bends/"),
         ({"folder": "elsewhere"}, r"data\.root must contain the folder elsewhere"),
-        ({"file": "other"}, r"no other\.parquet and no other\.csv"),
+        ({"file": "other"}, r"must contain other\.parquet or other\.csv"),
         (
             {"start_s": 120.0, "end_s": 110.0},
             r"end_s must be later than start_s = 120\.0, got 110\.0",

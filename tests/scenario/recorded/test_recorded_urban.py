@@ -30,19 +30,18 @@ from pfbench.model.pseudorange_errors import (
 from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning
 from pfbench.noise.time_varying import VarianceSurge
 from pfbench.noise.white import MeasurementOutage, NominalNoise
-from pfbench.scenario.recorded.urban_drive import (
-    PseudorangeReceiver,
-    UrbanDrive,
-    interpolate_reference,
-    read_drive,
-    select_epochs,
-    select_stretch,
-)
+from pfbench.scenario.recorded.urban_drive import PseudorangeReceiver, UrbanDrive
 from pfbench.scenario.recorded.urban_error_fit import (
     RangeResiduals,
     estimate_mixture,
     estimate_normal,
     range_residuals,
+)
+from pfbench.scenario.recorded.urban_log import (
+    interpolate_reference,
+    read_drive,
+    select_epochs,
+    select_stretch,
 )
 
 CONF = ROOT / "conf"

@@ -314,8 +314,8 @@ def test_impossible_settings_name_their_key(root: Path, make: object, message: s
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda table: table.drop(columns=["iono"]), "no column iono"),
-        (lambda table: pd.concat([table, table]), "two rows for one satellite and epoch"),
+        (lambda table: table.drop(columns=["iono"]), "must have a column iono"),
+        (lambda table: pd.concat([table, table]), "must have one row for each satellite and epoch"),
         (
             lambda table: table[(table["sys"] == "E") | (table["t"] > 1.0)],
             "must have a GPS satellite, got none at t = 0.000",
