@@ -26,6 +26,7 @@ __getattr__, __dir__ = lazy_attributes(
             "NonLineOfSightNoise",
         ),
         "error_replay": ("ErrorReplay",),
+        "outage": ("MeasurementOutage",),
         "time_varying": (
             "VarianceSurge",
             "BiasStep",
@@ -36,7 +37,6 @@ __getattr__, __dir__ = lazy_attributes(
             "LaplaceNoise",
             "OutlierNoise",
             "GlintNoise",
-            "MeasurementOutage",
         ),
     },
 )

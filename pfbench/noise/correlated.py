@@ -24,13 +24,13 @@ class GaussMarkovNoise(NoiseRegime):
     Exact at any spacing of the times.
 
     Attributes:
-        ratio: Stationary standard deviation in nominal standard deviations.
-        correlation_time: Time at which the correlation is 1/e, s.
-        of: Errors to which it is added.
+        sd_ratio: Stationary standard deviation in nominal standard deviations.
+        correlation_time_s: Time at which the correlation is 1/e, s.
+        base_regime: Errors to which it is added.
 
     Raises:
-        ValueError: If `ratio` is negative, `correlation_time` is not positive, or a filter asks
-            for the distribution.
+        ValueError: If `sd_ratio` is negative, `correlation_time_s` is not positive, or a filter
+            requests the distribution.
     """
 
     sd_ratio: float = 1.0
@@ -76,19 +76,20 @@ class NonLineOfSightNoise(NoiseRegime):
     """Reflected signals: measurements with an exponential bias at random times.
 
     The regime acts on ranges, in a scenario without ranges on positions, otherwise on all
-    components. All components of a source are affected together, each with its own bias, which is
+    components. All components of a source are affected together, each with a different bias, which is
     added to the measurement. [ours]
 
-    Attributes: probability: Probability of a missing line of sight, at any time. mean: Mean of the
-        bias in nominal standard deviations of the component. dwell: Mean duration without line of
-        sight, s. None draws each epoch independently. Otherwise
-            a stationary two-state Markov chain in continuous time, with a constant bias for the
-            duration. [ours]
-        of: Errors to which the bias is added.
+    Attributes:
+        probability: Probability of a missing line of sight, at any time.
+        mean_delay_sd: Mean of the bias in nominal standard deviations of the component.
+        mean_dwell_s: Mean duration without line of sight, s. None draws each epoch independently.
+            Otherwise a stationary two-state Markov chain in continuous time, with a constant bias
+            for the duration. [ours]
+        base_regime: Errors to which the bias is added.
 
     Raises:
-        ValueError: If `probability` is outside [0, 1] (or 1 with `dwell`), `mean` or `dwell` is not
-            positive, or a filter asks for a distribution per step that does not exist.
+        ValueError: If `probability` is outside [0, 1] (or 1 with `mean_dwell_s`), a duration or
+            mean is not positive, or a filter requests a distribution per step that does not exist.
     """
 
     probability: float = 0.2
@@ -101,14 +102,16 @@ class NonLineOfSightNoise(NoiseRegime):
         if not 0.0 <= self.probability <= 1.0 or endless:
             raise ValueError(
                 "noise.probability must be between 0 and 1, and below 1 if noise.mean_dwell_s is set, "
-                f"got {self.probability}."
+                f"got {self.probability}. Set a probability."
             )
         for key, value in (
             ("mean_delay_sd", self.mean_delay_sd),
             ("mean_dwell_s", self.mean_dwell_s),
         ):
             if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(f"noise.{key} must be positive and finite, got {value}.")
+                raise ValueError(
+                    f"noise.{key} must be positive and finite, got {value}. Change it."
+                )
 
     @override
     def draw_errors(

@@ -33,15 +33,18 @@ class ErrorReplay(NoiseRegime):
     East and down. Other components are nominal. In a scenario without positions all components are
     replayed in this way. [ours]
 
-    Attributes: root: Folder of all data sets (configuration key data.root). folder: Folder of the
-        record in `root`. file: File at 1 Hz with `utc_s`, truth `pn`, `pe`, `pd`, receiver `rx_pn`,
-        `rx_pe`, `rx_pd`. block: Length of each block, s. metres: Whether errors are in metres as
-        recorded. Otherwise each axis is scaled to the nominal
-            standard deviation of its component.
+    Attributes:
+        root: Folder of all data sets (configuration key data.root).
+        folder: Folder of the record in `root`.
+        file: File at 1 Hz with `utc_s`, truth `pn`, `pe`, `pd`, receiver `rx_pn`, `rx_pe`, `rx_pd`.
+        block_length_s: Length of each block, s.
+        absolute_metres: Whether errors are in metres as recorded. Otherwise each axis is scaled to
+            the nominal standard deviation of its component.
 
-    Raises: ValueError: If `block` is below 1 s. On drawing, if `root` or the file is missing, no
-        section
-            without a gap is as long as a block, or `metres` is set in a scenario without positions.
+    Raises:
+        ValueError: If `block_length_s` is below 1 s. On drawing, if `root` or the file is missing,
+            no section without a gap is as long as a block, or `absolute_metres` is set in a
+            scenario without positions.
     """
 
     root: str | None
@@ -53,7 +56,8 @@ class ErrorReplay(NoiseRegime):
     def __post_init__(self) -> None:
         if not self.block_length_s >= 1.0:
             raise ValueError(
-                f"noise.block_length_s must be at least 1 s, the interval of the record, got {self.block_length_s}."
+                "noise.block_length_s must be at least 1 s, the interval of the record, "
+                f"got {self.block_length_s}. Give longer blocks."
             )
 
     @override

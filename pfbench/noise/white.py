@@ -1,15 +1,12 @@
-"""Noise regimes without memory: nominal, heavy-tailed, impulsive errors, outages.
+"""Noise regimes without memory: nominal, heavy-tailed and impulsive errors.
 
-A regime that changes the errors of another regime has it as `of`. For example, an outage of a
-receiver with heavy tails is Outage(windows, of=StudentT(4)). The nominal part of each regime uses
-the random numbers of the nominal regime, so filters are compared across regimes on common random
-numbers.
+The nominal part of each regime uses the random numbers of the nominal regime, so filters are compared
+across regimes on common random numbers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -20,7 +17,6 @@ from pfbench.core.record import MeasurementChannels
 from pfbench.noise import distributions
 from pfbench.noise.base import NoiseRegime
 from pfbench.noise.distributions import ErrorDistribution
-from pfbench.noise.time_windows import Windows, check_windows, window_index
 
 
 class _UnitProcess(NoiseRegime):
@@ -82,12 +78,8 @@ class StudentTNoise(_UnitProcess):
     ) -> Tensor:
         t, k = len(time), len(channels.sd)
         z = draws.normal("world.receiver", t, k)
-        chi2 = (
-            draws.normal("world.tails", t, k * self.dof)
-            .square()
-            .reshape(-1, t, k, self.dof)
-            .sum(-1)
-        )
+        squares = draws.normal("world.tails", t, k * self.dof).square()
+        chi2 = squares.reshape(-1, t, k, self.dof).sum(-1)
         return channels.sd * z / torch.sqrt(chi2 / self.dof)
 
     @override
@@ -117,156 +109,102 @@ class LaplaceNoise(_UnitProcess):
 
 
 @dataclass(frozen=True)
-class OutlierNoise(_UnitProcess):
-    """Impulsive errors, a contaminated normal [Tukey 1960; Huber 1964].
+class _ContaminatedNoise(_UnitProcess):
+    """Normal errors, with some probability errors of another distribution.
 
     Attributes:
-        probability: Probability of an outlier per epoch, or per component.
-        size: Factor of an outlier on the nominal error.
-        together: Whether all components of an epoch are outliers together, or each independently.
+        probability: Probability of a large error per epoch, or per component.
+        sd_factor: Standard deviation of a large error in nominal standard deviations.
+        joint: Whether all components of an epoch have large errors together, or each independently.
 
     Raises:
-        ValueError: If `probability` is outside [0, 1], or `size` is below 1.
+        ValueError: If `probability` is outside [0, 1], or `sd_factor` is below 1.
+    """
+
+    probability: float
+    sd_factor: float
+    joint: bool
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.probability <= 1.0:
+            raise ValueError(
+                f"noise.probability must be between 0 and 1, got {self.probability}. "
+                "Set a probability."
+            )
+        if not self.sd_factor >= 1.0:
+            raise ValueError(
+                f"noise.sd_factor must be at least 1, got {self.sd_factor}. "
+                "Give a factor on the nominal standard deviation."
+            )
+
+    @property
+    def _large_errors(self) -> distributions.Family:
+        return distributions.make_normal
+
+    def _outlier_mask(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        """Draw a mask of large errors, [R, T, 1 or Dy]."""
+        size = 1 if self.joint else len(channels.sd)
+        return draws.uniform("world.outliers", len(time), size) < self.probability
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        family = distributions.contaminated_normal(
+            self.probability, self.sd_factor, self.joint, self._large_errors
+        )
+        return _same_at_all_steps(family, channels, time)
+
+
+@dataclass(frozen=True)
+class OutlierNoise(_ContaminatedNoise):
+    """Impulsive errors, a contaminated normal [Tukey 1960; Huber 1964].
+
+    The attributes are those of `GlintNoise`. An outlier is a nominal error times `sd_factor`.
     """
 
     probability: float = 0.05
     sd_factor: float = 10.0
     joint: bool = True
 
-    def __post_init__(self) -> None:
-        _check_contamination(self.probability, self.sd_factor)
-
     @override
     def draw_errors(
         self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
     ) -> Tensor:
-        outlier = (
-            draws.uniform("world.outliers", len(time), 1 if self.joint else len(channels.sd))
-            < self.probability
-        )
-        return torch.where(outlier, self.sd_factor, 1.0).to(
-            channels.sd
-        ) * NominalNoise().draw_errors(draws, channels, time)
-
-    @override
-    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
-        return _same_at_all_steps(
-            distributions.contaminated_normal(
-                self.probability, self.sd_factor, self.joint, distributions.make_normal
-            ),
-            channels,
-            time,
-        )
+        outlier_mask = self._outlier_mask(draws, channels, time)
+        factor = torch.where(outlier_mask, self.sd_factor, 1.0).to(channels.sd)
+        return factor * NominalNoise().draw_errors(draws, channels, time)
 
 
 @dataclass(frozen=True)
-class GlintNoise(_UnitProcess):
+class GlintNoise(_ContaminatedNoise):
     """Radar glint: normal errors, with some probability Laplace errors.
 
-    [Wu 1993, "Target tracking with glint noise"]. For glint with a wide normal use `OutlierNoise` with
-    together=false.
+    [Wu 1993, "Target tracking with glint noise"]. For glint with a wide normal use `OutlierNoise`
+    with joint=false.
 
     Attributes:
         probability: Probability of a glint per epoch, or per component.
-        size: Standard deviation of a glint in nominal standard deviations.
-        together: Whether all components of an epoch have glint together, or each independently.
+        sd_factor: Standard deviation of a glint in nominal standard deviations.
+        joint: Whether all components of an epoch have glint together, or each independently.
 
     Raises:
-        ValueError: If `probability` is outside [0, 1], or `size` is below 1.
+        ValueError: If `probability` is outside [0, 1], or `sd_factor` is below 1.
     """
 
     probability: float = 0.1
     sd_factor: float = 10.0
     joint: bool = False
 
-    def __post_init__(self) -> None:
-        _check_contamination(self.probability, self.sd_factor)
+    @property
+    @override
+    def _large_errors(self) -> distributions.Family:
+        return distributions.make_laplace
 
     @override
     def draw_errors(
         self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
     ) -> Tensor:
-        outlier = (
-            draws.uniform("world.outliers", len(time), 1 if self.joint else len(channels.sd))
-            < self.probability
-        )
+        outlier_mask = self._outlier_mask(draws, channels, time)
         spike = self.sd_factor * LaplaceNoise().draw_errors(draws, channels, time)
-        return torch.where(outlier, spike, NominalNoise().draw_errors(draws, channels, time))
-
-    @override
-    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
-        return _same_at_all_steps(
-            distributions.contaminated_normal(
-                self.probability, self.sd_factor, self.joint, distributions.make_laplace
-            ),
-            channels,
-            time,
-        )
-
-
-def _check_contamination(probability: float, size: float) -> None:
-    if not 0.0 <= probability <= 1.0:
-        raise ValueError(f"noise.probability must be between 0 and 1, got {probability}.")
-    if not size >= 1.0:
-        raise ValueError(
-            f"noise.sd_factor must be at least 1, got {size}. "
-            "Give a factor on the nominal standard deviation."
-        )
-
-
-@dataclass(frozen=True)
-class MeasurementOutage(NoiseRegime):
-    """Missing measurements of all or most sources in some time windows.
-
-    Attributes:
-        windows: Pairs of seconds (from, to), from inclusive, to exclusive, in order.
-        keep: Number of visible sources. The sources with the lowest numbers stay visible, the same
-            in all runs, so episodes stay paired. [ours]
-        span: Duration in seconds for which the windows are written, to stretch them to the record.
-            None uses them unchanged.
-        of: Errors of the visible measurements.
-
-    Raises:
-        ValueError: If a window is invalid or begins after the end of the record, or `keep` is not
-            below the number of sources.
-    """
-
-    windows_s: Windows = ((100.0, 130.0),)
-    visible_sources: int = 0
-    reference_duration_s: float | None = None
-    base_regime: NoiseRegime = field(default_factory=NominalNoise)
-
-    def __post_init__(self) -> None:
-        check_windows(self.windows_s, self.reference_duration_s)
-        if self.visible_sources < 0:
-            raise ValueError(
-                f"noise.visible_sources must be 0 or more, got {self.visible_sources}. "
-                "Give the number of visible sources."
-            )
-
-    @override
-    def draw_errors(
-        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
-    ) -> Tensor:
-        sources: Sequence[int] = sorted(set(channels.source))
-        if self.visible_sources >= len(sources):
-            raise ValueError(
-                f"noise.visible_sources must be less than the {len(sources)} sources of the scenario, "
-                f"got {self.visible_sources}. Otherwise no source is missing."
-            )
-        affected = torch.tensor(
-            [source in sources[self.visible_sources :] for source in channels.source]
-        )
-        missing = (window_index(self.windows_s, time, self.reference_duration_s) >= 0)[
-            :, None
-        ] & affected
-        return torch.where(missing, torch.nan, self.base_regime.draw_errors(draws, channels, time))
-
-    @override
-    def process_factors(self, time: Tensor) -> Tensor:
-        return self.base_regime.process_factors(time)
-
-    @override
-    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
-        # NaN in the record shows the outage, so only visible components need a distribution
-        return self.base_regime.error_distribution(channels, time)
+        return torch.where(outlier_mask, spike, NominalNoise().draw_errors(draws, channels, time))

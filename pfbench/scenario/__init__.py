@@ -38,13 +38,11 @@ __getattr__, __dir__ = lazy_attributes(
     __name__,
     {
         "base": ("Scenario",),
-        "emitter_prior": (
-            "EmitterPrior",
-            "QuadratureEmitterPrior",
-        ),
+        "emitter_prior": ("EmitterPrior",),
         "model_simulation": ("ModelSimulation",),
         "oracle_noise": ("RecordingRegime",),
         "passive_location": ("PassiveLocationScenario",),
+        "quadrature_prior": ("QuadratureEmitterPrior",),
         "recorded.aided_flight": (
             "BaroMagSensors",
             "RecordedAidedFlight",

@@ -55,14 +55,11 @@ class RecordingRegime:
         return self.regime.process_factors(time)
 
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
-        """Return the distribution of the errors at each step.
+        """Return family, shift and scale of the errors at each step.
 
         Args:
             channels: Measurement components.
             time: Times, s, [T].
-
-        Returns:
-            Family, shift and scale of the errors.
         """
         return self.regime.error_distribution(channels, time)
 
@@ -106,10 +103,10 @@ class OracleNoiseInputs(NamedTuple):
 class OracleNoiseModel(ModelWrapper):
     """A model with the true noise of each step.
 
-    The true noise consists of the factor on Q and the distribution of the errors. The process noise w is scaled about its mean by the root of the factor. The measurement
-    distribution is of the regime's family, with shift and scale relative to the normal distribution
-    of the inner model. All other properties are those of the inner model. It is linear only with
-    normal errors.
+    The true noise consists of the factor on Q and the distribution of the errors. The process noise w
+    is scaled about its mean by the root of the factor. The measurement distribution is of the
+    regime's family, with shift and scale relative to the normal distribution of the inner model. All
+    other properties are those of the inner model. It is linear only with normal errors.
 
     Args:
         model: Inner model with normal measurement noise.
@@ -134,22 +131,18 @@ class OracleNoiseModel(ModelWrapper):
         self.observes_initial = model.observes_initial
         self.family, shift, scale = regime.error_distribution(channels, time)
         process = process_variance_factors(regime, time)
-        self.scales_process, self.changes_errors = (
-            bool((process != 1.0).any()),
-            bool((shift != 0.0).any() or (scale != 1.0).any()),
-        )
-        self.linear = model.linear and self.family is distributions.make_normal
-        self.linear_given = model.linear_given if self.family is distributions.make_normal else ()
+        self.scales_process = bool((process != 1.0).any())
+        self.has_normal_errors = self.family is distributions.make_normal
+        changes_errors = bool((shift != 0.0).any() or (scale != 1.0).any())
+        self.has_nominal_errors = self.has_normal_errors and not changes_errors
+        self.linear = model.linear and self.has_normal_errors
+        self.linear_given = model.linear_given if self.has_normal_errors else ()
         choice = (
             "the filter model receives the true noise: at each step the factor on Q "
             "and the distribution of the errors"
         )
         self.choices = (*model.choices, choice)
-        for name, value in (
-            ("root", process.sqrt()),
-            ("shift", shift),
-            ("scale", scale),
-        ):
+        for name, value in (("root", process.sqrt()), ("shift", shift), ("scale", scale)):
             self.register_buffer(f"oracle_{name}", value.unsqueeze(0))
 
     @override
@@ -204,9 +197,8 @@ class OracleNoiseModel(ModelWrapper):
             return None
         root = u.root[:, None, None]
         if isinstance(distribution, Independent) and isinstance(distribution.base_dist, Normal):
-            return independent_normal(
-                distribution.base_dist.loc, root * distribution.base_dist.scale
-            )
+            base = distribution.base_dist
+            return independent_normal(base.loc, root * base.scale)
         if isinstance(distribution, MultivariateNormal):
             return dense_normal(distribution.mean, root.unsqueeze(-1) * distribution.scale_tril)
         return None
@@ -214,16 +206,13 @@ class OracleNoiseModel(ModelWrapper):
     @override
     def observation(self, x: Tensor, u: OracleNoiseInputs) -> Distribution:
         distribution = self.model.observation(x, u.inputs)
-        if self.family is distributions.make_normal and not self.changes_errors:
+        if self.has_nominal_errors:
             return distribution
         shift, scale = (a.unsqueeze(1) for a in (u.shift, u.scale))
         if isinstance(distribution, Independent) and isinstance(distribution.base_dist, Normal):
             centre, sd = distribution.base_dist.loc, distribution.base_dist.scale
             return self.family(centre + shift * sd, scale * sd)
-        if (
-            isinstance(distribution, MultivariateNormal)
-            and self.family is distributions.make_normal
-        ):
+        if isinstance(distribution, MultivariateNormal) and self.has_normal_errors:
             return dense_normal(
                 distribution.mean + shift * distribution.stddev,
                 scale.unsqueeze(-1) * distribution.scale_tril,
@@ -243,17 +232,15 @@ class OracleNoiseModel(ModelWrapper):
 
     @override
     def log_likelihood(self, y: Tensor, x: Tensor, u: OracleNoiseInputs) -> Tensor:
-        if self.family is distributions.make_normal and not self.changes_errors:
+        if self.has_nominal_errors:
             return self.model.log_likelihood(y, x, u.inputs)
         distribution = self.observation(x, u)
         if isinstance(distribution, MixtureDistribution):
             densities = [self._log_density(component, y) for component in distribution.components]
             return distribution.combine_log_densities(densities)
-        return (
-            self._log_density(distribution, y)
-            if isinstance(distribution, Independent)
-            else super().log_likelihood(y, x, u)
-        )
+        if isinstance(distribution, Independent):
+            return self._log_density(distribution, y)
+        return super().log_likelihood(y, x, u)
 
     def _log_density(self, distribution: Any, y: Tensor) -> Tensor:
         """Compute the log density [R, N] of the observed components of y [R, Dy]."""

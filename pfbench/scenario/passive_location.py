@@ -160,7 +160,7 @@ class PassiveLocationScenario:
             )
         first = PlatformInputs(*(a[:, 0] for a in assumed))
         limits = self.range_limits[0], self.range_limits[1]
-        start, spread, note = self.emitter_prior.law(
+        start, spread, note = self.emitter_prior.initial_moments(
             FirstMeasurement(y[:, 0], first, _vector(self.measurement_sd), self.velocity_sd, limits)
         )
         record = Record(y[:, 1:], PlatformInputs(*(a[:, 1:] for a in assumed)), start, spread)

@@ -29,8 +29,9 @@ from pfbench.filter.particle.proposals import draw_noise
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.model.textbook import Pendulum
+from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import MeasurementOutage, NominalNoise, OutlierNoise
+from pfbench.noise.white import NominalNoise, OutlierNoise
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.prior_predictive import simulate

@@ -36,7 +36,8 @@ from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, turn
 from pfbench.nav.preintegration import PreintegratedImu, preintegrate
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.white import MeasurementOutage, NominalNoise
+from pfbench.noise.outage import MeasurementOutage
+from pfbench.noise.white import NominalNoise
 from pfbench.scenario.model_simulation import ModelSimulation
 from pfbench.scenario.simulated_flight import SimulatedFlight
 

@@ -36,7 +36,8 @@ from pfbench.nav.ramps import CosineRamp, RampTrajectory
 from pfbench.nav.sar import SarSensor, compute_heading_difference
 from pfbench.nav.strapdown import InsIntervals
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.white import MeasurementOutage, NominalNoise
+from pfbench.noise.outage import MeasurementOutage
+from pfbench.noise.white import NominalNoise
 from pfbench.scenario.simulated_flight import SimulatedFlight
 
 IMU = ImuErrors(

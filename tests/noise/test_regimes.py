@@ -17,15 +17,9 @@ from pfbench.core.record import MeasurementChannels
 from pfbench.noise.base import NoiseRegime, check_unit_process, process_variance_factors
 from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
 from pfbench.noise.error_replay import ErrorReplay
+from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import BiasStep, VarianceSurge
-from pfbench.noise.white import (
-    GlintNoise,
-    LaplaceNoise,
-    MeasurementOutage,
-    NominalNoise,
-    OutlierNoise,
-    StudentTNoise,
-)
+from pfbench.noise.white import GlintNoise, LaplaceNoise, NominalNoise, OutlierNoise, StudentTNoise
 
 SD = torch.tensor([2.0, 0.05, 30.0], dtype=torch.float64)
 TIME = torch.arange(0.0, 300.0, dtype=torch.float64)

@@ -36,8 +36,9 @@ from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, cruise, turn
 from pfbench.nav.trajectory import TrajectoryStart
 from pfbench.noise.base import NoiseRegime
+from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import MeasurementOutage, NominalNoise
+from pfbench.noise.white import NominalNoise
 from pfbench.scenario.oracle_noise import RecordingRegime
 from pfbench.scenario.simulated_flight import SimulatedFlight
 

@@ -14,8 +14,9 @@ from scipy import stats
 import pfbench
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.textbook import Pendulum, StochasticVolatility
+from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import MeasurementOutage, NominalNoise, OutlierNoise
+from pfbench.noise.white import NominalNoise, OutlierNoise
 from pfbench.scenario.model_simulation import ModelSimulation
 
 RUNS, STEPS = 4000, 15

@@ -37,15 +37,9 @@ from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatili
 from pfbench.noise.base import NoiseRegime
 from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
 from pfbench.noise.error_replay import ErrorReplay
+from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import BiasStep, VarianceSurge
-from pfbench.noise.white import (
-    GlintNoise,
-    LaplaceNoise,
-    MeasurementOutage,
-    NominalNoise,
-    OutlierNoise,
-    StudentTNoise,
-)
+from pfbench.noise.white import GlintNoise, LaplaceNoise, NominalNoise, OutlierNoise, StudentTNoise
 from pfbench.scenario.model_simulation import ModelSimulation
 from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime
 

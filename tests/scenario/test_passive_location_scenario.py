@@ -36,9 +36,11 @@ from pfbench.model.passive_location import (
     relative_motion,
 )
 from pfbench.noise.base import NoiseRegime
-from pfbench.noise.white import MeasurementOutage, NominalNoise, OutlierNoise, StudentTNoise
-from pfbench.scenario.emitter_prior import FirstMeasurement, QuadratureEmitterPrior, first_fix
+from pfbench.noise.outage import MeasurementOutage
+from pfbench.noise.white import NominalNoise, OutlierNoise, StudentTNoise
+from pfbench.scenario.emitter_prior import FirstMeasurement, first_fix
 from pfbench.scenario.passive_location import PassiveLocationScenario
+from pfbench.scenario.quadrature_prior import QuadratureEmitterPrior
 
 SD = (1.64e-3, 1.64e-3, 1e-4, 1e-4, 1.0)
 SCENE = PassiveLocationScenario(
@@ -381,7 +383,7 @@ def test_the_moments_of_a_look_are_those_of_weighted_samples(
 ) -> None:
     z, own = looked(place, (-15.0, 15.0), COURSES[0])
     z, limits = z + noise * doubles(SD), (10e3, 500e3)
-    mean, spread, _ = QuadratureEmitterPrior().law(
+    mean, spread, _ = QuadratureEmitterPrior().initial_moments(
         FirstMeasurement(z, own, doubles(SD), 30.0, limits)
     )
     x, weight = samples(z[0], limits)
@@ -395,7 +397,7 @@ def test_the_moments_of_a_look_are_those_of_weighted_samples(
     assert np.abs((found - covariance) / np.outer(sd, sd)).max() < 9.0 / math.sqrt(
         known
     )  # tails count for more
-    fine, root, _ = QuadratureEmitterPrior(400, 9, 9).law(
+    fine, root, _ = QuadratureEmitterPrior(400, 9, 9).initial_moments(
         FirstMeasurement(z, own, doubles(SD), 30.0, limits)
     )
     assert (((mean - fine)[0] / doubles(sd)).abs() < 2e-3).all()

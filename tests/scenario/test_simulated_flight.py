@@ -24,7 +24,8 @@ from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, cruise, turn
 from pfbench.nav.trajectory import TrajectoryData, TrajectoryStart
 from pfbench.noise.base import NoiseRegime
-from pfbench.noise.white import MeasurementOutage, NominalNoise, OutlierNoise, StudentTNoise
+from pfbench.noise.outage import MeasurementOutage
+from pfbench.noise.white import NominalNoise, OutlierNoise, StudentTNoise
 from pfbench.scenario.simulated_flight import SimulatedFlight
 
 PATH = ManoeuvreTrajectory(

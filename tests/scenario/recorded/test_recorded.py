@@ -27,7 +27,8 @@ from pfbench.filter.gaussian.linearisation_rules import (
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.strapdown.total import StrapdownTotal
 from pfbench.nav.preintegration import PreintegratedImu
-from pfbench.noise.white import MeasurementOutage, NominalNoise
+from pfbench.noise.outage import MeasurementOutage
+from pfbench.noise.white import NominalNoise
 from pfbench.scenario.recorded.assembly import FixReceiver
 from pfbench.scenario.recorded.drive import RecordedDrive, RecordedFlights
 from pfbench.scenario.recorded.log_reader import read_log

@@ -17,8 +17,9 @@ from pfbench import job
 from pfbench.job import conf_dir
 from pfbench.model.strapdown.aided import StrapdownAided
 from pfbench.model.strapdown.tuning import AidedTuning
+from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import MeasurementOutage, NominalNoise
+from pfbench.noise.white import NominalNoise
 from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime
 from pfbench.scenario.recorded.aided_flight import (
     BaroMagSensors,

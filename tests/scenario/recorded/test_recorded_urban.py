@@ -28,8 +28,9 @@ from pfbench.model.pseudorange_errors import (
     NormalRangeError,
 )
 from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning
+from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import MeasurementOutage, NominalNoise
+from pfbench.noise.white import NominalNoise
 from pfbench.scenario.recorded.urban_drive import PseudorangeReceiver, UrbanDrive
 from pfbench.scenario.recorded.urban_error_fit import (
     RangeResiduals,

@@ -29,7 +29,8 @@ from pfbench.nav import earth
 from pfbench.nav.gnss.orbits import WalkerConstellation, azimuth_elevation, receive_signals
 from pfbench.nav.gnss.receiver_clock import ReceiverClock
 from pfbench.noise.base import NoiseRegime
-from pfbench.noise.white import MeasurementOutage, NominalNoise
+from pfbench.noise.outage import MeasurementOutage
+from pfbench.noise.white import NominalNoise
 from pfbench.scenario.recorded.raw_gnss_walk import RawGnssReceiver, RecordedWalk
 
 CONF = ROOT / "conf"

@@ -22,7 +22,8 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.strapdown.total import StrapdownTotal
-from pfbench.noise.white import MeasurementOutage, NominalNoise
+from pfbench.noise.outage import MeasurementOutage
+from pfbench.noise.white import NominalNoise
 from pfbench.scenario.recorded.assembly import FixReceiver
 from pfbench.scenario.recorded.drive import RecordedDrive
 from pfbench.scenario.recorded.fix_holdout import FixHoldout
