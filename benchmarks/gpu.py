@@ -353,7 +353,7 @@ def main() -> None:
         )
     if device.type == "cpu":
         torch.set_num_threads(1)
-        cpp.keep_freed_memory()
+        process_memory.keep_freed_memory()
     rate = copy_rate(device)
     found: list[Measured] = []
     failed: list[str] = []

@@ -132,7 +132,7 @@ def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) 
 
 def contestant(work: Any) -> tuple[Filter, dict[str, str]]:
     torch.set_num_threads(1)
-    cpp.keep_freed_memory()  # as a job does
+    process_memory.keep_freed_memory()  # as a job does
     filtered = ckf if "ckf" in sys.argv[3:-1] else sir
     run = filtered(work, getattr(torch, sys.argv[1]), sys.argv[2])
     return run, {"torch": torch.__version__, "numpy": sys.modules["numpy"].__version__}

@@ -28,7 +28,7 @@ from pfbench.core.record import Record, map_inputs
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.kernels import compilation, cpp
+from pfbench.kernels import compilation, process_memory
 from pfbench.noise.white import NominalNoise
 
 HERE = Path(__file__).parent
@@ -88,7 +88,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=default)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    cpp.keep_freed_memory()
+    process_memory.keep_freed_memory()
     warnings.simplefilter("ignore")  # of methods that say what they cost
     model, record = flights(chosen.runs, chosen.steps)
     found = methods(chosen.particles)

@@ -31,7 +31,7 @@ from pfbench.filter.loop import Watch, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.scoring import ScoreRecorder
-from pfbench.kernels import compilation, cpp
+from pfbench.kernels import compilation, process_memory
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.noise.white import NominalNoise
 from pfbench.scenario.model_simulation import ModelSimulation
@@ -192,7 +192,7 @@ def main() -> None:
     )
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    cpp.keep_freed_memory()
+    process_memory.keep_freed_memory()
     with compilation.use_compiled(), torch.no_grad():
         found = against(chosen.rounds, chosen.scale)
         together, steps = batched(chosen.rounds), max(20, round(300 * chosen.scale))

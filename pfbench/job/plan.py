@@ -19,7 +19,7 @@ from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.configuration import JobConfig
-from pfbench.kernels import cpp
+from pfbench.kernels.process_memory import keep_freed_memory
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.scenario.base import Scenario
@@ -227,7 +227,7 @@ def apply_global_settings(values: Mapping[str, Any]) -> None:
     """
     check_settings(values)
     torch.set_num_threads(values["threads"])
-    cpp.keep_freed_memory()
+    keep_freed_memory()
 
 
 _INTEGERS = {"runs": 1, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}  # with minimum

@@ -14,7 +14,7 @@ from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from pfbench.kernels import cpp
+from pfbench.kernels import process_memory
 
 GIB, MIB = 1 << 30, 1 << 20
 _USABLE_SHARE = 0.8  # of free memory: allocators and libraries are not counted [ours]
@@ -52,7 +52,7 @@ def start_peak_measurement(device: str) -> int | None:
     """Reset the peak of used memory and return the bytes in use, for `peak_above`."""
     if device != "cpu":
         torch.cuda.reset_peak_memory_stats(device)
-    return cpp.reset_peak_memory()
+    return process_memory.reset_peak_memory()
 
 
 def peak_above(baseline: int | None, device: str) -> int | None:
@@ -67,7 +67,7 @@ def peak_above(baseline: int | None, device: str) -> int | None:
     """
     if device != "cpu":
         return int(torch.cuda.max_memory_allocated(device))
-    return None if baseline is None else max(0, cpp.peak_memory() - baseline)
+    return None if baseline is None else max(0, process_memory.peak_memory() - baseline)
 
 
 class AllocationCounter(TorchDispatchMode):

@@ -90,9 +90,10 @@ def compilable(
         eager: Function for eager mode, if separate operations have a faster method.
         operator: Hand-written kernel. It replaces the compiled function on the CPU with one thread,
             and on a CUDA device if a kernel of its name exists. It is not used with gradients.
-        keep_in_graph: Whether (or for which tensors) a compiled step on the CPU uses the kernel as one
-            operator. False if torch's compiler does it as well.
-        use_torch_compiler: Whether torch's compiler is used without a kernel. Linear algebra does not gain.
+        keep_in_graph: Whether (or for which tensors) a compiled step on the CPU uses the kernel as
+            one operator. False if torch's compiler does it as well.
+        use_torch_compiler: Whether torch's compiler is used without a kernel. Linear algebra does
+            not gain from it.
 
     Returns:
         The compilable function.
@@ -107,16 +108,10 @@ def compilable(
     def compiled() -> Callable[..., Any]:
         return torch.compile(function, dynamic=True)
 
-    def kernel(args: tuple[Any, ...]) -> Callable[..., Any] | None:
-        return (
-            cuda.find_kernel(operator.__name__, args)
-            if operator is not None and _plain(args)
-            else None
-        )
-
     def run_compiled(*args: Any) -> Any:
         if _on_cuda(args):
-            return (kernel(args) or (compiled() if use_torch_compiler else run_eagerly))(*args)
+            kernel = _find_cuda_kernel(operator, args)
+            return (kernel or (compiled() if use_torch_compiler else run_eagerly))(*args)
         if (
             operator is not None
             and operator not in _failed
@@ -138,11 +133,20 @@ def compilable(
     def call(*args: Any) -> Any:
         if _graph.get():
             if _on_cuda(args):
-                return (kernel(args) or function)(*args)
+                return (_find_cuda_kernel(operator, args) or function)(*args)
             return (function if in_graph is None or not fits_graph(*args) else in_graph)(*args)
         return (run_compiled if _fused.get() else run_eagerly)(*args)
 
     return cast(F, call)
+
+
+def _find_cuda_kernel(
+    operator: Callable[..., Any] | None, args: tuple[Any, ...]
+) -> Callable[..., Any] | None:
+    """Return the CUDA kernel of an operator, None without one or with gradients."""
+    if operator is None or not _plain(args):
+        return None
+    return cuda.find_kernel(operator.__name__, args)
 
 
 def _register_shapes(operator: Callable[..., Any], template: Callable[..., Any]) -> None:

@@ -7,46 +7,16 @@ is missing or rejects the source. Gradients do not pass through the kernels.
 
 from __future__ import annotations
 
-import ctypes
-import hashlib
-import os
-import shutil
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
-from pathlib import Path
+from functools import cache
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from pfbench.kernels import cuda
+from pfbench.kernels.cpp_library import load_library
 
-_SOURCES = Path(__file__).parent / "src"
-_TORCH = Path(torch.__file__).parent
-_COMMON = ("-O3", "-march=native", "-fopenmp-simd", "-fPIC", "-std=c++17", "-c")
-_FLAGS = {
-    "random_normal": (*_COMMON, "-ffast-math", "-mno-recip"),
-    "compiled_step": _COMMON,
-    "particles": (
-        *_COMMON,
-        "-fno-math-errno",
-        "-fno-trapping-math",
-        "-fno-signed-zeros",
-        "-fassociative-math",
-    ),
-    "linear_algebra": (*_COMMON, "-fno-math-errno", "-fno-trapping-math"),
-    "scores": (
-        *_COMMON,
-        "-fno-math-errno",
-        "-fno-trapping-math",
-        "-fno-signed-zeros",
-        "-fassociative-math",
-    ),
-}
 _operators = torch.library.Library("pfbench", "DEF")
 
 
@@ -216,10 +186,13 @@ def weighted_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def cholesky_factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute lower triangular roots, as `core.covariance.cholesky_with_mask`.
+    """Compute lower triangular roots, as `core.covariance.factor`.
+
+    Args:
+        covariance: Covariances, [..., d, d].
 
     Returns:
-        Roots [..., d, d] and the mask [...] of valid ones.
+        Roots, [..., d, d], and a mask of the valid roots, [...].
     """
     lower, valid = _operator("cholesky_factor")(covariance.reshape(-1, *covariance.shape[-2:]))
     return lower.view(covariance.shape), valid.view(covariance.shape[:-2])
@@ -236,8 +209,8 @@ def kalman_update(
         omega: Covariances of e, [R, k, k].
 
     Returns:
-        Mean [R, d] and root [R, d, d] of xi; normalised distance [R]; diagonals [R, k + d]
-        of the roots of omega and of the information of xi; mask [R] of valid omega.
+        Mean of xi, [R, d]. Root of its covariance, [R, d, d]. Normalised distance, [R]. Diagonals
+        of the roots of omega and of the information of xi, [R, k + d]. Mask of valid omega, [R].
     """
     return _operator("kalman_update")(m, r, omega)
 
@@ -354,134 +327,8 @@ torch.library.register_fake(
     lambda phi, x, ancestors, *_: x.new_empty(x.shape[0], *ancestors.shape),
 )
 
-_KINDS = {"T": "AtenTensorHandle", "i": "int64_t"}
-_SIGNATURES = {  # arguments and results
-    "philox_normals": ("TiTTii", "T"), "philox_uniforms": ("TiTTii", "T"), "resample_systematic": ("TTT", "T"), "gather_particles": ("TT", "T"),
-    "propagate_affine": ("TTTT", "T"), "count_unique": ("TT", "T"), "sum_and_squares": ("T", "TT"), "weighted_moments": ("TT", "TT"),
-}  # fmt: skip
-
-
-class OperatorRegistry(dict[str, list[str]]):
-    """Operators by name, because the keys of torch's cache on disk cannot hold an operator."""
-
-    def __contains__(self, operator: object) -> bool:
-        return super().__contains__(str(operator))
-
-
-def declare_shims() -> OperatorRegistry:
-    """Return C declarations of the operators that compiled code calls directly."""
-
-    def declare(name: str, arguments: str, results: str) -> str:
-        words = [*(_KINDS[kind] for kind in arguments), *(f"{_KINDS[kind]}*" for kind in results)]
-        return f"AOTITorchError aoti_torch_cpu_{name}({', '.join(words)})"
-
-    _load()
-    return OperatorRegistry(
-        {f"pfbench.{name}.default": [declare(name, *kinds)] for name, kinds in _SIGNATURES.items()}
-    )
-
-
-def function_address(library: str, function: str) -> int:
-    """Return the address of a function in a loaded library.
-
-    Args:
-        library: Path of the library.
-        function: Name of the function.
-
-    Returns:
-        The address.
-
-    Raises:
-        AttributeError: If the library does not have this function.
-    """
-    value = ctypes.cast(getattr(ctypes.CDLL(library), function), ctypes.c_void_p).value
-    assert value is not None
-    return value
-
-
-@cache
-def keep_freed_memory() -> None:
-    """Make glibc keep freed memory for the next step; without effect for other C libraries.
-
-    Otherwise it returns blocks of some megabytes to the system and maps them again at each step,
-    which took a sixth of the time of a bootstrap filter with 100 runs of 500 particles.
-    """
-    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
-    if set_option is not None:
-        for option in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of malloc.h
-            set_option(option, 1 << 30)
-
-
-def reset_peak_memory() -> int | None:
-    """Reset the peak and return the present memory, bytes; None if not on Linux."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:  # freed memory of earlier jobs would hide the memory of this one
-        trim(0)
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return None
-    return _memory("VmRSS")
-
-
-def peak_memory() -> int:
-    """Return the peak memory of the process since `reset_peak_memory`, bytes."""
-    return _memory("VmHWM")
-
-
-def _memory(name: str) -> int:
-    (line,) = (
-        line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name)
-    )
-    return 1024 * int(line.split()[1])
-
 
 @cache
 def _operator(name: str) -> Callable[..., Any]:
-    _load()
+    load_library()
     return cast(Callable[..., Any], getattr(torch.ops.pfbench, name).default)
-
-
-@cache
-def _load() -> None:
-    """Compile the kernels unless they are cached, and load the library, which registers them."""
-    compiler = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
-    if compiler is None:
-        raise OSError("no C++ compiler")
-    environment = (compiler, _FLAGS, os.cpu_count(), torch.__version__)
-    sources = {name: (_SOURCES / f"{name}.cpp").read_bytes() for name in _FLAGS}
-    text = b"".join(sources.values()) + (_SOURCES / "tensors.h").read_bytes()
-    name = hashlib.sha256(text + repr(environment).encode()).hexdigest()[:16]
-    folder = Path(tempfile.gettempdir()) / f"pfbench_{os.getuid()}"
-    built = folder / f"{name}.so"
-    if not built.exists():
-        folder.mkdir(mode=0o700, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            parts, new = (
-                [Path(scratch) / f"{source}.o" for source in sources],
-                Path(scratch) / built.name,
-            )
-            commands = [
-                [
-                    compiler,
-                    *_FLAGS[source],
-                    f"-I{_TORCH / 'include'}",
-                    "-o",
-                    str(part),
-                    str(_SOURCES / f"{source}.cpp"),
-                ]
-                for source, part in zip(sources, parts, strict=True)
-            ]
-            with ThreadPoolExecutor() as pool:
-                list(pool.map(partial(subprocess.run, check=True, capture_output=True), commands))
-            # -ffast-math at linking would flush denormal numbers to zero in the whole process
-            libraries = [f"-L{_TORCH / 'lib'}", "-ltorch_cpu", "-lm"]
-            if sys.platform == "darwin":  # resolve symbols of Python at loading
-                libraries.append("-Wl,-undefined,dynamic_lookup")
-            subprocess.run(
-                [compiler, "-shared", "-o", new, *parts, *libraries],
-                check=True,
-                capture_output=True,
-            )
-            os.replace(new, built)
-    ctypes.CDLL(str(built), mode=ctypes.RTLD_GLOBAL)  # compiled steps call the kernels by name

@@ -6,6 +6,7 @@ on disk. Operators of pfbench stay whole in the compiled function.
 
 from __future__ import annotations
 
+import ctypes
 import inspect
 import logging
 import subprocess
@@ -18,6 +19,7 @@ from torch.fx import Graph as Operations
 from torch.fx import Node
 
 from pfbench.kernels import cpp
+from pfbench.kernels.cpp_library import load_library
 
 log = logging.getLogger("pfbench")
 
@@ -25,6 +27,11 @@ log = logging.getLogger("pfbench")
 _ENTRY = "_Z19inductor_entry_implPP16AtenTensorOpaqueS1_"
 
 TensorFunction = Callable[[list[Tensor]], Sequence[Tensor]]
+_KINDS = {"T": "AtenTensorHandle", "i": "int64_t"}
+_SIGNATURES = {  # arguments and results
+    "philox_normals": ("TiTTii", "T"), "philox_uniforms": ("TiTTii", "T"), "resample_systematic": ("TTT", "T"), "gather_particles": ("TT", "T"),
+    "propagate_affine": ("TTTT", "T"), "count_unique": ("TT", "T"), "sum_and_squares": ("T", "TT"), "weighted_moments": ("TT", "TT"),
+}  # fmt: skip
 
 
 class NativeEntry(NamedTuple):
@@ -37,6 +44,44 @@ class NativeEntry(NamedTuple):
 
     address: int
     constants: list[Tensor]
+
+
+class OperatorRegistry(dict[str, list[str]]):
+    """Operators by name, because the keys of torch's cache on disk cannot hold an operator."""
+
+    def __contains__(self, operator: object) -> bool:
+        return super().__contains__(str(operator))
+
+
+def declare_shims() -> OperatorRegistry:
+    """Return C declarations of the operators that compiled code calls directly."""
+
+    def declare(name: str, arguments: str, results: str) -> str:
+        words = [*(_KINDS[kind] for kind in arguments), *(f"{_KINDS[kind]}*" for kind in results)]
+        return f"AOTITorchError aoti_torch_cpu_{name}({', '.join(words)})"
+
+    load_library()
+    return OperatorRegistry(
+        {f"pfbench.{name}.default": [declare(name, *kinds)] for name, kinds in _SIGNATURES.items()}
+    )
+
+
+def function_address(library: str, function: str) -> int:
+    """Return the address of a function in a loaded library.
+
+    Args:
+        library: Path of the library.
+        function: Name of the function.
+
+    Returns:
+        The address.
+
+    Raises:
+        AttributeError: If the library does not have this function.
+    """
+    value = ctypes.cast(getattr(ctypes.CDLL(library), function), ctypes.c_void_p).value
+    assert value is not None
+    return value
 
 
 def compile_function(
@@ -65,7 +110,7 @@ def compile_function(
         _fuse_propagation(graph.graph)
         graph.recompile()
     # On the CPU the calls of the kernels are compiled with them: from Python they take 50 % longer.
-    shims = {"aot_inductor.custom_ops_to_c_shims": cpp.declare_shims()} if on_cpu else {}
+    shims = {"aot_inductor.custom_ops_to_c_shims": declare_shims()} if on_cpu else {}
     # The shapes are those of the example, so their checks are left out.
     options = {"cpp_wrapper": on_cpu, "size_asserts": False, **shims}
     artefacts: list[Any] = []
@@ -119,12 +164,12 @@ def _find_source(node: Any, operator: Any) -> Any:
     return node if isinstance(node, Node) and permutations == 1 else None
 
 
-def _stack_by_component(parts: Sequence[Tensor], dim: int = 0) -> Tensor:
-    """Stack parts [R, N] as components, component-major in memory; otherwise as torch.stack."""
-    last = parts[0].dim()
+def _stack_by_component(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
+    """Stack tensors [R, N] as components, component-major in memory; otherwise as torch.stack."""
+    last = tensors[0].dim()
     if dim not in (-1, last) or last < 2:
-        return torch.cat([part.unsqueeze(dim) for part in parts], dim)
-    return torch.cat([part.unsqueeze(0) for part in parts]).permute(*range(1, last + 1), 0)
+        return torch.cat([a.unsqueeze(dim) for a in tensors], dim)
+    return torch.cat([a.unsqueeze(0) for a in tensors]).permute(*range(1, last + 1), 0)
 
 
 def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> NativeEntry | None:
@@ -145,16 +190,16 @@ def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> Native
             graph.current_callable = call
         constants, inputs = arguments[: -len(example)], arguments[-len(example) :]
         if not all(a is b for a, b in zip(inputs, example, strict=True)):
-            raise TypeError("its arguments are in another order")
+            raise TypeError("its arguments must be in the order of the example")
         library = inspect.getclosurevars(call).nonlocals["f"].__self__.__file__
-        entry = NativeEntry(cpp.function_address(library, _ENTRY), constants)
+        entry = NativeEntry(function_address(library, _ENTRY), constants)
         batched = [a.unsqueeze(0) for a in example]
         results = cpp.run_steps(entry.address, len(expected), constants, [], batched, [])
         pairs = zip(results, expected, strict=True)
         if not all(
             torch.allclose(a.double(), from_storage(b).double(), equal_nan=True) for a, b in pairs
         ):
-            raise TypeError("its results differ")
+            raise TypeError("its results must equal those of the Python call")
     except (
         AttributeError, KeyError, TypeError, ValueError, RuntimeError, OSError, subprocess.CalledProcessError,
     ) as error:  # fmt: skip

@@ -63,8 +63,8 @@ class SatelliteGeometry(NamedTuple):
         rate = _product(torch.cat([shift, shift1, mixed], -1), torch.cat([w / r, e, 1 / r], -1))
         return -g, (g * ((e * w).sum(-1) / self.distance).unsqueeze(-2) - rate) / root
 
-    def _displacement(self, dp: Tensor, dv: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute truth minus INS in meridian axes: position and velocity [R, N, 3]."""
+    def _constants(self) -> Tensor:
+        """Return the quantities of the INS position and velocity that `_displacement` uses."""
         w = 1 - earth.E2 * self.sine**2
         across = earth.A / torch.sqrt(w)
         inside = (1 - earth.E2) * across
@@ -78,10 +78,13 @@ class SatelliteGeometry(NamedTuple):
             inside / w,
             earth.E2 / w,
         ]
-        constants = torch.cat([torch.stack(scalars, -1), self.vel], -1).unsqueeze(-2)
+        return torch.cat([torch.stack(scalars, -1), self.vel], -1).unsqueeze(-2)
+
+    def _displacement(self, dp: Tensor, dv: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute truth minus INS in meridian axes: position and velocity [R, N, 3]."""
         # Forward-mode AD is 100 times faster if the constants have tangents, even zero ones.
         # Python numbers have none, so the code below contains few.
-        constants = constants + (dp[..., :1] - dp[..., :1])
+        constants = self._constants() + (dp[..., :1] - dp[..., :1])
         s, c, twice_s, h, r_n, r_p, r_m, flat, v_e, v_n, v_u = constants.unbind(-1)
         (north, east, up), (dv_e, dv_n, dv_u) = dp.unbind(-1), dv.unbind(-1)
         h_t, radius = h - up, r_m

@@ -1,0 +1,77 @@
+"""Library of the C++ kernels: compilation, a cache on disk, and loading."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
+from pathlib import Path
+
+import torch
+
+_SOURCES = Path(__file__).parent / "src"
+_TORCH = Path(torch.__file__).parent
+_COMMON = ("-O3", "-march=native", "-fopenmp-simd", "-fPIC", "-std=c++17", "-c")
+_MATHS = ("-fno-math-errno", "-fno-trapping-math")
+_SUMS = ("-fno-signed-zeros", "-fassociative-math")
+_FLAGS = {
+    "random_normal": (*_COMMON, "-ffast-math", "-mno-recip"),
+    "compiled_step": _COMMON,
+    "particles": (*_COMMON, *_MATHS, *_SUMS),
+    "linear_algebra": (*_COMMON, *_MATHS),
+    "scores": (*_COMMON, *_MATHS, *_SUMS),
+}
+
+
+@cache
+def load_library() -> None:
+    """Compile the kernels unless they are cached, and load the library, which registers them.
+
+    Raises:
+        OSError: If no C++ compiler is installed.
+        CalledProcessError: If the compiler rejects the source.
+    """
+    compiler = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
+    if compiler is None:
+        raise OSError("a C++ compiler must be on the PATH (c++, g++ or clang++), got none")
+    environment = (compiler, _FLAGS, os.cpu_count(), torch.__version__)
+    sources = {name: (_SOURCES / f"{name}.cpp").read_bytes() for name in _FLAGS}
+    text = b"".join(sources.values()) + (_SOURCES / "tensors.h").read_bytes()
+    name = hashlib.sha256(text + repr(environment).encode()).hexdigest()[:16]
+    folder = Path(tempfile.gettempdir()) / f"pfbench_{os.getuid()}"
+    built = folder / f"{name}.so"
+    if not built.exists():
+        folder.mkdir(mode=0o700, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            objects = [Path(scratch) / f"{source}.o" for source in sources]
+            new = Path(scratch) / built.name
+            commands = [
+                [
+                    compiler,
+                    *_FLAGS[source],
+                    f"-I{_TORCH / 'include'}",
+                    "-o",
+                    str(file),
+                    str(_SOURCES / f"{source}.cpp"),
+                ]
+                for source, file in zip(sources, objects, strict=True)
+            ]
+            with ThreadPoolExecutor() as pool:
+                list(pool.map(partial(subprocess.run, check=True, capture_output=True), commands))
+            # -ffast-math at linking would flush denormal numbers to zero in the whole process
+            libraries = [f"-L{_TORCH / 'lib'}", "-ltorch_cpu", "-lm"]
+            if sys.platform == "darwin":  # resolve symbols of Python at loading
+                libraries.append("-Wl,-undefined,dynamic_lookup")
+            subprocess.run(
+                [compiler, "-shared", "-o", new, *objects, *libraries],
+                check=True,
+                capture_output=True,
+            )
+            os.replace(new, built)
+    ctypes.CDLL(str(built), mode=ctypes.RTLD_GLOBAL)  # compiled steps call the kernels by name
