@@ -6,28 +6,24 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, MultivariateNormal
+from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.affine_map import affine_map
-from pfbench.core.covariance import factor
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.normal import independent_normal
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel
-from pfbench.nav import attitude, error_dynamics
+from pfbench.model.ins_errors import (
+    NAVIGATION,
+    InsErrorModel,
+    additive_transition,
+    inflate_noise,
+    name_ins_components,
+)
+from pfbench.nav import error_dynamics
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver, ProcessNoiseInflation
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.strapdown import InsIntervals
 
-_AXES = {
-    "attitude": (("E", "N", "U"), "rad"),
-    "velocity": (("E", "N", "U"), "m/s"),
-    "position": (("N", "E", "U"), "m"),
-    "gyro_bias": (("x", "y", "z"), "rad/s"),
-    "gyro_constant": (("x", "y", "z"), "rad/s"),
-    "gyro_markov": (("x", "y", "z"), "rad/s"),
-    "accelerometer_bias": (("x", "y", "z"), "m/s^2"),
-}
 _TAYLOR = 4  # terms of exp(F T), at 1 s the fifth is below 1e-6 in any entry
 
 
@@ -43,7 +39,7 @@ class LooseStep(NamedTuple):
     gain: Tensor
 
 
-class InsGnss(StateSpaceModel):
+class InsGnss(InsErrorModel):
     """INS errors (INS minus truth) about the nominal trajectory, aided by a receiver.
 
     States: attitude phi (E, N, U), velocity (E, N, U), position in metres (N, E, U), then
@@ -72,7 +68,6 @@ class InsGnss(StateSpaceModel):
     """
 
     linear = True
-    p0: Tensor
     r: Tensor
     observed_indices: Tensor
 
@@ -86,10 +81,9 @@ class InsGnss(StateSpaceModel):
     ) -> None:
         super().__init__()
         drift = ("gyro_constant", "gyro_markov") if markov else ("gyro_bias",)
-        blocks = ("attitude", "velocity", "position", *drift, "accelerometer_bias")
-        self.names = tuple(f"{block}_{axis}" for block in blocks for axis in _AXES[block][0])
-        self.units = tuple(_AXES[block][1] for block in blocks for _ in range(3))
-        self.groups = {block: (3 * i, 3 * i + 1, 3 * i + 2) for i, block in enumerate(blocks)}
+        self.names, self.units, self.groups = name_ins_components(
+            (*NAVIGATION, *drift, "accelerometer_bias")
+        )
         self.imu, self.markov, self.inflation = imu, markov, inflation
         constant, random = imu.gyro_bias, imu.gyro_markov
         gyro = (constant, random) if markov else (_hypot(constant, random),)
@@ -118,18 +112,11 @@ class InsGnss(StateSpaceModel):
             )
         self.choices = tuple(choices)
 
-    @property
-    @override
-    def anchor(self) -> Tensor:
-        return self.p0
-
     @override
     def prepare(self, record: Record) -> Record:
-        return (
-            record
-            if isinstance(record.u, LooseStep)
-            else record._replace(u=self.discretise(record.u))
-        )
+        if isinstance(record.u, LooseStep):
+            return record
+        return record._replace(u=self.discretise(record.u))
 
     def discretise(self, u: InsIntervals) -> LooseStep:
         """Compute transition [..., D, D] and noise gain [..., D, W] of intervals, float64."""
@@ -150,20 +137,7 @@ class InsGnss(StateSpaceModel):
         )
         if self.inflation is None:
             return LooseStep(phi, noise)
-        extra = torch.cat(
-            [
-                self.inflation.motion,
-                *[self.inflation.gyro] * (d // 3 - 4),
-                self.inflation.accelerometer,
-            ]
-        )
-        full, ok = factor(noise @ noise.mT + torch.diag(extra.to(noise).square()))
-        if not bool(ok.all()):
-            raise ValueError(
-                f"model.inflation must be positive for every state, got {self.inflation}. "
-                "The noise covariance has no Cholesky factor."
-            )
-        return LooseStep(phi, full)
+        return LooseStep(phi, inflate_noise(noise, self.inflation, d // 3 - 4))
 
     def _continuous(self, u: InsIntervals) -> tuple[Tensor, Tensor, Tensor]:
         """Return F [..., D, D], G [..., D, 12], and spectral densities q [12]."""
@@ -195,10 +169,6 @@ class InsGnss(StateSpaceModel):
         return f, g, f.new_tensor([value for value in q for _ in range(3)])
 
     @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0)
-
-    @override
     def propagate(self, x: Tensor, u: LooseStep, w: Tensor) -> Tensor:
         return affine_map(u.phi, x, u.gain, w)
 
@@ -214,17 +184,7 @@ class InsGnss(StateSpaceModel):
 
     @override
     def transition(self, x: Tensor, u: LooseStep) -> Distribution | None:
-        if self.inflation is None:
-            return None
-        mean = self.propagate(x, u, x.new_zeros(*x.shape[:2], self.noise_dim))
-        root = self.noise_gain(u).unsqueeze(1)
-        return MultivariateNormal(mean, scale_tril=root, validate_args=False)
-
-    @override
-    def error(self, mean: Tensor, truth: Tensor) -> Tensor:
-        rotation = attitude.residual_error(truth[..., :3], mean[..., :3])
-        navigation = truth[..., 3:9] - mean[..., 3:9]
-        return torch.cat([rotation, navigation, mean[..., 9:] - truth[..., 9:]], -1)
+        return None if self.inflation is None else additive_transition(self, x, u)
 
 
 def _hypot(a: float, b: float) -> float:

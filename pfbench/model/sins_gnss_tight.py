@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, MultivariateNormal
+from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.affine_map import affine_map
 from pfbench.core.covariance import factor
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.normal import independent_normal
 from pfbench.core.record import Record, map_inputs
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.ins_errors import InsErrorModel, additive_transition
 from pfbench.model.tight_coupling import (
     GROUPS,
     NAMES,
@@ -22,7 +22,7 @@ from pfbench.model.tight_coupling import (
     compute_initial_sd,
     predict_measurement,
 )
-from pfbench.nav import attitude, earth, error_dynamics
+from pfbench.nav import earth, error_dynamics
 from pfbench.nav.aiding import AlignmentErrors, ProcessNoiseInflation
 from pfbench.nav.gnss.ranging import RangingInputs, RangingReceiver
 from pfbench.nav.gnss.satellite_geometry import SatelliteGeometry
@@ -40,13 +40,7 @@ class TightStep(NamedTuple):
         phi: Transition from the first fifteen errors, [R, T, 9, 15].
         gain: Lower triangular root of the noise, [R, T, 9, 9].
         duration: [R or 1, T], s.
-        sine: See `Sight`, as are the fields below.
-        cosine: See `Sight`.
-        height: See `Sight`.
-        vel: See `Sight`.
-        distance: See `Sight`.
-        line: See `Sight`.
-        closing: See `Sight`.
+        sine, cosine, height, vel, distance, line, closing: See `SatelliteGeometry`.
     """
 
     phi: Tensor
@@ -61,19 +55,19 @@ class TightStep(NamedTuple):
     closing: Tensor
 
 
-class SinsGnssTight(StateSpaceModel):
+class SinsGnssTight(InsErrorModel):
     """Errors of an INS (INS minus truth) and a receiver clock, measured by ranges.
 
-    States [17]: attitude phi (E, N, U), velocity (E, N, U), position in metres (N, E, U), where the
-    paper has radians for latitude and longitude [ours], constant gyro and accelerometer biases,
-    clock bias and drift in m and m/s. The groups are the paper's [COFM-AMSSRCPF 2024, Measurement
-    and Control, section 2]. Order, axes and signs are ours.
+    The 17 states are attitude phi (E, N, U), velocity (E, N, U), position in metres (N, E, U), constant
+    gyro and accelerometer biases, clock bias and drift in m and m/s. The paper has radians for
+    latitude and longitude [ours]. The groups are the paper's [COFM-AMSSRCPF 2024, Measurement and
+    Control, section 2]. Order, axes and signs are ours.
 
     Measurements are ranges and rates, INS minus receiver. They are not linearised, but almost
     linear: 2.5e-6 m for an error of 10 m. Phi is the matrix exponential to order 4 of the mean F of
     the interval. The noise is its exact integral, of rank 11: attitude, velocity, position, clock.
-    The biases are constant, so the transition has no density. With `inflation` the rank is 17 and
-    the transition has a density. `error` is corrected navigation minus truth, for sensors and clock
+    The biases are constant, so the transition is singular. With `inflation` the rank is 17 and the
+    transition has a density. `error` is corrected navigation minus truth, for sensors and clock
     estimate minus truth.
 
     Args:
@@ -82,12 +76,11 @@ class SinsGnssTight(StateSpaceModel):
         initial: Initial errors that the model assumes.
         inflation: Additional process noise, or None.
 
-    Raises: ValueError: If a sensor bias is 0, which makes the initial distribution improper, or a
-        sensor
-            has a Markov part.
+    Raises:
+        ValueError: If a sensor bias is 0, which makes the initial distribution improper, or a
+            sensor has a Markov part.
     """
 
-    p0: Tensor
     r: Tensor
     names, units, groups = NAMES, UNITS, GROUPS
 
@@ -106,11 +99,6 @@ class SinsGnssTight(StateSpaceModel):
         self.choices = (
             (f"process noise is inflated for every filter: {inflation}",) if inflation else ()
         )
-
-    @property
-    @override
-    def anchor(self) -> Tensor:
-        return self.p0
 
     @override
     def prepare(self, record: Record) -> Record:
@@ -155,7 +143,7 @@ class SinsGnssTight(StateSpaceModel):
         if not bool(ok.all()):
             raise ValueError(
                 f"model.imu must have random walks of both sensors, got {self.imu}. "
-                "The noise covariance has no Cholesky factor."
+                "Otherwise the noise covariance is singular."
             )
         return torch.cat([phi, driven @ b * span], -1), root
 
@@ -177,10 +165,6 @@ class SinsGnssTight(StateSpaceModel):
         # isotropic, so it is the same in body and in level axes
         density = torch.diag(f.new_tensor([gyro] * 3 + [accelerometer] * 3 + [0.0] * 3))
         return f, self._bias_columns(dcm), density
-
-    @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0)
 
     @override
     def propagate(self, x: Tensor, u: TightStep, w: Tensor) -> Tensor:
@@ -210,15 +194,4 @@ class SinsGnssTight(StateSpaceModel):
 
     @override
     def transition(self, x: Tensor, u: TightStep) -> Distribution | None:
-        if self.inflation is None:
-            return None
-        mean = self.propagate(x, u, x.new_zeros(*x.shape[:2], self.noise_dim))
-        return MultivariateNormal(
-            mean, scale_tril=self.noise_gain(u).unsqueeze(1), validate_args=False
-        )
-
-    @override
-    def error(self, mean: Tensor, truth: Tensor) -> Tensor:
-        rotation = attitude.residual_error(truth[..., :3], mean[..., :3])
-        navigation = truth[..., 3:9] - mean[..., 3:9]
-        return torch.cat([rotation, navigation, mean[..., 9:] - truth[..., 9:]], -1)
+        return None if self.inflation is None else additive_transition(self, x, u)

@@ -12,9 +12,9 @@ from typing_extensions import override
 
 from pfbench.core import quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.normal import independent_normal
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.ins_errors import InsErrorModel
 from pfbench.model.tight_coupling import (
     GROUPS,
     NAMES,
@@ -38,20 +38,9 @@ class NonlinearTightStep(NamedTuple):
 
     Attributes:
         dcm: Body to level at mid-interval, [R, T, 3, 3].
-        pos: See `strapdown.Intervals`, as are the fields up to `duration`.
-        pos_start: See `strapdown.Intervals`.
-        pos_end: See `strapdown.Intervals`.
-        vel: See `strapdown.Intervals`.
-        w_in: See `strapdown.Intervals`.
-        f: See `strapdown.Intervals`.
-        duration: See `strapdown.Intervals`.
-        sine: See `Sight`, as are the fields below.
-        cosine: See `Sight`.
-        height: See `Sight`.
-        vel_end: See `Sight.vel`.
-        distance: See `Sight`.
-        line: See `Sight`.
-        closing: See `Sight`.
+        pos, pos_start, pos_end, vel, w_in, f, duration: See `InsIntervals`.
+        sine, cosine, height, vel_end, distance, line, closing: See `SatelliteGeometry`, whose `vel`
+            is `vel_end`.
     """
 
     dcm: Tensor
@@ -71,7 +60,7 @@ class NonlinearTightStep(NamedTuple):
     closing: Tensor
 
 
-class SinsGnssTightNl(StateSpaceModel):
+class SinsGnssTightNl(InsErrorModel):
     """`SinsGnssTight` without linearisation, for INS errors of any size.
 
     An example is an INS with an approximate initial heading, wrong by 45 degrees. State [18]:
@@ -98,12 +87,11 @@ class SinsGnssTightNl(StateSpaceModel):
         receiver: Receiver noise and clock that the model assumes.
         initial: Initial errors that the model assumes.
 
-    Raises: ValueError: If a sensor bias is 0, which makes the initial distribution improper, or a
-        sensor
-            has a Markov part.
+    Raises:
+        ValueError: If a sensor bias is 0, which makes the initial distribution improper, or a
+            sensor has a Markov part.
     """
 
-    p0: Tensor
     r: Tensor
     names, units, groups = NAMES, UNITS, GROUPS
     noise_dim = 11
@@ -122,11 +110,6 @@ class SinsGnssTightNl(StateSpaceModel):
 
     @property
     @override
-    def anchor(self) -> Tensor:
-        return self.p0
-
-    @property
-    @override
     def origin(self) -> Tensor:
         return torch.cat([self.p0.new_ones(1), self.p0.new_zeros(17)])
 
@@ -138,10 +121,6 @@ class SinsGnssTightNl(StateSpaceModel):
         dcm = error_dynamics.mid_interval(u.intervals).dcm
         interval = (dcm, u.pos, u.pos_start, u.pos_end, u.vel, u.w_in, u.f, u.duration)
         return record._replace(u=NonlinearTightStep(*interval, *u.sight))
-
-    @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0)
 
     @override
     def propagate(self, x: Tensor, u: NonlinearTightStep, w: Tensor) -> Tensor:

@@ -12,16 +12,16 @@ from torch.nn.functional import pad
 from typing_extensions import override
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.normal import independent_normal
 from pfbench.core.record import Record
 from pfbench.model.azimuth_errors import AzimuthStep, ErrorEquations
-from pfbench.model.base import StateSpaceModel
-from pfbench.nav import attitude, earth, error_dynamics
+from pfbench.model.ins_errors import BIASES, NAVIGATION, InsErrorModel, name_ins_components
+from pfbench.nav import earth, error_dynamics
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.strapdown import InsIntervals
 
-_ATTITUDE, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
+_VELOCITY, _POSITION = slice(3, 6), slice(6, 9)
 
 
 class Discretisation(Protocol):
@@ -52,34 +52,32 @@ class TrapezoidDiscretisation:
     mean_weight = 0.5
 
 
-class SinsGpsAzimuth(StateSpaceModel):
+class SinsGpsAzimuth(InsErrorModel):
     """INS errors (INS minus truth) with an azimuth error of any size.
 
-    A receiver measures velocity and position errors. States: Euler errors of the attitude (E, N, U,
-    the azimuth error of any size, tilts of degrees), velocity (E, N, U), position in metres (N, E,
-    U) [particle filter with state reconstruction by Dynamic Matrix Control, eqs 1 and 14]. Sensor
-    biases are part of the white noise W, with factor `q_inflation`: s^2 = kappa^2 (b^2 + N^2 / T)
+    A receiver measures velocity and position errors. States are Euler errors of the attitude (E, N,
+    U), velocity (E, N, U) and position in metres (N, E, U). The azimuth error has any size, tilts are
+    degrees [particle filter with state reconstruction by Dynamic Matrix Control, eqs 1 and 14]. Sensor
+    biases are part of the white noise W, with `process_noise_factor`: s^2 = kappa^2 (b^2 + N^2 / T)
     [ours]. With `biases` gyro and accelerometer biases are states too, 15 in all. They have the
     driving noise of the sensors' Gauss-Markov parts, and W contains the white noise only.
 
     White noise is equal in all axes, so its distribution is invariant under rotation by M, and it
-    is additive in all error equations. `error` is corrected navigation minus truth, for sensor
-    states estimate minus truth.
+    is additive in all error equations.
 
     Args:
         imu: Sensor errors that the model assumes.
         receiver: Receiver noise that the model assumes, order position N, E, U, velocity E, N, U.
         initial: Initial errors that the model assumes.
-        form: Error equations: Paper, Full or Exact.
-        step: Discretisation: Euler or Trapezoid.
-        q_inflation: kappa, factor on the standard deviations of W.
+        error_equations: PrintedErrorEquations, LinearisedRateEquations or ExactErrorEquations.
+        discretisation: EulerDiscretisation or TrapezoidDiscretisation.
+        process_noise_factor: kappa, factor on the standard deviations of W.
         biases: Whether to use 15 states instead of 9.
 
     Raises:
         ValueError: If the factor is not positive, or with `biases` a sensor bias is 0.
     """
 
-    p0: Tensor
     r: Tensor
     observed_indices: Tensor
 
@@ -99,40 +97,17 @@ class SinsGpsAzimuth(StateSpaceModel):
                 f"model.process_noise_factor must be positive, got {process_noise_factor}. "
                 "Use 1.0 for the sensors' nominal noise."
             )
-        axes = {
-            "attitude": (("E", "N", "U"), "rad"),
-            "velocity": (("E", "N", "U"), "m/s"),
-            "position": (("N", "E", "U"), "m"),
-        }
-        if biases:
-            axes |= {
-                "gyro_bias": (("x", "y", "z"), "rad/s"),
-                "accelerometer_bias": (("x", "y", "z"), "m/s^2"),
-            }
-        self.names = tuple(
-            f"{group}_{axis}" for group, (axis_names, _) in axes.items() for axis in axis_names
+        self.names, self.units, self.groups = name_ins_components(
+            NAVIGATION + (BIASES if biases else ())
         )
-        self.units = tuple(unit for _, unit in axes.values() for _ in range(3))
-        self.groups = {group: (3 * i, 3 * i + 1, 3 * i + 2) for i, group in enumerate(axes)}
         self.noise_dim = 12 if biases else 6
         self.linear_given = (
             (*error_equations.linear_given, *range(9, len(self.names)))
             if error_equations.linear_given
             else ()
         )
-        (
-            self.imu,
-            self.error_equations,
-            self.discretisation,
-            self.process_noise_factor,
-            self.biases,
-        ) = (
-            imu,
-            error_equations,
-            discretisation,
-            process_noise_factor,
-            biases,
-        )
+        self.imu, self.process_noise_factor, self.biases = imu, process_noise_factor, biases
+        self.error_equations, self.discretisation = error_equations, discretisation
         sizes = _bias_sizes(imu)
         if biases and not bool((sizes > 0).all()):
             raise ValueError(
@@ -153,11 +128,6 @@ class SinsGpsAzimuth(StateSpaceModel):
     @override
     def chart(self) -> Chart:
         return Chart((EuclideanBlock(2), AngleBlock(1), EuclideanBlock(len(self.names) - 3)))
-
-    @property
-    @override
-    def anchor(self) -> Tensor:
-        return self.p0
 
     @override
     def prepare(self, record: Record) -> Record:
@@ -202,10 +172,6 @@ class SinsGpsAzimuth(StateSpaceModel):
         return torch.cat([pad(gain, (0, 6)), pad(walk, (6, 0))], -2)
 
     @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0)
-
-    @override
     def propagate(self, x: Tensor, u: AzimuthStep, w: Tensor) -> Tensor:
         a, span = x.mT, u.duration[:, None, None]  # component-major: rows of particles
         start = torch.cat([a[:, :6], a[:, _POSITION] / u.metres.unsqueeze(-1), a[:, 9:]], 1)
@@ -235,12 +201,6 @@ class SinsGpsAzimuth(StateSpaceModel):
     @override
     def observation(self, x: Tensor, u: AzimuthStep) -> Distribution:
         return independent_normal(x.mT.index_select(1, self.observed_indices).mT, self.r)
-
-    @override
-    def error(self, mean: Tensor, truth: Tensor) -> Tensor:
-        rotation = attitude.residual_error(truth[..., _ATTITUDE], mean[..., _ATTITUDE])
-        navigation = truth[..., 3:9] - mean[..., 3:9]
-        return torch.cat([rotation, navigation, mean[..., 9:] - truth[..., 9:]], -1)
 
 
 def _bias_sizes(imu: ImuErrors) -> Tensor:

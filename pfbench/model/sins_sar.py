@@ -10,10 +10,15 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock, wrap_angle
-from pfbench.core.covariance import factor
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.normal import independent_normal
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.ins_errors import (
+    BIASES,
+    NAVIGATION,
+    InsErrorModel,
+    inflate_noise,
+    name_ins_components,
+)
 from pfbench.nav import attitude
 from pfbench.nav.aiding import AlignmentErrors, ProcessNoiseInflation
 from pfbench.nav.component_major import (
@@ -30,13 +35,6 @@ from pfbench.nav.strapdown import InsIntervals
 
 _SIZES = (4, 3, 3, 3, 3)  # quaternion, velocity, position, gyro bias, accelerometer bias
 _CHART = Chart((QuaternionBlock(), EuclideanBlock(12)))
-_AXES = {
-    "attitude": (("E", "N", "U"), "rad"),
-    "velocity": (("E", "N", "U"), "m/s"),
-    "position": (("N", "E", "U"), "m"),
-    "gyro_bias": (("x", "y", "z"), "rad/s"),
-    "accelerometer_bias": (("x", "y", "z"), "m/s^2"),
-}
 
 
 class SarStep(NamedTuple):
@@ -71,7 +69,7 @@ class SarStep(NamedTuple):
     duration: Tensor
 
 
-class SinsSar(StateSpaceModel):
+class SinsSar(InsErrorModel):
     """INS errors (INS minus truth) with an attitude error quaternion.
 
     State [16] [Yan et al. 2016, eq. 1]: attitude error quaternion, velocity (E, N, U), position (N,
@@ -87,24 +85,26 @@ class SinsSar(StateSpaceModel):
     constant. A step is the midpoint rule with mean inputs of the interval.
 
     White sensor noise over an interval enters as x (+) G w with G = (-C, C) sqrt(T) times the
-    densities, rank 6. With `noise_at_q` the velocity block is R(q) C. The distribution is the same,
+    densities, rank 6. With `rotate_noise_by_error` the velocity block is R(q) C. The distribution is the same,
     because all axes have equal noise. Measurements are the heading difference and the position
     error in metres (North, East from the radar, Up from the barometer) [eqs. 4 and 5]. `error` is
     corrected navigation minus truth with attitude as a rotation vector, for sensor states estimate
     minus truth.
 
-    Args: imu: Sensor errors that the model assumes. receiver: Noise of radar and barometer that the
-        model assumes. initial: Initial errors that the model assumes. noise_at_q: Whether
-        accelerometer noise is rotated by the attitude error of each state, as in
-            the continuous G(x). Otherwise, as printed (G(t)), the noise is additive in the chart.
+    Args:
+        imu: Sensor errors that the model assumes.
+        receiver: Noise of radar and barometer that the model assumes.
+        initial: Initial errors that the model assumes.
+        rotate_noise_by_error: Whether accelerometer noise is rotated by the attitude error of each
+            state, as in the continuous G(x). Otherwise, as printed (G(t)), the noise is additive in
+            the chart.
         inflation: Additional process noise, or None.
 
-    Raises: ValueError: If a sensor has no constant bias or a Markov part, or `noise_at_q` is
-        combined with
-            `inflation`.
+    Raises:
+        ValueError: If a sensor is without a constant bias or has a Markov part, or
+            `rotate_noise_by_error` is combined with `inflation`.
     """
 
-    p0: Tensor
     r: Tensor
     density: Tensor
 
@@ -119,22 +119,21 @@ class SinsSar(StateSpaceModel):
         super().__init__()
         if imu.gyro_markov > 0 or imu.accelerometer_markov > 0:
             raise ValueError(
-                "model.imu must have constant biases. "
-                "Set gyro_markov_deg_h and accelerometer_markov_ug to 0."
+                f"model.imu must have constant biases, got gyro_markov_deg_h={imu.gyro_markov_deg_h}, "
+                f"accelerometer_markov_ug={imu.accelerometer_markov_ug}. Set both to 0."
             )
         biases = [imu.gyro_bias] * 3 + [imu.accelerometer_bias] * 3
         if min(biases) <= 0.0:
             raise ValueError(
                 f"model.imu must have positive biases, got gyro_bias_deg_h={imu.gyro_bias_deg_h}, "
-                f"accelerometer_bias_ug={imu.accelerometer_bias_ug}."
+                f"accelerometer_bias_ug={imu.accelerometer_bias_ug}. Change them."
             )
         if rotate_noise_by_error and inflation:
             raise ValueError(
-                "model.rotate_noise_by_error must be false with model.inflation, got true."
+                "model.rotate_noise_by_error must be false with model.inflation, got true. "
+                "Change one of them."
             )
-        self.names = tuple(f"{group}_{axis}" for group, (axes, _) in _AXES.items() for axis in axes)
-        self.units = tuple(unit for _, unit in _AXES.values() for _ in range(3))
-        self.groups = {group: (3 * i, 3 * i + 1, 3 * i + 2) for i, group in enumerate(_AXES)}
+        self.names, self.units, self.groups = name_ins_components(NAVIGATION + BIASES)
         self.rotate_noise_by_error, self.inflation = rotate_noise_by_error, inflation
         density = [imu.gyro_random_walk] * 3 + [imu.accelerometer_random_walk] * 3
         self.register_buffer(
@@ -156,21 +155,14 @@ class SinsSar(StateSpaceModel):
 
     @property
     @override
-    def anchor(self) -> Tensor:
-        return self.p0
-
-    @property
-    @override
     def origin(self) -> Tensor:
         return torch.cat([self.p0.new_ones(1), self.p0.new_zeros(15)])
 
     @override
     def prepare(self, record: Record) -> Record:
-        return (
-            record
-            if isinstance(record.u, SarStep)
-            else record._replace(u=self.discretise(record.u))
-        )
+        if isinstance(record.u, SarStep):
+            return record
+        return record._replace(u=self.discretise(record.u))
 
     def discretise(self, u: InsIntervals) -> SarStep:
         """Compute mean inputs over intervals, with the gain at the identity quaternion."""
@@ -179,19 +171,8 @@ class SinsSar(StateSpaceModel):
             a.squeeze(-1) for a in earth_quantities(u.pos.unsqueeze(-1), u.vel.unsqueeze(-1))
         )
         gain = self._gain(dcm, u.duration)
-        means = (
-            dcm,
-            u.dcm_end[..., 1],
-            u.f,
-            u.vel,
-            u.pos,
-            u.pos_start,
-            u.pos_end,
-            w_in,
-            free,
-            drift,
-        )
-        return SarStep(*means, gain, u.duration)
+        motion = (dcm, u.dcm_end[..., 1], u.f, u.vel, u.pos, u.pos_start, u.pos_end)
+        return SarStep(*motion, w_in, free, drift, gain, u.duration)
 
     def _gain(self, dcm: Tensor, duration: Tensor) -> Tensor:
         """Return the noise gain [..., 15, W]."""
@@ -201,45 +182,19 @@ class SinsSar(StateSpaceModel):
         gain[..., 0:3, 0:3], gain[..., 3:6, 3:6] = -dcm * gyro * root, dcm * accelerometer * root
         if self.inflation is None:
             return gain
-        extra = torch.cat(
-            [self.inflation.motion, self.inflation.gyro, self.inflation.accelerometer]
-        )
-        full, ok = factor(gain @ gain.mT + torch.diag(extra.to(gain).square()))
-        if not bool(ok.all()):
-            raise ValueError(
-                f"model.inflation must be positive for every state, got {self.inflation}. "
-                "The noise covariance has no Cholesky factor."
-            )
-        return full
-
-    @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0)
+        return inflate_noise(gain, self.inflation, 1)
 
     @override
     def propagate(self, x: Tensor, u: SarStep, w: Tensor) -> Tensor:
         q, dv, metres, *biases = x.mT.split(_SIZES, -2)  # component-major from here on: [R, k, N]
         drifting, pushed = (u.dcm @ bias for bias in biases)
-        pos_start, pos_end, span = (
-            u.pos_start.unsqueeze(-1),
-            u.pos_end.unsqueeze(-1),
-            u.duration[:, None, None],
-        )
-        dp = convert_from_metres(metres, pos_start)
+        dp, span = convert_from_metres(metres, u.pos_start.unsqueeze(-1)), u.duration[:, None, None]
         turn, push, slide = _rates(u, q, dv, dp, drifting, pushed)
         half = 0.5 * span
-        turn, push, slide = _rates(
-            u,
-            rotate_quaternion(q, turn * half),
-            dv + push * half,
-            dp + slide * half,
-            drifting,
-            pushed,
-        )
-        q, plain = (
-            rotate_quaternion(q, turn * span),
-            [dv + push * span, convert_to_metres(dp + slide * span, pos_end), *biases],
-        )
+        middle = rotate_quaternion(q, turn * half), dv + push * half, dp + slide * half
+        turn, push, slide = _rates(u, *middle, drifting, pushed)
+        metres = convert_to_metres(dp + slide * span, u.pos_end.unsqueeze(-1))
+        q, plain = rotate_quaternion(q, turn * span), [dv + push * span, metres, *biases]
         shaken = u.gain @ w.mT
         tilt, rest = shaken.split((3, 12), -2)
         if self.rotate_noise_by_error:

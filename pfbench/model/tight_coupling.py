@@ -6,26 +6,17 @@ import torch
 from torch import Tensor
 
 from pfbench.core.record import Record
+from pfbench.model.ins_errors import BIASES, NAVIGATION, name_ins_components
 from pfbench.nav.aiding import AlignmentErrors
 from pfbench.nav.gnss.ranging import RangingInputs
 from pfbench.nav.gnss.receiver_clock import ReceiverClock
 from pfbench.nav.gnss.satellite_geometry import SatelliteGeometry
 from pfbench.nav.imu_errors import ImuErrors
 
-_AXES = {
-    "attitude": (("E", "N", "U"), ("rad",) * 3),
-    "velocity": (("E", "N", "U"), ("m/s",) * 3),
-    "position": (("N", "E", "U"), ("m",) * 3),
-    "gyro_bias": (("x", "y", "z"), ("rad/s",) * 3),
-    "accelerometer_bias": (("x", "y", "z"), ("m/s^2",) * 3),
-    "clock": (("bias", "drift"), ("m", "m/s")),
-}
-NAMES = tuple(f"{block}_{axis}" for block, (axes, _) in _AXES.items() for axis in axes)
-UNITS = tuple(unit for _, units in _AXES.values() for unit in units)
-GROUPS = {
-    block: tuple(i for i, name in enumerate(NAMES) if name.startswith(f"{block}_"))
-    for block in _AXES
-}
+_INS = name_ins_components(NAVIGATION + BIASES)
+NAMES = (*_INS.names, "clock_bias", "clock_drift")
+UNITS = (*_INS.units, "m", "m/s")
+GROUPS = {**_INS.groups, "clock": (15, 16)}
 
 
 def predict_measurement(
@@ -38,6 +29,9 @@ def predict_measurement(
         velocity: Velocity errors East, North, Up, [R, N, 3], m/s.
         clock: Clock bias and drift, [R, N, 2], m and m/s.
         sight: Ranging geometry of one step.
+
+    Returns:
+        The prediction.
     """
     ranges, rates = sight.range_differences(position, velocity)
     return torch.cat([ranges - clock[..., :1], rates - clock[..., 1:]], -1)
@@ -64,7 +58,7 @@ def compute_initial_sd(imu: ImuErrors, clock: ReceiverClock, initial: AlignmentE
     if min(sizes) <= 0.0:
         raise ValueError(
             f"model.imu must have positive gyro and accelerometer biases, "
-            f"got {imu.gyro_bias_deg_h} deg/h and {imu.accelerometer_bias_ug} ug."
+            f"got {imu.gyro_bias_deg_h} deg/h and {imu.accelerometer_bias_ug} ug. Change them."
         )
     return torch.cat([initial.sd, torch.tensor(sizes, dtype=torch.float64)])
 
@@ -79,9 +73,9 @@ def check_ranging_inputs(record: Record, components: int) -> RangingInputs:
     Returns:
         Inputs.
 
-    Raises: ValueError: If the inputs are of another kind, or the measurements do not fit the
-        receiver of
-            the model.
+    Raises:
+        ValueError: If the inputs are of another kind, or the measurements do not fit the receiver
+            of the model.
     """
     if not isinstance(record.u, RangingInputs):
         raise ValueError(

@@ -586,7 +586,7 @@ def test_beliefs_that_the_model_cannot_hold_are_refused() -> None:
     ):
         SinsSar(replace(IMU, gyro_bias_deg_h=0.0), SarSensor(), INITIAL)
     with pytest.raises(
-        ValueError, match=r"model\.imu must have constant biases\. Set gyro_markov_deg_h"
+        ValueError, match=r"model\.imu must have constant biases, got gyro_markov_deg_h=0\.1"
     ):
         SinsSar(replace(IMU, gyro_markov_deg_h=0.1, gyro_markov_time_s=100.0), SarSensor(), INITIAL)
     with pytest.raises(

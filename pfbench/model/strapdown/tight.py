@@ -35,17 +35,11 @@ class TightMemsInputs(NamedTuple):
     Geometry is relative to a position that is fixed to the ground.
 
     Attributes:
-        turn: See `Increments`.
-        push: See `Increments`.
-        shift: See `Increments`.
-        jacobian: See `Increments`.
-        bias: See `Increments`.
-        gravity: See `Increments`.
-        duration: See `Increments`.
+        turn, push, shift, jacobian, bias, gravity, duration: See `PreintegratedImu`.
         line: Unit vectors to the satellites, East, North, Up, [R or 1, T, S, 3].
         reach: Distances of the satellites, [R or 1, T, S], m.
         velocity: Velocities of the satellites, East, North, Up, [R or 1, T, S, 3], m/s.
-        other: 1 for a satellite of a different system than the clock's, else 0, [R or 1, T, S].
+        other_system: 1 for a satellite of a different system than the clock's, else 0, [R or 1, T, S].
         range_sd: Standard deviation stated by the receiver, [R or 1, T, S], m.
         rate_sd: Standard deviation stated by the receiver, [R or 1, T, S], m/s.
     """

@@ -19,6 +19,7 @@ from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive
 from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel
+from pfbench.model.ins_errors import name_components
 from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.nav.preintegration import PreintegratedImu, rotate
 
@@ -81,11 +82,7 @@ class StrapdownTotal(StateSpaceModel):
             "gyro_bias": (("right", "forward", "up"), "rad/s"),
             "accelerometer_bias": (("right", "forward", "up"), "m/s^2"),
         }
-        self.names = tuple(
-            f"{group}_{axis}" for group, (axis_names, _) in axes.items() for axis in axis_names
-        )
-        self.units = tuple(unit for _, unit in axes.values() for _ in range(3))
-        self.groups = {group: (3 * i, 3 * i + 1, 3 * i + 2) for i, group in enumerate(axes)}
+        self.names, self.units, self.groups = name_components(axes)
 
     @property
     @override
