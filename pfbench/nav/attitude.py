@@ -20,8 +20,8 @@ def skew(a: Tensor) -> Tensor:
         a: Vectors, [..., 3]. skew(a) b equals a x b.
     """
     x, y, z = a.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
 
 
 def dcm_from_euler(euler: Tensor) -> Tensor:

@@ -19,8 +19,9 @@ def earth_quantities(pos: Tensor, vel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         pos: Position, [..., 3, N], rad, rad, m.
         vel: Velocity (E, N, U), [..., 3, N], m/s.
 
-    Returns: Rate of the level frame in inertial space rad/s, gravity with Coriolis acceleration
-        m/s^2, and rate of the position (rad/s, rad/s, m/s), [..., 3, N] each.
+    Returns:
+        Rate of the level frame in inertial space, rad/s, gravity with Coriolis acceleration, m/s^2,
+        and rate of the position, (rad/s, rad/s, m/s), [..., 3, N] each.
     """
     (lat, _, h), (v_e, v_n, v_u) = pos.unbind(-2), vel.unbind(-2)
     r_m, r_n = earth.radii(lat)
@@ -48,7 +49,7 @@ def convert_to_metres(dp: Tensor, pos: Tensor) -> Tensor:
 
 
 def convert_from_metres(metres: Tensor, pos: Tensor) -> Tensor:
-    """Convert position errors in metres to (rad, rad, m) (inverse of `to_metres`).
+    """Convert position errors in metres to (rad, rad, m) (inverse of `convert_to_metres`).
 
     Each pass has the error factor 0.01 error / Earth radius: 200 km are correct to a millimetre.
 

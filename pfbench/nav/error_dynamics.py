@@ -2,8 +2,8 @@
 
 Errors are INS minus truth: x [..., 9] = attitude (East, North, Up, `attitude.attitude_error`,
 of any size), velocity (East, North, Up), position. Position errors are in (rad, rad, m) in
-rates and F matrices. They are in metres (North, East, Up) over an interval, in `propagate` and
-`in_metres`. Nominal quantities come from the INS and include its errors. Everything broadcasts,
+rates and F matrices. They are in metres (North, East, Up) over an interval, in `propagate_error`
+and `convert_transition_to_metres`. Nominal quantities come from the INS and include its errors. Everything broadcasts,
 for example errors [R, N, 9] with nominals [R, 1, 3].
 
 [Yan Gongmin, postdoctoral report, eqs 4-17 to 4-21, for large misalignment angles; linear
@@ -140,24 +140,25 @@ def coupling_matrix(pos: Tensor, vel: Tensor) -> Tensor:
     r_m, r_n = radius_m + h, radius_n + h
     tan, sec = torch.tan(lat), 1 / torch.cos(lat)
     v_e, v_n = vel[..., 0], vel[..., 1]
-    o = torch.zeros_like(r_m)
+    z = torch.zeros_like(r_m)
     w_ie, w_en = earth.earth_rate(lat), earth.transport_rate(lat, h, vel)
 
-    f12 = _matrix(o, -1 / r_m, o, 1 / r_n, o, o, tan / r_n, o, o)
-    f_ie = _matrix(o, o, o, -w_ie[..., 2], o, o, w_ie[..., 1], o, o)
+    f12 = _matrix(z, -1 / r_m, z, 1 / r_n, z, z, tan / r_n, z, z)
+    f_ie = _matrix(z, z, z, -w_ie[..., 2], z, z, w_ie[..., 1], z, z)
     f_en = _matrix(
-        o, o, v_n / r_m**2, o, o, -v_e / r_n**2, v_e * sec**2 / r_n, o, -v_e * tan / r_n**2
+        z, z, v_n / r_m**2, z, z, -v_e / r_n**2, v_e * sec**2 / r_n, z, -v_e * tan / r_n**2
     )
     spring = _matrix(
-        o, o, o, o, o, o, o, o, 2 * earth.gravity(lat, h) / torch.sqrt(radius_m * radius_n)
+        z, z, z, z, z, z, z, z, 2 * earth.gravity(lat, h) / torch.sqrt(radius_m * radius_n)
     )
     across = attitude.skew(vel)
     f22 = across @ f12 - attitude.skew(2 * w_ie + w_en)
     f23 = across @ (2 * f_ie + f_en) + spring
-    f32 = _matrix(o, 1 / r_m, o, sec / r_n, o, o, o, o, o + 1)
-    f33 = _matrix(o, o, -v_n / r_m**2, v_e * sec * tan / r_n, o, -v_e * sec / r_n**2, o, o, o)
-    zero = torch.zeros_like(f12)
-    rows = [[zero, f12, f_ie + f_en], [zero, f22, f23], [zero, f32, f33]]
+    f32 = _matrix(z, 1 / r_m, z, sec / r_n, z, z, z, z, z + 1)
+    f33 = _matrix(z, z, -v_n / r_m**2, v_e * sec * tan / r_n, z, -v_e * sec / r_n**2, z, z, z)
+    attitude_columns = torch.zeros_like(f12)
+    blocks = ((f12, f_ie + f_en), (f22, f23), (f32, f33))
+    rows = [[attitude_columns, *row] for row in blocks]
     return torch.cat([torch.cat(row, dim=-1) for row in rows], dim=-2)
 
 

@@ -28,8 +28,8 @@ def prepare_steps(
         per_step: Samples per step, 1 or 2.
 
     Yields:
-        Body rotation [3, 3, R], velocity increment in body axes at the start of the step
-        [3, 1, R], and spans [3, R]: half the duration, the duration, and its inverse.
+        Body rotation, [3, 3, R], velocity increment in body axes at the start of the step,
+        [3, 1, R], and spans, [3, R]. The spans are half the duration, the duration, and its inverse.
     """
     n = dtheta.shape[-2]
     for begin in range(0, n, _CHUNK * per_step):
@@ -37,7 +37,7 @@ def prepare_steps(
         first = max(begin - 1, 0) if per_step == 1 else begin
         chunk = (dtheta[..., first:stop, :], dv[..., first:stop, :], d[..., first:stop])
         turn, push, t = correct_coning_sculling(*chunk, per_step, has_previous=first < begin)
-        inverse = torch.where(t > 0, 1 / t, torch.zeros_like(t))  # a step that fills up has t = 0
+        inverse = torch.where(t > 0, 1 / t, torch.zeros_like(t))  # a padded step has t = 0
         spans = torch.stack([t / 2, t, inverse], dim=-1)
         turns = attitude.dcm_from_rotation_vector(turn).permute(1, 2, 3, 0).contiguous()
         pushes = push.permute(1, 2, 0).unsqueeze(2).contiguous()

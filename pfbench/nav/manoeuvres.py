@@ -34,7 +34,7 @@ class ManoeuvreSegment:
     """A section of motion and the changes along it.
 
     Attributes:
-        duration: s.
+        duration_s: Duration, s.
         speed: Change of speed, m/s.
         climb: Change of flight-path angle, rad.
         heading: Change of heading (clockwise from North), rad.
@@ -53,7 +53,7 @@ class ManoeuvreSegment:
 
     def __post_init__(self) -> None:
         if not self.duration_s > 0:
-            raise ValueError(f"duration must be positive, got {self.duration_s}. Give seconds.")
+            raise ValueError(f"duration_s must be positive, got {self.duration_s}. Give seconds.")
 
 
 Manoeuvre: TypeAlias = tuple[ManoeuvreSegment, ...]
@@ -64,7 +64,7 @@ class ManoeuvreTrajectory(TrajectorySource):
     """Segments in sequence.
 
     Attributes:
-        segments: Manoeuvres and single segments, see `fly`.
+        segments: Manoeuvres and single segments, see `generate_manoeuvres`.
         start: Initial position, speed and heading.
     """
 
@@ -81,7 +81,7 @@ def accelerate(acceleration: float, duration_s: float, smooth: bool = False) -> 
 
     Args:
         acceleration: Mean acceleration, m/s^2.
-        duration: s.
+        duration_s: Duration, s.
         smooth: Whether the acceleration is continuous. Otherwise it is constant.
     """
     return (ManoeuvreSegment(duration_s, speed=acceleration * duration_s, smooth=smooth),)
@@ -97,8 +97,8 @@ def climb(angle_deg: float, pitch_duration_s: float, hold_duration_s: float) -> 
 
     Args:
         angle_deg: Climb angle.
-        pitch_duration: Duration of each pitch change, s.
-        hold_duration: Duration at the climb angle, s.
+        pitch_duration_s: Duration of each pitch change, s.
+        hold_duration_s: Duration at the climb angle, s.
     """
     angle = math.radians(angle_deg)
     return (
@@ -113,7 +113,7 @@ def turn(angle_deg: float, duration_s: float) -> Manoeuvre:
 
     Args:
         angle_deg: Change of heading, positive to the right.
-        duration: s.
+        duration_s: Duration, s.
     """
     return (ManoeuvreSegment(duration_s, heading=math.radians(angle_deg)),)
 
@@ -172,7 +172,7 @@ def _sample_counts(plan: list[ManoeuvreSegment], rate: float) -> list[int]:
         if abs(samples - round(samples)) > 1e-6 or round(samples) < 1:
             raise ValueError(
                 f"the duration of segment {k} must be a multiple of {1 / rate:.6g} s "
-                f"at rate={rate}, got {segment.duration_s} s ({samples:.4f} samples)."
+                f"at rate={rate}, got {segment.duration_s} s ({samples:.4f} samples). Change it."
             )
     return [round(segment.duration_s * rate) for segment in plan]
 

@@ -22,10 +22,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.nav import earth
-from pfbench.nav.trajectory import NODES, TrajectoryData, TrajectorySource
+from pfbench.nav.trajectory import NODES, WEIGHTS, TrajectoryData, TrajectorySource, ideal_sensors
 
 Array = NDArray[np.float64]
-_WEIGHTS = torch.tensor([5.0, 8.0, 5.0], dtype=torch.float64) / 18  # Gauss-Legendre, at NODES
 _POSITION, _ATTITUDE = 5, 3  # degrees of the splines
 _PASSES = 4  # Gauss-Newton steps for attitude, each squares the angular error
 
@@ -57,16 +56,16 @@ class MotionSpline(TrajectorySource):
 
     Attributes:
         recorded: The motion.
-        smoothing: Seconds between knots. Motion with a shorter period than about twice this value
-            is smoothed out.
-        whole: The flight is cut to a multiple of these seconds.
+        knot_interval_s: Time between knots, s. Motion with a shorter period than about twice this
+            value is smoothed out.
+        use_full_log: Time, s, of which the flight is a multiple. The rest is cut off.
         position_sd: Position errors of the record, m. Only the ratio to `velocity_sd` matters.
         velocity_sd: Velocity errors of the record, m/s.
 
     Raises:
         ValueError: If a size is not positive, the record has a gap that is too long for
-            `smoothing`, or it is shorter than `whole`. On `fly`, if `whole` is not a multiple of
-            the sampling interval.
+            `knot_interval_s`, or it is shorter than `use_full_log`. On `generate`, if
+            `use_full_log` is not a multiple of the sampling interval.
     """
 
     recorded: RecordedMotion
@@ -78,26 +77,27 @@ class MotionSpline(TrajectorySource):
     def __post_init__(self) -> None:
         for name in ("knot_interval_s", "use_full_log", "position_sd", "velocity_sd"):
             if not getattr(self, name) > 0.0:
-                raise ValueError(f"path.{name} must be positive, got {getattr(self, name)}.")
+                raise ValueError(
+                    f"trajectory.{name} must be positive, got {getattr(self, name)}. Change it."
+                )
         time = self.recorded.time
         step = time.diff()
         if len(time) < 2 or not bool((step > 0.0).all()):
             raise ValueError(
-                f"the recorded times must increase. Sort at least 2 rows by time, got {len(time)}."
+                f"recorded times must increase, got {len(time)} rows. Sort at least 2 rows by time."
             )
         i = int(step.argmax())
-        if (
-            float(step[i]) > 0.5 * self.knot_interval_s + 1e-9
-        ):  # splines need two instants between knots
+        # splines need two instants between knots
+        if float(step[i]) > 0.5 * self.knot_interval_s + 1e-9:
             raise ValueError(
-                f"path.smoothing must be at least twice the longest gap of the record, "
+                f"trajectory.knot_interval_s must be at least twice the longest gap of the record, "
                 f"{float(step[i]):.3f} s after t = {float(time[i]):.3f}, got {self.knot_interval_s}. "
                 "Increase it, or choose start and end without this gap."
             )
         if float(time[-1] - time[0]) < self.use_full_log:
             raise ValueError(
-                f"path.whole must be at most the duration of the record, "
-                f"{float(time[-1] - time[0]):.3f} s, got {self.use_full_log}."
+                "trajectory.use_full_log must be at most the duration of the record, "
+                f"{float(time[-1] - time[0]):.3f} s, got {self.use_full_log}. Reduce it."
             )
 
     @override
@@ -105,8 +105,8 @@ class MotionSpline(TrajectorySource):
         samples = self.use_full_log * rate
         if abs(samples - round(samples)) > 1e-6 or round(samples) < 1:
             raise ValueError(
-                f"path.whole must be a whole number of samples at rate={rate}, "
-                f"got {self.use_full_log} ({samples:g} samples)."
+                f"trajectory.use_full_log must be a whole number of samples at rate={rate}, "
+                f"got {self.use_full_log} ({samples:g} samples). Change it."
             )
         start = float(self.recorded.time[0])
         n = int((float(self.recorded.time[-1]) - start) / self.use_full_log + 1e-6) * round(samples)
@@ -117,7 +117,7 @@ class MotionSpline(TrajectorySource):
         position, attitude = self._fit_position(), self._fit_attitude()
         pos, vel, _ = position.at_step(ends)
         w, f = _ideal_sensors(position, attitude, nodes)
-        weights = _WEIGHTS[:, None] / rate
+        weights = WEIGHTS[:, None] / rate
         dtheta, dv = (weights * w).sum(1), (weights * f).sum(1)
         return TrajectoryData(steps / rate, pos, vel, _dcm(attitude, ends), dtheta, dv)
 
@@ -167,20 +167,9 @@ class _PositionSpline(NamedTuple):
 
 def _ideal_sensors(position: _PositionSpline, attitude: Any, t: Tensor) -> tuple[Tensor, Tensor]:
     """Compute angular rate and specific force in body axes [..., 3]."""
-    pos, v, acc = position.at_step(t)
-    to_body = _dcm(attitude, t).mT
-    w_ie, w_en = earth.earth_rate(pos[..., 0]), earth.transport_rate(pos[..., 0], pos[..., 2], v)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    f = (
-        acc
-        + torch.linalg.cross(2 * w_ie + w_en, v)
-        + earth.gravity(pos[..., 0], pos[..., 2])[..., None] * up
-    )
-    # rate of the body relative to the level frame, in body axes
-    w = torch.from_numpy(attitude(t.numpy().ravel(), 1)).reshape(v.shape)
-    return w + (to_body @ (w_ie + w_en)[..., None]).squeeze(-1), (to_body @ f[..., None]).squeeze(
-        -1
-    )
+    pos, vel, acceleration = position.at_step(t)
+    body_rate = torch.from_numpy(attitude(t.numpy().ravel(), 1)).reshape(vel.shape)
+    return ideal_sensors(pos, vel, acceleration, body_rate, _dcm(attitude, t).mT)
 
 
 def _dcm(attitude: Any, t: Tensor) -> Tensor:

@@ -19,11 +19,13 @@ class PreintegratedImu(NamedTuple):
 
     Body axes are right, forward, up.
 
-    Attributes: turn: Rotation from the body at the end to the body at the start, quaternion, [R or
-        1, T, 4]. push: Velocity increment, [R or 1, T, 3], m/s. shift: Position increment from
-        rest, [R or 1, T, 3], m. jacobian: Derivatives of (rotation vector on the right of `turn`,
-        push, shift) with respect
-            to (gyro, accelerometer) bias, [R or 1, T, 9, 6].
+    Attributes:
+        rotation: Rotation from the body at the end to the body at the start, quaternion,
+            [R or 1, T, 4].
+        velocity_increment: Velocity increment, [R or 1, T, 3], m/s.
+        position_increment: Position increment from rest, [R or 1, T, 3], m.
+        jacobian: Derivatives of (rotation vector on the right of `rotation`, velocity and position
+            increment) with respect to (gyro, accelerometer) bias, [R or 1, T, 9, 6].
         bias: Gyro and accelerometer bias that were subtracted, [R or 1, T, 6], rad/s, m/s^2.
         gravity: [R or 1, T], m/s^2, downwards.
         duration: [R or 1, T], s. 0 pads a short run: the interval changes nothing.
@@ -54,7 +56,8 @@ def preintegrate(
         bias: Gyro and accelerometer bias to subtract, [..., 6].
 
     Returns:
-        turn [..., 4], push [..., 3], shift [..., 3] and jacobian [..., 9, 6], see `Increments`.
+        Rotation [..., 4], velocity and position increment [..., 3] and Jacobian [..., 9, 6], see
+        `PreintegratedImu`.
     """
     half_turn = (rate - bias[..., None, :3]) * (0.5 * spans.unsqueeze(-1))
     halves = attitude.dcm_from_rotation_vector(half_turn)

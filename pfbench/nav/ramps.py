@@ -27,8 +27,8 @@ class CosineRamp:
     The rate is continuous and the second derivative is not.
 
     Attributes:
-        begin: Start time, s.
-        end: End time, s.
+        start_s: Start time, s.
+        end_s: End time, s.
         change: In the unit of the changing quantity.
     """
 
@@ -59,8 +59,8 @@ class CycloidRamp:
     Two derivatives are continuous.
 
     Attributes:
-        begin: Start time, s.
-        end: End time, s.
+        start_s: Start time, s.
+        end_s: End time, s.
         change: In the unit of the changing quantity.
     """
 
@@ -87,16 +87,16 @@ class RampTrajectory(TrajectorySource):
 
     Attributes:
         start: Initial position, speed, heading.
-        duration: s.
-        speed: Changes of speed, m/s. Changes of the horizontal speed if `rise` is given.
-        climb_deg: Changes of the flight-path angle. Not together with `rise`.
+        duration_s: Duration, s.
+        speed: Changes of speed, m/s. Changes of the horizontal speed with `climb_rate_changes`.
+        climb_deg: Changes of the flight-path angle. Not together with `climb_rate_changes`.
         heading_deg: Changes of heading, clockwise.
-        rise: Changes of the vertical speed, m/s.
+        climb_rate_changes: Changes of the vertical speed, m/s.
 
     Raises:
-        ValueError: If `climb_deg` and `rise` are both given. On `fly`, if the speed is negative,
-            the duration is not a whole number of samples, or a Cosine begins or ends between two
-            samples.
+        ValueError: If `climb_deg` and `climb_rate_changes` are both given. On `generate`, if the
+            speed is negative, the duration is not a whole number of samples, or a CosineRamp begins
+            or ends between two samples.
     """
 
     start: TrajectoryStart
@@ -108,15 +108,18 @@ class RampTrajectory(TrajectorySource):
 
     def __post_init__(self) -> None:
         if self.climb_deg and self.climb_rate_changes:
-            raise ValueError("path.climb_deg and path.rise must not both be set. Give one of them.")
+            raise ValueError(
+                "trajectory.climb_deg and trajectory.climb_rate_changes must not both be set, "
+                "got both. Give one of them."
+            )
 
     @override
     def generate(self, rate: float) -> TrajectoryData:
         n = round(self.duration_s * rate)
         if n < 1 or abs(n - self.duration_s * rate) > 1e-6:
             raise ValueError(
-                f"path.duration must be a whole number of samples at rate={rate}, "
-                f"got {self.duration_s}."
+                f"trajectory.duration_s must be a whole number of samples at rate={rate}, "
+                f"got {self.duration_s}. Change it."
             )
         for ramp in (*self.speed, *self.climb_deg, *self.heading_deg, *self.climb_rate_changes):
             if isinstance(ramp, CosineRamp):
@@ -150,17 +153,19 @@ class RampTrajectory(TrajectorySource):
 
 def _check_order(ramp: CosineRamp | CycloidRamp) -> None:
     if not ramp.end_s > ramp.start_s:
-        raise ValueError(f"end must be later than begin={ramp.start_s}, got {ramp.end_s}.")
+        raise ValueError(
+            f"end_s must be later than start_s = {ramp.start_s}, got {ramp.end_s}. Change one of them."
+        )
 
 
 def _check_on_samples(ramp: CosineRamp, duration: float, rate: float) -> None:
-    for name, time in (("begin", ramp.start_s), ("end", ramp.end_s)):
+    for name, time in (("start_s", ramp.start_s), ("end_s", ramp.end_s)):
         samples = time * rate
         # the second derivative, and with it the roll rate, jumps: quadrature over it is wrong
         if 0 < time < duration and abs(samples - round(samples)) > 1e-6:
             raise ValueError(
-                f"{name} of a Cosine must be a multiple of {1 / rate:.6g} s at rate={rate}, "
-                f"got {time}. Change it, or use a Cycloid."
+                f"{name} of a CosineRamp must be a multiple of {1 / rate:.6g} s at rate={rate}, "
+                f"got {time}. Change it, or use a CycloidRamp."
             )
 
 

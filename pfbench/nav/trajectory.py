@@ -20,7 +20,7 @@ G_TURN = 9.80665  # gravity of a coordinated turn [m/s^2], constant, independent
 NODES = torch.tensor(
     [0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6)], dtype=torch.float64
 )
-_WEIGHTS = torch.tensor([5.0, 8.0, 5.0], dtype=torch.float64) / 18
+WEIGHTS = torch.tensor([5.0, 8.0, 5.0], dtype=torch.float64) / 18  # Gauss-Legendre, at NODES
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def integrate_motion(
         )
     pos, node_pos = _positions(samples, nodes, start, 1 / rate)
     w, f = _ideal_sensors(nodes, node_pos)
-    weights = _WEIGHTS[:, None] / rate
+    weights = WEIGHTS[:, None] / rate
     time = torch.arange(len(samples.speed), dtype=torch.float64) / rate
     dcm = attitude.dcm_from_euler(_euler(samples))
     return TrajectoryData(
@@ -177,7 +177,7 @@ def _positions(
     v, node_v = _velocity(samples), _velocity(nodes)
 
     def integral(rate_at_nodes: Tensor, begin: float) -> Tensor:
-        steps = (rate_at_nodes * _WEIGHTS).sum(-1) * d
+        steps = (rate_at_nodes * WEIGHTS).sum(-1) * d
         return torch.cat(
             [torch.tensor([begin], dtype=torch.float64), begin + torch.cumsum(steps, 0)]
         )
@@ -212,14 +212,29 @@ def _hermite(y: Tensor, y1: Tensor, d: float) -> Tensor:
 
 def _ideal_sensors(m: MotionProfile, pos: Tensor) -> tuple[Tensor, Tensor]:
     """Compute angular rate and specific force, body axes [n, 3 nodes, 3 axes]."""
-    v, lat, h = _velocity(m), pos[..., 0], pos[..., 2]
     to_body = attitude.dcm_from_euler(_euler(m)).transpose(-1, -2)
-    w_ie, w_en = earth.earth_rate(lat), earth.transport_rate(lat, h, v)
+    return ideal_sensors(pos, _velocity(m), _acceleration(m), _body_rate(m), to_body)
+
+
+def ideal_sensors(
+    pos: Tensor, vel: Tensor, acceleration: Tensor, body_rate: Tensor, to_body: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Compute the output of ideal gyros and accelerometers.
+
+    Args:
+        pos: Latitude, longitude, height, [..., 3], rad, rad, m.
+        vel: Velocity East, North, Up, [..., 3], m/s.
+        acceleration: Time derivative of the velocity components, [..., 3], m/s^2.
+        body_rate: Rate of the body relative to the level frame, body axes, [..., 3], rad/s.
+        to_body: Level to body, [..., 3, 3].
+
+    Returns:
+        Angular rate, rad/s, and specific force, m/s^2, in body axes, [..., 3] each.
+    """
+    lat, h = pos[..., 0], pos[..., 2]
+    w_ie, w_en = earth.earth_rate(lat), earth.transport_rate(lat, h, vel)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    f = (
-        _acceleration(m)
-        + torch.linalg.cross(2 * w_ie + w_en, v)
-        + earth.gravity(lat, h)[..., None] * up
-    )
-    w = _body_rate(m) + (to_body @ (w_ie + w_en)[..., None]).squeeze(-1)
+    coriolis = torch.linalg.cross(2 * w_ie + w_en, vel)
+    f = acceleration + coriolis + earth.gravity(lat, h)[..., None] * up
+    w = body_rate + (to_body @ (w_ie + w_en)[..., None]).squeeze(-1)
     return w, (to_body @ f[..., None]).squeeze(-1)

@@ -23,16 +23,16 @@ class VarianceSurge(NoiseRegime):
 
     Errors outside the windows are identical to errors without a surge. Errors inside are scaled by
     the square root of the factor. Process noise is the noise of simulated sensors (see
-    `Regime.process`), or the driving noise of a simulated model.
+    `NoiseRegime.process_factors`), or the driving noise of a simulated model.
 
-    Attributes: windows: Pairs of seconds (from, to), from inclusive, to exclusive, in order. None
-        as `to` is
-            the end of the record.
-        r_factors: Factor on R in each window.
-        q_factors: Factor on Q in each window.
-        span: Duration in seconds for which the windows are written, to stretch them to the record.
-            None uses them unchanged.
-        of: Errors that are scaled.
+    Attributes:
+        windows_s: Pairs of seconds (from, to), from inclusive, to exclusive, in order. None as `to`
+            is the end of the record.
+        measurement_variance_factors: Factor on R in each window.
+        process_variance_factors: Factor on Q in each window.
+        reference_duration_s: Duration for which the windows are written, to stretch them to the
+            record, s. None uses them unchanged.
+        base_regime: Errors that are scaled.
 
     Raises:
         ValueError: If a window is invalid, the numbers of factors and windows differ, or a factor
@@ -89,12 +89,13 @@ class VarianceSurge(NoiseRegime):
 class BiasStep(NoiseRegime):
     """A constant bias of one or all components from some time on.
 
-    Attributes: size: Bias in nominal standard deviations of each component, with sign. time: Start
-        time, s. component: Index of the measurement component, from 0. None means all components.
-        span: Duration in seconds for which `time` is written, to stretch it to the record. None
-        uses
-            it unchanged.
-        of: Errors to which the bias is added.
+    Attributes:
+        bias_sd: Bias in nominal standard deviations of each component, with sign.
+        onset_s: Start time, s.
+        component: Index of the measurement component, from 0. None means all components.
+        reference_duration_s: Duration for which `onset_s` is written, to stretch it to the record,
+            s. None uses it unchanged.
+        base_regime: Errors to which the bias is added.
 
     Raises:
         ValueError: If the component does not exist, or the time is after the end of the record.

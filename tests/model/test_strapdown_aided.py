@@ -168,9 +168,9 @@ def test_what_does_not_fit_is_refused() -> None:
             {"magnetic_field_gauss": [0.0, 0.0, 0.0]},
             r"tuning\.magnetic_field_gauss must .*got \[0\.0, 0\.0, 0\.0\]",
         ),
-        ({"height_sd": 0.0}, r"believed\.height_sd"),
-        ({"magnetic_sd": [0.1]}, r"believed\.magnetic_sd must be three numbers, got \[0\.1\]"),
-        ({"magnetic_bias_walk": -1.0}, r"believed\.magnetic_bias_walk"),
+        ({"height_sd": 0.0}, r"tuning\.height_sd"),
+        ({"magnetic_sd": [0.1]}, r"tuning\.magnetic_sd must have 3 numbers, got \[0\.1\]"),
+        ({"magnetic_bias_walk": -1.0}, r"tuning\.magnetic_bias_walk"),
     ):
         with pytest.raises(ValueError, match=words):
             StrapdownAided(replace(BELIEVED, **changes))

@@ -271,20 +271,20 @@ def test_records_of_another_kind_are_refused() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: RangeErrorModel(0.0), r"believed\.floor"),
-        (lambda: RangeErrorModel(1.0, -1.0), r"believed\.factor .*got -1\.0 and 0\.0"),
-        (lambda: RangeErrorModel(1.0, 1.0, -1.0), r"believed\.added .*got 1\.0 and -1\.0"),
+        (lambda: RangeErrorModel(0.0), r"tuning\.floor_sd"),
+        (lambda: RangeErrorModel(1.0, -1.0), r"tuning\.stated_sd_factor .*got -1\.0 and 0\.0"),
+        (lambda: RangeErrorModel(1.0, 1.0, -1.0), r"tuning\.added_sd .*got 1\.0 and -1\.0"),
         (
             lambda: StrapdownTight(replace(BELIEVED, inter_system_sd=0.0)),
-            r"believed\.inter_system_sd",
+            r"tuning\.inter_system_sd",
         ),
         (
             lambda: StrapdownTight(replace(BELIEVED, inter_system_walk=-1.0)),
-            r"believed\.inter_system_walk",
+            r"tuning\.inter_system_walk",
         ),
         (
             lambda: StrapdownTight(replace(BELIEVED, motion=replace(MOTION, gyro_density=0.0))),
-            r"believed\.gyro_density",
+            r"tuning\.gyro_density",
         ),
     ],
 )

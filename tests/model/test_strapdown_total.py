@@ -342,5 +342,5 @@ def test_a_record_of_another_kind_is_refused() -> None:
     ],
 )
 def test_impossible_beliefs_name_their_key(key: str, value: object) -> None:
-    with pytest.raises(ValueError, match=rf"believed\.{key}"):
+    with pytest.raises(ValueError, match=rf"tuning\.{key}"):
         StrapdownTotal(replace(BELIEVED, **{key: value}))

@@ -87,7 +87,7 @@ def test_a_cycloid_has_a_continuous_second_derivative_where_a_cosine_jumps() -> 
 
 @pytest.mark.parametrize("kind", [CosineRamp, CycloidRamp])
 def test_a_ramp_that_ends_before_it_begins_is_refused(kind: Any) -> None:
-    with pytest.raises(ValueError, match=r"end must be later than begin=5\.0, got 5\.0"):
+    with pytest.raises(ValueError, match=r"end_s must be later than start_s = 5\.0, got 5\.0"):
         kind(5.0, 5.0, 1.0)
 
 
@@ -204,7 +204,9 @@ def test_the_mechanisation_closes_along_ramps(path: RampTrajectory) -> None:
 
 
 def test_paths_that_cannot_be_flown_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"path\.climb_deg and path\.rise must not both"):
+    with pytest.raises(
+        ValueError, match=r"trajectory\.climb_deg and trajectory\.climb_rate_changes must not both"
+    ):
         RampTrajectory(
             START,
             10.0,
@@ -213,7 +215,7 @@ def test_paths_that_cannot_be_flown_are_refused() -> None:
         )
     with pytest.raises(
         ValueError,
-        match=r"path\.duration must be a whole number of samples at rate=10\.0, got 10\.03",
+        match=r"trajectory\.duration_s must be a whole number of samples at rate=10\.0, got 10\.03",
     ):
         RampTrajectory(START, 10.03).generate(10.0)
     with pytest.raises(ValueError, match=r"speed must not be negative, got -20\.000 m/s"):
@@ -231,7 +233,7 @@ def test_paths_that_cannot_be_flown_are_refused() -> None:
 
 def test_a_cosine_must_begin_and_end_at_samples_and_a_cycloid_need_not() -> None:
     with pytest.raises(
-        ValueError, match=r"begin of a Cosine must be a multiple of 0\.1 s .*got 2\.05"
+        ValueError, match=r"start_s of a CosineRamp must be a multiple of 0\.1 s .*got 2\.05"
     ):
         RampTrajectory(START, 10.0, heading_deg=(CosineRamp(2.05, 8.0, 30.0),)).generate(10.0)
     RampTrajectory(START, 10.0, heading_deg=(CycloidRamp(2.05, 8.0, 30.0),)).generate(10.0)

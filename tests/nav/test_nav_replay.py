@@ -202,24 +202,24 @@ def without(r: RecordedMotion, rows: slice) -> RecordedMotion:
     [
         (
             lambda r: MotionSpline(r, knot_interval_s=0.0),
-            r"path\.knot_interval_s must be positive, got 0\.0",
+            r"trajectory\.knot_interval_s must be positive, got 0\.0",
         ),
         (
             lambda r: MotionSpline(r, knot_interval_s=0.15),
-            r"path\.smoothing must be at least twice .*0\.100 s after .* got 0\.15",
+            r"trajectory\.knot_interval_s must be at least twice .*0\.100 s after .* got 0\.15",
         ),
         (
             lambda r: MotionSpline(without(r, slice(50, 60))),
-            r"path\.smoothing must .*1\.100 s after t = 4\.900, got 0\.4",
+            r"trajectory\.knot_interval_s must .*1\.100 s after t = 4\.900, got 0\.4",
         ),
         (lambda r: MotionSpline(r._replace(time=r.time.flip(0))), "times must increase"),
         (
             lambda r: MotionSpline(r, use_full_log=100.0),
-            r"path\.whole must be .*57\.000 s, got 100\.0",
+            r"trajectory\.use_full_log must be .*57\.000 s, got 100\.0",
         ),
         (
             lambda r: MotionSpline(r, use_full_log=0.25).generate(50.0),
-            r"path\.whole must be .* at rate=50\.0, got 0\.25 \(12\.5 samples\)",
+            r"trajectory\.use_full_log must be .* at rate=50\.0, got 0\.25 \(12\.5 samples\)",
         ),
     ],
 )

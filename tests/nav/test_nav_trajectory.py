@@ -112,7 +112,7 @@ def test_segments_off_the_samples_are_refused():
 
 
 def test_other_nonsense_is_refused():
-    with pytest.raises(ValueError, match="duration must be positive, got 0"):
+    with pytest.raises(ValueError, match="duration_s must be positive, got 0"):
         ManoeuvreSegment(0)
     with pytest.raises(ValueError, match="Give at least one manoeuvre"):
         generate_manoeuvres([], TrajectoryStart(0, 0, 0), rate=10)
