@@ -1,1 +1,1 @@
-"""Parts that every other folder may use."""
+"""Data, charts, random streams, distributions and numerical checks of all other folders."""

@@ -6,82 +6,99 @@ The dimension d is smaller than D if the state has a quaternion. Each block appl
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core import quaternion
 
 
-class ChartBlock(Protocol):
-    """A block of components: `size` numbers in the state, `dimension` in a difference."""
-
-    @property
-    def size(self) -> int: ...
-
-    @property
-    def dimension(self) -> int: ...
-
-    def add(self, x: Tensor, d: Tensor) -> Tensor: ...
-
-    def subtract(self, y: Tensor, x: Tensor) -> Tensor: ...
-
-
 @dataclass(frozen=True)
-class EuclideanBlock:
-    """Real numbers.
+class ChartBlock(ABC):
+    """A block of components.
 
     Attributes:
-        size: Number of components.
+        size: Number of components of a state.
     """
 
     size: int
 
     @property
     def dimension(self) -> int:
+        """Number of components of a difference."""
         return self.size
 
+    @abstractmethod
+    def add(self, x: Tensor, d: Tensor) -> Tensor:
+        """Add a difference.
+
+        Args:
+            x: Components of states, [..., size].
+            d: Difference, [..., dimension].
+
+        Returns:
+            Components of states, [..., size].
+        """
+
+    @abstractmethod
+    def subtract(self, y: Tensor, x: Tensor) -> Tensor:
+        """Compute the shortest d with x (+) d = y.
+
+        Args:
+            y: Components of states, [..., size].
+            x: Components of states, [..., size].
+
+        Returns:
+            Difference, [..., dimension].
+        """
+
+
+@dataclass(frozen=True)
+class EuclideanBlock(ChartBlock):
+    """Real numbers."""
+
+    @override
     def add(self, x: Tensor, d: Tensor) -> Tensor:
         return x + d
 
+    @override
     def subtract(self, y: Tensor, x: Tensor) -> Tensor:
         return y - x
 
 
 @dataclass(frozen=True)
-class AngleBlock:
-    """Angles in [-pi, pi], rad.
+class AngleBlock(ChartBlock):
+    """Angles in [-pi, pi], rad."""
 
-    Attributes:
-        size: Number of components.
-    """
-
-    size: int
-
-    @property
-    def dimension(self) -> int:
-        return self.size
-
+    @override
     def add(self, x: Tensor, d: Tensor) -> Tensor:
         return wrap_angle(x + d)
 
+    @override
     def subtract(self, y: Tensor, x: Tensor) -> Tensor:
         return wrap_angle(y - x)
 
 
 @dataclass(frozen=True)
-class QuaternionBlock:
+class QuaternionBlock(ChartBlock):
     """A unit quaternion, scalar first, with right rotation vectors as differences: q exp(d)."""
 
     size: int = 4
-    dimension: int = 3
 
+    @property
+    @override
+    def dimension(self) -> int:
+        return 3
+
+    @override
     def add(self, x: Tensor, d: Tensor) -> Tensor:
         q = quaternion.quaternion_multiply(x, quaternion.quaternion_from_rotation_vector(d))
         return q / q.norm(dim=-1, keepdim=True)
 
+    @override
     def subtract(self, y: Tensor, x: Tensor) -> Tensor:
         conjugate = x * x.new_tensor([1.0, -1.0, -1.0, -1.0])
         return quaternion.rotation_vector_from_quaternion(
@@ -111,21 +128,35 @@ class Chart:
 
     @property
     def flat(self) -> bool:
-        """Whether all components are Euclidean."""
+        """True if all components are Euclidean."""
         return all(isinstance(block, EuclideanBlock) for block in self.blocks)
 
     def add(self, x: Tensor, d: Tensor) -> Tensor:
-        """Return x (+) d, [..., D], of a state [..., D] and a difference [..., d]."""
+        """Compute x (+) d.
+
+        Args:
+            x: States, [..., D].
+            d: Differences, [..., d].
+
+        Returns:
+            States, [..., D].
+        """
         if self.flat:
             return x + d
-        xs, ds = (
-            x.split([b.size for b in self.blocks], -1),
-            d.split([b.dimension for b in self.blocks], -1),
-        )
+        xs = x.split([b.size for b in self.blocks], -1)
+        ds = d.split([b.dimension for b in self.blocks], -1)
         return torch.cat([b.add(p, q) for b, p, q in zip(self.blocks, xs, ds, strict=True)], -1)
 
     def subtract(self, y: Tensor, x: Tensor) -> Tensor:
-        """Return the shortest d with x (+) d = y, [..., d], of two states [..., D]."""
+        """Compute the shortest d with x (+) d = y.
+
+        Args:
+            y: States, [..., D].
+            x: States, [..., D].
+
+        Returns:
+            Differences, [..., d].
+        """
         if self.flat:
             return y - x
         sizes = [b.size for b in self.blocks]

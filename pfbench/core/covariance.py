@@ -38,27 +38,25 @@ def _factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
 factor = compilable(_factor, operator=cpp.cholesky_factor, use_torch_compiler=False)
 
 
-def distribution_covariance(law: Any) -> Tensor:
+def distribution_covariance(distribution: Any) -> Tensor:
     """Return the covariance [..., k, k] of a multivariate normal or an independent distribution."""
-    return (
-        law.covariance_matrix
-        if isinstance(law, MultivariateNormal)
-        else torch.diag_embed(law.variance)
+    covariance: Tensor = (
+        distribution.covariance_matrix
+        if isinstance(distribution, MultivariateNormal)
+        else torch.diag_embed(distribution.variance)
     )
+    return covariance
 
 
-def shared_distribution_covariance(law: Any) -> Tensor:
+def shared_distribution_covariance(distribution: Any) -> Tensor:
     """Return the covariance of a batch [R, N]; [R, 1, k, k] if all particles share a normal scale."""
-    if isinstance(law, MultivariateNormal) and law.scale_tril.stride(1) == 0:
-        root = law.scale_tril[:, :1]
+    if isinstance(distribution, MultivariateNormal) and distribution.scale_tril.stride(1) == 0:
+        root = distribution.scale_tril[:, :1]
         return root @ root.mT
-    if (
-        isinstance(law, Independent)
-        and isinstance(law.base_dist, Normal)
-        and law.base_dist.scale.stride(1) == 0
-    ):
-        return torch.diag_embed(law.base_dist.scale[:, :1].square())
-    return distribution_covariance(law)
+    base = distribution.base_dist if isinstance(distribution, Independent) else None
+    if isinstance(base, Normal) and base.scale.stride(1) == 0:
+        return torch.diag_embed(base.scale[:, :1].square())
+    return distribution_covariance(distribution)
 
 
 def _solved_length(e: Tensor, covariance: Tensor) -> Tensor:
@@ -81,7 +79,7 @@ def gaussian_log_density(r: Tensor, covariance: Tensor, observed_mask: Tensor) -
     Args:
         r: Residual, [..., D]. Zero where missing.
         covariance: Covariance, [..., D, D].
-        seen: Mask of observed components, [..., D].
+        observed_mask: Mask of observed components, [..., D].
 
     Returns:
         Log density, [...]. NaN where the covariance is not positive definite.

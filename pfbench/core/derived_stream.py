@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 
@@ -16,7 +17,7 @@ Make: TypeAlias = Callable[[RandomStream, str, int, int], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
-class DerivedStream:
+class DerivedStream(RandomStream):
     """Random stream whose numbers are functions of another stream's numbers, run by run.
 
     Attributes:
@@ -30,15 +31,19 @@ class DerivedStream:
     normals: Make | None = None
 
     @property
+    @override
     def dtype(self) -> torch.dtype:
         return self.draws.dtype
 
+    @override
     def at_step(self, step: int) -> RandomStream:
         return replace(self, draws=self.draws.at_step(step))
 
+    @override
     def uniform(self, purpose: str, n: int, w: int) -> Tensor:
         return self.uniforms(self.draws, purpose, n, w)
 
+    @override
     def normal(self, purpose: str, n: int, w: int) -> Tensor:
         if self.normals is None:
             return torch.special.ndtri(self.uniform(purpose, n, w)).to(self.dtype)

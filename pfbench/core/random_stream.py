@@ -2,7 +2,7 @@
 
 Each number is a pure function of (seed, run, step, purpose, component, particle). A run therefore
 gets the same numbers alone, in any batch and on any device. More filters, runs or stages do not
-change the numbers of the others. The generator has no state.
+change the numbers of the others. The generator is stateless.
 
 References:
     J. Salmon, M. Moraes, R. Dror and D. Shaw (2011), Parallel random numbers: as easy as 1, 2, 3.
@@ -16,6 +16,7 @@ from typing import Protocol, TypeAlias
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.kernels import cpp, cuda
 from pfbench.kernels.compilation import compilable
@@ -43,12 +44,29 @@ class RandomStream(Protocol):
         """Return the stream of another time step."""
 
     def normal(self, purpose: str, n: int, w: int) -> Tensor:
-        """Draw standard normal numbers, [R, n, w]."""
+        """Draw standard normal numbers.
+
+        Args:
+            purpose: Label of the numbers.
+            n: Number of particles.
+            w: Number of components.
+
+        Returns:
+            Numbers, [R, n, w].
+        """
 
     def uniform(self, purpose: str, n: int, w: int) -> Tensor:
-        """Draw uniform numbers on the open interval (0, 1), [R, n, w].
+        """Draw uniform numbers on the open interval (0, 1).
 
         They are float64, because float32 has too few levels for 1e6 particles.
+
+        Args:
+            purpose: Label of the numbers.
+            n: Number of particles.
+            w: Number of components.
+
+        Returns:
+            Numbers, [R, n, w].
         """
 
 
@@ -62,7 +80,7 @@ class BatchRandomStream(RandomStream, Protocol):
 def draw_normals_blocked(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
-    """Draw the numbers of `normals` in blocks of components that fit the cache.
+    """Draw the numbers of `draw_normals` in blocks of components that fit the cache.
 
     Args:
         seed: Seed, [].
@@ -96,14 +114,14 @@ def _normals(
 
 def _box_muller(words: Words) -> Tensor:
     """Transform random words to standard normal numbers."""
-    parts = []
+    numbers = []
     a, b, c, d = words
     for radial, angular in ((a, b), (c, d)):
         # + 1/2 avoids log(0); a word that rounds up to 1 gives radius 0, which is harmless
         radius = torch.sqrt(-2.0 * torch.log((radial.float() + 0.5) * 2.0**-32))
         angle = angular.float() * (2.0 * torch.pi * 2.0**-32)
-        parts += [radius * torch.cos(angle), radius * torch.sin(angle)]
-    return torch.cat(parts, dim=-1)
+        numbers += [radius * torch.cos(angle), radius * torch.sin(angle)]
+    return torch.cat(numbers, dim=-1)
 
 
 def _eager_normals(
@@ -143,7 +161,7 @@ draw_uniforms = compilable(_uniforms, eager=_eager_uniforms, operator=cpp.philox
 
 
 @dataclass(frozen=True, eq=False)
-class PhiloxStream:
+class PhiloxStream(BatchRandomStream):
     """Stream of independent random numbers.
 
     Attributes:
@@ -167,15 +185,19 @@ class PhiloxStream:
         if not isinstance(self.seed, Tensor) and not 0 <= self.seed <= _WORD:
             raise ValueError(f"seed must be from 0 to 2**32 - 1, got {self.seed}. Change the seed.")
 
+    @override
     def at_step(self, step: int) -> PhiloxStream:
         return replace(self, step=step)
 
+    @override
     def select_runs(self, runs: slice) -> PhiloxStream:
         return replace(self, runs=self.runs[runs])
 
+    @override
     def normal(self, purpose: str, n: int, w: int) -> Tensor:
         return draw_normals(*self._counter(purpose, n, w))[..., :n].to(self.dtype).permute(1, 2, 0)
 
+    @override
     def uniform(self, purpose: str, n: int, w: int) -> Tensor:
         return draw_uniforms(*self._counter(purpose, n, w))[..., :n].permute(1, 2, 0)
 
@@ -197,7 +219,7 @@ def _words(
     )
     shape = (component.shape[0], runs.shape[0], quarters)
     counter = (particle, component[:, None, None], step, runs[:, None])
-    c0, c1, c2, c3 = (part.expand(shape) for part in counter)
+    c0, c1, c2, c3 = (word.expand(shape) for word in counter)
     return philox((c0, c1, c2, c3), (seed, key[1]))
 
 

@@ -53,7 +53,7 @@ class Record(NamedTuple):
             the model's `origin` applies to all runs.
         spread: Cholesky factor of each run's initial covariance about `start`, [R, d, d]. None if
             the model's `initial` distribution applies to all runs.
-        loop: Process that the filter's estimates correct. y and u are then its values without any
+        feedback: Process that the filter's estimates correct. y and u are then its values without any
             correction. None for data that do not depend on the filter.
     """
 
@@ -80,11 +80,11 @@ class Record(NamedTuple):
         start, spread = (None if a is None else a[runs] for a in (self.start, self.spread))
         return Record(self.y[runs], map_inputs(select, self.u), start, spread, self.feedback)
 
-    def to(self, like: Tensor) -> Record:
+    def to(self, target: Tensor) -> Record:
         """Move to the device of a tensor, and floating-point numbers to its dtype."""
 
         def move(a: Tensor) -> Tensor:
-            return a.to(like) if a.is_floating_point() else a.to(like.device)
+            return a.to(target) if a.is_floating_point() else a.to(target.device)
 
         start, spread = (None if a is None else move(a) for a in (self.start, self.spread))
         return Record(move(self.y), map_inputs(move, self.u), start, spread, self.feedback)
@@ -94,13 +94,14 @@ class SteppedModel(Protocol):
     """A model that may differ from step to step."""
 
     def at_step(self, t: int) -> Any:
-        """The model that describes step t."""
+        """Return the model that describes step t."""
 
 
 def iterate_steps(model: SteppedModel, record: Record) -> Iterator[tuple[int, Any, Record]]:
     """Iterate over the time steps of a record.
 
-    Every walk through a record uses this function: filters, training, online inference, bounds and simulation.
+    All loops over a record use this function: filters, training, online inference, bounds and
+    simulation.
 
     Args:
         model: State-space model.
@@ -117,22 +118,16 @@ def map_inputs(function: Any, u: Any) -> Any:
     """Apply a function to each tensor of the inputs, in nested NamedTuples too.
 
     Args:
-        f: Function of a tensor.
+        function: Function of a tensor.
         u: NamedTuple of inputs, or ().
 
     Returns:
         NamedTuple of the results.
     """
-    return (
-        type(u)(
-            *(
-                map_inputs(function, part) if isinstance(part, tuple) else function(part)
-                for part in u
-            )
-        )
-        if u
-        else u
-    )
+    if not u:
+        return u
+    values = (map_inputs(function, a) if isinstance(a, tuple) else function(a) for a in u)
+    return type(u)(*values)
 
 
 @dataclass(frozen=True)
@@ -144,11 +139,11 @@ class Episode:
         time: Time of each step, s, [T].
         truth: True state by component group, each [R, T, k]. Groups without truth are absent, steps
             without truth are NaN.
-        track: True East, North and height relative to the start, m, [R, T, 3]. None if the scenario
-            has no map.
+        track: True East, North and height relative to the start, m, [R, T, 3]. None if it cannot
+            be drawn on a map.
         notes: Modelling choices of this episode that a report must mention.
-        datasheet: Data of run 0 for the datasheet: `force` [T, 3] m/s^2 and `rate` [T, 3] rad/s in body
-            axes, `azimuth` and `elevation` of the satellites [T, S] rad (NaN below the horizon).
+        datasheet: Data of run 0 for the datasheet: `force` [T, 3] m/s^2 and `rate` [T, 3] rad/s in
+            body axes, `azimuth` and `elevation` of the satellites [T, S] rad (NaN below the horizon).
     """
 
     record: Record

@@ -1,0 +1,1 @@
+"""Hand-written kernels for the CPU and CUDA, and compilation of steps."""

@@ -1,0 +1,1 @@
+"""Gaussian filters: Kalman, extended, unscented, cubature and ensemble."""

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.innovation import Innovation
+from pfbench.filter.gaussian.innovation import Innovation, NoiseAdaptation
 from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.gaussian.noise_adaptation import scale_columns
@@ -20,7 +21,7 @@ from pfbench.filter.gaussian.principal_axes import (
 
 
 @dataclass(frozen=True)
-class ScalarNoiseAdaptation:
+class ScalarNoiseAdaptation(NoiseAdaptation):
     """One factor on R from the mean squared innovation, Q unchanged.
 
     Scalar form of [Mohamed and Schwarz 1999]: r = running mean of v' W v / k minus tr(W C_zz) / k,
@@ -41,23 +42,22 @@ class ScalarNoiseAdaptation:
         check_weight("ScalarNoiseAdaptation.forgetting_factor", self.forgetting_factor)
         if not self.max_r_factor >= 1.0:
             raise ValueError(
-                f"ScalarNoiseAdaptation.max_r_factor must be at least 1, got {self.max_r_factor}. Use 1 for no adaptation."
+                "ScalarNoiseAdaptation.max_r_factor must be at least 1, "
+                f"got {self.max_r_factor}. Use 1 for no adaptation."
             )
 
+    @override
     def predict_scale(
         self, predicted: AffineApproximation, belief: GaussianBelief
     ) -> AffineApproximation:
-        """Return the prediction without change."""
         return predicted
 
+    @override
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
-        """Scale R and update the running mean of the squared innovation."""
-        w, k = (
-            measurement_precision(innovation),
-            innovation.observed_mask.sum(-1, dtype=innovation.r.dtype),
-        )
+        w = measurement_precision(innovation)
+        k = innovation.observed_mask.sum(-1, dtype=innovation.r.dtype)
         mean_square = belief.memory.get("surprise", torch.ones_like(k))
         newest = (w * innovation.r.square()).sum(-1) / k.clamp(min=1.0)
         mean_square = torch.where(
@@ -74,7 +74,7 @@ class ScalarNoiseAdaptation:
 
 
 @dataclass(frozen=True)
-class MatrixNoiseAdaptation:
+class MatrixNoiseAdaptation(NoiseAdaptation):
     """Full matrices R and Q from residuals [Akhlaghi, Zhou and Huang 2017].
 
     For comparison. R <- a R + (1 - a) (e e' + C+_zz), with residual e and covariance C+_zz after
@@ -94,10 +94,10 @@ class MatrixNoiseAdaptation:
     def __post_init__(self) -> None:
         check_weight("MatrixNoiseAdaptation.forgetting_factor", self.forgetting_factor)
 
+    @override
     def predict_scale(
         self, predicted: AffineApproximation, belief: GaussianBelief
     ) -> AffineApproximation:
-        """Replace Q by a^k times the model's Q plus the estimate."""
         if "process" not in belief.memory:  # before the first measurement
             return predicted
         model_weight = belief.memory["kept"][:, None, None]
@@ -109,10 +109,10 @@ class MatrixNoiseAdaptation:
             m=m, omega=predicted.omega + (noise - predicted.noise), noise=noise
         )
 
+    @override
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
-        """Replace R and update the estimates of R and Q."""
         a, nominal = self.forgetting_factor, innovation.nominal
         defaults = (
             torch.ones_like(nominal),

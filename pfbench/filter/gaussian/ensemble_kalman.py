@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import factor, shared_distribution_covariance
 from pfbench.core.random_stream import RandomStream
@@ -54,14 +55,20 @@ class EnsembleForecast(NamedTuple):
 
 
 class EnsembleUpdate(Protocol):
-    """Update step: forecast -> differences from the predicted mean after it [R, N, d]."""
+    """Update of the ensemble by a measurement."""
 
-    def __call__(self, forecast: EnsembleForecast, draws: RandomStream) -> Tensor: ...
+    def __call__(self, forecast: EnsembleForecast, draws: RandomStream) -> Tensor:
+        """Return the differences of the updated members from the predicted mean, [R, N, d].
+
+        Args:
+            forecast: Predicted ensemble and innovation.
+            draws: Random stream of the step.
+        """
 
 
 @dataclass(frozen=True)
-class PerturbedObservationUpdate:
-    """Update each member with its own perturbed measurement.
+class PerturbedObservationUpdate(EnsembleUpdate):
+    """Update each member with a different perturbed measurement.
 
     x + K (y + e - h(x)), e ~ N(0, R), with the model's R. The errors e are neither centred nor
     replaced by their sample covariance. [ours]
@@ -70,6 +77,7 @@ class PerturbedObservationUpdate:
         Burgers, van Leeuwen and Evensen 1998, Analysis scheme in the ensemble Kalman filter.
     """
 
+    @override
     def __call__(self, forecast: EnsembleForecast, draws: RandomStream) -> Tensor:
         n, k = forecast.s.shape[1:]
         e = draws.normal("perturbed", n, k).to(forecast.s)
@@ -81,7 +89,7 @@ class PerturbedObservationUpdate:
 
 
 @dataclass(frozen=True)
-class EnsembleTransformUpdate:
+class EnsembleTransformUpdate(EnsembleUpdate):
     """Update the mean by the gain and the differences by T = (I + S S')^-1/2.
 
     Without random numbers. The result is the Kalman update of the ensemble's mean and covariance
@@ -94,6 +102,7 @@ class EnsembleTransformUpdate:
         filter.
     """
 
+    @override
     def __call__(self, forecast: EnsembleForecast, draws: RandomStream) -> Tensor:
         d, s, r, values, vectors = forecast
         q2 = 1.0 + values
@@ -165,7 +174,7 @@ class EnsembleKalmanFilter:
         Args:
             model: State-space model.
             belief: Ensemble at t-1.
-            seen: Record of step t.
+            record: Record of step t.
             draws: Random numbers of step t.
         """
         chart, n = model.chart, self.particles

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
-from pfbench.filter.gaussian.innovation import Innovation
+from pfbench.filter.gaussian.innovation import GainAdaptation, Innovation
 from pfbench.filter.gaussian.principal_axes import (
     axes_by_group,
     check_weight,
@@ -20,7 +21,7 @@ from pfbench.filter.gaussian.principal_axes import (
 
 
 @dataclass(frozen=True)
-class AdaptiveFactorGain:
+class AdaptiveFactorGain(GainAdaptation):
     """Scale the predicted covariance by 1 / alpha if the innovation is large.
 
     P- / alpha [Yang, He and Xu 2001] with dV = sqrt(v' W v / tr(W (C_zz + R))). The factor is
@@ -50,6 +51,7 @@ class AdaptiveFactorGain:
                 "Use .inf for no factor."
             )
 
+    @override
     def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:
         w = (
             measurement_precision(innovation)
@@ -66,7 +68,7 @@ class AdaptiveFactorGain:
 
 
 @dataclass(frozen=True)
-class BoundedRatioGain:
+class BoundedRatioGain(GainAdaptation):
     """Bound the ratio rho of predicted error to noise [ours, after the paper].
 
     The gain is rho / (1 + rho). rho is the largest eigenvalue of C_zz in units of the current R
@@ -93,6 +95,7 @@ class BoundedRatioGain:
                 f"got min_ratio={self.min_ratio}, max_ratio={self.max_ratio}. Choose 0 <= min_ratio <= max_ratio."
             )
 
+    @override
     def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:
         _, joint_mask = axes_by_group(innovation, self.groups)
         white = whitened_measurement(

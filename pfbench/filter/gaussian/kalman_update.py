@@ -107,7 +107,7 @@ def _triangle(white: Tensor) -> tuple[Tensor, Tensor]:
 def remove_negative_eigenvalues(
     omega: Tensor, noise: Tensor, addend: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Remove negative eigenvalues from Omega - noise where Omega + addend has no root.
+    """Remove negative eigenvalues from Omega - noise where Omega + addend is not positive.
 
     Args:
         omega: Omega, [R, k, k].

@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.jacobian import jacobian
 from pfbench.kernels import cpp
@@ -63,27 +64,41 @@ class AffineApproximation(NamedTuple):
 
 
 class LinearisationRule(Protocol):
-    """Linearise a map of d whitened coordinates, in the dtype and runs of `like`."""
+    """A rule that approximates a map of whitened coordinates by an affine one."""
 
     def __call__(
-        self, f: Map, like: Tensor, d: int, space: DifferenceSpace
-    ) -> AffineApproximation: ...
+        self, f: Map, template: Tensor, d: int, space: DifferenceSpace
+    ) -> AffineApproximation:
+        """Linearise a map.
+
+        Args:
+            f: Map.
+            template: Tensor with the dtype and the R runs of the result, [R, ...].
+            d: Number of whitened coordinates.
+            space: Difference and average of the values.
+
+        Returns:
+            The affine approximation.
+        """
 
 
 @dataclass(frozen=True)
-class TaylorLinearisation:
+class TaylorLinearisation(LinearisationRule):
     """First-order Taylor expansion by exact derivatives: extended Kalman filter."""
 
-    def __call__(self, f: Map, like: Tensor, d: int, space: DifferenceSpace) -> AffineApproximation:
-        y, covariance = f(like.new_zeros(like.shape[0], 1, d))
-        noise = covariance[:, 0].expand(like.shape[0], -1, -1)
+    @override
+    def __call__(
+        self, f: Map, template: Tensor, d: int, space: DifferenceSpace
+    ) -> AffineApproximation:
+        y, covariance = f(template.new_zeros(template.shape[0], 1, d))
+        noise = covariance[:, 0].expand(template.shape[0], -1, -1)
         return AffineApproximation(
             y[:, 0], jacobian(lambda xi: f(xi)[0], y, d, space.subtract), noise, noise
         )
 
 
 @dataclass(frozen=True)
-class SigmaPointLinearisation:
+class SigmaPointLinearisation(LinearisationRule):
     """Linearisation by sigma points and weights: unscented and cubature filters.
 
     Attributes:
@@ -93,9 +108,12 @@ class SigmaPointLinearisation:
 
     points: Callable[[int], tuple[Tensor, Tensor, Tensor]]
 
-    def __call__(self, f: Map, like: Tensor, d: int, space: DifferenceSpace) -> AffineApproximation:
-        xi, w_mean, w_cov = (a.to(like) for a in self.points(d))
-        values, covariance = f(xi.expand(like.shape[0], -1, -1))
+    @override
+    def __call__(
+        self, f: Map, template: Tensor, d: int, space: DifferenceSpace
+    ) -> AffineApproximation:
+        xi, w_mean, w_cov = (a.to(template) for a in self.points(d))
+        values, covariance = f(xi.expand(template.shape[0], -1, -1))
         y = space.mean(values, w_mean.expand(values.shape[:2]))
         r = space.subtract(values, y.unsqueeze(1))
         m, residual_cov = _fitted(r, xi, w_cov)
@@ -141,15 +159,16 @@ class UnscentedPoints:
     def __post_init__(self) -> None:
         if not self.alpha > 0.0:
             raise ValueError(
-                f"linearisation.points.alpha must be positive, got {self.alpha}. Set a positive spread."
+                f"linearisation.points.alpha must be positive, got {self.alpha}. Set a spread."
             )
 
     def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return points [P, d], mean weights [P] and covariance weights [P]."""
         squared_radius = self.alpha**2 * (d + self.kappa)
         if not squared_radius > 0.0:
             raise ValueError(
                 f"linearisation.points.kappa must be greater than -d = {-d}, got {self.kappa}. "
-                "alpha^2 (d + kappa) must be positive."
+                "Increase it."
             )
         offsets = math.sqrt(squared_radius) * torch.eye(d, dtype=torch.float64)
         xi = torch.cat([torch.zeros(1, d, dtype=torch.float64), offsets, -offsets])
@@ -165,6 +184,7 @@ class CubaturePoints:
     """Third-degree spherical-radial rule, 2 d points [Arasaratnam and Haykin 2009]."""
 
     def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return points [P, d], mean weights [P] and covariance weights [P]."""
         offsets = math.sqrt(d) * torch.eye(d, dtype=torch.float64)
         w = torch.full((2 * d,), 0.5 / d, dtype=torch.float64)
         return torch.cat([offsets, -offsets]), w, w

@@ -12,15 +12,16 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.innovation import Innovation
+from pfbench.filter.gaussian.innovation import Innovation, NoiseAdaptation
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.gaussian.principal_axes import PrincipalAxes, check_weight, principal_axes
 
 
 @dataclass(frozen=True)
-class FadingMemory:
+class FadingMemory(NoiseAdaptation):
     """Fading memory: P- = S C_f + Q [Tarn and Zaborszky 1970].
 
     C_f is the propagated covariance. For a constant state this is weighted least squares with
@@ -38,13 +39,14 @@ class FadingMemory:
     def __post_init__(self) -> None:
         if not self.fading_factor >= 1.0:
             raise ValueError(
-                f"FadingMemory.fading_factor must be at least 1, got {self.fading_factor}. Use 1 for no fading."
+                f"FadingMemory.fading_factor must be at least 1, got {self.fading_factor}. "
+                "Use 1 for no fading."
             )
 
+    @override
     def predict_scale(
         self, predicted: AffineApproximation, belief: GaussianBelief
     ) -> AffineApproximation:
-        """Multiply the propagated covariance by S."""
         m = scale_columns(predicted.m, math.sqrt(self.fading_factor), 1.0)
         return predicted._replace(
             m=m,
@@ -52,15 +54,15 @@ class FadingMemory:
             + (self.fading_factor - 1.0) * (predicted.omega - predicted.noise),
         )
 
+    @override
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
-        """Return the innovation without change."""
         return innovation, {}
 
 
 @dataclass(frozen=True)
-class ConstrainedNoiseAdaptation:
+class ConstrainedNoiseAdaptation(NoiseAdaptation):
     """Scale R by sensor group, and Q, until the innovations fit [ours].
 
     The paper updates Q, adjusts Q and R "dynamically", and bounds the ratio of error to noise.
@@ -108,10 +110,10 @@ class ConstrainedNoiseAdaptation:
                 f"deadband={self.deadband}, gate_sigmas={self.gate_sigmas}. Set 0 or more."
             )
 
+    @override
     def predict_scale(
         self, predicted: AffineApproximation, belief: GaussianBelief
     ) -> AffineApproximation:
-        """Scale the process noise: P- = C_f + q Q."""
         if "q" not in belief.memory:  # before the first measurement
             return predicted
         q = belief.memory["q"][:, None, None]
@@ -120,10 +122,10 @@ class ConstrainedNoiseAdaptation:
             m=m, omega=predicted.omega + (noise - predicted.noise), noise=noise
         )
 
+    @override
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
-        """Scale R, and update the running means and the factor on Q."""
         defaults = (
             torch.ones_like(innovation.r),
             torch.zeros_like(belief.mean[:, 0]),

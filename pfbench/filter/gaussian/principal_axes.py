@@ -65,11 +65,15 @@ def principal_axes(innovation: Innovation, groups: Sequence[int] | None = None) 
     w = (
         axes.mT @ torch.linalg.solve_triangular(root, innovation.r.unsqueeze(-1), upper=False)
     ).squeeze(-1)
-    seen = (
+    axis_mask = (
         innovation.observed_mask.to(squared_components).unsqueeze(-2) @ squared_components
     ).squeeze(-2) > 0.5
     return PrincipalAxes(
-        ratio, w, seen, squared_components, group_mask.to(squared_components) @ squared_components
+        ratio,
+        w,
+        axis_mask,
+        squared_components,
+        group_mask.to(squared_components) @ squared_components,
     )
 
 
@@ -125,7 +129,7 @@ def whitened_measurement(root: Tensor, covariance: Tensor, joint_mask: Tensor) -
     """Compute R^-1/2 C R^-1/2 within groups.
 
     Args:
-        root: Root of the noise from group_root, [R, k, k].
+        root: Root of the noise from `compute_group_root`, [R, k, k].
         covariance: Covariance C, [R, k, k].
         joint_mask: Mask of observed component pairs of one group, [R, k, k].
 

@@ -9,21 +9,24 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 
 class SphericalRule(Protocol):
-    """Mean over the unit sphere: d -> unit vectors [P, d] and weights [P] with sum 1.
+    """Mean over the unit sphere.
 
     Implementations are frozen, so that points can be cached.
     """
 
-    def __call__(self, d: int) -> tuple[Tensor, Tensor]: ...
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        """Return unit vectors [P, d] and weights [P] with sum 1."""
 
 
 class RadialRule(Protocol):
-    """Mean over |x|, x ~ N(0, I_d): d -> pairs of radius and weight, with sum 1."""
+    """Mean over |x|, x ~ N(0, I_d)."""
 
-    def __call__(self, d: int) -> list[tuple[float, float]]: ...
+    def __call__(self, d: int) -> list[tuple[float, float]]:
+        """Return pairs of radius and weight; the weights have sum 1."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class SphericalRadialPoints:
     | Simplex5, Radial3 | SSR53 (negative weights if d >= 8) | d^2 + 3 d + 2 |
     | Axis3, Radial5 | MCKF, the UKF with kappa = 2 | 2 d + 1 |
 
-    With negative weights a covariance may not be positive definite: see GaussianFilter.repair.
+    With negative weights a covariance may not be positive definite: see `GaussianFilter.repair_covariance`.
 
     Attributes:
         spherical_rule: Spherical rule.
@@ -55,6 +58,7 @@ class SphericalRadialPoints:
     radial_rule: RadialRule
 
     def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return points [P, d], and their weights [P] for means and for covariances."""
         return _product(self, d)
 
 
@@ -73,37 +77,41 @@ def _product(rule: SphericalRadialPoints, d: int) -> tuple[Tensor, Tensor, Tenso
 
 
 @dataclass(frozen=True)
-class RadialDegree3:
+class RadialDegree3(RadialRule):
     """One shell: E|x|^2 = d [Arasaratnam and Haykin 2009]."""
 
+    @override
     def __call__(self, d: int) -> list[tuple[float, float]]:
         return [(math.sqrt(d), 1.0)]
 
 
 @dataclass(frozen=True)
-class RadialDegree5:
+class RadialDegree5(RadialRule):
     """One shell and the centre: also E|x|^4 = d (d + 2) [Jia, Xin and Cheng 2013]."""
 
+    @override
     def __call__(self, d: int) -> list[tuple[float, float]]:
         return [(0.0, 2.0 / (d + 2)), (math.sqrt(d + 2), d / (d + 2))]
 
 
 @dataclass(frozen=True)
-class AxisDegree3:
+class AxisDegree3(SphericalRule):
     """Both ends of each axis, 2 d points [Arasaratnam and Haykin 2009]."""
 
+    @override
     def __call__(self, d: int) -> tuple[Tensor, Tensor]:
         return _with_opposites(torch.eye(d, dtype=torch.float64), 0.5 / d)
 
 
 @dataclass(frozen=True)
-class AxisDegree5:
+class AxisDegree5(SphericalRule):
     """Axes and diagonals of each pair of axes, 2 d^2 points [Jia, Xin and Cheng 2013]."""
 
+    @override
     def __call__(self, d: int) -> tuple[Tensor, Tensor]:
         axes = torch.eye(d, dtype=torch.float64)
-        k, l = torch.triu_indices(d, d, 1)
-        diagonals = torch.cat([axes[k] + axes[l], axes[k] - axes[l]]) / math.sqrt(2.0)
+        i, j = torch.triu_indices(d, d, 1)
+        diagonals = torch.cat([axes[i] + axes[j], axes[i] - axes[j]]) / math.sqrt(2.0)
         return _concatenated(
             _with_opposites(axes, (4 - d) / (2 * d * (d + 2))),
             _with_opposites(diagonals, 1.0 / (d * (d + 2))),
@@ -111,24 +119,26 @@ class AxisDegree5:
 
 
 @dataclass(frozen=True)
-class SimplexDegree3:
+class SimplexDegree3(SphericalRule):
     """Simplex corners and their opposites, 2 d + 2 points [Wang, Feng and Tseng 2014]."""
 
+    @override
     def __call__(self, d: int) -> tuple[Tensor, Tensor]:
         return _with_opposites(_simplex(d), 0.5 / (d + 1))
 
 
 @dataclass(frozen=True)
-class SimplexDegree5:
+class SimplexDegree5(SphericalRule):
     """Corners and projected edge midpoints of a simplex [Lu and Darmofal 2004]."""
 
+    @override
     def __call__(self, d: int) -> tuple[Tensor, Tensor]:
         corners = _simplex(d)
         corner_points = _with_opposites(corners, d * (7 - d) / (2 * (d + 1) ** 2 * (d + 2)))
         if d == 1:  # the edge midpoint is the centre
             return corner_points
-        k, l = torch.triu_indices(d + 1, d + 1, 1)
-        midpoints = math.sqrt(d / (2 * (d - 1))) * (corners[k] + corners[l])
+        i, j = torch.triu_indices(d + 1, d + 1, 1)
+        midpoints = math.sqrt(d / (2 * (d - 1))) * (corners[i] + corners[j])
         return _concatenated(
             corner_points,
             _with_opposites(midpoints, 2 * (d - 1) ** 2 / (d * (d + 1) ** 2 * (d + 2))),

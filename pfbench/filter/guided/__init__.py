@@ -1,0 +1,1 @@
+"""Proposals that a Gaussian filter guides."""

@@ -1,0 +1,1 @@
+"""Proposals and kernels with neural networks."""

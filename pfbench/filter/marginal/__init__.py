@@ -1,0 +1,1 @@
+"""Rao-Blackwellised filter."""

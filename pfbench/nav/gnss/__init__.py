@@ -1,0 +1,1 @@
+"""Satellite navigation: orbits, ephemerides, ranges and the receiver clock."""
