@@ -1,7 +1,6 @@
 """Kernels of particles.cu: operators of `pfbench.kernels.cpp` on a CUDA device, compiled by torch's NVRTC.
 
-If they do not compile, a warning is logged and torch's own compiler is used. The file has one
-function per operator, which makes it long.
+If they do not compile, a warning is logged and torch's own compiler is used.
 """
 
 from __future__ import annotations
@@ -75,186 +74,112 @@ def _draw(
     name = "normals" if dtype == torch.float32 else "uniforms"
     threads = min(256, 32 * -(-quarters // 32))
     grid = -(-quarters // threads), min(_ROWS, components * len(runs)), 1
-    _launch(
-        name,
-        grid,
-        threads,
-        out,
-        runs,
-        int(seed),
-        purpose,
-        int(step),
-        components,
-        len(runs),
-        quarters,
-    )
+    numbers = int(seed), purpose, int(step), components, len(runs), quarters
+    _launch(name, grid, threads, out, runs, *numbers)
     return out
 
 
 def _affine(
     phi: Tensor, x: Tensor, gain: Tensor, m: int, ancestors: Tensor | None = None, key: Any = (0, 0, 0, None),
-    noise: Tensor | None = None,
+    noise: Tensor | None = None
 ) -> Tensor:  # fmt: skip
     (d, runs, n), width = x.shape, gain.shape[-1]
     phi, gain = phi.to(x.dtype).contiguous(), gain.to(x.dtype).contiguous()
     out, (seed, purpose, step, numbers) = x.new_empty(d, runs, m), key
-    words = [
-        _REAL[x.dtype],
-        d,
-        width,
-        *("true" if flag else "false" for flag in (ancestors is not None, noise is None)),
-    ]
+    flags = ("true" if flag else "false" for flag in (ancestors is not None, noise is None))
+    name = f"affine<{', '.join((_REAL[x.dtype], str(d), str(width), *flags))}>"
     # An unused pointer may be any valid address.
     parent = x if ancestors is None else ancestors
     w, numbers = x if noise is None else noise, x if numbers is None else numbers
     per_run = (len(phi) > 1) + 2 * (len(gain) > 1)
     grid = -(-m // 512), min(_ROWS, runs), 1
-    name = f"affine<{', '.join(map(str, words))}>"
-    _launch(
-        name,
-        grid,
-        128,
-        out,
-        x,
-        parent,
-        w,
-        phi,
-        gain,
-        per_run,
-        numbers,
-        seed,
-        purpose,
-        step,
-        runs,
-        n,
-        m,
-    )
+    tensors = out, x, parent, w, phi, gain
+    _launch(name, grid, 128, *tensors, per_run, numbers, seed, purpose, step, runs, n, m)
     return out
 
 
-class CudaKernels:
-    """Operators on a CUDA device, with the names and arguments of `pfbench.kernels.cpp`."""
+def _philox_normals(
+    seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
+) -> Tensor:
+    """Draw standard normal numbers of blocks."""
+    return _draw(seed, purpose, step, runs, components, quarters, torch.float32)
 
-    @staticmethod
-    def philox_normals(
-        seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
-    ) -> Tensor:
-        """Draw standard normal numbers of blocks."""
-        return _draw(seed, purpose, step, runs, components, quarters, torch.float32)
 
-    @staticmethod
-    def philox_uniforms(
-        seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
-    ) -> Tensor:
-        """Draw uniform numbers of blocks."""
-        return _draw(seed, purpose, step, runs, components, quarters, torch.float64)
+def _philox_uniforms(
+    seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
+) -> Tensor:
+    """Draw uniform numbers of blocks."""
+    return _draw(seed, purpose, step, runs, components, quarters, torch.float64)
 
-    @staticmethod
-    def gather_particles(x: Tensor, ancestors: Tensor) -> Tensor:
-        """Gather particles by their ancestors."""
-        (d, runs, n), m = x.shape, ancestors.shape[1]
-        out = x.new_empty(d, runs, m)
-        grid = -(-m // 256), min(_ROWS, runs), 1
-        _launch(
-            f"copied<{_REAL[x.dtype]}>",
-            grid,
-            256,
-            out,
-            x.contiguous(),
-            ancestors.contiguous(),
-            d,
-            runs,
-            n,
-            m,
+
+def _gather_particles(x: Tensor, ancestors: Tensor) -> Tensor:
+    """Gather particles by their ancestors."""
+    (d, runs, n), m = x.shape, ancestors.shape[1]
+    out = x.new_empty(d, runs, m)
+    grid = -(-m // 256), min(_ROWS, runs), 1
+    name, sources = f"copied<{_REAL[x.dtype]}>", (x.contiguous(), ancestors.contiguous())
+    _launch(name, grid, 256, out, *sources, d, runs, n, m)
+    return out
+
+
+def _propagate_affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
+    """Compute phi x + gain w."""
+    stored = x.permute(2, 0, 1).contiguous()
+    return _affine(
+        phi, stored, gain, stored.shape[2], noise=w.permute(2, 0, 1).to(x.dtype).contiguous()
+    )
+
+
+def _gather_propagate(
+    phi: Tensor,
+    x: Tensor,
+    ancestors: Tensor,
+    gain: Tensor,
+    seed: Tensor,
+    purpose: int,
+    step: Tensor,
+    runs: Tensor,
+) -> Tensor:
+    """Gather particles by their ancestors and propagate them."""
+    if x.shape[0] != phi.shape[-1]:
+        raise ValueError(
+            f"x must have {phi.shape[-1]} components, got {x.shape[0]}. Use the gain of this model."
         )
-        return out
+    key = int(seed), purpose, int(step), runs
+    return _affine(phi, x.contiguous(), gain, ancestors.shape[1], ancestors.contiguous(), key)
 
-    @staticmethod
-    def propagate_affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
-        """Compute phi x + gain w."""
-        stored = x.permute(2, 0, 1).contiguous()
-        return _affine(
-            phi, stored, gain, stored.shape[2], noise=w.permute(2, 0, 1).to(x.dtype).contiguous()
-        )
 
-    @staticmethod
-    def gather_propagate(
-        phi: Tensor,
-        x: Tensor,
-        ancestors: Tensor,
-        gain: Tensor,
-        seed: Tensor,
-        purpose: int,
-        step: Tensor,
-        runs: Tensor,
-    ) -> Tensor:
-        """Gather particles by their ancestors and propagate them."""
-        if x.shape[0] != phi.shape[-1]:
-            raise ValueError(f"x must have {phi.shape[-1]} components, got {x.shape[0]}.")
-        return _affine(
-            phi,
-            x.contiguous(),
-            gain,
-            ancestors.shape[1],
-            ancestors.contiguous(),
-            (int(seed), purpose, int(step), runs),
-        )
+def _resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
+    """Resample systematically."""
+    runs, slots = a.shape
+    out = a.new_empty(runs, slots, dtype=torch.int64)
+    inside = 4 * slots <= _SHARED - 1024
+    blocks = min(runs, _ROWS)
+    marks = out if inside else a.new_empty(blocks, slots, dtype=torch.int32)
+    counts, uniforms = n.to(a.dtype).contiguous(), u.to(torch.float64).contiguous()
+    args = a.contiguous(), counts, int(len(n) > 1), uniforms, marks, int(inside), runs, slots
+    name, shared = f"systematic<{_REAL[a.dtype]}>", 4 * slots if inside else 0
+    _launch(name, (blocks, 1, 1), _BLOCK, out, *args, shared=shared)
+    return out
 
-    @staticmethod
-    def resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
-        """Resample systematically."""
-        runs, slots = a.shape
-        out = a.new_empty(runs, slots, dtype=torch.int64)
-        inside = 4 * slots <= _SHARED - 1024
-        blocks = min(runs, _ROWS)
-        marks = out if inside else a.new_empty(blocks, slots, dtype=torch.int32)
-        counts = n.to(a.dtype).contiguous()
-        args = (
-            a.contiguous(),
-            counts,
-            int(len(n) > 1),
-            u.to(torch.float64).contiguous(),
-            marks,
-            int(inside),
-            runs,
-            slots,
-        )
-        _launch(
-            f"systematic<{_REAL[a.dtype]}>",
-            (blocks, 1, 1),
-            _BLOCK,
-            out,
-            *args,
-            shared=4 * slots if inside else 0,
-        )
-        return out
 
-    @staticmethod
-    def count_unique(ancestors: Tensor, log_w: Tensor) -> Tensor:
-        """Count distinct values where a weight is positive."""
-        (runs, slots), bytes_ = log_w.shape, 4 * -(-2 * log_w.shape[1] // 4)
-        out = ancestors.new_empty(runs)
-        args = ancestors.contiguous(), log_w.contiguous(), runs, slots
-        _launch(
-            f"distinct<{_REAL[log_w.dtype]}>",
-            (min(runs, _ROWS), 1, 1),
-            _BLOCK,
-            out,
-            *args,
-            shared=bytes_,
-        )
-        return out
+def _count_unique(ancestors: Tensor, log_w: Tensor) -> Tensor:
+    """Count distinct values where a weight is positive."""
+    (runs, slots), bytes_ = log_w.shape, 4 * -(-2 * log_w.shape[1] // 4)
+    out = ancestors.new_empty(runs)
+    args = ancestors.contiguous(), log_w.contiguous(), runs, slots
+    name, grid = f"distinct<{_REAL[log_w.dtype]}>", (min(runs, _ROWS), 1, 1)
+    _launch(name, grid, _BLOCK, out, *args, shared=bytes_)
+    return out
 
-    @staticmethod
-    def weighted_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute weighted means and variances."""
-        runs, slots, d = x.shape
-        mean, variance = x.new_empty(runs, d), x.new_empty(runs, d)
-        args = x.permute(2, 0, 1).contiguous(), w.contiguous(), runs, slots
-        _launch(
-            f"moments<{_REAL[x.dtype]}, {d}>", (min(runs, _ROWS), 1, 1), 256, mean, variance, *args
-        )
-        return mean, variance
+
+def _weighted_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute weighted means and variances."""
+    runs, slots, d = x.shape
+    mean, variance = x.new_empty(runs, d), x.new_empty(runs, d)
+    args = x.permute(2, 0, 1).contiguous(), w.contiguous(), runs, slots
+    _launch(f"moments<{_REAL[x.dtype]}, {d}>", (min(runs, _ROWS), 1, 1), 256, mean, variance, *args)
+    return mean, variance
 
 
 def _fills_device(a: Tensor, most: int) -> bool:
@@ -266,6 +191,18 @@ def _fits_registers(x: Tensor) -> bool:
     """Return whether a thread can hold the sums of all components."""
     return x.shape[-1] <= _STATES.get(x.dtype, 0)
 
+
+KERNELS: dict[str, Callable[..., Any]] = {
+    "philox_normals": _philox_normals,
+    "philox_uniforms": _philox_uniforms,
+    "gather_particles": _gather_particles,
+    "propagate_affine": _propagate_affine,
+    "gather_propagate": _gather_propagate,
+    "resample_systematic": _resample_systematic,
+    "count_unique": _count_unique,
+    "weighted_moments": _weighted_moments,
+}
+"""Operators on a CUDA device, with the names and arguments of `pfbench.kernels.cpp`."""
 
 _ACCEPTS: dict[str, Callable[..., bool]] = {
     "philox_normals": lambda *_: True,
@@ -297,7 +234,7 @@ def _launch(
     stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
     code = driver.cuLaunchKernel(function, *grid, threads, 1, 1, shared, stream, pointers, None)
     if code:
-        raise RuntimeError(f"{name}: the CUDA driver returned error {code}")
+        raise RuntimeError(f"{name} cannot run: the CUDA driver returned error {code}.")
 
 
 @cache
@@ -308,5 +245,5 @@ def _kernel(name: str, device: int) -> tuple[Any, Any]:
 
 def register(operators: torch.library.Library) -> None:
     """Register the kernels for tensors on a CUDA device."""
-    for name in (*_ACCEPTS, "gather_propagate"):
-        operators.impl(name, getattr(CudaKernels, name), "CUDA")
+    for name, kernel in KERNELS.items():
+        operators.impl(name, kernel, "CUDA")

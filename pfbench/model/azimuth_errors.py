@@ -148,7 +148,7 @@ class ExactErrorEquations(ErrorEquations):
 def compute_level_coupling(alpha: Tensor, w: Tensor, f: Tensor) -> Tensor:
     """Compute G = ((I - M^T) w, (I - M) f) with M to first order in the tilts.
 
-    With x, y the tilts, c and s cosine and sine of the azimuth error,
+    x and y are the tilts, c and s are the cosine and sine of the azimuth error, and
     M = [[c, -s, y c + x s], [s, c, y s - x c], [-y, x, 1]].
 
     Args:

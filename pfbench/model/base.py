@@ -73,12 +73,12 @@ class StateSpaceModel(nn.Module, ABC):
 
     @property
     def has_residual(self) -> bool:
-        """Whether the model defines a residual other than y - y_hat."""
+        """True if the model defines a residual other than y - y_hat."""
         return type(self).residual is not StateSpaceModel.residual
 
     @property
     def has_noise_gain(self) -> bool:
-        """Whether the model defines `noise_gain`, so that None is a statement."""
+        """True if the model defines `noise_gain`. None then means noise that is not additive."""
         return type(self).noise_gain is not StateSpaceModel.noise_gain
 
     @abstractmethod
@@ -135,7 +135,15 @@ class StateSpaceModel(nn.Module, ABC):
         return None
 
     def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
-        """Compute y - y_hat; models wrap angles here."""
+        """Compute y - y_hat; models wrap angles here.
+
+        Args:
+            y: Measurements, [..., Dy].
+            y_hat: Predicted measurements, [..., Dy].
+
+        Returns:
+            Differences, [..., Dy].
+        """
         return y - y_hat
 
     def prepare(self, record: Record) -> Record:
@@ -160,7 +168,7 @@ class StateSpaceModel(nn.Module, ABC):
             truth: True values by group, [R, T, k].
 
         Returns:
-            States, [R, T, D]; NaN where a group has no truth.
+            States, [R, T, D]; NaN where the truth of a group is unknown.
 
         Raises:
             ValueError: if no group of this model has a truth.

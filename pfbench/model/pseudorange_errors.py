@@ -63,7 +63,7 @@ class PseudorangeError(Protocol):
 
 
 @dataclass(frozen=True)
-class NormalRangeError:
+class NormalRangeError(PseudorangeError):
     """Normal errors.
 
     Attributes:
@@ -78,12 +78,13 @@ class NormalRangeError:
     def __post_init__(self) -> None:
         check_positive("model.range_error.factor", self.factor)
 
+    @override
     def __call__(self, mean: Tensor, u: UrbanInputs) -> Distribution:
         return independent_normal(mean, (self.factor * u.sd).unsqueeze(1))
 
 
 @dataclass(frozen=True)
-class LosNlosRangeError:
+class LosNlosRangeError(PseudorangeError):
     """Normal errors, with an additional exponential delay without line of sight.
 
     The probability of a line of sight depends on the carrier-to-noise density C:
@@ -120,6 +121,7 @@ class LosNlosRangeError:
                 "Use 0 for the same share at every carrier-to-noise density."
             )
 
+    @override
     def __call__(self, mean: Tensor, u: UrbanInputs) -> Distribution:
         odds = math.log(self.share / (1.0 - self.share)) + self.slope * (u.cn0 - CN0_REFERENCE)
         distribution = NormalExponentialMixture(

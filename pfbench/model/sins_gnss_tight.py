@@ -58,8 +58,8 @@ class TightStep(NamedTuple):
 class SinsGnssTight(InsErrorModel):
     """Errors of an INS (INS minus truth) and a receiver clock, measured by ranges.
 
-    The 17 states are attitude phi (E, N, U), velocity (E, N, U), position in metres (N, E, U), constant
-    gyro and accelerometer biases, clock bias and drift in m and m/s. The paper has radians for
+    The 17 states are attitude phi (E, N, U), velocity (E, N, U), position in metres (N, E, U),
+    constant sensor biases, clock bias and drift in m and m/s. The paper has radians for
     latitude and longitude [ours]. The groups are the paper's [COFM-AMSSRCPF 2024, Measurement and
     Control, section 2]. Order, axes and signs are ours.
 

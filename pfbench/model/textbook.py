@@ -228,7 +228,7 @@ class Pendulum(StateSpaceModel):
         ValueError: if an argument is not positive.
     """
 
-    l: Tensor
+    noise_root: Tensor
     r: Tensor
     p0: Tensor
 
@@ -244,7 +244,7 @@ class Pendulum(StateSpaceModel):
         q = check_positive("model.noise", noise) ** 2 * torch.tensor(
             [[d**3 / 3, d**2 / 2], [d**2 / 2, d]], dtype=torch.float64
         )
-        self.register_buffer("l", torch.linalg.cholesky(q))
+        self.register_buffer("noise_root", torch.linalg.cholesky(q))
         self.register_buffer("r", check_positive("model.measurement_sd", [measurement_sd]))
         self.register_buffer("p0", check_positive("model.initial_sd", list(initial_sd)))
         self.step, self.noise_dim = d, 2
@@ -270,11 +270,11 @@ class Pendulum(StateSpaceModel):
         predicted_mean = torch.cat(
             [angle + rate * self.step, rate - 9.81 * torch.sin(angle) * self.step], -1
         )
-        return self.chart.add(predicted_mean, w @ self.l.mT)
+        return self.chart.add(predicted_mean, w @ self.noise_root.mT)
 
     @override
     def noise_gain(self, u: Any) -> Tensor:
-        return self.l.unsqueeze(0)
+        return self.noise_root.unsqueeze(0)
 
     @override
     def observation(self, x: Tensor, u: Any) -> Distribution:

@@ -40,7 +40,7 @@ class ImuErrors:
         accelerometer_markov_ug: Stationary standard deviation of the Gauss-Markov part, micro-g.
         accelerometer_markov_time_s: Correlation time, s.
         accelerometer_random_walk_ug_sqrt_hz: Velocity random walk, micro-g/sqrt(Hz).
-        drawn_biases: If true, the constant parts are drawn from N(0, sd^2) for each run and axis.
+        randomise_biases: If true, the constant parts are drawn from N(0, sd^2) for each run and axis.
             Otherwise they equal the stated value in every run and axis.
         gyro_misalignment: M_g in w~ = (I + M_g) w + errors, with scale factors on the diagonal
             and misalignments elsewhere.
@@ -201,7 +201,7 @@ def simulate_gauss_markov(
     stationary distribution.
 
     Args:
-        purpose: Label of the random stream.
+        label: Label of the random stream.
         n: Number of samples.
         sigma: Stationary standard deviation.
         time: Correlation time, s.

@@ -58,7 +58,7 @@ class MotionSpline(TrajectorySource):
         recorded: The motion.
         knot_interval_s: Time between knots, s. Motion with a shorter period than about twice this
             value is smoothed out.
-        use_full_log: Time, s, of which the flight is a multiple. The rest is cut off.
+        use_full_log: Time, s. The flight is cut to a multiple of it.
         position_sd: Position errors of the record, m. Only the ratio to `velocity_sd` matters.
         velocity_sd: Velocity errors of the record, m/s.
 

@@ -44,20 +44,26 @@ class NoiseRegime(Protocol):
             channels: Nominal noise, kind and source of each component.
             time: Times of the measurements, [T], s.
 
+        Returns:
+            Family, shift and scale of the errors.
+
         Raises:
-            ValueError: If the errors have no distribution per step.
+            ValueError: If the errors do not have a distribution per step.
         """
 
 
 def process_variance_factors(noise: NoiseRegime, time: Tensor) -> Tensor:
-    """Compute factors on the process noise variance of each step, [T].
+    """Compute factors on the process noise variance of each step.
 
-    The mean over the interval that ends at the time of the step. The first interval is as long as
-    the second.
+    A factor is the mean over the interval that ends at the time of the step. The first interval is
+    as long as the second.
 
     Args:
         noise: Noise regime.
         time: Times at the ends of the steps, [T], s.
+
+    Returns:
+        Factors, [T].
     """
     spans = torch.diff(time, prepend=2 * time[:1] - time[1:2]) if len(time) > 1 else time
     inside = 1.0 - (torch.arange(_SAMPLES, dtype=time.dtype) + 0.5) / _SAMPLES
@@ -91,8 +97,11 @@ def make_no_distribution_error(noise: str, reason: str) -> ValueError:
     Args:
         noise: Name of the regime.
         reason: Explanation.
+
+    Returns:
+        The error.
     """
     return ValueError(
-        f"oracle_noise must be false for noise={noise}, which has no distribution per step ({reason}). "
-        "Set oracle_noise=false."
+        f"oracle_noise must be false for noise={noise}, got true. Its errors do not have a "
+        f"distribution per step, because {reason}. Set oracle_noise=false."
     )

@@ -68,7 +68,9 @@ class GaussMarkovNoise(NoiseRegime):
 
     @override
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
-        raise make_no_distribution_error("gauss_markov", "its errors are correlated in time")
+        raise make_no_distribution_error(
+            noise="gauss_markov", reason="its errors are correlated in time"
+        )
 
 
 @dataclass(frozen=True)
@@ -152,13 +154,15 @@ class NonLineOfSightNoise(NoiseRegime):
         affected = _affected(channels)
         sources = [source for source, a in zip(channels.source, affected, strict=True) if a]
         if self.mean_dwell_s is not None:
-            raise make_no_distribution_error("nlos", "its biases persist")
+            raise make_no_distribution_error(noise="nlos", reason="its biases persist")
         if len(set(sources)) < len(sources):
             raise make_no_distribution_error(
-                "nlos", "it affects several components of one source together"
+                noise="nlos", reason="it affects several components of one source together"
             )
         if family is not distributions.make_normal or not bool((scale == 1.0).all()):
-            raise make_no_distribution_error("nlos", "the errors without bias are not nominal")
+            raise make_no_distribution_error(
+                noise="nlos", reason="the errors without bias are not nominal"
+            )
         probability = self.probability * torch.tensor(affected).to(scale)
         return ErrorDistribution(
             distributions.normal_plus_exponential(probability, self.mean_delay_sd), shift, scale

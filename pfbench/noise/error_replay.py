@@ -92,7 +92,7 @@ class ErrorReplay(NoiseRegime):
 
     @override
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
-        raise make_no_distribution_error("replay", "its errors are correlated in time")
+        raise make_no_distribution_error(noise="replay", reason="its errors are correlated in time")
 
     def read_record(self) -> np.ndarray:
         """Read receiver minus truth at each second, North, East, down [n, 3] m.

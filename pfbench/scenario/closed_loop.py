@@ -74,7 +74,15 @@ class ClosedLoopRun:
         self.course, self.record, self.ins, self.t = course, record, course.ins, -1
 
     def begin(self, record: Record, groups: dict[str, tuple[int, ...]]) -> FeedbackRun:
-        """Continue this pass from its current step."""
+        """Continue this pass from its current step.
+
+        Args:
+            record: Not used.
+            groups: Not used.
+
+        Returns:
+            This pass.
+        """
         return self
 
     def at_step(self, t: int) -> Record:

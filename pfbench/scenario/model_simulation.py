@@ -1,6 +1,6 @@
 """Episodes simulated from a model: for textbook models and training.
 
-A filter that uses the same model has no model error. Its results are better than in an
+A filter that uses the same model is without model error. Its results are better than in an
 application ("inverse crime").
 """
 

@@ -66,7 +66,7 @@ class PassiveLocationScenario:
             the scenario does not define divergence.
 
     Raises:
-        ValueError: if an argument has the wrong length or sign, or the aircraft has no horizontal
+        ValueError: if an argument has the wrong length or sign, or the aircraft is without horizontal
             velocity. `draw` raises it if the regime removes the first measurement.
     """
 

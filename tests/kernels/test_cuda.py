@@ -112,7 +112,7 @@ def loop(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Loo
 
         return on_device
     monkeypatch.setattr(cuda, "_launch", request.getfixturevalue("as_cpp"))
-    return lambda name, *args: getattr(cuda.CudaKernels, name)(*args)
+    return lambda name, *args: cuda.KERNELS[name](*args)
 
 
 def cloud_of(runs: int, n: int, d: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -258,7 +258,7 @@ def test_more_states_than_registers_hold_are_left_to_torch() -> None:
 def test_parents_of_another_size_are_refused() -> None:
     x, a = torch.zeros(3, 2, 4), torch.zeros(2, 4, dtype=torch.int64)
     with pytest.raises(ValueError, match="x must have 2 components, got 3"):
-        cuda.CudaKernels.gather_propagate(
+        cuda.KERNELS["gather_propagate"](
             torch.zeros(1, 2, 2),
             x,
             a,

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
 from pfbench.core.covariance import distribution_covariance, factor
 from pfbench.core.random_stream import RandomStream
@@ -27,13 +28,13 @@ from pfbench.filter.guided.guide_memory import (
 )
 from pfbench.filter.linearisation import mask_covariance, mean_noise, unwrap_independent
 from pfbench.filter.particle.point_sets import IidPoints, PointSet
-from pfbench.filter.particle.proposals import ProposalSample
+from pfbench.filter.particle.proposals import Proposal, ProposalSample
 from pfbench.filter.whitening import LOG_2PI, compute_half_square, log_determinant
 from pfbench.model.base import StateSpaceModel
 
 
 @dataclass(frozen=True)
-class GuidedNoiseProposal:
+class GuidedNoiseProposal(Proposal):
     """Draw each particle's noise from its approximate Gaussian posterior.
 
     y = h(f(parent, w)) + v is linearised in w by the guide's rule. The proposal is
@@ -41,11 +42,11 @@ class GuidedNoiseProposal:
     linear-Gaussian models it is the optimal proposal [Doucet, Godsill, Andrieu 2000].
 
     Attributes:
-        guide_filter: Gaussian filter whose rule linearises. It starts from each parent and therefore
-            takes no adaptations.
-        shared_by_particles: Linearise once per run, about the weighted mean without noise, instead of once
-            per particle. The ratio corrects any proposal, so exactness does not change. Linear
-            models always share.
+        guide_filter: Gaussian filter whose rule linearises. It starts from each parent and
+            therefore takes no adaptations.
+        shared_by_particles: Linearise once per run, about the weighted mean without noise, instead
+            of once per particle. The ratio corrects any proposal, so exactness does not change.
+            Linear models always share.
         covariance_factor: Factor on the proposal covariance. Values above 1 protect against an
             overconfident proposal.
         points: Source of z.
@@ -73,12 +74,13 @@ class GuidedNoiseProposal:
                 "iterations. Remove adaptations, gains and iterations."
             )
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
         noise = model.noise
         z = self.points(draws).normal("guide", belief.x.shape[1], model.noise_dim)
-        xi, log_det = self._posterior(model, belief, record, z)
+        xi, log_det = self.map_to_posterior(model, belief, record, z)
         w, log_ratio = xi, compute_log_ratio(xi, z, log_det, self.covariance_factor)
         if not standardise_noise(noise):
             w = noise.mean + noise.stddev * xi
@@ -90,10 +92,20 @@ class GuidedNoiseProposal:
             )
         return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
 
-    def _posterior(
+    def map_to_posterior(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, z: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return xi = m + sqrt(widen) U z [R, N, W] and log |det U| [R, N or 1]."""
+        """Map standard normal numbers to the posterior of the whitened noise.
+
+        Args:
+            model: State-space model.
+            belief: Particles at t-1.
+            record: Record of step t.
+            z: Standard normal numbers, [R, N, W].
+
+        Returns:
+            xi = m + sqrt(covariance_factor) U z, [R, N, W], and log |det U|, [R, N or 1].
+        """
         shared = self.shared_by_particles or model.linear
         x = (
             model.chart.mean(belief.x, normalise_log_weights(belief.log_w)).unsqueeze(1)

@@ -28,19 +28,19 @@ from pfbench.filter.guided.guide_memory import (
 )
 from pfbench.filter.linearisation import mean_noise
 from pfbench.filter.particle.point_sets import IidPoints, PointSet
-from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
+from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
 from pfbench.filter.whitening import LOG_2PI, compute_half_square, log_determinant
 from pfbench.model.base import ModelWrapper, StateSpaceModel, StaticModel
 
 
 @dataclass(frozen=True)
-class ParticleGuideProposal:
+class ParticleGuideProposal(Proposal):
     """Draw each particle from the posterior of its own Gaussian guide filter.
 
     Unscented particle filter [van der Merwe et al. 2000]. The covariance P of each particle is
     predicted and updated, x ~ N(x+, P+), and the ratio is p(x | parent) / N(x; x+, P+). P does not
     use the other particles, so the proposal is much wider than p(x | parent, y). In several
-    dimensions few particles have weight. GuidedNoise is cheaper and better. The cost is N guide
+    dimensions few particles have weight. `GuidedNoiseProposal` is cheaper and better. The cost is N guide
     steps per run.
 
     Attributes:
@@ -61,20 +61,21 @@ class ParticleGuideProposal:
     def __post_init__(self) -> None:
         check_covariance_factor(self.covariance_factor)
 
+    @override
     def __call__(
-        self, model: StateSpaceModel, belief: ParticleBelief, seen: Record, draws: RandomStream
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
         runs, n, _ = belief.x.shape
         if isinstance(model, StaticModel):  # no transition in this step
-            return BootstrapProposal()(model, belief, seen, draws)
+            return BootstrapProposal()(model, belief, record, draws)
         covariance = (
             belief.memory[COVARIANCE]
             if COVARIANCE in belief.memory
-            else self._first(model, runs, seen, draws)
+            else self._first(model, runs, record, draws)
         )
         before = unpack_guide_belief(belief.memory, belief.x, covariance.expand(-1, n, -1, -1))
-        record = Record(seen.y.repeat_interleave(n, 0), seen.u)
-        new = self.guide_filter.advance(_ParticlesAsRuns(model, runs, n), before, record)
+        repeated = Record(record.y.repeat_interleave(n, 0), record.u)
+        new = self.guide_filter.advance(_ParticlesAsRuns(model, runs, n), before, repeated)
         xi_mean, root, _ = kalman_gain_update(new.innovation)
         z = self.points(draws).normal("guide", n, model.chart.dimension)
         step = math.sqrt(self.covariance_factor) * (root @ z.reshape(runs * n, -1, 1)).squeeze(-1)
@@ -93,7 +94,7 @@ class ParticleGuideProposal:
             - compute_half_square(xi)
             - scale
         )
-        log_ratio = _log_transition(model, belief.x, x, seen.u) - log_q
+        log_ratio = _log_transition(model, belief.x, x, record.u) - log_q
         valid_mask = torch.isfinite(new.log_likelihood).unflatten(0, (runs, n))
         return ProposalSample(
             x,

@@ -13,6 +13,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.covariance import factor
 from pfbench.core.random_stream import RandomStream
@@ -32,13 +33,13 @@ from pfbench.filter.guided.guide_memory import (
 from pfbench.filter.linearisation import is_normal, mask_covariance
 from pfbench.filter.linearisation import linearised_innovation as innovation_at
 from pfbench.filter.particle.point_sets import IidPoints, PointSet
-from pfbench.filter.particle.proposals import ProposalSample
+from pfbench.filter.particle.proposals import Proposal, ProposalSample
 from pfbench.filter.whitening import compute_half_square, fill_missing, log_determinant, whiten
 from pfbench.model.base import StateSpaceModel
 
 
 @dataclass(frozen=True)
-class SharedGuideProposal:
+class SharedGuideProposal(Proposal):
     """Draw all particles from N(x+, P+), the posterior of one guide filter per run.
 
     The weights are p(y | x) N(x; x-, P-) / N(x; x+, P+). Particles do not have parents, and its
@@ -84,6 +85,7 @@ class SharedGuideProposal:
                 )
         check_covariance_factor(self.covariance_factor)
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:

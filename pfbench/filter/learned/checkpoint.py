@@ -20,7 +20,6 @@ from torch import Tensor, nn
 FORMAT = "pfbench checkpoint 1"
 UNTRAINED = "untrained"
 
-
 Weights = dict[str, Tensor]
 
 
@@ -79,10 +78,10 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 def hash_weights(networks: Mapping[str, Weights]) -> str:
     """Return 16 hexadecimal digits of the SHA-256 of all weights, names and shapes."""
     sha256 = hashlib.sha256()
-    for part in sorted(networks):
-        for name in sorted(networks[part]):
-            value = networks[part][name].detach().cpu().contiguous()
-            sha256.update(repr((part, name, str(value.dtype), tuple(value.shape))).encode())
+    for key in sorted(networks):
+        for name in sorted(networks[key]):
+            value = networks[key][name].detach().cpu().contiguous()
+            sha256.update(repr((key, name, str(value.dtype), tuple(value.shape))).encode())
             sha256.update(value.numpy().tobytes())
     return sha256.hexdigest()[:16]
 
@@ -91,7 +90,7 @@ def replace_checkpoint_by_hash(config: Any) -> Any:
     """Replace each checkpoint path in a configuration by the hash of its weights.
 
     Raises:
-        ValueError: As for `read`.
+        ValueError: As for `read_checkpoint`.
     """
     if isinstance(config, Mapping):
         return {
@@ -100,11 +99,9 @@ def replace_checkpoint_by_hash(config: Any) -> Any:
             else replace_checkpoint_by_hash(value)
             for key, value in config.items()
         }
-    return (
-        [replace_checkpoint_by_hash(value) for value in config]
-        if isinstance(config, list)
-        else config
-    )
+    if isinstance(config, list):
+        return [replace_checkpoint_by_hash(value) for value in config]
+    return config
 
 
 def checkpoint_provenance(
@@ -119,7 +116,7 @@ def checkpoint_provenance(
         runs: Run numbers of the job.
 
     Raises:
-        ValueError: If runs of this job were used for training or validation, or as for `read`.
+        ValueError: If runs of this job were used for training or validation, or as for `read_checkpoint`.
     """
     path = next(_checkpoints(config), None)
     if path is None:
@@ -127,15 +124,15 @@ def checkpoint_provenance(
     content = read_checkpoint(path)
     split = content.get("split", {})
     for name, use in (("train", "training"), ("validation", "validation")):
-        part = split.get(name, {})
+        data = split.get(name, {})
         if (
             split.get("scenario") == scenario
-            and part.get("seed") == seed
-            and int(runs.min()) < part["runs"]
+            and data.get("seed") == seed
+            and int(runs.min()) < data["runs"]
         ):
             raise ValueError(
                 f"seed must differ from the {use} seed of checkpoint={path}, got {seed}: runs 0 to "
-                f"{part['runs'] - 1} of {scenario} are {use} data. Set another seed."
+                f"{data['runs'] - 1} of {scenario} are {use} data. Set another seed."
             )
     details: dict[str, Any] = {
         name: content[name] for name in ("choices", "cost", "best") if name in content
@@ -150,15 +147,15 @@ def _checkpoints(config: Any) -> Iterator[str]:
         yield from [checkpoint] if isinstance(checkpoint, str) and checkpoint != UNTRAINED else []
         config = list(config.values())
     if isinstance(config, list):
-        for part in config:
-            yield from _checkpoints(part)
+        for value in config:
+            yield from _checkpoints(value)
 
 
 def _hash_label(path: str) -> str:
     """Return the hash of a checkpoint as text."""
-    return (
-        path if path == UNTRAINED else f"weights {hash_weights(read_checkpoint(path)['networks'])}"
-    )
+    if path == UNTRAINED:
+        return path
+    return f"weights {hash_weights(read_checkpoint(path)['networks'])}"
 
 
 def load_parameters(path: str, weights: Weights, modules: Mapping[str, nn.Module]) -> None:

@@ -1,7 +1,7 @@
 """Differentiable resampling for training, with the bias of each method.
 
-`resamplers.Resample` ignores that the choice of ancestors depends on the parameters. Variational SMC, FIVO
-and AESMC drop this term too [Naesseth et al. 2018; Maddison et al. 2017; Le et al. 2018]. The gradient then
+`EssResampler` ignores that the choice of ancestors depends on the parameters. Variational SMC, FIVO and
+AESMC drop this term too [Naesseth et al. 2018; Maddison et al. 2017; Le et al. 2018]. The gradient then
 has a low variance and a bias.
 """
 
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
@@ -27,26 +28,28 @@ def _always() -> EssResampler:
 
 
 @dataclass(frozen=True)
-class StopGradientResampler:
+class StopGradientResampler(Resampler):
     """Resample with weights 1/N w / stop(w): their value is 1/N, their gradient the score.
 
-    For any unbiased scheme the gradient of the estimated evidence (not of its logarithm) is unbiased:
-    E[grad Z_hat] = grad Z. It has the variance of a score and needs many particles.
+    For any unbiased scheme the gradient of the estimated evidence (not of its logarithm) is
+    unbiased: E[grad Z_hat] = grad Z. It has the variance of a score and needs many particles.
 
     Attributes:
         resampler: Resampler that copies.
 
     References:
-        Scibior and Wood 2021, "Differentiable particle filtering without modifying the forward pass".
+        Scibior and Wood 2021, "Differentiable particle filtering without modifying the forward
+        pass".
     """
 
     resampler: EssResampler = field(default_factory=_always)
 
     @property
+    @override
     def is_exact(self) -> bool:
-        """Whether the inner resampler is exact."""
         return is_every_part_exact(**{"resampler.inner": self.resampler})
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,
@@ -60,14 +63,14 @@ class StopGradientResampler:
 
 
 @dataclass(frozen=True)
-class SoftResampler:
+class SoftResampler(Resampler):
     """Ancestors by a' = alpha a + (1 - alpha) / N with weights w / (N a') [Karkus, Hsu, Lee 2018].
 
-    Part of the gradient passes through the weights. The choice of ancestors is ignored, with a smaller bias
-    for a smaller alpha. The target of the particles is the same for any alpha.
+    Part of the gradient passes through the weights. The choice of ancestors is ignored, with a
+    smaller bias for a smaller alpha. The target of the particles is the same for any alpha.
 
     Attributes:
-        alpha: 1 is plain resampling. Towards 0 the weights have no influence.
+        alpha: 1 is plain resampling. Towards 0 the influence of the weights vanishes.
         resampler: Resampler that copies. StopGradientResampler removes the remaining bias.
 
     Raises:
@@ -78,16 +81,18 @@ class SoftResampler:
     resampler: Resampler = field(default_factory=_always)
 
     @property
+    @override
     def is_exact(self) -> bool:
-        """Whether the inner resampler is exact."""
         return is_every_part_exact(**{"resampler.inner": self.resampler})
 
     def __post_init__(self) -> None:
         if not 0.0 < self.alpha <= 1.0:
             raise ValueError(
-                f"resampler.alpha must be in (0, 1], got {self.alpha}. Use 1 for resampling by the weights"
+                f"resampler.alpha must be in (0, 1], got {self.alpha}. "
+                "Use 1 for resampling by the weights."
             )
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,
@@ -108,23 +113,23 @@ class SoftResampler:
 
 
 @dataclass(frozen=True)
-class OptimalTransportResampler:
+class OptimalTransportResampler(Resampler):
     """Optimal transport of particles to equal weights, x_j' = N sum_i P_ij x_i.
 
-    P minimises |x_i - x_j|^2 less epsilon times its entropy between weighted and equal particles, by
-    Sinkhorn iterations on logarithms. Distances are in unweighted standard deviations over the root of the
-    dimension. The last half iteration normalises the rows, and the column sums become the new weights
-    [ours], so the mean is kept for any number of iterations. The covariance shrinks with epsilon: the
-    posterior is reached only as N grows and epsilon falls. In a curved chart it uses coordinates about the
-    mean [ours].
+    P minimises |x_i - x_j|^2 less epsilon times its entropy between weighted and equal particles,
+    by Sinkhorn iterations on logarithms. Distances are in unweighted standard deviations over the
+    root of the dimension. The last half iteration normalises the rows, and the column sums become
+    the new weights [ours], so the mean is unchanged for any number of iterations. The covariance
+    shrinks with epsilon: the posterior is reached only as N grows and epsilon falls. In a curved
+    chart it uses coordinates about the mean [ours].
 
     Attributes:
         epsilon: Weight of the entropy.
         iterations: Number of Sinkhorn iterations.
-        threshold: As in Resample.
+        threshold: As in `EssResampler`.
 
     Raises:
-        ValueError: If epsilon is not positive, there are no iterations or the threshold is outside
+        ValueError: If epsilon is not positive, iterations is below 1, or the threshold is outside
             [0, 1]. On use, if particles have a past or a memory.
 
     References:
@@ -138,15 +143,17 @@ class OptimalTransportResampler:
 
     def __post_init__(self) -> None:
         if not self.epsilon > 0.0 or self.iterations < 1:
-            values = f"{self.epsilon} and {self.iterations}"
             raise ValueError(
-                f"resampler.epsilon must be positive and iterations at least 1, got {values}. Raise them"
+                "resampler.epsilon must be positive and iterations at least 1, "
+                f"got {self.epsilon} and {self.iterations}. Raise them."
             )
         if not 0.0 <= self.threshold <= 1.0:
             raise ValueError(
-                f"resampler.threshold must be from 0 (never) to 1 (always), got {self.threshold}. Choose a ratio of ESS to N"
+                f"resampler.threshold must be from 0 (never) to 1 (always), got {self.threshold}. "
+                "Choose a ratio of ESS to N."
             )
 
+    @override
     def __call__(
         self,
         model: StateSpaceModel,
@@ -157,12 +164,11 @@ class OptimalTransportResampler:
     ) -> tuple[ParticleBelief, Tensor]:
         if any(value.shape[1] > 1 for value in (*belief.memory.values(), *belief.window.values())):
             raise ValueError(
-                "resampler must copy particles that have a past or memory, got OptimalTransportResampler; choose SoftResampler or StopGradientResampler"
+                "resampler must copy particles that have a past or memory, got "
+                "OptimalTransportResampler. Choose SoftResampler or StopGradientResampler."
             )
-        a = normalise_log_weights(
-            belief.log_w
-        )  # transport needs no correction for other probabilities
-        hit = 1.0 / a.square().sum(-1) <= self.threshold * n.squeeze(1)
+        a = normalise_log_weights(belief.log_w)  # transport needs no correction of probabilities
+        resampled = 1.0 / a.square().sum(-1) <= self.threshold * n.squeeze(1)
         mean = model.chart.mean(belief.x, a).unsqueeze(1)
         deviations = model.chart.subtract(belief.x, mean)
         # unweighted: if one particle has all weight, weighted deviations are 0 and distances infinite
@@ -179,7 +185,7 @@ class OptimalTransportResampler:
             x=model.chart.add(mean, plan.mT @ deviations / column_sums.unsqueeze(-1)),
             log_w=torch.log(column_sums),
         )
-        return select_by_run(hit, fresh, belief), hit
+        return select_by_run(resampled, fresh, belief), resampled
 
 
 def compute_transport_plan(x: Tensor, log_a: Tensor, epsilon: float, iterations: int) -> Tensor:

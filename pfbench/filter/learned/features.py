@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
@@ -61,8 +62,11 @@ def make_feature_context(
 
     Args:
         model: State-space model.
-        cloud: Belief before the step.
-        seen: Record of the step.
+        belief: Belief before the step.
+        record: Record of the step.
+
+    Returns:
+        The quantities.
     """
     x, w = belief.x, normalise_log_weights(belief.log_w).unsqueeze(-1)
     start = (model.origin.expand(1, -1) if record.start is None else record.start).unsqueeze(1)
@@ -91,63 +95,56 @@ def make_feature_context(
 
 
 class Feature(Protocol):
-    """Feature: context of the step -> numbers [R, N or 1, k] of about one."""
+    """Input of a network, scaled to about one."""
 
-    def __call__(self, scene: FeatureContext) -> Tensor: ...
+    def __call__(self, context: FeatureContext) -> Tensor:
+        """Compute the numbers [R, N or 1, k] in the context of the step."""
 
 
 @dataclass(frozen=True)
-class InnovationFeature:
+class InnovationFeature(Feature):
     """Innovation of each noise-free child, 4 k numbers.
 
     In noise standard deviations (asinh) and in predicted ones, the logarithm of their ratio, and
     the mask of observed components.
     """
 
-    def __call__(self, scene: FeatureContext) -> Tensor:
-        in_noise_sd, in_predicted_sd = (
-            torch.asinh(scene.r / scene.noise_sd),
-            scene.r / scene.expected_sd,
-        )
-        log_sd_ratio = torch.log(scene.expected_sd / scene.noise_sd) / _LOG_SCALE
-        return torch.cat(
-            [
-                in_noise_sd,
-                in_predicted_sd,
-                log_sd_ratio,
-                scene.observed_mask.to(in_noise_sd).expand_as(in_noise_sd),
-            ],
-            -1,
-        )
+    @override
+    def __call__(self, context: FeatureContext) -> Tensor:
+        in_noise_sd = torch.asinh(context.r / context.noise_sd)
+        in_predicted_sd = context.r / context.expected_sd
+        log_sd_ratio = torch.log(context.expected_sd / context.noise_sd) / _LOG_SCALE
+        mask = context.observed_mask.to(in_noise_sd).expand_as(in_noise_sd)
+        return torch.cat([in_noise_sd, in_predicted_sd, log_sd_ratio, mask], -1)
 
 
 @dataclass(frozen=True)
-class ParentFeature:
+class ParentFeature(Feature):
     """State of each particle, 2 d numbers.
 
     Relative to the mean in standard deviations of the particles, and (asinh) relative to the start
     in those of the initial distribution.
     """
 
-    def __call__(self, scene: FeatureContext) -> Tensor:
-        chart, x = scene.model.chart, scene.belief.x
-        from_mean, from_start = (
-            chart.subtract(x, scene.mean) / scene.sd,
-            chart.subtract(x, scene.start) / scene.scale,
-        )
+    @override
+    def __call__(self, context: FeatureContext) -> Tensor:
+        chart, x = context.model.chart, context.belief.x
+        from_mean = chart.subtract(x, context.mean) / context.sd
+        from_start = chart.subtract(x, context.start) / context.scale
         return torch.cat([from_mean, torch.asinh(from_start)], -1)
 
 
 @dataclass(frozen=True)
-class SpreadFeature:
+class SpreadFeature(Feature):
     """Log ratio of the particles' standard deviations to the initial ones, d numbers."""
 
-    def __call__(self, scene: FeatureContext) -> Tensor:
-        return torch.log(scene.sd / scene.scale) / _LOG_SCALE
+    @override
+    def __call__(self, context: FeatureContext) -> Tensor:
+        return torch.log(context.sd / context.scale) / _LOG_SCALE
 
 
 @dataclass(frozen=True)
-class InputFeature:
+class InputFeature(Feature):
     """Inputs of the step by name, each divided by its scale.
 
     Attributes:
@@ -159,8 +156,9 @@ class InputFeature:
 
     input_scales: Mapping[str, float]
 
-    def __call__(self, scene: FeatureContext) -> Tensor:
-        u, parts = scene.record.u, []
+    @override
+    def __call__(self, context: FeatureContext) -> Tensor:
+        u, values = context.record.u, []
         for name, scale in self.input_scales.items():
             names = getattr(u, "_fields", ())
             if name not in names:
@@ -169,17 +167,18 @@ class InputFeature:
                     f"({', '.join(names) or 'this model has none'}), got {name}. Remove it."
                 )
             value = getattr(u, name)
-            parts.append((value.flatten(1) if value.dim() > 1 else value[:, None]) / scale)
-        return torch.cat(parts, -1).unsqueeze(1)
+            values.append((value.flatten(1) if value.dim() > 1 else value[:, None]) / scale)
+        return torch.cat(values, -1).unsqueeze(1)
 
 
 @dataclass(frozen=True)
-class FeatureStack:
+class FeatureStack(Feature):
     """All features [R, N, F], limited to +-`feature_limit`, with 0 for non-finite values.
 
     Attributes:
         features: Features.
-        feature_limit: Limit of each number, so that outlying particles stay within the training range.
+        feature_limit: Limit of each number, so that outlying particles stay within the training
+            range.
     """
 
     features: Sequence[Feature] = field(
@@ -187,9 +186,10 @@ class FeatureStack:
     )
     feature_limit: float = 10.0
 
-    def __call__(self, scene: FeatureContext) -> Tensor:
-        shape = scene.belief.x.shape[:2]
-        features = torch.cat([part(scene).expand(*shape, -1) for part in self.features], -1)
+    @override
+    def __call__(self, context: FeatureContext) -> Tensor:
+        shape = context.belief.x.shape[:2]
+        features = torch.cat([feature(context).expand(*shape, -1) for feature in self.features], -1)
         return torch.nan_to_num(features, 0.0, self.feature_limit, -self.feature_limit).clamp(
             -self.feature_limit, self.feature_limit
         )

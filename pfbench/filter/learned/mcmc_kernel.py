@@ -37,21 +37,21 @@ class LearnedRandomWalk(nn.Module):
     before the window holds `lag` noises. [ours]
 
     Args:
-        network: Makes the module, as for Learned. Its features are 2 numbers per measurement and
+        network: Makes the module, as for `LearnedProposal`. Its features are 2 numbers per measurement and
             1 per noise of the path.
         lag: L, at least 1. The cost is L model steps.
         scale: h times the root of the number of moved components. 2.38 is best for a random walk
             in a normal distribution.
-        checkpoint: As for Learned.
-        seed: As for Learned.
+        checkpoint: As for `LearnedProposal`.
+        seed: As for `LearnedProposal`.
 
     Raises:
-        ValueError: If depth is below 1 or the scale not positive. On use, as for Learned, and if
-            the noise is not normal.
+        ValueError: If `lag` is below 1 or the scale not positive. On use, as for
+            `LearnedProposal`, and if the noise is not normal.
     """
 
     is_exact = True
-    part = "kernel"
+    checkpoint_key = "kernel"
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class LearnedRandomWalk(nn.Module):
                 f"lag={lag}, scale={scale}. The default scale is 2.38."
             )
         self.make, self.lag, self.scale = network, lag, scale
-        self.learnable = CheckpointSpec(self.part, checkpoint, seed)
+        self.learnable = CheckpointSpec(self.checkpoint_key, checkpoint, seed)
         self.network: nn.Module | None = None
         self.sizes = 0, 0, 0
 
@@ -78,17 +78,15 @@ class LearnedRandomWalk(nn.Module):
         return StateHistory(self.lag, store_noise=True)
 
     def build(self, model: StateSpaceModel, measurement_size: int, fresh: bool = False) -> None:
-        """Build the network for `seen` measurement components and load the checkpoint.
+        """Build the network and load the checkpoint.
 
         Args:
             model: State-space model.
-            seen: Number of measurement components.
+            measurement_size: Number of measurement components.
             fresh: Start from untrained weights.
         """
-        features, noise = (
-            self.lag * (2 * measurement_size + model.noise_dim),
-            self.lag * model.noise_dim,
-        )
+        features = self.lag * (2 * measurement_size + model.noise_dim)
+        noise = self.lag * model.noise_dim
         self.sizes = features, noise, 0
         self.network = build_networks(
             self.learnable,
@@ -101,7 +99,16 @@ class LearnedRandomWalk(nn.Module):
     def propose(
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
     ) -> tuple[ParticleBelief, Tensor]:
-        """Propose new noises and their log ratio [R, N]."""
+        """Propose new noises.
+
+        Args:
+            model: State-space model.
+            belief: Particles with a window of states and noises.
+            draws: Random numbers.
+
+        Returns:
+            Proposed belief and log acceptance ratio, [R, N].
+        """
         proposed, log_alpha, _ = self.propose_step(model, belief, draws)
         return proposed, log_alpha
 
@@ -112,7 +119,7 @@ class LearnedRandomWalk(nn.Module):
 
         Args:
             model: State-space model.
-            cloud: Particles with a window of states and noises.
+            belief: Particles with a window of states and noises.
             draws: Random numbers.
 
         Returns:
@@ -176,21 +183,16 @@ class LearnedRandomWalk(nn.Module):
         self, model: StateSpaceModel, belief: ParticleBelief, xi: Tensor
     ) -> Distribution:
         """Return the step distribution given innovations, observed masks and noises."""
-        parts = [torch.asinh(xi)]
-        for j, seen in enumerate(belief.past[-self.lag :]):
-            distribution: Any = model.observation(
-                belief.window["states"][:, :, j - self.lag], seen.u
-            )
-            observed_mask = ~torch.isnan(seen.y).unsqueeze(1)
-            r = torch.where(
-                observed_mask,
-                model.residual(seen.y.nan_to_num().unsqueeze(1), distribution.mean),
-                0.0,
-            )
-            parts += [torch.asinh(r / distribution.stddev), observed_mask.to(r).expand_as(r)]
-        features = torch.nan_to_num(torch.cat(parts, -1), 0.0, _LIMIT, -_LIMIT).clamp(
-            -_LIMIT, _LIMIT
-        )
+        inputs = [torch.asinh(xi)]
+        for j, record in enumerate(belief.past[-self.lag :]):
+            states = belief.window["states"][:, :, j - self.lag]
+            distribution: Any = model.observation(states, record.u)
+            observed_mask = ~torch.isnan(record.y).unsqueeze(1)
+            y = record.y.nan_to_num().unsqueeze(1)
+            r = torch.where(observed_mask, model.residual(y, distribution.mean), 0.0)
+            inputs += [torch.asinh(r / distribution.stddev), observed_mask.to(r).expand_as(r)]
+        features = torch.nan_to_num(torch.cat(inputs, -1), 0.0, _LIMIT, -_LIMIT)
+        features = features.clamp(-_LIMIT, _LIMIT)
         assert self.network is not None
         value: Distribution = self.network(features)
         return value

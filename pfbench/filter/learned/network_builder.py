@@ -24,14 +24,14 @@ class CheckpointSpec:
     """Source of the weights of a learned part of a filter.
 
     Attributes:
-        part: Name in the checkpoint: `proposal` or `kernel`.
+        key: Name in the checkpoint: `proposal` or `kernel`.
         checkpoint: File, `untrained`, or None, which raises on use.
         seed: Seed of untrained weights.
         frame: Description of the distribution that the network corrects. The same weights give
             another distribution in another frame.
     """
 
-    part: str
+    key: str
     checkpoint: str | None
     seed: int
     frame: str = ""
@@ -55,6 +55,9 @@ def build_networks(
         model: State-space model, which determines dtype and device.
         fresh: Start from untrained weights.
 
+    Returns:
+        The modules by name.
+
     Raises:
         ValueError: If no checkpoint is set, or it belongs to another model or network.
     """
@@ -70,7 +73,7 @@ def build_networks(
     if path not in (None, UNTRAINED) and not fresh:
         content = read_checkpoint(str(path))
         _check_sizes(str(path), content, learnable, sizes, model)
-        load_parameters(str(path), content["networks"][learnable.part], modules)
+        load_parameters(str(path), content["networks"][learnable.key], modules)
     return modules
 
 
@@ -82,11 +85,11 @@ def _check_sizes(
     model: StateSpaceModel,
 ) -> None:
     """Check that a checkpoint fits the filter and the model."""
-    part, choices = learnable.part, content["choices"]
-    if part not in content["networks"]:
-        parts = ", ".join(content["networks"])
+    key, choices = learnable.key, content["choices"]
+    if key not in content["networks"]:
+        keys = ", ".join(content["networks"])
         raise ValueError(
-            f"checkpoint must hold a learned {part}, got a learned {parts} in {path}. "
+            f"checkpoint must hold a learned {key}, got a learned {keys} in {path}. "
             "Train this filter."
         )
     trained = list(content["model"]["names"])
@@ -100,14 +103,14 @@ def _check_sizes(
             f"({', '.join(trained)}) in {path}. Train on this model, or set "
             f"{' '.join(options) or 'the scenario and the model of the training'}."
         )
-    frame = content.get("frames", {}).get(part, learnable.frame)  # missing in older files
+    frame = content.get("frames", {}).get(key, learnable.frame)  # missing in older files
     if frame != learnable.frame:
         raise ValueError(
             f"checkpoint must correct {learnable.frame}, got {frame} in {path}. Set "
             f"filter={choices.get('filter', 'NAME')} as in the training, or train this filter."
         )
     for (name, label), size, stored in zip(
-        SIZES.items(), sizes, content["sizes"][part], strict=True
+        SIZES.items(), sizes, content["sizes"][key], strict=True
     ):
         if size != stored:
             raise ValueError(

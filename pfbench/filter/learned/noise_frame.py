@@ -40,8 +40,8 @@ def from_frame(
     Args:
         guide: Guided proposal, or None.
         model: State-space model.
-        cloud: Belief before the step.
-        seen: Record of the step.
+        belief: Belief before the step.
+        record: Record of the step.
         zeta: Noise of the network, [R, N, W].
 
     Returns:
@@ -49,7 +49,7 @@ def from_frame(
     """
     if guide is None:
         return zeta, torch.zeros_like(zeta[..., 0])
-    xi, log_det = guide._posterior(model, belief, record, zeta)
+    xi, log_det = guide.map_to_posterior(model, belief, record, zeta)
     return xi, log_det + 0.5 * zeta.shape[-1] * math.log(guide.covariance_factor)
 
 
@@ -68,8 +68,8 @@ def to_frame(
     Args:
         guide: Guided proposal, or None.
         model: State-space model.
-        cloud: Belief before the step.
-        seen: Record of the step.
+        belief: Belief before the step.
+        record: Record of the step.
         parent: Parents, [R, D].
         xi: Standardised noise, [R, 1, W].
 
@@ -92,8 +92,11 @@ def append_states(belief: ParticleBelief, states: Tensor) -> ParticleBelief:
     """Append states with weight 0 to the particles.
 
     Args:
-        cloud: Belief with N particles.
+        belief: Belief with N particles.
         states: States to append, [R, M, D].
+
+    Returns:
+        Belief with N + M particles.
     """
     log_w = torch.full_like(states[..., 0], -torch.inf)
     return belief._replace(
@@ -107,13 +110,14 @@ def scale_noise(model: StateSpaceModel, xi: Tensor) -> Tensor:
     Args:
         model: State-space model.
         xi: Standardised noise, [R, N, W].
+
+    Returns:
+        Noise, [R, N, W].
     """
     noise = model.noise
-    return (
-        xi
-        if isinstance(unwrap_independent(noise), StandardNormal)
-        else noise.mean + noise.stddev * xi
-    )
+    if isinstance(unwrap_independent(noise), StandardNormal):
+        return xi
+    return noise.mean + noise.stddev * xi
 
 
 def log_noise_density(model: StateSpaceModel, w: Tensor, xi: Tensor) -> Tensor:

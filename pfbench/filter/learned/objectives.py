@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.random_stream import RandomStream
@@ -56,25 +57,25 @@ class TrainingStep(NamedTuple):
 
 
 class Objective(Protocol):
-    """A loss of each run and step, [R].
-
-    Attributes:
-        needs_filter_gradient: Whether its gradient passes through the filter.
-        needs_simulated_data: Whether it needs data simulated from the model, with known states and noise.
-            Inputs and gaps are those of the training data.
-    """
+    """A loss of each run and step."""
 
     @property
-    def needs_filter_gradient(self) -> bool: ...
+    def needs_filter_gradient(self) -> bool:
+        """True if the gradient passes through the filter."""
 
     @property
-    def needs_simulated_data(self) -> bool: ...
+    def needs_simulated_data(self) -> bool:
+        """True if the loss needs data simulated from the model, with known states and noise.
 
-    def __call__(self, lesson: TrainingStep) -> Tensor: ...
+        Inputs and gaps are those of the training data.
+        """
+
+    def __call__(self, step: TrainingStep) -> Tensor:
+        """Compute the loss of a step, [R]."""
 
 
 @dataclass(frozen=True)
-class EvidenceLowerBound:
+class EvidenceLowerBound(Objective):
     """Negative log evidence of each step: E[log Z_hat] <= log p(y), tighter with more particles.
 
     The objective of variational SMC, FIVO and AESMC, which differ in when they resample. The loss
@@ -87,14 +88,15 @@ class EvidenceLowerBound:
     needs_filter_gradient = True
     needs_simulated_data = False
 
-    def __call__(self, lesson: TrainingStep) -> Tensor:
-        valid = torch.isfinite(lesson.after.log_evidence)
-        log_z = torch.where(valid, lesson.after.log_evidence, 0.0)
-        return torch.where(valid, lesson.before.log_evidence - log_z, 0.0)
+    @override
+    def __call__(self, step: TrainingStep) -> Tensor:
+        valid = torch.isfinite(step.after.log_evidence)
+        log_z = torch.where(valid, step.after.log_evidence, 0.0)
+        return torch.where(valid, step.before.log_evidence - log_z, 0.0)
 
 
 @dataclass(frozen=True)
-class StateErrorLoss:
+class StateErrorLoss(Objective):
     """Mean square error in standard deviations of the initial distribution [ours].
 
     It rewards a good mean, not good weights. It needs the truth and a resampler through which
@@ -107,14 +109,15 @@ class StateErrorLoss:
     needs_filter_gradient = True
     needs_simulated_data = False
 
-    def __call__(self, lesson: TrainingStep) -> Tensor:
-        error = lesson.model.error(lesson.step_info.mean, lesson.truth) / lesson.scale
+    @override
+    def __call__(self, step: TrainingStep) -> Tensor:
+        error = step.model.error(step.step_info.mean, step.truth) / step.scale
         finite = torch.isfinite(error)
         return torch.where(finite, error, 0.0).square().sum(-1) / finite.sum(-1).clamp(min=1)
 
 
 @dataclass(frozen=True)
-class InferenceCompilation:
+class InferenceCompilation(Objective):
     """-log q(w | parent, y) of the noise of simulated data: forward KL, which covers all modes.
 
     The proposal is evaluated at the true parent. The filter runs without a gradient.
@@ -126,24 +129,23 @@ class InferenceCompilation:
     needs_filter_gradient = False
     needs_simulated_data = True
 
-    def __call__(self, lesson: TrainingStep) -> Tensor:
-        proposal = lesson.method.proposal
+    @override
+    def __call__(self, step: TrainingStep) -> Tensor:
+        proposal = step.method.proposal
         if not isinstance(proposal, LearnedProposal):
             raise ValueError(
-                "filter.proposal must be LearnedProposal for train.objective=InferenceCompilation, got "
-                f"{type(proposal).__name__}. Choose filter=neural_sir."
+                "filter.proposal must be LearnedProposal for train.objective=InferenceCompilation, "
+                f"got {type(proposal).__name__}. Choose filter=neural_sir."
             )
-        if isinstance(lesson.model, StaticModel):
-            return torch.zeros_like(lesson.after.log_w[:, 0])
-        assert lesson.parent is not None
-        assert lesson.noise is not None
-        return -proposal.log_density(
-            lesson.model, lesson.before, lesson.record, lesson.parent, lesson.noise
-        )
+        if isinstance(step.model, StaticModel):
+            return torch.zeros_like(step.after.log_w[:, 0])
+        assert step.parent is not None
+        assert step.noise is not None
+        return -proposal.log_density(step.model, step.before, step.record, step.parent, step.noise)
 
 
 @dataclass(frozen=True)
-class ExpectedSquaredJump:
+class ExpectedSquaredJump(Objective):
     """Negative expected squared jump of a learned kernel: acceptance times squared step length.
 
     References:
@@ -153,34 +155,35 @@ class ExpectedSquaredJump:
     needs_filter_gradient = False
     needs_simulated_data = False
 
-    def __call__(self, lesson: TrainingStep) -> Tensor:
+    @override
+    def __call__(self, step: TrainingStep) -> Tensor:
         kernels = [
-            move.kernel for move in lesson.method.moves if isinstance(move, MetropolisHastings)
+            move.kernel for move in step.method.moves if isinstance(move, MetropolisHastings)
         ]
         learned = [kernel for kernel in kernels if isinstance(kernel, LearnedRandomWalk)]
         if not learned:
             raise ValueError(
-                "filter.moves must have a LearnedRandomWalk for train.objective=ExpectedSquaredJump, got none. "
-                "Choose filter=neural_mh."
+                "filter.moves must have a LearnedRandomWalk for train.objective=ExpectedSquaredJump, "
+                "got none. Choose filter=neural_mh."
             )
-        _, log_alpha, step = learned[0].propose_step(lesson.model, lesson.after, lesson.draws)
+        _, log_alpha, increment = learned[0].propose_step(step.model, step.after, step.draws)
         acceptance = torch.exp(torch.nan_to_num(log_alpha, -torch.inf, 0.0).clamp(max=0.0))
-        weighted = acceptance * lesson.after.log_w.exp()
-        return -(weighted * step.square().mean(-1)).sum(-1)
+        weighted = acceptance * step.after.log_w.exp()
+        return -(weighted * increment.square().mean(-1)).sum(-1)
 
 
 def find_learned_parts(method: ParticleFilter) -> dict[str, LearnedProposal | LearnedRandomWalk]:
     """Return the trainable parts of a filter, by their name in a checkpoint.
 
     Raises:
-        ValueError: If the filter has no network.
+        ValueError: If the filter does not have a network.
     """
     stages = [
         method.proposal,
         *(move.kernel for move in method.moves if isinstance(move, MetropolisHastings)),
     ]
     parts = {
-        stage.part: stage
+        stage.checkpoint_key: stage
         for stage in stages
         if isinstance(stage, LearnedProposal | LearnedRandomWalk)
     }
@@ -206,10 +209,10 @@ def simulate_from_model(
         and the noise [R, T, W].
 
     Raises:
-        ValueError: a distribution of the model cannot be drawn.
+        ValueError: If a distribution of the model cannot be drawn.
     """
-    law = initial_law(model, len(record.y), record.spread)
-    x = draw_initial_state(model, law, draws.at_step(0), "imagined", start=record.start)
+    initial = initial_law(model, len(record.y), record.spread)
+    x = draw_initial_state(model, initial, draws.at_step(0), "imagined", start=record.start)
     states, noises, rows = [x], [], []
     for step in simulate_steps(model, record, draws, x, "noise"):
         y = draw_values(step.distribution, draws.at_step(step.t + 1), "imagined", 1)[:, 0]

@@ -3,7 +3,7 @@
 The network is any nn.Module that maps features [R, N, F] to a distribution with batch [R, N]
 and event [W]. The ratio p(w) / q(w) is computed here for any network output, so a learned
 proposal does not change the target of the filter. Insufficient training only lowers the
-effective sample size. learned_laws contains networks.
+effective sample size. `networks` contains networks.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Make = Callable[[int, int], nn.Module]
 
 
 class NoiseDistribution(NamedTuple):
-    """Distribution of a step's noise: zeta ~ law, standardised noise xi = m + U zeta.
+    """Distribution of a step's noise: zeta ~ distribution, standardised noise xi = m + U zeta.
 
     Attributes:
         distribution: Distribution of zeta, batch [R, N], event [W].
@@ -58,8 +58,8 @@ class LearnedProposal(nn.Module):
     """Proposal whose network maps features to a noise distribution.
 
     After [Naesseth et al. 2018]. The network output refers to a frame: to the standard deviations
-    of the noise or, with a `guide_filter`, to coordinates in which the guide's normal distribution is
-    N(0, I). A network with output N(0, I) is therefore the bootstrap or the guided proposal, to
+    of the noise or, with a `guide_filter`, to coordinates in which the guide's normal distribution
+    is N(0, I). A network with output N(0, I) is therefore the bootstrap or the guided proposal, to
     the last digit, and training corrects it.
 
     Args:
@@ -67,20 +67,21 @@ class LearnedProposal(nn.Module):
         features: Input features, by default innovation, parent and spread of the particles.
         guide_filter: Guided proposal of each particle's noise that is corrected. None corrects the
             model's noise.
-        defensive_fraction: Fraction of particles drawn from the frame's distribution instead [Hesterberg
-            1995]. It limits each weight to 1 / share times its value there. 0 draws none.
+        defensive_fraction: Fraction of particles drawn from the frame's distribution instead
+            [Hesterberg 1995]. It limits each weight to 1 / fraction times its value there. 0 draws
+            none.
         memory: Hidden size of a recurrent network (GRU) over past records, one state per run. 0
             uses none.
         checkpoint: File of trained weights, or `untrained`. None raises on use.
         seed: Seed of an untrained network.
 
     Raises:
-        ValueError: If `defensive_fraction` is not in [0, 1). On use, if no checkpoint is set, or if it belongs
-            to another model or network.
+        ValueError: If `defensive_fraction` is not in [0, 1). On use, if no checkpoint is set, or if
+            it belongs to another model or network.
     """
 
     is_exact = True
-    part = "proposal"
+    checkpoint_key = "proposal"
 
     def __init__(
         self,
@@ -97,16 +98,14 @@ class LearnedProposal(nn.Module):
         if defensive_fraction == 1.0 or memory < 0:
             raise ValueError(
                 "proposal.defensive_fraction must be below 1 and proposal.memory at least 0, got "
-                f"defensive_fraction={defensive_fraction}, memory={memory}. Use 0 to switch either off."
+                f"defensive_fraction={defensive_fraction}, memory={memory}. Use 0 for neither."
             )
-        self.make, self.guide_filter, self.defensive_fraction, self.hidden = (
-            network,
-            guide_filter,
-            defensive_fraction,
-            memory,
-        )
+        self.make, self.guide_filter = network, guide_filter
+        self.defensive_fraction, self.hidden = defensive_fraction, memory
         self.features_of = FeatureStack() if features is None else FeatureStack(features)
-        self.learnable = CheckpointSpec(self.part, checkpoint, seed, describe_frame(guide_filter))
+        self.learnable = CheckpointSpec(
+            self.checkpoint_key, checkpoint, seed, describe_frame(guide_filter)
+        )
         self.network: nn.Module | None = None
         self.recurrent: nn.Module | None = None
         self.sizes = 0, 0, memory
@@ -118,21 +117,21 @@ class LearnedProposal(nn.Module):
 
         Args:
             model: State-space model.
-            cloud: Belief before the step, which determines the number of features.
-            seen: Record of the step.
+            belief: Belief before the step, which determines the number of features.
+            record: Record of the step.
             fresh: Start from untrained weights.
 
         Raises:
             ValueError: As for the class.
         """
-        features, noise = (
-            self.features_of(make_feature_context(model, belief, record)).shape[-1],
-            model.noise_dim,
-        )
+        features = self.features_of(make_feature_context(model, belief, record)).shape[-1]
+        noise = model.noise_dim
 
         def make() -> dict[str, nn.Module]:
-            parts: dict[str, nn.Module] = {"network": self.make(features + self.hidden, noise)}
-            return parts | ({"recurrent": nn.GRUCell(features, self.hidden)} if self.hidden else {})
+            modules: dict[str, nn.Module] = {"network": self.make(features + self.hidden, noise)}
+            if self.hidden:
+                modules["recurrent"] = nn.GRUCell(features, self.hidden)
+            return modules
 
         self.sizes = features, noise, self.hidden
         for name, module in build_networks(self.learnable, make, self.sizes, model, fresh).items():
@@ -142,23 +141,23 @@ class LearnedProposal(nn.Module):
     def forward(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
-        law, memory = self.compute_distribution(model, belief, record)
+        distribution, memory = self.compute_distribution(model, belief, record)
         # the label of the corrected proposal: an untrained network then gives the same particles
         z = draws.normal(
             "noise" if self.guide_filter is None else "guide", belief.x.shape[1], model.noise_dim
         )
-        zeta = sample_from(law, z, draws)
+        zeta = sample_from(distribution, z, draws)
         if isinstance(model, StaticModel):  # no transition in this step
             return ProposalSample(
                 belief.x, torch.zeros_like(belief.log_w), memory, scale_noise(model, z)
             )
-        log_q = law.log_prob(zeta)
+        log_q = distribution.log_prob(zeta)
         if self.defensive_fraction:
             stay = choose_defensive_particles(
                 self.defensive_fraction, belief.log_w > -torch.inf, draws, "learned.kept"
             )
             zeta = torch.where(stay.mask.unsqueeze(-1), z, zeta)
-            log_q = stay.log_mixture(log_standard_normal(zeta), law.log_prob(zeta))
+            log_q = stay.log_mixture(log_standard_normal(zeta), distribution.log_prob(zeta))
         xi, log_det = from_frame(self.guide_filter, model, belief, record, zeta)
         w = scale_noise(model, xi)
         return ProposalSample(
@@ -175,8 +174,11 @@ class LearnedProposal(nn.Module):
 
         Args:
             model: State-space model.
-            cloud: Belief before the step.
-            seen: Record of the step.
+            belief: Belief before the step.
+            record: Record of the step.
+
+        Returns:
+            The distribution, and the memory of the belief after this step.
         """
         if self.network is None:
             self.build(model, belief, record)
@@ -194,13 +196,13 @@ class LearnedProposal(nn.Module):
     ) -> Tensor:
         """Compute log q(w | parent), the objective of inference compilation.
 
-        The density is the network's own, without the defensive fraction. The parent is appended to
+        The density is that of the network, without the defensive fraction. The parent is appended to
         the particles with weight 0, which gives it the features of a particle.
 
         Args:
             model: State-space model.
-            cloud: Belief before the step.
-            seen: Record of the step.
+            belief: Belief before the step.
+            record: Record of the step.
             parent: Parents, [R, D].
             w: Noises, [R, W].
 

@@ -26,7 +26,7 @@ from pfbench.core.random_stream import RandomStream
 
 
 def sample_from(
-    law: Distribution, z: Tensor, draws: RandomStream, purpose: str = "learned"
+    distribution: Distribution, z: Tensor, draws: RandomStream, purpose: str = "learned"
 ) -> Tensor:
     """Sample a distribution from standard normal numbers.
 
@@ -35,7 +35,7 @@ def sample_from(
     Its gradient is the implicit one, component by component.
 
     Args:
-        law: Distribution with batch [R, N] or [R, 1] and event [W].
+        distribution: Distribution with batch [R, N] or [R, 1] and event [W].
         z: Standard normal numbers, [R, N, W].
         draws: Random stream for further numbers.
         purpose: Label of further numbers.
@@ -49,22 +49,28 @@ def sample_from(
     References:
         M. Figurnov, S. Mohamed and A. Mnih (2018), Implicit reparameterization gradients.
     """
-    base: Any = law.base_dist if isinstance(law, Independent) else law
+    base: Any = distribution.base_dist if isinstance(distribution, Independent) else distribution
     if isinstance(base, Normal):
         return base.loc + base.scale * z
-    if isinstance(law, LowRankMultivariateNormal):
-        factor: Tensor = law.cov_factor
+    if isinstance(distribution, LowRankMultivariateNormal):
+        factor: Tensor = distribution.cov_factor
         more = draws.normal(f"{purpose}.factor", z.shape[1], factor.shape[-1])
-        return law.loc + law.cov_diag.sqrt() * z + (factor @ more.unsqueeze(-1)).squeeze(-1)
-    if isinstance(law, MultivariateNormal):
-        return law.loc + (law.scale_tril @ z.unsqueeze(-1)).squeeze(-1)
+        return (
+            distribution.loc
+            + distribution.cov_diag.sqrt() * z
+            + (factor @ more.unsqueeze(-1)).squeeze(-1)
+        )
+    if isinstance(distribution, MultivariateNormal):
+        return distribution.loc + (distribution.scale_tril @ z.unsqueeze(-1)).squeeze(-1)
     if isinstance(base, TransformedDistribution):
         value = sample_from(base.base_dist, z, draws, purpose)
         for transform in base.transforms:
             value = transform(value)
         return value
-    if isinstance(law, MixtureSameFamily):
-        return _sample_mixture(law, z, draws.uniform(f"{purpose}.which", z.shape[1], 1).to(z))
+    if isinstance(distribution, MixtureSameFamily):
+        return _sample_mixture(
+            distribution, z, draws.uniform(f"{purpose}.which", z.shape[1], 1).to(z)
+        )
     try:
         return base.icdf(torch.special.ndtr(z))
     except NotImplementedError:
@@ -75,9 +81,9 @@ def sample_from(
         ) from None
 
 
-def _sample_mixture(law: MixtureSameFamily, z: Tensor, u: Tensor) -> Tensor:
+def _sample_mixture(distribution: MixtureSameFamily, z: Tensor, u: Tensor) -> Tensor:
     """Sample a mixture of diagonal normals from z [R, N, W] and u [R, N, 1]."""
-    components, categorical = law.component_distribution, law.mixture_distribution
+    components, categorical = distribution.component_distribution, distribution.mixture_distribution
     normal = components.base_dist if isinstance(components, Independent) else None
     if not (isinstance(normal, Normal) and isinstance(categorical, Categorical)):
         raise ValueError(

@@ -45,6 +45,9 @@ def partition_state(model: StateSpaceModel, sampled: Sequence[str] | None) -> St
         model: State-space model.
         sampled: Names of sampled groups or states, or None.
 
+    Returns:
+        The partition.
+
     Raises:
         ValueError: If a name is unknown, or no name is set and nothing is declared linear.
     """
@@ -53,16 +56,16 @@ def partition_state(model: StateSpaceModel, sampled: Sequence[str] | None) -> St
         linear = list(range(d)) if model.linear else sorted(model.linear_given)
         if not linear:
             raise ValueError(
-                "filter.sampled_states must be names for a model with no component that is linear given "
-                f"the rest, got null with {type(model).__name__}. Choose groups of "
+                "filter.sampled_states must be names for a model with no component that is linear "
+                f"given the rest, got null with {type(model).__name__}. Choose groups of "
                 f"{sorted(model.groups)} (filter=sir samples all). The rest is linearised."
             )
         return StatePartition([i for i in range(d) if i not in linear], linear, model.linear)
     unknown = [name for name in sampled if name not in model.groups and name not in model.names]
     if unknown:
         raise ValueError(
-            f"filter.sampled_states must be groups {sorted(model.groups)} or states {list(model.names)} "
-            f"of {type(model).__name__}, got {unknown}. Correct the names."
+            f"filter.sampled_states must be groups {sorted(model.groups)} or states "
+            f"{list(model.names)} of {type(model).__name__}, got {unknown}. Correct the names."
         )
     selected: set[int] = set()
     for name in sampled:
@@ -88,22 +91,22 @@ def predict_with_root(
         Prediction [R, N, D] and root A [R, N or 1, d, m] of the joint normal distribution.
     """
     chart, noise, gain = model.chart, model.noise, model.noise_gain(u)
-    l, w = len(split.linear), 0 if gain is not None else model.noise_dim
+    d, w = len(split.linear), 0 if gain is not None else model.noise_dim
     predicted = model.propagate(x, u, mean_noise(model, x))
 
     def propagate(at: Tensor, xi: Tensor) -> Tensor:
         driven = mean_noise(model, xi)
         if w:
-            driven = driven + noise.stddev * xi[..., l:]
-        start = chart.add(at, embed_components(xi[..., :l], split.linear, chart.dimension))
+            driven = driven + noise.stddev * xi[..., d:]
+        start = chart.add(at, embed_components(xi[..., :d], split.linear, chart.dimension))
         return model.propagate(start, u, driven)
 
     centre = model.origin.expand(len(x), 1, -1) if split.is_common else x
-    slopes = derivative(propagate, centre, l + w, chart.subtract)
+    slopes = derivative(propagate, centre, d + w, chart.subtract)
     if gain is not None:
         scaled_gain = (gain * noise.stddev).unsqueeze(1)
         slopes = torch.cat([slopes, scaled_gain.expand(*slopes.shape[:2], -1, -1)], -1)
-    state_root, noise_root = slopes[..., :l] @ root, slopes[..., l:]
+    state_root, noise_root = slopes[..., :d] @ root, slopes[..., d:]
     return predicted, torch.cat([state_root, noise_root.expand(*state_root.shape[:2], -1, -1)], -1)
 
 
@@ -115,7 +118,7 @@ def linearise_measurement(
     Args:
         model: State-space model.
         x: Particles, [R, N, D].
-        seen: Record of the step.
+        record: Record of the step.
         split: Partition of the state.
 
     Returns:

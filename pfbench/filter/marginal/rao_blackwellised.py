@@ -21,6 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
@@ -44,11 +45,12 @@ from pfbench.model.base import StateSpaceModel, initial_law
 
 
 @dataclass(frozen=True)
-class MarginalWeightUpdate:
+class MarginalWeightUpdate(WeightUpdate):
     """Previous log weights plus log ratio, which contains the measurement density."""
 
     is_exact = True
 
+    @override
     def __call__(
         self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
     ) -> Tensor:
@@ -57,11 +59,11 @@ class MarginalWeightUpdate:
 
 
 @dataclass(frozen=True)
-class MarginalisedProposal:
+class MarginalisedProposal(Proposal):
     """Draw the sampled part and condition the rest on it and on the measurement.
 
     The log ratio is the log density of the measurement given the sampled path, to be used with
-    Given. The states contain sampled values and conditional means. memory["root"] [R, N or 1, l, l]
+    `MarginalWeightUpdate`. The states contain sampled values and conditional means. memory["root"] [R, N or 1, l, l]
     is a root of the conditional covariance.
 
     Attributes:
@@ -71,6 +73,7 @@ class MarginalisedProposal:
     split: StatePartition
     is_exact = True  # if l is linear and normal given s
 
+    @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
@@ -87,9 +90,7 @@ class MarginalisedProposal:
         x = model.chart.add(x, embed_components(shift, self.split.linear, model.chart.dimension))
         observed_count = (~torch.isnan(record.y)).sum(-1, dtype=x.dtype).unsqueeze(-1)
         log_likelihood = log_likelihood - log_sd - 0.5 * LOG_2PI * observed_count
-        valid_mask = (
-            torch.isfinite(root).all(-1).all(-1)
-        )  # otherwise weight 0 and the previous root
+        valid_mask = torch.isfinite(root).all(-1).all(-1)  # else weight 0 and the previous root
         memory = {"root": torch.where(valid_mask[..., None, None], root, before)}
         return ProposalSample(x, torch.where(valid_mask, log_likelihood, -torch.inf), memory)
 
@@ -128,7 +129,10 @@ class RaoBlackwellisedFilter:
 
     @property
     def is_exact(self) -> bool:
-        """Does the cloud target p(x_t | y_1:t) as N grows? Not claimed where components are chosen by name."""
+        """True if the particles target p(x_t | y_1:t) as N grows.
+
+        This is not claimed for components that are selected by name.
+        """
         return is_every_part_exact(resampler=self.resampler) and self.sampled_states is None
 
     def init(
@@ -177,7 +181,7 @@ class RaoBlackwellisedFilter:
         Args:
             model: State-space model.
             belief: Belief at t-1.
-            seen: Record of step t.
+            record: Record of step t.
             draws: Random numbers of step t.
         """
         split = partition_state(model, self.sampled_states)
@@ -192,9 +196,9 @@ class RaoBlackwellisedFilter:
         return cloud, _with_conditional(info, cloud, split) if split.linear else info
 
 
-def _combined(columns: list[Tensor], z: Tensor, like: Tensor) -> Tensor:
+def _combined(columns: list[Tensor], z: Tensor, template: Tensor) -> Tensor:
     """Compute sum_j L_j z_j [R, N, d], zeros without columns."""
-    shift = like.new_zeros(*z.shape[:2], like.shape[-2])
+    shift = template.new_zeros(*z.shape[:2], template.shape[-2])
     for j, column in enumerate(columns):
         shift = shift + column * z[..., j : j + 1]
     return shift
