@@ -40,8 +40,8 @@ def log_density(distribution: Distribution, y: Tensor, observed_mask: Tensor, na
         Log density, [R, N]; 0 where no component is observed.
 
     Raises:
-        TypeError: if the distribution has not one event dimension.
-        ValueError: if a component is missing that cannot be integrated out.
+        TypeError: If the distribution has not one event dimension.
+        ValueError: If a component is missing that cannot be integrated out.
     """
     kind = type(distribution).__name__
     if len(distribution.event_shape) != 1:

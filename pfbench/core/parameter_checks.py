@@ -33,7 +33,7 @@ def check_positive(name: str, values: Any) -> Tensor:
         The numbers.
 
     Raises:
-        ValueError: if a number is not positive or not finite.
+        ValueError: If a number is not positive or not finite.
     """
     tensor = as_float64(values)
     if not bool(((tensor > 0) & torch.isfinite(tensor)).all()):

@@ -171,7 +171,7 @@ class StateSpaceModel(nn.Module, ABC):
             States, [R, T, D]; NaN where the truth of a group is unknown.
 
         Raises:
-            ValueError: if no group of this model has a truth.
+            ValueError: If no group of this model has a truth.
         """
         available = [name for name in self.groups if name in truth]
         if not available:
@@ -212,8 +212,8 @@ class StateSpaceModel(nn.Module, ABC):
             Log likelihood, [R, N].
 
         Raises:
-            TypeError: if the observation distribution has not one event dimension.
-            ValueError: if a missing component cannot be integrated out, or a distribution
+            TypeError: If the observation distribution has not one event dimension.
+            ValueError: If a missing component cannot be integrated out, or a distribution
                 without a mean meets a residual.
         """
         distribution: Any = self.observation(x, u)

@@ -30,7 +30,7 @@ class LinearGaussian(StateSpaceModel):
         observes_initial: Whether the first measurement is of x_0.
 
     Raises:
-        ValueError: if shapes do not fit or a standard deviation is not positive.
+        ValueError: If shapes do not fit or a standard deviation is not positive.
     """
 
     linear = True
@@ -128,7 +128,7 @@ def local_level(
         Model with one state.
 
     Raises:
-        ValueError: if a standard deviation is not positive.
+        ValueError: If a standard deviation is not positive.
 
     References:
         Durbin and Koopman 2012, ch. 2 (Nile data).
@@ -157,7 +157,7 @@ def linear_walk(
         Model with position and velocity.
 
     Raises:
-        ValueError: if an argument is not positive.
+        ValueError: If an argument is not positive.
     """
     check_positive("noise", noise)
     check_positive("step", step)

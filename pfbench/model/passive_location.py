@@ -83,7 +83,9 @@ class PassiveLocation(StateSpaceModel):
         }
         for name, (values, length) in lengths.items():
             if len(values) != length:
-                raise ValueError(f"model.{name} must be {length} numbers, got {list(values)}.")
+                raise ValueError(
+                    f"model.{name} must be {length} numbers, got {list(values)}. Correct the list."
+                )
         if not 0.0 <= acceleration_sd < float("inf"):
             raise ValueError(
                 f"model.acceleration_sd must be 0 or more, got {acceleration_sd}. Give m/s^2."

@@ -70,7 +70,7 @@ class NormalRangeError(PseudorangeError):
         factor: Factor on the standard deviation reported by the receiver.
 
     Raises:
-        ValueError: if the factor is not positive.
+        ValueError: If the factor is not positive.
     """
 
     factor: float = 1.0
@@ -98,7 +98,7 @@ class LosNlosRangeError(PseudorangeError):
         slope: Slope of the logit, per dB-Hz.
 
     Raises:
-        ValueError: if the share is not in (0, 1), sd or tail is not positive, or the slope is not
+        ValueError: If the share is not in (0, 1), sd or tail is not positive, or the slope is not
             finite.
     """
 

@@ -45,7 +45,7 @@ class UnivariateGrowth(StateSpaceModel):
         initial_sd: Standard deviation of x_0 about 0.
 
     Raises:
-        ValueError: if a standard deviation is not positive.
+        ValueError: If a standard deviation is not positive.
     """
 
     q: Tensor
@@ -107,7 +107,7 @@ class StochasticVolatility(StateSpaceModel):
         sigma: Standard deviation of the process noise.
 
     Raises:
-        ValueError: if |rho| is 1 or more, or sigma is not positive.
+        ValueError: If |rho| is 1 or more, or sigma is not positive.
     """
 
     sigma: Tensor
@@ -186,7 +186,7 @@ class Benes(StateSpaceModel):
         measurement_sd: Standard deviation of the measurement noise.
 
     Raises:
-        ValueError: if an argument is not positive.
+        ValueError: If an argument is not positive.
     """
 
     d: Tensor
@@ -225,7 +225,7 @@ class Pendulum(StateSpaceModel):
         initial_sd: Standard deviations of angle and rate about 0, rad and rad/s, [2].
 
     Raises:
-        ValueError: if an argument is not positive.
+        ValueError: If an argument is not positive.
     """
 
     noise_root: Tensor
@@ -293,7 +293,7 @@ class Lorenz63(StateSpaceModel):
         initial_sd: Standard deviation of each state about (1, 1, 25).
 
     Raises:
-        ValueError: if an argument is not positive.
+        ValueError: If an argument is not positive.
     """
 
     q: Tensor

@@ -71,7 +71,7 @@ class UrbanTuning:
         """Root densities in the order of the process noise, SI units, [8].
 
         Raises:
-            ValueError: if a density is not positive.
+            ValueError: If a density is not positive.
         """
         names = [
             "distance",
@@ -90,7 +90,7 @@ class UrbanTuning:
         """Initial standard deviations in the chart, SI units, [9].
 
         Raises:
-            ValueError: if a standard deviation is not positive, or the position does not have three.
+            ValueError: If a standard deviation is not positive, or the position does not have three.
         """
         names = ["clock", "drift", "inter_system", "scale", "yaw_bias"]
         position = check_three_positive(
@@ -129,7 +129,7 @@ class UrbanGnss(StateSpaceModel):
         range_error: Distribution of a pseudorange about its line-of-sight value.
 
     Raises:
-        ValueError: if a density or standard deviation is not positive.
+        ValueError: If a density or standard deviation is not positive.
     """
 
     density: Tensor
@@ -168,7 +168,7 @@ class UrbanGnss(StateSpaceModel):
         """Return the record after a check of its inputs.
 
         Raises:
-            ValueError: if the inputs are not `UrbanInputs`.
+            ValueError: If the inputs are not `UrbanInputs`.
         """
         if not isinstance(record.u, UrbanInputs):
             raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,10 +22,8 @@ from pfbench.nav.trajectory import (
 
 
 @dataclass(frozen=True)
-class CosineRamp:
-    """A change by half a cosine, 1/2 - 1/2 cos(pi u), between two times.
-
-    The rate is continuous and the second derivative is not.
+class _Ramp(ABC):
+    """A smooth change between two times.
 
     Attributes:
         start_s: Start time, s.
@@ -37,10 +36,26 @@ class CosineRamp:
     change: float
 
     def __post_init__(self) -> None:
-        _check_order(self)
+        if not self.end_s > self.start_s:
+            raise ValueError(
+                f"end_s must be later than start_s = {self.start_s}, got {self.end_s}. "
+                "Change one of them."
+            )
 
+    @abstractmethod
     def evaluate(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return value and two time derivatives at times t s."""
+
+
+@dataclass(frozen=True)
+class CosineRamp(_Ramp):
+    """A change by half a cosine, 1/2 - 1/2 cos(pi u), between two times.
+
+    The rate is continuous and the second derivative is not.
+    """
+
+    @override
+    def evaluate(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         k = math.pi / (self.end_s - self.start_s)
         a = k * (t.clamp(self.start_s, self.end_s) - self.start_s)
         inside = ((t > self.start_s) & (t < self.end_s)).to(t)
@@ -53,26 +68,14 @@ class CosineRamp:
 
 
 @dataclass(frozen=True)
-class CycloidRamp:
+class CycloidRamp(_Ramp):
     """A change with a raised-cosine rate, u - sin(2 pi u) / 2 pi, between two times.
 
     Two derivatives are continuous.
-
-    Attributes:
-        start_s: Start time, s.
-        end_s: End time, s.
-        change: In the unit of the changing quantity.
     """
 
-    start_s: float
-    end_s: float
-    change: float
-
-    def __post_init__(self) -> None:
-        _check_order(self)
-
+    @override
     def evaluate(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return value and two time derivatives at times t s."""
         length = self.end_s - self.start_s
         u = (t.clamp(self.start_s, self.end_s) - self.start_s) / length
         turn = 2 * math.pi * u
@@ -101,10 +104,10 @@ class RampTrajectory(TrajectorySource):
 
     start: TrajectoryStart
     duration_s: float
-    speed: Sequence[CosineRamp | CycloidRamp] = ()
-    climb_deg: Sequence[CosineRamp | CycloidRamp] = ()
-    heading_deg: Sequence[CosineRamp | CycloidRamp] = ()
-    climb_rate_changes: Sequence[CosineRamp | CycloidRamp] = ()
+    speed: Sequence[_Ramp] = ()
+    climb_deg: Sequence[_Ramp] = ()
+    heading_deg: Sequence[_Ramp] = ()
+    climb_rate_changes: Sequence[_Ramp] = ()
 
     def __post_init__(self) -> None:
         if self.climb_deg and self.climb_rate_changes:
@@ -151,13 +154,6 @@ class RampTrajectory(TrajectorySource):
         return MotionProfile(along, along1, torch.atan2(up, speed), climb1, *angles)
 
 
-def _check_order(ramp: CosineRamp | CycloidRamp) -> None:
-    if not ramp.end_s > ramp.start_s:
-        raise ValueError(
-            f"end_s must be later than start_s = {ramp.start_s}, got {ramp.end_s}. Change one of them."
-        )
-
-
 def _check_on_samples(ramp: CosineRamp, duration: float, rate: float) -> None:
     for name, time in (("start_s", ramp.start_s), ("end_s", ramp.end_s)):
         samples = time * rate
@@ -169,9 +165,7 @@ def _check_on_samples(ramp: CosineRamp, duration: float, rate: float) -> None:
             )
 
 
-def _total(
-    ramps: Sequence[CosineRamp | CycloidRamp], t: Tensor, start: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def _total(ramps: Sequence[_Ramp], t: Tensor, start: float) -> tuple[Tensor, Tensor, Tensor]:
     """Sum ramps from a start value, with derivatives."""
     value, rate, second = torch.full_like(t, start), torch.zeros_like(t), torch.zeros_like(t)
     for ramp in ramps:

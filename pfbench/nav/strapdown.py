@@ -152,7 +152,7 @@ def _check_samples(n: int, n_dv: int, per_interval: int, per_step: int) -> None:
             "Give one of each per sample."
         )
     if per_step not in (1, 2):
-        raise ValueError(f"samples_per_step must be 1 or 2, got {per_step}.")
+        raise ValueError(f"samples_per_step must be 1 or 2, got {per_step}. Choose one.")
     if per_interval < 1 or per_interval % per_step:
         raise ValueError(
             f"samples_per_interval must be a positive multiple of samples_per_step={per_step}, "

@@ -6,6 +6,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
@@ -50,6 +51,20 @@ class NoiseRegime(Protocol):
         Raises:
             ValueError: If the errors do not have a distribution per step.
         """
+
+
+class LayeredRegime(NoiseRegime):
+    """A regime that changes the errors of another regime, with the process noise of that one.
+
+    Attributes:
+        base_regime: The other regime.
+    """
+
+    base_regime: NoiseRegime
+
+    @override
+    def process_factors(self, time: Tensor) -> Tensor:
+        return self.base_regime.process_factors(time)
 
 
 def process_variance_factors(noise: NoiseRegime, time: Tensor) -> Tensor:

@@ -12,13 +12,13 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.noise import distributions
-from pfbench.noise.base import NoiseRegime, make_no_distribution_error
+from pfbench.noise.base import LayeredRegime, NoiseRegime, make_no_distribution_error
 from pfbench.noise.distributions import ErrorDistribution
 from pfbench.noise.white import NominalNoise
 
 
 @dataclass(frozen=True)
-class GaussMarkovNoise(NoiseRegime):
+class GaussMarkovNoise(LayeredRegime):
     """First-order Gauss-Markov noise in addition to other errors.
 
     Exact at any spacing of the times.
@@ -63,10 +63,6 @@ class GaussMarkovNoise(NoiseRegime):
         ) + self.sd_ratio * channels.sd * torch.stack(x, 1)
 
     @override
-    def process_factors(self, time: Tensor) -> Tensor:
-        return self.base_regime.process_factors(time)
-
-    @override
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
         raise make_no_distribution_error(
             noise="gauss_markov", reason="its errors are correlated in time"
@@ -74,7 +70,7 @@ class GaussMarkovNoise(NoiseRegime):
 
 
 @dataclass(frozen=True)
-class NonLineOfSightNoise(NoiseRegime):
+class NonLineOfSightNoise(LayeredRegime):
     """Reflected signals: measurements with an exponential bias at random times.
 
     The regime acts on ranges, in a scenario without ranges on positions, otherwise on all
@@ -143,10 +139,6 @@ class NonLineOfSightNoise(NoiseRegime):
             bias = torch.where(hidden, torch.where(previous, bias, lag[:, t]), 0.0)
             biases.append(bias)
         return torch.stack(biases, 1)
-
-    @override
-    def process_factors(self, time: Tensor) -> Tensor:
-        return self.base_regime.process_factors(time)
 
     @override
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:

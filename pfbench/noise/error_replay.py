@@ -119,7 +119,8 @@ class ErrorReplay(NoiseRegime):
         missing = sorted(set(columns) - set(table.columns))
         if missing:
             raise ValueError(
-                f"{path} must have the columns {', '.join(columns)}. Missing: {', '.join(missing)}."
+                f"{path} must have the columns {', '.join(columns)}, got none named "
+                f"{', '.join(missing)}. Add or rename columns."
             )
         second = np.rint(table["utc_s"].to_numpy() - table["utc_s"].iloc[0]).astype(int)
         out = np.full((second[-1] + 1, 3), np.nan)

@@ -15,14 +15,14 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
-from pfbench.noise.base import NoiseRegime
+from pfbench.noise.base import LayeredRegime, NoiseRegime
 from pfbench.noise.distributions import ErrorDistribution
 from pfbench.noise.time_windows import Windows, check_windows, window_index
 from pfbench.noise.white import NominalNoise
 
 
 @dataclass(frozen=True)
-class MeasurementOutage(NoiseRegime):
+class MeasurementOutage(LayeredRegime):
     """Missing measurements of all or most sources in some time windows.
 
     Attributes:
@@ -68,10 +68,6 @@ class MeasurementOutage(NoiseRegime):
             :, None
         ] & affected
         return torch.where(missing, torch.nan, self.base_regime.draw_errors(draws, channels, time))
-
-    @override
-    def process_factors(self, time: Tensor) -> Tensor:
-        return self.base_regime.process_factors(time)
 
     @override
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:

@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
-from pfbench.noise.base import NoiseRegime
+from pfbench.noise.base import LayeredRegime, NoiseRegime
 from pfbench.noise.distributions import ErrorDistribution
 from pfbench.noise.time_windows import Windows, check_windows, window_index
 from pfbench.noise.white import NominalNoise
@@ -86,7 +86,7 @@ class VarianceSurge(NoiseRegime):
 
 
 @dataclass(frozen=True)
-class BiasStep(NoiseRegime):
+class BiasStep(LayeredRegime):
     """A constant bias of one or all components from some time on.
 
     Attributes:
@@ -118,10 +118,6 @@ class BiasStep(NoiseRegime):
             self.base_regime.draw_errors(draws, channels, time)
             + self._bias(channels, time) * channels.sd
         )
-
-    @override
-    def process_factors(self, time: Tensor) -> Tensor:
-        return self.base_regime.process_factors(time)
 
     @override
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:

@@ -28,12 +28,12 @@ def check_windows(windows: Windows, span: float | None) -> None:
         if not start < stop:
             raise ValueError(
                 "noise.windows_s must be windows [from, to] in seconds with from < to, "
-                f"got {list(window)}."
+                f"got {list(window)}. Exchange or change its times."
             )
         if start < last:
             raise ValueError(
                 f"noise.windows_s must be in order without overlap, got {list(window)}, which "
-                "starts before the previous window ends."
+                "starts before the previous window ends. Sort or join the windows."
             )
         last = stop
     if span is not None and not 0.0 < span < math.inf:

@@ -34,7 +34,7 @@ def check_divergence_threshold(threshold: float | None) -> None:
         threshold: Position error, m. None if the scenario does not define divergence.
 
     Raises:
-        ValueError: if the threshold is not finite and positive.
+        ValueError: If the threshold is not finite and positive.
     """
     if threshold is not None and not (math.isfinite(threshold) and threshold > 0.0):
         raise ValueError(

@@ -45,7 +45,7 @@ class ClosedLoopIns:
             The pass before its first step.
 
         Raises:
-            ValueError: if the first nine states are not errors of attitude, velocity and position.
+            ValueError: If the first nine states are not errors of attitude, velocity and position.
         """
         if any(groups.get(name) != indices for name, indices in _LAYOUT.items()):
             raise ValueError(

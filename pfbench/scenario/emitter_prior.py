@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.model.passive_location import SPEED_OF_LIGHT, PlatformInputs
 
@@ -44,14 +45,14 @@ class EmitterPrior(Protocol):
 
 
 @dataclass(frozen=True)
-class LinearisedEmitterPrior:
+class LinearisedEmitterPrior(EmitterPrior):
     """Prior as printed: the measured range, with its standard deviation to first order.
 
     `first_fix` contains the equations.
     """
 
+    @override
     def initial_moments(self, first: FirstMeasurement) -> tuple[Tensor, Tensor, str]:
-        """Compute mean, Cholesky factor and note; see `EmitterPrior`."""
         start, spread, clipped = first_fix(*first)
         note = (
             "range of the first measurement clipped to its limits in "

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
@@ -23,11 +24,11 @@ from pfbench.core.simulate import (
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.base import NoiseRegime, process_variance_factors
 from pfbench.noise.white import NominalNoise
-from pfbench.scenario.base import check_divergence_threshold
+from pfbench.scenario.base import Scenario, check_divergence_threshold
 
 
 @dataclass(frozen=True)
-class ModelSimulation:
+class ModelSimulation(Scenario):
     """A scenario that simulates `steps` steps of `model`.
 
     Initial state, driving noise and measurements have the model's own distributions. A noise
@@ -42,7 +43,7 @@ class ModelSimulation:
             the scenario does not define divergence.
 
     Raises:
-        ValueError: if steps is below 1, or the threshold is not positive. `draw` raises it if a
+        ValueError: If steps is below 1, or the threshold is not positive. `draw` raises it if a
             regime changes measurement errors that are not independent normal.
     """
 
@@ -58,17 +59,8 @@ class ModelSimulation:
                 f"scenario.steps must be at least 1, got {self.steps}. Increase scenario.steps."
             )
 
+    @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
-        """Simulate states and measurements.
-
-        Args:
-            noise: Noise regime.
-            runs: Run numbers, [R].
-            seed: Seed; with the run number it fixes all random numbers of a run.
-
-        Returns:
-            Episode with R runs.
-        """
         model, stream = self.model, PhiloxStream(seed, runs)
         time = self.interval_s * torch.arange(1, self.steps + 1, dtype=torch.float64)
         blank = torch.full((len(runs), self.steps, 1), torch.nan, dtype=torch.float64)

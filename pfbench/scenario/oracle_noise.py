@@ -74,7 +74,7 @@ class RecordingRegime:
             The model with oracle noise.
 
         Raises:
-            ValueError: if the scenario drew no errors; see `OracleNoiseModel`.
+            ValueError: If the scenario drew no errors; see `OracleNoiseModel`.
         """
         if self.channels is None:
             raise ValueError(
@@ -115,7 +115,7 @@ class OracleNoiseModel(ModelWrapper):
         time: Times of the steps, s, [T].
 
     Raises:
-        ValueError: if the regime does not define a distribution at each step. Methods raise it for a
+        ValueError: If the regime does not define a distribution at each step. Methods raise it for a
             record of a different length, and for measurement noise that is not normal. A regime that
             is not normal also needs independent components.
     """

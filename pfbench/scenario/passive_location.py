@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.chart import wrap_angle
 from pfbench.core.random_stream import PhiloxStream
@@ -19,14 +20,14 @@ from pfbench.model.passive_location import (
     relative_motion,
 )
 from pfbench.noise.base import NoiseRegime, process_variance_factors
-from pfbench.scenario.base import check_divergence_threshold
+from pfbench.scenario.base import Scenario, check_divergence_threshold
 from pfbench.scenario.emitter_prior import EmitterPrior, FirstMeasurement, LinearisedEmitterPrior
 
 _KINDS = ("angle", "angle", "rate", "rate", "rate")
 
 
 @dataclass(frozen=True)
-class PassiveLocationScenario:
+class PassiveLocationScenario(Scenario):
     """Straight level flight past a manoeuvring emitter on the ground.
 
     The scenario is from Pu and Qin, "Application of quasi Monte Carlo polymerization re-sampling
@@ -66,7 +67,7 @@ class PassiveLocationScenario:
             the scenario does not define divergence.
 
     Raises:
-        ValueError: if an argument has the wrong length or sign, or the aircraft is without horizontal
+        ValueError: If an argument has the wrong length or sign, or the aircraft is without horizontal
             velocity. `draw` raises it if the regime removes the first measurement.
     """
 
@@ -131,20 +132,8 @@ class PassiveLocationScenario:
                 f"scenario.steps must be at least 1, got {self.steps}. Increase scenario.steps."
             )
 
+    @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
-        """Simulate emitter, aircraft and measurements.
-
-        Args:
-            noise: Noise regime.
-            runs: Run numbers, [R].
-            seed: Seed. With the run number it fixes all random numbers of a run.
-
-        Returns:
-            Episode with R runs.
-
-        Raises:
-            ValueError: if the regime removes the first measurement.
-        """
         draws = PhiloxStream(seed, runs)
         time = self.interval_s * torch.arange(self.steps + 1, dtype=torch.float64)
         target, acceleration = self._simulate_emitter(noise, draws, time)

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.model.passive_location import PlatformInputs, predict_bearing, relative_motion
-from pfbench.scenario.emitter_prior import FirstMeasurement
+from pfbench.scenario.emitter_prior import EmitterPrior, FirstMeasurement
 
 # ranges of the coarse search: 20 m apart at 10 km, where the elevation resolves 80 m
 _COARSE_RANGES = 2000
@@ -20,7 +21,7 @@ _LOG_LIKELIHOOD_DROP = 20.0  # below the maximum, at which the search excludes a
 
 
 @dataclass(frozen=True)
-class QuadratureEmitterPrior:
+class QuadratureEmitterPrior(EmitterPrior):
     """Moments of the emitter given the first measurement, by quadrature [ours].
 
     Before the measurement, the horizontal range has a uniform distribution between its limits. The
@@ -44,8 +45,8 @@ class QuadratureEmitterPrior:
     bearings: int = 5
     velocities: int = 5
 
+    @override
     def initial_moments(self, first: FirstMeasurement) -> tuple[Tensor, Tensor, str]:
-        """Compute mean, Cholesky factor and note in batches of runs; see `EmitterPrior`."""
         # a run has many nodes, so that batches limit the memory
         platform = [leaf.expand(len(first.z), *leaf.shape[1:]) for leaf in first.platform]
         batches = zip(*(leaf.split(_RUNS_PER_BATCH) for leaf in (first.z, *platform)), strict=True)

@@ -9,6 +9,7 @@ from functools import cache
 import torch
 from torch import Tensor
 from tqdm import tqdm
+from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record
@@ -16,13 +17,13 @@ from pfbench.nav import attitude, earth, imu_errors, strapdown
 from pfbench.nav.aiding import AidingSensor, AlignmentErrors, FlightSolution, GnssReceiver
 from pfbench.nav.trajectory import TrajectoryData, TrajectorySource
 from pfbench.noise.base import NoiseRegime, process_variance_factors
-from pfbench.scenario.base import check_divergence_threshold
+from pfbench.scenario.base import Scenario, check_divergence_threshold
 from pfbench.scenario.closed_loop import ClosedLoopIns
 from pfbench.scenario.episode_cache import Arrays, load_or_build
 
 
 @dataclass(frozen=True)
-class SimulatedFlight:
+class SimulatedFlight(Scenario):
     """Simulated flight with an INS. Filters estimate the INS errors.
 
     The inertial sensors are simulated at their own rate and processed by the mechanisation. No
@@ -43,7 +44,7 @@ class SimulatedFlight:
             the scenario does not define divergence.
 
     Raises:
-        ValueError: if the interval is not an even number of samples, or `closed_loop` is set with a
+        ValueError: If the interval is not an even number of samples, or `closed_loop` is set with a
             sensor other than a GNSS receiver. `draw` raises it if the flight is not a whole number
             of intervals.
     """
@@ -73,17 +74,8 @@ class SimulatedFlight:
                 f"got true with {type(self.receiver).__name__}. Set scenario.closed_loop=false."
             )
 
+    @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
-        """Simulate INS and measurements.
-
-        Args:
-            noise: Noise regime.
-            runs: Run numbers, [R].
-            seed: Seed. With the run number it fixes all random numbers of a run.
-
-        Returns:
-            Episode with R runs.
-        """
         draws = PhiloxStream(seed, runs)
         flown, truth, track, datasheet = self.fly(noise, runs, seed)
         aiding = self.receiver.measure(flown, draws, process_variance_factors(noise, flown.time))

@@ -155,7 +155,7 @@ class StrapdownTotal(StateSpaceModel):
         if not values:
             raise ValueError(
                 f"truth must contain a group of the model, {sorted(self.groups)}, "
-                f"got {sorted(truth)}."
+                f"got {sorted(truth)}. Choose a scenario that fits the model."
             )
         missing = values[0].new_full((*values[0].shape[:-1], 1), torch.nan)
         blocks = [

@@ -123,13 +123,14 @@ def read_rinex(file: Path) -> pd.DataFrame:
         first = lines[0][:60] if lines else ""
         raise ValueError(
             f"the file {file.name} must be a RINEX 2 or 3 navigation file, "
-            f"got first line {first!r}."
+            f"got first line {first!r}. Choose another file."
         )
     body = next((i + 1 for i, line in enumerate(lines) if "END OF HEADER" in line), len(lines))
     table = pd.DataFrame(list(_records(lines, body, 3 if version[0] == "3" else 2, file.name)))
     if table.empty:
         raise ValueError(
-            f"the file {file.name} must contain ephemerides of GPS or Galileo, got none."
+            f"the file {file.name} must contain ephemerides of GPS or Galileo, got none. "
+            "Choose another file."
         )
     return table
 

@@ -102,10 +102,13 @@ class RangingReceiver(AidingSensor):
     def __post_init__(self) -> None:
         for name, size in (("pseudorange_sd", self.pseudorange_sd), ("rate_sd", self.rate_sd)):
             if not size > 0.0:
-                raise ValueError(f"receiver.{name} must be positive, got {size}.")
+                raise ValueError(
+                    f"receiver.{name} must be positive, got {size}. Set a standard deviation."
+                )
         if not -90.0 <= self.mask_deg <= 90.0:
             raise ValueError(
-                f"receiver.mask_deg must be between -90 and 90 degrees, got {self.mask_deg}."
+                f"receiver.mask_deg must be between -90 and 90 degrees, got {self.mask_deg}. "
+                "Set the smallest elevation."
             )
         names = self.satellites
         if names is not None and (not names or len(set(names)) < len(names)):

@@ -35,7 +35,7 @@ class ReceiverClock:
         for name in (field.name for field in fields(self)):
             if not getattr(self, name) > 0.0:
                 raise ValueError(
-                    f"receiver.clock.{name} must be positive, got {getattr(self, name)}."
+                    f"receiver.clock.{name} must be positive, got {getattr(self, name)}. Change it."
                 )
 
     def noise_gain(self, duration: Tensor) -> Tensor:

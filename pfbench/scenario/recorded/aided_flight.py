@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.model.strapdown.tuning import AidedTuning
 from pfbench.noise.base import NoiseRegime, check_unit_process
 from pfbench.noise.white import NominalNoise
-from pfbench.scenario.base import check_added_sd, check_divergence_threshold
+from pfbench.scenario.base import Scenario, check_added_sd, check_divergence_threshold
 from pfbench.scenario.recorded.assembly import FixReceiver
 from pfbench.scenario.recorded.drive import RecordedDrive
 from pfbench.scenario.recorded.log_tables import Array, find_dataset, parse_numbers, read_table
@@ -36,7 +37,7 @@ class BaroMagSensors:
         magnetic_sd: Standard deviation of added field errors, gauss. 0 adds no errors.
 
     Raises:
-        ValueError: if the hard iron does not have three numbers, or a standard deviation is
+        ValueError: If the hard iron does not have three numbers, or a standard deviation is
             negative.
     """
 
@@ -64,7 +65,7 @@ class BaroMagSensors:
 
 
 @dataclass(frozen=True)
-class RecordedAidedFlight:
+class RecordedAidedFlight(Scenario):
     """Recorded flight with barometer and magnetometer.
 
     Runs differ as in the flight, and in the initial errors of the instrument biases. The pressure
@@ -80,7 +81,7 @@ class RecordedAidedFlight:
             the scenario does not define divergence.
 
     Raises:
-        ValueError: if the threshold is not positive. `draw` raises it for errors of the flight and
+        ValueError: If the threshold is not positive. `draw` raises it for errors of the flight and
             for a missing column.
     """
 
@@ -93,17 +94,8 @@ class RecordedAidedFlight:
     def __post_init__(self) -> None:
         check_divergence_threshold(self.divergence_threshold_m)
 
+    @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
-        """Read the flight and draw the errors of some runs.
-
-        Args:
-            noise: Noise regime.
-            runs: Run numbers, [R].
-            seed: Seed. With the run number it fixes all random numbers of a run.
-
-        Returns:
-            Episode with R runs. Times are those of the log.
-        """
         flight, draws = self.flight, PhiloxStream(seed, runs)
         error_free = FixReceiver(
             flight.receiver.fix_interval_s, [0.0] * 3, flight.receiver.velocity_sd and [0.0] * 3

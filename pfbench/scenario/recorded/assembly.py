@@ -32,7 +32,7 @@ class FixReceiver:
             measured.
 
     Raises:
-        ValueError: if the interval is not positive, or the standard deviations are not three
+        ValueError: If the interval is not positive, or the standard deviations are not three
             numbers of at least 0.
     """
 

@@ -11,12 +11,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
 from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.noise.base import NoiseRegime
-from pfbench.scenario.base import check_divergence_threshold, check_duration
+from pfbench.scenario.base import Scenario, check_divergence_threshold, check_duration
 from pfbench.scenario.recorded.assembly import FixReceiver, assemble
 from pfbench.scenario.recorded.fix_holdout import FixHoldout
 from pfbench.scenario.recorded.log_reader import read_log
@@ -26,8 +27,10 @@ from pfbench.scenario.recorded.time_grid import SAME_TIME, ResampledLog, resampl
 
 
 @dataclass(frozen=True)
-class RecordedDrive:
+class RecordedDrive(Scenario):
     """One recorded log. Runs differ in receiver errors and initial errors.
+
+    Times of an episode are those of the log.
 
     Attributes:
         root: Folder of all data sets (configuration key data.root).
@@ -46,7 +49,7 @@ class RecordedDrive:
             the scenario does not define divergence.
 
     Raises:
-        ValueError: if a step, an interval or the threshold is not positive. `draw` raises it for a
+        ValueError: If a step, an interval or the threshold is not positive. `draw` raises it for a
             missing root or folder, an invalid log, or a run without withheld fixes.
     """
 
@@ -66,17 +69,8 @@ class RecordedDrive:
         check_divergence_threshold(self.divergence_threshold_m)
         check_duration("scenario.filter_step_s", self.filter_step_s)
 
+    @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
-        """Read the log and draw the errors of some runs.
-
-        Args:
-            noise: Noise regime.
-            runs: Run numbers, [R].
-            seed: Seed. With the run number it fixes all random numbers of a run.
-
-        Returns:
-            Episode with R runs. Times are those of the log.
-        """
         return self.over(self.read(), noise, runs, seed)
 
     def read(self) -> ResampledLog:
@@ -111,11 +105,12 @@ class RecordedDrive:
 
 
 @dataclass(frozen=True)
-class RecordedFlights:
+class RecordedFlights(Scenario):
     """Several flights of one data set as one batch.
 
     Run r is flight r modulo the number of flights, each time with new errors. Short flights are
-    extended to the longest one, without motion, measurements and truth.
+    extended to the longest one, without motion, measurements and truth. Times are relative to the
+    start of each flight.
 
     Attributes:
         root: Folder of all data sets (configuration key data.root).
@@ -132,7 +127,7 @@ class RecordedFlights:
             the scenario does not define divergence.
 
     Raises:
-        ValueError: if the step or the threshold is not positive, or no flight is selected. `draw`
+        ValueError: If the step or the threshold is not positive, or no flight is selected. `draw`
             raises it for a missing root or folder, an invalid log, or flights with different fix
             times.
     """
@@ -154,17 +149,8 @@ class RecordedFlights:
         if not self.flights:
             raise ValueError("scenario.flights must not be empty, got []. Select a flight.")
 
+    @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
-        """Read the flights and draw the errors of some runs.
-
-        Args:
-            noise: Noise regime.
-            runs: Run numbers, [R].
-            seed: Seed. With the run number it fixes all random numbers of a run.
-
-        Returns:
-            Episode with R runs. Times are relative to the start of each flight.
-        """
         folder, velocity = (
             find_dataset(self.root, self.folder),
             self.receiver.velocity_sd is not None,

@@ -30,7 +30,7 @@ class FixHoldout:
         shift_between_runs: Whether the pattern depends on the run number.
 
     Raises:
-        ValueError: if a number of fixes is below 1.
+        ValueError: If a number of fixes is below 1.
     """
 
     used_fixes: int = 1
@@ -80,7 +80,7 @@ class FixHoldout:
             The episode without the withheld fixes.
 
         Raises:
-            ValueError: if a run does not have a withheld fix.
+            ValueError: If a run does not have a withheld fix.
         """
         recorded = torch.from_numpy(leg.fixes)
         withheld_mask = self.select(

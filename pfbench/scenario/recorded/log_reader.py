@@ -76,7 +76,7 @@ def read_log(
         The log in right-forward-up and East-North-Up axes.
 
     Raises:
-        ValueError: if a check fails. The message names file, column, row, value and remedy.
+        ValueError: If a check fails. The message names file, column, row, value and remedy.
     """
     names = files or LogFiles()
     select = {"path": path, "imu": imu}

@@ -27,7 +27,7 @@ def find_dataset(root: str | None, folder: str) -> Path:
         The folder.
 
     Raises:
-        ValueError: if data.root is not set, or does not contain the folder.
+        ValueError: If data.root is not set, or does not contain the folder.
     """
     remedy = f"Set the environment variable PFBENCH_DATA or data.root to the folder with {folder}/."
     if root is None:
@@ -76,7 +76,7 @@ def read_table(folder: Path, name: str, select: dict[str, int | None]) -> LogTab
         The selected rows.
 
     Raises:
-        ValueError: if the file does not exist or is ambiguous, a selection is missing or not in the
+        ValueError: If the file does not exist or is ambiguous, a selection is missing or not in the
             file, or the table has fewer than two rows.
     """
     files = [
@@ -147,7 +147,7 @@ def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
         Numbers, [n, k].
 
     Raises:
-        ValueError: if a column is missing, or contains text, NaN or infinity.
+        ValueError: If a column is missing, or contains text, NaN or infinity.
     """
     missing = [column for column in columns if column not in table.rows]
     if missing:
@@ -182,7 +182,7 @@ def read_times(table: LogTable, longest: float) -> Array:
         Increasing times, s, [n].
 
     Raises:
-        ValueError: as `parse_numbers`, `check_increasing` and `check_seconds`.
+        ValueError: As `parse_numbers`, `check_increasing` and `check_seconds`.
     """
     time = parse_numbers(table, ("t",))[:, 0]
     check_increasing(table, time)
@@ -198,7 +198,7 @@ def check_increasing(table: LogTable, time: Array) -> None:
         time: Times, s, [n].
 
     Raises:
-        ValueError: at the first time that is not later than the previous one.
+        ValueError: At the first time that is not later than the previous one.
     """
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
@@ -220,7 +220,7 @@ def check_seconds(table: LogTable, time: Array, longest: float) -> None:
         longest: Longest plausible median interval, s.
 
     Raises:
-        ValueError: if the median interval is longer. The message suggests a unit.
+        ValueError: If the median interval is longer. The message suggests a unit.
     """
     typical = float(np.median(np.diff(time)))
     if typical <= longest:

@@ -78,7 +78,7 @@ def read_sky(
         The measurements.
 
     Raises:
-        ValueError: if a column or the origin is missing, an epoch contains a satellite twice, or
+        ValueError: If a column or the origin is missing, an epoch contains a satellite twice, or
             the times do not match any epoch.
     """
     table = read_table(folder, "pseudorange", {})
@@ -154,7 +154,7 @@ def subtract_nominal_ranges(
         Reduced ranges, m, and rates, m/s, [K, 2 S], and a note for the report.
 
     Raises:
-        ValueError: if the first time does not have a GPS satellite.
+        ValueError: If the first time does not have a GPS satellite.
     """
     reach = np.linalg.norm(gnss_log.satellite_position, axis=-1)
     line = gnss_log.satellite_position / reach[..., None]

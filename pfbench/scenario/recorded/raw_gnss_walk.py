@@ -12,13 +12,19 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.strapdown.tuning import TightTuning
 from pfbench.noise.base import NoiseRegime, check_unit_process
 from pfbench.noise.white import NominalNoise
-from pfbench.scenario.base import check_added_sd, check_divergence_threshold, check_duration
+from pfbench.scenario.base import (
+    Scenario,
+    check_added_sd,
+    check_divergence_threshold,
+    check_duration,
+)
 from pfbench.scenario.recorded.assembly import FixReceiver, assemble, encode_names
 from pfbench.scenario.recorded.log_reader import read_log
 from pfbench.scenario.recorded.log_tables import find_dataset
@@ -44,7 +50,7 @@ class RawGnssReceiver:
         mask_deg: Smallest elevation, degrees.
 
     Raises:
-        ValueError: if the interval is not positive, a standard deviation is negative, or the mask is
+        ValueError: If the interval is not positive, a standard deviation is negative, or the mask is
             outside [-90, 90].
     """
 
@@ -73,7 +79,7 @@ class RawGnssReceiver:
 
 
 @dataclass(frozen=True)
-class RecordedWalk:
+class RecordedWalk(Scenario):
     """One recorded log with raw measurements. Runs differ in initial and added errors.
 
     The nominal receiver clock has the bias and drift of the first recorded epoch at the reference.
@@ -97,7 +103,7 @@ class RecordedWalk:
             the scenario does not define divergence.
 
     Raises:
-        ValueError: if the step or the threshold is not positive. `draw` raises it for a missing root
+        ValueError: If the step or the threshold is not positive. `draw` raises it for a missing root
             or folder, an invalid log, a start without GPS satellites, or a regime that changes the
             process noise.
     """
@@ -117,17 +123,8 @@ class RecordedWalk:
         check_divergence_threshold(self.divergence_threshold_m)
         check_duration("scenario.filter_step_s", self.filter_step_s)
 
+    @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
-        """Read the walk and draw the errors of some runs.
-
-        Args:
-            noise: Noise regime.
-            runs: Run numbers, [R].
-            seed: Seed. With the run number it fixes all random numbers of a run.
-
-        Returns:
-            Episode with R runs. Times are those of the log.
-        """
         leg, gnss_log = self._read()
         draws, fix_mask = PhiloxStream(seed, runs), torch.from_numpy(leg.fix_steps)
         motion = assemble(

@@ -90,7 +90,7 @@ def resample_log(
         The log on filter steps.
 
     Raises:
-        ValueError: if the common time contains fewer than two fixes, required velocities are not
+        ValueError: If the common time contains fewer than two fixes, required velocities are not
             recorded, or the reference has a gap at the start.
     """
     low = max(log.imu.time[0], log.reference.time[0], -np.inf if start is None else start)

@@ -38,7 +38,7 @@ class RecordedTrajectory:
         checksum: Checksum of the table, set by the class.
 
     Raises:
-        ValueError: if root, folder or file is missing, or the end is not after the start.
+        ValueError: If root, folder or file is missing, or the end is not after the start.
             `generate` raises it for an invalid table, and for errors of `MotionSpline`.
     """
 
@@ -101,7 +101,7 @@ def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> Recor
         The recorded motion.
 
     Raises:
-        ValueError: if the table or the origin is invalid.
+        ValueError: If the table or the origin is invalid.
     """
     if len(origin) != 3 or not abs(origin[0]) <= 89.0:
         raise ValueError(

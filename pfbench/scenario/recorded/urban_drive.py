@@ -10,13 +10,19 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.pseudorange_errors import NormalRangeError
 from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning
 from pfbench.noise.base import NoiseRegime, check_unit_process
-from pfbench.scenario.base import check_added_sd, check_divergence_threshold, check_duration
+from pfbench.scenario.base import (
+    Scenario,
+    check_added_sd,
+    check_divergence_threshold,
+    check_duration,
+)
 from pfbench.scenario.recorded.log_tables import find_dataset
 from pfbench.scenario.recorded.urban_log import (
     UrbanLog,
@@ -40,7 +46,7 @@ class PseudorangeReceiver:
         clock_drift: Nominal drift of the receiver clock, m/s. It is subtracted from the ranges.
 
     Raises:
-        ValueError: if the interval is not positive, or range_sd is negative.
+        ValueError: If the interval is not positive, or range_sd is negative.
     """
 
     fix_interval_s: float = 1.0
@@ -53,7 +59,7 @@ class PseudorangeReceiver:
 
 
 @dataclass(frozen=True)
-class UrbanDrive:
+class UrbanDrive(Scenario):
     """One recorded city drive. Runs differ in initial and added errors.
 
     Steps end at the epochs of the odometry. Steps at intervals of `receiver.fix_interval_s` have
@@ -73,7 +79,7 @@ class UrbanDrive:
             the scenario does not define divergence.
 
     Raises:
-        ValueError: if the threshold is not positive. `draw` raises it for a missing root or folder,
+        ValueError: If the threshold is not positive. `draw` raises it for a missing root or folder,
             an invalid table, fewer than two epochs, a start without heading, or a regime that
             changes the process noise.
     """
@@ -89,17 +95,8 @@ class UrbanDrive:
     def __post_init__(self) -> None:
         check_divergence_threshold(self.divergence_threshold_m)
 
+    @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
-        """Read the drive and draw the errors of some runs.
-
-        Args:
-            noise: Noise regime.
-            runs: Run numbers, [R].
-            seed: Seed. With the run number it fixes all random numbers of a run.
-
-        Returns:
-            Episode with R runs. Times are those of the drive.
-        """
         drive = select_stretch(
             read_drive(find_dataset(self.root, self.folder)), self.start_s, self.end_s
         )

@@ -105,7 +105,7 @@ def fit_clock(
         Parameters, [k], and the clock.
 
     Raises:
-        ValueError: if the search does not converge.
+        ValueError: If the search does not converge.
     """
     t, n = data.time.numpy(), max(2, 1 + round(float(np.ptp(data.time.numpy())) / knot))
     knots = np.linspace(t.min(), t.max(), n)
@@ -147,7 +147,7 @@ def estimate_normal(
         The distribution and the clock.
 
     Raises:
-        ValueError: as `fit_clock`.
+        ValueError: As `fit_clock`.
     """
 
     def log_density(e: Tensor, p: Tensor) -> Tensor:
@@ -172,7 +172,7 @@ def estimate_mixture(
         The distribution and the clock.
 
     Raises:
-        ValueError: as `fit_clock`.
+        ValueError: As `fit_clock`.
     """
 
     def log_density(e: Tensor, p: Tensor) -> Tensor:

@@ -64,7 +64,7 @@ def read_drive(folder: Path) -> UrbanLog:
         The drive.
 
     Raises:
-        ValueError: if a table or column is missing, or the tables have different epochs.
+        ValueError: If a table or column is missing, or the tables have different epochs.
     """
     pseudoranges, wheels, truth = (
         read_table(folder, name, {}) for name in ("pseudorange", "odometry", "truth")
@@ -128,7 +128,7 @@ def select_stretch(drive: UrbanLog, start: float | None, end: float | None) -> U
         The selected part of the drive.
 
     Raises:
-        ValueError: if it contains fewer than two epochs.
+        ValueError: If it contains fewer than two epochs.
     """
     low, high = (-np.inf if start is None else start), (np.inf if end is None else end)
     inside = (drive.time >= low) & (drive.time <= high)
