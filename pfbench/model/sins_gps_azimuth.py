@@ -135,7 +135,7 @@ class SinsGpsAzimuth(InsErrorModel):
             return record
         if not isinstance(record.u, InsIntervals):
             raise ValueError(
-                f"record.u must be Intervals of an INS for SinsGpsAzimuth, "
+                f"record.u must be InsIntervals for SinsGpsAzimuth, "
                 f"got {type(record.u).__name__}. Choose a simulated flight."
             )
         u, middle = record.u, error_dynamics.mid_interval(record.u)

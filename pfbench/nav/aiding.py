@@ -132,7 +132,7 @@ class AlignmentErrors:
         attitude_arcmin: East, North, Up, [3].
         velocity: East, North, Up, [3], m/s.
         position: North, East, Up, [3], m.
-        drawn: Whether each run draws its errors. Otherwise every run has exactly one standard
+        randomise: Whether each run draws its errors. Otherwise every run has exactly one standard
             deviation, and the filters assume the same distribution as before.
 
     Raises:

@@ -5,7 +5,7 @@ smoothly). Angles change by the quintic u^3 (10 - 15 u + 6 u^2), so angular rate
 acceleration are continuous and zero at the joints [ours].
 
 Manoeuvres, which are written in YAML, use degrees where an argument name ends in `_deg`. A
-Segment is in SI units and radians.
+`ManoeuvreSegment` is in SI units and radians.
 """
 
 from __future__ import annotations

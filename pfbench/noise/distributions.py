@@ -30,14 +30,14 @@ class ErrorDistribution(NamedTuple):
 
 
 class MixtureDistribution(Distribution):
-    """A mixture: with probability weights[k] the distribution parts[k].
+    """A mixture: with probability weights[k] the distribution components[k].
 
     Torch's mixture requires components of one family. A mixture of univariate distributions is
     univariate. A mixture of Independent ones draws all components of a vector from the same part.
 
     Args:
-        weights: Weight of each part, broadcast against the batch of the parts. 0 omits a part.
-        parts: Univariate or Independent distributions of equal shapes.
+        weights: Weight of each component, broadcast against their batch. 0 omits a component.
+        components: Univariate or Independent distributions of equal shapes.
     """
 
     arg_constraints = {}  # noqa: RUF012
@@ -70,7 +70,7 @@ class MixtureDistribution(Distribution):
         )
 
     def combine_log_densities(self, log_densities: Sequence[Tensor]) -> Tensor:
-        """Combine the log densities of the parts into the log density of the mixture."""
+        """Combine the log densities of the components into the log density of the mixture."""
         weighted = [
             torch.log(w) + log_p for w, log_p in zip(self.weights, log_densities, strict=True)
         ]

@@ -362,9 +362,9 @@ def test_the_range_changes_as_position_and_velocity_say() -> None:
 def test_faulty_settings_and_files_say_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"validity must be positive, got 0"):
         BroadcastConstellation("x", "y", 0.0, validity=0)
-    with pytest.raises(ValueError, match=r"begin must be seconds of GPS time .*, got noon"):
+    with pytest.raises(ValueError, match=r"start_s must be seconds of GPS time .*, got noon"):
         BroadcastConstellation("x", "y", "noon")
-    with pytest.raises(ValueError, match=r"begin must .*without a zone"):
+    with pytest.raises(ValueError, match=r"start_s must .*without a zone"):
         BroadcastConstellation("x", "y", "2016-06-06T12:00:00+01:00")
     with pytest.raises(
         ValueError, match=r"satellites must be a positive multiple of planes=6, got 25"
@@ -379,7 +379,7 @@ def test_faulty_settings_and_files_say_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"without .*b\.16n. Set the environment variable"):
         _ = BroadcastConstellation(str(tmp_path), "b.16n", 0.0).names
     with pytest.raises(
-        ValueError, match=r"begin must be within .*got 2020-01-01.*Give a time near them"
+        ValueError, match=r"start_s must be within .*got 2020-01-01.*Give a time near them"
     ):
         _ = written(tmp_path, begin="2020-01-01").names
     with pytest.raises(ValueError, match=r"must include sqrtA, cic"):

@@ -107,8 +107,8 @@ class ParticleGuideProposal(Proposal):
     ) -> Tensor:
         """Return the covariance of the initial distribution, one per run [R, 1, d, d]."""
         d = model.chart.dimension
-        cost = f"{runs} x N updates of {d} states in every step, N times the cost of Guided"
-        warnings.warn(f"GuidedParticles: {cost}", stacklevel=2)
+        cost = f"{runs} x N updates of {d} states in every step, N times the cost of SharedGuideProposal"
+        warnings.warn(f"ParticleGuideProposal: {cost}", stacklevel=2)
         return self.guide_filter.init(
             model, runs, draws, record.start, record.spread
         ).covariance.unsqueeze(1)

@@ -58,7 +58,7 @@ class StopGradientResampler(Resampler):
         n: Tensor,
         draws: RandomStream,
     ) -> tuple[ParticleBelief, Tensor]:
-        # Resample corrects weights by log w - log a; with a detached this has the gradient of the score
+        # the resampler corrects weights by log w - log a; with a detached this has the gradient of the score
         return self.resampler(model, belief, log_a.detach(), n, draws)
 
 

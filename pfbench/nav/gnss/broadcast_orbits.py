@@ -37,12 +37,12 @@ class BroadcastConstellation(Constellation):
         path: RINEX 2 or 3 navigation file in `root`, or a Parquet file with the RINEX names of the
             parameters as columns, `prn` and optionally `sys` (G or E). Satellites that are marked
             unhealthy are ignored.
-        begin: GPS time of t = 0, in seconds since 1980-01-06 or as an ISO date such as
+        start_s: GPS time of t = 0, in seconds since 1980-01-06 or as an ISO date such as
             2016-06-06T12:00:00.
         validity: Seconds before and after its time of ephemeris for which an ephemeris is used.
 
     Raises:
-        ValueError: If `validity` is not positive or `begin` is not a date. On use, if the file is
+        ValueError: If `validity` is not positive or `start_s` is not a date. On use, if the file is
             missing or faulty, or contains no ephemeris for t = 0.
     """
 
@@ -67,7 +67,7 @@ class BroadcastConstellation(Constellation):
             return (datetime.fromisoformat(str(self.start_s)) - EPOCH).total_seconds()
         except (TypeError, ValueError):
             raise ValueError(
-                f"begin must be seconds of GPS time or an ISO date, got {self.start_s}. "
+                f"start_s must be seconds of GPS time or an ISO date, got {self.start_s}. "
                 "Give a date and GPS time without a zone, like 2016-06-06T12:00:00."
             ) from None
 
@@ -179,7 +179,7 @@ class BroadcastConstellation(Constellation):
         if not (table["toe"].abs() <= self.validity).any():
             first, last = (self.epoch + table["toe"].agg(["min", "max"])).tolist()
             raise ValueError(
-                f"begin must be within {self.validity:.0f} s of the ephemerides in {self.path} "
+                f"start_s must be within {self.validity:.0f} s of the ephemerides in {self.path} "
                 f"(GPS time {first:.0f} to {last:.0f} s), got {self.start_s} "
                 f"(GPS time {self.epoch:.0f} s). Give a time near them."
             )

@@ -28,16 +28,7 @@ class RangingInputs(NamedTuple):
     """Inputs of a tightly coupled filter: INS intervals, and satellites at their ends.
 
     Attributes:
-        dcm: See `strapdown.Intervals`.
-        dcm_end: See `strapdown.Intervals`.
-        pos: See `strapdown.Intervals`.
-        pos_start: See `strapdown.Intervals`.
-        pos_end: See `strapdown.Intervals`.
-        vel: See `strapdown.Intervals`.
-        vel_end: See `strapdown.Intervals`.
-        w_in: See `strapdown.Intervals`.
-        f: See `strapdown.Intervals`.
-        duration: See `strapdown.Intervals`.
+        dcm, dcm_end, pos, pos_start, pos_end, vel, vel_end, w_in, f, duration: See `InsIntervals`.
         satellite: Earth-fixed positions of S satellites, [1, T, S, 3], m. Unknown satellites are
             at the Earth's centre.
         satellite_vel: Velocities, [1, T, S, 3], m/s.

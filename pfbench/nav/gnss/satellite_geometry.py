@@ -1,7 +1,7 @@
 """Lines of sight to satellites, and exact range differences without cancellation.
 
 Ranges are 2e7 m and their errors are metres, so the difference of two ranges loses seven
-digits. `Sight` expands exactly about the INS position instead, which also serves float32.
+digits. `SatelliteGeometry` expands exactly about the INS position, which also suits float32.
 """
 
 from __future__ import annotations

@@ -638,7 +638,7 @@ def test_flattened_weights_are_biased(form: Tempering, surprise: float) -> None:
 # a guide for each particle
 
 
-@pytest.mark.filterwarnings("ignore:GuidedParticles")
+@pytest.mark.filterwarnings("ignore:ParticleGuideProposal")
 @pytest.mark.parametrize("guide", [EKF, CKF], ids=["ekf", "ckf"])
 def test_guided_particles_are_unbiased(guide: GaussianFilter) -> None:
     method = ParticleFilter(
@@ -662,13 +662,13 @@ def exact_growth(y: Tensor) -> Any:
 
 
 def test_a_guide_for_each_particle_is_told_to_be_dear() -> None:
-    with pytest.warns(UserWarning, match="N times the cost of Guided"):
+    with pytest.warns(UserWarning, match="N times the cost of SharedGuideProposal"):
         filter_record(
             ParticleFilter(10, proposal=ParticleGuideProposal(EKF)), WALK, WALK_Y[:1], runs=2
         )
 
 
-@pytest.mark.filterwarnings("ignore:GuidedParticles")
+@pytest.mark.filterwarnings("ignore:ParticleGuideProposal")
 def test_a_singular_transition_is_refused_and_noise_takes_it() -> None:
     model, y, exact = CASES["singular"]()
     with pytest.raises(ValueError, match="Choose GuidedNoise"):
