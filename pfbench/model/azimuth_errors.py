@@ -148,7 +148,7 @@ class ExactErrorEquations(ErrorEquations):
 def compute_level_coupling(alpha: Tensor, w: Tensor, f: Tensor) -> Tensor:
     """Compute G = ((I - M^T) w, (I - M) f) with M to first order in the tilts.
 
-    x and y are the tilts, c and s are the cosine and sine of the azimuth error, and
+    The tilts are x and y. The cosine and sine of the azimuth error are c and s. Then
     M = [[c, -s, y c + x s], [s, c, y s - x c], [-y, x, 1]].
 
     Args:

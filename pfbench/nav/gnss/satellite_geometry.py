@@ -40,9 +40,9 @@ class SatelliteGeometry(NamedTuple):
     def range_differences(self, dp: Tensor, dv: Tensor) -> tuple[Tensor, Tensor]:
         """Compute range and rate at the INS minus their values at the truth.
 
-        The result is exact, without the cancellation of two ranges, and without the clock. With the
-        line e, the distance r and the position D, truth minus INS, the ranges differ by g.
-        g = r s / (1 + sqrt(1 + s)) with s = (2 e.D + |D|^2 / r) / r.
+        The result is exact, without the cancellation of two ranges, and without the clock. The line
+        is e, the distance is r, and D is truth minus INS in position. Then the ranges differ by
+        r s / (1 + sqrt(1 + s)) with s = (2 e.D + |D|^2 / r) / r.
 
         Args:
             dp: Position errors North, East, Up, [R, N, 3], m, INS minus truth, in metres at
