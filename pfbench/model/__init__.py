@@ -68,6 +68,10 @@ __getattr__, __dir__ = lazy_attributes(
             "local_level",
             "linear_walk",
         ),
+        "nonlinear_dynamics": (
+            "Pendulum",
+            "Lorenz63",
+        ),
         "passive_location": (
             "PlatformInputs",
             "PassiveLocation",
@@ -101,8 +105,6 @@ __getattr__, __dir__ = lazy_attributes(
             "UnivariateGrowth",
             "StochasticVolatility",
             "Benes",
-            "Pendulum",
-            "Lorenz63",
         ),
         "urban_gnss": (
             "UrbanTuning",

@@ -1,13 +1,11 @@
-"""Small nonlinear models from the literature, for tests and tutorials.
+"""Scalar nonlinear models from the literature, for tests and tutorials.
 
-Their posteriors can be computed in closed form or on a grid. The models share a module because each
-consists of a few equations.
+Their posteriors can be computed in closed form or on a grid.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -15,7 +13,6 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
-from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
 from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.parameter_checks import as_float64, check_positive
 from pfbench.core.record import Record
@@ -211,135 +208,3 @@ class Benes(StateSpaceModel):
     @override
     def observation(self, x: Tensor, u: Any) -> Distribution:
         return independent_normal(x, self.r)
-
-
-class Pendulum(StateSpaceModel):
-    """Noisy pendulum with measured horizontal deflection [Sarkka 2013, ex. 3.7].
-
-    y = sin(angle) + measurement_sd v. The dynamics use an Euler step.
-
-    Args:
-        step: Time step, s.
-        noise: Root density of the white angular acceleration, rad/s^2/sqrt(Hz).
-        measurement_sd: Standard deviation of the measurement noise.
-        initial_sd: Standard deviations of angle and rate about 0, rad and rad/s, [2].
-
-    Raises:
-        ValueError: If an argument is not positive.
-    """
-
-    noise_root: Tensor
-    r: Tensor
-    p0: Tensor
-
-    def __init__(
-        self,
-        step: float = 0.05,
-        noise: float = 0.1,
-        measurement_sd: float = 0.3,
-        initial_sd: Sequence[float] = (0.5, 0.5),
-    ) -> None:
-        super().__init__()
-        d = float(check_positive("model.step", step))
-        q = check_positive("model.noise", noise) ** 2 * torch.tensor(
-            [[d**3 / 3, d**2 / 2], [d**2 / 2, d]], dtype=torch.float64
-        )
-        self.register_buffer("noise_root", torch.linalg.cholesky(q))
-        self.register_buffer("r", check_positive("model.measurement_sd", [measurement_sd]))
-        self.register_buffer("p0", check_positive("model.initial_sd", list(initial_sd)))
-        self.step, self.noise_dim = d, 2
-        self.names, self.units, self.groups = (
-            ("angle", "rate"),
-            ("rad", "rad/s"),
-            {"angle": (0,), "rate": (1,)},
-        )
-        self.linear_given = self.groups["rate"]
-
-    @property
-    @override
-    def chart(self) -> Chart:
-        return Chart((AngleBlock(1), EuclideanBlock(1)))
-
-    @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0)
-
-    @override
-    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        angle, rate = x[..., :1], x[..., 1:]
-        predicted_mean = torch.cat(
-            [angle + rate * self.step, rate - 9.81 * torch.sin(angle) * self.step], -1
-        )
-        return self.chart.add(predicted_mean, w @ self.noise_root.mT)
-
-    @override
-    def noise_gain(self, u: Any) -> Tensor:
-        return self.noise_root.unsqueeze(0)
-
-    @override
-    def observation(self, x: Tensor, u: Any) -> Distribution:
-        return independent_normal(torch.sin(x[..., :1]), self.r)
-
-
-class Lorenz63(StateSpaceModel):
-    """Lorenz attractor (10, 28, 8/3) with noisy measurements [Lorenz 1963].
-
-    All three states are measured. Each step is one Runge-Kutta step of order 4.
-
-    Args:
-        step: Time step.
-        process_sd: Standard deviation of the process noise of each state.
-        measurement_sd: Standard deviation of the measurement noise of each state.
-        initial_sd: Standard deviation of each state about (1, 1, 25).
-
-    Raises:
-        ValueError: If an argument is not positive.
-    """
-
-    q: Tensor
-    r: Tensor
-    p0: Tensor
-
-    def __init__(
-        self,
-        step: float = 0.02,
-        process_sd: float = 0.1,
-        measurement_sd: float = 1.0,
-        initial_sd: float = 5.0,
-    ) -> None:
-        super().__init__()
-        self.register_buffer("q", check_positive("model.process_sd", [process_sd] * 3))
-        self.register_buffer("r", check_positive("model.measurement_sd", [measurement_sd] * 3))
-        self.register_buffer("p0", check_positive("model.initial_sd", [initial_sd] * 3))
-        self.step, self.noise_dim = float(check_positive("model.step", step)), 3
-        self.names, self.units, self.groups = ("x", "y", "z"), ("",) * 3, {"state": (0, 1, 2)}
-
-    @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0, self.p0.new_tensor([1.0, 1.0, 25.0]))
-
-    def drift(self, x: Tensor) -> Tensor:
-        """Compute the time derivative of states [..., 3]."""
-        a, b, c = x.unbind(-1)
-        return torch.stack([10.0 * (b - a), a * (28.0 - c) - b, a * b - 8.0 / 3.0 * c], -1)
-
-    @override
-    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        h = self.step
-        k1 = self.drift(x)
-        k2 = self.drift(x + 0.5 * h * k1)
-        k3 = self.drift(x + 0.5 * h * k2)
-        k4 = self.drift(x + h * k3)
-        return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4) + self.q * w
-
-    @override
-    def noise_gain(self, u: Any) -> Tensor:
-        return torch.diag(self.q).unsqueeze(0)
-
-    @override
-    def observation(self, x: Tensor, u: Any) -> Distribution:
-        return independent_normal(x, self.r)
-
-    @override
-    def transition(self, x: Tensor, u: Any) -> Distribution:
-        return independent_normal(self.propagate(x, u, torch.zeros_like(x)), self.q)

@@ -28,7 +28,7 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import draw_noise
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.model.textbook import Pendulum
+from pfbench.model.nonlinear_dynamics import Pendulum
 from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import VarianceSurge
 from pfbench.noise.white import NominalNoise, OutlierNoise

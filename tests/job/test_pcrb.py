@@ -27,10 +27,11 @@ from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.model.ins_gnss import InsGnss
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.model.nonlinear_dynamics import Pendulum
 from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
 from pfbench.model.strapdown.total import StrapdownTotal
 from pfbench.model.strapdown.tuning import StrapdownTuning
-from pfbench.model.textbook import Benes, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver, ProcessNoiseInflation
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, turn

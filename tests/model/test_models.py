@@ -25,7 +25,8 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel, StaticModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
+from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
 
 MODELS: dict[str, Callable[[], StateSpaceModel]] = {
     "growth": UnivariateGrowth,

@@ -31,6 +31,7 @@ from pfbench.filter.particle.resampling import EssResampler
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
+from pfbench.model.nonlinear_dynamics import Pendulum
 from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
 from pfbench.model.pseudorange_errors import NormalExponentialMixture
 from pfbench.model.textbook import Pendulum, StochasticVolatility, UnivariateGrowth

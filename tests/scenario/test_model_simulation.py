@@ -13,7 +13,8 @@ from scipy import stats
 
 import pfbench
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Pendulum, StochasticVolatility
+from pfbench.model.nonlinear_dynamics import Pendulum
+from pfbench.model.textbook import StochasticVolatility
 from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import VarianceSurge
 from pfbench.noise.white import NominalNoise, OutlierNoise

@@ -33,7 +33,8 @@ from pfbench.filter.gaussian.linearisation_rules import (
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
+from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
 from pfbench.noise.base import NoiseRegime
 from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
 from pfbench.noise.error_replay import ErrorReplay

@@ -42,7 +42,8 @@ from pfbench.filter.linearisation import compute_additive_gain
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, UnivariateGrowth
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
+from pfbench.model.textbook import Benes, UnivariateGrowth
 from pfbench.noise.white import NominalNoise
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.scenario.model_simulation import ModelSimulation

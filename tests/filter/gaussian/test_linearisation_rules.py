@@ -30,7 +30,7 @@ from pfbench.filter.gaussian.spherical_radial import (
 )
 from pfbench.filter.loop import run_filter
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.textbook import Lorenz63
+from pfbench.model.nonlinear_dynamics import Lorenz63
 
 COUNTS = {
     "ckf3": lambda n: 2 * n,

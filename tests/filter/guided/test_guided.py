@@ -54,7 +54,8 @@ from pfbench.filter.reconstructed.proposal import ReconstructedProposal
 from pfbench.filter.reconstructed.weight_correction import MarginalRatioCorrection
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.model.textbook import Lorenz63, Pendulum, TimeIndexInputs, UnivariateGrowth
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
+from pfbench.model.textbook import TimeIndexInputs, UnivariateGrowth
 from pfbench.testing import check_evidence, filter_record, reference_moments
 
 EKF, UKF, CKF = (

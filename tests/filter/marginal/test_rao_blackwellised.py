@@ -42,8 +42,9 @@ from pfbench.model.azimuth_errors import ExactErrorEquations as ExactForm
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.ins_gnss import InsGnss
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
 from pfbench.model.sins_gps_azimuth import SinsGpsAzimuth, TrapezoidDiscretisation
-from pfbench.model.textbook import Lorenz63, Pendulum, UnivariateGrowth
+from pfbench.model.textbook import UnivariateGrowth
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, turn

@@ -52,7 +52,8 @@ from pfbench.filter.particle.resampling import EssResampler
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
+from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
 from pfbench.noise.white import NominalNoise
 from pfbench.testing import (
     PathPosterior,

@@ -46,7 +46,8 @@ from pfbench.filter.particle.weight_update import BayesWeightUpdate, FlooredWeig
 from pfbench.kernels import compilation, cpp
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
+from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
 from pfbench.noise.white import NominalNoise
 from pfbench.scenario.model_simulation import ModelSimulation
 from pfbench.testing import check_convergence, check_evidence, filter_record, reference_moments

@@ -43,8 +43,9 @@ from pfbench.filter.whitening import whiten
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
 from pfbench.model.passive_location import PassiveLocation
-from pfbench.model.textbook import Lorenz63, Pendulum, UnivariateGrowth
+from pfbench.model.textbook import UnivariateGrowth
 from pfbench.noise.white import NominalNoise
 
 N = 400

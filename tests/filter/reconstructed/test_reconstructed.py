@@ -37,8 +37,9 @@ from pfbench.filter.reconstructed.weight_correction import (
 from pfbench.model.azimuth_errors import PrintedErrorEquations
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
 from pfbench.model.sins_gps_azimuth import SinsGpsAzimuth, TrapezoidDiscretisation
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.testing import check_evidence, filter_record, reference_moments

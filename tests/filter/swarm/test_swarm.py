@@ -54,7 +54,8 @@ from pfbench.filter.swarm.swarm_weighting import (
 from pfbench.filter.swarm.velocity_update import GaussianVelocity, InertiaVelocity, SwarmState
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
+from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
 from pfbench.noise.white import NominalNoise
 
 ALWAYS = EssResampler(Systematic(), 1.0)
