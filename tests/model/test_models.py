@@ -191,7 +191,7 @@ def white_acceleration(step: float, density: float) -> np.ndarray:
 
 def test_white_acceleration_is_integrated_exactly() -> None:
     expected = white_acceleration(0.7, 0.3)
-    for factor in (linear_walk(0.7, 0.3, 1.0).g, Pendulum(0.7, 0.3).l):
+    for factor in (linear_walk(0.7, 0.3, 1.0).g, Pendulum(0.7, 0.3).noise_root):
         assert np.allclose((factor @ factor.mT).numpy(), expected, rtol=1e-12)
 
 

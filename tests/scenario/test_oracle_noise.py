@@ -486,7 +486,7 @@ def test_told_in_single_precision() -> None:
         (
             NonLineOfSightNoise(mean_dwell_s=9.0),
             THREE,
-            r"oracle_noise must be false for noise=nlos.* \(its biases persist\)",
+            r"oracle_noise must be false for noise=nlos.* because its biases persist",
         ),
         (NonLineOfSightNoise(base_regime=StudentTNoise(4)), THREE, "are not nominal"),
         (NonLineOfSightNoise(base_regime=SURGE), THREE, "are not nominal"),
