@@ -38,7 +38,7 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.resampling import EssResampler
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.run_batches import choose_run_batch
-from pfbench.kernels import compilation, cpp
+from pfbench.kernels import compilation, process_memory
 from pfbench.model.base import StateSpaceModel
 
 HERE = Path(__file__).parent

@@ -14,7 +14,8 @@ __getattr__, __dir__ = lazy_attributes(
             "EnsembleKalmanFilter",
         ),
         "gaussian.gain_adaptation": ("AdaptiveFactorGain", "BoundedRatioGain"),
-        "gaussian.gaussian_filter": ("NoiseAdaptation", "GainAdaptation", "GaussianFilter"),
+        "gaussian.gaussian_filter": ("GaussianFilter",),
+        "gaussian.innovation": ("NoiseAdaptation", "GainAdaptation"),
         "gaussian.linearisation_rules": (
             "LinearisationRule",
             "TaylorLinearisation",

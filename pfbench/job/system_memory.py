@@ -97,7 +97,7 @@ class AllocationCounter(TorchDispatchMode):
 class MemoryTrimmer:
     """Callable that returns large amounts of freed memory to the system.
 
-    `cpp.keep_freed_memory` makes the C library keep freed memory. Small objects then lie between
+    `keep_freed_memory` makes the C library keep freed memory. Small objects then lie between
     holes that are too small for the tensors of the next step. A job with 60 MB of live tensors grew
     to 850 MB within a hundred steps [measured]. A release takes milliseconds, so it happens only if
     the resident memory is 50 % and 256 MiB above the first step after the last release. A query

@@ -28,7 +28,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.particle_moments import compute_nis
-from pfbench.model.base import StateSpaceModel, StaticModel, normal_batch
+from pfbench.model.base import StateSpaceModel, StaticModel
 from pfbench.noise.white import NominalNoise
 from pfbench.scenario.model_simulation import ModelSimulation
 

@@ -235,7 +235,7 @@ def test_moving(
         .to(dtype)
         .permute(1, 2, 0)
     )
-    wanted = base._dense_affine(
+    wanted = affine_map._dense_affine(
         phi, belief._select_components(first, ancestors).permute(1, 2, 0), gain, noise
     )
     torch.testing.assert_close(

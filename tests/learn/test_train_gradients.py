@@ -28,7 +28,7 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.resampling import EssResampler, Resampler
 from pfbench.filter.particle.resampling_schemes import Multinomial, Systematic
-from pfbench.model.base import StateSpaceModel, independent_normal, normal_batch
+from pfbench.model.base import StateSpaceModel
 from pfbench.testing import check_evidence, filter_record
 
 Y = torch.tensor([[0.8], [1.9], [-0.4], [2.5], [1.0], [-1.5]], dtype=torch.float64)

@@ -34,8 +34,7 @@ from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_lev
 from pfbench.model.nonlinear_dynamics import Pendulum
 from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
 from pfbench.model.pseudorange_errors import NormalExponentialMixture
-from pfbench.model.textbook import Pendulum, StochasticVolatility, UnivariateGrowth
-from pfbench.model.urban_gnss import NormalExponentialMixture
+from pfbench.model.textbook import StochasticVolatility, UnivariateGrowth
 from pfbench.ppl.correlated_numbers import CorrelatedStream, SortedResampler
 from pfbench.ppl.ibis_smc2 import smc2
 from pfbench.ppl.marginal_likelihood import FilterLikelihood, GaussianHmmLikelihood

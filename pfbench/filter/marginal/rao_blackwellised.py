@@ -36,9 +36,10 @@ from pfbench.filter.marginal.conditional_linearisation import (
     predict_with_root,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
+from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
 from pfbench.filter.particle.resampling import EssResampler, Resampler
 from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.weight_update import WeightUpdate
 from pfbench.filter.square_root_update import condition_on, kalman_update_root
 from pfbench.filter.whitening import LOG_2PI
 from pfbench.model.base import StateSpaceModel, initial_law

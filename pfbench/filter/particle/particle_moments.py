@@ -13,7 +13,7 @@ from pfbench.core.covariance import shared_distribution_covariance, squared_leng
 from pfbench.core.density import has_finite_moments
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo, normalise_log_weights
-from pfbench.filter.gaussian.gaussian_filter import around_first
+from pfbench.filter.gaussian.linearisation_rules import around_first
 from pfbench.filter.linearisation import mask_covariance
 from pfbench.filter.particle.weight_update import has_long_rows
 from pfbench.kernels import cpp
