@@ -70,9 +70,8 @@ from pfbench.report.plots.plotting import (
     render_palette_png,
 )
 from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
-from pfbench.scenario.recorded.drive import find_dataset
-from pfbench.scenario.recorded.urban_drive import UrbanDrive, read_drive
-from pfbench.scenario.recorded.urban_drive import select_stretch as cut
+from pfbench.scenario.recorded.log_tables import find_dataset
+from pfbench.scenario.recorded.urban_drive import UrbanDrive
 from pfbench.scenario.recorded.urban_error_fit import (
     estimate_mixture,
     estimate_normal,

@@ -150,7 +150,9 @@ def test_random_numbers_are_used_once(name: str) -> None:
     draws, record = CountingStream(1, torch.arange(4)), Record(Y.expand(4, -1, -1))
     with torch.no_grad():
         run_filter(method_of(name), tracker(), record, draws)
-    if name == "rbpf":  # draws the sampled components instead of the whole state, by the same numbers
+    if (
+        name == "rbpf"
+    ):  # draws the sampled components instead of the whole state, by the same numbers
         assert draws.counts.pop((0, "initial")) == 2
     assert {key: n for key, n in draws.counts.items() if n > 1} == {}
 
