@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 import tomllib
@@ -191,24 +192,23 @@ def statements(function: ast.FunctionDef) -> int:
     return len(body) - 1 - (ast.get_docstring(function) is not None)
 
 
-# Today's counts of files over 250 lines and of functions over 25 statements. They may only fall.
-LIMITS = {"files": 45, "functions": 17}
-
-
 def test_files_and_functions_are_short() -> None:
-    files = {
-        module_name(f): n for f in FILES if (n := len(f.read_text().splitlines())) > LONGEST_FILE
-    }
+    """A file of more than 250 lines says in its docstring why it is long; none has more than 350."""
+    lines = {file: len(file.read_text().splitlines()) for file in FILES}
+    assert [module_name(f) for f, n in lines.items() if n > LONGEST_FILE + 100] == []
+    unexplained = [
+        module_name(f)
+        for f, n in lines.items()
+        if n > LONGEST_FILE and not re.search(r"\blong\b", ast.get_docstring(tree_of(f)) or "")
+    ]
+    assert unexplained == []
     functions = {
         f"{module_name(file)}.{node.name}": n
         for file in FILES
         for node in ast.walk(tree_of(file))
         if isinstance(node, ast.FunctionDef) and (n := statements(node)) > LONGEST_FUNCTION
     }
-    assert len(files) <= LIMITS["files"], sorted(files.items(), key=lambda item: -item[1])
-    assert len(functions) <= LIMITS["functions"], sorted(
-        functions.items(), key=lambda item: -item[1]
-    )
+    assert functions == {}
 
 
 def test_the_doors_list_what_they_export() -> None:
@@ -262,3 +262,28 @@ def test_tests_do_not_import_tests() -> None:
     for file in (ROOT / "tests").rglob("*.py"):
         tests = [name for name in imported_at_import(file) if name.startswith("test_")]
         assert not tests, f"{file.name} imports {tests}: move the shared code to a helper module"
+
+
+def missing_imports(source: str) -> list[str]:
+    """Return the names of pfbench that a script imports and that do not exist."""
+    missing = []
+    for name in imported(ast.parse(source), ()):
+        module, _, attribute = name.rpartition(".")
+        if name.split(".")[0] != "pfbench" or not module:
+            continue
+        if not hasattr(importlib.import_module(module), attribute):
+            try:
+                importlib.import_module(name)
+            except ImportError:
+                missing.append(name)
+    return missing
+
+
+def test_scripts_import_names_that_exist() -> None:
+    """Scripts outside the package run by hand, so a moved name would be found late."""
+    files = [
+        f for folder in ("docs", "experiments", "benchmarks") for f in (ROOT / folder).rglob("*.py")
+    ]
+    assert len(files) > 20
+    assert {str(f.name): names for f in files if (names := missing_imports(f.read_text()))} == {}
+    assert missing_imports("from pfbench.filter import Chaos") == ["pfbench.filter.Chaos"]

@@ -1,4 +1,4 @@
-"""Figure 1 of Tian et al. and their chaotic map, drawn from our code: `python docs/methods/escape_factor.py`."""
+"""Figure 1 of Tian et al. and their chaotic map, computed by pfbench: `python docs/methods/escape_factor.py`."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from pfbench.filter.flock import Inertia
 
-from pfbench.filter import chaos
+from pfbench.filter import InertiaVelocity
+from pfbench.filter.swarm import chaotic_sequences
 
 MOST = 150  # iterations, as in their figure
 BLUE, ORANGE = "#0072B2", "#D55E00"
 
 
 def main() -> None:
-    """The escape factor over the iterations, two chaotic sequences, and the law of many."""
-    figure, (factor, orbit, law) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
+    """The escape factor over the iterations, two chaotic sequences, and the distribution of many."""
+    figure, (factor, orbit, histogram) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
     k = np.arange(MOST + 1)
-    meant = [Inertia(escape=0.12).escape_factor(i / MOST) for i in k]
+    intended = [InertiaVelocity(escape_coefficient=0.12).compute_escape_factor(i / MOST) for i in k]
     factor.plot(
         k,
         0.12 - 0.12 * np.cos(k * np.pi) / MOST,
@@ -30,14 +30,14 @@ def main() -> None:
         ls="--",
         label="as printed [eq. 35]",
     )
-    factor.plot(k, meant, color=BLUE, label="as meant, and as their figure rises")
+    factor.plot(k, intended, color=BLUE, label="as intended: rises as in their figure")
     factor.set(title="escape factor c3 = c4", xlabel="iteration", ylabel="c3", ylim=(0, 0.26))
     factor.legend(fontsize=8, loc="upper left")
 
     z = torch.tensor([0.3, 0.3 + 1e-6], dtype=torch.float64)
     sequence = [z]
     for _ in range(40):
-        sequence.append(chaos.logistic(sequence[-1], z))
+        sequence.append(chaotic_sequences.logistic_map(sequence[-1], z))
     both = torch.stack(sequence)
     orbit.plot(both[:, 0], color=BLUE, marker="o", ms=3, label="from 0.3")
     orbit.plot(both[:, 1], color=ORANGE, ls="--", marker="s", ms=3, label="from 0.3 + 1e-6")
@@ -45,14 +45,18 @@ def main() -> None:
     orbit.legend(fontsize=8, loc="lower left")
 
     generator = torch.Generator().manual_seed(1)
-    values = chaos.settled(torch.rand(200_000, dtype=torch.float64, generator=generator))
-    law.hist(
+    values = chaotic_sequences.iterate_logistic(
+        torch.rand(200_000, dtype=torch.float64, generator=generator)
+    )
+    histogram.hist(
         values.numpy(), bins=50, range=(0, 1), density=True, color="0.75", label="200 000 sequences"
     )
     at = np.linspace(0.004, 0.996, 400)
-    law.plot(at, 1 / (np.pi * np.sqrt(at * (1 - at))), color=BLUE, label="arcsine law")
-    law.set(title="their law after 50 iterations", xlabel="z", ylabel="density")
-    law.legend(fontsize=8, loc="upper center")
+    histogram.plot(
+        at, 1 / (np.pi * np.sqrt(at * (1 - at))), color=BLUE, label="arcsine distribution"
+    )
+    histogram.set(title="distribution after 50 iterations", xlabel="z", ylabel="density")
+    histogram.legend(fontsize=8, loc="upper center")
     figure.savefig(Path(__file__).with_name("escape_factor.png"), dpi=80)
 
 

@@ -40,7 +40,7 @@ class ClaimTestResult:
     Attributes:
         comparison: Test.
         outcome: "holds", "fails" or "open".
-        why: Reason of an open outcome, or what contradicts a claim that fails; may be empty.
+        reason: Reason of an open outcome, or what contradicts a claim that fails; may be empty.
         pairs: Runs included; 0 if nothing ran.
         lost_a: Lost runs of a.
         lost_b: Lost runs of b.
@@ -53,14 +53,14 @@ class ClaimTestResult:
         family: Number of these tests.
         within: Distance of the median from the border inside the claimed region, in SD over valid
             runs. Negative outside, NaN if lost runs decide the median.
-        beyond: Distance of the median outside the region of sufficient effects, in the same unit.
+        outside: Distance of the median outside the region of sufficient effects, in the same unit.
         needed: Runs per condition that decide the measured effect with power 0.8, if the runs were
             too few. Infinite if no number does, else NaN.
     """
 
     comparison: ClaimTest
     outcome: str
-    why: str = ""
+    reason: str = ""
     pairs: int = 0
     lost_a: int = 0
     lost_b: int = 0
@@ -72,7 +72,7 @@ class ClaimTestResult:
     p_holm: float = np.nan
     family: int = 0
     within: float = np.nan
-    beyond: float = np.nan
+    outside: float = np.nan
     needed: float = np.nan
 
 
@@ -105,7 +105,7 @@ def run_claim_test(
     counts_lost |= test.statistic == "below"
     finite = len(values) if counts_lost else int(np.isfinite(values).any(axis=1).sum())
     if finite < (runs + 1) // 2:
-        return replace(result, why=LOST if lost_a + lost_b else NOT_RUN)
+        return replace(result, reason=LOST if lost_a + lost_b else NOT_RUN)
     if test.statistic == "cost":
         return _test_cost(result, values)
     if test.statistic == "share":
@@ -124,7 +124,7 @@ def check_effect_size(result: ClaimTestResult) -> ClaimTestResult:
     if 1 / EFFECT_FACTOR <= share <= EFFECT_FACTOR:
         return result
     reason = f"the direction holds, the effect is {share:.2g} of the printed effect"
-    return replace(result, outcome=FAILS, why=reason)
+    return replace(result, outcome=FAILS, reason=reason)
 
 
 def _test_median(result: ClaimTestResult, s: ClaimSample, alpha: float) -> ClaimTestResult:
@@ -140,14 +140,16 @@ def _test_median(result: ClaimTestResult, s: ClaimSample, alpha: float) -> Claim
     if result.comparison.statistic == "report":
         return result
     inside, outside = _measure_depth(s)
-    result = replace(result, within=inside, beyond=outside, p=region_p_value(s))
+    result = replace(result, within=inside, outside=outside, p=region_p_value(s))
     is_above = low >= s.high - s.worth if s.worth else low > s.high
     is_below = high <= s.low + s.worth if s.worth else high < s.low
-    return replace(result, outcome=FAILS) if is_above or is_below else replace(result, why=NO_POWER)
+    return (
+        replace(result, outcome=FAILS) if is_above or is_below else replace(result, reason=NO_POWER)
+    )
 
 
 def _measure_depth(s: ClaimSample) -> tuple[float, float]:
-    """Compute `within` and `beyond` of a result."""
+    """Compute `within` and `outside` of a result."""
     valid, median = s.d[np.abs(s.d) <= s.largest], float(np.median(s.d))
     if valid.size < 2 or abs(median) > s.largest:
         return np.nan, np.nan
@@ -171,7 +173,7 @@ def _test_share(result: ClaimTestResult, hits: Array, alpha: float) -> ClaimTest
         p=float(p),
     )
     is_below = interval.high <= limit
-    return replace(result, outcome=FAILS) if is_below else replace(result, why=NO_POWER)
+    return replace(result, outcome=FAILS) if is_below else replace(result, reason=NO_POWER)
 
 
 def _test_cost(result: ClaimTestResult, seconds: Array) -> ClaimTestResult:
@@ -185,7 +187,7 @@ def _test_cost(result: ClaimTestResult, seconds: Array) -> ClaimTestResult:
     if test.low * _TIMING_FACTOR <= ratio <= test.high / _TIMING_FACTOR:
         return replace(result, outcome=HOLDS)
     is_outside = ratio < test.low / _TIMING_FACTOR or ratio > test.high * _TIMING_FACTOR
-    return replace(result, outcome=FAILS) if is_outside else replace(result, why=NO_POWER)
+    return replace(result, outcome=FAILS) if is_outside else replace(result, reason=NO_POWER)
 
 
 def _display(value: float, s: ClaimSample) -> float:

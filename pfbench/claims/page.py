@@ -132,7 +132,7 @@ def rows_by_paper(
 def format_result(result: ClaimTestResult) -> str:
     """Format the measured value with its interval, and the printed value."""
     if np.isnan(result.effect):
-        return result.why
+        return result.reason
     unit = f" {result.unit}" if result.unit else ""
     number, printed = table_formats.format_number, result.comparison.printed
     has_interval = not (np.isinf(result.low) and np.isinf(result.high))

@@ -119,12 +119,12 @@ def _correct_by_paper(
 def _decide_corrected(result: ClaimTestResult, alpha: float) -> ClaimTestResult:
     """Decide a test by its corrected p-value."""
     if result.p_holm > alpha:
-        needed = _required_runs(result, alpha) if result.why == NO_POWER else result.needed
+        needed = _required_runs(result, alpha) if result.reason == NO_POWER else result.needed
         return replace(result, needed=needed)
     if result.outcome == FAILS:
         default = "the direction holds, the effect is below the claimed effect"
-        return replace(result, why=result.why or default)
-    return check_effect_size(replace(result, outcome=HOLDS, why=""))
+        return replace(result, reason=result.reason or default)
+    return check_effect_size(replace(result, outcome=HOLDS, reason=""))
 
 
 def _required_runs(result: ClaimTestResult, alpha: float) -> float:
@@ -141,8 +141,8 @@ def _required_runs(result: ClaimTestResult, alpha: float) -> float:
     runs = []
     if result.within > 0:  # one-sided: the two-sided test at twice the level
         runs.append(power.required_runs(result.within, min(1.0, 2 * level), target))
-    if result.beyond > 0:
-        runs.append(power.required_runs(result.beyond, alpha, efficiency=_MEDIAN_EFFICIENCY))
+    if result.outside > 0:
+        runs.append(power.required_runs(result.outside, alpha, efficiency=_MEDIAN_EFFICIENCY))
     return min(runs, default=np.inf)
 
 
@@ -206,8 +206,8 @@ def _timings(results: Mapping[str, _Results]) -> list[str]:
 
 def _combine(results: Sequence[ClaimTestResult]) -> tuple[str, str]:
     """Combine tests of one form: all must hold, and one failure decides."""
-    reasons = [r.why for r in results if r.outcome == FAILS]
+    reasons = [r.reason for r in results if r.outcome == FAILS]
     if reasons:
         return FAILS, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
-    reasons = [r.why for r in results if r.outcome == OPEN]
+    reasons = [r.reason for r in results if r.outcome == OPEN]
     return (OPEN, reasons[0]) if reasons else (HOLDS, "")

@@ -1,6 +1,6 @@
 """State-space models: propagation driven by noise, and a distribution of the measurement.
 
-The wrappers belong to this module because the first step of every model may be a `StaticModel`.
+The file is long, since the wrappers are part of it: the first step of a model may be a `StaticModel`.
 """
 
 from __future__ import annotations

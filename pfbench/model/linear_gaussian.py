@@ -41,7 +41,7 @@ class LinearGaussian(StateSpaceModel):
     m0: Tensor
     l0: Tensor
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the eight matrices of a linear model
         self,
         transition_matrix: Any,
         noise_factor: Any,

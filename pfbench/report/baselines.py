@@ -38,7 +38,7 @@ class BaselineComparison:
         baseline: Label of the baseline.
         cells: Names of the conditions that have both, `scenario / noise / model`.
         ratios: Ratio of the median errors by condition, below 1 if the method is better, 0 or infinite if lost runs decide.
-        shown: Decision within each cell: the method, the baseline or "inconclusive".
+        decisions: Decision within each cell: the method, the baseline or "inconclusive".
         ratio: Median of the ratios.
         effect: Rank-biserial correlation over conditions, positive if the method is better.
         p: p-value of Wilcoxon's test.
@@ -52,7 +52,7 @@ class BaselineComparison:
     baseline: str
     cells: tuple[str, ...]
     ratios: tuple[float, ...]
-    shown: tuple[str, ...]
+    decisions: tuple[str, ...]
     ratio: float
     effect: float
     p: float
@@ -83,12 +83,12 @@ class BaselineComparison:
     @property
     def better(self) -> int:
         """Number of conditions in which the method is better."""
-        return self.shown.count(self.method)
+        return self.decisions.count(self.method)
 
     @property
     def worse(self) -> int:
         """Number of conditions in which the method is worse."""
-        return self.shown.count(self.baseline)
+        return self.decisions.count(self.baseline)
 
 
 def compare_with_baselines(

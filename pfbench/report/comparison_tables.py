@@ -56,7 +56,9 @@ def effect_table(verdicts: Sequence[PairwiseTest]) -> pd.DataFrame:
                 f"adjusted equivalence p (±{100 * v.margin:g} %, {v.family} tests)": v.p_equivalent,
                 "equivalent": v.equivalent,
                 "SD of log RMSE ratio [%]": 100 * v.scatter,
-                f"runs required for ±{100 * v.wanted:g} % (power 0.8)": _format_count(v.needed),
+                f"runs required for ±{100 * v.target_effect:g} % (power 0.8)": _format_count(
+                    v.needed
+                ),
                 "smallest detectable change [%]": 100 * v.detectable,
             }
             for v in verdicts

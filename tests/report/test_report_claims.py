@@ -464,7 +464,7 @@ def test_what_lacks_power_says_the_runs_that_it_takes() -> None:
         values = normal(middle, 0.5, 20)
         rows = frame([LESS, other], **values, n=np.exp(np.linspace(-1, 1.1, 20)))
         found = verdicts.decide_claims([claim(LESS, other)], rows)[0].findings[""][0]
-        assert (found.outcome, found.why, found.family) == ("open", "too few runs", 2)
+        assert (found.outcome, found.reason, found.family) == ("open", "too few runs", 2)
         for_it = power.required_runs(-middle / 0.5, 2 * 0.05 / 2) if middle < 0 else np.inf
         beyond = middle + np.log(1.1)  # worth the name is a tenth
         against_it = (

@@ -61,7 +61,7 @@ class OneStepResponse(DmcResponse):
     Phi is the linearised transition of one interval.
 
     Attributes:
-        held: Names of the states without an input, such as the azimuth.
+        uncontrolled_states: Names of the states without an input, such as the azimuth.
         units: Unit of each state's input in SI units, all 1 if None. They determine how far each
             state is shifted.
 
@@ -69,7 +69,7 @@ class OneStepResponse(DmcResponse):
         ValueError: On use, if a name is not a state, or the number of units is not that of states.
     """
 
-    held: Sequence[str] = ()
+    uncontrolled_states: Sequence[str] = ()
     units: Sequence[float] | None = None
 
     @override
@@ -83,7 +83,7 @@ class OneStepResponse(DmcResponse):
                 "Set one for each state."
             )
         b = h.new_ones(d) if self.units is None else h.new_tensor(list(self.units))
-        b[state_indices(model, "response.held", self.held)] = 0.0
+        b[state_indices(model, "response.uncontrolled_states", self.uncontrolled_states)] = 0.0
         centre = chart.mean(belief.x, normalise_log_weights(belief.log_w)).unsqueeze(1)
         return h @ transition_jacobian(model, centre, record.u) * b, b
 

@@ -97,7 +97,7 @@ def _plot_pair(axis: Axes, row: int, pair: BaselineComparison, limits: tuple[flo
     """Plot the ratio of a pair in each condition, and the median as a bar."""
     low, high = limits
     dot: Any = {"ls": "none", "ms": 2.6, "mew": 0.6, "zorder": 2, "clip_on": False}
-    for k, (ratio, winner) in enumerate(zip(pair.ratios, pair.shown, strict=True)):
+    for k, (ratio, winner) in enumerate(zip(pair.ratios, pair.decisions, strict=True)):
         is_open = winner == INCONCLUSIVE
         colour = _OPEN if is_open else _BETTER if winner == pair.method else _WORSE
         face: Any = {"mfc": "white", "mec": "0.55"} if is_open else {"mfc": colour, "mec": colour}

@@ -43,9 +43,9 @@ class PairwiseTest:
         margin: Relative difference of RMSE within which filters are equivalent.
         p_equivalent: p-value of equivalence within the margin, Holm over `family`.
         equivalent: Whether equivalence is shown.
-        wanted: Relative difference of RMSE for which `needed` is computed.
+        target_effect: Relative difference of RMSE for which `needed` is computed.
         scatter: SD over runs of the log ratio, over runs that neither filter lost.
-        needed: Runs required to show the difference `wanted` with power 0.8.
+        needed: Runs required to show the difference `target_effect` with power 0.8.
         detectable: Smallest relative difference that the available pairs show with power 0.8.
         p_page: p-value corrected over all `page` comparisons of a report; NaN without one.
         page: Comparisons of the report.
@@ -80,7 +80,7 @@ class PairwiseTest:
     margin: float = np.nan
     p_equivalent: float = np.nan
     equivalent: bool = False
-    wanted: float = np.nan
+    target_effect: float = np.nan
     scatter: float = np.nan
     needed: float = np.nan
     detectable: float = np.nan

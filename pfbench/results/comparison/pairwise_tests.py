@@ -125,7 +125,7 @@ def _compare(
             p_holm=float(p[k]),
             margin=margin,
             p_equivalent=float(p_equivalent[k]),
-            wanted=target_effect,
+            target_effect=target_effect,
         )
         for k, ((labels, errors), d) in enumerate(zip(pairs, differences, strict=True))
     ]
@@ -180,13 +180,13 @@ def _describe(
 
 
 def _sample_sizes(v: PairwiseTest, alpha: float) -> tuple[float, float]:
-    """Compute the runs required for `wanted` and the smallest detectable relative difference."""
-    if not np.isfinite(v.scatter) or not np.isfinite(v.wanted):
+    """Compute the runs required for `target_effect` and the smallest detectable relative difference."""
+    if not np.isfinite(v.scatter) or not np.isfinite(v.target_effect):
         return np.nan, np.nan
     if v.scatter == 0:
         least = power.min_pairs(alpha)
         return float(least), 0.0 if v.pairs >= least else np.inf
-    runs = power.required_runs(float(np.log1p(v.wanted)) / v.scatter, alpha)
+    runs = power.required_runs(float(np.log1p(v.target_effect)) / v.scatter, alpha)
     return runs, float(np.expm1(power.detectable_effect(v.scatter, v.pairs, alpha)))
 
 

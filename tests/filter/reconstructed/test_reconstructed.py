@@ -757,8 +757,8 @@ def test_what_cannot_be_is_told() -> None:
             DmcController(control_weight=[1.0, 2.0, 3.0]),
             MarginalRatioCorrection(),
         ),
-        "response.held must be among the states": (
-            DmcController(response=OneStepResponse(held=("azimuth",))),
+        "response.uncontrolled_states must be among the states": (
+            DmcController(response=OneStepResponse(uncontrolled_states=("azimuth",))),
             MarginalRatioCorrection(),
         ),
         "units must have 2 numbers, got 1": (
