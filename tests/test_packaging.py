@@ -78,7 +78,7 @@ def test_a_stage_of_another_project_runs_beside_the_shipped_ones(mylab: Path) ->
         with np.load(file, allow_pickle=False) as stored:
             meta = json.loads(str(stored["meta"]))
             found[meta["choices"]["filter"]] = (
-                meta["exact"],
+                meta["is_exact"],
                 stored["error"],
                 meta["config"]["filter"],
             )

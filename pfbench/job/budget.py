@@ -45,7 +45,7 @@ class BudgetAllocation(NamedTuple):
 
     def to_metadata(self) -> dict[str, float]:
         """Return the values under the names of a result file."""
-        names = ("particles", "costs", "price", "asked")
+        names = ("particles", "costs", "price", "request")
         return dict(zip(names, self, strict=True))
 
 

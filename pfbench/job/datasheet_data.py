@@ -62,7 +62,7 @@ def compute_datasheet(
     - `seen` [T, Dy], share of runs in which a component is measured.
     - `residual` [R, T, Dy], see `compute_residuals`.
     - `track` [R, T, 3] in m, `force` [T, 3] in m/s^2 and `rate` [T, 3] in rad/s, if they exist.
-    - `azimuth` and `elevation` [T, S] in rad, `range` [T] in m, and `bound` [T, d], if they exist.
+    - `azimuth` and `elevation` [T, S] in rad, `range` [T] in m, and `pcrb` [T, d], if they exist.
 
     Args:
         values: Resolved configuration.
@@ -89,12 +89,12 @@ def compute_datasheet(
             "seen": (~torch.isnan(episode.record.y)).double().mean(0).float(),
             **{name: value.float() for name, value in episode.datasheet.items()},
         }
-    for name, value in (("track", episode.track), ("bound", pcrb)):
+    for name, value in (("track", episode.track), ("pcrb", pcrb)):
         if value is not None:
             outputs[name] = value.float()
     seconds = {"world": drawn_time - start_time, "measures": time.perf_counter() - drawn_time}
     meta = _make_metadata(values, model, episode, recording_regime) | {
-        "bound": pcrb_text,
+        "pcrb": pcrb_text,
         "seconds": seconds,
     }
     return meta, {name: value.cpu().numpy() for name, value in outputs.items()}
@@ -183,7 +183,7 @@ def _make_metadata(
         "steps": steps,
         "kinds": list(channels.kind) if channels and has_kinds else ["measurement"] * size,
         "satellites": list(names) if len(names) == satellites else numbers,
-        "choices_made": [*model.choices, *episode.notes],
+        "modelling_choices": [*model.choices, *episode.notes],
         "state": describe_state(model),
         **make_provenance(),
     }

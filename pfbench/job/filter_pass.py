@@ -74,7 +74,7 @@ class TimedFilterPass(NamedTuple):
         }
         scores = self.recorder.arrays()
         outputs |= {name: a.float() if a.is_floating_point() else a for name, a in scores.items()}
-        optional = {"track": episode.track, "bound": pcrb, "range": episode.datasheet.get("range")}
+        optional = {"track": episode.track, "pcrb": pcrb, "range": episode.datasheet.get("range")}
         outputs |= {name: a.float() for name, a in optional.items() if a is not None}
         return {name: a.cpu().numpy() for name, a in outputs.items()}
 

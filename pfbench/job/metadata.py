@@ -45,9 +45,9 @@ def make_metadata(
         "dtype": values["dtype"],
         "device": device if device == "cpu" else torch.cuda.get_device_name(device),
         "threads": values["threads"],
-        "exact": method.is_exact or is_exact_kalman,
-        "told": values["oracle_noise"],
-        "choices_made": [*model.choices, *notes],
+        "is_exact": method.is_exact or is_exact_kalman,
+        "oracle_noise": values["oracle_noise"],
+        "modelling_choices": [*model.choices, *notes],
         "state": describe_state(model),
         **make_provenance(),
     }

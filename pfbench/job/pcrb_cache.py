@@ -66,7 +66,7 @@ def compute_pcrb(
                 oracle, truth, episode.record, initial, run_by_run=True
             )
         sd = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-        return {"bound": sd.contiguous(), "apart": torch.tensor(is_separate)}
+        return {"pcrb": sd.contiguous(), "is_separate": torch.tensor(is_separate)}
 
     try:
         result = load_or_build(values["episode_cache_dir"], _recipe(values, model, runs), compute)
@@ -74,9 +74,9 @@ def compute_pcrb(
         wrapper = "" if is_nominal else f"{type(oracle).__name__}: "
         return None, "no bound: " + f"{error}".removeprefix(wrapper)
     oracle_text = "" if is_nominal else " with oracle noise"
-    method = "mean over the runs" if bool(result["apart"]) else "one recursion for all runs"
+    method = "mean over the runs" if bool(result["is_separate"]) else "one recursion for all runs"
     start = ", from the model's own initial distribution" if is_replaced else ""
-    return result["bound"], f"posterior Cramer-Rao bound of the model{oracle_text}, {method}{start}"
+    return result["pcrb"], f"posterior Cramer-Rao bound of the model{oracle_text}, {method}{start}"
 
 
 def _recipe(values: Mapping[str, Any], model: StateSpaceModel, runs: Tensor) -> tuple[object, ...]:

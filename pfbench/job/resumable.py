@@ -26,12 +26,12 @@ class ResumableResults:
     def __init__(self, path: Path, request: Mapping[str, Any]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self.state: dict[str, Any] = {"asked": json.loads(json.dumps(request)), "done": {}}
+        self.state: dict[str, Any] = {"request": json.loads(json.dumps(request)), "done": {}}
         try:
             stored = json.loads(path.read_text())
         except (FileNotFoundError, json.JSONDecodeError):
             return
-        if stored.get("asked") == self.state["asked"]:
+        if stored.get("request") == self.state["request"]:
             self.state = stored
 
     def __call__(self, name: str, make: Callable[[], Any]) -> Any:

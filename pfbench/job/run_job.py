@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("pfbench")
 
-_SHARED = ("time", "bound", "range", "scored")  # arrays without an axis of runs
+_SHARED = ("time", "pcrb", "range", "score_steps")  # arrays without an axis of runs
 _RESERVED = (DATASHEETS, "claims")  # folders of reports that are not studies
 
 
@@ -141,13 +141,13 @@ def compute_job(config: JobConfig, label: str) -> tuple[dict[str, Any], dict[str
         batch_outputs.append(result.arrays(episode, batch_pcrb[0]))
     meta, outputs = _join_batches(batch_metadata, batch_outputs, total)
     if pcrb:  # the batches share it
-        outputs |= {"bound": batch_outputs[0]["bound"]} if "bound" in outputs else {}
-        meta["seconds"]["bound"] = pcrb[2]
+        outputs |= {"pcrb": batch_outputs[0]["pcrb"]} if "pcrb" in outputs else {}
+        meta["seconds"]["pcrb"] = pcrb[2]
     meta["seconds"] = {"world": episodes.seconds, **meta["seconds"]}
     if allocation:
         meta["particles"] = allocation.particles
     bought = allocation.to_metadata() if allocation else None
-    return {**meta, "bought": bought, "trained": trained}, outputs
+    return {**meta, "budget_allocation": bought, "trained": trained}, outputs
 
 
 def _result_path(values: Mapping[str, Any]) -> Path:
@@ -182,7 +182,7 @@ def _batch_metadata(
     if (number := result.estimate.trace.get("particles")) is not None:
         extremes = {"least": int(number.min()), "most": int(number.max())}
         meta["particles_used"] = extremes | {"mean": float(number.mean())}
-    return {**meta, "runs": runs, "bound": pcrb[1], "seconds": {"bound": pcrb[2], **result.seconds}}
+    return {**meta, "runs": runs, "pcrb": pcrb[1], "seconds": {"pcrb": pcrb[2], **result.seconds}}
 
 
 def _join_batches(
@@ -202,10 +202,10 @@ def _join_batches(
         for name, first in outputs[0].items()
     }
     weights = np.array([meta["runs"] for meta in metadata]) / total
-    if "bound" in joint:
-        variances = (batch["bound"].astype(float) ** 2 for batch in outputs)
+    if "pcrb" in joint:
+        variances = (batch["pcrb"].astype(float) ** 2 for batch in outputs)
         mean = sum(weight * v for weight, v in zip(weights, variances, strict=True))
-        joint["bound"] = np.sqrt(mean).astype(np.float32)
+        joint["pcrb"] = np.sqrt(mean).astype(np.float32)
     memory = [meta["memory"] for meta in metadata]
     times = [meta["seconds"] for meta in metadata]
     meta = {

@@ -35,12 +35,12 @@ class ProperScores(NamedTuple):
     Attributes:
         crps: Continuous ranked probability score per component, [R, d], in its unit.
         pit: Probability of values below the truth, [R, d]. Uniform for a calibrated filter.
-        energy: Energy score per group, [R, G], the multivariate CRPS.
+        energy_score: Energy score per group, [R, G], the multivariate CRPS.
     """
 
     crps: Tensor
     pit: Tensor
-    energy: Tensor
+    energy_score: Tensor
 
 
 class LikelihoodCounter:
@@ -145,14 +145,14 @@ class ScoreRecorder:
         return {"error": error, "nees": nees}
 
     def arrays(self) -> dict[str, Tensor]:
-        """Return the scores: `scored` [S], `crps` and `pit` [R, S, d], `energy` [R, S, G].
+        """Return the scores: `score_steps` [S], `crps` and `pit` [R, S, d], `energy_score` [R, S, G].
 
         `nis` and `nis_dof` [R, S] follow if the filter provides them. Empty if no step is scored.
         """
         if not self.scores:
             return {}
         columns = zip(ProperScores._fields, zip(*self.scores, strict=True), strict=True)
-        results = {"scored": torch.tensor(self.at_step)}
+        results = {"score_steps": torch.tensor(self.at_step)}
         results |= {name: torch.stack(values, 1) for name, values in columns}
         if self.innovations:
             nis, dof = zip(*self.innovations, strict=True)

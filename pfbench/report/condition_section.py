@@ -82,7 +82,7 @@ def write_condition_section(
         ),
         "unscored": _list_unscored(data, context.groups),
         "bounds": distinct_values(
-            result.meta["bound"] for result in data.full_results.values() if "bound" in result.meta
+            result.meta["pcrb"] for result in data.full_results.values() if "pcrb" in result.meta
         ),
         **_count_statuses(data.results),
     }

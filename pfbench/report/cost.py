@@ -181,7 +181,7 @@ def _format_costs(
     The target is the price of the job, which differs between conditions, or else the median cost.
     """
     middle = float(np.median(costs))
-    prices = [(meta.get("bought") or {}).get("price", middle) for meta in metadata]
+    prices = [(meta.get("budget_allocation") or {}).get("price", middle) for meta in metadata]
     far: dict[str, list[float]] = {}
     for meta, cost, price in zip(metadata, costs, prices, strict=True):
         if not price / _CLOSE <= cost <= price * _CLOSE:

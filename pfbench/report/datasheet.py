@@ -124,7 +124,7 @@ def _statistics_figures(sheet: store.JobResult) -> Iterator[_Figure]:
         yield "residuals_time", text, scenario_figures.plot_residuals_over_time
     if sheet.meta["runs"] > 1 and scenario_data.compute_spreads(sheet):
         text = "Spread of the true states over the runs (standard deviation of the norm)"
-        if "bound" in sheet.data:
+        if "pcrb" in sheet.data:
             text += (
                 ", and the posterior Cramér-Rao bound (PCRB), a lower bound of the root mean "
                 "square error. The bound exceeds the spread if the initial distribution of the "
@@ -155,7 +155,7 @@ def list_facts(sheet: store.JobResult) -> list[str]:
     is_equal = scenario_data.drop_equal_runs(residual).shape[0] == 1
     if is_equal and meta["runs"] > 1 and not np.isnan(residual).all():
         texts.append("All runs have equal residuals, which are counted once.")
-    return [*texts, f"{meta['bound'][0].upper()}{meta['bound'][1:]}."]
+    return [*texts, f"{meta['pcrb'][0].upper()}{meta['pcrb'][1:]}."]
 
 
 def _describe_track(track: np.ndarray) -> str:

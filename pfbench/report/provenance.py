@@ -28,7 +28,7 @@ _PHASES = {
     "filter": "filters",
     "scores": "scores",
     "world": "data",
-    "bound": "PCRB",
+    "pcrb": "PCRB",
     "compile": "compilation",
 }
 
@@ -85,7 +85,7 @@ def modelling_choices(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
     labels_by_choice: dict[str, list[str]] = {}
     for cell in conditions:
         for job in cell.jobs:
-            for text in job.meta.get("choices_made", ()):
+            for text in job.meta.get("modelling_choices", ()):
                 labels_by_choice.setdefault(text, []).append(job.label)
     all_labels = {job.label for cell in conditions for job in cell.jobs}
     return [

@@ -46,8 +46,8 @@ def compute_spreads(
         finite_mask = ~np.isnan(value)
         if finite_mask.any() and (value[finite_mask] > _ROUNDING * block.scale).any():
             bound = None
-            if "bound" in sheet.data:
-                variance = sheet.data["bound"][finite_mask][:, block.places].astype(np.float64) ** 2
+            if "pcrb" in sheet.data:
+                variance = sheet.data["pcrb"][finite_mask][:, block.places].astype(np.float64) ** 2
                 bound = np.sqrt(variance.sum(-1)) * block.scale
             rows.append((block, sheet.data["time"][finite_mask], value[finite_mask], bound))
     return rows

@@ -93,8 +93,8 @@ def _overview_row(label: str, result: store.JobResult, alpha: float) -> dict[str
     nis, band = _mean_nis(result, alpha)
     return {
         "filter": label,
-        "asymptotically exact": bool(meta.get("exact")),
-        "oracle noise": bool(meta.get("told")),
+        "asymptotically exact": bool(meta.get("is_exact")),
+        "oracle noise": bool(meta.get("oracle_noise")),
         "particles": str(particles or "–"),
         "runs": count.runs,
         "lost runs": count.lost,
@@ -161,8 +161,8 @@ def _accuracy_row(result: store.JobResult, block: ComponentGroup, alpha: float) 
         "steps inside the interval [%]": 100 * nees.inside,
     }
     row |= metrics.table_columns(result, "components", block)
-    if "bound" in data:
-        floor = data["bound"][:, block.places].astype(np.float64) * block.scale
+    if "pcrb" in data:
+        floor = data["pcrb"][:, block.places].astype(np.float64) * block.scale
         row["RMSE / PCRB"] = error_measures.rmse_to_pcrb(error, lost, floor)
     if "range" in data and block.state_group == "position":
         for name, last in (("", None), (f", last {_LAST} steps", _LAST)):

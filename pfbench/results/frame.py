@@ -14,7 +14,7 @@ from pfbench.results.error_measures import convergence_time
 from pfbench.results.state_groups import component_groups
 
 _WHOLE_RUN_ARRAYS = ("log_evidence", "lost")
-_SHARED_ARRAYS = ("time", "bound", "range")  # without an axis of runs
+_SHARED_ARRAYS = ("time", "pcrb", "range")  # without an axis of runs
 
 
 def load_frame(
@@ -85,7 +85,7 @@ def select_steps(result: store.JobResult, mask: np.ndarray) -> store.JobResult:
     """
     if mask.all():
         return result
-    skipped = (*_WHOLE_RUN_ARRAYS, "scored", *metrics.scored_arrays())
+    skipped = (*_WHOLE_RUN_ARRAYS, "score_steps", *metrics.scored_arrays())
     selected = {
         name: array[mask] if name in _SHARED_ARRAYS else array[:, mask]
         for name, array in result.data.items()
@@ -138,11 +138,11 @@ def to_long_rows(
 
 def _select_scores(data: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
     """Select scores at the steps of a mask [T], with their new step numbers."""
-    if "scored" not in data or not (remaining := mask[data["scored"]]).any():
+    if "score_steps" not in data or not (remaining := mask[data["score_steps"]]).any():
         return {}
     names = [name for name in metrics.scored_arrays() if name in data]
     scores = {name: data[name][:, remaining] for name in names}
-    return {"scored": (np.cumsum(mask) - 1)[data["scored"][remaining]], **scores}
+    return {"score_steps": (np.cumsum(mask) - 1)[data["score_steps"][remaining]], **scores}
 
 
 def _metric_rows(result: store.JobResult) -> Iterator[pd.DataFrame]:

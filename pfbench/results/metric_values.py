@@ -119,9 +119,11 @@ def compute_crps(data: MetricInput) -> ByComponent:
 def compute_energy_score(data: MetricInput) -> ByComponent:
     """Compute the energy score; a group of mixed units has none."""
     group = data.group
-    if "energy" not in data.result.data or group is None or group.group != group.state_group:
+    if "energy_score" not in data.result.data or group is None or group.group != group.state_group:
         return {}
-    energy = data.result.data["energy"][..., data.group_index].astype(np.float64) * group.scale
+    energy = (
+        data.result.data["energy_score"][..., data.group_index].astype(np.float64) * group.scale
+    )
     return {"norm": mean_score_per_run(energy, data.lost)}
 
 

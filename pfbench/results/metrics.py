@@ -157,7 +157,7 @@ METRICS: tuple[Metric, ...] = (
         "energy", compute_energy_score, "components", GROUP_UNIT, "lower",
         "Generalisation of the CRPS to the vector of a group, mean over valid runs and scored "
         "steps.",
-        head="energy score", scored_names=("energy",),
+        head="energy score", scored_names=("energy_score",),
     ),
     *(
         Metric(

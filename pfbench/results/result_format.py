@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 1
+FORMAT = 2
 
 # Axes that must agree across arrays: R runs, T steps, D components, G groups, S scored steps.
 _AXES = {"time": "T", "error": "RTD", "sd": "RTD", "nees": "RTG", "log_evidence": "R", "lost": "R"}
 
 _OPTIONAL = {
-    "scored": "S",
+    "score_steps": "S",
     "crps": "RSD",
     "pit": "RSD",
-    "energy": "RSG",
-    "bound": "TD",
+    "energy_score": "RSG",
+    "pcrb": "TD",
     "range": "T",
 }
 
@@ -74,7 +74,7 @@ def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndar
         "D": len(meta["state"]["names"]),
         "G": len(meta["state"]["groups"]),
         "T": data["time"].size,
-        "S": data["scored"].size if "scored" in data else 0,
+        "S": data["score_steps"].size if "score_steps" in data else 0,
     }
     for name, axes in (
         _AXES | {name: axes for name, axes in _OPTIONAL.items() if name in data}

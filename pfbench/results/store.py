@@ -35,7 +35,7 @@ class JobResult(NamedTuple):
             (names, units, groups).
         data: `time` [T] (s), `error` and `sd` [R, T, D], `nees` [R, T, G], `log_evidence` and
             `lost` [R]. Optional: traces [R, T], `track` [R, T, 3] (m; East, North, Up), and the
-            scored steps [S] with `crps`, `pit` [R, S, D] and `energy` [R, S, G].
+            scored steps [S] with `crps`, `pit` [R, S, D] and `energy_score` [R, S, G].
     """
 
     meta: dict[str, Any]

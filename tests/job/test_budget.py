@@ -121,12 +121,12 @@ def test_filters_of_a_study_evaluate_the_likelihood_equally_often(tmp_path: Path
     )
     for name in ("sir", "apf", "pso_pf", "mcmc_rpf"):
         assert found[name]["likelihoods_per_step"] == pytest.approx(1000, rel=0.15), name
-        assert found[name]["bought"]["price"] == 1000.0
-        assert found[name]["bought"]["particles"] == found[name]["particles"]
+        assert found[name]["budget_allocation"]["price"] == 1000.0
+        assert found[name]["budget_allocation"]["particles"] == found[name]["particles"]
     assert found["sir"]["particles"] == 1000
     assert found["pso_pf"]["particles"] < 100  # it looks again in each of its iterations
     assert found["ekf"]["particles"] is None  # nothing to buy
-    assert (found["cofm_amssrcpf"]["particles"], found["cofm_amssrcpf"]["bought"]) == (
+    assert (found["cofm_amssrcpf"]["particles"], found["cofm_amssrcpf"]["budget_allocation"]) == (
         200,
         None,
     )  # has a number of its own
@@ -135,18 +135,18 @@ def test_filters_of_a_study_evaluate_the_likelihood_equally_often(tmp_path: Path
 
 def test_a_number_that_was_given_to_a_filter_stays(tmp_path: Path) -> None:
     found = metas(tmp_path, *WALK, "filter=mcmc_rpf", "filter.particles=60")["mcmc_rpf"]
-    assert (found["particles"], found["bought"]) == (60, None)
+    assert (found["particles"], found["budget_allocation"]) == (60, None)
 
 
 def test_the_same_number_buys_nothing_and_equal_time_finds_one(tmp_path: Path) -> None:
     walk = [word for word in WALK if not word.startswith("budget")]
-    assert metas(tmp_path, *walk, "filter=mcmc_rpf")["mcmc_rpf"]["bought"] is None
+    assert metas(tmp_path, *walk, "filter=mcmc_rpf")["mcmc_rpf"]["budget_allocation"] is None
     home = tmp_path / "time"
     found = metas(home, *walk, "filter=mcmc_rpf", "budget=time")["mcmc_rpf"]
     assert (
-        budget.MIN_PARTICLES <= found["particles"] == found["bought"]["particles"] < 200
+        budget.MIN_PARTICLES <= found["particles"] == found["budget_allocation"]["particles"] < 200
     )  # dearer than SIR, whatever the machine
-    assert found["bought"]["asked"] == 200
+    assert found["budget_allocation"]["request"] == 200
 
 
 def test_a_step_compiled_as_a_whole_has_no_known_price(tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def test_a_job_leaves_one_file_that_numpy_reads(twice: Any) -> None:
     }
     assert meta["seconds"]["filter"] > 0
     assert {"pfbench", "commit", "python", "torch", "numpy"} == meta["versions"].keys()
-    assert meta["exact"] is True
+    assert meta["is_exact"] is True
 
 
 def test_the_line_printed_is_the_error_stored(twice: Any) -> None:
@@ -175,7 +175,7 @@ def test_runs_in_two_jobs_are_the_runs_of_one(tmp_path: Path, method: str) -> No
     whole = result(tmp_path, *words, "runs=5", study="whole")[1]
     head = result(tmp_path, *words, "runs=2", study="head")[1]
     tail = result(tmp_path, *words, "first_run=2", "runs=3", study="tail")[1]
-    common = ("time", "bound", "scored")
+    common = ("time", "pcrb", "score_steps")
     joined = {
         name: whole[name] if name in common else np.concatenate([head[name], tail[name]])
         for name in whole
@@ -252,10 +252,10 @@ def test_the_bound_of_a_linear_world_is_kalmans_deviation(
         tmp_path, *WALK, *words, "filter=ekf", "runs=3", "oracle_noise=true", study="told"
     )
     plain = result(tmp_path, *WALK, *words, "filter=ekf", "runs=3", study="plain")
-    assert told[1]["bound"].shape == (25, 2)
-    assert np.allclose(told[1]["bound"], told[1]["sd"], rtol=1e-5)
-    assert np.array_equal(told[1]["bound"], plain[1]["bound"])
-    assert "posterior Cramer-Rao bound of the model" in plain[0]["bound"]
+    assert told[1]["pcrb"].shape == (25, 2)
+    assert np.allclose(told[1]["pcrb"], told[1]["sd"], rtol=1e-5)
+    assert np.array_equal(told[1]["pcrb"], plain[1]["pcrb"])
+    assert "posterior Cramer-Rao bound of the model" in plain[0]["pcrb"]
 
 
 WHY = {
@@ -269,9 +269,9 @@ WHY = {
 def test_where_there_is_no_bound_the_job_says_why(tmp_path: Path, case: str) -> None:
     words, reason = WHY[case]
     meta, arrays = result(tmp_path, *WALK[:1], "scenario.steps=4", *words, "filter=ekf", "runs=2")
-    assert "bound" not in arrays
-    assert meta["bound"].startswith("no bound: ")
-    assert reason in meta["bound"]
+    assert "pcrb" not in arrays
+    assert meta["pcrb"].startswith("no bound: ")
+    assert reason in meta["pcrb"]
 
 
 def test_worlds_that_are_not_the_models_have_no_bound_unless_asked() -> None:
@@ -303,11 +303,11 @@ def test_a_location_brings_its_range_and_a_bound_from_the_models_own_prior(tmp_p
     # 226.3 km at first, closing by 200 m/s on the east axis while the emitter goes north-west
     t = np.arange(1, 4)
     assert np.allclose(arrays["range"], np.hypot(160e3 - 215.0 * t, 160e3 + 15.0 * t), rtol=1e-6)
-    assert arrays["bound"].shape == (3, 4)
-    assert "the model's own initial distribution" in meta["bound"]
+    assert arrays["pcrb"].shape == (3, 4)
+    assert "the model's own initial distribution" in meta["pcrb"]
     # the prior, 60 km per axis and 30 m/s, is more than the first look leaves of it
-    assert (arrays["bound"][0, :2] < 60e3).all()
-    assert np.allclose(arrays["bound"][0, 2:], 30.0, rtol=0.3)
+    assert (arrays["pcrb"][0, :2] < 60e3).all()
+    assert np.allclose(arrays["pcrb"][0, 2:], 30.0, rtol=0.3)
 
 
 def test_the_bound_is_kept_with_the_worlds_and_known_by_what_decides_it(tmp_path: Path) -> None:
@@ -382,7 +382,10 @@ def test_a_failed_job_leaves_a_note_and_its_success_takes_it_away(tmp_path: Path
     (note,) = folder.iterdir()
     assert note.name.endswith(".failed.json")
     said = json.loads(note.read_text())
-    assert said["message"] == "ValueError: threads must be a whole number of at least 1, got 0."
+    assert (
+        said["message"]
+        == "ValueError: threads must be a whole number of at least 1, got 0. Change this value."
+    )
     assert said["choices"]["filter"] == "ekf"
     assert "Traceback" in said["traceback"]
     assert str(note) in failed.out

@@ -225,7 +225,7 @@ class Kicked(Pendulum):
 
     def __init__(self, unseen: float = 0.0) -> None:
         super().__init__(step=0.2)
-        self.l = doubles([[unseen, 0.0], [0.0, 0.1]])
+        self.noise_root = doubles([[unseen, 0.0], [0.0, 0.1]])
 
 
 def pendulum_slopes(x: np.ndarray) -> np.ndarray:
@@ -258,7 +258,7 @@ class Loose(Kicked):
 
     def __init__(self) -> None:
         super().__init__()
-        self.l = doubles([[0.1, 0.0], [0.0, 0.0]])
+        self.noise_root = doubles([[0.1, 0.0], [0.0, 0.0]])
 
 
 def test_jacobians_that_differ_out_of_the_noises_reach_are_refused_and_the_remedy_works() -> None:

@@ -51,7 +51,7 @@ def test_a_posterior_is_heard_as_it_was_told(tmp_path: Path) -> None:
         pieces = ResumableResults(tmp_path / "told.json", {"accepted": accepted is not None})
         pieces("posterior", posterior.to_dict)
         heard = ParameterPosterior.from_dict(
-            ResumableResults(pieces.path, pieces.state["asked"])("posterior", never)
+            ResumableResults(pieces.path, pieces.state["request"])("posterior", never)
         )
         for name, a in draws.items():
             assert torch.equal(heard.draws[name], a)

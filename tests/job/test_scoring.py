@@ -58,7 +58,9 @@ def test_a_large_cloud_of_a_normal_law_scores_as_the_law() -> None:
     assert ((cloud.crps - exact.crps).abs() < 6 * sd / math.sqrt(n)).all()
     assert ((cloud.pit - exact.pit).abs() < 6 * 0.5 / math.sqrt(n)).all()
     # 64 points stand for the cloud: the mean distance from the truth is off by a few standard errors of 64, and by the bias
-    assert ((cloud.energy - exact.energy).abs() < 6 * sd.sum(-1, keepdim=True) / 8).all()
+    assert (
+        (cloud.energy_score - exact.energy_score).abs() < 6 * sd.sum(-1, keepdim=True) / 8
+    ).all()
     z = torch.tensor([0.5, -1.5], dtype=torch.float64)  # Gneiting and Raftery 2007, eq. 21
     expected = (
         z * (2 * torch.special.ndtr(z) - 1)
@@ -79,7 +81,7 @@ def test_the_energy_score_of_one_component_is_its_crps() -> None:
     error, _ = law()
     deviation = PhiloxStream(2, torch.arange(3)).normal("z", 64, 2)
     scores = score_particles(error, deviation, torch.zeros(3, 64, dtype=torch.float64), GROUPS)
-    torch.testing.assert_close(scores.energy[:, :2], scores.crps)
+    torch.testing.assert_close(scores.energy_score[:, :2], scores.crps)
 
 
 @pytest.mark.usefixtures("both")
@@ -109,7 +111,7 @@ def test_a_point_scores_its_distance() -> None:
     flat = score_normal(error, 0 * covariance, torch.zeros(3, 8, 2, dtype=torch.float64), GROUPS)
     for scores in (point, flat):
         torch.testing.assert_close(scores.crps, error.abs())
-        torch.testing.assert_close(scores.energy[:, 2], error.norm(dim=1))
+        torch.testing.assert_close(scores.energy_score[:, 2], error.norm(dim=1))
 
 
 @pytest.mark.usefixtures("both")
@@ -122,7 +124,7 @@ def test_without_a_truth_there_is_no_score() -> None:
         GROUPS,
     )
     assert torch.isnan(scores.crps).tolist() == torch.isnan(scores.pit).tolist() == [[False, True]]
-    assert torch.isnan(scores.energy).tolist() == [[False, True, True]]
+    assert torch.isnan(scores.energy_score).tolist() == [[False, True, True]]
 
 
 @pytest.mark.usefixtures("both")
@@ -190,9 +192,9 @@ def test_an_honest_filter_is_calibrated_and_a_confident_one_is_not(
     for judge, watch in ((honest, honest), (proud, confident)):
         run_filter(method, MODEL, episode.record, PhiloxStream(4, runs), watch)
         found = judge.arrays()
-        assert found["scored"].tolist() == [9, 19]
+        assert found["score_steps"].tolist() == [9, 19]
         assert found["crps"].shape == found["pit"].shape == (300, 2, 2)
-        assert found["energy"].shape == (300, 2, len(MODEL.groups))
+        assert found["energy_score"].shape == (300, 2, len(MODEL.groups))
     p = [
         stats.kstest(judge.arrays()["pit"][:, -1, 0], "uniform").pvalue for judge in (honest, proud)
     ]

@@ -548,7 +548,7 @@ def test_train_and_run_at_the_command_line(tmp_path: Path) -> None:
     said = pfbench("run", *run, home=tmp_path)
     assert said.code == 0, said.err
     (result,) = store.list_results(tmp_path / "results" / "mine")
-    assert result.meta["exact"]
+    assert result.meta["is_exact"]
     assert result.meta["trained"]["cost"] == checkpoint.read_checkpoint(path)["cost"]
     assert result.meta["trained"]["weights"] == checkpoint.hash_weights(kept["networks"])
     moved = tmp_path / "moved.pt"

@@ -101,9 +101,9 @@ def write(
         "dtype": "float64",
         "device": "cpu",
         "threads": 1,
-        "exact": method.particles is not None,
-        "choices_made": ["initial heading error drawn from the filter's own prior"],
-        "told": False,
+        "is_exact": method.particles is not None,
+        "modelling_choices": ["initial heading error drawn from the filter's own prior"],
+        "oracle_noise": False,
         "versions": versions,
         "host": "bench",
         "created": "2026-01-01T00:00:00+00:00",
@@ -166,9 +166,9 @@ def _scores(error: np.ndarray, sd: np.ndarray, instants: int = 4) -> dict[str, n
     )
     found = {
         name: value.astype(np.float32)
-        for name, value in (("crps", crps), ("pit", ndtr(-z)), ("energy", energy))
+        for name, value in (("crps", crps), ("pit", ndtr(-z)), ("energy_score", energy))
     }
-    return {"scored": scored, **found}
+    return {"score_steps": scored, **found}
 
 
 def _smooth(rng: np.random.Generator, runs: int, steps: int) -> np.ndarray:

@@ -41,7 +41,7 @@ def test_scores_in_units_by_hand(study, loaded):
         ["metric", "group", "component"]
     )
     arrays = loaded["lossy"].data
-    kept = arrays["time"][arrays["scored"]] >= 15.0
+    kept = arrays["time"][arrays["score_steps"]] >= 15.0
     assert kept.tolist() == [False, True, True, True]
     crps = arrays["crps"][5, kept].astype(float)
     assert own.loc[("crps", "attitude", "attitude_N"), "value"] == pytest.approx(
@@ -51,7 +51,7 @@ def test_scores_in_units_by_hand(study, loaded):
         crps[:, :3].mean() * ARCMIN
     )
     assert own.loc[("crps", "attitude", "mean"), "unit"] == "arcmin"
-    energy = arrays["energy"][5, kept, 2].astype(float)
+    energy = arrays["energy_score"][5, kept, 2].astype(float)
     assert own.loc[("energy", "position", "norm"), "value"] == pytest.approx(energy.mean())
     pit = arrays["pit"][5, kept, 6:].astype(float)
     assert own.loc[("coverage_50", "position", "mean"), "value"] == pytest.approx(
@@ -65,11 +65,11 @@ def test_scores_in_units_by_hand(study, loaded):
 def test_scores_are_cut_with_the_instants(loaded):
     whole = loaded["honest"]
     late = frame.drop_before(whole, 15.0)
-    np.testing.assert_array_equal(late.data["time"][late.data["scored"]], [20.0, 30.0, 40.0])
+    np.testing.assert_array_equal(late.data["time"][late.data["score_steps"]], [20.0, 30.0, 40.0])
     np.testing.assert_array_equal(late.data["pit"], whole.data["pit"][:, 1:])
-    assert frame.drop_before(whole, 40.0).data["scored"].tolist() == [0]
+    assert frame.drop_before(whole, 40.0).data["score_steps"].tolist() == [0]
     early = frame.select_steps(whole, whole.data["time"] < 10.0)
-    assert not {"scored", "crps", "pit", "energy"} & early.data.keys()
+    assert not {"score_steps", "crps", "pit", "energy_score"} & early.data.keys()
     assert (
         calibration_plots.calibration_figures(
             {"honest": early}, ["position"], line_styles(["honest"])
@@ -141,7 +141,7 @@ def test_columns_and_lines(loaded):
     assert table.loc["lossy", "CRPS [arcmin]"] == pytest.approx(
         arrays["crps"][kept][..., :3].astype(float).mean() * ARCMIN
     )
-    energy = arrays["energy"][kept][..., 0].astype(float).mean() * ARCMIN
+    energy = arrays["energy_score"][kept][..., 0].astype(float).mean() * ARCMIN
     assert table.loc["lossy", "energy score [arcmin]"] == pytest.approx(energy)
     coverage = table["coverage of the 90 % interval [%]"]
     assert coverage["narrow"] < 70 < coverage["honest"]
@@ -173,5 +173,7 @@ def test_scores_of_wrong_shape_are_refused(study, tmp_path):
         store.write_result(tmp_path / path.name, meta, {**arrays, "pit": arrays["pit"][:, :3]})
     with pytest.raises(ValueError, match=r"crps must have shape \['R', 'S', 'D'\] = \(60, 0, 9\)"):
         store.write_result(
-            tmp_path / path.name, meta, {name: a for name, a in arrays.items() if name != "scored"}
+            tmp_path / path.name,
+            meta,
+            {name: a for name, a in arrays.items() if name != "score_steps"},
         )

@@ -22,8 +22,8 @@ META: dict[str, Any] = {
     "key": "0123456789abcdef", "study": "datasheets", "label": "datasheet", "seed": 1, "first_run": 0, "runs": RUNS,
     "steps": STEPS, "choices": {"scenario": "flight", "noise": "nominal", "model": "ins_gnss", "filter": "none"},
     "config": {"scenario": {"interval": 1.0}}, "about": "A <b>made up</b> flight.", "kinds": ["range"] * SLOTS + ["rate"],
-    "satellites": ["G01", "G02", "G07", "G30"], "choices_made": ["nothing"], "state": synthetic.STATE,
-    "bound": "posterior Cramer-Rao bound of the model", "versions": synthetic.VERSIONS,
+    "satellites": ["G01", "G02", "G07", "G30"], "modelling_choices": ["nothing"], "state": synthetic.STATE,
+    "pcrb": "posterior Cramer-Rao bound of the model", "versions": synthetic.VERSIONS,
     "seconds": {"world": 1.0, "measures": 0.5},
 }  # fmt: skip
 
@@ -48,7 +48,7 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
         "rate": rng.standard_normal((STEPS, 3)).astype(np.float32),
         "azimuth": np.where(np.isnan(up), np.nan, np.arange(SLOTS) * 1.5 + 0.001 * time[:, None]),
         "elevation": up,
-        "bound": np.full((STEPS, 9), 0.5, np.float32),
+        "pcrb": np.full((STEPS, 9), 0.5, np.float32),
     }
 
 
@@ -90,7 +90,7 @@ def test_every_figure_is_drawn_where_there_are_data(whole: store.JobResult, tmp_
 
 def test_what_is_missing_is_said_and_not_drawn(whole: store.JobResult) -> None:
     none = without(
-        whole, "track", "force", "rate", "azimuth", "elevation", "bound", bound="no bound: recorded"
+        whole, "track", "force", "rate", "azimuth", "elevation", "pcrb", pcrb="no bound: recorded"
     )
     assert names(none) == ["seen", "residuals", "residuals_time", "spread"]
     said = " ".join(datasheet.list_missing_figures(none))
@@ -252,7 +252,7 @@ def changed(file: Path, **more: Any) -> store.JobResult:
     found = store.read_result(file)
     store.write_result(
         file,
-        {**found.meta, "bound": "posterior Cramer-Rao bound of the model"},
+        {**found.meta, "pcrb": "posterior Cramer-Rao bound of the model"},
         {**found.data, **more},
     )
     return store.read_result(file)
@@ -310,7 +310,7 @@ def test_the_bound_and_the_range_are_drawn_and_tabled_where_there_are_any(tmp_pa
     plain = tables.accuracy_table({"ekf": store.read_result(file)}, "position")
     assert not [name for name in plain if "PCRB" in name or "range" in name]
     bound = np.linspace(1.0, 2.0, 40)[:, None] * np.ones(9)
-    result = changed(file, bound=bound, range=np.linspace(1000.0, 2000.0, 40))
+    result = changed(file, pcrb=bound, range=np.linspace(1000.0, 2000.0, 40))
     style = {"ekf": LineStyle("blue", "-", "o", 1.0)}
     block = next(b for b in component_groups(result.meta["state"]) if b.group == "position")
     line = error_plots.plot_error({"ekf": result}, block, style).axes[0].lines[-1]

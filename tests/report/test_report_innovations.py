@@ -19,7 +19,7 @@ def results(tmp_path):
         rng = np.random.default_rng(k)
         lost = np.array([True, *[False] * 5])
         own = {
-            "scored": np.array([4, 9, 19]),
+            "score_steps": np.array([4, 9, 19]),
             "nis": rng.chisquare(3, (6, 3)),
             "nis_dof": np.full((6, 3), 3),
             "lost": lost,

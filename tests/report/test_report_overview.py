@@ -18,7 +18,7 @@ NAN = np.nan
 def told(**arrays: Any) -> JobResult:
     """Three runs of four steps, the last one lost, of a filter of ten particles."""
     meta = {
-        "particles": 10, "exact": True, "seconds": {"per_step": 2e-3}, "memory": 3 * 2**20, "likelihoods_per_step": 12.5,
+        "particles": 10, "is_exact": True, "seconds": {"per_step": 2e-3}, "memory": 3 * 2**20, "likelihoods_per_step": 12.5,
         "state": {"groups": {"state": [0]}, "names": ["x"], "units": [""]},
     }  # fmt: skip
     common = {

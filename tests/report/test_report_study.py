@@ -193,12 +193,12 @@ def test_a_budget_that_was_not_kept_is_not_claimed():
     assert f"{kind} not met by dear (4.7 times the target) (1 to 5 ms" in cost.format_budget(
         [*alike, dear]
     )
-    priced = [{**one, "bought": {"price": 1e-3}} for one in alike]
+    priced = [{**one, "budget_allocation": {"price": 1e-3}} for one in alike]
     slow = [
-        {**job(9, k * 1e-2, budget=kind), "bought": {"price": 1e-2}} for k in (1, 1.1)
+        {**job(9, k * 1e-2, budget=kind), "budget_allocation": {"price": 1e-2}} for k in (1, 1.1)
     ]  # a cell where SIR takes longer
     assert "not met" not in cost.format_budget([*priced, *slow])
-    twice = [{**dear, "bought": {"price": price}} for price in (1e-3, 2e-3)]
+    twice = [{**dear, "budget_allocation": {"price": price}} for price in (1e-3, 2e-3)]
     assert "not met by dear (2.5 to 5 times the target)" in cost.format_budget([*priced, *twice])
     counted = [
         {**job(n, budget=store.BUDGETS[2]), "likelihoods_per_step": n * k}

@@ -105,7 +105,7 @@ def test_key_refuses_what_json_cannot_say(value):
 def test_what_is_read_is_what_was_written(tmp_path):
     path = store.write_result(tmp_path / "new" / "a.npz", meta(), arrays(1 / 3))
     result = store.read_result(path)
-    assert result.meta == {"format": 1, **meta()}
+    assert result.meta == {"format": 2, **meta()}
     assert list(result.meta["state"]["groups"]) == [
         "position",
         "b_velocity",
@@ -195,7 +195,7 @@ def test_a_foreign_or_other_format_file_is_named(tmp_path):
     ):
         store.read_result(tmp_path / "foreign.npz")
     np.savez(tmp_path / "future.npz", meta=np.array(json.dumps({"format": 99})))
-    with pytest.raises(ValueError, match=r"must have format 1, got 99"):
+    with pytest.raises(ValueError, match=r"must have format 2, got 99"):
         store.read_result(tmp_path / "future.npz")
     np.save(tmp_path / "single.npy", np.zeros(3))
     (tmp_path / "single.npy").rename(tmp_path / "single.npz")

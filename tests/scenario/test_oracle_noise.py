@@ -607,12 +607,14 @@ def test_the_switch_reaches_the_result(tmp_path: Path) -> None:
         with np.load(file, allow_pickle=False) as found:
             metas.append(json.loads(str(found["meta"])))
             arrays.append(found["log_evidence"])
-    by = {meta["told"]: (meta, evidence) for meta, evidence in zip(metas, arrays, strict=True)}
+    by = {
+        meta["oracle_noise"]: (meta, evidence) for meta, evidence in zip(metas, arrays, strict=True)
+    }
     assert set(by) == {False, True}
     assert by[True][1].mean() > by[False][1].mean()
-    assert any("receives the true noise" in text for text in by[True][0]["choices_made"])
-    assert not any("receives the true noise" in text for text in by[False][0]["choices_made"])
-    assert by[True][0]["exact"]
+    assert any("receives the true noise" in text for text in by[True][0]["modelling_choices"])
+    assert not any("receives the true noise" in text for text in by[False][0]["modelling_choices"])
+    assert by[True][0]["is_exact"]
     report = pfbench(
         "report",
         "study=adhoc",

@@ -55,7 +55,7 @@ def point_marker(time: np.ndarray) -> str:
 
 def pcrb_sd(result: store.JobResult) -> np.ndarray | None:
     """Return the standard deviations [T, d] of the PCRB, or None if the job has none."""
-    return result.data.get("bound")
+    return result.data.get("pcrb")
 
 
 def component_pcrb(results: Results, component: str) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -84,7 +84,7 @@ def sum_nis(result: store.JobResult) -> tuple[np.ndarray, np.ndarray, np.ndarray
         innovations.
     """
     data = result.data
-    if "nis" not in data or "scored" not in data:
+    if "nis" not in data or "score_steps" not in data:
         return None
     valid_mask = ~data["lost"]
     nis = np.asarray(data["nis"], dtype=np.float64)[valid_mask]
@@ -94,7 +94,7 @@ def sum_nis(result: store.JobResult) -> tuple[np.ndarray, np.ndarray, np.ndarray
     observed_mask = dof > 0
     if not observed_mask.any():
         return None
-    time = data["time"][data["scored"][observed_mask]]
+    time = data["time"][data["score_steps"][observed_mask]]
     return time, nis[observed_mask], dof[observed_mask]
 
 
