@@ -120,7 +120,7 @@ def nats(model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tens
     mean = model.chart.mean(belief.x, normalise_log_weights(belief.log_w)).unsqueeze(1)
     z = torch.zeros(*mean.shape[:2], model.noise_dim).to(mean)
     guide = GuidedNoiseProposal(GaussianFilter(TaylorLinearisation()))
-    told: Tensor = -guide._posterior(
+    told: Tensor = -guide.map_to_posterior(
         model, belief._replace(x=mean, log_w=mean.new_zeros(mean.shape[:2])), record, z
     )[1]
     return told[:, 0]

@@ -39,7 +39,7 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
     if name in DENSE and model.transition(x, first.u) is None:
         return "density of x_t given x_t-1"
     if name == "dmc_density" and model.noise_gain(first.u) is None:
-        return "not additive"
+        return "additive noise"
     if name == "rbpf" and not (model.linear or model.linear_given):
         return "no component that is linear given the rest"
     if record.feedback is not None and (method_past(name) or name == "rbpf"):

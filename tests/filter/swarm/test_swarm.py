@@ -901,11 +901,11 @@ def test_in_flight_the_corrected_swarm_converges_and_the_printed_one_returns_the
 @pytest.mark.parametrize("scenario", ["sar_flight", "anshun_fit", "passive_1", "flight_300s"])
 def test_swarms_fly_with_quaternions_missing_satellites_and_bearings(scenario: str) -> None:
     cfg = composed(scenario)
-    if "path" in cfg.scenario and "segments" in cfg.scenario.trajectory:
+    if "trajectory" in cfg.scenario and "segments" in cfg.scenario.trajectory:
         cfg.scenario.trajectory.segments = cfg.scenario.trajectory.segments[:1]
-    if "path" in cfg.scenario and "duration" in cfg.scenario.trajectory:
+    if "trajectory" in cfg.scenario and "duration_s" in cfg.scenario.trajectory:
         cfg.scenario.trajectory.duration_s = 20.0
-    if "imu_rate" in cfg.scenario:
+    if "imu_rate_hz" in cfg.scenario:
         cfg.scenario.imu_rate_hz = 20.0
     model = job.instantiate(cfg.model)
     record = job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(2), 1).record

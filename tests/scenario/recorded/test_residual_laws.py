@@ -44,20 +44,20 @@ NO_LAW = {
 
 def shortened(scene: DictConfig) -> DictConfig:
     """Two minutes of it with a turn where it is simulated; the IMU is read less often, which changes nothing at the truth."""
-    path, drive = scene.get("path", {}), scene.get("flight", scene)
+    path, drive = scene.get("trajectory", {}), scene.get("flight", scene)
     with open_dict(scene):
-        if "start" in drive and "end" in drive:
-            drive.end = drive.start + 60.0
-        if "imu_rate" in scene:
-            scene.imu_rate_hz = max(10.0, 2.0 / scene.interval)
-        if "paths" in scene:
-            scene.paths = scene.paths[:2]
+        if "start_s" in drive and "end_s" in drive:
+            drive.end_s = drive.start_s + 60.0
+        if "imu_rate_hz" in scene:
+            scene.imu_rate_hz = max(10.0, 2.0 / scene.filter_interval_s)
+        if "flights" in scene:
+            scene.flights = scene.flights[:2]
         if "segments" in path:
             path.segments = path.segments[:3]
-        elif "duration" in path:
-            path.duration = 120.0
-        elif "end" in path:
-            path.end = 61.0
+        elif "duration_s" in path:
+            path.duration_s = 120.0
+        elif "end_s" in path:
+            path.end_s = 61.0
     return scene
 
 
