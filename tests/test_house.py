@@ -25,6 +25,7 @@ FLOORS = (
     ("model", "noise"),
     ("filter", "scenario"),
     ("results",),
+    ("config",),
     ("report", "job", "learn", "ppl", "testing"),
     ("claims",),
     ("cli",),
@@ -39,7 +40,7 @@ ONLY = {  # (importing folder, imported folder): the modules that it may name
 }
 NEVER = {("filter", "noise"), ("scenario", "results"), ("scenario", "filter"), ("nav", "kernels")}
 AT_THE_SAME_FLOOR = {("ppl", "report"), ("learn", "job")}
-FOREIGN = {"hydra": {"cli", "job"}, "omegaconf": {"cli", "job"}}
+FOREIGN = {"hydra": {"cli", "config", "job"}, "omegaconf": {"cli", "config", "job"}}
 NO_ENGINE = ("torch", "pyro", "hydra")  # stored files are enough for these folders
 STORED = {"results", "report", "claims"}
 LONGEST_FILE, LONGEST_FUNCTION = 250, 25
@@ -72,7 +73,7 @@ def allowed(folder: str, name: str) -> bool:
     parts = name.split(".")
     target = parts[1] if len(parts) > 1 else ""
     if target not in FLOOR:  # the package itself: its version and `load`
-        return FLOOR[folder] >= FLOOR["job"]
+        return FLOOR[folder] >= FLOOR["config"]
     pair = (folder, target)
     if target == folder or pair in TOGETHER:
         return True

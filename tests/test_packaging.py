@@ -67,6 +67,7 @@ def test_a_stage_of_another_project_runs_beside_the_shipped_ones(mylab: Path) ->
         "run",
         "-m",
         "hydra.searchpath=[file://conf]",
+        "trust=[mylab]",
         *walk,
         "filter=sir,careful,bold",
         "study=mine",

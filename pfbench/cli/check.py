@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 
 from pfbench.cli.messages import format_error
-from pfbench.job.configuration import compose, list_groups
+from pfbench.config.composition import compose, list_groups
 
 HELP = """\
 pfbench check

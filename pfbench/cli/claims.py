@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pfbench.job.configuration import compose, conf_dir, experiments_dir
+from pfbench.config.composition import compose
+from pfbench.config.folders import conf_dir, experiments_dir
 
 HELP = """\
 pfbench claims [key=value ...]

@@ -6,7 +6,9 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from pfbench.job.configuration import JobConfig, compose, experiments_dir
+from pfbench.config.composition import JobConfig, compose
+from pfbench.config.folders import experiments_dir
+from pfbench.config.sweep_check import expand_sweep
 
 
 def compose_study(words: Sequence[str]) -> JobConfig:
@@ -53,30 +55,6 @@ def read_sweep(experiment: str) -> list[str]:
         return []
     params = OmegaConf.select(OmegaConf.load(path), "hydra.sweeper.params") or {}
     return [f"{name}={value}" for name, value in params.items()]
-
-
-def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
-    """Expand overrides as Hydra's sweeper does.
-
-    A later override replaces an earlier one.
-
-    Args:
-        overrides: Overrides, some with several values.
-
-    Returns:
-        For each key the alternatives, each as an override.
-    """
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
-    alternatives: dict[str, list[str]] = {}
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
-        key = override.get_key_element()
-        if override.is_sweep_override():
-            values = [f"{key}={value}" for value in override.sweep_string_iterator()]
-        else:
-            values = [override.input_line or f"{key}={override.get_value_element_as_str()}"]
-        alternatives[key] = values
-    return list(alternatives.values())
 
 
 def read_description(path: Path) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pfbench.cli.compose import read_description
 from pfbench.cli.messages import suggest_similar
-from pfbench.job.configuration import list_groups
+from pfbench.config.composition import list_groups
 
 HELP = """\
 pfbench list [GROUP]

@@ -9,6 +9,7 @@ from importlib import import_module
 
 import pfbench
 from pfbench.cli.messages import format_error, suggest_similar
+from pfbench.config.trust import ENVIRONMENT, split_trust
 
 # command: function of the module of the same name, summary
 COMMANDS = {
@@ -65,6 +66,10 @@ def _run_command(command: str, options: Sequence[str]) -> None:
     shows_traceback = "--traceback" in options or bool(os.environ.get("PFBENCH_TRACEBACK"))
     words = [word for word in options if word != "--traceback"]
     try:
+        words, packages = split_trust(words)
+        os.environ[ENVIRONMENT] = ",".join(
+            packages
+        )  # for all parts, and the processes of a launcher
         getattr(import_module(f"pfbench.cli.{command}"), COMMANDS[command][0])(words)
     except KeyboardInterrupt:
         print(

@@ -165,7 +165,7 @@ def _format_unknown_key(name: str, words: Sequence[str]) -> str:
 
 def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:
     """List the dotted keys of the configuration of all other overrides."""
-    from pfbench.job.configuration import compose
+    from pfbench.config.composition import compose
 
     others = [word for word in words if "=" in word and excluded not in word and "," not in word]
     try:

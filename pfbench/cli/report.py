@@ -10,7 +10,8 @@ from typing import Any
 from pfbench.cli.claims import write_claims_page
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error
-from pfbench.job.configuration import JobConfig, compose, experiments_dir
+from pfbench.config.composition import JobConfig, compose
+from pfbench.config.folders import experiments_dir
 
 HELP = """\
 pfbench report study=NAME [key=value ...]

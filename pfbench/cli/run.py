@@ -10,8 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pfbench.cli.compose import expand_sweep, given_keys, read_sweep
-from pfbench.job.configuration import compose, conf_dir, register_experiments
+from pfbench.cli.compose import given_keys, read_sweep
+from pfbench.config.composition import compose, register_experiments
+from pfbench.config.folders import conf_dir
+from pfbench.config.sweep_check import check_words, expand_sweep
 
 HELP = """\
 pfbench run [-m] key=value ...
@@ -45,6 +47,7 @@ def run_jobs(words: Sequence[str]) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
     overrides = [word for word in words if word not in flags]
+    check_words([*flags, *overrides])
     sys.argv = ["pfbench run", *flags, *overrides]
     decorate = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
     application = decorate(run_task)

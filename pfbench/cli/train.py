@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pfbench.job.configuration import compose
+from pfbench.config.composition import compose
 
 HELP = """\
 pfbench train key=value ...

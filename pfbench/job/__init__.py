@@ -37,22 +37,20 @@ __all__ = [
 __getattr__, __dir__ = lazy_attributes(
     __name__,
     {
-        "configuration": (
+        ".config.composition": (
             "JobConfig",
             "compose",
-            "conf_dir",
-            "experiments_dir",
             "list_groups",
             "register_experiments",
             "resolve_config",
         ),
+        ".config.folders": ("conf_dir", "experiments_dir"),
         "datasheet_data": ("build_datasheet",),
         "metadata": ("read_versions",),
         "pcrb_cache": ("compute_pcrb",),
         "plan": (
             "IGNORED_IN_KEY",
             "JobPlan",
-            "apply_global_settings",
             "build_plan",
             "instantiate",
             "job_key",
@@ -63,6 +61,7 @@ __getattr__, __dir__ = lazy_attributes(
             "compute_job",
             "run",
         ),
+        "settings": ("apply_global_settings",),
         "scoring": (
             "ProperScores",
             "ScoreRecorder",

@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pfbench.config.composition import JobConfig
 from pfbench.core.record import Episode, iterate_steps
-from pfbench.job.configuration import JobConfig
 from pfbench.job.metadata import describe_state, make_provenance
 from pfbench.job.pcrb_cache import compute_pcrb
-from pfbench.job.plan import DATASHEETS, IGNORED_IN_KEY, apply_global_settings, instantiate_parts
+from pfbench.job.plan import DATASHEETS, IGNORED_IN_KEY, instantiate_parts
+from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.scenario.oracle_noise import RecordingRegime

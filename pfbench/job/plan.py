@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,12 +13,13 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from pfbench.config.composition import JobConfig
+from pfbench.config.trust import check_configuration, trusted_packages
 from pfbench.core.record import Episode
 from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.run_batches import choose_run_batch
-from pfbench.job.configuration import JobConfig
-from pfbench.kernels.process_memory import keep_freed_memory
+from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.scenario.base import Scenario
@@ -145,7 +145,7 @@ def build_plan(config: JobConfig) -> JobPlan:
     apply_global_settings(values)
     # The model first: a scenario may contain it, and an error then names the key of the model.
     model, scenario, noise, method = instantiate_parts(
-        values, ("model", "scenario", "noise", "filter")
+        values, ("model", "scenario", "noise", "filter"), config.trusted
     )
     runs = torch.arange(values["first_run"], values["first_run"] + values["runs"])
     return JobPlan(config, model, scenario, RecordingRegime(noise), method, runs)
@@ -158,81 +158,37 @@ def job_key(values: Mapping[str, Any]) -> str:
     return store.config_key(values, (*IGNORED_IN_KEY, *defaults))
 
 
-def instantiate(node: Any) -> Any:
-    """Build the object that a node names by `_target_`, with plain lists and dicts."""
+def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:
+    """Build the object that a node names by `_target_`. Lists and dicts become plain ones.
+
+    Args:
+        node: Node of a configuration.
+        trusted: Packages that it may name besides pfbench and those of PFBENCH_TRUST.
+
+    Returns:
+        The object.
+
+    Raises:
+        ValueError: If a name in the node is not public or not trusted.
+    """
+    is_config = OmegaConf.is_config(node)
+    values = OmegaConf.to_container(node, resolve=True) if is_config else node
+    check_configuration(values, (*trusted, *trusted_packages()))
     return hydra.utils.instantiate(node, _convert_="all")
 
 
-def instantiate_parts(values: Mapping[str, Any], names: Sequence[str]) -> tuple[Any, ...]:
+def instantiate_parts(
+    values: Mapping[str, Any], names: Sequence[str], trusted: Sequence[str] = ()
+) -> tuple[Any, ...]:
     """Build several parts of a configuration.
 
     Args:
         values: Resolved configuration. Errors name the full key of a part in it.
         names: Top-level keys of the parts, in the order of their construction.
+        trusted: Packages that the parts may name besides pfbench.
 
     Returns:
         The objects.
     """
     tree = OmegaConf.create({name: values[name] for name in names})
-    return tuple(instantiate(tree[name]) for name in names)
-
-
-def check_settings(values: Mapping[str, Any]) -> None:
-    """Check the settings of a job that do not belong to one of its objects.
-
-    Args:
-        values: Configuration.
-
-    Raises:
-        ValueError: If a value is invalid. The message names key, requirement and value.
-    """
-    requirements = {
-        **{key: f"a whole number of at least {least}" for key, least in _INTEGERS.items()},
-        "oracle_noise": "true (the filter receives the true noise regime) or false",
-        "pcrb": "auto (where the model's distributions are the simulated ones), true or false",
-        "memory_limit_gib": "the GiB that the job may use, or null for most of the free memory",
-        "dtype": "float64 (default) or float32",
-        "budget": f"one of {', '.join(store.BUDGETS)}",
-        "engine": "auto, eager, kernels or compiled",
-        "device": "cpu, cuda, or one of several GPUs such as cuda:1",
-    }
-    valid = {
-        **{key: type(values[key]) is int and values[key] >= _INTEGERS[key] for key in _INTEGERS},
-        "oracle_noise": type(values["oracle_noise"]) is bool,
-        "pcrb": values["pcrb"] in (True, False, "auto"),
-        "memory_limit_gib": _is_memory_limit(values["memory_limit_gib"]),
-        "dtype": values["dtype"] in ("float32", "float64"),
-        "budget": values["budget"] in store.BUDGETS,
-        "engine": values["engine"] in ("auto", "eager", "kernels", "compiled"),
-        "device": re.fullmatch(r"cpu|cuda(:\d+)?", str(values["device"])) is not None,
-    }
-    for key, requirement in requirements.items():
-        if not valid[key]:
-            raise ValueError(f"{key} must be {requirement}, got {values[key]}. Change this value.")
-    device, count = values["device"], torch.cuda.device_count()
-    if device != "cpu" and (torch.device(device).index or 0) >= count:
-        raise ValueError(
-            f"device must be cpu or one of {count} CUDA devices, got {device}. Use device=cpu."
-        )
-
-
-def apply_global_settings(values: Mapping[str, Any]) -> None:
-    """Check the settings of a job, and set threads and memory allocator.
-
-    Args:
-        values: Configuration.
-
-    Raises:
-        ValueError: If a value is invalid.
-    """
-    check_settings(values)
-    torch.set_num_threads(values["threads"])
-    keep_freed_memory()
-
-
-_INTEGERS = {"runs": 1, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}  # with minimum
-
-
-def _is_memory_limit(value: Any) -> bool:
-    """Return whether a value is a memory limit: a positive number, or None."""
-    return value is None or (isinstance(value, int | float) and value > 0)
+    return tuple(instantiate(tree[name], trusted) for name in names)

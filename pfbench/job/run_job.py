@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,10 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
+from pfbench.config.composition import CHOICES, JobConfig, resolve_config
 from pfbench.core.record import Episode
 from pfbench.filter.learned.checkpoint import checkpoint_provenance
 from pfbench.job.allocation import EpisodeSource, apply_budget, max_runs_in_memory
-from pfbench.job.configuration import CHOICES, JobConfig, resolve_config
 from pfbench.job.filter_pass import TimedFilterPass, pass_filter
 from pfbench.job.metadata import make_metadata
 from pfbench.job.pcrb_cache import compute_pcrb
@@ -153,11 +152,6 @@ def compute_job(config: JobConfig, label: str) -> tuple[dict[str, Any], dict[str
 def _result_path(values: Mapping[str, Any]) -> Path:
     """Return the file of a job."""
     study = values["study"]
-    if not re.fullmatch(r"\w[\w.-]*", str(study)):
-        raise ValueError(
-            "study must be the name of a results folder (letters, digits, points, dashes and "
-            f"underscores), got {study}. Choose another name."
-        )
     if study in _RESERVED:
         raise ValueError(
             f"study must not be {' or '.join(_RESERVED)}, got {study}. These folders hold other "

@@ -26,6 +26,7 @@ from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
 from pfbench.kernels import cuda
+from pfbench.kernels.private_folder import use_private_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -106,7 +107,7 @@ def compilable(
 
     @cache
     def compiled() -> Callable[..., Any]:
-        return torch.compile(function, dynamic=True)
+        return _compile_by_torch(function)
 
     def run_compiled(*args: Any) -> Any:
         if _on_cuda(args):
@@ -147,6 +148,12 @@ def _find_cuda_kernel(
     if operator is None or not _plain(args):
         return None
     return cuda.find_kernel(operator.__name__, args)
+
+
+def _compile_by_torch(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function by torch's compiler."""
+    use_private_cache()
+    return torch.compile(function, dynamic=True)
 
 
 def _register_shapes(operator: Callable[..., Any], template: Callable[..., Any]) -> None:

@@ -304,6 +304,17 @@ def run_steps(
     return results
 
 
+def register_step(step: int, outputs: int, arguments: list[Tensor]) -> None:
+    """Register a compiled step, so that `run_steps` checks its arguments.
+
+    Args:
+        step: Address of the compiled step.
+        outputs: Number of tensors that a step returns.
+        arguments: Arguments of one step with the types, shapes and strides that it was compiled for.
+    """
+    _operator("register_step")(step, outputs, arguments)
+
+
 _STEP = (
     philox_normals,
     philox_uniforms,
@@ -315,6 +326,7 @@ _STEP = (
     count_unique,
     sum_and_squares,
     weighted_moments,
+    register_step,
     run_steps,
 )
 _GAUSSIAN = cholesky_factor, kalman_update, fit_affine

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import torch
 
+from pfbench.kernels.private_folder import check_private, code_folder
+
 _SOURCES = Path(__file__).parent / "src"
 _TORCH = Path(torch.__file__).parent
 _COMMON = ("-O3", "-march=native", "-fopenmp-simd", "-fPIC", "-std=c++17", "-c")
@@ -34,7 +36,7 @@ def load_library() -> None:
     """Compile the kernels unless they are cached, and load the library, which registers them.
 
     Raises:
-        OSError: If no C++ compiler is installed.
+        OSError: If no C++ compiler is installed, or others can write the compiled code.
         CalledProcessError: If the compiler rejects the source.
     """
     compiler = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
@@ -42,12 +44,12 @@ def load_library() -> None:
         raise OSError("a C++ compiler must be on the PATH (c++, g++ or clang++), got none")
     environment = (compiler, _FLAGS, os.cpu_count(), torch.__version__)
     sources = {name: (_SOURCES / f"{name}.cpp").read_bytes() for name in _FLAGS}
-    text = b"".join(sources.values()) + (_SOURCES / "tensors.h").read_bytes()
+    headers = (file.read_bytes() for file in sorted(_SOURCES.glob("*.h")))
+    text = b"".join([*sources.values(), *headers])
     name = hashlib.sha256(text + repr(environment).encode()).hexdigest()[:16]
-    folder = Path(tempfile.gettempdir()) / f"pfbench_{os.getuid()}"
+    folder = code_folder()
     built = folder / f"{name}.so"
     if not built.exists():
-        folder.mkdir(mode=0o700, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             objects = [Path(scratch) / f"{source}.o" for source in sources]
             new = Path(scratch) / built.name
@@ -74,4 +76,5 @@ def load_library() -> None:
                 capture_output=True,
             )
             os.replace(new, built)
+    check_private(built)
     ctypes.CDLL(str(built), mode=ctypes.RTLD_GLOBAL)  # compiled steps call the kernels by name

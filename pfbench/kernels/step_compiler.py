@@ -20,6 +20,7 @@ from torch.fx import Node
 
 from pfbench.kernels import cpp
 from pfbench.kernels.cpp_library import load_library
+from pfbench.kernels.private_folder import use_private_cache
 
 log = logging.getLogger("pfbench")
 
@@ -103,6 +104,7 @@ def compile_function(
     from torch.fx.experimental.proxy_tensor import make_fx
     from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
+    use_private_cache()
     decompositions = {torch.ops.aten.stack.default: _stack_by_component}
     graph = make_fx(function, decomposition_table=decompositions)(*example)
     on_cpu = not any(a.is_cuda for a in example)
@@ -172,6 +174,15 @@ def _stack_by_component(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
     return torch.cat([a.unsqueeze(0) for a in tensors]).permute(*range(1, last + 1), 0)
 
 
+def _register_entry(
+    library: str, constants: list[Tensor], example: list[Tensor], outputs: int
+) -> NativeEntry:
+    """Return the entry of a library, after registering what it takes."""
+    entry = NativeEntry(function_address(library, _ENTRY), constants)
+    cpp.register_step(entry.address, outputs, [*constants, *example])
+    return entry
+
+
 def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> NativeEntry | None:
     """Return the C++ function behind `run`; log a line and return None if it is not as expected."""
     arguments: list[Tensor] = []
@@ -192,7 +203,7 @@ def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> Native
         if not all(a is b for a, b in zip(inputs, example, strict=True)):
             raise TypeError("its arguments must be in the order of the example")
         library = inspect.getclosurevars(call).nonlocals["f"].__self__.__file__
-        entry = NativeEntry(function_address(library, _ENTRY), constants)
+        entry = _register_entry(library, constants, example, len(expected))
         batched = [a.unsqueeze(0) for a in example]
         results = cpp.run_steps(entry.address, len(expected), constants, [], batched, [])
         pairs = zip(results, expected, strict=True)

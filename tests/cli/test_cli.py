@@ -111,7 +111,7 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "told maybe": (("oracle_noise=maybe",), ("oracle_noise must be true", "or false, got maybe")),
     "study in a folder": (
         ("study=a/b",),
-        ("study must be the name of a results folder", "got a/b"),
+        ("study must be a name of letters", "got 'a/b'"),
     ),
     "study of claims": (("study=claims",), ("study must not be datasheets or claims, got claims",)),
     "regime": (
@@ -120,7 +120,7 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "no such class": (
         ("noise._target_=pfbench.noise.white.Louder",),
-        ("noise: a value is not valid", "Louder"),
+        ("noise._target_ must be a public class of pfbench", "got 'pfbench.noise.white.Louder'"),
     ),
     "a model without its scenario": (
         ("model=ins_gnss",),

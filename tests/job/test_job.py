@@ -210,9 +210,7 @@ def test_single_precision_is_close_to_double(tmp_path: Path, method: str) -> Non
 
 
 def test_the_worlds_of_a_study_are_flown_once_for_all_filters(tmp_path: Path) -> None:
-    segments = (
-        "scenario.trajectory.segments=[{_target_:pfbench.nav.manoeuvres.cruise,duration_s:10}]"
-    )
+    segments = "scenario.trajectory.segments=[{_target_:pfbench.nav.cruise,duration_s:10}]"
     said = pfbench(
         "run",
         "-m",

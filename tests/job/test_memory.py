@@ -28,7 +28,7 @@ from pfbench.scenario.model_simulation import ModelSimulation
 
 draw = plan.JobPlan.draw_episode
 MODEL = linear_walk(1.0, 0.3, 1.0)
-SEGMENT = "[{_target_:pfbench.nav.manoeuvres.cruise,duration_s:4}]"
+SEGMENT = "[{_target_:pfbench.nav.cruise,duration_s:4}]"
 WALK = ("scenario=linear_walk", "scenario.steps=12", "runs=7", "particles=100", "filter=sir")
 
 

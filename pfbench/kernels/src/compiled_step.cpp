@@ -6,6 +6,10 @@
 #include <torch/csrc/stable/tensor.h>
 
 #include <cstdint>
+#include <map>
+#include <mutex>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
 #ifdef __SSE2__
@@ -35,6 +39,61 @@ struct Flush {
     ~Flush() { _mm_setcsr(before); }
 #endif
 };
+
+// What a compiled step takes as given: type, sizes and strides of each argument, and the number of its results. Its code was made
+// for these alone and does not look at them again.
+struct Signature {
+    int64_t outputs;
+    std::vector<std::vector<int64_t>> layouts;
+};
+std::map<int64_t, Signature> signatures;  // by the address of the step
+std::mutex signatures_lock;
+
+// Type, sizes and strides of a tensor from an axis on. The stride of an axis of one entry has no meaning.
+std::vector<int64_t> layout(const Tensor& a, int64_t first = 0) {
+    int32_t type;
+    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_dtype(a.get(), &type));
+    std::vector<int64_t> numbers{type};
+    for (int64_t k = first; k < a.dim(); ++k) {
+        numbers.push_back(a.size(k));
+        numbers.push_back(a.size(k) > 1 ? a.stride(k) : 0);
+    }
+    return numbers;
+}
+
+void register_step(int64_t step, int64_t outputs, std::vector<Tensor> arguments) {
+    Signature signature{outputs, {}};
+    for (const Tensor& a : arguments) signature.layouts.push_back(layout(a));
+    const std::lock_guard<std::mutex> guard(signatures_lock);
+    signatures[step] = signature;
+}
+
+// Raises unless a step is known and its first call gets what it was compiled for.
+void check_step(int64_t step, int64_t outputs, const std::vector<Tensor>& constants, const std::vector<Tensor>& state,
+                const std::vector<Tensor>& seen, const std::vector<Tensor>& shared) {
+    const std::lock_guard<std::mutex> guard(signatures_lock);
+    const auto found = signatures.find(step);
+    if (found == signatures.end()) throw std::runtime_error("run_steps: step must be the address of a registered step.");
+    if (outputs != found->second.outputs || outputs < static_cast<int64_t>(state.size()))
+        throw std::runtime_error("run_steps: outputs must be the number of results of the step.");
+    if (seen.empty()) throw std::runtime_error("run_steps: inputs must have at least one tensor.");
+    std::vector<std::vector<int64_t>> layouts;
+    for (const Tensor& a : constants) layouts.push_back(layout(a));
+    for (const Tensor& a : state) layouts.push_back(layout(a));
+    for (const Tensor& a : seen) {
+        if (a.dim() < 1 || a.size(0) != seen[0].size(0))
+            throw std::runtime_error("run_steps: inputs must have one row for each step.");
+        layouts.push_back(layout(a, 1));
+    }
+    for (const Tensor& a : shared) layouts.push_back(layout(a));
+    if (layouts.size() != found->second.layouts.size())
+        throw std::runtime_error("run_steps: the step must have " + std::to_string(found->second.layouts.size()) + " arguments, got " +
+                                 std::to_string(layouts.size()) + ".");
+    for (size_t k = 0; k < layouts.size(); ++k)
+        if (layouts[k] != found->second.layouts[k])
+            throw std::runtime_error("run_steps: argument " + std::to_string(k) +
+                                     " must have the type, shape and strides that the step was compiled for.");
+}
 
 AtenTensorHandle again(const Tensor& a) {
     AtenTensorHandle made;
@@ -69,6 +128,7 @@ AtenTensorHandle particles_first(const Tensor& a) {
 // first), its part of `seen` [T, ...] and `shared`.
 std::vector<Tensor> follow(int64_t step, int64_t outputs, std::vector<Tensor> constants, std::vector<Tensor> state,
                            std::vector<Tensor> seen, std::vector<Tensor> shared) {
+    check_step(step, outputs, constants, state, seen, shared);
     const Lock held;
     const Flush flushed;
     const int64_t steps = seen[0].size(0);
@@ -92,4 +152,7 @@ std::vector<Tensor> follow(int64_t step, int64_t outputs, std::vector<Tensor> co
 }
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) { library.impl("run_steps", TORCH_BOX(&follow)); }
+STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
+    library.impl("run_steps", TORCH_BOX(&follow));
+    library.impl("register_step", TORCH_BOX(&register_step));
+}

@@ -7,7 +7,7 @@
 #include <tuple>
 #include <vector>
 
-#include "tensors.h"
+#include "operator_checks.h"
 
 namespace {
 // Numbers of as many runs as fill a register.
@@ -193,6 +193,7 @@ Lanes<T> squared_length(Lanes<T>* e, Lanes<T>* covariance, int64_t d) {
 }
 
 Tensor squared_length_operator(Tensor e, Tensor covariance) {
+    checks::squared_mahalanobis(e, covariance);
     const int64_t systems = e.size(0), d = e.size(1);
     return by_type(e, [&](auto one) {
         using T = decltype(one);
@@ -210,6 +211,7 @@ Tensor squared_length_operator(Tensor e, Tensor covariance) {
 }
 
 std::tuple<Tensor, Tensor> rooted_operator(Tensor covariance) {
+    checks::cholesky_factor(covariance);
     const int64_t runs = covariance.size(0), d = covariance.size(1);
     return by_type(covariance, [&](auto one) {
         using T = decltype(one);
@@ -227,6 +229,7 @@ std::tuple<Tensor, Tensor> rooted_operator(Tensor covariance) {
 }
 
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> updated_operator(Tensor m, Tensor r, Tensor omega) {
+    checks::kalman_update(m, r, omega);
     const int64_t runs = m.size(0), k = m.size(1), d = m.size(2), width = d + 1;
     return by_type(m, [&](auto one) {
         using T = decltype(one);
@@ -275,6 +278,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> updated_operator(Tensor m, Te
 }
 
 std::tuple<Tensor, Tensor> fitted_operator(Tensor r, Tensor xi, Tensor w) {
+    checks::fit_affine(r, xi, w);
     const int64_t runs = r.size(0), points = r.size(1), k = r.size(2), d = xi.size(1);
     return by_type(r, [&](auto one) {
         using T = decltype(one);

@@ -11,7 +11,7 @@
 #include <tuple>
 #include <vector>
 
-#include "tensors.h"
+#include "operator_checks.h"
 
 // of normals.cpp
 extern "C" void normals(float*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
@@ -289,8 +289,18 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
 
 constexpr std::array<int64_t, 3> COMPONENTS_FIRST = {2, 0, 1};
 
+// Whether all indices are from 0 to size - 1; without a branch, so that many are compared at a time.
+bool within(const int64_t* index, int64_t count, int64_t size) {
+    uint64_t largest = 0;
+    for (int64_t i = 0; i < count; ++i) largest = std::max(largest, static_cast<uint64_t>(index[i]));
+    return count == 0 || largest < static_cast<uint64_t>(size);
+}
+
 template <class T, void (*DRAW)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t)>
 Tensor drawn(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
+    if (std::is_same_v<T, float>) checks::philox_normals(seed, purpose, step, runs, components, quarters);
+    else checks::philox_uniforms(seed, purpose, step, runs, components, quarters);
+    require(components * runs.size(0) < MAX_SIZE && quarters < MAX_SIZE, "philox: more than 2^30 numbers of a kind");
     const Tensor out = fresh<T>({components, runs.size(0), 4 * quarters});
     const Packed<int64_t> run(runs);
     DRAW(numbers<T>(out), run.data, runs.size(0), components, quarters, *numbers<int64_t>(step), *numbers<int64_t>(seed), purpose);
@@ -298,9 +308,14 @@ Tensor drawn(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t com
 }
 
 Tensor systematic_operator(Tensor a, Tensor n, Tensor u) {
+    checks::resample_systematic(a, n, u);
     const int64_t runs = a.size(0), slots = a.size(1);
     const Tensor out = fresh<int64_t>({runs, slots});
     const auto wanted = few<double>(n, runs), uniform = few<double>(u, runs);
+    bool valid = slots > 0;  // a comparison with NaN is false
+    for (int64_t r = 0; r < runs; ++r)
+        valid &= wanted[r] >= 0 && wanted[r] <= static_cast<double>(slots) && uniform[r] >= 0 && uniform[r] <= 1;
+    require(valid, "resample_systematic: n must be from 0 to the number of slots, and u from 0 to 1. Change the particle count.");
     by_type(a, [&](auto one) {
         systematic(numbers<int64_t>(out), Packed<decltype(one)>(a).data, wanted.data(), uniform.data(), runs, slots);
     });
@@ -308,8 +323,10 @@ Tensor systematic_operator(Tensor a, Tensor n, Tensor u) {
 }
 
 Tensor copied_operator(Tensor x, Tensor ancestors) {
+    checks::gather_particles(x, ancestors);
     const int64_t components = x.size(0), runs = x.size(1), wanted = ancestors.size(1);
     const Packed<int64_t> from(ancestors);
+    require(within(from.data, runs * wanted, x.size(2)), "gather_particles: ancestors must be from 0 to N - 1.");
     return by_type(x, [&](auto one) {
         using T = decltype(one);
         const Tensor out = fresh<T>({components, runs, wanted});
@@ -319,6 +336,7 @@ Tensor copied_operator(Tensor x, Tensor ancestors) {
 }
 
 Tensor log_normal_operator(Tensor y, Tensor mean, Tensor scale, Tensor constant) {
+    checks::log_normal(y, mean, scale, constant);
     const int64_t runs = mean.size(0), particles = mean.size(1), components = mean.size(2);
     return by_type(mean, [&](auto one) {
         using T = decltype(one);
@@ -339,6 +357,7 @@ bool quiet(const Tensor& w) {
 }
 
 Tensor affine_operator(Tensor phi, Tensor x, Tensor gain, Tensor w) {
+    checks::propagate_affine(phi, x, gain, w);
     const int64_t runs = x.size(0), particles = x.size(1), rows = phi.size(1);
     const bool one = phi.size(0) == 1 && gain.size(0) == 1;  // runs then lie side by side as particles of one run do
     return by_type(x, [&](auto like) {
@@ -355,15 +374,19 @@ Tensor affine_operator(Tensor phi, Tensor x, Tensor gain, Tensor w) {
 }
 
 Tensor distinct_operator(Tensor copy_of, Tensor log_w) {
+    checks::count_unique(copy_of, log_w);
     const int64_t runs = copy_of.size(0);
     const Tensor out = fresh<int64_t>({runs});
+    const Packed<int64_t> ancestor(copy_of);
+    require(within(ancestor.data, runs * copy_of.size(1), 2 * copy_of.size(1)), "count_unique: ancestors must be from 0 to 2 N - 1.");
     by_type(log_w, [&](auto one) {
-        distinct(numbers<int64_t>(out), Packed<int64_t>(copy_of).data, Packed<decltype(one)>(log_w).data, runs, copy_of.size(1));
+        distinct(numbers<int64_t>(out), ancestor.data, Packed<decltype(one)>(log_w).data, runs, copy_of.size(1));
     });
     return out;
 }
 
 std::tuple<Tensor, Tensor> totals_operator(Tensor part) {
+    checks::sum_and_squares(part);
     const int64_t runs = part.size(0);
     return by_type(part, [&](auto one) {
         using T = decltype(one);
@@ -374,6 +397,7 @@ std::tuple<Tensor, Tensor> totals_operator(Tensor part) {
 }
 
 std::tuple<Tensor, Tensor> moments_operator(Tensor x, Tensor w) {
+    checks::weighted_moments(x, w);
     const int64_t runs = x.size(0), components = x.size(2);
     return by_type(x, [&](auto one) {
         using T = decltype(one);
@@ -385,8 +409,10 @@ std::tuple<Tensor, Tensor> moments_operator(Tensor x, Tensor w) {
 }
 
 Tensor spread_operator(Tensor x, Tensor mean, Tensor w, Tensor groups) {
+    checks::group_covariance(x, mean, w, groups);
     const int64_t runs = x.size(0), many = groups.size(0), size = groups.size(1);
     const Packed<int64_t> components(groups);
+    require(within(components.data, many * size, x.size(2)), "group_covariance: groups must be indices of components.");
     return by_type(x, [&](auto one) {
         using T = decltype(one);
         const Tensor out = fresh<T>({runs, many, size, size});

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pfbench
+from pfbench.config.folders import conf_dir, experiments_dir
+from pfbench.config.protected_keys import check_protected_keys
+from pfbench.config.trust import check_configuration, check_study, split_trust
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -28,11 +30,16 @@ class JobConfig:
         choices: Name of the file chosen in each group, for instance `{"filter": "sir", ...}`.
         uses_shared_particles: Whether `filter.particles` refers to the key `particles`. Only then
             may a budget replace the number.
+        trusted: Packages that `_target_` may name besides pfbench.
+
+    Raises:
+        ValueError: If a group is missing, or a value names what is not trusted.
     """
 
     values: dict[str, Any]
     choices: dict[str, str]
     uses_shared_particles: bool = False
+    trusted: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         missing = [group for group in CHOICES if group not in self.choices]
@@ -41,6 +48,9 @@ class JobConfig:
                 f"choices must name {', '.join(CHOICES)}, got {sorted(self.choices)}. Add "
                 f"{', '.join(missing)}, or build the configuration with job.compose([...])."
             )
+        check_configuration(self.values, self.trusted)
+        if "study" in self.values:
+            check_study(self.values["study"])
 
 
 def compose(overrides: Sequence[str] = ()) -> JobConfig:
@@ -49,41 +59,73 @@ def compose(overrides: Sequence[str] = ()) -> JobConfig:
     Works within and without a Hydra application. Hydra's global state is the same afterwards.
 
     Args:
-        overrides: Hydra overrides such as `"scenario=flight_300s"` or `"+experiment=quickstart"`.
+        overrides: Hydra overrides such as `"scenario=flight_300s"` or `"+experiment=quickstart"`,
+            and `"trust=[mylab]"` for packages whose classes the configuration may name.
 
     Returns:
         The configuration of one job.
+
+    Raises:
+        ValueError: If a file sets a key that only the command line may set, or a value names what
+            is not trusted.
     """
-    from hydra import compose as compose_config
-    from hydra import initialize_config_dir
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import open_dict
 
-    register_experiments()
+    words, trusted = split_trust(overrides)
     with _preserved_hydra_state():
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            composed = compose_config("config", list(overrides), return_hydra_config=True)
+        composed = compose_tree(words)
         HydraConfig.instance().set_config(composed)  # an experiment may look up the choices
         choices = {str(k): str(v) for k, v in composed.hydra.runtime.choices.items()}
         with open_dict(composed):
             del composed["hydra"]
-        return resolve_config(composed, choices)
+        return resolve_config(composed, choices, trusted)
+
+
+def compose_tree(words: Sequence[str]) -> DictConfig:
+    """Compose a configuration with Hydra's own settings and check the keys that files may not set.
+
+    Args:
+        words: Hydra overrides.
+
+    Returns:
+        The configuration, not resolved, with the node `hydra`.
+
+    Raises:
+        UntrustedConfigError: If a file sets a key that only the command line may set.
+    """
+    from hydra import compose as compose_config
+    from hydra import initialize_config_dir
+
+    def compose_words(some: Sequence[str]) -> DictConfig:
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return compose_config("config", list(some), return_hydra_config=True)
+
+    register_experiments()
+    with _preserved_hydra_state():
+        composed = compose_words(words)
+        check_protected_keys(composed, words, compose_words)
+    return composed
 
 
 def resolve_config(
-    config: JobConfig | DictConfig | Mapping[str, Any], choices: Mapping[str, str] | None = None
+    config: JobConfig | DictConfig | Mapping[str, Any],
+    choices: Mapping[str, str] | None = None,
+    trusted: Sequence[str] = (),
 ) -> JobConfig:
     """Resolve all interpolations of a configuration.
 
     Args:
         config: Configuration of a job. One that is resolved already is returned unchanged.
         choices: Names of the chosen scenario, noise, filter and model. Default: `config.choices`.
+        trusted: Packages that `_target_` may name besides pfbench and those of PFBENCH_TRUST.
 
     Returns:
         The resolved configuration.
 
     Raises:
-        ValueError: If the choices do not name scenario, noise, filter and model.
+        ValueError: If the choices do not name scenario, noise, filter and model, or a value names
+            what is not trusted.
     """
     from omegaconf import OmegaConf
 
@@ -96,17 +138,8 @@ def resolve_config(
     values = OmegaConf.to_container(tree, resolve=True)
     assert isinstance(values, dict)
     names = {str(group): str(name) for group, name in (choices or {}).items()}
-    return JobConfig({str(key): value for key, value in values.items()}, names, is_shared)
-
-
-def conf_dir() -> Path:
-    """Return the folder of configurations, in the package or the checkout."""
-    return _find_folder("conf", "config.yaml")
-
-
-def experiments_dir() -> Path:
-    """Return the folder of experiments, in the package or the checkout."""
-    return _find_folder("experiments", "quickstart.yaml")
+    _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
+    return JobConfig({str(key): value for key, value in values.items()}, names, is_shared, packages)
 
 
 def list_groups() -> dict[str, list[Path]]:
@@ -156,14 +189,3 @@ def _preserved_hydra_state() -> Iterator[None]:
         yield
     finally:
         GlobalHydra.instance().hydra, HydraConfig.instance().cfg = saved
-
-
-def _find_folder(name: str, marker: str) -> Path:
-    """Return the folder inside or next to the package that contains the marker file."""
-    package = Path(pfbench.__file__).resolve().parent
-    for folder in (package / name, package.parent / name):
-        if (folder / marker).exists():
-            return folder
-    raise FileNotFoundError(
-        f"{name}/{marker} must be inside or next to {package}, got neither. Reinstall pfbench."
-    )

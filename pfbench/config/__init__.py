@@ -1,0 +1,1 @@
+"""Configuration of jobs: composition, trust, and keys that files may not set."""

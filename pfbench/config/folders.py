@@ -1,0 +1,28 @@
+"""Folders of the configuration files, of the installed package or of the checkout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pfbench
+
+
+def conf_dir() -> Path:
+    """Return the folder of configurations, of the installed package or of the checkout."""
+    return _find_folder("conf", "config.yaml")
+
+
+def experiments_dir() -> Path:
+    """Return the folder of experiments, of the installed package or of the checkout."""
+    return _find_folder("experiments", "quickstart.yaml")
+
+
+def _find_folder(name: str, marker: str) -> Path:
+    """Return the folder inside or next to the package that contains the marker file."""
+    package = Path(pfbench.__file__).resolve().parent
+    for folder in (package / name, package.parent / name):
+        if (folder / marker).exists():
+            return folder
+    raise FileNotFoundError(
+        f"{name}/{marker} must be inside or next to {package}, got neither. Reinstall pfbench."
+    )

@@ -1,0 +1,100 @@
+"""Check of a command before Hydra acts on it: Hydra makes folders and calls plugins before any job."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pfbench.config.composition import compose, compose_tree
+from pfbench.config.folders import conf_dir, experiments_dir
+from pfbench.config.trust import UntrustedConfigError, check_study
+
+
+def check_words(words: Sequence[str]) -> None:
+    """Check the words of `pfbench run`, those of all jobs of a sweep included.
+
+    A job whose configuration is invalid for another reason fails by itself later, and the other jobs
+    of the sweep run.
+
+    Args:
+        words: Overrides and flags of Hydra, without `trust`.
+
+    Raises:
+        UntrustedConfigError: If a file sets what only the command line may set, or names what is
+            not trusted.
+    """
+    from hydra._internal.utils import get_args_parser
+
+    args = get_args_parser().parse_args(list(words))
+    if args.config_path or args.config_name:
+        raise UntrustedConfigError(
+            "--config-path and --config-name must not be used, since pfbench has its own main file. "
+            "Use --config-dir=FOLDER for more files."
+        )
+    overrides = list(args.overrides)
+    if args.config_dir:
+        overrides.append(f"hydra.searchpath=[file://{args.config_dir}]")
+    if args.multirun:
+        _check_sweep(overrides)
+    else:
+        _check_composition(overrides)
+
+
+def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
+    """Expand overrides as Hydra's sweeper does. A later override replaces an earlier one.
+
+    Args:
+        overrides: Overrides, some with several values.
+
+    Returns:
+        For each key the alternatives, each as an override.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    alternatives: dict[str, list[str]] = {}
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key = override.get_key_element()
+        if override.is_sweep_override():
+            values = [f"{key}={value}" for value in override.sweep_string_iterator()]
+        else:
+            values = [override.input_line or f"{key}={override.get_value_element_as_str()}"]
+        alternatives[key] = values
+    return list(alternatives.values())
+
+
+def _check_composition(words: list[str]) -> Mapping[str, object]:
+    """Compose a configuration for its checks. Other errors are left to the job."""
+    try:
+        return compose(words).values
+    except UntrustedConfigError:
+        raise
+    except Exception:
+        return {}
+
+
+def _check_sweep(overrides: list[str]) -> None:
+    """Check the first job of a sweep, and all values that can choose a file that is not pfbench's."""
+    try:
+        tree = compose_tree([options[0] for options in expand_sweep(overrides)])
+        params = tree.hydra.sweeper.params or {}
+        swept = [f"{name}={value}" for name, value in params.items()]
+        alternatives = expand_sweep([*swept, *overrides])
+    except UntrustedConfigError:
+        raise
+    except Exception:  # Hydra reports an invalid override
+        return
+    first = [options[0] for options in alternatives]
+    values = _check_composition(first)
+    for index, options in enumerate(alternatives):
+        for option in options[1:]:
+            key, _, value = option.lstrip("+").partition("=")
+            if key == "study":
+                check_study(value.strip("'\""))
+            is_plain = key in values and not isinstance(values[key], Mapping)
+            if not is_plain and not _is_own_file(key, value):
+                _check_composition([*first[:index], option, *first[index + 1 :]])
+
+
+def _is_own_file(group: str, name: str) -> bool:
+    """Return whether a choice of a group is a file of pfbench."""
+    folder = experiments_dir() if group == "experiment" else conf_dir() / group
+    return (folder / f"{name}.yaml").is_file()

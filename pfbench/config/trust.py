@@ -1,0 +1,204 @@
+"""Trust: what a configuration may name, and which keys a file may not set.
+
+A scenario or an experiment may come from a stranger. Before anything is built from a configuration,
+all of it is checked: `_target_` may name public classes of pfbench and names of packages that the
+user trusts, and folders and Hydra's own settings come from the command line or from pfbench.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+ENVIRONMENT = "PFBENCH_TRUST"  # trusted packages, for the processes of a sweep
+FOLDERS = ("nav", "model", "noise", "scenario", "filter", "learn")
+# public functions that build an object; the other ones run filters, read logs or write files
+BUILDERS = {
+    "nav": ("accelerate", "climb", "cruise", "turn"),
+    "model": ("linear_walk", "local_level"),
+}
+# packages that are too large to be trusted as a whole: each can read, write or run files
+BROAD = (
+    "hydra",
+    "joblib",
+    "numpy",
+    "omegaconf",
+    "pandas",
+    "pyro",
+    "ray",
+    "scipy",
+    "sympy",
+    "torch",
+)
+HYDRA_KEYS = ("_target_", "_args_", "_partial_", "_convert_", "_recursive_")
+NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+")
+STUDY = re.compile(r"[A-Za-z0-9_][\w.+-]{0,99}", re.ASCII)
+DEEPEST = 40  # levels of a configuration
+
+
+class UntrustedConfigError(ValueError):
+    """A configuration names what it may not name, or sets what it may not set."""
+
+
+def split_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
+    """Take the key `trust` out of overrides.
+
+    Args:
+        words: Overrides, for instance `["scenario=mine", "trust=[mylab]"]`.
+
+    Returns:
+        The other overrides, and the trusted packages with those of the environment variable.
+
+    Raises:
+        UntrustedConfigError: If an entry is not a name, or is too large to be trusted.
+    """
+    others = [word for word in words if not word.startswith("trust=")]
+    texts = [word.partition("=")[2] for word in words if word.startswith("trust=")]
+    return others, _parse_packages([*texts, os.environ.get(ENVIRONMENT, "")])
+
+
+def trusted_packages() -> tuple[str, ...]:
+    """Return the packages that the environment variable names."""
+    return _parse_packages([os.environ.get(ENVIRONMENT, "")])
+
+
+def _parse_packages(texts: Sequence[str]) -> tuple[str, ...]:
+    """Parse lists of packages such as `[mylab,other.filters]`."""
+    names = [name.strip(" '\"") for text in texts for name in text.strip(" []").split(",")]
+    packages = tuple(dict.fromkeys(name for name in names if name))
+    for name in packages:
+        if not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", name):
+            raise UntrustedConfigError(
+                f"trust must be a list of package names, got {name!r}. Use trust=[mylab]."
+            )
+        if name in BROAD or name.split(".")[0] in sys.stdlib_module_names or name == "pfbench":
+            raise UntrustedConfigError(
+                f"trust must not be a general library, got {name!r}. It can run or delete files. "
+                "Name the package that defines your classes."
+            )
+    return packages
+
+
+def check_configuration(values: Any, trusted: Sequence[str] = (), path: str = "") -> None:
+    """Check all names that instantiation would import, and that nothing is left to resolve.
+
+    Args:
+        values: Resolved configuration: dictionaries, lists and plain values.
+        trusted: Names of packages that the user trusts.
+        path: Key of `values`, for messages.
+
+    Raises:
+        UntrustedConfigError: If a name is not public or not trusted, or if a text still has an interpolation.
+    """
+    for key, node in _walk(values, path):
+        if isinstance(node, str) and "${" in node:
+            raise UntrustedConfigError(
+                f"{key} must be resolved, got {node!r}. Remove the escaped interpolation."
+            )
+        if isinstance(node, Mapping):
+            _check_node(key, node, trusted)
+
+
+def check_study(name: Any) -> None:
+    """Check the name of a study, which is also the name of its folder.
+
+    Args:
+        name: Value of the key `study`.
+
+    Raises:
+        UntrustedConfigError: If it is not a plain name.
+    """
+    if not isinstance(name, str) or not STUDY.fullmatch(name) or set(name) == {"."}:
+        raise UntrustedConfigError(
+            f"study must be a name of letters, digits, '_', '-', '+' and '.', got {name!r}. "
+            "Use results_dir=... and reports_dir=... for other folders."
+        )
+
+
+def _walk(node: Any, path: str, depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Yield all nodes of a configuration with their keys."""
+    if depth > DEEPEST:
+        raise UntrustedConfigError(
+            f"{path} must have at most {DEEPEST} levels, got more. Simplify the configuration."
+        )
+    yield path, node
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            yield from _walk(value, f"{path}.{key}" if path else str(key), depth + 1)
+    elif isinstance(node, list | tuple):
+        for index, value in enumerate(node):
+            yield from _walk(value, f"{path}[{index}]", depth + 1)
+
+
+def _check_node(key: str, node: Mapping[Any, Any], trusted: Sequence[str]) -> None:
+    """Check one dictionary of a configuration."""
+    special = [name for name in node if isinstance(name, str) and re.fullmatch(r"_.*_", name)]
+    unknown = [name for name in special if name not in HYDRA_KEYS]
+    if unknown:
+        raise UntrustedConfigError(
+            f"{key} must not have the key {unknown[0]}. Keys of instantiation are "
+            f"{', '.join(HYDRA_KEYS)}."
+        )
+    if "_target_" not in node:
+        return
+    target = node["_target_"]
+    requirement = (
+        f"{key}{'.' if key else ''}_target_ must be a public class of pfbench or of a trusted "
+        f"package, got {target!r}. "
+    )
+    if not isinstance(target, str) or not NAME.fullmatch(target):
+        raise UntrustedConfigError(requirement + "Write it as pfbench.FOLDER.Class.")
+    if target.startswith("pfbench."):
+        if not _is_public(target):
+            raise UntrustedConfigError(requirement + "See pfbench.FOLDER.__all__ for the names.")
+    elif not any(target.startswith(f"{package}.") for package in trusted):
+        package = target.split(".")[0]
+        is_library = package in BROAD or package in sys.stdlib_module_names
+        remedy = (
+            "Remove this node."
+            if is_library
+            else f"If you trust this package, add trust=[{package}] on the command line."
+        )
+        raise UntrustedConfigError(requirement + "Nothing was run. " + remedy)
+    elif not _is_defined_in(target, trusted):
+        raise UntrustedConfigError(requirement + "The package imports this name from elsewhere.")
+
+
+@cache
+def _is_public(target: str) -> bool:
+    """Return whether a name of pfbench is a class or a builder that a folder exports.
+
+    Classes are recognised by their capital, since the check must not import torch.
+    """
+    parts = target.split(".")
+    if len(parts) != 3 or parts[1] not in FOLDERS:
+        return False
+    folder, name = parts[1:]
+    door = import_module(f"pfbench.{folder}")
+    return name in door.__all__ and (name[0].isupper() or name in BUILDERS.get(folder, ()))
+
+
+def _is_defined_in(target: str, trusted: Sequence[str]) -> bool:
+    """Return whether a name is defined by a trusted package, not imported there from another one."""
+    parts = target.split(".")
+    value: Any = None
+    for count in range(len(parts) - 1, 0, -1):
+        name = ".".join(parts[:count])
+        if not any(name == package or name.startswith(f"{package}.") for package in trusted):
+            return False
+        try:
+            value = import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not (name == error.name or name.startswith(f"{error.name}.")):
+                raise
+            continue
+        for attribute in parts[count:]:
+            value = getattr(value, attribute)
+        break
+    module = str(getattr(value, "__module__", ""))
+    return any(module == package or module.startswith(f"{package}.") for package in trusted)

@@ -1,0 +1,73 @@
+"""Settings of a job that do not belong to one of its objects: seed, threads, precision, device, engine."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from pfbench.kernels.process_memory import keep_freed_memory
+from pfbench.results import store
+
+
+def check_settings(values: Mapping[str, Any]) -> None:
+    """Check the settings of a job that do not belong to one of its objects.
+
+    Args:
+        values: Configuration.
+
+    Raises:
+        ValueError: If a value is invalid. The message names key, requirement and value.
+    """
+    requirements = {
+        **{key: f"a whole number of at least {least}" for key, least in _INTEGERS.items()},
+        "oracle_noise": "true (the filter receives the true noise regime) or false",
+        "pcrb": "auto (where the model's distributions are the simulated ones), true or false",
+        "memory_limit_gib": "the GiB that the job may use, or null for most of the free memory",
+        "dtype": "float64 (default) or float32",
+        "budget": f"one of {', '.join(store.BUDGETS)}",
+        "engine": "auto, eager, kernels or compiled",
+        "device": "cpu, cuda, or one of several GPUs such as cuda:1",
+    }
+    valid = {
+        **{key: type(values[key]) is int and values[key] >= _INTEGERS[key] for key in _INTEGERS},
+        "oracle_noise": type(values["oracle_noise"]) is bool,
+        "pcrb": values["pcrb"] in (True, False, "auto"),
+        "memory_limit_gib": _is_memory_limit(values["memory_limit_gib"]),
+        "dtype": values["dtype"] in ("float32", "float64"),
+        "budget": values["budget"] in store.BUDGETS,
+        "engine": values["engine"] in ("auto", "eager", "kernels", "compiled"),
+        "device": re.fullmatch(r"cpu|cuda(:\d+)?", str(values["device"])) is not None,
+    }
+    for key, requirement in requirements.items():
+        if not valid[key]:
+            raise ValueError(f"{key} must be {requirement}, got {values[key]}. Change this value.")
+    device, count = values["device"], torch.cuda.device_count()
+    if device != "cpu" and (torch.device(device).index or 0) >= count:
+        raise ValueError(
+            f"device must be cpu or one of {count} CUDA devices, got {device}. Use device=cpu."
+        )
+
+
+def apply_global_settings(values: Mapping[str, Any]) -> None:
+    """Check the settings of a job, and set threads and memory allocator.
+
+    Args:
+        values: Configuration.
+
+    Raises:
+        ValueError: If a value is invalid.
+    """
+    check_settings(values)
+    torch.set_num_threads(values["threads"])
+    keep_freed_memory()
+
+
+_INTEGERS = {"runs": 1, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}  # with minimum
+
+
+def _is_memory_limit(value: Any) -> bool:
+    """Return whether a value is a memory limit: a positive number, or None."""
+    return value is None or (isinstance(value, int | float) and value > 0)

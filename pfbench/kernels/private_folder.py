@@ -1,0 +1,51 @@
+"""Folder of compiled code. Code is loaded only from a folder that the user alone can write."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+
+def code_folder() -> Path:
+    """Return the folder of compiled code, `pfbench` in the user's cache folder.
+
+    Raises:
+        OSError: If it cannot be made, or if others can write there.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "pfbench"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    check_private(folder)
+    return folder
+
+
+def use_private_cache() -> None:
+    """Make torch's compiler keep its code in `code_folder`, unless the user chose another folder.
+
+    Its default is a folder of a predictable name in the system's temporary folder.
+
+    Raises:
+        OSError: If the folder cannot be made, or if others can write there.
+    """
+    if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(code_folder() / "torch")
+
+
+def check_private(path: Path) -> None:
+    """Check that a folder or a file belongs to the user and that no other can write it.
+
+    Args:
+        path: Path of the folder or file.
+
+    Raises:
+        PermissionError: If it is a link, belongs to another user, or others may write it.
+    """
+    status = path.lstat()
+    is_plain = stat.S_ISDIR(status.st_mode) or stat.S_ISREG(status.st_mode)
+    is_owned = not hasattr(os, "getuid") or status.st_uid == os.getuid()
+    if not is_plain or not is_owned or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise PermissionError(
+            f"{path} must be a folder or file of this user that others cannot write. Compiled code "
+            "is not loaded from it. Remove it, or set XDG_CACHE_HOME to a private folder."
+        )

@@ -1,0 +1,98 @@
+// Checks of an operator's arguments: device, type and shape, O(number of axes).
+#pragma once
+#include <cctype>
+#include <cstdint>
+#include <string>
+
+#include "tensors.h"
+
+namespace {
+constexpr int64_t MAX_SIZE = int64_t{1} << 30;  // of an axis: counters of particles have 32 bits
+
+class ArgumentCheck {
+    const char* operator_name;
+    int64_t sizes[26];  // of the axes A to Z; -1 as long as no argument has one
+    int32_t real_type = -1;
+
+    [[noreturn]] void fail(const char* argument, const std::string& requirement, const std::string& value) const {
+        throw std::runtime_error(std::string(operator_name) + ": " + argument + " must " + requirement + ", got " + value + ".");
+    }
+
+    static std::string shape_of(const Tensor& a) {
+        std::string text = "[";
+        for (int64_t k = 0; k < a.dim(); ++k) text += (k ? ", " : "") + std::to_string(a.size(k));
+        return text + "]";
+    }
+
+    static std::string axes_of(const char* axes) {
+        std::string text = "[";
+        for (const char* axis = axes; *axis; ++axis) {
+            text += axis == axes ? "" : ", ";
+            text += static_cast<char>(std::toupper(*axis));
+            if (std::islower(*axis)) text += " or 1";
+        }
+        return text + "]";
+    }
+
+    void shape(const char* argument, const Tensor& a, const char* axes) {
+        int32_t device;
+        STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(a.get(), &device));
+        if (device != aoti_torch_device_type_cpu()) fail(argument, "be on the CPU", "a tensor on another device");
+        const int64_t count = static_cast<int64_t>(std::char_traits<char>::length(axes));
+        bool valid = a.dim() == count;
+        for (int64_t k = 0; valid && k < count; ++k) {
+            const int64_t size = a.size(k);
+            if (size >= MAX_SIZE) fail(argument, "have less than 2^30 entries along each axis", shape_of(a));
+            if (axes[k] == '1') {
+                valid = size == 1;
+                continue;
+            }
+            if (std::islower(axes[k]) && size == 1) continue;
+            int64_t& wanted = sizes[std::toupper(axes[k]) - 'A'];
+            if (wanted < 0) wanted = size;
+            valid = size == wanted;
+        }
+        if (valid) return;
+        std::string known;
+        for (char axis = 'A'; axis <= 'Z'; ++axis)
+            if (const int64_t size = sizes[axis - 'A']; size >= 0)
+                known += (known.empty() ? " with " : ", ") + std::string(1, axis) + " = " + std::to_string(size);
+        fail(argument, "have shape " + axes_of(axes), shape_of(a) + known);
+    }
+
+  public:
+    explicit ArgumentCheck(const char* name) : operator_name(name) {
+        for (int64_t& size : sizes) size = -1;
+    }
+
+    // float32 or float64, the same type for all real arguments
+    void real(const char* argument, const Tensor& a, const char* axes) {
+        const int32_t type = kind(a);
+        if (real_type < 0) real_type = type;
+        if (type != real_type || (type != kind<float>() && type != kind<double>()))
+            fail(argument, "be float32 or float64 as the other real arguments", "another type");
+        shape(argument, a, axes);
+    }
+
+    void number(const char* argument, const Tensor& a, const char* axes) {
+        const int32_t type = kind(a);
+        if (type != kind<float>() && type != kind<double>() && type != kind<int64_t>())
+            fail(argument, "be float32, float64 or int64", "another type");
+        shape(argument, a, axes);
+    }
+
+    void int64(const char* argument, const Tensor& a, const char* axes) {
+        if (kind(a) != kind<int64_t>()) fail(argument, "be int64", "another type");
+        shape(argument, a, axes);
+    }
+
+    void integer(const char* argument, int64_t value) {
+        if (value < 0 || value >= MAX_SIZE * 4) fail(argument, "be from 0 to 2^32 - 1", std::to_string(value));
+    }
+};
+
+// Raises where a condition on the values of an argument does not hold.
+inline void require(bool condition, const char* message) {
+    if (!condition) throw std::runtime_error(message);
+}
+}  // namespace

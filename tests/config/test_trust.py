@@ -1,0 +1,278 @@
+"""Hostile files: nothing runs, is written or is deleted because a file says so."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from command_line import pfbench
+
+from pfbench import job
+from pfbench.config import trust
+from pfbench.config.sweep_check import check_words
+from pfbench.config.trust import UntrustedConfigError
+
+CANARY = "CANARY"  # replaced by the path of a file that must not change
+NEW = "NEWFILE"  # replaced by the path of a file that must not appear
+
+
+def call(target: str, *args: Any, **more: Any) -> dict[str, Any]:
+    return {"_target_": target, **({"_args_": list(args)} if args else {}), **more}
+
+
+NODES: dict[str, Any] = {  # nodes that ran code, wrote or deleted files, or would
+    "path_write": call("pathlib.Path.write_text", call("pathlib.Path", NEW), "x"),
+    "path_unlink": call("pathlib.Path.unlink", call("pathlib.Path", CANARY)),
+    "os_system": call("os.system", f"touch {NEW}"),
+    "posix_system": call("posix.system", f"touch {NEW}"),
+    "os_remove": call("os.remove", CANARY),
+    "popen": call("subprocess.Popen", ["touch", NEW]),
+    "run": call("subprocess.run", ["touch", NEW]),
+    "rmtree": call("shutil.rmtree", f"{CANARY}.folder"),
+    "copy": call("shutil.copy", CANARY, NEW),
+    "eval": call("builtins.eval", f"open({NEW!r}, 'w')"),
+    "exec": call("builtins.exec", f"open({NEW!r}, 'w')"),
+    "open": call("builtins.open", NEW, "w"),
+    "import": call("importlib.import_module", "antigravity"),
+    "sympify": call("sympy.sympify", f"open({NEW!r}, 'w')"),
+    "sympy_parser": call("sympy.parsing.sympy_parser.parse_expr", f"open({NEW!r}, 'w')"),
+    "read_pickle": call("pandas.read_pickle", CANARY),
+    "pandas_eval": call("pandas.eval", f"@pd.io.common.os.system('touch {NEW}')"),
+    "torch_load": call("torch.load", CANARY, weights_only=False),
+    "numpy_load": call("numpy.load", CANARY, allow_pickle=True),
+    "numpy_save": call("numpy.save", NEW, [1]),
+    "load_library": call("torch.ops.load_library", CANARY),
+    "torch_save": call("torch.save", [1], NEW),
+    "cpp_extension": call("torch.utils.cpp_extension.load", "x", [CANARY]),
+    "joblib_load": call("joblib.load", CANARY),
+    "pickle_loads": call("pickle.loads", "x"),
+    "yaml_load": call("yaml.unsafe_load", f"!!python/object/apply:os.system ['touch {NEW}']"),
+    "hydra_call": call("hydra.utils.call", {"_target_": "os.system"}),
+    "hydra_get": call("hydra.utils.get_method", path="os.system"),
+    "partial": call("os.system", _partial_=True),
+    "functools": call("functools.partial", call("os.system", f"touch {NEW}")),
+    "exit": call("sys.exit", 0),
+    "environment": call("os.putenv", "PFBENCH_TRUST", "os"),
+    "atexit": call("atexit.register", call("os.system", f"touch {NEW}", _partial_=True)),
+    "own_store": call("pfbench.results.store.write_result", NEW, {}, {}),
+    "own_command": call("pfbench.cli.main.main", ["report", "study=adhoc"]),
+    "own_job": call("pfbench.job.run", {}),
+    "own_instantiate": call("pfbench.job.plan.hydra.utils.call", {}),
+    "own_module": call("pfbench.job.plan.torch.load", CANARY),
+    "own_train": call("pfbench.learn.train", NEW),
+    "private": call("pfbench.filter.__getattr__", "ParticleFilter"),
+    "attribute_of_class": call("pfbench.filter.ParticleFilter.__init__.__globals__.get", "os"),
+    "spaces": call("os.system ", f"touch {NEW}"),
+    "no_text": {"_target_": ["os.system"]},
+    "unknown_key": {"_target_": "pfbench.noise.NominalNoise", "_call_": "os.system"},
+    "escaped": "\\${oc.create:'{_target_: os.system, command: x}'}",
+    "from_text": "${oc.create:'{_target_: os.system, command: touch " + NEW + "}'}",
+}
+FILES: dict[str, tuple[str, str]] = {  # group and text of whole files
+    "results": ("noise", "# @package _global_\nresults_dir: NEWFILE\n"),
+    "reports": ("noise", "# @package _global_\nreports_dir: NEWFILE\n"),
+    "episodes": ("noise", "# @package _global_\nepisode_cache_dir: NEWFILE\n"),
+    "study": ("noise", "# @package _global_\nstudy: ../../outside\n"),
+    "absolute_study": ("noise", "# @package _global_\nstudy: NEWFILE\n"),
+    "trust": ("noise", "# @package _global_\ntrust: [os]\n"),
+    "checkpoint": ("train", "# @package _global_\ntrain:\n  checkpoint_path: NEWFILE\n"),
+    "run_folder": ("noise", "# @package _global_\nhydra:\n  run:\n    dir: NEWFILE\n"),
+    "sweep_folder": ("noise", "# @package _global_\nhydra:\n  sweep:\n    dir: NEWFILE\n"),
+    "output": ("noise", "# @package _global_\nhydra:\n  output_subdir: NEWFILE\n"),
+    "callbacks": (
+        "noise",
+        "# @package _global_\nhydra:\n  callbacks:\n    a: {_target_: os.system, command: touch NEWFILE}\n",
+    ),
+    "launcher": ("noise", "# @package _global_\nhydra:\n  launcher:\n    _target_: os.system\n"),
+    "logging": (
+        "noise",
+        "# @package _global_\nhydra:\n  job_logging:\n    handlers:\n      console:\n"
+        "        (): os.system\n        command: touch NEWFILE\n",
+    ),
+    "log_file": (
+        "noise",
+        "# @package _global_\nhydra:\n  job_logging:\n    handlers:\n      console:\n"
+        "        class: logging.FileHandler\n        filename: NEWFILE\n",
+    ),
+    "env_set": (
+        "noise",
+        "# @package _global_\nhydra:\n  job:\n    env_set:\n      PFBENCH_TRUST: sympy.core\n",
+    ),
+    "sweeper": (
+        "experiment",
+        "# @package _global_\nhydra:\n  sweeper:\n    params:\n      episode_cache_dir: NEWFILE\n",
+    ),
+    "swept_launcher": (
+        "experiment",
+        "# @package _global_\nhydra:\n  sweeper:\n    params:\n      hydra.run.dir: NEWFILE\n",
+    ),
+    "setup": (
+        "experiment",
+        "# @package _global_\ndefaults:\n  - override /hydra/launcher: slurm\n"
+        "hydra:\n  launcher:\n    setup: [touch NEWFILE]\n",
+    ),
+}
+GROUPS = ("noise", "scenario", "filter", "model", "train")
+COMMANDS = ("run", "datasheet", "report", "train", "run -m", "claims")
+
+
+def text_of(node: Any) -> str:
+    """A file whose class is honest and whose parameter is the node."""
+    return yaml.safe_dump({"_target_": "pfbench.noise.NominalNoise", "sd_factor": node})
+
+
+def try_file(folder: Path, group: str, text: str, command: str) -> Any:
+    """Run a command with a file; return what it said, after checking that nothing changed."""
+    canary, new = folder / "canary.txt", folder / "new"
+    canary.write_text("kept")
+    (folder / "canary.txt.folder").mkdir()
+    (folder / "conf" / group).mkdir(parents=True)
+    text = text.replace(CANARY, str(canary)).replace(NEW, str(new))
+    (folder / "conf" / group / "hostile.yaml").write_text(text)
+    before = sorted(folder.rglob("*"))
+    plus = "+" if group == "experiment" else ""
+    said = pfbench(
+        *command.split(), f"hydra.searchpath=[file://{folder / 'conf'}]", "scenario=linear_walk",
+        *(["filter=neural_sir"] if command == "train" else []), f"{plus}{group}=hostile",
+        *(["study=adhoc"] if command in ("report", "claims") else []),
+        "runs=2", "results_dir=results", "reports_dir=reports",
+        home=folder,
+    )  # fmt: skip
+    after = {path for path in folder.rglob("*") if path.relative_to(folder).parts[0] != "results"}
+    assert after <= set(before)
+    assert canary.read_text() == "kept"
+    assert (folder / "canary.txt.folder").is_dir()
+    return said
+
+
+def test_hostile_nodes_are_refused_before_anything_is_built(tmp_path: Path) -> None:
+    assert len(NODES) + len(FILES) >= 60
+    for number, (name, node) in enumerate(NODES.items()):
+        folder = tmp_path / name
+        folder.mkdir()
+        group, command = GROUPS[number % len(GROUPS)], COMMANDS[number % (len(COMMANDS) - 1)]
+        said = try_file(folder, group, text_of(node), command)
+        assert said.code == 1, (name, said)
+        assert "must" in said.err, (name, said.err)
+        assert f"{group}." in said.err or "hydra" in said.err, (name, said.err)
+        assert not (folder / "results").exists(), name
+    assert os.environ.get("PFBENCH_TRUST", "") == ""
+
+
+def test_files_cannot_set_folders_or_the_settings_of_hydra(tmp_path: Path) -> None:
+    for number, (name, (group, text)) in enumerate(FILES.items()):
+        folder = tmp_path / name
+        folder.mkdir()
+        command = "train" if group == "train" else ("run -m", "run", "datasheet")[number % 3]
+        words = (folder, group, text, command)
+        if name in ("results", "reports"):  # the command line of try_file sets them
+            continue
+        said = try_file(*words)
+        assert said.code == 1, (name, said)
+        assert "must" in said.err, (name, said.err)
+
+
+def test_a_file_cannot_set_the_folder_of_results(tmp_path: Path) -> None:
+    (tmp_path / "conf" / "noise").mkdir(parents=True)
+    for key in ("results_dir", "reports_dir"):
+        (tmp_path / "conf" / "noise" / "hostile.yaml").write_text(
+            f"# @package _global_\n{key}: {tmp_path / 'new'}\n"
+        )
+        words = [f"hydra.searchpath=[file://{tmp_path / 'conf'}]", "noise=hostile"]
+        with pytest.raises(UntrustedConfigError, match=f"{key} must be set on the command line"):
+            job.compose(words)
+        assert job.compose([*words, f"{key}=here"]).values[key] == "here"
+
+
+def test_every_alternative_of_a_sweep_is_checked(tmp_path: Path) -> None:
+    (tmp_path / "conf" / "noise").mkdir(parents=True)
+    (tmp_path / "conf" / "noise" / "hostile.yaml").write_text(FILES["callbacks"][1])
+    words = ["-m", f"hydra.searchpath=[file://{tmp_path / 'conf'}]", "scenario=linear_walk"]
+    check_words([*words, "noise=nominal,outliers"])
+    with pytest.raises(UntrustedConfigError, match=r"hydra\.callbacks"):
+        check_words([*words, "noise=nominal,hostile"])
+    with pytest.raises(UntrustedConfigError, match="study must be a name"):
+        check_words([*words, "study=a,../b"])
+    for flag in ("--config-path=/tmp", "--config-name=other"):
+        with pytest.raises(UntrustedConfigError, match="--config-path and --config-name"):
+            check_words([flag])
+
+
+def test_studies_are_plain_names() -> None:
+    for name in ("adhoc", "a-b_2.c+d", "2026"):
+        trust.check_study(name)
+    for name in (
+        "",
+        ".",
+        "..",
+        "../x",
+        "a/b",
+        "/tmp/x",
+        "a\\b",
+        "~",
+        "a b",
+        "-x",
+        "x" * 101,
+        "a\n",
+        None,
+        3,
+        "ä",
+    ):
+        with pytest.raises(UntrustedConfigError, match="study must be"):
+            trust.check_study(name)
+
+
+MYLAB = """
+import os
+from pathlib import Path
+
+from pfbench.noise import NominalNoise
+
+
+class Quiet(NominalNoise):
+    pass
+"""
+
+
+def test_a_package_that_the_user_trusts_may_be_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "trustedlab.py").write_text(MYLAB)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    words = ["scenario=linear_walk", "++noise={_target_: trustedlab.Quiet}"]
+    with pytest.raises(UntrustedConfigError, match=r"trust=\[trustedlab\]"):
+        job.compose(words)
+    config = job.compose([*words, "trust=[trustedlab]"])
+    assert type(job.build_plan(config).recording_regime.regime).__name__ == "Quiet"
+    monkeypatch.setenv("PFBENCH_TRUST", "trustedlab")
+    assert job.compose(words).trusted == ("trustedlab",)
+    for name in (
+        "trustedlab.os.system",
+        "trustedlab.Path",
+        "trustedlab.Path.unlink",
+        "trustedlab.NominalNoise",
+    ):
+        with pytest.raises(UntrustedConfigError, match="from elsewhere"):
+            trust.check_configuration({"noise": {"_target_": name}}, ("trustedlab",))
+    for name in ("os", "torch", "pathlib", "builtins", "pfbench", "not a name", "a;b"):
+        with pytest.raises(UntrustedConfigError, match="trust must"):
+            trust.split_trust([f"trust=[{name}]"])
+    assert trust.split_trust(["trust=[torch.nn,a.b]", "runs=3"])[0] == ["runs=3"]
+
+
+def test_capital_names_of_the_public_folders_are_classes() -> None:
+    """The check recognises a class by its capital."""
+    import importlib
+
+    for folder in trust.FOLDERS:
+        door = importlib.import_module(f"pfbench.{folder}")
+        for name in door.__all__:
+            assert name[0].isupper() == isinstance(getattr(door, name), type), name
+    assert all(
+        name in importlib.import_module(f"pfbench.{folder}").__all__
+        for folder, names in trust.BUILDERS.items()
+        for name in names
+    )

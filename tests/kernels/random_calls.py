@@ -1,0 +1,159 @@
+"""Random calls of the C++ operators, valid and wrong: `random_calls.py CALLS SEED`. A wrong call must raise.
+
+With an argument `sanitize` the operators are built with AddressSanitizer and UndefinedBehaviorSanitizer. Their
+runtimes must be preloaded, see test_operator_checks.py.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pfbench.kernels import cpp, cpp_library, manifest
+from pfbench.kernels.manifest import Argument
+
+OPERATORS = {
+    name: arguments
+    for name, arguments in manifest.read_operators().items()
+    if name != "gather_propagate"  # on a CUDA device only
+}
+REALS = (torch.float32, torch.float64)
+
+
+def make_tensor(
+    argument: Argument, shape: list[int], real: torch.dtype, rng: random.Random
+) -> Tensor:
+    """A tensor of an argument's kind whose memory is contiguous, permuted, a slice or expanded."""
+    dtype = {"real": real, "int64": torch.int64}.get(argument.kind) or rng.choice(
+        (*REALS, torch.int64)
+    )
+    layout = rng.randrange(4)
+    if layout == 1 and len(shape) > 1:
+        x = torch.rand(shape[::-1]).permute(*reversed(range(len(shape))))
+    elif layout == 2 and shape:
+        x = torch.rand(*shape[:-1], 2 * shape[-1] + 3)[..., 1 : 2 * shape[-1] + 1 : 2]
+    elif layout == 3 and shape:
+        x = torch.rand(1, *shape[1:]).expand(shape)
+    else:
+        x = torch.rand(shape)
+    if dtype == torch.int64:
+        return (4 * x).long()
+    if layout == 0 and rng.random() < 0.3 and x.numel():
+        x.view(-1)[rng.randrange(x.numel())] = rng.choice((torch.nan, torch.inf, -torch.inf, 1e38))
+    return x.to(dtype) if layout != 3 or not shape else x[:1].to(dtype).expand(shape)
+
+
+def make_call(name: str, rng: random.Random) -> list[Any]:
+    """Valid arguments of random sizes."""
+    sizes: dict[str, int] = {}
+    real, arguments = rng.choice(REALS), []
+    for argument in OPERATORS[name]:
+        if argument.kind == "int":
+            arguments.append(rng.choice((0, 1, 2, 5)))
+            continue
+        shape = []
+        for axis in argument.axes:
+            longest = 70 if axis.upper() in "NM" else 9
+            size = sizes.setdefault(axis.upper(), rng.choice((0, 1, 2, rng.randint(1, longest))))
+            shape.append(1 if axis == "1" or (axis.islower() and rng.random() < 0.4) else size)
+        arguments.append(make_tensor(argument, shape, real, rng))
+    return fix_values(name, arguments, sizes)
+
+
+def fix_values(name: str, arguments: list[Any], sizes: dict[str, int]) -> list[Any]:
+    """Put indices and counts into their range."""
+    if name == "resample_systematic":
+        n = max(sizes["N"], 0)
+        arguments[1] = torch.randint(0, n + 1, arguments[1].shape)
+        arguments[2] = torch.rand(arguments[2].shape)
+    limits = {
+        "gather_particles": (1, "N", 1),
+        "count_unique": (0, "N", 2),
+        "group_covariance": (3, "K", 1),
+    }
+    if name in limits:
+        place, axis, factor = limits[name]
+        arguments[place] = torch.randint(0, max(1, factor * sizes[axis]), arguments[place].shape)
+    return arguments
+
+
+def spoil(name: str, arguments: list[Any], rng: random.Random) -> list[Any]:
+    """Change one argument of a valid call in its shape, type or values."""
+    place = rng.randrange(len(arguments))
+    argument, value = OPERATORS[name][place], arguments[place]
+    spoiled = list(arguments)
+    if argument.kind == "int":
+        spoiled[place] = rng.choice((-1, -(2**40), 2**40, 2**62))
+        return spoiled
+    kind = rng.randrange(4)
+    if kind == 0 and value.dim():
+        axis = rng.randrange(value.dim())
+        spoiled[place] = torch.cat(
+            [value] + [value.narrow(axis, 0, min(1, value.shape[axis]))] * 2, axis
+        )
+    elif kind == 1:
+        spoiled[place] = (
+            value.unsqueeze(0) if value.dim() < 3 or rng.random() < 0.5 else value[0:0].sum(0)
+        )
+    elif kind == 2:
+        spoiled[place] = value.to(
+            rng.choice((torch.int32, torch.float16, torch.bool, torch.complex64))
+        )
+    elif name in ("gather_particles", "count_unique", "group_covariance", "resample_systematic"):
+        index = {
+            "gather_particles": 1,
+            "count_unique": 0,
+            "group_covariance": 3,
+            "resample_systematic": 1,
+        }[name]
+        spoiled[index] = arguments[index] + rng.choice((-(2**40), 2**40, 1000, -1000))
+    else:
+        spoiled[place] = value.to(torch.int16)
+    return spoiled
+
+
+def is_valid(name: str, arguments: list[Any]) -> bool:
+    """Whether the Python check accepts a call; values are not checked there."""
+    try:
+        manifest.check_arguments(name, arguments)
+    except ValueError:
+        return False
+    return True
+
+
+def run(calls: int, seed: int) -> dict[str, int]:
+    """Make random calls and count what became of them."""
+    cpp.sum_and_squares(torch.rand(1, 1))  # compiles and loads the operators
+    rng = random.Random(seed)
+    torch.manual_seed(seed)
+    counts = dict.fromkeys(("computed", "refused", "wrong but computed", "valid but refused"), 0)
+    for _ in range(calls):
+        name = rng.choice(list(OPERATORS))
+        arguments = make_call(name, rng)
+        if rng.random() < 0.5:
+            arguments = spoil(name, arguments, rng)
+        valid = is_valid(name, arguments)
+        try:
+            getattr(torch.ops.pfbench, name).default(*arguments)
+            counts["computed" if valid else "wrong but computed"] += 1
+        except (RuntimeError, NotImplementedError, TypeError) as error:
+            is_about_values = "must be" in str(error) or "more than" in str(error)
+            counts["refused" if not valid or is_about_values else "valid but refused"] += 1
+    return counts
+
+
+if __name__ == "__main__":
+    if "sanitize" in sys.argv:
+        flags = (
+            "-fsanitize=address,undefined,float-cast-overflow",
+            "-fno-sanitize-recover=undefined",
+            "-g",
+            "-O1",
+        )
+        cpp_library._FLAGS = {name: (*given, *flags) for name, given in cpp_library._FLAGS.items()}  # type: ignore[assignment]
+    torch.set_num_threads(1)
+    print(run(int(sys.argv[1]), int(sys.argv[2])))

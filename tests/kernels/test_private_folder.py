@@ -1,0 +1,68 @@
+"""Compiled code is loaded only from a folder that the user alone can write."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pfbench.kernels import private_folder
+
+LOAD = """
+import torch
+from pfbench.kernels import cpp
+try:
+    cpp.sum_and_squares(torch.rand(1, 2))
+    print("loaded")
+except OSError as error:
+    print("refused", error)
+"""
+
+
+def test_a_folder_that_others_can_write_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = private_folder.code_folder()
+    assert folder == tmp_path / "pfbench"
+    assert folder.stat().st_mode & 0o777 == 0o700
+    for mode in (0o770, 0o707, 0o777, 0o720):
+        folder.chmod(mode)
+        with pytest.raises(PermissionError, match="others cannot write"):
+            private_folder.code_folder()
+    folder.rmdir()
+    (tmp_path / "elsewhere").mkdir()
+    folder.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(PermissionError, match="Remove it"):
+        private_folder.code_folder()
+
+
+def test_a_folder_of_another_user_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    private_folder.code_folder()
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+    with pytest.raises(PermissionError, match="of this user"):
+        private_folder.code_folder()
+
+
+@pytest.mark.slow
+def test_a_library_that_others_can_write_is_not_loaded(tmp_path: Path) -> None:
+    def load() -> str:
+        environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+        command = [sys.executable, "-c", LOAD]
+        done = subprocess.run(
+            command, capture_output=True, text=True, env=environment, check=True, timeout=600
+        )
+        return done.stdout
+
+    assert load() == "loaded\n"
+    (library,) = (tmp_path / "pfbench").glob("*.so")
+    library.chmod(0o666)
+    assert load().startswith("refused")
+    library.chmod(0o600)
+    assert load() == "loaded\n"
