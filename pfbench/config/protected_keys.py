@@ -56,7 +56,8 @@ def check_protected_keys(
     values = to_plain(composed)
     for key, choices in allowed.items():
         value = _select(values, key)
-        if key not in given_keys and value not in choices:
+        is_allowed = value in choices or (key == "train.checkpoint_path" and _is_in_results(value))
+        if key not in given_keys and not is_allowed:
             raise UntrustedConfigError(
                 f"{key} must be set on the command line, got {value!r} from a file. "
                 f"Add {key}=... to the command, or remove the key from the file."
@@ -64,6 +65,12 @@ def check_protected_keys(
     _check_swept_keys(values, given_keys, allowed)
     check_study(OmegaConf.select(composed, "study"))
     _check_hydra(values, words, compose_reference)
+
+
+def _is_in_results(value: Any) -> bool:
+    """Return whether a path is below the folder of results, whatever the value of that key."""
+    path = re.fullmatch(r"\$\{results_dir\}/([\w./-]+)", str(value))
+    return path is not None and ".." not in path[1].split("/")
 
 
 def read_file(path: Path) -> dict[str, Any]:

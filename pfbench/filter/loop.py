@@ -16,6 +16,7 @@ from pfbench.core.random_stream import BatchRandomStream, RandomStream
 from pfbench.core.record import FeedbackRun, Record, iterate_steps
 from pfbench.filter.belief import Filter, StepInfo
 from pfbench.filter.feedback import apply_feedback, correctable_groups
+from pfbench.filter.input_check import check_model, check_record
 from pfbench.filter.run_batches import join_infos, join_runs, split_runs
 from pfbench.model.base import StateSpaceModel
 
@@ -196,16 +197,16 @@ def run_filter(
         Means, variances, evidence and diagnostics.
 
     Raises:
-        ValueError: If the record is empty or has infinite values, or if model or filter do not
+        ValueError: If record, model and random stream do not fit, or if model or filter do not
             support the record's feedback.
     """
-    _check_measurements(record)
+    check_record(model, record, draws)
     feedback = None
     if record.feedback is not None:
         feedback = record.feedback.begin(record, correctable_groups(model))
-    batches = split_runs(
-        prepare_record(model, record), draws, None if feedback is not None else run_batch
-    )
+    prepared = prepare_record(model, record)
+    check_model(model, prepared)
+    batches = split_runs(prepared, draws, None if feedback is not None else run_batch)
     passes = [FilterPass(method, model, *batch, feedback, lookahead=True) for batch in batches]
     means, variances, evidences, traces = [], [], [], []
     for t, steps in enumerate(zip(*passes, strict=True)):
@@ -222,11 +223,3 @@ def run_filter(
         torch.where(valid, torch.stack(rows, 1), torch.nan) for rows in (means, variances)
     )
     return FilterResult(mean, variance, evidences[-1], trace)
-
-
-def _check_measurements(record: Record) -> None:
-    """Raise a ValueError if a record is empty or has infinite measurements."""
-    if record.y.shape[1] == 0:
-        raise ValueError("record.y must have at least one time step, got 0. Add measurements.")
-    if bool(torch.isinf(record.y).any()):
-        raise ValueError("record.y must be finite, got infinity. Mark a missing component as NaN.")

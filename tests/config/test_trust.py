@@ -79,6 +79,10 @@ FILES: dict[str, tuple[str, str]] = {  # group and text of whole files
     "absolute_study": ("noise", "# @package _global_\nstudy: NEWFILE\n"),
     "trust": ("noise", "# @package _global_\ntrust: [os]\n"),
     "checkpoint": ("train", "# @package _global_\ntrain:\n  checkpoint_path: NEWFILE\n"),
+    "checkpoint_above": (
+        "train",
+        "# @package _global_\ntrain:\n  checkpoint_path: ${results_dir}/../../network.pt\n",
+    ),
     "run_folder": ("noise", "# @package _global_\nhydra:\n  run:\n    dir: NEWFILE\n"),
     "sweep_folder": ("noise", "# @package _global_\nhydra:\n  sweep:\n    dir: NEWFILE\n"),
     "output": ("noise", "# @package _global_\nhydra:\n  output_subdir: NEWFILE\n"),
@@ -276,3 +280,8 @@ def test_capital_names_of_the_public_folders_are_classes() -> None:
         for folder, names in trust.BUILDERS.items()
         for name in names
     )
+
+
+def test_the_experiments_of_pfbench_set_no_protected_key() -> None:
+    for file in job.experiments_dir().glob("*.yaml"):
+        assert job.compose([f"+experiment={file.stem}"]).values["study"]

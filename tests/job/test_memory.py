@@ -212,7 +212,9 @@ def test_a_job_is_instantiated_once_and_drawn_once(
     """Under a budget and a memory limit; if the episodes do not fit together, each batch is drawn once, two for the trial."""
     built, drawn = [], []
     monkeypatch.setattr(
-        plan, "instantiate", lambda node: built.append(node._target_) or instantiate(node)
+        plan,
+        "instantiate",
+        lambda node, trusted=(): built.append(node._target_) or instantiate(node, trusted),
     )
     monkeypatch.setattr(
         plan.JobPlan,

@@ -684,6 +684,6 @@ def test_the_filter_that_models_the_biases_is_consistent_and_the_others_are_not(
     turned = nees(
         unscented,
         "model=sins_gps_azimuth15",
-        "model.error_equations._target_=pfbench.model.azimuth_errors.PrintedErrorEquations",
+        "model.error_equations._target_=pfbench.model.PrintedErrorEquations",
     )
     assert turned[-1] > 2 * high  # biases turned by the azimuth error

@@ -10,6 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.filter.belief import ParticleBelief, ess
+from pfbench.kernels.compilation import is_capturing
 
 
 class ParticleCount(Protocol):
@@ -24,6 +25,32 @@ class ParticleCount(Protocol):
 
     def __call__(self, belief: ParticleBelief) -> Tensor:
         """Compute the number for the next step, float [R, 1], from the belief before it."""
+
+
+def count_particles(stage: ParticleCount, belief: ParticleBelief) -> Tensor:
+    """Compute the number of active particles by a stage, and check it if the stage is a user's own.
+
+    Args:
+        stage: Particle count.
+        belief: Belief before resampling.
+
+    Returns:
+        Numbers, [R or 1, 1].
+
+    Raises:
+        ValueError: If a number is not between 1 and the number of slots.
+    """
+    n, (runs, slots) = stage(belief), belief.log_w.shape
+    if type(stage).__module__.startswith("pfbench.") or is_capturing():
+        return n  # within its limits; a check would make the device wait
+    is_valid = n.shape in ((runs, 1), (1, 1)) and bool(((n >= 1) & (n <= slots)).all())
+    if not is_valid:
+        values = f"{list(n.shape)} with values from {float(n.min()):g} to {float(n.max()):g}"
+        raise ValueError(
+            f"particle_count {type(stage).__name__} must return [{runs} or 1, 1] numbers from 1 to "
+            f"{slots} slots, got {values}. Start with more particles, or clamp the number."
+        )
+    return n
 
 
 @dataclass(frozen=True)

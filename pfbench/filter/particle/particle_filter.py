@@ -24,7 +24,7 @@ from pfbench.filter.exactness import is_every_part_exact
 from pfbench.filter.moves.metropolis import Move
 from pfbench.filter.moves.path_history import PathHistory, combine_histories
 from pfbench.filter.particle.auxiliary_weights import AuxiliaryWeights, PosteriorWeights
-from pfbench.filter.particle.particle_count import FixedCount, ParticleCount
+from pfbench.filter.particle.particle_count import FixedCount, ParticleCount, count_particles
 from pfbench.filter.particle.particle_moments import (
     StepSummary,
     compute_nis,
@@ -192,7 +192,7 @@ class ParticleFilter(Filter):
         trace: dict[str, Tensor] = {}
         log_a = self.auxiliary_weights(model, belief, record)
         belief, trace["resampled"] = self.resampler(
-            model, belief, log_a, self.particle_count(belief), draws
+            model, belief, log_a, count_particles(self.particle_count, belief), draws
         )
         if belief.ancestors is not None:
             trace["ancestors"] = count_distinct_ancestors(belief.ancestors, belief.log_w)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from torch import Tensor
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, ess
+from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.auxiliary_weights import (
     AdditiveTempering,
     AuxiliaryWeights,
@@ -34,6 +36,8 @@ from pfbench.filter.particle.particle_count import (
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.resampling import EssResampler, ResamplingScheme
 from pfbench.filter.particle.resampling_schemes import Multinomial, Stratified, Systematic
+from pfbench.kernels import compilation
+from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing import check_evidence, reference_moments
 
 STRENGTHS = [0.1, 0.5, 1.0]
@@ -273,3 +277,34 @@ def test_the_number_changes_from_step_to_step_without_a_nan(preference: Auxiliar
 def test_bad_arguments_are_named(make: Any, key: str) -> None:
     with pytest.raises(ValueError, match=key):
         make()
+
+
+@dataclass(frozen=True)
+class TooMany:
+    """A user's stage that asks for more particles than there are slots."""
+
+    is_exact = True
+    factor: float = 2.0
+
+    def initial_count(self, slots: int) -> int:
+        return slots
+
+    def __call__(self, belief: ParticleBelief) -> torch.Tensor:
+        runs, slots = belief.log_w.shape
+        return torch.full((runs, 1), self.factor * slots, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_stage_that_asks_for_too_many_particles_is_refused(compiled: bool) -> None:
+    record = Record(torch.zeros(2, 3, 1, dtype=torch.float64))
+    draws = PhiloxStream(1, torch.arange(2))
+    for factor in (2.0, 0.0, -1.0, torch.nan):
+        method = ParticleFilter(20, particle_count=TooMany(factor))
+        with (
+            compilation.use_compiled(compiled),
+            pytest.raises(ValueError, match=r"from 1 to 20 slots"),
+        ):
+            run_filter(method, linear_walk(1.0, 0.3, 1.0), record, draws)
+    run_filter(
+        ParticleFilter(20, particle_count=TooMany(1.0)), linear_walk(1.0, 0.3, 1.0), record, draws
+    )

@@ -1,0 +1,104 @@
+"""Check of what a filter receives: measurements, inputs and random numbers against the model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.model.base import StateSpaceModel
+
+
+def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) -> None:
+    """Check the shapes and types of a record.
+
+    Args:
+        model: State-space model.
+        record: Measurements [R, T, Dy] and inputs.
+        draws: Random stream of R runs.
+
+    Raises:
+        ValueError: If a shape or a type is wrong, if the record is empty, or if a measurement is
+            infinite.
+    """
+    y = record.y
+    if y.dim() != 3 or not y.is_floating_point():
+        raise ValueError(
+            "record.y must be a tensor of real numbers with axes [R, T, Dy], got "
+            f"{str(y.dtype).removeprefix('torch.')} {list(y.shape)}. Convert it, for instance by "
+            "y.double()."
+        )
+    if y.shape[1] == 0:
+        raise ValueError("record.y must have at least one time step, got 0. Add measurements.")
+    if bool(torch.isinf(y).any()):
+        raise ValueError("record.y must be finite, got infinity. Mark a missing component as NaN.")
+    runs, steps, _ = y.shape
+    numbers: Any = getattr(draws, "runs", None)
+    if isinstance(numbers, Tensor) and numbers.shape != (runs,):
+        raise ValueError(
+            f"draws must be of {runs} runs, as record.y is, got {len(numbers)}. "
+            f"Use PhiloxStream(seed, torch.arange({runs}))."
+        )
+    for name, value in _named_inputs(record.u):
+        if value.dim() < 2 or value.shape[0] not in (1, runs) or value.shape[1] != steps:
+            raise ValueError(
+                f"record.u{name} must have the axes [{runs} or 1, {steps}, ...] of runs and steps, "
+                f"got {list(value.shape)}."
+            )
+    _check_initial("start", record.start, (runs, model.chart.size))
+    size = len(model.names)
+    _check_initial("spread", record.spread, (runs, size, size))
+
+
+def check_model(model: StateSpaceModel, record: Record) -> None:
+    """Check what a model computes at the first step: finite states and as many measurements as y has.
+
+    Args:
+        model: State-space model.
+        record: Prepared record, see `prepare_record`.
+
+    Raises:
+        ValueError: If the model and the record do not fit.
+    """
+    first, step_model = record.at_step(0), model.at_step(0)
+    runs, width = first.y.shape
+    start = model.origin.expand(runs, -1) if record.start is None else record.start
+    x = start.unsqueeze(1).to(model.anchor)
+    name = type(model).__name__
+    with torch.no_grad():
+        w = step_model.noise.mean.expand(runs, 1, step_model.noise_dim)
+        next_x = step_model.propagate(x, first.u, torch.nan_to_num(w))
+        if next_x.shape != x.shape or not bool(next_x.isfinite().all()):
+            state = list(next_x.shape) if next_x.shape != x.shape else "numbers that are not finite"
+            raise ValueError(
+                f"{name}.propagate must return finite states {list(x.shape)}, got {state} for the "
+                "first step. Check the inputs and the parameters of the model."
+            )
+        distribution: Any = step_model.observation(next_x, first.u)
+    shape = (*distribution.batch_shape, *distribution.event_shape)
+    if not shape or shape[-1] != width:
+        raise ValueError(
+            f"record.y must have as many components as {name} observes, {shape[-1] if shape else 0}, "
+            f"got {width}."
+        )
+
+
+def _named_inputs(u: Any, name: str = "") -> list[tuple[str, Tensor]]:
+    """Return the input tensors with the names of their fields."""
+    if isinstance(u, Tensor):
+        return [(name, u)]
+    fields = getattr(u, "_fields", range(len(u)))
+    return [
+        pair
+        for field, value in zip(fields, u, strict=True)
+        for pair in _named_inputs(value, f"{name}.{field}")
+    ]
+
+
+def _check_initial(name: str, value: Tensor | None, shape: tuple[int, ...]) -> None:
+    """Check the shape of the initial states or covariances of the runs."""
+    if value is not None and tuple(value.shape) != shape:
+        raise ValueError(f"record.{name} must have shape {list(shape)}, got {list(value.shape)}.")
