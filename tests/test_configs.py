@@ -34,7 +34,7 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.base import StateSpaceModel
-from pfbench.results import store
+from pfbench.results.config_key import compute_config_key
 
 FILES = [*sorted(CONF.rglob("*.yaml")), *sorted(job.experiments_dir().glob("*.yaml"))]
 EXPERIMENTS = [file.stem for file in sorted(job.experiments_dir().glob("*.yaml"))]
@@ -271,7 +271,7 @@ def test_every_choice_of_every_experiment_composes(experiment: str) -> None:
             with open_dict(cfg):
                 del cfg["hydra"]
             config: Any = OmegaConf.to_container(cfg, resolve=True)
-            names.add(store.config_key(config, job.IGNORED_IN_KEY))
+            names.add(compute_config_key(config, job.IGNORED_IN_KEY))
             job.instantiate(cfg["filter"])
             job.instantiate(cfg.model)
         assert len(names) == number  # a choice that reached no job would make two cells one

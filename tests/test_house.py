@@ -20,7 +20,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 # The floors from the ground up. A folder may import the folders of lower floors, and itself.
 FLOORS = (
-    ("core", "kernels"),
+    ("core", "files", "kernels"),
     ("nav",),
     ("model", "noise"),
     ("filter", "scenario"),

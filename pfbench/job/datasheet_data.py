@@ -19,6 +19,7 @@ from pfbench.job.plan import DATASHEETS, IGNORED_IN_KEY, instantiate_parts
 from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
+from pfbench.results.config_key import compute_config_key
 from pfbench.scenario.oracle_noise import RecordingRegime
 
 RUNS = 20  # default: spreads to a sixth, in seconds [ours]
@@ -43,7 +44,7 @@ def build_datasheet(config: JobConfig, about: str = "") -> Path:
     """
     values, choices = config.values, config.choices
     selected = {name: values[name] for name in _CONFIG_KEYS}
-    key = store.config_key(selected, IGNORED_IN_KEY)
+    key = compute_config_key(selected, IGNORED_IN_KEY)
     path = Path(values["results_dir"]) / DATASHEETS / f"{key}.npz"
     if path.exists() and not values["overwrite"]:
         return path

@@ -22,6 +22,7 @@ from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
+from pfbench.results.config_key import compute_config_key
 from pfbench.scenario.base import Scenario
 from pfbench.scenario.oracle_noise import RecordingRegime
 
@@ -155,7 +156,7 @@ def job_key(values: Mapping[str, Any]) -> str:
     """Compute the key of a job from all settings that affect its results."""
     values = {**values, "filter": replace_checkpoint_by_hash(values.get("filter"))}
     defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
-    return store.config_key(values, (*IGNORED_IN_KEY, *defaults))
+    return compute_config_key(values, (*IGNORED_IN_KEY, *defaults))
 
 
 def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+
+from pfbench.files.atomic_write import write_atomically
+from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
 
 
 class ResumableResults:
     """Finished parts of a study by name, JSON values that are written at once.
 
-    A file of another request, or one that is cut off, is replaced.
+    A file of another request, or a damaged one, is replaced.
 
     Args:
         path: File of the results. Its folder is created.
@@ -20,19 +22,19 @@ class ResumableResults:
 
     Attributes:
         path: File of the results.
-        state: Content of the file: `asked`, the request, and `done`, the parts by name.
+        state: Content of the file: `request` and `done`, the parts by name.
     """
 
     def __init__(self, path: Path, request: Mapping[str, Any]) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.state: dict[str, Any] = {"request": json.loads(json.dumps(request)), "done": {}}
         try:
             stored = json.loads(path.read_text())
-        except (FileNotFoundError, json.JSONDecodeError):
+        except (FileNotFoundError, ValueError):
             return
-        if stored.get("request") == self.state["request"]:
-            self.state = stored
+        is_whole = isinstance(stored, dict) and has_valid_digest(stored)
+        if is_whole and stored.get("request") == self.state["request"]:
+            self.state = {key: stored[key] for key in ("request", "done")}
 
     def __call__(self, name: str, make: Callable[[], Any]) -> Any:
         """Return one part, computed by `make` unless an earlier call has stored it.
@@ -47,7 +49,8 @@ class ResumableResults:
         finished = self.state["done"]
         if name not in finished:
             finished[name] = make()
-            temporary = self.path.with_name(f".{self.path.name}")
-            temporary.write_text(json.dumps(self.state))
-            os.replace(temporary, self.path)
+            # of the values as JSON returns them
+            content = json.loads(json.dumps(self.state))
+            text = json.dumps({**content, DIGEST: hash_content(content)})
+            write_atomically(self.path, lambda file: file.write(text.encode()))
         return finished[name]

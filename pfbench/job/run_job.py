@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pfbench.config.composition import CHOICES, JobConfig, resolve_config
 from pfbench.core.record import Episode
+from pfbench.files.atomic_write import set_aside
 from pfbench.filter.learned.checkpoint import checkpoint_provenance
 from pfbench.job.allocation import EpisodeSource, apply_budget, max_runs_in_memory
 from pfbench.job.filter_pass import TimedFilterPass, pass_filter
@@ -71,10 +72,9 @@ def run(
     path = _result_path(values)
     job_choices = {group: config.choices[group] for group in CHOICES}
     name = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
-    if path.exists() and not values["overwrite"]:
-        outcome = JobOutcome(
-            path, "skipped", _main_rmse(store.read_result(path).data, store.read_metadata(path))
-        )
+    result = None if values["overwrite"] else _read_finished(path)
+    if result is not None:
+        outcome = JobOutcome(path, "skipped", _main_rmse(result.data, result.meta))
         repeat = "(overwrite=true to repeat)"
         log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
         return outcome
@@ -147,6 +147,18 @@ def compute_job(config: JobConfig, label: str) -> tuple[dict[str, Any], dict[str
         meta["particles"] = allocation.particles
     bought = allocation.to_metadata() if allocation else None
     return {**meta, "budget_allocation": bought, "trained": trained}, outputs
+
+
+def _read_finished(path: Path) -> store.JobResult | None:
+    """Read the result of a finished job. A damaged file is set aside, and the job runs again."""
+    if not path.exists():
+        return None
+    try:
+        return store.read_result(path)
+    except store.DamagedResultError as error:
+        new_path = set_aside(path)
+        log.warning("warning  %s   renamed to %s. Running the job", error, new_path.name)
+        return None
 
 
 def _result_path(values: Mapping[str, Any]) -> Path:

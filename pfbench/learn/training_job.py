@@ -18,7 +18,7 @@ from pfbench.learn.training_data import TrainingData, draw_training_data
 from pfbench.learn.training_log import open_tensorboard, write_losses
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.base import NoiseRegime
-from pfbench.results import store
+from pfbench.results.config_key import compute_config_key
 
 
 def train(
@@ -143,7 +143,7 @@ def _checkpoint_path(
     groups = ("model", "scenario", "filter", "train", "noise", "dtype")
     settings = {group: cfg[group] for group in groups} | {"noises": [*regimes]}
     ignored = ("scenario.root", "scenario.cache_dir", "train.checkpoint_path")
-    key = store.config_key(checkpoint.replace_checkpoint_by_hash(settings), ignored)
+    key = compute_config_key(checkpoint.replace_checkpoint_by_hash(settings), ignored)
     name = f"{choices['filter']}_{choices['scenario']}_{key}.pt"
     return Path(cfg["results_dir"]) / cfg["study"] / "checkpoints" / name
 

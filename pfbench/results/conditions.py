@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pfbench.files.atomic_write import set_aside
 from pfbench.results import store
+
+log = logging.getLogger("pfbench")
 
 _SHARED_SETTINGS = ("scenario", "noise", "dtype")  # settings that decide the data of a filter
 _LOCATION_SETTINGS = ("scenario.cache_dir", "scenario.root")  # settings that do not
@@ -69,7 +73,7 @@ def load_conditions(
         Conditions sorted by scenario, noise and model.
     """
     files = sorted((Path(results) / study).glob("*.npz"))
-    items = [(path, store.read_metadata(path)) for path in files]
+    items = [item for path in files if (item := _read_undamaged(path)) is not None]
     if not items:
         raise FileNotFoundError(_no_results_message(study, Path(results)))
     if not allow_mixed_versions:
@@ -86,6 +90,15 @@ def load_conditions(
             _check_equal(members, settings, where)
         conditions.append(Condition(*key, jobs))
     return conditions
+
+
+def _read_undamaged(path: Path) -> tuple[Path, dict[str, Any]] | None:
+    """Read the metadata of a result. A damaged file is set aside and left out."""
+    try:
+        return path, store.read_result(path).meta
+    except store.DamagedResultError as error:
+        log.warning("warning  %s   renamed to %s", error, set_aside(path).name)
+        return None
 
 
 def differing_settings(jobs: Sequence[JobFile]) -> list[str]:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from pfbench.files.digest import DIGEST
+
 FORMAT = 2
 
 # Axes that must agree across arrays: R runs, T steps, D components, G groups, S scored steps.
@@ -61,7 +63,7 @@ def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndar
         )
     for name, value in data.items():
         # the first three are arguments of numpy's savez
-        if name in ("file", "args", "allow_pickle", "meta"):
+        if name in ("file", "args", "allow_pickle", "meta", DIGEST):
             raise ValueError(
                 f"{path}: name of an array must not be reserved, got {name!r}. Use another name."
             )

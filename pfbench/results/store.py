@@ -6,25 +6,26 @@ A file holds `meta`, a JSON text, and plain arrays without pickles. A failed job
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
 import traceback
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, NamedTuple
-from uuid import uuid4
 
 import numpy as np
 
+from pfbench.files.atomic_write import write_atomically
+from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
 from pfbench.results.result_format import FORMAT, check_arrays, check_metadata
 
 # values of the key `budget`
 SAME_N, SAME_TIME, SAME_LIKELIHOODS = BUDGETS = ("particles", "time", "likelihoods")
+
+
+class DamagedResultError(ValueError):
+    """A file of a result is damaged, or is the result of another job."""
 
 
 class JobResult(NamedTuple):
@@ -40,30 +41,6 @@ class JobResult(NamedTuple):
 
     meta: dict[str, Any]
     data: dict[str, np.ndarray]
-
-
-def config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) -> str:
-    """Compute the key of a job: 16 hexadecimal digits of the SHA-256 of its configuration.
-
-    Args:
-        config: Plain nested dictionary with string keys.
-        ignore: Dotted paths that change where a job runs but not what it computes, such as
-            `results` or `data.root`. A path covers all keys below it and may be missing.
-
-    Returns:
-        The key.
-
-    Raises:
-        ValueError: If JSON cannot represent a value (NaN included).
-    """
-    relevant = _without(config, {tuple(path.split(".")) for path in ignore})
-    try:
-        text = json.dumps(relevant, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"configuration must be numbers, texts, lists and dicts, got {error}."
-        ) from error
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def write_result(path: str | Path, meta: Mapping[str, Any], data: Mapping[str, Any]) -> Path:
@@ -89,7 +66,8 @@ def write_result(path: str | Path, meta: Mapping[str, Any], data: Mapping[str, A
     check_arrays(path, full, plain)
     # Unsorted, since the order of the groups is that of the last axis of nees.
     text = np.array(json.dumps(full))
-    _write(path, lambda file: np.savez_compressed(file, meta=text, **plain))
+    digest = np.array(hash_content({"meta": text, **plain}))
+    _write(path, lambda file: np.savez_compressed(file, meta=text, digest=digest, **plain))
     _note(path).unlink(missing_ok=True)
     for stale in path.parent.glob(f"{path.stem}.*.tmp"):
         stale.unlink(missing_ok=True)
@@ -101,12 +79,23 @@ def read_result(path: str | Path) -> JobResult:
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the file is damaged, is not a result of pfbench, or has another format.
+        DamagedResultError: If the file is damaged or is the result of another job.
+        ValueError: If it is not a result of pfbench, or has another format.
     """
     path = Path(path)
     with _opened(path) as file:
         meta = _meta(path, file)
-        data = {name: _member(path, file, name) for name in file.files if name != "meta"}
+        data = {name: _member(path, file, name) for name in file.files}
+    if not has_valid_digest(data):
+        raise DamagedResultError(
+            f"{path} is damaged: its digest must be that of its content. Run the job again."
+        )
+    if meta["key"] != path.stem:
+        raise DamagedResultError(
+            f"{path} must be the result of job {path.stem}, got that of job {meta['key']}. "
+            "Give the file its own name, or delete it."
+        )
+    data = {name: value for name, value in data.items() if name not in ("meta", DIGEST)}
     check_arrays(path, meta, data)
     return JobResult(meta, data)
 
@@ -159,22 +148,18 @@ def list_results(folder: str | Path) -> Iterator[JobResult]:
 
 
 def list_failures(folder: str | Path) -> list[dict[str, Any]]:
-    """Read the failure notes of a folder, by key, of jobs without a result."""
+    """List the failures of jobs without a result by key: failure notes, then damaged files."""
     notes = sorted(Path(folder).glob("*.failed.json"))
     results = (note.with_name(note.name.replace(".failed.json", ".npz")) for note in notes)
     pairs = zip(notes, results, strict=True)
-    return [json.loads(note.read_text()) for note, result in pairs if not result.exists()]
-
-
-def _without(config: Any, paths: set[tuple[str, ...]]) -> Any:
-    if not isinstance(config, Mapping):
-        return config
-    below = {name: {path[1:] for path in paths if path[0] == name} for name in config}
-    return {
-        name: _without(value, below[name])
-        for name, value in config.items()
-        if () not in below[name]
-    }
+    failed = [json.loads(note.read_text()) for note, result in pairs if not result.exists()]
+    damaged = {path.name.partition(".")[0] for path in Path(folder).glob("*.npz.damaged*")}
+    lost = sorted(key for key in damaged if not (Path(folder) / f"{key}.npz").exists())
+    unknown = dict.fromkeys(("scenario", "noise", "model", "filter"), "unknown")
+    return failed + [
+        {"key": key, "choices": unknown, "message": f"{key}.npz was damaged. Run the job again"}
+        for key in lost
+    ]
 
 
 def _note(path: Path) -> Path:
@@ -182,20 +167,12 @@ def _note(path: Path) -> Path:
 
 
 def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.name.split('.')[0]}.{uuid4().hex[:8]}.tmp")
     try:
-        with temporary.open("xb") as file:
-            fill(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        write_atomically(path, fill)
     except FileNotFoundError:
         # Another sweep finished the same key and removed this temporary file. Its result is kept.
         if not path.exists():
             raise
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -206,8 +183,8 @@ def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
     with path.open("rb") as raw:
         try:
             file = np.load(raw, allow_pickle=False)
-        except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
-            raise ValueError(
+        except Exception as error:  # numpy and zipfile raise many kinds for damaged files
+            raise DamagedResultError(
                 f"{path} is damaged: it must be an npz file ({error}). Delete it and run the job again."
             ) from error
         if not isinstance(file, np.lib.npyio.NpzFile):
@@ -224,8 +201,8 @@ def _member(path: Path, file: np.lib.npyio.NpzFile, name: str) -> np.ndarray:
         raise ValueError(
             f"{path} must be a result of pfbench, got a file without {name!r}. Move it away."
         ) from error
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(
+    except Exception as error:
+        raise DamagedResultError(
             f"{path} is damaged: {name!r} must be readable ({error}). "
             "Delete it and run the job again."
         ) from error

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from pfbench.results import store
+from pfbench.results.config_key import compute_config_key
 
 STATE: dict[str, Any] = {
     "names": [
@@ -78,7 +79,7 @@ def write(
         "filter": {"name": method.name, "particles": method.particles, **(config or {})},
         "noise": noise,
     }
-    name = store.config_key(
+    name = compute_config_key(
         {**settings, "seed": seed, "runs": runs, "steps": steps, "versions": versions["commit"]}
     )
     arrays = _arrays(method, noise, runs, steps, seed, name)

@@ -6,6 +6,7 @@ from omegaconf import OmegaConf
 from pfbench import job
 from pfbench.job.plan import DEFAULTS_NOT_IN_KEY
 from pfbench.results import store
+from pfbench.results.config_key import compute_config_key
 
 CONFIG = OmegaConf.load(job.conf_dir() / "config.yaml")
 
@@ -18,7 +19,7 @@ def test_a_job_states_what_a_report_knows():
 
 def test_the_usual_budget_is_no_part_of_a_jobs_name():
     config = {"filter": {"particles": 10}, "seed": 1, "results": "here"}
-    before = store.config_key(
+    before = compute_config_key(
         config, job.IGNORED_IN_KEY
     )  # of jobs that ran when there was no such key
     assert job.job_key(config) == job.job_key({**config, "budget": store.SAME_N}) == before

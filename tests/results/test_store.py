@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pfbench.results import store
+from pfbench.results.config_key import compute_config_key
 
 R, T, D = 3, 5, 2
 STATE = {"names": ["x", "v"], "units": ["m", "m/s"], "groups": {"position": [0], "b_velocity": [1]}}
@@ -67,31 +68,31 @@ def reversed_deep(config):
 
 @given(st.dictionaries(st.text(min_size=1, max_size=5), CONFIGS, max_size=4))
 def test_key_knows_content_not_order(config):
-    name = store.config_key(config)
-    assert name == store.config_key(reversed_deep(config))
+    name = compute_config_key(config)
+    assert name == compute_config_key(reversed_deep(config))
     assert len(name) == 16
     assert set(name) <= set("0123456789abcdef")
 
 
 def test_key_survives_the_process():
-    code = "from pfbench.results import store; print(store.config_key({'b': [1, 2.5, None], 'a': {'c': 'ü'}}))"
+    code = "from pfbench.results.config_key import compute_config_key; print(compute_config_key({'b': [1, 2.5, None], 'a': {'c': 'ü'}}))"
     environment = {**os.environ, "PYTHONHASHSEED": "77"}
     other = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
     )
-    assert other.stdout.strip() == store.config_key({"a": {"c": "ü"}, "b": [1, 2.5, None]})
+    assert other.stdout.strip() == compute_config_key({"a": {"c": "ü"}, "b": [1, 2.5, None]})
 
 
 def test_ignored_paths_change_nothing_and_others_do():
     here = {"seed": 1, "results": "a", "data": {"root": "x", "name": "log"}, "threads": 1}
     there = {"seed": 1, "results": "b", "data": {"root": "y", "name": "log"}, "threads": 8}
     ignore = ("results", "data.root", "threads", "absent.path")
-    assert store.config_key(here, ignore) == store.config_key(there, ignore)
-    assert store.config_key(here, ignore) != store.config_key({**here, "seed": 2}, ignore)
-    assert store.config_key(here, ignore) != store.config_key(
+    assert compute_config_key(here, ignore) == compute_config_key(there, ignore)
+    assert compute_config_key(here, ignore) != compute_config_key({**here, "seed": 2}, ignore)
+    assert compute_config_key(here, ignore) != compute_config_key(
         {**here, "data": {"root": "x", "name": "other"}}, ignore
     )
-    assert store.config_key(here, ("data",)) == store.config_key(
+    assert compute_config_key(here, ("data",)) == compute_config_key(
         {k: v for k, v in here.items() if k != "data"}
     )
 
@@ -99,11 +100,11 @@ def test_ignored_paths_change_nothing_and_others_do():
 @pytest.mark.parametrize("value", [float("nan"), {1, 2}, np.zeros(2)])
 def test_key_refuses_what_json_cannot_say(value):
     with pytest.raises(ValueError, match="configuration must be numbers"):
-        store.config_key({"filter": {"gain": value}})
+        compute_config_key({"filter": {"gain": value}})
 
 
 def test_what_is_read_is_what_was_written(tmp_path):
-    path = store.write_result(tmp_path / "new" / "a.npz", meta(), arrays(1 / 3))
+    path = store.write_result(tmp_path / "new" / f"{meta()['key']}.npz", meta(), arrays(1 / 3))
     result = store.read_result(path)
     assert result.meta == {"format": 2, **meta()}
     assert list(result.meta["state"]["groups"]) == [
@@ -124,18 +125,19 @@ def test_numpy_alone_reads_it(tmp_path):
 
 
 def test_an_exception_in_the_middle_leaves_the_folder_as_it_was(tmp_path, monkeypatch):
-    store.write_result(tmp_path / "old.npz", meta(), arrays(1.0))
+    old = f"{meta()['key']}.npz"
+    store.write_result(tmp_path / old, meta(), arrays(1.0))
 
     def half(file, **members):
         file.write(b"PK half a file")
         raise OSError("disk full")
 
     monkeypatch.setattr(np, "savez_compressed", half)
-    for name in ("new.npz", "old.npz"):
+    for name in ("new.npz", old):
         with pytest.raises(OSError, match="disk full"):
             store.write_result(tmp_path / name, meta(), arrays(2.0))
-    assert [path.name for path in tmp_path.iterdir()] == ["old.npz"]
-    assert store.read_result(tmp_path / "old.npz").data["error"][0, 0, 0] == 1.0
+    assert [path.name for path in tmp_path.iterdir()] == [old]
+    assert store.read_result(tmp_path / old).data["error"][0, 0, 0] == 1.0
 
 
 def test_a_kill_in_the_middle_leaves_no_result_and_the_next_save_sweeps_up(tmp_path):

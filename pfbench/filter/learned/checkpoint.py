@@ -7,17 +7,17 @@ data, losses and cost. A job key contains a hash of the weights, independent of 
 from __future__ import annotations
 
 import hashlib
-import os
-import pickle
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import torch
 from torch import Tensor, nn
 
-FORMAT = "pfbench checkpoint 1"
+from pfbench.files.atomic_write import write_atomically
+from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+
+FORMAT = "pfbench checkpoint 2"
 UNTRAINED = "untrained"
 
 Weights = dict[str, Tensor]
@@ -39,14 +39,9 @@ def write_checkpoint(path: str | Path, content: Mapping[str, Any]) -> None:
         path: File to write.
         content: Tensors, numbers, texts, lists and dicts.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.name}.{uuid4().hex[:8]}.tmp")
-    try:
-        torch.save({"format": FORMAT, **content}, temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    full = {"format": FORMAT, **content}
+    full[DIGEST] = hash_content(full)
+    write_atomically(Path(path), lambda file: torch.save(full, file))
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -62,7 +57,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+    except Exception as error:  # torch raises many kinds for damaged files
         raise ValueError(
             f"checkpoint must be a file of weights, got {path}, which is damaged or another file "
             f"({type(error).__name__}). Use a checkpoint that `pfbench train` wrote."
@@ -71,6 +66,11 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         stored = content.get("format") if isinstance(content, dict) else type(content).__name__
         raise ValueError(
             f"checkpoint must have the format {FORMAT!r}, got {stored!r} in {path}. Train again."
+        )
+    if not has_valid_digest(content):
+        raise ValueError(
+            f"checkpoint must be undamaged, got {path} with a digest that is not that of its content. "
+            "Train again."
         )
     return content
 

@@ -1,0 +1,43 @@
+"""Key of a job: a hash of its configuration."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+
+def compute_config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) -> str:
+    """Compute the key of a job: 16 hexadecimal digits of the SHA-256 of its configuration.
+
+    Args:
+        config: Plain nested dictionary with string keys.
+        ignore: Dotted paths that change where a job runs but not what it computes, such as
+            `results` or `data.root`. A path covers all keys below it and may be missing.
+
+    Returns:
+        The key.
+
+    Raises:
+        ValueError: If JSON cannot represent a value (NaN included).
+    """
+    relevant = _without(config, {tuple(path.split(".")) for path in ignore})
+    try:
+        text = json.dumps(relevant, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"configuration must be numbers, texts, lists and dicts, got {error}."
+        ) from error
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _without(config: Any, paths: set[tuple[str, ...]]) -> Any:
+    if not isinstance(config, Mapping):
+        return config
+    below = {name: {path[1:] for path in paths if path[0] == name} for name in config}
+    return {
+        name: _without(value, below[name])
+        for name, value in config.items()
+        if () not in below[name]
+    }
