@@ -9,7 +9,10 @@ from torch import Tensor
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel
+from pfbench.core.simulate import draw_initial_state
+from pfbench.model.base import StateSpaceModel, initial_law
+
+_STATES = 4  # of each run that the model is tried with
 
 
 def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) -> None:
@@ -53,32 +56,36 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
     _check_initial("spread", record.spread, (runs, size, size))
 
 
-def check_model(model: StateSpaceModel, record: Record) -> None:
-    """Check what a model computes at the first step: finite states and as many measurements as y has.
+def check_model(model: StateSpaceModel, record: Record, draws: RandomStream) -> None:
+    """Check what a model computes at the first step, for a few states of its initial distribution.
 
     Args:
         model: State-space model.
         record: Prepared record, see `prepare_record`.
+        draws: Random stream of R runs.
 
     Raises:
-        ValueError: If the model and the record do not fit.
+        ValueError: If states have another shape, if none of a run is finite, or if the model
+            observes another number of components than `record.y` has.
     """
     first, step_model = record.at_step(0), model.at_step(0)
     runs, width = first.y.shape
-    start = model.origin.expand(runs, -1) if record.start is None else record.start
-    x = start.unsqueeze(1).to(model.anchor)
     name = type(model).__name__
     with torch.no_grad():
-        w = step_model.noise.mean.expand(runs, 1, step_model.noise_dim)
-        next_x = step_model.propagate(x, first.u, torch.nan_to_num(w))
-        if next_x.shape != x.shape or not bool(next_x.isfinite().all()):
+        distribution: Any = initial_law(model, runs, record.spread)
+        stream = draws.at_step(0)
+        x = draw_initial_state(model, distribution, stream, "input check", _STATES, record.start)
+        w = torch.nan_to_num(step_model.noise.mean).expand(runs, _STATES, step_model.noise_dim)
+        next_x = step_model.propagate(x, first.u, w)
+        if next_x.shape != x.shape or not bool(next_x.isfinite().all(-1).any(-1).all()):
             state = list(next_x.shape) if next_x.shape != x.shape else "numbers that are not finite"
             raise ValueError(
                 f"{name}.propagate must return finite states {list(x.shape)}, got {state} for the "
                 "first step. Check the inputs and the parameters of the model."
             )
-        distribution: Any = step_model.observation(next_x, first.u)
-    shape = (*distribution.batch_shape, *distribution.event_shape)
+        # of no particles, which a counter of likelihood evaluations does not count
+        observed: Any = step_model.observation(next_x[:, :0], first.u)
+    shape = (*observed.batch_shape, *observed.event_shape)
     if not shape or shape[-1] != width:
         raise ValueError(
             f"record.y must have as many components as {name} observes, {shape[-1] if shape else 0}, "
