@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -139,7 +140,9 @@ class SweepProgress:
         try:
             alternatives = expand_sweep([*params, *overrides])
             first = [values[0] for values in alternatives]
-            values = compose([word for word in first if "hydra" not in word]).values
+            values = compose(
+                [word for word in first if not re.match(r"[+~]*hydra[/.](?!searchpath)", word)]
+            ).values
         except Exception:  # the sweep itself reports the error
             return cls()
         jobs = 1

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.protected_keys import check_protected_keys
 from pfbench.config.trust import check_configuration, check_study, split_trust
@@ -102,6 +103,7 @@ def compose_tree(words: Sequence[str]) -> DictConfig:
             return compose_config("config", list(some), return_hydra_config=True)
 
     register_experiments()
+    check_files(words)
     with _preserved_hydra_state():
         composed = compose_words(words)
         check_protected_keys(composed, words, compose_words)

@@ -48,8 +48,6 @@ def check_protected_keys(
     Raises:
         UntrustedConfigError: If a file set a protected key, or the study has an invalid name.
     """
-    from omegaconf import OmegaConf
-
     given_keys = {word.lstrip("+~").partition("=")[0] for word in words}
     defaults = read_file(conf_dir() / "config.yaml")
     allowed = {key: (defaults.get(key),) for key in FOLDER_KEYS} | dict(OTHER_KEYS)
@@ -63,8 +61,32 @@ def check_protected_keys(
                 f"Add {key}=... to the command, or remove the key from the file."
             )
     _check_swept_keys(values, given_keys, allowed)
-    check_study(OmegaConf.select(composed, "study"))
+    for key, value in _list_nested(values, "cache_dir"):
+        if key not in given_keys and value not in OTHER_KEYS["scenario.cache_dir"]:
+            raise UntrustedConfigError(
+                f"{key} must be null or that of the command line, got {value!r} from a file. "
+                f"Add {key}=... to the command, or remove the key from the file."
+            )
+    check_study(values.get("study"))  # not resolved: Hydra would resolve it to another text
+    for group, name in (_select(values, "hydra.runtime.choices") or {}).items():
+        if isinstance(name, str) and (name.startswith("/") or ".." in name.split("/")):
+            raise UntrustedConfigError(
+                f"{group} must be the name of a file in its group, got {name!r}. Use its name."
+            )
     _check_hydra(values, words, compose_reference)
+
+
+def _list_nested(node: Any, name: str, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of a key at any depth, with their full keys."""
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            full_key = f"{path}.{key}" if path else str(key)
+            if key == name:
+                yield full_key, value
+            yield from _list_nested(value, name, full_key)
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            yield from _list_nested(value, name, f"{path}[{index}]")
 
 
 def _is_in_results(value: Any) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from pfbench.config.composition import compose, compose_tree
+from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.trust import UntrustedConfigError, check_study
 
@@ -33,6 +34,7 @@ def check_words(words: Sequence[str]) -> None:
     overrides = list(args.overrides)
     if args.config_dir:
         overrides.append(f"hydra.searchpath=[file://{args.config_dir}]")
+    check_files(overrides)
     if args.multirun:
         _check_sweep(overrides)
     else:

@@ -7,6 +7,7 @@ user trusts, and folders and Hydra's own settings come from the command line or 
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import sys
@@ -24,17 +25,11 @@ BUILDERS = {
 }
 # packages that are too large to be trusted as a whole: each can read, write or run files
 BROAD = (
-    "hydra",
-    "joblib",
-    "numpy",
-    "omegaconf",
-    "pandas",
-    "pyro",
-    "ray",
-    "scipy",
-    "sympy",
-    "torch",
-)
+    "__main__", "cloudpickle", "fsspec", "hydra", "hydra_plugins", "jinja2", "joblib", "matplotlib", "numpy",
+    "omegaconf", "pandas", "pip", "pkg_resources", "pyro", "ray", "scipy", "seaborn", "setuptools", "sympy",
+    "torch", "triton", "yaml",
+)  # fmt: skip
+HARMLESS = ("pyro.distributions", "torch.distributions", "torch.nn")  # parts of them
 HYDRA_KEYS = ("_target_", "_args_", "_partial_", "_convert_", "_recursive_")
 NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+")
 STUDY = re.compile(r"[A-Za-z0-9_][\w.+-]{0,99}", re.ASCII)
@@ -76,7 +71,8 @@ def _parse_packages(texts: Sequence[str]) -> tuple[str, ...]:
             raise UntrustedConfigError(
                 f"trust must be a list of package names, got {name!r}. Use trust=[mylab]."
             )
-        if name in BROAD or name.split(".")[0] in sys.stdlib_module_names or name == "pfbench":
+        is_broad = name.split(".")[0] in (*BROAD, "pfbench", *sys.stdlib_module_names)
+        if is_broad and name not in HARMLESS:
             raise UntrustedConfigError(
                 f"trust must not be a general library, got {name!r}. It can run or delete files. "
                 "Name the package that defines your classes."
@@ -113,6 +109,7 @@ def check_study(name: Any) -> None:
     Raises:
         UntrustedConfigError: If it is not a plain name.
     """
+    name = str(name) if isinstance(name, int | float) else name  # study=2024
     if not isinstance(name, str) or not STUDY.fullmatch(name) or set(name) == {"."}:
         raise UntrustedConfigError(
             f"study must be a name of letters, digits, '_', '-', '+' and '.', got {name!r}. "
@@ -154,6 +151,10 @@ def _check_node(key: str, node: Mapping[Any, Any], trusted: Sequence[str]) -> No
     if not isinstance(target, str) or not NAME.fullmatch(target):
         raise UntrustedConfigError(requirement + "Write it as pfbench.FOLDER.Class.")
     if target.startswith("pfbench."):
+        if "_args_" in node:
+            raise UntrustedConfigError(
+                f"{key} must name the arguments of {target}, got _args_. Write them as keys."
+            )
         if not _is_public(target):
             raise UntrustedConfigError(requirement + "See pfbench.FOLDER.__all__ for the names.")
     elif not any(target.startswith(f"{package}.") for package in trusted):
@@ -187,6 +188,11 @@ def _is_defined_in(target: str, trusted: Sequence[str]) -> bool:
     """Return whether a name is defined by a trusted package, not imported there from another one."""
     parts = target.split(".")
     value: Any = None
+    if importlib.util.find_spec(parts[0]) is None:
+        raise UntrustedConfigError(
+            f"{target} must be importable, but the package {parts[0]} is not installed. Install it, or "
+            "set PYTHONPATH to the folder that contains it."
+        )
     for count in range(len(parts) - 1, 0, -1):
         name = ".".join(parts[:count])
         if not any(name == package or name.startswith(f"{package}.") for package in trusted):

@@ -175,6 +175,8 @@ def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:
     is_config = OmegaConf.is_config(node)
     values = OmegaConf.to_container(node, resolve=True) if is_config else node
     check_configuration(values, (*trusted, *trusted_packages()))
+    if is_config and OmegaConf.to_container(node, resolve=False) != values:
+        node = values  # what was checked: a resolver may give another value next time
     return hydra.utils.instantiate(node, _convert_="all")
 
 

@@ -21,6 +21,7 @@ from pfbench.job.filter_pass import TimedFilterPass, pass_filter
 from pfbench.job.metadata import make_metadata
 from pfbench.job.pcrb_cache import compute_pcrb
 from pfbench.job.plan import DATASHEETS, JobPlan, build_plan, job_key
+from pfbench.job.settings import check_settings
 from pfbench.results import store
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ def run(
     name = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
     result = None if values["overwrite"] else _read_finished(path)
     if result is not None:
+        check_settings(values)
         outcome = JobOutcome(path, "skipped", _main_rmse(result.data, result.meta))
         repeat = "(overwrite=true to repeat)"
         log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)

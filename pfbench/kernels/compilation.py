@@ -150,10 +150,24 @@ def _find_cuda_kernel(
     return cuda.find_kernel(operator.__name__, args)
 
 
+@contextmanager
+def kept_validation() -> Iterator[None]:
+    """Restore the validation of distributions, which torch's compiler turns off in the process.
+
+    Without it a measurement outside the support has a density, and no error is raised.
+    """
+    is_validated = torch.distributions.Distribution._validate_args
+    try:
+        yield
+    finally:
+        torch.distributions.Distribution.set_default_validate_args(is_validated)
+
+
 def _compile_by_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function by torch's compiler."""
     use_private_cache()
-    return torch.compile(function, dynamic=True)
+    with kept_validation():
+        return torch.compile(function, dynamic=True)
 
 
 def _register_shapes(operator: Callable[..., Any], template: Callable[..., Any]) -> None:

@@ -19,6 +19,7 @@ from torch.fx import Graph as Operations
 from torch.fx import Node
 
 from pfbench.kernels import cpp
+from pfbench.kernels.compilation import kept_validation
 from pfbench.kernels.cpp_library import load_library
 from pfbench.kernels.private_folder import use_private_cache
 
@@ -123,7 +124,11 @@ def compile_function(
 
     fake_mode = FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True)
     # The cache of autograd would return a function without its artefact.
-    with tracing(TracingContext(fake_mode)), patch_functorch(enable_autograd_cache=False):
+    with (
+        tracing(TracingContext(fake_mode)),
+        patch_functorch(enable_autograd_cache=False),
+        kept_validation(),
+    ):
         fakes = [fake_mode.from_tensor(a, static_shapes=True) for a in example]
         run: Any = compile_fx(graph, fakes, inner_compile=compile_inner, config_patches=options)
     entry = _find_entry(artefacts, run, example) if on_cpu else None

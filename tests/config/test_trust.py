@@ -105,6 +105,45 @@ FILES: dict[str, tuple[str, str]] = {  # group and text of whole files
         "noise",
         "# @package _global_\nhydra:\n  job:\n    env_set:\n      PFBENCH_TRUST: sympy.core\n",
     ),
+    "study_of_hydra": (
+        "experiment",
+        "# @package _global_\nstudy: ${hydra:job.name}\nhydra:\n  callbacks:\n"
+        "    a: {_target_: joblib.load, filename: CANARY}\n",
+    ),
+    "study_unknown": (
+        "experiment",
+        "# @package _global_\nstudy: ${nope}\nhydra:\n  job:\n    env_set: {PATH: NEWFILE}\n",
+    ),
+    "positional": (
+        "scenario",
+        "_target_: pfbench.scenario.SimulatedFlight\n"
+        "_args_: [trajectory, imu, receiver, initial_errors, 100.0, 1.0, NEWFILE]\n",
+    ),
+    "nested_cache": (
+        "scenario",
+        "_target_: pfbench.scenario.ModelSimulation\nmodel: {a: {cache_dir: NEWFILE}}\n",
+    ),
+    "choice": (
+        "experiment",
+        "# @package _global_\ndefaults:\n  - override /noise: ../../../../../../../../../NEWFILE\n",
+    ),
+    "default_by_value": (
+        "noise",
+        "defaults:\n  - /filter@_global_.hydra.job: x_${filter}\n",
+    ),
+    "default_by_time": ("noise", "defaults:\n  - /train: t${now:%S}\n"),
+    "swept_package": (
+        "experiment",
+        "# @package _global_\nhydra:\n  sweeper:\n    params:\n      +noise@hydra.job: outliers\n",
+    ),
+    "swept_value": (
+        "experiment",
+        "# @package _global_\nq: 1\nhydra:\n  sweeper:\n    params:\n      runs: ${q}\n",
+    ),
+    "launcher_file": (
+        "hydra/launcher",
+        "# @package _global_\nhydra:\n  job:\n    env_set: {PATH: NEWFILE}\n",
+    ),
     "sweeper": (
         "experiment",
         "# @package _global_\nhydra:\n  sweeper:\n    params:\n      episode_cache_dir: NEWFILE\n",
@@ -193,11 +232,16 @@ def test_a_file_cannot_set_the_folder_of_results(tmp_path: Path) -> None:
 
 def test_every_alternative_of_a_sweep_is_checked(tmp_path: Path) -> None:
     (tmp_path / "conf" / "noise").mkdir(parents=True)
-    (tmp_path / "conf" / "noise" / "hostile.yaml").write_text(FILES["callbacks"][1])
     words = ["-m", f"hydra.searchpath=[file://{tmp_path / 'conf'}]", "scenario=linear_walk"]
+    file = tmp_path / "conf" / "noise" / "hostile.yaml"
+    file.write_text(FILES["episodes"][1])
     check_words([*words, "noise=nominal,outliers"])
-    with pytest.raises(UntrustedConfigError, match=r"hydra\.callbacks"):
+    with pytest.raises(UntrustedConfigError, match="episode_cache_dir must be set on the command"):
         check_words([*words, "noise=nominal,hostile"])
+    file.write_text(FILES["callbacks"][1])  # by no choice of any job may it be read
+    with pytest.raises(UntrustedConfigError, match=r"hydra must have sweeper\.params only"):
+        check_words([*words, "noise=nominal,outliers"])
+    file.unlink()
     with pytest.raises(UntrustedConfigError, match="study must be a name"):
         check_words([*words, "study=a,../b"])
     for flag in ("--config-path=/tmp", "--config-name=other"):
@@ -206,7 +250,7 @@ def test_every_alternative_of_a_sweep_is_checked(tmp_path: Path) -> None:
 
 
 def test_studies_are_plain_names() -> None:
-    for name in ("adhoc", "a-b_2.c+d", "2026"):
+    for name in ("adhoc", "a-b_2.c+d", "2026", 2026, 1.0, True):
         trust.check_study(name)
     for name in (
         "",
@@ -222,7 +266,6 @@ def test_studies_are_plain_names() -> None:
         "x" * 101,
         "a\n",
         None,
-        3,
         "ä",
     ):
         with pytest.raises(UntrustedConfigError, match="study must be"):
@@ -261,7 +304,10 @@ def test_a_package_that_the_user_trusts_may_be_named(
     ):
         with pytest.raises(UntrustedConfigError, match="from elsewhere"):
             trust.check_configuration({"noise": {"_target_": name}}, ("trustedlab",))
-    for name in ("os", "torch", "pathlib", "builtins", "pfbench", "not a name", "a;b"):
+    for name in (
+        "os", "torch", "pathlib", "builtins", "pfbench", "not a name", "a;b", "torch.hub", "torch.serialization",
+        "hydra.utils", "numpy.f2py", "__main__", "pip", "setuptools", "pfbench.job", "os.path", "hydra_plugins",
+    ):  # fmt: skip
         with pytest.raises(UntrustedConfigError, match="trust must"):
             trust.split_trust([f"trust=[{name}]"])
     assert trust.split_trust(["trust=[torch.nn,a.b]", "runs=3"])[0] == ["runs=3"]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pfbench.core import affine_map, covariance, density
 from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, gather_ancestors
 from pfbench.filter.gaussian import gaussian_filter, kalman_update, linearisation_rules
 from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, UnscentedPoints
@@ -567,3 +568,16 @@ def test_a_compilation_is_told_with_its_cost(
         "compiled", ParticleFilter(100), linear_walk(1.0, 0.3, 1.0), 10
     )
     assert "engine=compiled: inner loops compiled in 3.2 s. Later jobs reuse them" in caplog.text
+
+
+@compiler
+@pytest.mark.filterwarnings("ignore")  # the compiler's own
+def test_compiling_keeps_the_validation_of_distributions() -> None:
+    """torch's compiler turns it off for the process: a negative count would then have a probability."""
+    before = torch.distributions.Distribution._validate_args
+    model = linear_walk(1.0, 0.3, 1.0)
+    record = Record(torch.zeros(2, 3, 1, dtype=torch.float64))
+    with compilation.use_compiled():
+        run_filter(ParticleFilter(20), model, record, PhiloxStream(1, torch.arange(2)))
+    compilation._compile_by_torch(lambda a: a + 1.0)(torch.ones(2))
+    assert torch.distributions.Distribution._validate_args == before

@@ -1,0 +1,98 @@
+"""Scan of the user's configuration files for what only the command line may do.
+
+Hydra composes a configuration for each job, and a file may choose other files by the values of
+that job. A check of one composition therefore cannot speak for all. The files themselves can: none
+may place anything in the node `hydra`, or choose a file by an interpolation.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pfbench.config.trust import UntrustedConfigError
+
+_PACKAGE = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
+_SEARCH_PATH = re.compile(r"[+~]*hydra\.searchpath=\[?(.*?)\]?$")
+
+
+def check_files(words: Sequence[str]) -> None:
+    """Check all files in the folders that the command line adds to the search path.
+
+    Args:
+        words: Overrides. Files of installed packages (`pkg://`) are not checked.
+
+    Raises:
+        UntrustedConfigError: If a file sets a node of Hydra, or a default has an interpolation.
+    """
+    for word in words:
+        match = _SEARCH_PATH.match(word)
+        for entry in match[1].split(",") if match else ():
+            folder = entry.strip(" '\"")
+            if folder.startswith("file://"):
+                for path in sorted(Path(folder.removeprefix("file://")).rglob("*.yaml")):
+                    _check_file(path)
+
+
+def _check_file(path: Path) -> None:
+    """Check one file."""
+    import yaml
+    from omegaconf import OmegaConf
+
+    text = path.read_text(errors="replace")
+    package = _PACKAGE.search(text)
+    is_hydra_group = path.parent.parent.name == "hydra"
+    if package and ("hydra" in package[1] or is_hydra_group):
+        raise UntrustedConfigError(
+            f"{path}: the package of a file must not be in hydra, got {package[1]}. Remove the line."
+        )
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    except (yaml.YAMLError, OSError, ValueError):  # Hydra reports it if the file is chosen
+        return
+    if not isinstance(content, Mapping):
+        return
+    for text_of_default in _list_texts(content.get("defaults")):
+        is_placed = "@" in text_of_default and "hydra" in text_of_default.partition("@")[2]
+        if is_placed or "${" in text_of_default or ".." in text_of_default:
+            raise UntrustedConfigError(
+                f"{path}: defaults must name files of a group directly and outside hydra, "
+                f"got {text_of_default!r}. Choose the file on the command line."
+            )
+    _check_hydra_node(path, content.get("hydra"))
+
+
+def _check_hydra_node(path: Path, node: Any) -> None:
+    """Check that the node `hydra` of a file has the values of a sweep only."""
+    if node is None:
+        return
+    sweeper = node.get("sweeper") if isinstance(node, Mapping) else None
+    is_sweep = (
+        isinstance(sweeper, Mapping) and set(node) == {"sweeper"} and set(sweeper) == {"params"}
+    )
+    if not is_sweep:
+        raise UntrustedConfigError(
+            f"{path}: hydra must have sweeper.params only, got {node!r}. Set the settings of hydra "
+            "on the command line."
+        )
+    for name, value in ((sweeper or {}).get("params") or {}).items():
+        if "@" in str(name) or "${" in str(value):
+            raise UntrustedConfigError(
+                f"{path}: hydra.sweeper.params must be plain keys and values, got {name}={value}. "
+                "Give it on the command line."
+            )
+
+
+def _list_texts(node: Any) -> Iterator[str]:
+    """Yield the keys and values of a defaults list."""
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            yield str(key)
+            yield from _list_texts(value)
+    elif isinstance(node, list):
+        for item in node:
+            yield from _list_texts(item)
+    elif node is not None:
+        yield str(node)
