@@ -151,9 +151,11 @@ def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> st
 def _format_unknown_key(name: str, words: Sequence[str]) -> str:
     """Format an error about a key that does not exist."""
     override = next((word for word in words if word.lstrip("+~").startswith(f"{name}=")), name)
-    if renamed := find_renamed(name):
+    renamed, keys = find_renamed(name), _composed_keys(words, name)
+    # a misspelt key may be an old key of another scenario: scenario.step for scenario.steps
+    siblings = [key for key in keys if key.rpartition(".")[0] == name.rpartition(".")[0]]
+    if renamed and (renamed[1] in keys or not suggest_similar(name, siblings)):
         return f"{renamed[0]}: renamed to {renamed[1]}"
-    keys = _composed_keys(words, name)
     if name in keys and {"-m", "--multirun"} & set(words):
         return (
             f"{override}: not all jobs of this sweep have the key {name}. "

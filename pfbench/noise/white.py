@@ -61,7 +61,7 @@ class StudentTNoise(_UnitProcess):
         dof: Degrees of freedom.
 
     Raises:
-        ValueError: If `dof` is below 3, where the variance is infinite.
+        ValueError: If `dof` is below 3, where the variance is large or infinite.
     """
 
     dof: int = 4
@@ -69,7 +69,7 @@ class StudentTNoise(_UnitProcess):
     def __post_init__(self) -> None:
         if self.dof < 3:
             raise ValueError(
-                f"noise.dof must be at least 3, got {self.dof}. Below 3 the variance is infinite."
+                f"noise.dof must be at least 3, got {self.dof}. The variance of smaller values is large or infinite."
             )
 
     @override

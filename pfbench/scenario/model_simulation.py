@@ -43,7 +43,7 @@ class ModelSimulation(Scenario):
             the scenario does not define divergence.
 
     Raises:
-        ValueError: If steps is below 1, or the threshold is not positive. `draw` raises it if a
+        ValueError: If steps is below 1, or the interval or the threshold is not positive. `draw` raises it if a
             regime changes measurement errors that are not independent normal.
     """
 
@@ -54,9 +54,14 @@ class ModelSimulation(Scenario):
 
     def __post_init__(self) -> None:
         check_divergence_threshold(self.divergence_threshold_m)
-        if self.steps < 1:
+        if not isinstance(self.steps, int) or self.steps < 1:
             raise ValueError(
-                f"scenario.steps must be at least 1, got {self.steps}. Increase scenario.steps."
+                f"scenario.steps must be a whole number of at least 1, got {self.steps}. "
+                "Change scenario.steps."
+            )
+        if not self.interval_s > 0.0:
+            raise ValueError(
+                f"scenario.interval_s must be positive, got {self.interval_s}. Give it in seconds."
             )
 
     @override

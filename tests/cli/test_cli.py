@@ -69,7 +69,7 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "no particles": (("filter.particles=0",), ("filter.particles must be at least 2, got 0",)),
     "particles in words": (
         ("filter.particles=many",),
-        ("filter: a value is not valid", "Check filter.particles=many"),
+        ("filter.particles must be a whole number, got 'many'", "Write it without a point"),
     ),
     "negative deviation": (
         ("model.measurement_sd=-1",),

@@ -149,5 +149,16 @@ def test_filters_draw_from_other_streams_than_episodes() -> None:
 
 
 def test_a_scenario_without_steps_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"scenario\.steps must be at least 1, got 0"):
+    with pytest.raises(
+        ValueError, match=r"scenario\.steps must be a whole number of at least 1, got 0"
+    ):
         ModelSimulation(Pendulum(), 0)
+
+
+def test_numbers_of_a_scenario_are_checked() -> None:
+    model = linear_walk(1.0, 0.3, 1.0)
+    for interval in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match=r"scenario\.interval_s must be positive"):
+            ModelSimulation(model, 5, interval)
+    with pytest.raises(ValueError, match=r"scenario\.steps must be a whole number .* got 5\.5"):
+        ModelSimulation(model, 5.5)  # type: ignore[arg-type]

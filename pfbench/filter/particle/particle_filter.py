@@ -85,6 +85,11 @@ class ParticleFilter(Filter):
     points: PointSet = field(default_factory=IidPoints)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.particles, int):
+            raise ValueError(
+                f"filter.particles must be a whole number, got {self.particles!r}. Write it without a "
+                "point or exponent."
+            )
         if self.particles < 2:
             raise ValueError(
                 f"filter.particles must be at least 2, got {self.particles}. Choose more particles."
