@@ -205,7 +205,7 @@ def run_filter(
     if record.feedback is not None:
         feedback = record.feedback.begin(record, correctable_groups(model))
     prepared = prepare_record(model, record)
-    check_model(model, prepared, draws)
+    check_model(model, prepared)
     batches = split_runs(prepared, draws, None if feedback is not None else run_batch)
     passes = [FilterPass(method, model, *batch, feedback, lookahead=True) for batch in batches]
     means, variances, evidences, traces = [], [], [], []

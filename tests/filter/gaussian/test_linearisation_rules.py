@@ -207,7 +207,7 @@ def test_rules_that_have_another_name(n: int) -> None:
 
 def test_the_unscented_filter_of_kappa_two_filters_alike() -> None:
     y = 10.0 * torch.randn(
-        2, 12, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(3)
+        2, 12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)
     )
     one, other = (
         mean(scheme, Lorenz63(), y) for scheme in (RULES["mckf"], UnscentedPoints(1.0, 0.0, 2.0))
