@@ -31,7 +31,7 @@ def check_files(words: Sequence[str]) -> None:
         match = _SEARCH_PATH.match(word)
         for entry in match[1].split(",") if match else ():
             folder = entry.strip(" '\"")
-            if folder.startswith("file://"):
+            if folder and not folder.startswith("pkg://"):  # Hydra takes a bare path as a file
                 for path in sorted(Path(folder.removeprefix("file://")).rglob("*.yaml")):
                     _check_file(path)
 
