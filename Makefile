@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo report test test-fast test-slow mutants format lint bench clean
+.PHONY: demo report test test-fast test-slow mutants faults format lint bench clean
 
 # Python compiles modules at first import. Compiling all installed packages took half of the set-up time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -32,6 +32,9 @@ test-slow: $(VENV)/.installed
 
 mutants: $(VENV)/.installed     ## plant each fault of tests/mutants.toml and check that a test fails
 	$(BIN)/python tests/mutants.py
+
+faults: $(VENV)/.installed      ## disturb pfbench and count the outcomes in docs/reliability.md: hours; repeat to continue
+	PYTHONPATH=tests $(BIN)/python -m faults.main
 
 format: $(VENV)/.installed      ## format the code and apply safe fixes of the linter
 	$(BIN)/ruff check --fix-only --quiet .

@@ -11,6 +11,8 @@ import re
 import shutil
 from pathlib import Path
 
+from pfbench.files.recorded_folder import record_change
+
 REPORTS = Path(__file__).parents[1] / "reports"
 
 # Figure of each study, relative to its folder and without suffix.
@@ -64,6 +66,7 @@ def publish_report(folder: Path) -> None:
         shutil.copyfile(source, folder / f"headline{source.suffix}")
     page = folder / "report.md"
     page.write_text(reduce_markdown(page.read_text(), folder, stem))
+    record_change(page)
 
 
 def reduce_markdown(text: str, folder: Path, stem: str) -> str:

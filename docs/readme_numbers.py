@@ -180,6 +180,9 @@ def all_seven() -> str:
     )
     return "\n".join(
         (
+            "Computed by the rules of the first edition, which took regimes of a scenario for independent. "
+            "The study will be decided again by the rules of [statistics](docs/statistics.md).",
+            "",
             f"- Best mean ranks over {conditions} conditions, of {len(ranks)} filters: "
             + ", ".join(f"`{name}` {ranks[name]:.1f}" for name in best)
             + f". Last: `{worst}` {ranks[worst]:.1f}.",

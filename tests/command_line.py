@@ -17,6 +17,8 @@ from hydra._internal.hydra import Hydra
 
 from pfbench import cli
 
+GONE = (ProcessLookupError, FileNotFoundError, PermissionError)
+
 
 class Said(NamedTuple):
     """Exit code and what was printed."""
@@ -78,3 +80,18 @@ def process(*words: object, home: Path, cwd: Path, **more: str) -> Said:
 
 def environment(home: Path) -> dict[str, str]:
     return {"PFBENCH_RESULTS": str(home / "results"), "PFBENCH_EPISODES": str(home / "worlds")}
+
+
+def processes_of(home: Path, doing: str) -> list[int]:
+    """Processes that belong to the sweep of this home, by what they say of themselves."""
+    found, mark = [], f"PFBENCH_RESULTS={home / 'results'}".encode()
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(*GONE):
+            own = entry.name.isdigit() and int(entry.name) != os.getpid()
+            if (
+                own
+                and mark in (entry / "environ").read_bytes().split(b"\0")
+                and doing in (entry / "cmdline").read_text()
+            ):
+                found.append(int(entry.name))
+    return found

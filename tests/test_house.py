@@ -27,7 +27,7 @@ FLOORS = (
     ("results",),
     ("config",),
     ("report", "job", "learn", "ppl", "testing"),
-    ("claims",),
+    ("claims", "judge"),
     ("cli",),
     ("__main__",),
 )
@@ -42,7 +42,7 @@ NEVER = {("filter", "noise"), ("scenario", "results"), ("scenario", "filter"), (
 AT_THE_SAME_FLOOR = {("ppl", "report"), ("learn", "job")}
 FOREIGN = {"hydra": {"cli", "config", "job"}, "omegaconf": {"cli", "config", "job"}}
 NO_ENGINE = ("torch", "pyro", "hydra")  # stored files are enough for these folders
-STORED = {"results", "report", "claims"}
+STORED = {"results", "report", "claims", "judge"}
 LONGEST_FILE, LONGEST_FUNCTION = 250, 25
 MODULES_IN_A_FOLDER = 15
 
@@ -230,7 +230,9 @@ def test_a_report_needs_no_engine() -> None:
     modules = [
         module_name(f)
         for f in FILES
-        if module_name(f).startswith(("pfbench.report", "pfbench.results", "pfbench.claims"))
+        if module_name(f).startswith(
+            ("pfbench.report", "pfbench.results", "pfbench.claims", "pfbench.judge")
+        )
     ]
     code = (
         f"import sys, {', '.join(modules)}; print([m for m in {NO_ENGINE!r} if m in sys.modules])"

@@ -25,6 +25,7 @@ from pfbench.claims.claim_tests import OPEN, ClaimTestResult
 from pfbench.claims.measurements import claim_job_metadata, load_claim_measurements
 from pfbench.claims.schema import PAPERS, Claim, ClaimTest
 from pfbench.claims.verdicts import VERDICTS, ClaimVerdict, decide_claims
+from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import table_formats, writers
 
 STUDY = "claims"  # folder of the page among the reports
@@ -65,30 +66,26 @@ def write_claims(
         load_claim_measurements(claims, results, allow_mixed_versions=allow_mixed_versions),
         alpha,
     )
-    folder = Path(out) / STUDY
-    writers.remove_old_files(folder)
-    writers.write_table(folder, STUDY, claims_table(verdicts))
-    text = json.dumps([_to_json(verdict) for verdict in verdicts], indent=1, allow_nan=False)
-    (folder / "verdicts.json").write_text(text + "\n", encoding="utf-8")
     studies = {study for claim in claims for study in claim.studies}
     jobs = claim_job_metadata(claims, results, mixed=allow_mixed_versions)
-    study_jobs = jobs_table(jobs)
-    if len(study_jobs):
-        writers.write_table(folder, "studies", study_jobs)
-    drawings = claims_figures.claim_figures(verdicts)
-    context = {
+    context: dict[str, Any] = {
         "papers": rows_by_paper(verdicts, report_anchors(studies, out), jobs),
-        "made": study_jobs,
+        "made": jobs_table(jobs),
         "commits": list_commits(jobs.values()),
         "verdicts": VERDICTS,
         "count": count_verdicts(verdicts),
         "alpha": alpha,
         "n": len(verdicts),
-        "drawings": [
-            writers.render_figure(drawing, STUDY, folder, formats) for drawing in drawings
-        ],
     }
-    return writers.render_template("page", folder, context, Path(__file__).parent)
+    text = json.dumps([_to_json(verdict) for verdict in verdicts], indent=1, allow_nan=False)
+    with RecordedFolder(Path(out) / STUDY) as folder:
+        writers.write_table(folder, STUDY, claims_table(verdicts))
+        folder.write("verdicts.json", text + "\n")
+        if len(context["made"]):
+            writers.write_table(folder, "studies", context["made"])
+        drawings = claims_figures.claim_figures(verdicts)
+        context["drawings"] = writers.render_figures(drawings, STUDY, folder, formats)
+        return writers.render_template("page", folder, context, Path(__file__).parent)
 
 
 def report_anchors(studies: Iterable[str], out: str | Path) -> dict[str, set[str]]:

@@ -17,6 +17,7 @@ COMMANDS = {
     "report": ("report_study", "write the report of a study: figures, tables and tests"),
     "claims": ("report_claims", "write the page of the papers' claims and verdicts"),
     "datasheet": ("report_scenario", "write the datasheet of a scenario"),
+    "judge": ("judge_trajectories", "compare trajectories of other programs with a reference"),
     "train": ("train_network", "train the network of a neural_* filter"),
     "list": ("list_options", "list what a configuration can choose"),
     "check": ("check_installation", "compose all configurations and print versions"),
@@ -44,6 +45,15 @@ def main(argv: Sequence[str] | None = None) -> None:
         SystemExit: With code 1 if the command failed, 2 if it does not exist, 130 if interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        _dispatch(words)
+        sys.stdout.flush()  # here, since Python reports an error of its last flush with a traceback
+    except BrokenPipeError:  # the reader closed the pipe, as in `pfbench list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _dispatch(words: Sequence[str]) -> None:
+    """Print help or version, or run a command."""
     if not words or words[0] in ("-h", "--help", "help"):
         print(_usage())
         return
@@ -76,8 +86,8 @@ def _run_command(command: str, options: Sequence[str]) -> None:
             "\nInterrupted. Finished jobs are kept. Repeat the command to resume.", file=sys.stderr
         )
         raise SystemExit(130) from None
-    except BrokenPipeError:  # the reader closed the pipe, as in `pfbench list | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:
+        raise
     except Exception as error:
         if shows_traceback:
             raise

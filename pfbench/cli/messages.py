@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -11,6 +12,15 @@ from typing import Any
 
 # extra of the package that installs a launcher
 _EXTRAS = {"ray": "ray", "submitit": "slurm", "joblib": "launch"}
+# errors of the file system: remedy
+_STORAGE = {
+    errno.ENOSPC: "Free space",
+    errno.EDQUOT: "Free space of the quota",
+    errno.EFBIG: "Raise the limit of the file size (ulimit -f)",
+    errno.EROFS: "Make the folder writable or set another one",
+    errno.EACCES: "Change its permissions or set another folder",
+    errno.EPERM: "Change its permissions or set another folder",
+}
 _ALL_KEYS = " List all: pfbench run --cfg job"
 
 
@@ -26,8 +36,13 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
     """
     if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
         return _format_refusal(f"{error}", error.__cause__, words)
+    if isinstance(error, OSError) and error.errno in _STORAGE:
+        return _format_storage(error)
     text = f"{error}".strip() or type(error).__name__
     if match := re.search(r"Could not override '([^']+)'", text):
+        if match[1] == "experiment":
+            name = next((w.partition("=")[2] for w in words if w.startswith("experiment=")), "NAME")
+            return f"experiment={name} must be added with a plus sign. Use +experiment={name}"
         return _format_unknown_key(match[1], words)
     launchers = "|".join(_EXTRAS)
     if match := re.search(rf"[Cc]ould not (?:find|load) 'hydra/launcher/({launchers})", text):
@@ -35,6 +50,16 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
         return f'{launcher} is not installed. Run pip install "pfbench[{_EXTRAS[match[1]]}]"'
     if match := re.search(r"Could not find '(.+)/([^/']*)'", text):
         return _format_unknown_choice(match[1], match[2], re.findall(r"^\t(\w+)$", text, re.M))
+    if message := _format_value_error(text):
+        return message
+    renamed = next((find_renamed(word) for word in words if find_renamed(word)), None)
+    return f"{text} {renamed[0]}: renamed to {renamed[1]}" if renamed else text
+
+
+def _format_value_error(text: str) -> str:
+    """Format an error of Hydra about a single value; empty for other errors."""
+    if match := re.search(r"Ambiguous value for argument '([^']+)'", text):
+        return f"{match[1]} must be one value, got several. Add -m to run all: pfbench run -m ..."
     if match := re.search(r"Interpolation key '([^']+)' not found\s+full_key: (\S+)", text):
         group, _, name = match[1].partition(".")
         return (
@@ -45,8 +70,16 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
         return f"{match[1]} must be set. Set {match[1]}=..."
     if match := re.search(r"Error parsing override '([^']*)'", text):
         return f"'{match[1]}' must be key=value. Quote it if the shell reads brackets or spaces."
-    renamed = next((find_renamed(word) for word in words if find_renamed(word)), None)
-    return f"{text} {renamed[0]}: renamed to {renamed[1]}" if renamed else text
+    return ""
+
+
+def _format_storage(error: OSError) -> str:
+    """Format an error of the file system with its remedy."""
+    name = error.filename or "files of the command"
+    return (
+        f"{name} must be accessible, got '{error.strerror}'. {_STORAGE[error.errno or 0]}, then "
+        "repeat the command. Finished jobs are kept."
+    )
 
 
 def suggest_similar(name: str, options: Sequence[str]) -> str:
@@ -120,6 +153,8 @@ def _format_unknown_choice(group: str, name: str, options: Sequence[str]) -> str
     """Format an error about a choice that does not exist."""
     if renamed := find_renamed(f"{group}={name}"):
         return f"{renamed[0]}: renamed to {renamed[1]}"
+    if group != "experiment" and name.lower() in options:
+        return f"{group}={name} does not exist. Names are in lower case: {group}={name.lower()}"
     is_listed = "/" not in group
     available = f"pfbench list {group}" if is_listed else ", ".join(options)
     return f"{group}={name} does not exist.{suggest_similar(name, options)} List all: {available}"
@@ -135,6 +170,11 @@ def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> st
     target = re.search(r"Error loading '([\w.]+)'", message)
     if target and (new := _renamed_keys()["targets"].get(target[1])):
         return f"{key}._target_={target[1]}: renamed to {new}"
+    if target and (module := re.search(r"No module named '([\w.]+)'", message)):
+        return (
+            f"{key}._target_ must be importable, got {target[1]}: the module {module[1]} is not "
+            "installed. Install it, or set PYTHONPATH to its parent folder."
+        )
     if type(cause) is not ValueError:
         overrides = [word for word in words if word.lstrip("+").startswith(f"{key}.")]
         source = " ".join(overrides) or "its YAML file"
@@ -168,13 +208,21 @@ def _format_unknown_key(name: str, words: Sequence[str]) -> str:
 def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:
     """List the dotted keys of the configuration of all other overrides."""
     from pfbench.config.composition import compose
+    from pfbench.config.sweep_check import expand_sweep
 
-    others = [word for word in words if "=" in word and excluded not in word and "," not in word]
+    others = [word for word in words if "=" in word and excluded not in word]
+    keys: dict[str, None] = {}
     try:
-        composed = compose([word for word in others if not word.startswith("hydra")])
+        alternatives = expand_sweep([word for word in others if not word.startswith("hydra")])
+        first = [options[0] for options in alternatives]
+        for i, options in enumerate(alternatives):
+            for option in options[1:]:
+                composed = compose([*first[:i], option, *first[i + 1 :]])
+                keys |= dict.fromkeys(_dotted_keys(composed.values))
+        keys |= dict.fromkeys(_dotted_keys(compose(first).values))
     except Exception:  # with a second mistake, a suggestion would only confuse
         return []
-    return list(_dotted_keys(composed.values))
+    return list(keys)
 
 
 def _dotted_keys(node: Any, path: str = "") -> Iterator[str]:

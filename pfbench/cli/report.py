@@ -9,7 +9,7 @@ from typing import Any
 
 from pfbench.cli.claims import write_claims_page
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
-from pfbench.cli.messages import format_error
+from pfbench.cli.messages import format_error, suggest_similar
 from pfbench.config.composition import JobConfig, compose
 from pfbench.config.folders import experiments_dir
 
@@ -56,7 +56,22 @@ def report_study(words: Sequence[str]) -> None:
         raise ValueError(
             "study must be a study, got datasheets. Use: pfbench datasheet scenario=NAME"
         )
+    _check_existence(study, Path(config.values["results_dir"]))
     print(f"report: {_write_page(config).resolve()}")
+
+
+def _check_existence(study: str, results: Path) -> None:
+    """Check that a study has a folder of results or an experiment."""
+    experiments = {path.stem for path in experiments_dir().glob("*.yaml")}
+    if study in experiments or (results / study).is_dir():
+        return
+    available = sorted({path.parent.name for path in results.glob("*/*.npz")})
+    similar = suggest_similar(study, sorted({*available, *experiments}))
+    raise ValueError(
+        f"study must be a study with results, got {study}.{similar} "
+        f"Studies with results in {results}: {', '.join(available) or 'none'}. "
+        f"Run its jobs first: pfbench run study={study} ..."
+    )
 
 
 def make_report_options(config: JobConfig) -> Any:

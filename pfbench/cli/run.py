@@ -5,16 +5,15 @@ from __future__ import annotations
 import os
 import re
 import sys
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from pfbench.cli.compose import given_keys, read_sweep
-from pfbench.config.composition import compose, register_experiments
+from pfbench.cli.study_plan import StudyPlan, plan_study
+from pfbench.cli.sweep_progress import SWEEP_JOBS, SweepProgress
+from pfbench.cli.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
+from pfbench.config.composition import register_experiments
 from pfbench.config.folders import conf_dir
-from pfbench.config.sweep_check import check_words, expand_sweep
+from pfbench.config.sweep_check import check_words
 
 HELP = """\
 pfbench run [-m] key=value ...
@@ -26,13 +25,15 @@ Finished jobs are skipped: repeat an interrupted command to resume.
   pfbench run -m scenario=flight_300s filter=ekf,sir noise=nominal,outliers study=mine
   pfbench run -m +experiment=quickstart
   pfbench run -m +experiment=quickstart hydra/launcher=cores     on all cores
+  pfbench run -m scenario=flight_300s filter=ekf,sir study=mine runs=until-decided
+                             adds runs until each pair of filters is decided
 
   pfbench list               scenarios, noise regimes, filters and experiments
   pfbench run --cfg job      all keys with their values"""
 
 _RETRIES = 3  # of a sweep that lost a process, as many as Ray allows
-_SWEEP_JOBS = "PFBENCH_SWEEP_JOBS"  # environment variable: number of jobs, for the counter
 _FLAGS = ("-m", "--multirun")
+_PRINTING_FLAGS = {"--cfg", "-c", "--info", "-i", "--hydra-help", "--version", "--resolve"}
 
 
 def run_jobs(words: Sequence[str]) -> None:
@@ -48,18 +49,97 @@ def run_jobs(words: Sequence[str]) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
     overrides = [word for word in words if word not in flags]
+    overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
     check_words([*flags, *overrides])
-    sys.argv = ["pfbench run", *flags, *overrides]
     decorate = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
     application = decorate(run_task)
-    if not flags:
-        application()
+    is_printed = any(word.partition("=")[0] in _PRINTING_FLAGS for word in words)
+    plan = None if is_printed else plan_or_none(overrides)
+    if plan and wants_until_decided(plan):
+        check_has_sweep(flags)
+        sweep = GrowingSweep.from_plan(plan)
+        others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
+        sweep.run(lambda more: run_sweep(application, [*flags, *others, *more], plan, is_part=True))
         return
-    sweep = SweepProgress.start([word for word in overrides if not word.startswith("-")])
+    print_study_size(plan)
+    if flags:
+        run_sweep(application, [*flags, *overrides], plan)
+        return
+    sys.argv = ["pfbench run", *overrides]
+    application()
+
+
+def plan_or_none(overrides: Sequence[str]) -> StudyPlan | None:
+    """Plan a study; None if its configuration is not valid, which Hydra reports.
+
+    Args:
+        overrides: Overrides and flags of Hydra.
+    """
+    try:
+        return plan_study([word for word in overrides if not word.startswith("-")])
+    except Exception:
+        return None
+
+
+def print_study_size(plan: StudyPlan | None) -> None:
+    """Print what the chosen runs and worlds can show.
+
+    Args:
+        plan: Plan of the study, None if it is not valid.
+    """
+    try:
+        sentence = plan.describe_size() if plan else ""
+    except Exception:  # a scenario of the sweep is not valid: its job reports the error
+        return
+    if sentence:
+        print(sentence, flush=True)
+
+
+def run_sweep(
+    application: Callable[[], Any],
+    words: Sequence[str],
+    plan: StudyPlan | None,
+    *,
+    is_part: bool = False,
+) -> None:
+    """Run all jobs of a sweep and print their counts.
+
+    Args:
+        application: Application of Hydra, which reads its words from `sys.argv`.
+        words: Flags and overrides.
+        plan: Plan of the sweep, None if it is not valid.
+        is_part: Whether more runs may follow, so that the next command is not printed.
+    """
+    sys.argv = ["pfbench run", *words]
+    sweep = SweepProgress.start(plan)
     try:
         run_with_retries(application)
-    finally:
-        sweep.finish()
+    except BaseException:
+        sweep.finish(is_complete=False, is_part=is_part)
+        raise
+    sweep.finish(is_part=is_part)
+
+
+def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
+    """Write each key below a swept group as a sweep of one value, which Hydra applies to the jobs alone.
+
+    Hydra applies other keys first to a configuration without the swept choices, where they may not
+    exist: `scenario=linear_walk,growth scenario.steps=15`.
+
+    Args:
+        words: Overrides and flags of a sweep.
+
+    Returns:
+        The words in the same order.
+    """
+    pairs = [word.partition("=") for word in words]
+    groups = {key for key, _, value in pairs if "," in value and "." not in key}
+    return [
+        f"{key}=choice({value})"
+        if key.split(".")[0] in groups and "." in key and re.fullmatch(r"[\w.+-]+", value)
+        else word
+        for word, (key, _, value) in zip(words, pairs, strict=True)
+    ]
 
 
 def run_task(cfg: Any) -> float:
@@ -78,7 +158,7 @@ def run_task(cfg: Any) -> float:
 
     application: Any = HydraConfig.get()
     counter = ""
-    if total := os.environ.get(_SWEEP_JOBS):
+    if total := os.environ.get(SWEEP_JOBS):
         number = OmegaConf.select(application, "job.num", throw_on_missing=False)
         counter = "" if number is None else f"[{number + 1}/{total}] "
     return job.run(cfg, application.runtime.choices, counter).rmse
@@ -108,67 +188,3 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
                 ) from error
             message = "warning run: a process of the sweep was killed. Running the remaining jobs"
             print(message, file=sys.stderr)
-
-
-@dataclass
-class SweepProgress:
-    """Counts of a sweep, from the files that its jobs write.
-
-    Any launcher can run the jobs.
-
-    Attributes:
-        jobs: Number of jobs, or None if unknown.
-        study: Name of the study, or None if it cannot be determined.
-        folder: Folder of the results.
-        start_time: Start of the sweep, seconds since the epoch.
-    """
-
-    jobs: int | None = None
-    study: str | None = None
-    folder: Path = Path()
-    start_time: float = field(default_factory=time.time)
-
-    @classmethod
-    def start(cls, overrides: Sequence[str]) -> SweepProgress:
-        """Count the jobs of a sweep and set the total for the counters of its jobs.
-
-        Args:
-            overrides: Overrides of the sweep.
-        """
-        names = [word.partition("=")[2] for word in overrides if word.startswith("+experiment=")]
-        params = [word for name in names for word in read_sweep(name)]
-        try:
-            alternatives = expand_sweep([*params, *overrides])
-            first = [values[0] for values in alternatives]
-            values = compose(
-                [word for word in first if not re.match(r"[+~]*hydra[/.](?!searchpath)", word)]
-            ).values
-        except Exception:  # the sweep itself reports the error
-            return cls()
-        jobs = 1
-        for options in alternatives:
-            jobs *= len(options)
-        os.environ[_SWEEP_JOBS] = str(jobs)
-        is_swept = any(
-            len(options) > 1 and "study" in given_keys(options) for options in alternatives
-        )
-        study = None if is_swept or len(names) > 1 else str(values["study"])
-        return cls(jobs, study, Path(values["results_dir"]) / str(values["study"]))
-
-    def finish(self) -> None:
-        """Print the counts and the next command."""
-        os.environ.pop(_SWEEP_JOBS, None)
-        if self.study is None or self.jobs is None:
-            return
-        finished = self._count("*.npz")
-        failed = self._count("*.failed.json")
-        skipped = max(0, self.jobs - finished - failed)
-        counts = f"{finished} finished, {skipped} skipped, {failed} failed"
-        elapsed = time.time() - self.start_time
-        command = f"pfbench report study={self.study}"
-        print(f"sweep: {counts} in {elapsed:.0f} s.  Next: {command}")
-
-    def _count(self, pattern: str) -> int:
-        """Count the files that were written since the start."""
-        times = (file.stat().st_mtime for file in self.folder.glob(pattern))
-        return sum(modified >= self.start_time - 0.05 for modified in times)

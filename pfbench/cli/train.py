@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 
 from pfbench.config.composition import compose
@@ -50,4 +51,5 @@ def train_network(words: Sequence[str]) -> None:
     about = {"versions": job.read_versions()}
     path = fit(values, choices, regimes, job.instantiate, about, print)
     shared = [word for word in words if not word.startswith(_NOT_OF_A_JOB)]
-    print(f"checkpoint: {path.resolve()}\nNext: pfbench run {' '.join(shared)} checkpoint={path}")
+    command = shlex.join(["pfbench", "run", *shared, f"checkpoint={path}"])  # brackets for zsh
+    print(f"checkpoint: {path.resolve()}\nNext: {command}")

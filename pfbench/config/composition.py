@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
+from pfbench.config.paper_block import check_paper_blocks
 from pfbench.config.protected_keys import check_protected_keys
 from pfbench.config.trust import check_configuration, check_study, split_trust
 
@@ -50,6 +51,7 @@ class JobConfig:
                 f"{', '.join(missing)}, or build the configuration with job.compose([...])."
             )
         check_configuration(self.values, self.trusted)
+        check_paper_blocks(self.values)
         if "study" in self.values:
             check_study(self.values["study"])
 

@@ -52,8 +52,9 @@ def split_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
     Raises:
         UntrustedConfigError: If an entry is not a name, or is too large to be trusted.
     """
-    others = [word for word in words if not word.startswith("trust=")]
-    texts = [word.partition("=")[2] for word in words if word.startswith("trust=")]
+    is_trust = [word.lstrip("+").startswith("trust=") for word in words]
+    others = [word for word, is_key in zip(words, is_trust, strict=True) if not is_key]
+    texts = [word.partition("=")[2] for word, is_key in zip(words, is_trust, strict=True) if is_key]
     return others, _parse_packages([*texts, os.environ.get(ENVIRONMENT, "")])
 
 

@@ -7,6 +7,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensor
+
+RUN_NUMBERS = 1 << 32  # a run number is a word of the random counter; more would repeat streams
 
 
 def as_float64(values: Any) -> Tensor:
@@ -62,3 +65,21 @@ def check_three_positive(name: str, values: Sequence[float]) -> Tensor:
             f"{name} must have 3 numbers, got {list(values)}. Set one number for each axis."
         )
     return check_positive(name, list(values))
+
+
+def check_run_numbers(runs: Tensor) -> None:
+    """Check the range of run numbers on the CPU. On another device the host would wait for them.
+
+    Args:
+        runs: Run numbers, int64, [R].
+
+    Raises:
+        ValueError: If a number is not from 0 to 2**32 - 1.
+    """
+    if runs.device.type != "cpu" or isinstance(runs, FakeTensor):
+        return
+    wrong = runs[(runs < 0) | (runs >= RUN_NUMBERS)].tolist()
+    if wrong:
+        raise ValueError(
+            f"runs must be from 0 to 2**32 - 1, got {wrong[0]}. Use another seed for more runs."
+        )

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import check_run_numbers
 from pfbench.kernels import cpp, cuda
 from pfbench.kernels.compilation import compilable
 
@@ -167,13 +168,13 @@ class PhiloxStream(BatchRandomStream):
     Attributes:
         seed: Integer from 0 to 2**32 - 1. In a recorded step a tensor [], as `step`.
         runs: Run numbers, int64, [R]. The number of a run, not its index in the batch, decides its
-            random numbers.
+            random numbers. From 0 to 2**32 - 1.
         dtype: Type of the normals. They are drawn in single precision (24 bits, largest value 6.7)
             and converted, which takes a sixth of the time of double precision.
         step: Time step. 0 is the step of the initial distribution.
 
     Raises:
-        ValueError: If the seed is out of range.
+        ValueError: If the seed or a run number is out of range. It would repeat another stream.
     """
 
     seed: int | Tensor
@@ -184,6 +185,8 @@ class PhiloxStream(BatchRandomStream):
     def __post_init__(self) -> None:
         if not isinstance(self.seed, Tensor) and not 0 <= self.seed <= _WORD:
             raise ValueError(f"seed must be from 0 to 2**32 - 1, got {self.seed}. Change the seed.")
+        if isinstance(self.step, int) and self.step == 0:  # later steps have the same runs
+            check_run_numbers(self.runs)
 
     @override
     def at_step(self, step: int) -> PhiloxStream:
@@ -212,14 +215,10 @@ def _words(
     key: tuple[Tensor, int], step: Tensor, runs: Tensor, component: Tensor, quarters: int
 ) -> Words:
     """Return four random words for each component, run and quarter of the particles, [w, R, q]."""
-    particle, step, seed = (
-        torch.arange(quarters, device=runs.device),
-        step.to(runs.device),
-        key[0].to(runs.device),
-    )
-    shape = (component.shape[0], runs.shape[0], quarters)
-    counter = (particle, component[:, None, None], step, runs[:, None])
-    c0, c1, c2, c3 = (word.expand(shape) for word in counter)
+    particle = torch.arange(quarters, device=runs.device)
+    step, seed = step.to(runs.device), key[0].to(runs.device)
+    counter = particle, component[:, None, None], step, runs[:, None]
+    c0, c1, c2, c3 = (word.expand(len(component), len(runs), quarters) for word in counter)
     return philox((c0, c1, c2, c3), (seed, key[1]))
 
 

@@ -45,6 +45,11 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
             f"draws must be of {runs} runs, as record.y is, got {len(numbers)}. "
             f"Use PhiloxStream(seed, torch.arange({runs}))."
         )
+    if not isinstance(record.u, tuple):
+        raise ValueError(
+            f"record.u must be a NamedTuple of tensors [R, T, ...], got {type(record.u).__name__}. "
+            "Define a NamedTuple with a field for each input."
+        )
     for name, value in _named_inputs(record.u):
         if value.dim() < 2 or value.shape[0] not in (1, runs) or value.shape[1] != steps:
             raise ValueError(
@@ -84,6 +89,7 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
                 f"{name}.propagate must return finite states {list(x.shape)}, got {state} for the "
                 "first step. Check the inputs and the parameters of the model."
             )
+        _check_independence(step_model, x, first.u, w, next_x)
         observed = _observe(step_model, next_x, first.u)
     shape = (*observed.batch_shape, *observed.event_shape)
     is_blank = bool(torch.isnan(record.y).all())  # a record without measurements may have any width
@@ -91,6 +97,33 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
         raise ValueError(
             f"record.y must have as many components as {name} observes, {shape[-1] if shape else 0}, "
             f"got {width}."
+        )
+    if tuple(observed.batch_shape) != (runs, _STATES):
+        raise ValueError(
+            f"{name}.observation must return a distribution of batch shape [R, N] = "
+            f"{[runs, _STATES]}, got {list(observed.batch_shape)}. Compute it from the states x, and "
+            "expand what all particles share."
+        )
+
+
+def _check_independence(
+    model: StateSpaceModel, x: Tensor, u: Any, w: Tensor, next_x: Tensor
+) -> None:
+    """Check that a particle moves by itself: one state is replaced, and all others must stay."""
+    changed = x.clone()
+    changed[0, 0] = x[0, 1]
+    result, expected = model.propagate(changed, u, w), next_x.clone()
+    expected[0, 0] = next_x[0, 1]
+    scale = next_x.abs().nan_to_num(posinf=0.0).amax((0, 1))
+    tolerance = 1e3 * torch.finfo(x.dtype).eps * (scale + 1.0)
+    is_equal = ((result - expected).abs() <= tolerance) | (result == expected)
+    is_equal |= result.isnan() & expected.isnan()
+    if not bool(is_equal.all()):
+        wrong = torch.nonzero(~is_equal)[0].tolist()
+        raise ValueError(
+            f"{type(model).__name__}.propagate must move each particle of each run by itself, got "
+            f"another state at [run, particle, component] = {wrong} after the state of run 0, "
+            "particle 0 was replaced. Do not sum over the axes of runs and particles."
         )
 
 
@@ -100,8 +133,8 @@ def _observe(model: StateSpaceModel, x: Tensor, u: Any) -> Any:
     A counter of likelihood evaluations replaces that of the object.
     """
     inner = model
-    while isinstance(inner, ModelWrapper):
-        inner = inner.model
+    while isinstance(inner, ModelWrapper) and type(inner).observation is ModelWrapper.observation:
+        inner = inner.model  # a wrapper with an observation of its own has inputs of its own
     return type(inner).observation(inner, x, u)
 
 
@@ -109,6 +142,11 @@ def _named_inputs(u: Any, name: str = "") -> list[tuple[str, Tensor]]:
     """Return the input tensors with the names of their fields."""
     if isinstance(u, Tensor):
         return [(name, u)]
+    if not isinstance(u, tuple):
+        raise ValueError(
+            f"record.u{name} must be a tensor or a tuple of tensors, got {type(u).__name__}. "
+            "Convert it, for instance by torch.as_tensor."
+        )
     fields = getattr(u, "_fields", range(len(u)))
     return [
         pair

@@ -16,6 +16,7 @@ from pfbench.core.random_stream import BatchRandomStream, RandomStream
 from pfbench.core.record import FeedbackRun, Record, iterate_steps
 from pfbench.filter.belief import Filter, StepInfo
 from pfbench.filter.feedback import apply_feedback, correctable_groups
+from pfbench.filter.health import HealthMonitor, with_cached_nis
 from pfbench.filter.input_check import check_model, check_record
 from pfbench.filter.run_batches import join_infos, join_runs, split_runs
 from pfbench.model.base import StateSpaceModel
@@ -33,12 +34,15 @@ class FilterResult(NamedTuple):
         log_evidence: log p(y_1:T), [R]. -inf where the run is lost.
         trace: Diagnostics per run and step, {name: [R, T]}: `ess`, `resampled` and the results of
             `watch`.
+        health: Health of each run as an index in `pfbench.filter.health.HEALTH`, int8 [R]: ok, lost,
+            collapsed, diverged or overconfident. It is computed without the truth.
     """
 
     mean: Tensor
     variance: Tensor
     log_evidence: Tensor
     trace: dict[str, Tensor]
+    health: Tensor
 
     @property
     def lost(self) -> Tensor:
@@ -187,6 +191,8 @@ def run_filter(
         model: State-space model of the filter.
         record: Measurements [R, T, Dy] and inputs.
         draws: Random stream. Step 0 is the initial distribution, step t the t-th measurement.
+            Particles have the wider type of model and stream: a float32 model with a float64 stream
+            computes in float64. Give both the same type.
         watch: (t, info) -> {name: [R] or [R, ...]}, for results other than mean and variance. It
             cannot influence the filter.
         on_step: Function called after each step, such as a progress bar.
@@ -207,14 +213,16 @@ def run_filter(
     prepared = prepare_record(model, record)
     check_model(model, prepared)
     batches = split_runs(prepared, draws, None if feedback is not None else run_batch)
+    monitor = HealthMonitor(prepared)
     passes = [FilterPass(method, model, *batch, feedback, lookahead=True) for batch in batches]
     means, variances, evidences, traces = [], [], [], []
     for t, steps in enumerate(zip(*passes, strict=True)):
-        info = join_infos([step.info for step in steps])
+        info = with_cached_nis(join_infos([step.info for step in steps]))
         means.append(info.mean)
         variances.append(info.variance)
         evidences.append(join_runs([run.belief.log_evidence for run in passes]))
         traces.append(info.trace | (watch(t, info) if watch else {}))
+        monitor.check(t, model, prepared, info)
         if on_step:
             on_step()
     trace = {name: torch.stack([row[name] for row in traces], 1) for name in traces[0]}
@@ -222,4 +230,5 @@ def run_filter(
     mean, variance = (
         torch.where(valid, torch.stack(rows, 1), torch.nan) for rows in (means, variances)
     )
-    return FilterResult(mean, variance, evidences[-1], trace)
+    health = monitor.classify(~torch.isfinite(evidences[-1]))
+    return FilterResult(mean, variance, evidences[-1], trace, health)

@@ -16,10 +16,12 @@ from pfbench.core.record import Episode, iterate_steps
 from pfbench.job.metadata import describe_state, make_provenance
 from pfbench.job.pcrb_cache import compute_pcrb
 from pfbench.job.plan import DATASHEETS, IGNORED_IN_KEY, instantiate_parts
+from pfbench.job.raw_estimate import compute_raw_estimate
 from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.config_key import compute_config_key
+from pfbench.results.state_groups import main_component_group
 from pfbench.scenario.oracle_noise import RecordingRegime
 
 RUNS = 20  # default: spreads to a sixth, in seconds [ours]
@@ -84,6 +86,8 @@ def compute_datasheet(
         drawn_time = time.perf_counter()
         pcrb, pcrb_text = compute_pcrb(values, model, recording_regime, episode, runs)
         truth = model.assemble(episode.truth)
+        group = main_component_group(describe_state(model))
+        raw = compute_raw_estimate(model, truth, episode.record, group.places)
         outputs = {
             "time": episode.time,
             **_unfiltered_arrays(model, compute_deviations(model, truth)),
@@ -97,6 +101,7 @@ def compute_datasheet(
     seconds = {"world": drawn_time - start_time, "measures": time.perf_counter() - drawn_time}
     meta = _make_metadata(values, model, episode, recording_regime) | {
         "pcrb": pcrb_text,
+        "raw_estimate": raw._asdict() | {"threshold": raw.threshold},
         "seconds": seconds,
     }
     return meta, {name: value.cpu().numpy() for name, value in outputs.items()}

@@ -70,6 +70,7 @@ class TimedFilterPass(NamedTuple):
             "nees": torch.where(is_lost, torch.nan, trace.pop("nees")).float(),
             "log_evidence": estimate.log_evidence.double(),
             "lost": estimate.lost,
+            "health": estimate.health,
             **{name: a if a.dtype == torch.bool else a.float() for name, a in trace.items()},
         }
         scores = self.recorder.arrays()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,19 @@ def _recipe(values: Mapping[str, Any], model: StateSpaceModel, runs: Tensor) -> 
     source_hash = hashlib.sha256(source).hexdigest()
     episodes = values["noise"], values["seed"], int(runs[0]), len(runs)
     return ("bound 1", source_hash, values["model"], scenario, *episodes)
+
+
+def lacks_bound(values: Mapping[str, Any], meta: Mapping[str, Any], names: Container[str]) -> bool:
+    """Return whether a finished job lacks a bound that is requested now and was not when it ran.
+
+    Args:
+        values: Resolved configuration of the job.
+        meta: Metadata of its result.
+        names: Names of the arrays of its result.
+    """
+    strictness = {False: 0, "auto": 1, True: 2}
+    before = strictness.get(meta["config"].get("pcrb"), 0)
+    return "pcrb" not in names and strictness.get(values["pcrb"], 0) > before
 
 
 def _missing_reason(values: Mapping[str, Any], episode: Episode) -> str:

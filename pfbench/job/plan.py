@@ -13,7 +13,9 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from pfbench.config.composition import JobConfig
+from pfbench.config.composition import CHOICES, JobConfig
+from pfbench.config.paper_block import PAPER, PARTS
+from pfbench.config.source_digest import hash_user_code
 from pfbench.config.trust import check_configuration, trusted_packages
 from pfbench.core.record import Episode
 from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
@@ -22,31 +24,17 @@ from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
-from pfbench.results.config_key import compute_config_key
+from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
 from pfbench.scenario.base import Scenario
 from pfbench.scenario.oracle_noise import RecordingRegime
 
 DATASHEETS = "datasheets"  # folder of the results that holds the scenarios' datasheets
 
-# paths of the configuration that decide where and how fast a job runs, not what it computes
+# paths of the configuration that do not enter the key of a job
 IGNORED_IN_KEY = (
-    "results_dir",
-    "reports_dir",
-    "episode_cache_dir",
-    "data",
-    "study",
-    "threads",
-    "engine",
-    "memory_limit_gib",
-    "overwrite",
-    "report",
-    "scenario.root",
-    "scenario.cache_dir",
+    *PLACE_SETTINGS,
+    *(f"{group}.{PAPER}" for group in PARTS),  # names and limits for reports
     "particles",  # part of the key where a filter uses it, as filter.particles
-    "pcrb",  # does not change the filter's results; overwrite=true adds it to a finished job
-    "runs_in",  # an experiment's table from which `runs` is taken
-    "train",
-    "checkpoint",  # the filter's weights are part of the key, by a hash of their content
 )
 # settings of a comparison that are part of the key only if they differ from the default
 DEFAULTS_NOT_IN_KEY: Mapping[str, Any] = {"budget": store.SAME_N}
@@ -153,8 +141,14 @@ def build_plan(config: JobConfig) -> JobPlan:
 
 
 def job_key(values: Mapping[str, Any]) -> str:
-    """Compute the key of a job from all settings that affect its results."""
+    """Compute the key of a job from all settings that affect its results.
+
+    The source code of a user's classes is part of it. That of pfbench is not: reports refuse results
+    of several versions or commits.
+    """
+    code = hash_user_code({name: values.get(name) for name in CHOICES})
     values = {**values, "filter": replace_checkpoint_by_hash(values.get("filter"))}
+    values |= {"user_code": code} if code else {}
     defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
     return compute_config_key(values, (*IGNORED_IN_KEY, *defaults))
 
@@ -174,6 +168,9 @@ def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:
     """
     is_config = OmegaConf.is_config(node)
     values = OmegaConf.to_container(node, resolve=True) if is_config else node
+    if isinstance(values, dict) and PAPER in values:
+        node = values = {key: value for key, value in values.items() if key != PAPER}
+        is_config = False
     check_configuration(values, (*trusted, *trusted_packages()))
     if is_config and OmegaConf.to_container(node, resolve=False) != values:
         node = values  # what was checked: a resolver may give another value next time
@@ -194,4 +191,7 @@ def instantiate_parts(
         The objects.
     """
     tree = OmegaConf.create({name: values[name] for name in names})
+    for node in tree.values():
+        if OmegaConf.is_dict(node):
+            node.pop(PAPER, None)
     return tuple(instantiate(tree[name], trusted) for name in names)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,17 +18,18 @@ from pfbench.filter.learned.checkpoint import checkpoint_provenance
 from pfbench.job.allocation import EpisodeSource, apply_budget, max_runs_in_memory
 from pfbench.job.filter_pass import TimedFilterPass, pass_filter
 from pfbench.job.metadata import make_metadata
-from pfbench.job.pcrb_cache import compute_pcrb
+from pfbench.job.pcrb_cache import compute_pcrb, lacks_bound
 from pfbench.job.plan import DATASHEETS, JobPlan, build_plan, job_key
 from pfbench.job.settings import check_settings
 from pfbench.results import store
+from pfbench.results.headline import describe_runs, main_rmse
+from pfbench.results.joined_runs import join_arrays, join_metadata
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 log = logging.getLogger("pfbench")
 
-_SHARED = ("time", "pcrb", "range", "score_steps")  # arrays without an axis of runs
 _RESERVED = (DATASHEETS, "claims")  # folders of reports that are not studies
 
 
@@ -73,10 +73,10 @@ def run(
     path = _result_path(values)
     job_choices = {group: config.choices[group] for group in CHOICES}
     name = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
-    result = None if values["overwrite"] else _read_finished(path)
+    result = None if values["overwrite"] else _read_finished(path, values)
     if result is not None:
         check_settings(values)
-        outcome = JobOutcome(path, "skipped", _main_rmse(result.data, result.meta))
+        outcome = JobOutcome(path, "skipped", main_rmse(result.data, result.meta))
         repeat = "(overwrite=true to repeat)"
         log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
         return outcome
@@ -85,22 +85,19 @@ def run(
     except Exception as error:
         note = store.write_failure(path, job_choices, error)
         remark = f"traceback: {note}" if note else f"previous result kept: {path}"
-        log.error(
-            "%sfailed    %s   %s: %s   %s", counter, name, type(error).__name__, error, remark
-        )
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"  # on one line
+        log.error("%sfailed    %s   %s   %s", counter, name, reason, remark)
         raise
     head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
     store.write_result(path, {**head, **meta}, outputs)
-    outcome = JobOutcome(path, "finished", _main_rmse(outputs, meta))
+    outcome = JobOutcome(path, "finished", main_rmse(outputs, meta))
     seconds = meta["seconds"]
     log.info(
-        "%sfinished  t=%.1f s  %s   %s   lost %d/%d   %.3g ms/step",
+        "%sfinished  t=%.1f s  %s   %s   %.3g ms/step",
         counter,
         seconds["world"] + seconds["filter"],
         name,
-        _format_rmse(outcome.rmse, meta),
-        int(outputs["lost"].sum()),
-        meta["runs"],
+        describe_runs(outputs, {**head, **meta}),
         1e3 * seconds["per_step"],
     )
     return outcome
@@ -140,7 +137,8 @@ def compute_job(config: JobConfig, label: str) -> tuple[dict[str, Any], dict[str
         result = pass_filter(plan, episode, runs, title)
         batch_metadata.append(_batch_metadata(plan, episode, result, batch_pcrb))
         batch_outputs.append(result.arrays(episode, batch_pcrb[0]))
-    meta, outputs = _join_batches(batch_metadata, batch_outputs, total)
+    _check_durations(batch_metadata, batch_outputs)
+    meta, outputs = join_metadata(batch_metadata), join_arrays(batch_outputs, batch_metadata)
     if pcrb:  # the batches share it
         outputs |= {"pcrb": batch_outputs[0]["pcrb"]} if "pcrb" in outputs else {}
         meta["seconds"]["pcrb"] = pcrb[2]
@@ -151,16 +149,20 @@ def compute_job(config: JobConfig, label: str) -> tuple[dict[str, Any], dict[str
     return {**meta, "budget_allocation": bought, "trained": trained}, outputs
 
 
-def _read_finished(path: Path) -> store.JobResult | None:
+def _read_finished(path: Path, values: Mapping[str, Any]) -> store.JobResult | None:
     """Read the result of a finished job. A damaged file is set aside, and the job runs again."""
-    if not path.exists():
-        return None
     try:
-        return store.read_result(path)
+        result = store.read_result(path)
+    except FileNotFoundError:  # not finished, or renamed by another sweep
+        return None
     except store.DamagedResultError as error:
         new_path = set_aside(path)
         log.warning("warning  %s   renamed to %s. Running the job", error, new_path.name)
         return None
+    if lacks_bound(values, result.meta, result.data):
+        log.info("pcrb=%s   %s has no bound. Running the job", values["pcrb"], path.name)
+        return None
+    return result
 
 
 def _result_path(values: Mapping[str, Any]) -> Path:
@@ -193,58 +195,11 @@ def _batch_metadata(
     return {**meta, "runs": runs, "pcrb": pcrb[1], "seconds": {"pcrb": pcrb[2], **result.seconds}}
 
 
-def _join_batches(
-    metadata: Sequence[dict[str, Any]], outputs: Sequence[dict[str, np.ndarray]], total: int
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Join the batches of a job. A PCRB of the batches becomes its root mean square."""
-    if len(outputs) == 1:
-        return metadata[0], outputs[0]
+def _check_durations(metadata: Sequence[dict[str, Any]], outputs: Sequence[dict[str, Any]]) -> None:
+    """Raise ValueError if the runs of two batches have different durations."""
     if any(batch["time"].shape != outputs[0]["time"].shape for batch in outputs):
         size = metadata[0]["runs"]
         raise ValueError(
             "memory must be enough for all runs together, since they have different durations, got "
             f"enough for {size} runs. Split the job (runs={size}, first_run=...)."
         )
-    joint = {
-        name: first if name in _SHARED else np.concatenate([batch[name] for batch in outputs])
-        for name, first in outputs[0].items()
-    }
-    weights = np.array([meta["runs"] for meta in metadata]) / total
-    if "pcrb" in joint:
-        variances = (batch["pcrb"].astype(float) ** 2 for batch in outputs)
-        mean = sum(weight * v for weight, v in zip(weights, variances, strict=True))
-        joint["pcrb"] = np.sqrt(mean).astype(np.float32)
-    memory = [meta["memory"] for meta in metadata]
-    times = [meta["seconds"] for meta in metadata]
-    meta = {
-        **metadata[0],
-        "runs": total,
-        "parts": len(outputs),
-        "seconds": {name: sum(batch[name] for batch in times) for name in times[0]},
-        "memory": None if None in memory else max(memory),
-        "likelihoods_per_step": float(
-            weights @ [meta["likelihoods_per_step"] for meta in metadata]
-        ),
-    }
-    return meta, joint
-
-
-def _main_group(meta: Mapping[str, Any]) -> str:
-    """Return the group of the headline: position if there is one, else the first."""
-    groups = meta["state"]["groups"]
-    return "position" if "position" in groups else next(iter(groups))
-
-
-def _main_rmse(outputs: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> float:
-    """Compute the RMSE of the main group over all valid runs."""
-    components = meta["state"]["groups"][_main_group(meta)]
-    errors = outputs["error"][..., components].astype(float)
-    square = (errors**2).sum(-1)[~outputs["lost"]]
-    return math.sqrt(np.nanmean(square)) if np.isfinite(square).any() else math.inf
-
-
-def _format_rmse(rmse: float, meta: Mapping[str, Any]) -> str:
-    """Format the headline error with its unit, if the components share one."""
-    group = _main_group(meta)
-    units = {meta["state"]["units"][i] for i in meta["state"]["groups"][group]}
-    return f"{group} RMSE {rmse:.4g} {units.pop() if len(units) == 1 else ''}".rstrip()

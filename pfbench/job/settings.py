@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from pfbench.core.parameter_checks import RUN_NUMBERS
 from pfbench.kernels.process_memory import keep_freed_memory
 from pfbench.results import store
 
@@ -44,6 +45,11 @@ def check_settings(values: Mapping[str, Any]) -> None:
     for key, requirement in requirements.items():
         if not valid[key]:
             raise ValueError(f"{key} must be {requirement}, got {values[key]}. Change this value.")
+    if values["first_run"] + values["runs"] > RUN_NUMBERS:
+        raise ValueError(
+            f"first_run + runs must be at most 2**32 = {RUN_NUMBERS}, got {values['first_run']} + "
+            f"{values['runs']}. Larger run numbers would repeat random numbers: use another seed."
+        )
     device, count = values["device"], torch.cuda.device_count()
     if device != "cpu" and (torch.device(device).index or 0) >= count:
         raise ValueError(

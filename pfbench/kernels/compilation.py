@@ -18,14 +18,14 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from typing import Any, TypeVar, cast
 
 import torch
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
-from pfbench.kernels import cuda
+from pfbench.kernels import cuda, manifest
 from pfbench.kernels.private_folder import use_private_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -105,14 +105,14 @@ def compilable(
         _register_shapes(in_graph, function)
     fits_graph = keep_in_graph if callable(keep_in_graph) else lambda *_: True
 
-    @cache
-    def compiled() -> Callable[..., Any]:
-        return _compile_by_torch(function)
+    compiled = cache(partial(_compile_by_torch, function))
 
     def run_compiled(*args: Any) -> Any:
         if _on_cuda(args):
-            kernel = _find_cuda_kernel(operator, args)
-            return (kernel or (compiled() if use_torch_compiler else run_eagerly))(*args)
+            return (
+                _find_cuda_kernel(operator, args)
+                or (compiled() if use_torch_compiler else run_eagerly)
+            )(*args)
         if (
             operator is not None
             and operator not in _failed
@@ -122,12 +122,8 @@ def compilable(
             try:
                 return operator(*args)
             except (OSError, subprocess.CalledProcessError) as error:
-                fallback = "torch's compiler" if use_torch_compiler else "eager mode"
-                log.warning(
-                    "%s does not compile here (%s). Using %s",
-                    operator.__name__, type(error).__name__, fallback,
-                )  # fmt: skip
-                _failed.add(operator)
+                _note_failure(operator, error, use_torch_compiler)
+        _check(operator, args)
         return (compiled() if use_torch_compiler else run_eagerly)(*args)
 
     @wraps(function)
@@ -135,7 +131,10 @@ def compilable(
         if _graph.get():
             if _on_cuda(args):
                 return (_find_cuda_kernel(operator, args) or function)(*args)
+            _check(operator, args)
             return (function if in_graph is None or not fits_graph(*args) else in_graph)(*args)
+        if not _fused.get():
+            _check(operator, args)
         return (run_compiled if _fused.get() else run_eagerly)(*args)
 
     return cast(F, call)
@@ -144,10 +143,32 @@ def compilable(
 def _find_cuda_kernel(
     operator: Callable[..., Any] | None, args: tuple[Any, ...]
 ) -> Callable[..., Any] | None:
-    """Return the CUDA kernel of an operator, None without one or with gradients."""
-    if operator is None or not _plain(args):
-        return None
-    return cuda.find_kernel(operator.__name__, args)
+    """Return the CUDA kernel of an operator, None without one or with gradients.
+
+    The kernel checks its arguments itself. Without one they are checked here.
+    """
+    kernel = None
+    if operator is not None and _plain(args):
+        kernel = cuda.find_kernel(operator.__name__, args)
+    if kernel is None:
+        _check(operator, args)
+    return kernel
+
+
+def _note_failure(
+    operator: Callable[..., Any], error: BaseException, use_torch_compiler: bool
+) -> None:
+    """Log that a kernel does not compile, and do not try it again."""
+    fallback = "torch's compiler" if use_torch_compiler else "eager mode"
+    name, kind = operator.__name__, type(error).__name__
+    log.warning("%s does not compile here (%s). Using %s", name, kind, fallback)
+    _failed.add(operator)
+
+
+def _check(operator: Callable[..., Any] | None, args: tuple[Any, ...]) -> None:
+    """Check arguments as the operator does. A recorded step has shapes and no values."""
+    if operator is not None and not torch.compiler.is_compiling():
+        manifest.check_arguments(operator.__name__, args, with_values=not _graph.get())
 
 
 @contextmanager

@@ -1,14 +1,16 @@
 """Kernels in C++ for the CPU and one thread, registered as torch operators.
 
 They are compiled at first use. The file has one function per operator, which makes it long. Each
-computes the results of a torch function. It raises OSError or CalledProcessError if the C++ compiler
-is missing or rejects the source. Gradients do not pass through the kernels.
+computes the results of a torch function. It raises ValueError for wrong arguments, and OSError or
+CalledProcessError if the C++ compiler is missing or rejects the source. Gradients do not pass through
+the kernels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from inspect import unwrap
 from typing import Any, cast
 
 import torch
@@ -16,10 +18,12 @@ from torch import Tensor
 
 from pfbench.kernels import cuda
 from pfbench.kernels.cpp_library import load_library
+from pfbench.kernels.operator_door import explain_errors
 
 _operators = torch.library.Library("pfbench", "DEF")
 
 
+@explain_errors
 def philox_normals(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
@@ -41,6 +45,7 @@ def philox_normals(
     return _operator("philox_normals")(seed, purpose, step, runs, components, quarters)
 
 
+@explain_errors
 def philox_uniforms(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
@@ -62,6 +67,7 @@ def philox_uniforms(
     return _operator("philox_uniforms")(seed, purpose, step, runs, components, quarters)
 
 
+@explain_errors
 def resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     """Choose ancestors by systematic resampling.
 
@@ -76,6 +82,7 @@ def resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     return _operator("resample_systematic")(a, n, u)
 
 
+@explain_errors
 def gather_particles(x: Tensor, ancestors: Tensor) -> Tensor:
     """Gather particles by their ancestors.
 
@@ -89,6 +96,7 @@ def gather_particles(x: Tensor, ancestors: Tensor) -> Tensor:
     return _operator("gather_particles")(x, ancestors)
 
 
+@explain_errors
 def log_normal(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tensor:
     """Compute -1/2 sum ((y - mean) scale)^2 - constant over components.
 
@@ -104,6 +112,7 @@ def log_normal(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tens
     return _operator("log_normal")(y, mean, scale, constant)
 
 
+@explain_errors
 def propagate_affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
     """Compute phi x + gain w.
 
@@ -119,6 +128,7 @@ def propagate_affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
     return _operator("propagate_affine")(phi, x, gain, w)
 
 
+@explain_errors
 def gather_propagate(
     phi: Tensor,
     x: Tensor,
@@ -154,6 +164,7 @@ def gather_propagate(
     )
 
 
+@explain_errors
 def count_unique(ancestors: Tensor, log_w: Tensor) -> Tensor:
     """Count the distinct ancestors of particles with a finite log weight.
 
@@ -167,11 +178,13 @@ def count_unique(ancestors: Tensor, log_w: Tensor) -> Tensor:
     return _operator("count_unique")(ancestors, log_w)
 
 
+@explain_errors
 def sum_and_squares(terms: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the sums of terms [R, N] and of their squares, [R, 1] each."""
     return _operator("sum_and_squares")(terms)
 
 
+@explain_errors
 def weighted_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the mean and the variance of weighted particles.
 
@@ -185,6 +198,7 @@ def weighted_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     return _operator("weighted_moments")(x, w)
 
 
+@explain_errors
 def cholesky_factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Compute lower triangular roots, as `core.covariance.factor`.
 
@@ -194,10 +208,12 @@ def cholesky_factor(covariance: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Roots, [..., d, d], and a mask of the valid roots, [...].
     """
-    lower, valid = _operator("cholesky_factor")(covariance.reshape(-1, *covariance.shape[-2:]))
-    return lower.view(covariance.shape), valid.view(covariance.shape[:-2])
+    batch, matrix = covariance.shape[:-2], covariance.shape[-2:]
+    lower, valid = _operator("cholesky_factor")(covariance.reshape(batch.numel(), *matrix))
+    return lower.view(covariance.shape), valid.view(batch)
 
 
+@explain_errors
 def kalman_update(
     m: Tensor, r: Tensor, omega: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -215,6 +231,7 @@ def kalman_update(
     return _operator("kalman_update")(m, r, omega)
 
 
+@explain_errors
 def fit_affine(r: Tensor, xi: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """Fit an affine function to residuals at weighted points.
 
@@ -229,6 +246,7 @@ def fit_affine(r: Tensor, xi: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     return _operator("fit_affine")(r, xi, w)
 
 
+@explain_errors
 def group_covariance(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tensor:
     """Compute the covariances of groups of components.
 
@@ -244,6 +262,7 @@ def group_covariance(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tens
     return _operator("group_covariance")(x, mean, w, groups)
 
 
+@explain_errors
 def squared_mahalanobis(e: Tensor, covariance: Tensor) -> Tensor:
     """Compute e' covariance^-1 e.
 
@@ -254,12 +273,14 @@ def squared_mahalanobis(e: Tensor, covariance: Tensor) -> Tensor:
     Returns:
         Squared distances, [...].
     """
-    d = e.shape[-1]
+    batch, matrix = e.shape[:-1], covariance.shape[-2:]
     return _operator("squared_mahalanobis")(
-        e.reshape(-1, d), covariance.expand(*e.shape, d).reshape(-1, d, d)
-    ).view(e.shape[:-1])
+        e.reshape(batch.numel(), e.shape[-1]),
+        covariance.expand(*batch, *matrix).reshape(batch.numel(), *matrix),
+    ).view(batch)
 
 
+@explain_errors
 def marginal_scores(error: Tensor, deviation: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the CRPS and P(below 0) of weighted particles.
 
@@ -274,45 +295,10 @@ def marginal_scores(error: Tensor, deviation: Tensor, w: Tensor) -> tuple[Tensor
     return _operator("marginal_scores")(error, deviation, w)
 
 
+@explain_errors
 def energy_score(points: Tensor) -> Tensor:
     """Compute the energy score [R] of equally weighted points [R, n, s] against 0."""
     return _operator("energy_score")(points)
-
-
-def run_steps(
-    step: int,
-    outputs: int,
-    constants: list[Tensor],
-    state: list[Tensor],
-    inputs: list[Tensor],
-    shared: list[Tensor],
-) -> list[Tensor]:
-    """Run a compiled step T times.
-
-    Args:
-        step: Address of the compiled step.
-        outputs: Number of tensors that a step returns.
-        constants: First arguments of each step.
-        state: Next arguments of the first step. Later steps take the first outputs of the last one.
-        inputs: Inputs of all steps, [T, ...]. Each step takes one row.
-        shared: Last arguments of each step.
-
-    Returns:
-        `outputs` tensors of each step, in order, as views [R, N, ...] of [..., R, N].
-    """
-    results: list[Tensor] = _operator("run_steps")(step, outputs, constants, state, inputs, shared)
-    return results
-
-
-def register_step(step: int, outputs: int, arguments: list[Tensor]) -> None:
-    """Register a compiled step, so that `run_steps` checks its arguments.
-
-    Args:
-        step: Address of the compiled step.
-        outputs: Number of tensors that a step returns.
-        arguments: Arguments of one step with the types, shapes and strides that it was compiled for.
-    """
-    _operator("register_step")(step, outputs, arguments)
 
 
 _STEP = (
@@ -326,13 +312,12 @@ _STEP = (
     count_unique,
     sum_and_squares,
     weighted_moments,
-    register_step,
-    run_steps,
 )
 _GAUSSIAN = cholesky_factor, kalman_update, fit_affine
 _REPORT = group_covariance, squared_mahalanobis, marginal_scores, energy_score
 for _kernel in _STEP + _GAUSSIAN + _REPORT:
-    _operators.define(_kernel.__name__ + torch.library.infer_schema(_kernel, mutates_args=()))
+    _schema = torch.library.infer_schema(unwrap(_kernel), mutates_args=())
+    _operators.define(_kernel.__name__ + _schema)
 cuda.register(_operators)
 torch.library.register_fake(
     "pfbench::gather_propagate",

@@ -67,7 +67,7 @@ def load_library() -> None:
             with ThreadPoolExecutor() as pool:
                 list(pool.map(partial(subprocess.run, check=True, capture_output=True), commands))
             # -ffast-math at linking would flush denormal numbers to zero in the whole process
-            libraries = [f"-L{_TORCH / 'lib'}", "-ltorch_cpu", "-lm"]
+            libraries = [f"-L{_TORCH / 'lib'}", "-ltorch_cpu", "-lm", "-ldl"]
             if sys.platform == "darwin":  # resolve symbols of Python at loading
                 libraries.append("-Wl,-undefined,dynamic_lookup")
             subprocess.run(

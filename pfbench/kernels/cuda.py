@@ -15,6 +15,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from pfbench.kernels.operator_door import check_first
+
 log = logging.getLogger("pfbench")
 _SOURCE = Path(__file__).parent / "src" / "particles.cu"
 _REAL = {torch.float32: "float", torch.float64: "double"}
@@ -46,7 +48,7 @@ def _compiles() -> bool:
 
 
 def find_kernel(name: str, args: tuple[Any, ...]) -> Callable[..., Any] | None:
-    """Return the operator of this name on a CUDA device; None if it does not take these arguments.
+    """Return the operator of this name on a CUDA device, or None if it does not take the arguments.
 
     Args:
         name: Name of the operator.
@@ -75,7 +77,7 @@ def _draw(
     threads = min(256, 32 * -(-quarters // 32))
     grid = -(-quarters // threads), min(_ROWS, components * len(runs)), 1
     numbers = int(seed), purpose, int(step), components, len(runs), quarters
-    _launch(name, grid, threads, out, runs, *numbers)
+    _launch(name, grid, threads, out, runs.contiguous(), *numbers)
     return out
 
 
@@ -124,6 +126,8 @@ def _gather_particles(x: Tensor, ancestors: Tensor) -> Tensor:
 
 def _propagate_affine(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
     """Compute phi x + gain w."""
+    if not _is_square(phi):
+        raise ValueError(f"propagate_affine: phi must be square on CUDA, got {list(phi.shape)}.")
     stored = x.permute(2, 0, 1).contiguous()
     return _affine(
         phi, stored, gain, stored.shape[2], noise=w.permute(2, 0, 1).to(x.dtype).contiguous()
@@ -141,10 +145,6 @@ def _gather_propagate(
     runs: Tensor,
 ) -> Tensor:
     """Gather particles by their ancestors and propagate them."""
-    if x.shape[0] != phi.shape[-1]:
-        raise ValueError(
-            f"x must have {phi.shape[-1]} components, got {x.shape[0]}. Use the gain of this model."
-        )
     key = int(seed), purpose, int(step), runs
     return _affine(phi, x.contiguous(), gain, ancestors.shape[1], ancestors.contiguous(), key)
 
@@ -166,10 +166,9 @@ def _resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
 def _count_unique(ancestors: Tensor, log_w: Tensor) -> Tensor:
     """Count distinct values where a weight is positive."""
     (runs, slots), bytes_ = log_w.shape, 4 * -(-2 * log_w.shape[1] // 4)
-    out = ancestors.new_empty(runs)
-    args = ancestors.contiguous(), log_w.contiguous(), runs, slots
+    out, sources = ancestors.new_empty(runs), (ancestors.contiguous(), log_w.contiguous())
     name, grid = f"distinct<{_REAL[log_w.dtype]}>", (min(runs, _ROWS), 1, 1)
-    _launch(name, grid, _BLOCK, out, *args, shared=bytes_)
+    _launch(name, grid, _BLOCK, out, *sources, runs, slots, shared=bytes_)
     return out
 
 
@@ -188,27 +187,29 @@ def _fills_device(a: Tensor, most: int) -> bool:
 
 
 def _fits_registers(x: Tensor) -> bool:
-    """Return whether a thread can hold the sums of all components."""
+    """Return whether a thread holds the sums of all components."""
     return x.shape[-1] <= _STATES.get(x.dtype, 0)
 
 
+def _is_square(phi: Tensor) -> bool:
+    """Return whether a state keeps its components, as the kernel of `propagate_affine` assumes."""
+    return phi.shape[1:] == phi.shape[2:] * 2
+
+
 KERNELS: dict[str, Callable[..., Any]] = {
-    "philox_normals": _philox_normals,
-    "philox_uniforms": _philox_uniforms,
-    "gather_particles": _gather_particles,
-    "propagate_affine": _propagate_affine,
-    "gather_propagate": _gather_propagate,
-    "resample_systematic": _resample_systematic,
-    "count_unique": _count_unique,
-    "weighted_moments": _weighted_moments,
-}
-"""Operators on a CUDA device, with the names and arguments of `pfbench.kernels.cpp`."""
+    kernel.__name__.removeprefix("_"): check_first(kernel)
+    for kernel in (
+        _philox_normals, _philox_uniforms, _gather_particles, _propagate_affine, _gather_propagate,
+        _resample_systematic, _count_unique, _weighted_moments,
+    )
+}  # fmt: skip
+"""Operators of `pfbench.kernels.cpp` on a CUDA device. They do not check values: the host would wait."""
 
 _ACCEPTS: dict[str, Callable[..., bool]] = {
     "philox_normals": lambda *_: True,
     "philox_uniforms": lambda *_: True,
     "gather_particles": lambda x, ancestors: x.dtype in _REAL,
-    "propagate_affine": lambda phi, x, gain, w: _fits_registers(x),
+    "propagate_affine": lambda phi, x, gain, w: _fits_registers(x) and _is_square(phi),
     "resample_systematic": lambda a, n, u: _fills_device(a, 1 << 20),
     "count_unique": lambda ancestors, log_w: _fills_device(log_w, (_SHARED - 1024) // 2),
     "weighted_moments": lambda x, w: _fills_device(w, 1 << 20) and _fits_registers(x),

@@ -1,6 +1,6 @@
 """Manifest of the operators: their arguments, and the checks that are made from it.
 
-`operators.toml` states kind and axes of each argument. The C++ operators check them by
+`operators.toml` states kind, axes and range of each argument. The C++ operators check them by
 `src/operator_checks.h`, which `python -m pfbench.kernels.manifest` writes. Eager functions and CUDA
 kernels check them by `check_arguments`.
 """
@@ -15,15 +15,43 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 FOLDER = Path(__file__).parent
 HEADER = FOLDER / "src" / "operator_checks.h"
-_ARGUMENT = re.compile(r"(\w+): (\w+)(?: \[(.*)\])?")
+LARGEST_SIZE = (1 << 30) - 1  # of an axis: counters of particles have 32 bits
+LARGEST_INTEGER = (1 << 32) - 1
+_ARGUMENT = re.compile(r"(\w+): (\w+)(?: \[(.*)\])?(?: (below|to) (?:(\d+) )?([A-Z]|1))?")
 _KINDS = {
     "real": (torch.float32, torch.float64),
     "number": (torch.float32, torch.float64, torch.int64),
     "int64": (torch.int64,),
 }
+
+
+class Limit(NamedTuple):
+    """Largest value of an argument: `factor` times the size of `axis`, minus 1 for indices.
+
+    Attributes:
+        factor: Factor of the size.
+        axis: Letter of an axis, or `1`.
+        is_index: Whether the values are indices, which lie below the size.
+    """
+
+    factor: int
+    axis: str
+    is_index: bool
+
+    @property
+    def text(self) -> str:
+        """The largest value in words, for instance `2 N - 1`."""
+        size = self.axis if self.factor == 1 else f"{self.factor} {self.axis}"
+        return f"{size} - 1" if self.is_index else size
+
+    def largest(self, sizes: dict[str, int]) -> int:
+        """Return the largest value for the sizes of a call by letter."""
+        size = 1 if self.axis == "1" else sizes[self.axis]
+        return self.factor * size - self.is_index
 
 
 class Argument(NamedTuple):
@@ -33,17 +61,23 @@ class Argument(NamedTuple):
         name: Name.
         kind: `real`, `number`, `int64`, or `int` for a plain integer.
         axes: Letter of each axis, in lower case where the size may also be 1.
+        positive: Letters of the axes that must have an entry.
+        limit: Range of the values from 0 on, or None.
+        has_batch: Whether the first axis is any number of batch axes.
     """
 
     name: str
     kind: str
     axes: str
+    positive: str = ""
+    limit: Limit | None = None
+    has_batch: bool = False
 
     @property
     def shape(self) -> str:
         """Shape in words, as in the manifest."""
         words = [f"{axis.upper()} or 1" if axis.islower() else axis for axis in self.axes]
-        return f"[{', '.join(words)}]"
+        return f"[{', '.join(['...', *words[1:]] if self.has_batch else words)}]"
 
 
 @cache
@@ -60,36 +94,55 @@ def read_operators() -> dict[str, tuple[Argument, ...]]:
     }
 
 
-def check_arguments(name: str, arguments: Sequence[Any]) -> None:
+def check_arguments(name: str, arguments: Sequence[Any], with_values: bool = True) -> None:
     """Check the arguments of an operator.
 
     Args:
         name: Name of the operator.
         arguments: Its arguments, in order.
+        with_values: Check the ranges of values, too. Those of tensors on another device than the
+            CPU are never checked, because the host would wait for them.
 
     Raises:
-        ValueError: If the number, the type or a shape is wrong. The message names the argument.
+        ValueError: If the number, a type, a device, a shape or a value is wrong. The message names
+            the argument.
     """
     expected = read_operators()[name]
     if len(arguments) != len(expected):
         raise ValueError(f"{name} must have {len(expected)} arguments, got {len(arguments)}.")
     sizes: dict[str, int] = {}
     real: torch.dtype | None = None
+    device: torch.device | None = None
     for argument, value in zip(expected, arguments, strict=True):
         if argument.kind == "int":
-            if not isinstance(value, int | torch.SymInt) or value < 0:
-                raise ValueError(
-                    f"{name}: {argument.name} must be a whole number from 0 on, got {value!r}."
-                )
+            _check_integer(name, argument, value)
             continue
         _check_type(name, argument, value, real)
         real = value.dtype if argument.kind == "real" else real
-        _check_shape(name, argument, tuple(value.shape), sizes)
+        if value.shape:  # a number [] may lie on the host
+            device = device or value.device
+            if value.device != device:
+                raise ValueError(
+                    f"{name}: {argument.name} must be on {device}, got {value.device}."
+                )
+        _check_shape(name, argument, value.shape, sizes)
+    if with_values:
+        for argument, value in zip(expected, arguments, strict=True):
+            if argument.limit is not None:
+                _check_values(name, argument, value, sizes)
+
+
+def _check_integer(name: str, argument: Argument, value: Any) -> None:
+    """Check a plain integer."""
+    if not isinstance(value, int | torch.SymInt) or not 0 <= value <= LARGEST_INTEGER:
+        raise ValueError(
+            f"{name}: {argument.name} must be a whole number from 0 to 2^32 - 1, got {value!r}."
+        )
 
 
 def _check_type(name: str, argument: Argument, value: Any, real: torch.dtype | None) -> None:
     """Check the type of a tensor."""
-    if not isinstance(value, torch.Tensor):
+    if not isinstance(value, Tensor):
         raise ValueError(f"{name}: {argument.name} must be a tensor, got {type(value).__name__}.")
     kinds = _KINDS[argument.kind] if argument.kind != "real" or real is None else (real,)
     if value.dtype not in kinds:
@@ -98,32 +151,66 @@ def _check_type(name: str, argument: Argument, value: Any, real: torch.dtype | N
 
 
 def _check_shape(
-    name: str, argument: Argument, shape: tuple[int, ...], sizes: dict[str, int]
+    name: str, argument: Argument, shape: Sequence[int], sizes: dict[str, int]
 ) -> None:
     """Check the shape of a tensor against the sizes that earlier arguments have."""
-    is_valid = len(shape) == len(argument.axes)
-    for axis, size in zip(argument.axes, shape, strict=False):
+    axes, last = argument.axes, list(shape)
+    if argument.has_batch:
+        axes = axes[1:]
+        last = last[max(0, len(last) - len(axes)) :]
+    is_valid = len(last) == len(axes)
+    for axis, size in zip(axes, last, strict=False):
         if axis.islower() and size == 1:
             continue
-        expected_size = int(axis) if axis.isdigit() else sizes.setdefault(axis.upper(), size)
-        is_valid = is_valid and size == expected_size
-    if not is_valid:
-        sizes_text = ", ".join(f"{axis} = {size}" for axis, size in sizes.items())
-        raise ValueError(
-            f"{name}: {argument.name} must have shape {argument.shape}, got {list(shape)}"
-            f"{f' with {sizes_text}' if sizes_text else ''}."
+        expected_size = 1 if axis == "1" else sizes.setdefault(axis.upper(), size)
+        is_valid = (
+            is_valid and size == expected_size and (size > 0 or axis not in argument.positive)
         )
+    if is_valid and max(shape, default=0) <= LARGEST_SIZE:
+        return
+    text = ", ".join(f"{axis} = {size}" for axis, size in sizes.items())
+    bound = "".join(f" and {axis} at least 1" for axis in argument.positive)
+    raise ValueError(
+        f"{name}: {argument.name} must have shape {argument.shape}{bound}, got {list(shape)}"
+        f"{f' with {text}' if text else ''}. Sizes must be below 2^30."
+    )
+
+
+def _check_values(name: str, argument: Argument, value: Tensor, sizes: dict[str, int]) -> None:
+    """Check the range of the values of a tensor on the CPU."""
+    if value.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(value):
+        return
+    assert argument.limit is not None
+    largest = argument.limit.largest(sizes)
+    if value.numel() == 0:
+        return
+    # one pass over the values; NaN passes through, and its comparison is false
+    low, high = torch.aminmax(value)
+    if low.item() >= 0 and high.item() <= largest:
+        return
+    wrong = value[~((value >= 0) & (value <= largest))][0].item()
+    raise ValueError(
+        f"{name}: {argument.name} must be from 0 to {argument.limit.text}, got {wrong:g} with "
+        f"{', '.join(f'{axis} = {size}' for axis, size in sizes.items())}."
+    )
 
 
 def _parse_argument(operator: str, text: str) -> Argument:
-    """Parse an argument such as `n: number [R|1, 1]`."""
+    """Parse an argument such as `n: number [R|1, 1] to N`."""
     match = _ARGUMENT.fullmatch(text)
     if match is None or match[2] not in (*_KINDS, "int"):
         raise ValueError(f"{operator}: an argument must be 'name: kind [axes]', got {text!r}.")
     axes = [axis.strip() for axis in (match[3] or "").split(",") if axis.strip()]
-    if not all(re.fullmatch(r"[A-Z](\|1)?|1", axis) for axis in axes):
-        raise ValueError(f"{operator}: axes must be letters, letters with |1, or 1, got {text!r}.")
-    return Argument(match[1], match[2], "".join(a[0].lower() if "|" in a else a for a in axes))
+    has_batch = axes[:1] == ["..."]
+    axes = ["B", *axes[1:]] if has_batch else axes
+    if not all(re.fullmatch(r"[A-Z](\|1|>0)?|1", axis) for axis in axes):
+        raise ValueError(
+            f"{operator}: axes must be letters, letters with |1 or >0, or 1, got {text!r}."
+        )
+    letters = "".join(a[0].lower() if "|" in a else a[0] for a in axes)
+    positive = "".join(a[0] for a in axes if ">" in a)
+    limit = Limit(int(match[5] or 1), match[6], match[4] == "below") if match[4] else None
+    return Argument(match[1], match[2], letters, positive, limit, has_batch)
 
 
 def make_header() -> str:
@@ -140,15 +227,22 @@ def make_header() -> str:
         types = {"int": "int64_t"}
         signature = ", ".join(f"{types.get(a.kind, 'const Tensor&')} {a.name}" for a in arguments)
         lines += ["", f"inline void {name}({signature}) {{", f'    ArgumentCheck check("{name}");']
-        for a in arguments:
-            call = (
-                f'check.integer("{a.name}", {a.name});'
-                if a.kind == "int"
-                else f'check.{a.kind}("{a.name}", {a.name}, "{a.axes}");'
-            )
-            lines.append(f"    {call}")
+        lines += [f"    check.{_cpp_call(a)};" for a in arguments]
+        ranges = ((a.name, a.limit) for a in arguments if a.limit is not None)
+        for name_, (factor, axis, is_index) in ranges:
+            largest = f"{factor}, '{axis}', {int(is_index)}"
+            lines.append(f'    check.range("{name_}", {name_}, {largest});')
         lines.append("}")
     return "\n".join([*lines, "", "}  // namespace checks", "}  // namespace", ""])
+
+
+def _cpp_call(argument: Argument) -> str:
+    """Return the C++ check of type and shape of an argument."""
+    name, kind, axes, positive, *_ = argument
+    if kind == "int":
+        return f'integer("{name}", {name})'
+    more = f', "{positive}"' if positive else ""
+    return f'{kind}("{name}", {name}, "{axes}"{more})'
 
 
 if __name__ == "__main__":

@@ -6,9 +6,9 @@ on disk. Operators of pfbench stay whole in the compiled function.
 
 from __future__ import annotations
 
-import ctypes
 import inspect
 import logging
+import os
 import subprocess
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -18,15 +18,12 @@ from torch import Tensor
 from torch.fx import Graph as Operations
 from torch.fx import Node
 
-from pfbench.kernels import cpp
+from pfbench.kernels import step_table
 from pfbench.kernels.compilation import kept_validation
 from pfbench.kernels.cpp_library import load_library
 from pfbench.kernels.private_folder import use_private_cache
 
 log = logging.getLogger("pfbench")
-
-# C++ name of the function that torch's compiler generates
-_ENTRY = "_Z19inductor_entry_implPP16AtenTensorOpaqueS1_"
 
 TensorFunction = Callable[[list[Tensor]], Sequence[Tensor]]
 _KINDS = {"T": "AtenTensorHandle", "i": "int64_t"}
@@ -40,11 +37,11 @@ class NativeEntry(NamedTuple):
     """Compiled function that C++ code can call.
 
     Attributes:
-        address: Address of the function.
+        step: Number of the function, see `step_table.register_step`.
         constants: Tensors that it takes before the arguments.
     """
 
-    address: int
+    step: int
     constants: list[Tensor]
 
 
@@ -66,24 +63,6 @@ def declare_shims() -> OperatorRegistry:
     return OperatorRegistry(
         {f"pfbench.{name}.default": [declare(name, *kinds)] for name, kinds in _SIGNATURES.items()}
     )
-
-
-def function_address(library: str, function: str) -> int:
-    """Return the address of a function in a loaded library.
-
-    Args:
-        library: Path of the library.
-        function: Name of the function.
-
-    Returns:
-        The address.
-
-    Raises:
-        AttributeError: If the library does not have this function.
-    """
-    value = ctypes.cast(getattr(ctypes.CDLL(library), function), ctypes.c_void_p).value
-    assert value is not None
-    return value
 
 
 def compile_function(
@@ -183,9 +162,8 @@ def _register_entry(
     library: str, constants: list[Tensor], example: list[Tensor], outputs: int
 ) -> NativeEntry:
     """Return the entry of a library, after registering what it takes."""
-    entry = NativeEntry(function_address(library, _ENTRY), constants)
-    cpp.register_step(entry.address, outputs, [*constants, *example])
-    return entry
+    path = torch.tensor(list(os.fsencode(library)), dtype=torch.uint8)
+    return NativeEntry(step_table.register_step(path, outputs, [*constants, *example]), constants)
 
 
 def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> NativeEntry | None:
@@ -210,7 +188,7 @@ def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> Native
         library = inspect.getclosurevars(call).nonlocals["f"].__self__.__file__
         entry = _register_entry(library, constants, example, len(expected))
         batched = [a.unsqueeze(0) for a in example]
-        results = cpp.run_steps(entry.address, len(expected), constants, [], batched, [])
+        results = step_table.run_steps(entry.step, constants, [], batched, [])
         pairs = zip(results, expected, strict=True)
         if not all(
             torch.allclose(a.double(), from_storage(b).double(), equal_nan=True) for a, b in pairs

@@ -12,6 +12,7 @@ __all__ = [
     "GnssReceiver",
     "ImuErrors",
     "ManoeuvreTrajectory",
+    "PlausibleLimits",
     "ProcessNoiseInflation",
     "RampTrajectory",
     "RangingReceiver",
@@ -50,6 +51,7 @@ __getattr__, __dir__ = lazy_attributes(
             "climb",
             "turn",
         ),
+        "plausible_limits": ("PlausibleLimits",),
         "ramps": (
             "CosineRamp",
             "CycloidRamp",

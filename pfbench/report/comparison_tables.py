@@ -1,4 +1,4 @@
-"""Tables of comparisons: pairs, effect sizes, ranks, baselines and lost-run rules."""
+"""Tables of comparisons: pairs, and effect sizes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from pfbench.report.baselines import BaselineComparison
 from pfbench.report.table_formats import format_number
-from pfbench.results.comparison.lost_run_rules import LOST_RUN_RULES
-from pfbench.results.comparison.lost_run_sensitivity import LostRunSensitivity
 from pfbench.results.comparison.pairwise_results import PairwiseTest
-from pfbench.results.comparison.ranking_results import RankingResult
 
 
 def decision_table(verdicts: Sequence[PairwiseTest]) -> pd.DataFrame:
@@ -82,87 +78,6 @@ def all_comparisons_table(verdicts: Sequence[PairwiseTest]) -> pd.DataFrame:
                 "decision": _format_decision(v),
             }
             for v in verdicts
-        ]
-    )
-
-
-def rank_table(rankings: Sequence[RankingResult]) -> pd.DataFrame:
-    """Build the table of mean ranks over conditions, a column per group."""
-    tested = [ranking for ranking in rankings if not ranking.refused]
-    labels = list(dict.fromkeys(label for ranking in tested for label in ranking.filters))
-    by_group = {
-        f"rank, {ranking.group}": dict(zip(ranking.filters, ranking.ranks, strict=True))
-        for ranking in tested
-    }
-    return pd.DataFrame(
-        [
-            {"filter": label, **{k: ranks.get(label, np.nan) for k, ranks in by_group.items()}}
-            for label in labels
-        ]
-    )
-
-
-def ranking_pair_table(ranking: RankingResult) -> pd.DataFrame:
-    """Build the table of pairs across conditions for a group."""
-    return pd.DataFrame(
-        [
-            {
-                "a": p.a,
-                "b": p.b,
-                "conditions won (a, b)": f"{p.wins}, {p.losses}",
-                "RMSE change a vs b [%]": 100 * (p.ratio - 1),
-                "rank-biserial correlation": p.effect,
-                f"adjusted p (Nemenyi, {p.family} tests)": p.p_nemenyi,
-                f"adjusted p (Conover, Holm, {p.family} tests)": p.p_conover,
-                f"adjusted p (Wilcoxon, Holm, {p.family} tests)": p.p_wilcoxon,
-                "P(a better), Bayesian signed rank": p.bayes_a,
-                f"P(equivalent within ±{100 * ranking.margin:g} %)": p.bayes_equal,
-                "P(b better)": p.bayes_b,
-                "P(error a < error b)": p.better,
-                "P lower": p.better_low,
-                "P upper": p.better_high,
-                "decision": f"{p.winner} better" if p.winner in (p.a, p.b) else "inconclusive",
-            }
-            for p in ranking.pairs
-        ]
-    )
-
-
-def baseline_table(pairs: Sequence[BaselineComparison]) -> pd.DataFrame:
-    """Build the table of proposed methods against baselines, a row per pair."""
-    return pd.DataFrame(
-        [
-            {
-                "method": pair.method,
-                "baseline": pair.baseline,
-                "conditions": len(pair.cells),
-                "better": pair.better,
-                "worse": pair.worse,
-                "inconclusive": len(pair.cells) - pair.better - pair.worse,
-                "RMSE change vs baseline [%]": 100 * (pair.ratio - 1),
-                "rank-biserial correlation": pair.effect,
-                "p": pair.p,
-                f"adjusted p (Holm, {pair.family} tests)": pair.p_holm,
-                "decision across conditions": pair.decided,
-            }
-            for pair in pairs
-        ]
-    )
-
-
-def lost_rule_table(sensitivities: Sequence[LostRunSensitivity]) -> pd.DataFrame:
-    """Build the table of decisions that depend on the lost-run rule."""
-    rules = [rule.name for rule in LOST_RUN_RULES]
-    return pd.DataFrame(
-        [
-            {
-                "condition": s.cell,
-                "group": s.group,
-                "a": s.a,
-                "b": s.b,
-                **dict(zip(rules, s.winners, strict=True)),
-            }
-            for s in sensitivities
         ]
     )
 

@@ -15,12 +15,12 @@ from pfbench.report.plots import calibration_plots, comparison_figures, conditio
 from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.plotting import format_slug
 from pfbench.report.provenance import distinct_values
-from pfbench.results import coverage, status, store
+from pfbench.results import coverage, store
 from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
 from pfbench.results.comparison.pairwise_tests import compare_pairs
 from pfbench.results.conditions import Condition, differing_settings
 from pfbench.results.frame import drop_before, to_long_rows
-from pfbench.results.state_groups import component_groups
+from pfbench.results.state_groups import component_groups, select_main_group
 
 PAIRS = 60  # pairs of a table at most
 
@@ -84,7 +84,7 @@ def write_condition_section(
         "bounds": distinct_values(
             result.meta["pcrb"] for result in data.full_results.values() if "pcrb" in result.meta
         ),
-        **_count_statuses(data.results),
+        **summary.status_lists(data.results),
     }
     return section, list(data.tests), data.runs
 
@@ -111,7 +111,7 @@ def _load_condition(condition: Condition, context: ReportContext) -> _ConditionD
     fronts = [cost.pareto_front(condition.name, runs, group) for group in groups]
     runs = runs[runs.group.isin(groups)]
     tests = compare_pairs(runs, options.alpha, options.equivalence_margin, options.target_effect)
-    main = summary.select_main_group(groups)
+    main = select_main_group(groups)
     return _ConditionData(full_results, results, runs, fronts, tests, main)
 
 
@@ -190,21 +190,6 @@ def _list_unscored(data: _ConditionData, groups: Sequence[str]) -> list[str]:
     }
     scored = {front.group for front in data.fronts}
     return [group for group in groups if group in available - scored]
-
-
-def _count_statuses(results: Mapping[str, store.JobResult]) -> dict[str, Any]:
-    """Count the runs of each filter by status."""
-    counts = [(label, status.count_statuses(result)) for label, result in results.items()]
-    return {
-        "status_counts": counts,
-        "lost": [(label, n.lost, n.runs) for label, n in counts if n.lost],
-        "diverged": [(label, n.diverged, n.runs) for label, n in counts if n.diverged],
-        "overconfident": [
-            (label, n.severely_overconfident, n.runs)
-            for label, n in counts
-            if n.severely_overconfident
-        ],
-    }
 
 
 def _order_by_rmse(fronts: Sequence[cost.ParetoFront], group: str) -> list[str]:

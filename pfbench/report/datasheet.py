@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import scenario_data, writers
 from pfbench.report.plots import scenario_figures
 from pfbench.report.plots.figure_files import FigureSpec
@@ -50,24 +51,23 @@ def write_datasheet(
         )
     choices = sheet.meta["choices"]
     name = format_slug(f"{choices['scenario']}_{choices['noise']}")
-    folder = Path(out) / "datasheets" / name
-    writers.remove_old_files(folder)
-    figures = writers.render_figures(datasheet_figures(sheet), name, folder, formats)
-    residuals, spreads = whiteness_table(sheet), spread_table(sheet)
-    for name, table in (("residuals", residuals), ("spread", spreads)):
-        if len(table):
-            writers.write_table(folder, name, table)
+    tables = {"residuals": whiteness_table(sheet), "spread": spread_table(sheet)}
     context = {
         "name": f"{choices['scenario']} / {choices['noise']}",
         "meta": sheet.meta,
         "facts": list_facts(sheet),
         "missing": list_missing_figures(sheet),
-        "drawings": figures,
-        "residuals": residuals,
-        "spread": spreads,
+        **tables,
         "settings": json.dumps(sheet.meta["config"]["scenario"], indent=1),
     }
-    return writers.render_template("datasheet", folder, context)
+    with RecordedFolder(Path(out) / "datasheets" / name) as folder:
+        context["drawings"] = writers.render_figures(
+            datasheet_figures(sheet), name, folder, formats
+        )
+        for stem, table in tables.items():
+            if len(table):
+                writers.write_table(folder, stem, table)
+        return writers.render_template("datasheet", folder, context)
 
 
 def datasheet_figures(sheet: store.JobResult) -> list[FigureSpec]:
@@ -155,6 +155,8 @@ def list_facts(sheet: store.JobResult) -> list[str]:
     is_equal = scenario_data.drop_equal_runs(residual).shape[0] == 1
     if is_equal and meta["runs"] > 1 and not np.isnan(residual).all():
         texts.append("All runs have equal residuals, which are counted once.")
+    if "raw_estimate" in meta:
+        texts.append(scenario_data.describe_raw_estimate(meta))
     return [*texts, f"{meta['pcrb'][0].upper()}{meta['pcrb'][1:]}."]
 
 

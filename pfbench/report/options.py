@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
 
+from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.plots.plotting import LineStyle, line_styles, mute_others
 from pfbench.results.conditions import Condition, natural_sort_key
 
@@ -80,7 +80,7 @@ class ReportContext(NamedTuple):
 
     groups: Sequence[str]
     style: Mapping[str, LineStyle]
-    folder: Path
+    folder: RecordedFolder
     options: ReportOptions
     brief: bool
 

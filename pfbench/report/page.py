@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 from tqdm import tqdm
 
+from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import comparison_tables, cost, provenance, writers
 from pfbench.report.across_section import write_comparison
 from pfbench.report.condition_section import write_condition_section
@@ -16,7 +17,6 @@ from pfbench.report.options import ReportContext, ReportOptions, is_brief, order
 from pfbench.report.plots.paper import paper_figures
 from pfbench.report.plots.plotting import line_styles
 from pfbench.results import store
-from pfbench.results.comparison.lost_run_rules import LOST_RUN_RULES
 from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
 from pfbench.results.comparison.pairwise_tests import correct_over_report
 from pfbench.results.conditions import Condition, load_conditions, natural_sort_key
@@ -34,8 +34,9 @@ def write_report(
 ) -> Path:
     """Write the report of a study to `<out>/<study>/`.
 
-    The folder contains index.html, report.md, verdicts.json, across.json, pfbench.bib, figures/ and
-    tables/. Equal results give equal bytes. Figures and tables of an earlier report are removed.
+    The folder contains index.html, report.md, verdicts.json, decisions.json, pfbench.bib, figures/ and
+    tables/. Equal results give equal bytes. Files that an earlier report wrote are removed if this one
+    does not write them and they are unchanged (manifest.json). Other files stay.
 
     Args:
         study: Name of the folder in `results`.
@@ -52,17 +53,29 @@ def write_report(
     """
     options = options or ReportOptions()
     conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
-    context = _make_context(conditions, Path(out) / study, options)
-    folder = context.folder
-    drawings = paper_figures.paper_figures(
-        study, conditions, context.style, options.paper_figures, options.start_time_s
-    )
-    writers.remove_old_files(folder)  # after all checks
+    with RecordedFolder(Path(out) / study) as folder:
+        context = _make_context(conditions, folder, options)
+        drawings = paper_figures.paper_figures(
+            study, conditions, context.style, options.paper_figures, options.start_time_s
+        )
+        variables = _write_parts(study, conditions, context)
+        variables |= {
+            "paper": writers.render_figures(drawings, "paper", folder, options.figure_formats),
+            "failures": store.list_failures(Path(results) / study),
+        }
+        return writers.render_template("page", folder, variables)
+
+
+def _write_parts(
+    study: str, conditions: Sequence[Condition], context: ReportContext
+) -> dict[str, Any]:
+    """Write figures, tables and decisions of a study; return the variables of its page."""
+    folder, options = context.folder, context.options
     sections, tests, table = _write_sections(study, conditions, context)
     note = cost.format_budget([job.meta for condition in conditions for job in condition.jobs])
     bibtex = provenance.format_bibtex(conditions)
-    (folder / "pfbench.bib").write_text(bibtex, encoding="utf-8")
-    variables = {
+    folder.write("pfbench.bib", bibtex)
+    return {
         "study": study,
         "options": options,
         "groups": context.groups,
@@ -71,14 +84,12 @@ def write_report(
         "verdicts": tests,
         "verdict_file": writers.write_json(folder, "verdicts", tests),
         "everything": comparison_tables.all_comparisons_table(_select_tests(tests, sections)),
-        "paper": writers.render_figures(drawings, "paper", folder, options.figure_formats),
         "page_shown": sum(v.p_page <= options.alpha for v in tests),
         "shown": sum(v.winner != INCONCLUSIVE for v in tests),
         "family_sizes": sorted({v.family for v in tests}),
         "budget": note,
         **write_comparison(sections, tests, table, context, note),
         "metric_definitions": metric_definitions(),
-        "lost_rules": [rule.name for rule in LOST_RUN_RULES],
         "bibtex": bibtex,
         "shared": [
             *provenance.list_shared_settings(conditions),
@@ -86,13 +97,11 @@ def write_report(
             *provenance.training_cost(conditions),
         ],
         "choices": provenance.modelling_choices(conditions),
-        "failures": store.list_failures(Path(results) / study),
     }
-    return writers.render_template("page", folder, variables)
 
 
 def _make_context(
-    conditions: Sequence[Condition], folder: Path, options: ReportOptions
+    conditions: Sequence[Condition], folder: RecordedFolder, options: ReportOptions
 ) -> ReportContext:
     """Check the options against the results and return the context of all sections."""
     groups = _select_groups(conditions, options)

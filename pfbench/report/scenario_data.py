@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from pfbench.results import store
-from pfbench.results.state_groups import component_groups
+from pfbench.results.state_groups import component_groups, main_component_group
+from pfbench.results.status import divergence_threshold
 
 
 def list_satellites(sheet: store.JobResult) -> list[str]:
@@ -90,4 +92,29 @@ def select_tracks(track: np.ndarray) -> np.ndarray:
         track[:1]
         if np.array_equal(track, np.broadcast_to(track[:1], track.shape), equal_nan=True)
         else track
+    )
+
+
+def describe_raw_estimate(meta: Mapping[str, Any]) -> str:
+    """Describe the error of the simplest estimate from raw measurements, and the threshold.
+
+    Args:
+        meta: Metadata of a datasheet.
+
+    Returns:
+        Sentences with the error, five times the error, and the divergence threshold in use.
+    """
+    raw, group = meta["raw_estimate"], main_component_group(meta["state"])
+    method = {0: "dead reckoning", 1: "least squares of one step"}.get(
+        raw["steps"], f"least squares of {raw['steps']} steps"
+    )
+    stated = divergence_threshold(meta)
+
+    def show(value: float | None) -> str:
+        return "none" if value is None else f"{value * group.scale:.3g} {group.unit}".rstrip()
+
+    return (
+        f"Estimate from raw measurements alone ({method}): {group.group} RMSE {show(raw['rmse'])}; "
+        f"dead reckoning: {show(raw['dead_reckoning'])}. Computed divergence threshold: "
+        f"{show(raw['threshold'])}. Threshold of the scenario: {show(stated)}."
     )

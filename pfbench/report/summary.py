@@ -1,9 +1,7 @@
-"""Summary of a large study: the main group of each condition, and proposed methods against baselines.
+"""Summary of a study: the main group of each condition, and the status of the runs.
 
-The main group of a condition is the position or, without a position, the first group of the state. If scenarios differ in it, the
-main groups are ranked together, because ranks are dimensionless. A proposed method is compared with the baselines of its paper:
-Wilcoxon's test with conditions as blocks and Holm's correction over these pairs alone. The papers define the pairs, not the
-results [ours]. Conditions of a scenario share geometry and random numbers and are dependent blocks.
+The main group of a condition is the position or, without a position, the first group of the state.
+If scenarios differ in it, the main groups are compared under one name. Their ratios need no unit.
 """
 
 from __future__ import annotations
@@ -11,14 +9,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pandas as pd
 
-from pfbench.report.baselines import BaselineComparison
+from pfbench.results import store
 from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
-from pfbench.results.comparison.ranking_results import RankingResult
 from pfbench.results.conditions import natural_sort_key
-from pfbench.results.status import StatusCounts
+from pfbench.results.status import StatusCounts, count_statuses
 
 MAIN = "main group"
 CellName = tuple[str, str, str]
@@ -31,21 +29,18 @@ class StudySummary:
     Attributes:
         filters: Number of filters.
         cells: Number of conditions.
-        worlds: Number of scenarios.
+        worlds: Number of worlds: families of scenarios.
         regimes: Number of noise regimes.
         runs: Number of runs of all filters.
         incomplete: Conditions with missing filters, and the number of these filters.
         group: Compared group, with the groups by scenario if they differ.
-        ranked: Filters and mean ranks, best first; empty without a test across conditions.
-        decisions: Number of pairs with a significant difference across conditions.
-        pairs: Number of pairs across conditions.
-        unbeaten: Top group across conditions.
         often: Filters and the number of conditions in which they are in the top group, most first.
         compared: Number of conditions with comparisons.
         lost: Filters, lost runs and all runs, most lost first, without filters that lost no run.
         diverged: Filters, diverged runs and all runs.
         overconfident: Filters, severely overconfident runs and all runs.
-        planned: Comparisons of proposed methods with baselines.
+        collapsed: Filters, collapsed runs and all runs.
+        undefined: Number of jobs whose scenario defines no divergence.
     """
 
     filters: int
@@ -55,27 +50,19 @@ class StudySummary:
     runs: int
     incomplete: tuple[tuple[str, int], ...]
     group: str
-    ranked: tuple[tuple[str, float], ...]
-    decisions: int
-    pairs: int
-    unbeaten: tuple[str, ...]
     often: tuple[tuple[str, int], ...]
     compared: int
     lost: tuple[tuple[str, int, int], ...]
     diverged: tuple[tuple[str, int, int], ...]
     overconfident: tuple[tuple[str, int, int], ...]
-    planned: tuple[BaselineComparison, ...]
+    collapsed: tuple[tuple[str, int, int], ...]
+    undefined: int
 
     @property
     def foremost(self) -> tuple[tuple[str, int], ...]:
         """The first six of `often`, and all that tie with the sixth."""
         least = self.often[:6][-1][1] if self.often else 0
         return tuple(item for item in self.often if item[1] >= least)
-
-
-def select_main_group(groups: Sequence[str]) -> str:
-    """Return the position, or the first group with truth, or an empty name."""
-    return "position" if "position" in groups else groups[0] if groups else ""
 
 
 def select_main_rows(
@@ -93,9 +80,7 @@ def select_main_rows(
     main_groups = pd.Series(
         list(zip(table.scenario, table.noise, table.model, strict=True)), index=table.index
     ).map(mains)
-    rows = table[
-        (table.group == main_groups) & (table.metric == "rmse") & (table.component == "norm")
-    ].assign(group=name)
+    rows = table[(table.group == main_groups) & (table.component == "norm")].assign(group=name)
     main_tests = [
         replace(v, group=name)
         for v in tests
@@ -105,9 +90,7 @@ def select_main_rows(
 
 
 def summarise_study(
-    ranking: RankingResult,
     tests: Sequence[PairwiseTest],
-    pairs: Sequence[BaselineComparison],
     table: pd.DataFrame,
     mains: Mapping[CellName, str],
     status_counts: Sequence[tuple[str, StatusCounts]],
@@ -115,9 +98,7 @@ def summarise_study(
     """Build the summary of a study.
 
     Args:
-        ranking: Ranking of the main groups.
         tests: Pairwise tests of the main groups.
-        pairs: Result of `compare_with_baselines`.
         table: Rows of the main groups.
         mains: Main group by condition.
         status_counts: Filter and number of runs by status of each job.
@@ -134,20 +115,29 @@ def summarise_study(
     lost: Counter[str] = Counter()
     diverged: Counter[str] = Counter()
     severe: Counter[str] = Counter()
+    collapsed: Counter[str] = Counter()
     for label, n in status_counts:
         runs[label] += n.runs
         lost[label] += n.lost
         diverged[label] += n.diverged or 0
         severe[label] += n.severely_overconfident
+        collapsed[label] += n.collapsed
     return StudySummary(
-        filters=len(everyone), cells=len(labels), worlds=len({name for name, _, _ in mains}),
-        regimes=len({noise for _, noise, _ in mains}), runs=runs.total(),
-        incomplete=tuple(item for item in lacking if item[1]), group=_format_group(ranking.group, mains),
-        ranked=tuple(sorted(zip(ranking.filters, ranking.ranks, strict=False), key=lambda item: (item[1], natural_sort_key(item[0])))),
-        decisions=ranking.shown, pairs=len(ranking.pairs), unbeaten=tuple(ranking.unbeaten) if ranking.pairs else (), often=often,
-        compared=compared, lost=_order_by_share(lost, runs), diverged=_order_by_share(diverged, runs), overconfident=_order_by_share(severe, runs),
-        planned=tuple(pairs),
-    )  # fmt: skip
+        filters=len(everyone),
+        cells=len(labels),
+        worlds=table["family"].nunique(),
+        regimes=len({noise for _, noise, _ in mains}),
+        runs=runs.total(),
+        incomplete=tuple(item for item in lacking if item[1]),
+        group=_format_group(str(table["group"].iloc[0]) if len(table) else "", mains),
+        often=often,
+        compared=compared,
+        lost=_order_by_share(lost, runs),
+        diverged=_order_by_share(diverged, runs),
+        overconfident=_order_by_share(severe, runs),
+        collapsed=_order_by_share(collapsed, runs),
+        undefined=sum(n.diverged is None for _, n in status_counts),
+    )
 
 
 def list_top_group(tests: Sequence[PairwiseTest]) -> list[str]:
@@ -190,3 +180,28 @@ def _format_group(group: str, mains: Mapping[CellName, str]) -> str:
         )
         texts += [f"{name} in {', '.join(worlds)}"] if name else []
     return f"{most}, and {', '.join(texts)}"
+
+
+def status_lists(results: Mapping[str, store.JobResult]) -> dict[str, Any]:
+    """Count the runs of each filter by status.
+
+    Args:
+        results: Results of a condition by label.
+
+    Returns:
+        Template variables: all counts, and for each kind the filters with such runs.
+    """
+    counts = [
+        (label, count_statuses(result.data, result.meta)) for label, result in results.items()
+    ]
+
+    def of_kind(kind: str) -> list[tuple[str, int, int]]:
+        return [(label, getattr(n, kind), n.runs) for label, n in counts if getattr(n, kind)]
+
+    kinds = {name: of_kind(name) for name in ("lost", "diverged", "collapsed")}
+    return {
+        "status_counts": counts,
+        "undefined": all(n.diverged is None for _, n in counts),
+        "overconfident": of_kind("severely_overconfident"),
+        **kinds,
+    }

@@ -2,42 +2,12 @@
 
 from __future__ import annotations
 
-import re
-import unicodedata
-from html import escape
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-
-def _greek(letter: str) -> str:
-    """Return the LaTeX name of a Greek letter."""
-    return unicodedata.name(letter).split()[-1].lower().replace("lamda", "lambda")
-
-
-# Characters that require LaTeX math mode, or that the default encoding replaces ("<", ">", "|").
-_MATHS = {
-    "<": "<", ">": ">", "|": "|", "∞": r"\infty", "−": "-", "±": r"\pm",
-    "×": r"\times", "÷": r"\div", "·": r"\cdot",
-    "°": r"^\circ", "′": "'", "″": "''", "≥": r"\ge", "≤": r"\le", "≈": r"\approx",
-    "≠": r"\ne", "→": r"\to", "√": r"\surd",
-    "∑": r"\sum", "∂": r"\partial", "∈": r"\in", "‖": r"\|", "µ": r"\mu",
-    **{sign: f"^{text}" for sign, text in zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True)},
-    **{sign: f"_{text}" for sign, text in zip("₀₁₂₃₄₅₆₇₈₉", "0123456789", strict=True)},
-    **{letter: f"\\{_greek(letter)}" for letter in "αβγδεζηθικλμνξπρστυφχψω"},
-    **{letter: f"\\{_greek(letter).capitalize()}" for letter in "ΓΔΘΛΞΠΣΥΦΨΩ"},
-}  # fmt: skip
-_LATEX = str.maketrans({
-    "\\": r"\textbackslash ", "_": r"\_", "%": r"\%", "$": r"\$", "#": r"\#", "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde ", "^": r"\textasciicircum ", "&": r"\&", "–": "--",
-    "—": "---", "…": r"\dots ", "“": "``", "”": "''",
-    "‘": "`", "’": "'", "\u00a0": "~", "\u2009": r"\,", "\u202f": r"\,",
-    "ß": r"\ss{}", "ø": r"\o{}", "Ø": r"\O{}",
-    **{sign: f"${text}$" for sign, text in _MATHS.items()},
-})  # fmt: skip
-_ACCENTS = dict(zip("\u0300\u0301\u0302\u0303\u0308\u030a\u030c\u0327", "`'^~\"rvc", strict=True))
+from pfbench.files.escapes import escape_csv, escape_html, escape_latex, escape_markdown
 
 
 def format_html(table: pd.DataFrame) -> str:
@@ -47,14 +17,14 @@ def format_html(table: pd.DataFrame) -> str:
     """
     numeric = [_is_number(table[name]) for name in table]
     head = "".join(
-        f"<th{' class=number' if right else ''}>{escape(str(name))}"
+        f"<th{' class=number' if right else ''}>{escape_html(str(name))}"
         for name, right in zip(table, numeric, strict=True)
     )
     kinds = ["<td>" if right else "<td class=t>" for right in numeric]
     body = "\n".join(
         "<tr>"
         + "".join(
-            kind + escape(format_number(value), quote=False)
+            kind + escape_html(format_number(value))
             for kind, value in zip(kinds, values, strict=True)
         )
         for values in table.itertuples(index=False)
@@ -69,7 +39,7 @@ def format_markdown(table: pd.DataFrame) -> str:
         [str(name) for name in table],
         *([format_number(v) for v in row] for row in table.itertuples(index=False)),
     ]
-    cells = [[text.replace("|", r"\|") for text in row] for row in cells]
+    cells = [[escape_markdown(text) for text in row] for row in cells]
     width = [max(3, *(len(row[j]) for row in cells)) for j in range(len(table.columns))]
     right = [_is_number(table[name]) for name in table]
     rows = [
@@ -100,31 +70,21 @@ def format_latex(table: pd.DataFrame, note: str = "") -> str:
         [str(name) for name in table],
         *([format_number(v) for v in row] for row in table.itertuples(index=False)),
     ]
-    lines = [" & ".join(map(_tex, row)) + r" \\" for row in rows]
+    lines = [" & ".join(map(escape_latex, row)) + r" \\" for row in rows]
     body = ["\\toprule", lines[0], "\\midrule", *lines[1:], "\\bottomrule"]
     if note:
-        body.append(rf"\multicolumn{{{len(table.columns)}}}{{l}}{{\footnotesize {_tex(note)}}} \\")
+        body.append(
+            rf"\multicolumn{{{len(table.columns)}}}{{l}}{{\footnotesize {escape_latex(note)}}} \\"
+        )
     return "\n".join([rf"\begin{{tabular}}{{{layout}}}", *body, r"\end{tabular}", ""])
 
 
-def _tex(text: str) -> str:
-    """Escape a text for LaTeX, which stops at unsupported characters."""
-    return re.sub(r"[^\x00-\x7f]", _escape_character, text.translate(_LATEX)).replace(
-        r"$-$$\infty$", r"$-\infty$"
-    )
-
-
-def _escape_character(sign: re.Match[str]) -> str:
-    """Return an accent command, or the code point of other characters."""
-    parts = unicodedata.normalize("NFD", sign[0])
-    if len(parts) == 2 and parts[0].isascii() and parts[1] in _ACCENTS:
-        return rf"\{_ACCENTS[parts[1]]}{{{parts[0]}}}"
-    return f"(U+{ord(sign[0]):04X})"
-
-
 def format_csv(table: pd.DataFrame) -> str:
-    """Format a table as CSV with all digits."""
-    return table.to_csv(index=False, lineterminator="\n")
+    """Format a table as CSV with all digits. A spreadsheet computes none of its texts."""
+    plain = table.map(lambda value: escape_csv(value) if isinstance(value, str) else value)
+    return plain.to_csv(
+        index=False, lineterminator="\n", header=[escape_csv(str(name)) for name in table]
+    )
 
 
 def format_number(value: Any) -> str:

@@ -89,7 +89,7 @@ def short_accuracy_table(table: pd.DataFrame) -> pd.DataFrame:
 def _overview_row(label: str, result: store.JobResult, alpha: float) -> dict[str, Any]:
     meta, data = result.meta, result.data
     lost, particles = data["lost"], meta.get("particles")
-    count = status.count_statuses(result)
+    count = status.count_statuses(data, meta)
     nis, band = _mean_nis(result, alpha)
     return {
         "filter": label,
@@ -100,7 +100,9 @@ def _overview_row(label: str, result: store.JobResult, alpha: float) -> dict[str
         "lost runs": count.lost,
         "lost runs [%]": 100 * float(status.lost_fraction(lost).value),
         "diverged runs": "–" if count.diverged is None else str(count.diverged),
+        "overconfident runs": count.overconfident,
         "severely overconfident runs": count.severely_overconfident,
+        "collapsed runs": count.collapsed,
         "time per step [ms]": 1e3 * meta["seconds"]["per_step"],
         "likelihood evaluations per step": meta.get("likelihoods_per_step", np.nan),
         "peak memory above baseline [MiB]": (meta.get("memory") or np.nan) / 2**20,

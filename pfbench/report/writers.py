@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -13,9 +14,12 @@ from typing import Any
 
 import jinja2
 import pandas as pd
+from markupsafe import Markup
 
+from pfbench.files.escapes import escape_code_block, escape_markdown
+from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import table_formats
-from pfbench.report.plots.figure_files import FigureSpec, write_figure
+from pfbench.report.plots.figure_files import FigureSpec, draw_figure
 from pfbench.report.plots.plotting import format_slug
 
 _HERE = Path(__file__).parent
@@ -23,7 +27,7 @@ _MANY = 2000  # entries above which a JSON file is compressed
 
 
 def render_template(
-    template: str, folder: Path, context: Mapping[str, Any], home: Path = _HERE
+    template: str, folder: RecordedFolder, context: Mapping[str, Any], home: Path = _HERE
 ) -> Path:
     """Write index.html and report.md from templates.
 
@@ -43,11 +47,11 @@ def render_template(
             .get_template(f"{template}.{kind}.jinja")
             .render({**context, "css": css})
         )
-        (folder / name).write_text(page, encoding="utf-8")
-    return folder / "index.html"
+        folder.write(name, page)
+    return folder.path / "index.html"
 
 
-def write_json(folder: Path, name: str, typed: Sequence[Any]) -> str:
+def write_json(folder: RecordedFolder, name: str, typed: Sequence[Any]) -> str:
     """Write dataclasses as JSON, compressed and with nine digits if there are thousands.
 
     Args:
@@ -61,17 +65,13 @@ def write_json(folder: Path, name: str, typed: Sequence[Any]) -> str:
     many = len(typed) > _MANY
     rows = [to_json_types(asdict(row), 9 if many else None) for row in typed]
     text = json.dumps(rows, indent=None if many else 1, allow_nan=False)
-    for old in (folder / f"{name}.json", folder / f"{name}.json.gz"):
-        old.unlink(missing_ok=True)
     if not many:
-        (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
-        return f"{name}.json"
-    (folder / f"{name}.json.gz").write_bytes(gzip.compress(text.encode(), mtime=0))
-    return f"{name}.json.gz"
+        return folder.write(f"{name}.json", text + "\n").name
+    return folder.write(f"{name}.json.gz", gzip.compress(text.encode(), mtime=0)).name
 
 
 def render_figure(
-    drawing: FigureSpec, prefix: str, folder: Path, formats: Sequence[str]
+    drawing: FigureSpec, prefix: str, folder: RecordedFolder, formats: Sequence[str]
 ) -> dict[str, Any]:
     """Write the files of a figure and return its template variables.
 
@@ -81,14 +81,13 @@ def render_figure(
         folder: Folder of the report.
         formats: Formats of the figure.
     """
-    paths = write_figure(
-        drawing._replace(name=f"{prefix}_{drawing.name}"), folder / "figures", formats
-    )
-    first = max(paths, key=lambda path: path.suffix)  # svg if available
+    contents = draw_figure(drawing, formats)
+    for suffix, content in contents.items():
+        folder.write(f"figures/{prefix}_{drawing.name}.{suffix}", content)
     return {
-        "file": f"figures/{first.name}",
+        "file": f"figures/{prefix}_{drawing.name}.{max(contents)}",  # svg if available
         "caption": drawing.caption,
-        "source": min(map(_data_address, paths), key=len),
+        "source": min(itertools.starmap(_data_address, contents.items()), key=len),
         "name": drawing.name,
         "anchor": format_slug(f"{prefix}_{drawing.name}"),
         "broad": drawing.name.startswith("spread_"),
@@ -96,7 +95,7 @@ def render_figure(
 
 
 def render_figures(
-    drawings: Sequence[FigureSpec], prefix: str, folder: Path, formats: Sequence[str]
+    drawings: Sequence[FigureSpec], prefix: str, folder: RecordedFolder, formats: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Write the files of figures and return their template variables.
 
@@ -109,7 +108,7 @@ def render_figures(
     return [render_figure(drawing, prefix, folder, formats) for drawing in drawings]
 
 
-def write_table(folder: Path, name: str, table: pd.DataFrame, note: str = "") -> None:
+def write_table(folder: RecordedFolder, name: str, table: pd.DataFrame, note: str = "") -> None:
     """Write a table as CSV and LaTeX.
 
     Args:
@@ -118,26 +117,15 @@ def write_table(folder: Path, name: str, table: pd.DataFrame, note: str = "") ->
         table: Table.
         note: Note below the LaTeX table and in the last column of the CSV file.
     """
-    (folder / "tables").mkdir(parents=True, exist_ok=True)
     text = table_formats.format_csv(table.assign(note=note) if note else table)
-    (folder / "tables" / f"{name}.csv").write_text(text, encoding="utf-8")
-    (folder / "tables" / f"{name}.tex").write_text(
-        table_formats.format_latex(table, note), encoding="utf-8"
-    )
+    folder.write(f"tables/{name}.csv", text)
+    folder.write(f"tables/{name}.tex", table_formats.format_latex(table, note))
 
 
-def remove_old_files(folder: Path) -> None:
-    """Remove the figures and tables of an earlier report, which may belong to removed conditions."""
-    for pattern in ("figures/*.svg", "figures/*.png", "tables/*.csv", "tables/*.tex"):
-        for path in folder.glob(pattern):
-            path.unlink()
-    folder.mkdir(parents=True, exist_ok=True)
-
-
-def _data_address(path: Path) -> str:
-    """Return the image as a data URI, so that the page needs no file."""
-    kind = "svg+xml" if path.suffix == ".svg" else "png"
-    return f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
+def _data_address(suffix: str, content: bytes) -> str:
+    """Return an image as a data URI, so that the page needs no file."""
+    kind = "svg+xml" if suffix == "svg" else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def to_json_types(value: Any, digits: int | None = None) -> Any:
@@ -158,19 +146,26 @@ def to_json_types(value: Any, digits: int | None = None) -> Any:
     return value if digits is None else float(f"{value:.{digits}g}")
 
 
-def _environment(escaping: bool, home: Path = _HERE) -> jinja2.Environment:
-    """Return the template environment of HTML (escaping) or Markdown pages."""
+def _environment(is_html: bool, home: Path = _HERE) -> jinja2.Environment:
+    """Return the template environment of HTML or Markdown pages. Each value is escaped once."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(home),
-        autoescape=escaping,
+        autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
+        finalize=None if is_html else _escape_value,
     )
     environment.filters |= {
-        "table": table_formats.format_html,
-        "pipe": table_formats.format_markdown,
+        "table": lambda table: Markup(table_formats.format_html(table)),
+        "pipe": lambda table: Markup(table_formats.format_markdown(table)),
+        "code": lambda text: Markup(escape_code_block(text)),
         "number": table_formats.format_number,
     }
     return environment
+
+
+def _escape_value(value: Any) -> Markup:
+    """Escape a value of a Markdown template, unless a template or a table made it."""
+    return value if hasattr(value, "__html__") else Markup(escape_markdown(str(value)))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pfbench.files.atomic_write import set_aside
 from pfbench.results import store
+from pfbench.results.joined_runs import find_consecutive_parts, join_metadata, read_joined
 
 log = logging.getLogger("pfbench")
 
@@ -20,21 +21,23 @@ _Described = tuple[Path, dict[str, Any]]
 
 
 class JobFile(NamedTuple):
-    """Result file of a job; its arrays are read on demand.
+    """Result file of a job, or files of its consecutive runs; arrays are read on demand.
 
     Attributes:
         path: File.
         label: Name of the filter, with the settings that distinguish it within its condition.
         meta: Metadata, see `store.JobResult`.
+        parts: Files of consecutive runs. `path` is the first of them. Empty for a single file.
     """
 
     path: Path
     label: str
     meta: dict[str, Any]
+    parts: tuple[Path, ...] = ()
 
     def load(self) -> store.JobResult:
-        """Read the arrays and metadata."""
-        return store.read_result(self.path)
+        """Read the arrays and metadata of all runs."""
+        return read_joined(self.parts or (self.path,))
 
 
 class Condition(NamedTuple):
@@ -59,25 +62,36 @@ class Condition(NamedTuple):
 
 
 def load_conditions(
-    study: str, results: str | Path = "results", *, allow_mixed_versions: bool = False
+    study: str,
+    results: str | Path = "results",
+    *,
+    allow_mixed_versions: bool = False,
+    keys: Collection[str] | None = None,
 ) -> list[Condition]:
     """List the conditions of a study; arguments and errors as `load_frame`.
+
+    Jobs that differ in their runs alone and continue each other are joined.
 
     Args:
         study: Name of the folder in `results`.
         results: Folder of all studies.
         allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a
             condition.
+        keys: Keys of the jobs that are read, None for all.
 
     Returns:
         Conditions sorted by scenario, noise and model.
     """
     files = sorted((Path(results) / study).glob("*.npz"))
+    files = [path for path in files if keys is None or path.stem in keys]
     items = [item for path in files if (item := _read_undamaged(path)) is not None]
     if not items:
         raise FileNotFoundError(_no_results_message(study, Path(results)))
+    _check_distinct(items)
     if not allow_mixed_versions:
         _check_equal(items, ("versions.pfbench", "versions.commit"), "the study")
+    groups = {group[0][0]: group for group in find_consecutive_parts(items)}
+    items = [(path, join_metadata([meta for _, meta in group])) for path, group in groups.items()]
     items.sort(key=lambda item: (_condition_key(item[1]), *_job_order(item[1])))
     conditions = []
     for key, group in groupby(items, key=lambda item: _condition_key(item[1])):
@@ -88,7 +102,9 @@ def load_conditions(
             _check_equal(members, ("seed", "first_run", "runs", "steps"), where)
             settings = [f"config.{name}" for name in unlabelled_settings(jobs)]
             _check_equal(members, settings, where)
-        conditions.append(Condition(*key, jobs))
+        parts = [tuple(path for path, _ in groups[job.path]) for job in jobs]
+        joined_jobs = [job._replace(parts=p) for job, p in zip(jobs, parts, strict=True)]
+        conditions.append(Condition(*key, tuple(joined_jobs)))
     return conditions
 
 
@@ -182,6 +198,20 @@ def _flatten(config: Any, path: str = "") -> dict[str, Any]:
         for name, below in config.items()
         for key, value in _flatten(below, f"{path}.{name}" if path else name).items()
     }
+
+
+def _check_distinct(items: Sequence[_Described]) -> None:
+    """Raise ValueError if two files hold the same runs of one job."""
+    first: dict[str, Path] = {}
+    for path, meta in items:
+        runs = [meta["seed"], meta.get("first_run"), meta["runs"]]
+        job = repr([meta["choices"], meta["label"], *runs, meta["config"]])
+        if job in first:
+            raise ValueError(
+                f"{path.parent} must hold each job once, but {first[job].name} and {path.name} hold "
+                f"the same runs of {meta['label']}. Delete the copy."
+            )
+        first[job] = path
 
 
 def _check_equal(items: Sequence[_Described], names: Sequence[str], where: str) -> None:

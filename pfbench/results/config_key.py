@@ -7,6 +7,27 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+# paths of a configuration that decide where, when and how fast a job runs, not what it computes
+PLACE_SETTINGS = (
+    "results_dir",
+    "reports_dir",
+    "episode_cache_dir",
+    "data",
+    "study",
+    "threads",
+    "engine",
+    "memory_limit_gib",
+    "overwrite",
+    "report",
+    "scenario.root",
+    "scenario.cache_dir",
+    "pcrb",  # does not change the filter's results; a job without the bound runs again where it is requested
+    "runs_in",  # an experiment's table from which `runs` is taken
+    "until_decided",  # caps of a study that adds runs
+    "train",
+    "checkpoint",  # the filter's weights are part of the key, by a hash of their content
+)
+
 
 def compute_config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) -> str:
     """Compute the key of a job: 16 hexadecimal digits of the SHA-256 of its configuration.

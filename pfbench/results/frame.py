@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pfbench.results import metrics, store
+from pfbench.results import metrics, status, store
 from pfbench.results.conditions import Condition, JobFile, load_conditions
 from pfbench.results.error_measures import convergence_time
 from pfbench.results.state_groups import component_groups
 
-_WHOLE_RUN_ARRAYS = ("log_evidence", "lost")
+_WHOLE_RUN_ARRAYS = ("log_evidence", "lost", "health", "run")
 _SHARED_ARRAYS = ("time", "pcrb", "range")  # without an axis of runs
 
 
@@ -37,8 +37,8 @@ def load_frame(
             in seconds.
 
     Returns:
-        Columns study, key, scenario, noise, model, filter, label, particles, seed, run, lost,
-        group, component, unit, metric, value, with the metrics of `metrics.METRICS`. A lost run has
+        Columns study, key, scenario, family, noise, model, filter, label, particles, seed, run, lost,
+        keeps_track, group, component, unit, metric, value, with the metrics of `metrics.METRICS`. A lost run has
         infinite errors and scores, and NaN elsewhere.
 
     Raises:
@@ -91,7 +91,7 @@ def select_steps(result: store.JobResult, mask: np.ndarray) -> store.JobResult:
         for name, array in result.data.items()
         if name not in skipped
     }
-    shared = {name: result.data[name] for name in _WHOLE_RUN_ARRAYS}
+    shared = {name: result.data[name] for name in _WHOLE_RUN_ARRAYS if name in result.data}
     scores = _select_scores(result.data, mask)
     return store.JobResult(result.meta, {**selected, **shared, **scores})
 
@@ -116,7 +116,9 @@ def to_long_rows(
         The rows of the job.
     """
     lost = result.data["lost"]
-    columns = [*_metric_rows(drop_before(result, start_time_s)), *_convergence(result, converged)]
+    scored = drop_before(result, start_time_s)
+    keeps = status.keeps_track(scored.data, scored.meta)
+    columns = [*_metric_rows(scored), *_convergence(result, converged)]
     rows = pd.concat(columns, ignore_index=True)
     first, runs = job.meta.get("first_run", 0), lost.size
     repeats = len(rows) // runs
@@ -124,6 +126,7 @@ def to_long_rows(
         "study": job.meta["study"],
         "key": job.meta["key"],
         "scenario": condition.scenario,
+        "family": status.scenario_family(job.meta, condition.scenario),
         "noise": condition.noise,
         "model": condition.model,
         "filter": job.meta["choices"]["filter"],
@@ -132,6 +135,7 @@ def to_long_rows(
         "seed": job.meta["seed"],
         "run": np.tile(np.arange(first, first + runs), repeats),
         "lost": np.tile(lost, repeats),
+        "keeps_track": np.tile(keeps, repeats),
     }
     return pd.concat([pd.DataFrame(head, index=rows.index), rows], axis=1)
 

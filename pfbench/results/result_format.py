@@ -22,6 +22,8 @@ _OPTIONAL = {
     "energy_score": "RSG",
     "pcrb": "TD",
     "range": "T",
+    "health": "R",
+    "run": "R",
 }
 
 _META = ("key", "study", "choices", "config", "label", "seed", "runs", "state")
@@ -71,6 +73,7 @@ def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndar
             raise ValueError(
                 f"{path}: {name} must be numbers, booleans or texts, got Python objects. Convert them."
             )
+    _check_run_numbers(path, meta, data)
     size: dict[str, int] = {
         "R": int(meta["runs"]),
         "D": len(meta["state"]["names"]),
@@ -85,4 +88,21 @@ def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndar
         if data[name].shape != expected:
             raise ValueError(
                 f"{path}: {name} must have shape {list(axes)} = {expected}, got {data[name].shape}"
+            )
+
+
+def _check_run_numbers(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndarray]) -> None:
+    """Check that each run has a number of its own: a repeated run would count twice."""
+    first = meta.get("first_run", 0)
+    if type(first) is not int or first < 0 or first + int(meta["runs"]) > 1 << 32:
+        raise ValueError(
+            f"{path}: first_run must be a whole number from 0 to 2**32 - runs, got {first}. "
+            "Run the job again."
+        )
+    if "run" in data:
+        numbers, counts = np.unique(data["run"], return_counts=True)
+        if (counts > 1).any():
+            raise ValueError(
+                f"{path}: run must have distinct run numbers, got {numbers[counts > 1][0]} "
+                f"{counts.max()} times. Run the job again."
             )

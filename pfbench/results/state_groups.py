@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,3 +47,14 @@ def component_groups(state: Mapping[str, Any]) -> list[ComponentGroup]:
             names = [state["names"][i] for i in indices]
             groups.append(ComponentGroup(name, group, indices, names, display, scale))
     return groups
+
+
+def select_main_group(groups: Sequence[str]) -> str:
+    """Return the position, or the first group, or an empty name."""
+    return "position" if "position" in groups else groups[0] if groups else ""
+
+
+def main_component_group(state: Mapping[str, Any]) -> ComponentGroup:
+    """Return the group of the headline: position if there is one, else the first of one unit."""
+    groups = {group.group: group for group in component_groups(state)}
+    return groups[select_main_group(list(groups))]

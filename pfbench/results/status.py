@@ -1,12 +1,17 @@
-"""Status of runs and filters: lost, diverged, overconfident, severely overconfident.
+"""Status of runs and filters: lost, diverged, overconfident, collapsed.
 
 - **lost**: the filter failed numerically. Recorded by the filter.
-- **diverged**: the run was not lost, and its last position error exceeds the divergence threshold
-  of the scenario, `divergence_threshold_m`. The filter's covariance is not used. If the scenario
-  states no threshold, no run is diverged, and tables print "–".
-- **severely overconfident**: the run was not lost, and the mean over time of the NEES of some group
-  exceeds 100 times its degrees of freedom [ours].
-- **overconfident**: NEES averaged over runs and time exceeds the upper chi-square limit;
+- **diverged**: the run was not lost, but its error exceeds the divergence threshold. It does so in at
+  least 10 % of the steps with truth, or in the last one. The error is that of the main group. The
+  scenario states the threshold as `paper.divergence_threshold`, for all filters alike. The filter's
+  covariance is not used.
+- **track kept**: neither lost nor diverged.
+- **overconfident run**: the mean over time of the NEES of the main group exceeds the 0.999 quantile
+  of the chi-square distribution.
+- **severely overconfident**: it exceeds 100 times the degrees of freedom in some group [ours].
+- **collapsed**: the filter itself reports impossible innovations at a spread or effective sample
+  size at the floor, see `pfbench.filter.health`.
+- **overconfident filter**: NEES averaged over runs and time exceeds the upper chi-square limit;
   **underconfident** is below the lower one.
 """
 
@@ -16,12 +21,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import stats
 
-from pfbench.results import store
 from pfbench.results.consistency import NeesConsistency, nees_band
-from pfbench.results.error_measures import Array, Flags, RunMean, convergence_time, finite_mean
+from pfbench.results.error_measures import Array, Flags, RunMean, finite_mean
+from pfbench.results.state_groups import main_component_group
 
-POSITION = "position"  # group whose error decides divergence
+DIVERGED_SHARE = 0.1  # of the steps with truth, beyond the threshold
+COLLAPSED = 2  # in the array `health`, see `pfbench.filter.health.HEALTH`
 
 
 class StatusCounts(NamedTuple):
@@ -32,12 +39,16 @@ class StatusCounts(NamedTuple):
         diverged: Diverged runs; None without a divergence threshold.
         severely_overconfident: Severely overconfident runs.
         runs: All runs.
+        overconfident: Overconfident runs, severely overconfident ones included.
+        collapsed: Collapsed runs that are not lost.
     """
 
     lost: int
     diverged: int | None
     severely_overconfident: int
     runs: int
+    overconfident: int = 0
+    collapsed: int = 0
 
 
 def lost_fraction(lost: Flags) -> RunMean:
@@ -47,18 +58,39 @@ def lost_fraction(lost: Flags) -> RunMean:
 
 
 def is_diverged(error: Array, lost: Flags, threshold: float) -> Flags:
-    """Return the valid runs [R] whose last error exceeds a threshold.
+    """Return the valid runs [R] whose error exceeds a threshold too often or at the end.
 
     Args:
-        error: Position error, [R, T, K]; NaN without truth.
+        error: Error of the main group, [R, T, K]; NaN without truth.
         lost: Lost runs, [R].
         threshold: Divergence threshold in the unit of the error.
 
     Returns:
         Mask, [R]. False for a run without truth.
     """
-    steps = np.arange(error.shape[1], dtype=np.float64)
-    return np.isinf(convergence_time(steps, error, lost, threshold)) & ~np.asarray(lost, bool)
+    norm = np.sqrt(np.sum(np.asarray(error, dtype=np.float64) ** 2, axis=-1))
+    has_truth = ~np.isnan(norm)
+    exceeds = norm > threshold
+    share = exceeds.sum(axis=1) / np.maximum(has_truth.sum(axis=1), 1)
+    last = has_truth.shape[1] - 1 - has_truth[:, ::-1].argmax(axis=1)
+    at_end = np.take_along_axis(exceeds, last[:, None], axis=1)[:, 0]
+    return ((share >= DIVERGED_SHARE) | at_end) & ~np.asarray(lost, bool)
+
+
+def is_overconfident(nees: Array, dof: int, lost: Flags) -> Flags:
+    """Return the valid runs [R] whose mean NEES exceeds the 0.999 quantile of its distribution.
+
+    Args:
+        nees: Normalised estimation error squared of one group, [R, T].
+        dof: Degrees of freedom of the group.
+        lost: Lost runs, [R].
+
+    Returns:
+        Mask, [R].
+    """
+    with np.errstate(over="ignore"):
+        mean = finite_mean(np.asarray(nees, dtype=np.float64), axis=1)
+    return (mean > stats.chi2.ppf(0.999, dof)) & ~np.asarray(lost, dtype=bool)
 
 
 def is_severely_overconfident(
@@ -106,20 +138,73 @@ def classify_consistency(consistency: NeesConsistency, dof: int, alpha: float = 
 
 
 def divergence_threshold(meta: Mapping[str, Any]) -> float | None:
-    """Return the divergence threshold in metres that a job's scenario states, else None."""
-    scenario = meta.get("config", {}).get("scenario")
-    value = scenario.get("divergence_threshold_m") if isinstance(scenario, Mapping) else None
+    """Return the divergence threshold that a job's scenario states, in the unit of the main group."""
+    value = _paper_block(meta).get("divergence_threshold")
     return None if value is None else float(value)
 
 
-def count_statuses(result: store.JobResult) -> StatusCounts:
-    """Count the runs of a job by status."""
-    lost, groups = result.data["lost"], result.meta["state"]["groups"]
+def scenario_family(meta: Mapping[str, Any], scenario: str) -> str:
+    """Return the family of a job's scenario: scenarios of one trajectory have one family.
+
+    Args:
+        meta: Metadata of a job.
+        scenario: Name of the scenario, used if it states no family.
+
+    Returns:
+        The name.
+    """
+    return str(_paper_block(meta).get("family") or scenario)
+
+
+def _paper_block(meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the node `paper` of a job's scenario."""
+    scenario = meta.get("config", {}).get("scenario")
+    block = scenario.get("paper") if isinstance(scenario, Mapping) else None
+    return block if isinstance(block, Mapping) else {}
+
+
+def keeps_track(data: Mapping[str, Array], meta: Mapping[str, Any]) -> Flags:
+    """Return the runs [R] that are neither lost nor diverged.
+
+    Args:
+        data: Arrays of a result.
+        meta: Metadata of the result. Without a threshold, only lost runs lose the track.
+
+    Returns:
+        Mask, [R].
+    """
+    lost = np.asarray(data["lost"], dtype=bool)
+    threshold = divergence_threshold(meta)
+    if threshold is None:
+        return ~lost
+    error = data["error"][..., main_component_group(meta["state"]).places]
+    return ~lost & ~is_diverged(error, lost, threshold)
+
+
+def count_statuses(data: Mapping[str, Array], meta: Mapping[str, Any]) -> StatusCounts:
+    """Count the runs of a job by status.
+
+    Args:
+        data: Arrays of a result.
+        meta: Metadata of the result.
+
+    Returns:
+        The numbers of runs.
+    """
+    lost, groups = np.asarray(data["lost"], dtype=bool), meta["state"]["groups"]
     dofs = [len(components) for components in groups.values()]
-    severe = is_severely_overconfident(result.data["nees"], dofs, lost)
-    threshold = divergence_threshold(result.meta)
-    diverged = None
-    if threshold is not None and POSITION in groups:
-        error = result.data["error"][..., list(groups[POSITION])]
-        diverged = int(is_diverged(error, lost, threshold).sum())
-    return StatusCounts(int(lost.sum()), diverged, int(severe.sum()), int(lost.size))
+    severe = is_severely_overconfident(data["nees"], dofs, lost)
+    name = main_component_group(meta["state"]).state_group
+    nees = data["nees"][..., list(groups).index(name)]
+    narrow = is_overconfident(nees, len(groups[name]), lost) | severe
+    has_threshold = divergence_threshold(meta) is not None
+    diverged = int((~keeps_track(data, meta) & ~lost).sum()) if has_threshold else None
+    collapsed = np.asarray(data.get("health", np.zeros(lost.shape))) == COLLAPSED
+    return StatusCounts(
+        int(lost.sum()),
+        diverged,
+        int(severe.sum()),
+        int(lost.size),
+        int(narrow.sum()),
+        int((collapsed & ~lost).sum()),
+    )

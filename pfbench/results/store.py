@@ -16,7 +16,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from pfbench.files.atomic_write import write_atomically
+from pfbench.files.atomic_write import remove_temporary_files, write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
 from pfbench.results.result_format import FORMAT, check_arrays, check_metadata
 
@@ -69,8 +69,7 @@ def write_result(path: str | Path, meta: Mapping[str, Any], data: Mapping[str, A
     digest = np.array(hash_content({"meta": text, **plain}))
     _write(path, lambda file: np.savez_compressed(file, meta=text, digest=digest, **plain))
     _note(path).unlink(missing_ok=True)
-    for stale in path.parent.glob(f"{path.stem}.*.tmp"):
-        stale.unlink(missing_ok=True)
+    remove_temporary_files(path)
     return path
 
 
@@ -130,6 +129,7 @@ def write_failure(
         "traceback": "".join(traceback.format_exception(error)),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+    note[DIGEST] = hash_content(note)
     text = json.dumps(note, indent=1, sort_keys=True)
     _write(_note(path), lambda file: file.write(text.encode()))
     return _note(path)
@@ -152,18 +152,31 @@ def list_failures(folder: str | Path) -> list[dict[str, Any]]:
     notes = sorted(Path(folder).glob("*.failed.json"))
     results = (note.with_name(note.name.replace(".failed.json", ".npz")) for note in notes)
     pairs = zip(notes, results, strict=True)
-    failed = [json.loads(note.read_text()) for note, result in pairs if not result.exists()]
+    failed = [_read_note(note) for note, result in pairs if not result.exists()]
     damaged = {path.name.partition(".")[0] for path in Path(folder).glob("*.npz.damaged*")}
     lost = sorted(key for key in damaged if not (Path(folder) / f"{key}.npz").exists())
-    unknown = dict.fromkeys(("scenario", "noise", "model", "filter"), "unknown")
-    return failed + [
-        {"key": key, "choices": unknown, "message": f"{key}.npz was damaged. Run the job again"}
-        for key in lost
-    ]
+    return failed + [_unknown_failure(key, f"{key}.npz was damaged") for key in lost]
 
 
 def _note(path: Path) -> Path:
     return path.with_name(f"{path.stem}.failed.json")
+
+
+def _read_note(path: Path) -> dict[str, Any]:
+    """Read a failure note. Of a damaged one only the name of the file is used."""
+    try:
+        note = json.loads(path.read_bytes())
+        if isinstance(note, dict) and has_valid_digest(note) and path.name.startswith(note["key"]):
+            return note
+    except ValueError:
+        pass
+    return _unknown_failure(path.name.partition(".")[0], f"{path.name} is damaged")
+
+
+def _unknown_failure(key: str, reason: str) -> dict[str, Any]:
+    """Return the failure of a job whose choices are unknown."""
+    unknown = dict.fromkeys(("scenario", "noise", "model", "filter"), "unknown")
+    return {"key": key, "choices": unknown, "message": f"{reason}. Run the job again"}
 
 
 def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Protocol
 
 from torch import Tensor
@@ -25,22 +24,6 @@ class Scenario(Protocol):
         Returns:
             Episode with R runs.
         """
-
-
-def check_divergence_threshold(threshold: float | None) -> None:
-    """Check the position error beyond which a run counts as diverged.
-
-    Args:
-        threshold: Position error, m. None if the scenario does not define divergence.
-
-    Raises:
-        ValueError: If the threshold is not finite and positive.
-    """
-    if threshold is not None and not (math.isfinite(threshold) and threshold > 0.0):
-        raise ValueError(
-            f"scenario.divergence_threshold_m must be finite and positive, got {threshold}. "
-            "Use null for a scenario without this limit."
-        )
 
 
 def check_duration(name: str, value: float) -> None:

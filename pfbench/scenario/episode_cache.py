@@ -18,6 +18,8 @@ from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
 Arrays = dict[str, Tensor]
 log = logging.getLogger("pfbench")
 
+_KEY = "episode_key"  # name of the key in a file, which shows that a file has another one's name
+
 
 def load_or_build(folder: str | Path | None, recipe: object, build: Callable[[], Arrays]) -> Arrays:
     """Load tensors from the cache, or build and store them.
@@ -33,7 +35,8 @@ def load_or_build(folder: str | Path | None, recipe: object, build: Callable[[],
     """
     if folder is None:
         return build()
-    path = Path(folder) / f"{hashlib.sha256(repr(recipe).encode()).hexdigest()[:16]}.npz"
+    key = hashlib.sha256(f"episodes 2 {recipe!r}".encode()).hexdigest()[:16]
+    path = Path(folder) / f"{key}.npz"
     if path.exists():
         try:
             return _read(path)
@@ -44,6 +47,7 @@ def load_or_build(folder: str | Path | None, recipe: object, build: Callable[[],
             )  # fmt: skip
     tensors = build()
     data: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}
+    data[_KEY] = np.array(key)
     data[DIGEST] = np.array(hash_content(data))
     write_atomically(path, lambda file: np.savez(file, **data))
     return tensors
@@ -53,11 +57,15 @@ def _read(path: Path) -> Arrays:
     """Read a file of the cache.
 
     Raises:
-        ValueError: If its digest is not that of its content. Other errors are those of numpy.
+        ValueError: If its digest is not that of its content, or its key is that of other episodes.
+            Other errors are those of numpy.
     """
     # opened here, since numpy leaves a damaged file open
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         data = {name: file[name] for name in file.files}
     if not has_valid_digest(data):
         raise ValueError("its digest must be that of its content")
-    return {name: torch.from_numpy(value) for name, value in data.items() if name != DIGEST}
+    if str(data.get(_KEY)) != path.stem:
+        raise ValueError(f"its key must be {path.stem}, got {data.get(_KEY)}")
+    items = (item for item in data.items() if item[0] not in (DIGEST, _KEY))
+    return {name: torch.from_numpy(value) for name, value in items}

@@ -24,7 +24,7 @@ from pfbench.core.simulate import (
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.base import NoiseRegime, process_variance_factors
 from pfbench.noise.white import NominalNoise
-from pfbench.scenario.base import Scenario, check_divergence_threshold
+from pfbench.scenario.base import Scenario
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,6 @@ class ModelSimulation(Scenario):
         model: State-space model that draws states and measurements.
         steps: Measurements per run.
         interval_s: Time between measurements, s, for the time axis of the report.
-        divergence_threshold_m: Position error, m, beyond which a run counts as diverged. None if
-            the scenario does not define divergence.
 
     Raises:
         ValueError: If steps is below 1, or the interval or the threshold is not positive. `draw` raises it if a
@@ -50,10 +48,8 @@ class ModelSimulation(Scenario):
     model: StateSpaceModel
     steps: int
     interval_s: float = 1.0
-    divergence_threshold_m: float | None = None
 
     def __post_init__(self) -> None:
-        check_divergence_threshold(self.divergence_threshold_m)
         if not isinstance(self.steps, int) or self.steps < 1:
             raise ValueError(
                 f"scenario.steps must be a whole number of at least 1, got {self.steps}. "

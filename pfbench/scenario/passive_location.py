@@ -20,7 +20,7 @@ from pfbench.model.passive_location import (
     relative_motion,
 )
 from pfbench.noise.base import NoiseRegime, process_variance_factors
-from pfbench.scenario.base import Scenario, check_divergence_threshold
+from pfbench.scenario.base import Scenario
 from pfbench.scenario.emitter_prior import EmitterPrior, FirstMeasurement, LinearisedEmitterPrior
 
 _KINDS = ("angle", "angle", "rate", "rate", "rate")
@@ -63,8 +63,6 @@ class PassiveLocationScenario(Scenario):
         randomise_emitter: Whether each run draws its emitter from the prior of
             `QuadratureEmitterPrior`. The range is uniform between its limits, in the direction of
             `target_position`. The velocity is normal about 0.
-        divergence_threshold_m: Position error, m, beyond which a run counts as diverged. None if
-            the scenario does not define divergence.
 
     Raises:
         ValueError: If an argument has the wrong length or sign, or the aircraft is without horizontal
@@ -87,10 +85,8 @@ class PassiveLocationScenario(Scenario):
     doppler_includes_acceleration: bool = False
     emitter_prior: EmitterPrior = field(default_factory=LinearisedEmitterPrior)
     randomise_emitter: bool = False
-    divergence_threshold_m: float | None = None
 
     def __post_init__(self) -> None:
-        check_divergence_threshold(self.divergence_threshold_m)
         sizes = {
             "target_position": 2,
             "target_velocity": 2,

@@ -17,7 +17,7 @@ from pfbench.nav import attitude, earth, imu_errors, strapdown
 from pfbench.nav.aiding import AidingSensor, AlignmentErrors, FlightSolution, GnssReceiver
 from pfbench.nav.trajectory import TrajectoryData, TrajectorySource
 from pfbench.noise.base import NoiseRegime, process_variance_factors
-from pfbench.scenario.base import Scenario, check_divergence_threshold
+from pfbench.scenario.base import Scenario
 from pfbench.scenario.closed_loop import ClosedLoopIns
 from pfbench.scenario.episode_cache import Arrays, load_or_build
 
@@ -40,8 +40,6 @@ class SimulatedFlight(Scenario):
         cache_dir: Folder for simulated flights. None disables the cache.
         closed_loop: Whether the estimated errors correct the INS after every interval. Results
             contain the errors of the corrected navigation.
-        divergence_threshold_m: Position error, m, beyond which a run counts as diverged. None if
-            the scenario does not define divergence.
 
     Raises:
         ValueError: If the interval is not an even number of samples, or `closed_loop` is set with a
@@ -57,10 +55,8 @@ class SimulatedFlight(Scenario):
     filter_interval_s: float = 1.0
     cache_dir: str | None = None
     closed_loop: bool = False
-    divergence_threshold_m: float | None = None
 
     def __post_init__(self) -> None:
-        check_divergence_threshold(self.divergence_threshold_m)
         samples = self.imu_rate_hz * self.filter_interval_s
         if samples < 2 or abs(samples / 2 - round(samples / 2)) > 1e-9:
             raise ValueError(

@@ -275,7 +275,7 @@ def test_the_flag_of_a_sweep_may_stand_anywhere(tmp_path: Path, place: int) -> N
 # the other commands
 
 
-COMMANDS = ("run", "report", "claims", "datasheet", "train", "list", "check")
+COMMANDS = ("run", "report", "claims", "datasheet", "judge", "train", "list", "check")
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -15,7 +15,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from command_line import environment, pfbench
+from command_line import GONE, environment, pfbench, processes_of
 from hydra import compose, initialize_config_dir
 
 from pfbench import job
@@ -23,7 +23,6 @@ from pfbench.cli.messages import format_error
 from pfbench.cli.run import run_with_retries
 from pfbench.results import store
 
-GONE = (ProcessLookupError, FileNotFoundError, PermissionError)
 FILTERS = ("sir", "rpf", "apf", "gpf")
 SWEEP = (
     "run",
@@ -193,25 +192,10 @@ def started(home: Path, *words: str, **more: str) -> Iterator[subprocess.Popen[s
     try:
         yield sweep
     finally:
-        for process in (*workers(home, ""), sweep.pid):
+        for process in (*processes_of(home, ""), sweep.pid):
             with suppress(*GONE):
                 os.kill(process, signal.SIGKILL)
         sweep.communicate()
-
-
-def workers(home: Path, doing: str) -> list[int]:
-    """Processes that belong to the sweep of this home, by what they say of themselves."""
-    found, mark = [], f"PFBENCH_RESULTS={home / 'results'}".encode()
-    for entry in Path("/proc").iterdir():
-        with suppress(*GONE):
-            own = entry.name.isdigit() and int(entry.name) != os.getpid()
-            if (
-                own
-                and mark in (entry / "environ").read_bytes().split(b"\0")
-                and doing in (entry / "cmdline").read_text()
-            ):
-                found.append(int(entry.name))
-    return found
 
 
 def wait(what: Callable[[], Any], sweep: subprocess.Popen[str], seconds: float = 300.0) -> Any:
@@ -239,7 +223,7 @@ def test_a_killed_worker_of_ray_costs_its_own_cell_which_is_done_again(
         done = {
             file: file.stat().st_mtime_ns for file in (tmp_path / "results" / "adhoc").glob("*.npz")
         }
-        victim = wait(lambda: workers(tmp_path, "ray::_run_job"), sweep)[0]
+        victim = wait(lambda: processes_of(tmp_path, "ray::_run_job"), sweep)[0]
         os.kill(victim, signal.SIGKILL)
         _, err = sweep.communicate(timeout=120)
     assert sweep.returncode == 0, err

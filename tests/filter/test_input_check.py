@@ -14,8 +14,12 @@ from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import CubaturePoints
 from pfbench.filter.loop import run_filter
+from pfbench.filter.moves.flow_kernels import NoiseFlowStatKernel
+from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.weight_update import BayesWeightUpdate, FlooredWeightUpdate
 from pfbench.kernels import compilation
+from pfbench.model.base import ModelWrapper
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 
 MODEL = linear_walk(1.0, 0.3, 1.0)
@@ -43,6 +47,38 @@ class Wide(LinearGaussian):
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
         moved = super().propagate(x, u, w)
         return torch.cat([moved, moved], -1)
+
+
+class Mixing(LinearGaussian):
+    """A model whose particles attract each other."""
+
+    @override
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return super().propagate(x, u, w) + 0.1 * x.mean(1, keepdim=True)
+
+
+class MixingRuns(LinearGaussian):
+    """A model that subtracts the mean over the runs."""
+
+    @override
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return super().propagate(x, u, w) - x.mean(0, keepdim=True)
+
+
+class OneParticle(LinearGaussian):
+    """A model that observes the mean of the particles."""
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Any:
+        return super().observation(x.mean(1, keepdim=True), u)
+
+
+class OneRun(LinearGaussian):
+    """A model that observes the first run."""
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Any:
+        return super().observation(x[:1], u)
 
 
 def parameters(model: LinearGaussian) -> tuple[Tensor, ...]:
@@ -90,6 +126,48 @@ WRONG: dict[str, tuple[Any, Record, PhiloxStream, str]] = {
         DRAWS,
         r"record.spread must have shape \[3, 2, 2\], got \[3, 2\]",
     ),
+    "inputs without a name": (
+        MODEL,
+        Record(Y, torch.zeros(RUNS, STEPS, 2)),  # type: ignore[arg-type]
+        DRAWS,
+        r"record.u must be a NamedTuple of tensors .*, got Tensor. Define",
+    ),
+    "inputs as a dictionary": (
+        MODEL,
+        Record(Y, {"force": torch.zeros(RUNS, STEPS, 2)}),  # type: ignore[arg-type]
+        DRAWS,
+        r"record.u must be a NamedTuple of tensors .*, got dict. Define",
+    ),
+    "inputs of numbers": (
+        MODEL,
+        Record(Y, Inputs(3.0)),  # type: ignore[arg-type]
+        DRAWS,
+        r"record.u.force must be a tensor or a tuple of tensors, got float",
+    ),
+    "particles that are mixed": (
+        Mixing(*parameters(MODEL)),
+        Record(Y),
+        DRAWS,
+        r"Mixing.propagate must move each particle of each run by itself",
+    ),
+    "runs that are mixed": (
+        MixingRuns(*parameters(MODEL)),
+        Record(Y),
+        DRAWS,
+        r"MixingRuns.propagate must move each particle of each run by itself",
+    ),
+    "one observation for all particles": (
+        OneParticle(*parameters(MODEL)),
+        Record(Y),
+        DRAWS,
+        r"OneParticle.observation must .* \[3, 4\], got \[3, 1\]",
+    ),
+    "one observation for all runs": (
+        OneRun(*parameters(MODEL)),
+        Record(Y),
+        DRAWS,
+        r"OneRun.observation must .* \[3, 4\], got \[1, 4\]",
+    ),
     "states that are not numbers": (
         Broken(*parameters(MODEL)),
         Record(Y),
@@ -112,6 +190,58 @@ def test_what_does_not_fit_is_refused_in_every_engine(case: str) -> None:
         for compiled in (False, True):
             with compilation.use_compiled(compiled), pytest.raises(ValueError, match=message):
                 run_filter(method, model, record, draws)
+
+
+class Doubled(NamedTuple):
+    inner: Inputs
+
+
+class WrappedInputs(ModelWrapper):
+    """A wrapper with inputs of its own, as a model with oracle noise has."""
+
+    @override
+    def propagate(self, x: Tensor, u: Doubled, w: Tensor) -> Tensor:
+        return self.model.propagate(x, u.inner, w)
+
+    @override
+    def observation(self, x: Tensor, u: Doubled) -> Any:
+        return self.model.observation(x, u.inner)
+
+
+class Driven(LinearGaussian):
+    """A model whose observation needs its inputs."""
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Any:
+        return super().observation(x + 0.0 * u.force[..., None, :2], u)
+
+
+def test_a_wrapper_gives_its_inputs_to_its_own_observation() -> None:
+    inputs = Doubled(Inputs(torch.zeros(1, STEPS, 2, dtype=torch.float64)))
+    model = WrappedInputs(Driven(*parameters(MODEL)))
+    result = run_filter(ParticleFilter(20), model, Record(Y, inputs), DRAWS)
+    assert not result.lost.any()
+
+
+@pytest.mark.parametrize(
+    "update", [BayesWeightUpdate(), FlooredWeightUpdate()], ids=["bayes", "floor"]
+)
+def test_weights_below_the_precision_of_their_logarithms_lose_the_run(update: Any) -> None:
+    """At 1e8 standard deviations log weights are noise; 1e5 are resolved."""
+    y = Y.clone()
+    y[0, 2], y[1, 2], y[2, 2] = 1e200, 1e9, 1e5
+    result = run_filter(ParticleFilter(20, weight_update=update), MODEL, Record(y), DRAWS)
+    assert result.lost.tolist() == [True, True, False]
+    assert torch.isneginf(result.log_evidence[:2]).all()
+
+
+def test_statistics_of_the_path_need_a_proper_start() -> None:
+    f, g, h, r, m0, l0 = parameters(MODEL)
+    method = ParticleFilter(20, moves=[MetropolisHastings(NoiseFlowStatKernel(), 1)])
+    with pytest.raises(
+        ValueError, match=r"must be positive definite .* got variances \[0.0, 0.0\]"
+    ):
+        run_filter(method, LinearGaussian(f, g, h, r, m0, 0.0 * l0), Record(Y), DRAWS)
 
 
 def test_what_fits_is_computed() -> None:

@@ -104,10 +104,9 @@ def test_a_job_leaves_one_file_that_numpy_reads(twice: Any) -> None:
 def test_the_line_printed_is_the_error_stored(twice: Any) -> None:
     _, file, first, _, _ = twice
     error = stored(file)[1]["error"].astype(float)
-    assert (
-        f"linear_walk / nominal / sir   state RMSE {math.sqrt((error**2).sum(-1).mean()):.4g}   lost 0/3"
-        in first.out
-    )
+    rmse = math.sqrt((error[..., 0] ** 2).mean())
+    line = f"linear_walk / nominal / sir   state [m] RMSE {rmse:.4g} m; track kept in 3 of 3 runs"
+    assert line in first.out
 
 
 def test_a_finished_job_is_not_computed_again(twice: Any) -> None:
@@ -270,6 +269,40 @@ def test_where_there_is_no_bound_the_job_says_why(tmp_path: Path, case: str) -> 
     assert "pcrb" not in arrays
     assert meta["pcrb"].startswith("no bound: ")
     assert reason in meta["pcrb"]
+
+
+def test_a_bound_that_is_requested_later_is_added(tmp_path: Path) -> None:
+    """The job runs again once, under the same key, and never because a bound is not wanted."""
+    words = (*WALK[:1], "scenario.steps=4", "filter=ekf", "runs=2")
+    before, arrays = result(tmp_path, *words, "pcrb=false")
+    assert "pcrb" not in arrays
+    after, joined = result(tmp_path, *words)
+    assert after["key"] == before["key"]
+    assert "posterior Cramer-Rao bound" in after["pcrb"]
+    assert np.isfinite(joined.pop("pcrb")).all()
+    assert identical(joined, arrays)
+    for word in ("pcrb=auto", "pcrb=false", "pcrb=true"):
+        assert result(tmp_path, *words, word)[0] == after  # the same file: skipped
+
+
+def test_a_bound_that_does_not_exist_is_tried_once(tmp_path: Path) -> None:
+    words = ("scenario=benes", "scenario.steps=4", "filter=ekf", "runs=2")
+    result(tmp_path, *words, "pcrb=false")
+    (file,) = (tmp_path / "results" / "adhoc").glob("*.npz")
+    stamps = []
+    for _ in range(2):
+        assert "no bound" in result(tmp_path, *words)[0]["pcrb"]
+        stamps.append(file.stat().st_mtime_ns)
+    assert stamps[0] == stamps[1]
+
+
+def test_run_numbers_that_would_repeat_random_numbers_are_refused(tmp_path: Path) -> None:
+    words = (*WALK[:1], "scenario.steps=4", "filter=ekf", "runs=2")
+    last = result(tmp_path, *words, f"first_run={2**32 - 2}", study="last")
+    assert not np.array_equal(last[1]["error"], result(tmp_path, *words, study="first")[1]["error"])
+    said = pfbench("run", *words, f"first_run={2**32 - 1}", home=tmp_path)
+    assert said.code != 0
+    assert "first_run + runs must be at most 2**32" in said.err + said.out
 
 
 def test_worlds_that_are_not_the_models_have_no_bound_unless_asked() -> None:

@@ -16,11 +16,8 @@ from torch import Tensor
 from pfbench.kernels import cpp, cpp_library, manifest
 from pfbench.kernels.manifest import Argument
 
-OPERATORS = {
-    name: arguments
-    for name, arguments in manifest.read_operators().items()
-    if name != "gather_propagate"  # on a CUDA device only
-}
+OPERATORS = manifest.read_operators()
+ON_CPU = [name for name in OPERATORS if name != "gather_propagate"]  # that one is on CUDA only
 REALS = (torch.float32, torch.float64)
 
 
@@ -47,9 +44,9 @@ def make_tensor(
     return x.to(dtype) if layout != 3 or not shape else x[:1].to(dtype).expand(shape)
 
 
-def make_call(name: str, rng: random.Random) -> list[Any]:
-    """Valid arguments of random sizes."""
-    sizes: dict[str, int] = {}
+def make_call(name: str, rng: random.Random, given: dict[str, int] | None = None) -> list[Any]:
+    """Valid arguments of random or given sizes."""
+    sizes = dict(given or {})
     real, arguments = rng.choice(REALS), []
     for argument in OPERATORS[name]:
         if argument.kind == "int":
@@ -58,26 +55,23 @@ def make_call(name: str, rng: random.Random) -> list[Any]:
         shape = []
         for axis in argument.axes:
             longest = 70 if axis.upper() in "NM" else 9
-            size = sizes.setdefault(axis.upper(), rng.choice((0, 1, 2, rng.randint(1, longest))))
+            least = int(axis in argument.positive)
+            size = sizes.setdefault(
+                axis.upper(), rng.choice((least, 1, 2, rng.randint(1, longest)))
+            )
             shape.append(1 if axis == "1" or (axis.islower() and rng.random() < 0.4) else size)
         arguments.append(make_tensor(argument, shape, real, rng))
     return fix_values(name, arguments, sizes)
 
 
 def fix_values(name: str, arguments: list[Any], sizes: dict[str, int]) -> list[Any]:
-    """Put indices and counts into their range."""
-    if name == "resample_systematic":
-        n = max(sizes["N"], 0)
-        arguments[1] = torch.randint(0, n + 1, arguments[1].shape)
-        arguments[2] = torch.rand(arguments[2].shape)
-    limits = {
-        "gather_particles": (1, "N", 1),
-        "count_unique": (0, "N", 2),
-        "group_covariance": (3, "K", 1),
-    }
-    if name in limits:
-        place, axis, factor = limits[name]
-        arguments[place] = torch.randint(0, max(1, factor * sizes[axis]), arguments[place].shape)
+    """Put values into the ranges of the manifest."""
+    for place, argument in enumerate(OPERATORS[name]):
+        if argument.limit is None:
+            continue
+        shape, largest = arguments[place].shape, max(0, argument.limit.largest(sizes))
+        is_uniform = argument.limit.axis == "1"
+        arguments[place] = torch.rand(shape) if is_uniform else torch.randint(0, largest + 1, shape)
     return arguments
 
 
@@ -91,10 +85,12 @@ def spoil(name: str, arguments: list[Any], rng: random.Random) -> list[Any]:
         return spoiled
     kind = rng.randrange(4)
     if kind == 0 and value.dim():
-        axis = rng.randrange(value.dim())
+        axis = rng.randrange(int(argument.has_batch), value.dim())
         spoiled[place] = torch.cat(
             [value] + [value.narrow(axis, 0, min(1, value.shape[axis]))] * 2, axis
         )
+    elif kind == 1 and argument.has_batch:
+        spoiled[place] = value.reshape(-1)[:1].sum()  # any number of axes more would be valid
     elif kind == 1:
         spoiled[place] = (
             value.unsqueeze(0) if value.dim() < 3 or rng.random() < 0.5 else value[0:0].sum(0)
@@ -103,21 +99,28 @@ def spoil(name: str, arguments: list[Any], rng: random.Random) -> list[Any]:
         spoiled[place] = value.to(
             rng.choice((torch.int32, torch.float16, torch.bool, torch.complex64))
         )
-    elif name in ("gather_particles", "count_unique", "group_covariance", "resample_systematic"):
-        index = {
-            "gather_particles": 1,
-            "count_unique": 0,
-            "group_covariance": 3,
-            "resample_systematic": 1,
-        }[name]
+    elif places := [k for k, other in enumerate(OPERATORS[name]) if other.limit is not None]:
+        index = rng.choice(places)
         spoiled[index] = arguments[index] + rng.choice((-(2**40), 2**40, 1000, -1000))
     else:
         spoiled[place] = value.to(torch.int16)
     return spoiled
 
 
+def wrong_values(argument: Argument, value: Any) -> list[Any]:
+    """Values that an argument must not have: of a wrong kind, type, shape or range."""
+    if argument.kind == "int":
+        return [-1, 2**32, 1.5, None]
+    wrong = [3, None, value.to(torch.int32), value.to(torch.float16), value.unsqueeze(0)]
+    if argument.has_batch:
+        wrong[-1] = value.reshape(-1)[0]
+    if argument.limit is not None:
+        wrong += [value - 1000, value + 1000]
+    return wrong
+
+
 def is_valid(name: str, arguments: list[Any]) -> bool:
-    """Whether the Python check accepts a call; values are not checked there."""
+    """Whether the Python check accepts a call."""
     try:
         manifest.check_arguments(name, arguments)
     except ValueError:
@@ -132,17 +135,17 @@ def run(calls: int, seed: int) -> dict[str, int]:
     torch.manual_seed(seed)
     counts = dict.fromkeys(("computed", "refused", "wrong but computed", "valid but refused"), 0)
     for _ in range(calls):
-        name = rng.choice(list(OPERATORS))
+        name = rng.choice(ON_CPU)
         arguments = make_call(name, rng)
         if rng.random() < 0.5:
             arguments = spoil(name, arguments, rng)
         valid = is_valid(name, arguments)
         try:
-            getattr(torch.ops.pfbench, name).default(*arguments)
+            getattr(cpp, name)(*arguments)  # its check is that in C++
             counts["computed" if valid else "wrong but computed"] += 1
-        except (RuntimeError, NotImplementedError, TypeError) as error:
-            is_about_values = "must be" in str(error) or "more than" in str(error)
-            counts["refused" if not valid or is_about_values else "valid but refused"] += 1
+        except (RuntimeError, ValueError, TypeError) as error:
+            is_too_large = "more than" in str(error)  # the only check outside of the manifest
+            counts["refused" if not valid or is_too_large else "valid but refused"] += 1
     return counts
 
 

@@ -417,7 +417,7 @@ def test_a_loop_by_hand_scores_vectors(dtype: torch.dtype, points: int) -> None:
 def test_what_no_compiler_improves_runs_eagerly_where_its_loop_does_not_compile(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    def refused(a: Tensor) -> Tensor:
+    def sum_and_squares(terms: Tensor) -> Tensor:
         raise OSError("no C++ compiler")
 
     compiled: list[bool] = []
@@ -430,13 +430,16 @@ def test_what_no_compiler_improves_runs_eagerly_where_its_loop_does_not_compile(
         assert (
             float(
                 compilation.compilable(
-                    separate, operator=refused, keep_in_graph=False, use_torch_compiler=False
-                )(torch.ones(()))
+                    separate,
+                    operator=sum_and_squares,
+                    keep_in_graph=False,
+                    use_torch_compiler=False,
+                )(torch.ones(1, 1))
             )
             == 2.0
         )
     assert compiled == [False]
-    assert "refused does not compile here (OSError). Using eager mode" in caplog.text
+    assert "sum_and_squares does not compile here (OSError). Using eager mode" in caplog.text
 
 
 @compiler

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import random
 import re
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import random_calls
 import torch
 from torch import Tensor
 
@@ -18,7 +20,7 @@ from pfbench.core import affine_map, random_stream
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter import belief
 from pfbench.filter.particle import particle_moments, resampling_schemes
-from pfbench.kernels import cpp, cuda
+from pfbench.kernels import cpp, cuda, manifest
 
 COMPILER = next(
     (found for name in ("c++", "g++", "clang++") if (found := shutil.which(name))), None
@@ -248,26 +250,48 @@ def test_more_states_than_registers_hold_are_left_to_torch() -> None:
         return torch.empty(100, 10, d, dtype=dtype)
 
     def taken(d: int, dtype: torch.dtype) -> bool:
-        return cuda._ACCEPTS["propagate_affine"](None, x(d, dtype), None, None)
+        return cuda._ACCEPTS["propagate_affine"](torch.empty(1, d, d), x(d, dtype), None, None)
 
     assert [taken(d, torch.float32) for d in (32, 33)] == [True, False]
     assert [taken(d, torch.float64) for d in (20, 21)] == [True, False]
     assert not taken(2, torch.float16)
 
 
-def test_parents_of_another_size_are_refused() -> None:
-    x, a = torch.zeros(3, 2, 4), torch.zeros(2, 4, dtype=torch.int64)
-    with pytest.raises(ValueError, match="x must have 2 components, got 3"):
-        cuda.KERNELS["gather_propagate"](
-            torch.zeros(1, 2, 2),
-            x,
-            a,
-            torch.zeros(1, 2, 1),
-            torch.tensor(1),
-            2,
-            torch.tensor(3),
-            torch.arange(2),
-        )
+def test_the_door_on_a_device_checks_types_and_shapes_before_anything_is_launched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Every kernel refuses each spoiled argument as the manifest does, and launches a valid call."""
+    launched = []
+    monkeypatch.setattr(cuda, "_launch", lambda name, *_, **__: launched.append(name))
+    rng = random.Random(5)
+    for name in cuda.KERNELS:
+        valid = random_calls.make_call(name, rng, {axis: 3 for axis in "DRNMWE"})
+        cuda.KERNELS[name](*valid)
+        assert len(launched) == 1, name
+        for place, argument in enumerate(manifest.read_operators()[name]):
+            for value in random_calls.wrong_values(argument, valid[place]):
+                call = [*valid[:place], value, *valid[place + 1 :]]
+                with pytest.raises(ValueError, match=f"^{name}: \\w+ must "):
+                    cuda.KERNELS[name](*call)
+        assert len(launched) == 1, name
+        launched.clear()
+
+
+def test_a_transition_between_states_of_two_sizes_is_left_to_torch() -> None:
+    """The kernel would read beyond the end of its matrices."""
+    phi, x, gain, w = (torch.rand(shape) for shape in ((1, 2, 3), (5, 7, 3), (1, 2, 1), (5, 7, 1)))
+    assert not cuda._ACCEPTS["propagate_affine"](phi, x, gain, w)
+    with pytest.raises(ValueError, match="propagate_affine: phi must be square on CUDA"):
+        cuda.KERNELS["propagate_affine"](phi, x, gain, w)
+
+
+def test_run_numbers_with_gaps_in_memory(loop: Loop) -> None:
+    key = torch.tensor(3), 99, torch.tensor(7)
+    strided = torch.arange(12)[::3]
+    assert torch.equal(
+        loop("philox_uniforms", *key, strided, 2, 3),
+        random_stream._uniforms(*key, strided.contiguous(), 2, 3),
+    )
 
 
 def test_operators_know_the_shape_of_what_they_make() -> None:

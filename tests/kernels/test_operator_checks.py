@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import random_calls
 import torch
 from checkout import TESTS
 
-from pfbench.kernels import cpp, manifest
+from pfbench.core import affine_map, covariance, density, random_stream
+from pfbench.filter import belief
+from pfbench.filter.gaussian import kalman_update, linearisation_rules
+from pfbench.filter.particle import particle_moments, resampling_schemes, weight_update
+from pfbench.job import scoring
+from pfbench.kernels import compilation, cpp, manifest, step_table
+from pfbench.kernels.step_compiler import compile_function
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
 compiler = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler")
@@ -61,38 +70,109 @@ WRONG = {
     "no particles": lambda: cpp.marginal_scores(
         torch.rand(1, 2), torch.rand(1, 0, 2), torch.rand(1, 0)
     ),
-    "unknown step": lambda: cpp.run_steps(4096, 1, [], [], [torch.rand(2, 1)], []),
 }
 
 
 @compiler
 def test_wrong_values_are_refused() -> None:
-    for case, call in WRONG.items():
-        with pytest.raises(RuntimeError) as raised:
+    for call in WRONG.values():
+        with pytest.raises(
+            (ValueError, RuntimeError), match=r"must be from 0|more than|at least 1"
+        ):
             call()
-        assert "must be" in str(raised.value) or "more than" in str(raised.value), case
+
+
+def eager_function(name: str) -> Callable[..., Any]:
+    """The function that pfbench calls for an operator."""
+    return {
+        "philox_normals": random_stream.draw_normals,
+        "philox_uniforms": random_stream.draw_uniforms,
+        "resample_systematic": resampling_schemes._systematic,
+        "gather_particles": belief._gather_components,
+        "log_normal": density._quadratic,
+        "propagate_affine": affine_map._affine,
+        "count_unique": particle_moments.count_distinct_ancestors,
+        "sum_and_squares": weight_update._totals,
+        "weighted_moments": particle_moments._flat_moments,
+        "cholesky_factor": covariance.factor,
+        "kalman_update": kalman_update._updated,
+        "fit_affine": linearisation_rules._fitted,
+        "group_covariance": particle_moments._spread,
+        "squared_mahalanobis": covariance.squared_length,
+        "marginal_scores": scoring._marginal_scores,
+        "energy_score": scoring._energy_score,
+    }[name]
+
+
+def refusal(call: Callable[..., Any], arguments: list[Any]) -> str:
+    """Type and message of the error of a call; an empty text if there is none."""
+    try:
+        call(*arguments)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+@compiler
+@pytest.mark.parametrize("name", random_calls.ON_CPU)
+def test_a_wrong_call_has_one_message_in_eager_mode_and_in_cpp(name: str) -> None:
+    """Each argument of each operator: another kind, type, shape and range; and one too few."""
+    rng = random.Random(name)
+    valid = random_calls.make_call(name, rng, dict.fromkeys("BDRNMWEKPGS", 3))
+    function = eager_function(name)
+    assert refusal(function, valid) == refusal(getattr(cpp, name), valid) == ""
+    calls = [valid[:-1]]
+    for place, argument in enumerate(manifest.read_operators()[name]):
+        for value in random_calls.wrong_values(argument, valid[place]):
+            calls.append([*valid[:place], value, *valid[place + 1 :]])
+    torch.set_num_threads(1)
+    for call in calls:
+        message = refusal(function, call)
+        assert message.startswith(f"ValueError: {name}"), message
+        assert " must " in message
+        assert refusal(getattr(cpp, name), call) == message
+        with compilation.use_compiled():
+            assert refusal(function, call) == message
+
+
+@compiler
+def test_a_step_is_called_by_its_number_only() -> None:
+    """No address goes through Python, and a library without a step is not taken."""
+    for number in (-1, 0, 4096, 2**62, id(X)):
+        with pytest.raises(RuntimeError, match="must be the number of a registered step"):
+            step_table.run_steps(number, [], [], [torch.rand(2, 1)], [])
+    names = [b"", b"no such file", str(Path(torch.__file__).parent / "lib/libc10.so").encode()]
+    for name in names:
+        with pytest.raises(RuntimeError, match="library must be a step of torch's compiler"):
+            step_table.register_step(torch.tensor(list(name), dtype=torch.uint8), 1, [])
+    with pytest.raises(RuntimeError, match="must be a path as bytes"):
+        step_table.register_step(torch.zeros(4), 1, [])
 
 
 @compiler
 def test_a_compiled_step_takes_the_arguments_that_it_was_compiled_for() -> None:
-    """The address is not called: the check comes first."""
     example = [torch.rand(3, 2), torch.rand(4, dtype=torch.float64)]
-    cpp.register_step(4096, 1, example)
+    _, entry = compile_function(lambda a, b: [a + 1.0, b * 2.0], example)
+    assert entry is not None
+    number, constants = entry
+    good = [torch.rand(1, 3, 2), torch.rand(1, 4).double()]
+    first, second = step_table.run_steps(number, constants, [], good, [])
+    assert torch.equal(first, good[0][0] + 1.0)
+    assert torch.equal(second, good[1][0] * 2.0)
     wrong = {
-        "outputs": (2, [torch.rand(1, 3, 2), torch.rand(1, 4).double()]),
-        "arguments": (1, [torch.rand(1, 3, 2)]),
-        "argument 0": (1, [torch.rand(1, 2, 3), torch.rand(1, 4).double()]),
-        "argument 1": (1, [torch.rand(1, 3, 2), torch.rand(1, 4)]),
-        "one row": (1, [torch.rand(1, 3, 2), torch.rand(2, 4).double()]),
+        "arguments": [good[0]],
+        "argument 0": [torch.rand(1, 2, 3), good[1]],
+        "argument 1": [good[0], torch.rand(1, 4)],
+        "one row": [good[0], torch.rand(2, 4).double()],
+        "strides": [torch.rand(1, 2, 3).permute(0, 2, 1), good[1]],
     }
-    for words, (outputs, inputs) in wrong.items():
+    for words, inputs in wrong.items():
         with pytest.raises(RuntimeError, match=words):
-            cpp.run_steps(4096, outputs, [], [], inputs, [])
+            step_table.run_steps(number, constants, [], inputs, [])
     with pytest.raises(RuntimeError, match="inputs must have at least one"):
-        cpp.run_steps(4096, 1, example, [], [], [])
-    strided = torch.rand(1, 2, 3).permute(0, 2, 1)
-    with pytest.raises(RuntimeError, match="strides"):
-        cpp.run_steps(4096, 1, [], [], [strided, torch.rand(1, 4).double()], [])
+        step_table.run_steps(number, constants, example, [], [])
+    with pytest.raises(RuntimeError, match="state must have at most 2 tensors"):
+        step_table.run_steps(number, constants, [*example, example[0]], [good[0]], [])
 
 
 def test_the_python_check_names_the_argument() -> None:
@@ -108,7 +188,7 @@ def test_the_python_check_names_the_argument() -> None:
             "resample_systematic",
             [W, torch.ones(4), ONE],
         ),
-        r"quarters must be a whole number from 0 on, got -1": (
+        r"quarters must be a whole number from 0 to 2\^32 - 1, got -1": (
             "philox_normals",
             [torch.tensor(1), 1, torch.tensor(1), torch.arange(2), 1, -1],
         ),

@@ -11,12 +11,13 @@ import pandas as pd
 import pymap3d
 import pytest
 import torch
+from ephemeris_cases import EPHEMERIDES, as_rinex, later_by_two_hours
 from recorded_data import DATA, recorded
 from torch import Tensor
 
 from pfbench.nav import earth
 from pfbench.nav.gnss.broadcast_orbits import BroadcastConstellation
-from pfbench.nav.gnss.ephemeris import GM_GPS, WEEK, read_rinex
+from pfbench.nav.gnss.ephemeris import GM_GPS
 from pfbench.nav.gnss.orbits import (
     GPS_OMEGA,
     LIGHT,
@@ -27,21 +28,11 @@ from pfbench.nav.gnss.orbits import (
     receive_signals,
     sagnac,
 )
+from pfbench.nav.gnss.rinex import WEEK, read_rinex
 
 TIMES = torch.arange(0.0, 7200.0, 240.0, dtype=torch.float64) + 13.0
 NOON = (datetime(2016, 6, 6, 12) - datetime(1980, 1, 6)).total_seconds()
 
-# one eccentric and one nearly circular satellite, every parameter at work
-EPHEMERIDES = pd.DataFrame(
-    {
-        "sys": ["G", "E"], "prn": [7, 14], "week": [1900, 1900], "toe": [129600.0, 129600.0], "toc": [129584.0, 129600.0],
-        "sqrtA": [5153.7, 5289.3], "e": [0.0123, 0.163], "i0": [0.96, 0.86], "Omega0": [-2.4, 0.8], "omega": [0.47, 2.95],
-        "M0": [2.37, 0.12], "deltan": [4.4e-9, 3.9e-9], "Omegadot": [-7.8e-9, -6.1e-9], "idot": [6.2e-10, -4.0e-10],
-        "cuc": [9.1e-6, 2.0e-6], "cus": [1.1e-5, -3.0e-6], "crc": [173.8, 293.9], "crs": [20.1, 33.7],
-        "cic": [-1.8e-7, 2.0e-6], "cis": [-8.0e-8, 2.1e-6], "af0": [2.3e-5, 4.8e-4], "af1": [1.3e-12, 2.0e-12],
-        "af2": [1e-18, 0.0], "tgd": [5.1e-9, -3.0e-9], "ttx": [126000.0, 126000.0],
-    }
-)  # fmt: skip
 HARMONICS, DRIFTS = ("cuc", "cus", "crc", "crs", "cic", "cis"), ("deltan", "Omegadot", "idot")
 KEPLER = EPHEMERIDES.assign(**dict.fromkeys(HARMONICS + DRIFTS, 0.0))
 
@@ -220,10 +211,9 @@ def test_harmonic_corrections_move_along_across_and_out(tmp_path: Path) -> None:
 
 
 def test_the_nearest_ephemeris_is_used_and_none_beyond_its_validity(tmp_path: Path) -> None:
-    later = EPHEMERIDES.assign(
-        toe=EPHEMERIDES["toe"] + 7200.0, toc=EPHEMERIDES["toc"] + 7200.0, af0=1.0
-    )
-    both = written(tmp_path, pd.concat([later, EPHEMERIDES.iloc[[0]]]))
+    plain = EPHEMERIDES.assign(af0=0.0, af1=0.0, af2=0.0)
+    later = later_by_two_hours(plain).assign(af0=5e-8)
+    both = written(tmp_path, pd.concat([later, plain.iloc[[0]]]))
     assert both.names == ("E14", "G07")
     times = torch.tensor([-7201.0, -7199.0, 3599.0, 3601.0, 14399.0, 14401.0], dtype=torch.float64)
     offset, _ = both.clock(times)
@@ -233,17 +223,17 @@ def test_the_nearest_ephemeris_is_used_and_none_beyond_its_validity(tmp_path: Pa
     known = torch.tensor(
         [[False, False], [False, True], [True, True], [True, True], [True, True], [False, False]]
     )
-    assert torch.equal(offset > 0.5, late)
+    assert torch.equal(offset > 2e-8, late)
     assert torch.equal(~torch.isnan(offset), known)
     for field in (*both.at(times), both.relativity(times), both.group_delay(times)):
         assert torch.equal(~torch.isnan(field.reshape(6, 2, -1)[..., 0]), known)
 
 
 def test_a_second_upload_replaces_the_first_and_the_unhealthy_are_left_out(tmp_path: Path) -> None:
-    again = EPHEMERIDES.assign(ttx=EPHEMERIDES["ttx"] + 60.0, af0=0.5)
+    again = EPHEMERIDES.assign(ttx=EPHEMERIDES["ttx"] + 60.0, af0=EPHEMERIDES["af0"] + 5e-8)
     for order in ([EPHEMERIDES, again], [again, EPHEMERIDES]):
         offset, _ = written(tmp_path, pd.concat(order)).clock(torch.zeros(1, dtype=torch.float64))
-        assert torch.allclose(offset, exact(0.5), atol=1e-9)
+        assert torch.allclose(offset, exact([[4.8e-4, 2.3e-5]]) + 5e-8, atol=1e-9)
     assert written(tmp_path, EPHEMERIDES.assign(health=[1.0, 0.0])).names == ("E14",)
 
 
@@ -386,62 +376,9 @@ def test_faulty_settings_and_files_say_what_to_do(tmp_path: Path) -> None:
         _ = written(tmp_path, EPHEMERIDES.drop(columns=["sqrtA", "cic"])).names
 
 
-FIRST = (
-    "af0",
-    "af1",
-    "af2",
-    "iode",
-    "crs",
-    "deltan",
-    "M0",
-    "cuc",
-    "e",
-    "cus",
-    "sqrtA",
-    "toe",
-    "cic",
-    "Omega0",
-    "cis",
-    "i0",
-)
-ORDER = (*FIRST, "crc", "omega", "Omegadot", "idot", "codes", "week", "l2p", "ura", "health")
-
-
-def rinex(version: int) -> str:
-    """The same ephemerides as a RINEX file, those of Galileo as I/NAV and, with a wrong clock, as F/NAV."""
-    indent = version + 1
-    kind = "N: GNSS NAV DATA    M: MIXED" if version == 3 else "N: GPS NAV DATA"
-    lines = [f"{version:6d}.00           {kind:<40}RINEX VERSION / TYPE", f"{'':60}END OF HEADER"]
-    for row in EPHEMERIDES.assign(iode=1.0, codes=5.0, l2p=0.0, ura=2.0, health=0.0).to_dict(
-        "records"
-    ):
-        if version == 2 and row["sys"] == "E":
-            continue
-        last = [row["tgd"], 3.0] if row["sys"] == "G" else [9e-9, row["tgd"]]
-        for codes in (5.0, 258.0) if row["sys"] == "E" else (1.0,):
-            row = {**row, "codes": codes, "af0": row["af0"] + (codes == 258.0)}
-            head = (
-                f"{row['sys']}{row['prn']:02d} 2016 06 06"
-                if version == 3
-                else f"{row['prn']:2d} 16  6  6"
-            )
-            date = (
-                "11 59 44"
-                if row["sys"] == "G" and version == 3
-                else "12 00 00"
-                if version == 3
-                else "11 59 44.0"
-            )
-            numbers = [*(row[name] for name in ORDER), *last, row["ttx"], 4.0]
-            text = [f"{value:19.12E}".replace("E", "D") for value in numbers]
-            lines.append(f"{head} {date}" + "".join(text[:3]))
-            lines += [" " * indent + "".join(text[k : k + 4]) for k in range(3, len(text), 4)]
-    return "\n".join(lines) + "\n"
-
-
 @pytest.mark.parametrize("version", [2, 3])
 def test_rinex_files_are_read(tmp_path: Path, version: int) -> None:
-    (tmp_path / "nav.rnx").write_text(rinex(version))
+    (tmp_path / "nav.rnx").write_text(as_rinex(version))
     read = BroadcastConstellation(str(tmp_path), "nav.rnx", NOON)
     plain = written(tmp_path)
     some = slice(0, 2) if version == 3 else slice(1, 2)
@@ -457,13 +394,13 @@ def test_rinex_files_that_are_none_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "nav.rnx"
     for text, message in (
         ("", "must be a RINEX 2 or 3"),
-        (rinex(2).replace("N: GPS", "O: GPS"), "must be a RINEX 2 or 3"),
+        (as_rinex(2).replace("N: GPS", "O: GPS"), "must be a RINEX 2 or 3"),
         (
-            rinex(2).replace("9.600000000000D-01", "9.6x000000000D-01"),
-            r"line 3, .*could not convert",
+            as_rinex(2).replace("9.600000000000D-01", "9.6x000000000D-01"),
+            r"line 3, .*expected a number like",
         ),
-        ("\n".join(rinex(3).splitlines()[:8]), r"line 3, .*not a complete record"),
-        ("\n".join(rinex(2).splitlines()[:2]), "must contain ephemerides of GPS or Galileo"),
+        ("\n".join(as_rinex(3).splitlines()[:8]), r"line 3, .*not a complete record"),
+        ("\n".join(as_rinex(2).splitlines()[:2]), "must contain ephemerides of GPS or Galileo"),
     ):
         file.write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -487,8 +424,9 @@ def test_the_two_files_of_one_day_are_one() -> None:
     radius = text.at(times)[0].norm(dim=-1)
     assert 25.9e6 < float(radius.min()) < float(radius.max()) < 27.3e6  # NaN would fail
     assert [note[:45] for note in text.notes] == [
-        "gnss_orbits/brdc1580.16n: an ephemeris of G14"
-    ]  # 42 159 km, for two hours
+        "gnss_orbits/brdc1580.16n: an ephemeris of G14",  # 42 159 km, for two hours
+        "gnss_orbits/brdc1580.16n: 14 ephemerides are ",  # unhealthy: G04
+    ]
 
 
 @recorded

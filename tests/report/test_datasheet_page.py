@@ -146,7 +146,7 @@ def test_an_old_command_names_the_new_one(tmp_path: Path, words: tuple[str, ...]
 def test_a_study_with_a_scenario_is_still_a_study(tmp_path: Path) -> None:
     said = pfbench("report", "study=none", *WALK, home=tmp_path)
     assert said.code == 1
-    assert "No results in" in said.err
+    assert "study must be a study with results, got none" in said.err
 
 
 @pytest.mark.slow

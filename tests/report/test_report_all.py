@@ -96,6 +96,7 @@ def test_a_study_is_shown_as_its_experiment_says(made: dict[str, Any], tmp_path:
     assert (
         pfbench("report", "study=recorded_car", "report.start_time_s=1.0", home=tmp_path).code == 0
     )
+    there(tmp_path, "results/my_own/a.npz")
     assert pfbench("report", "study=my_own", home=tmp_path).code == 0
     assert made["my_own"].start_time_s == 0.0
     assert made["recorded_car"].start_time_s == 1.0  # the words come last

@@ -18,24 +18,25 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from pfbench.report import baselines, cost, summary
+from pfbench.report import cost, summary
 from pfbench.report.cost import ParetoFront
 from pfbench.report.plots import (
     axis_ticks,
     comparison_plots,
     condition_figures,
     cost_plots,
+    decision_plots,
     filter_plots,
     label_placement,
     plotting,
-    rank_plots,
     summary_figures,
 )
 from pfbench.report.plots.figure_files import FigureSpec, write_figure
 from pfbench.results import store
-from pfbench.results.comparison import condition_blocks, rankings
+from pfbench.results.comparison import baselines, condition_blocks
 from pfbench.results.comparison.pairwise_tests import compare_pairs
 from pfbench.results.conditions import load_conditions
+from pfbench.results.decisions import planned_pairs, tidy_table
 from pfbench.results.frame import to_long_rows
 
 BASES = (
@@ -73,6 +74,7 @@ def rows(worlds: int, labels: tuple[str, ...], runs: int = 8) -> pd.DataFrame:
             parts.append(pd.DataFrame({
                 "scenario": f"passive_{world}", "noise": noise, "model": "m", "label": label, "group": "position",
                 "component": "norm", "unit": "m", "metric": "rmse", "seed": 1, "run": np.arange(runs), "lost": False,
+                "family": f"passive_{world}", "keeps_track": True,
                 "value": 1.1**k * rng.lognormal(0, 0.1, runs),
             }))  # fmt: skip
     return pd.concat(parts, ignore_index=True)
@@ -108,19 +110,16 @@ def test_letters_of_figures_of_many_filters_can_be_read_and_are_not_cut(
         for k, noise in product(range(worlds), table.noise.unique())
     }
     some = table[table.label.isin([*BASES, "dmc_reconstructed_printed"])]
-    own, decided, name = summary.select_main_rows(some, compare_pairs(some), of)
+    _, decided, name = summary.select_main_rows(some, compare_pairs(some), of)
     source = condition_blocks.ranking_blocks(table, name)
-    one, pairs = (
-        rankings.rank_filters(table, name),
-        baselines.compare_with_baselines(condition_blocks.ranking_blocks(own, name), decided, 0.05),
-    )
+    pairs = baselines.list_planned_pairs(sorted(set(table.label)))
     assert len(pairs) > 4
-    style = plotting.mute_others(plotting.line_styles(sorted(set(table.label))), BASES[:3])
+    planned = planned_pairs.decide_planned_pairs(tidy_table.tidy_runs(table), pairs)
+    errors = [d for d in planned if d.metric == "error"]
     made = {
-        "map": lambda: summary_figures.plot_ratio_map(one, source),
-        "proposed": lambda: summary_figures.plot_baseline_ratios(pairs),
-        "matrix": lambda: comparison_plots.plot_matrix(decided, one),
-        "rank": lambda: rank_plots.plot_critical_difference(one, style),
+        "map": lambda: summary_figures.plot_ratio_map(source),
+        "planned": lambda: decision_plots.plot_planned_pairs(errors, 0.05),
+        "matrix": lambda: comparison_plots.plot_matrix(decided),
         "forest": lambda: comparison_plots.plot_forest(
             [v for v in decided if v.noise == "student"][:12]
         ),
@@ -176,9 +175,7 @@ def test_a_track_is_shown_where_somebody_estimated_it(tmp_path: Path) -> None:
 def test_numbers_of_a_matrix_stay_in_their_squares(tmp_path: Path) -> None:
     table = rows(3, (*BASES, "dmc_reconstructed_printed"), runs=16)
     figure = drawn(
-        lambda: comparison_plots.plot_matrix(
-            compare_pairs(table), rankings.rank_filters(table, "position")
-        ),
+        lambda: comparison_plots.plot_matrix(compare_pairs(table)),
         tmp_path,
     )
     (axis,) = figure.axes

@@ -22,8 +22,8 @@ def results(tmp_path_factory):
 def test_one_row_per_run_and_figure(results):
     table = frame.load_frame("demo", results)
     assert list(table.columns) == [
-        "study", "key", "scenario", "noise", "model", "filter", "label", "particles", "seed", "run", "lost",
-        "group", "component", "unit", "metric", "value",
+        "study", "key", "scenario", "family", "noise", "model", "filter", "label", "particles", "seed", "run", "lost",
+        "keeps_track", "group", "component", "unit", "metric", "value",
     ]  # fmt: skip
     assert not table.duplicated(["key", "run", "group", "component", "metric"]).any()
     assert (table.groupby(["label", "group", "component", "metric"]).size() == 10).all()

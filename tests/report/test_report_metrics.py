@@ -83,27 +83,31 @@ def test_equivalence_of_many_pairs_is_that_of_each():
     assert signed_rank.equivalence_p_values(d, 0.05).tolist() == each
 
 
-def test_a_run_is_diverged_if_its_last_error_exceeds_the_threshold():
-    error = np.zeros((5, 6, 2))
-    error[0, 2] = 100.0  # returned
-    error[1, 3:] = 100.0
-    error[2, 3:5], error[2, 5] = 100.0, np.nan  # the last step has no truth
+def test_a_run_is_diverged_if_its_error_exceeds_the_threshold_in_a_tenth_of_the_steps_or_at_the_end():
+    error = np.zeros((7, 21, 2))
+    error[0, 2:4] = 100.0  # 2 of 21 steps
+    error[1, -1] = 100.0
+    error[2, -2], error[2, -1] = 100.0, np.nan  # the last step has no truth
     error[3] = np.nan
     error[4] = 100.0
-    lost = np.array([False] * 4 + [True])
-    assert status.is_diverged(error, lost, 50.0).tolist() == [False, True, True, False, False]
+    error[5, 2:5] = 100.0  # 3 of 21 steps
+    error[6, 2:4], error[6, 4:12] = 100.0, np.nan  # 2 of 13 steps with truth
+    lost = np.arange(7) == 4
+    diverged = status.is_diverged(error, lost, 50.0)
+    assert diverged.tolist() == [False, True, True, False, False, True, True]
 
 
 def test_a_scenario_without_a_threshold_has_no_diverged_runs_but_a_dash(results):
     (condition,) = conditions.load_conditions("demo", results)
     result = condition.jobs[0].load()
-    assert status.count_statuses(result).diverged is None
+    assert status.count_statuses(result.data, result.meta).diverged is None
     assert tables.overview_table({"ekf": result})["diverged runs"].tolist() == ["–"]
     arrays = {**result.data, "error": result.data["error"].copy()}
     arrays["error"][:3, -4:, 6:] = 1e4
-    config = {**result.meta["config"], "scenario": {"divergence_threshold_m": 1e3}}
+    config = {**result.meta["config"], "scenario": {"paper": {"divergence_threshold": 1e3}}}
     far = store.JobResult({**result.meta, "config": config}, arrays)
-    assert status.count_statuses(far) == (0, 3, 0, 8)
+    count = status.count_statuses(far.data, far.meta)
+    assert (count.lost, count.diverged, count.runs) == (0, 3, 8)
     assert tables.overview_table({"ekf": far})["diverged runs"].tolist() == ["3"]
 
 

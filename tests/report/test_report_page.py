@@ -55,7 +55,7 @@ def test_every_figure_and_table_is_there_and_on_the_page(report):
     kinds = {name.removeprefix("flight_surge_ins_gnss_") for name in names}
     assert kinds == {
         "track", "error_attitude", "error_velocity", "error_position", "rmse", "front", "nees", "cost", "ess", "calibration",
-        "forest_attitude", "forest_velocity", "forest_position",
+        "forest_attitude", "forest_velocity", "forest_position", "decisions_planned",
         "spread_ekf", "spread_ukf", "spread_sir", "spread_cofm_amssrcpf",
     }  # fmt: skip
     assert {path.suffix for path in (report / "figures").iterdir()} == {".svg", ".png"}
@@ -78,7 +78,7 @@ def test_every_figure_and_table_is_there_and_on_the_page(report):
         assert path.with_suffix(".tex").read_text().startswith(r"\begin{tabular}")
         assert f"| {table.columns[1]}" in text
     own = [
-        path for path in (report / "tables").glob("*.csv") if not path.name.startswith("across_")
+        path for path in (report / "tables").glob("*.csv") if not path.name.startswith("decisions_")
     ]
     assert len(own) == 10  # overview, and three for each of three groups
 
@@ -143,13 +143,21 @@ def test_same_results_same_bytes_whatever_the_order_of_files(results, tmp_path, 
     assert everything(first) == everything(second)
 
 
-def test_a_new_report_leaves_no_figure_of_the_old_one(results, tmp_path):
-    (tmp_path / "demo" / "figures").mkdir(parents=True)
-    (tmp_path / "demo" / "figures" / "gone_cell.svg").write_text("old")
-    (tmp_path / "demo" / "notes.txt").write_text("mine")
+def test_a_new_report_removes_the_figures_of_the_old_one_alone(results, tmp_path, caplog):
+    folder = tmp_path / "demo"
+    both = replace(QUICK, groups=("position", "velocity"))
+    page.write_report("demo", results, tmp_path, both)
+    old = {path.name for path in (folder / "figures").iterdir()}
+    mine = [folder / "figures" / "photo.png", folder / "tables" / "mine.csv", folder / "notes.txt"]
+    for path in mine:
+        path.write_text("mine")
     page.write_report("demo", results, tmp_path, QUICK)
-    assert not (tmp_path / "demo" / "figures" / "gone_cell.svg").exists()
-    assert (tmp_path / "demo" / "notes.txt").read_text() == "mine"
+    new = {path.name for path in (folder / "figures").iterdir()}
+    assert {name for name in old - new if "velocity" in name}
+    assert not {name for name in new if "velocity" in name}
+    assert all(path.read_text() == "mine" for path in mine)
+    assert "figures/photo.png, notes.txt, tables/mine.csv" in caplog.text
+    assert {path.name for path in folder.rglob("*.kept")} == set()
 
 
 def test_mixed_versions_are_refused_and_named_when_allowed(tmp_path):
@@ -259,15 +267,6 @@ def test_options_are_checked():
         page.ReportOptions(figure_formats=("gif",))
 
 
-def test_why_no_test_across_cells_is_made_is_said_once(report):
-    start = "Not tested across conditions: "
-    for name in ("report.md", "index.html"):
-        (line,) = (line for line in (report / name).read_text().splitlines() if start in line)
-        said = line.partition(start)[2].partition(". Reason:")[0]
-        assert sorted(said.split(", ")) == ["attitude", "position", "velocity"]
-        assert "share 1 condition" in line
-
-
 def test_unknown_group_is_refused(results, tmp_path):
     message = (
         r"report\.groups must be groups .* got height\. Choose from attitude, velocity, position"
@@ -281,7 +280,7 @@ def test_text_of_a_stranger_is_not_markup(tmp_path):
         synthetic.write(tmp_path / "demo", synthetic.Method(name, float(size)), runs=20, steps=20)
     made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     assert "<b>sir" not in made.read_text()
-    assert r"<b>sir</b>\|x" in (made.parent / "report.md").read_text()
+    assert r"&lt;b>sir&lt;/b>\|x" in (made.parent / "report.md").read_text()
 
 
 @pytest.mark.parametrize(

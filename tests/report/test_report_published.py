@@ -11,26 +11,12 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.noise.white import NominalNoise
-from pfbench.results.statistics import effect_sizes, rank_tests, signed_rank
+from pfbench.results.statistics import effect_sizes, signed_rank
 from pfbench.scenario.model_simulation import ModelSimulation
 
-# R 4, ?friedman.test: 22 players round first base in three ways [Hollander, Wolfe 1973, p. 140]
-ROUNDING = np.array([
-    [5.40, 5.50, 5.55], [5.85, 5.70, 5.75], [5.20, 5.60, 5.50], [5.55, 5.50, 5.40], [5.90, 5.85, 5.70], [5.45, 5.55, 5.60],
-    [5.40, 5.40, 5.35], [5.45, 5.50, 5.35], [5.25, 5.15, 5.00], [5.85, 5.80, 5.70], [5.25, 5.20, 5.10], [5.65, 5.55, 5.45],
-    [5.60, 5.35, 5.45], [5.05, 5.00, 4.95], [5.50, 5.50, 5.40], [5.45, 5.55, 5.50], [5.55, 5.55, 5.35], [5.45, 5.50, 5.55],
-    [5.50, 5.45, 5.25], [5.65, 5.60, 5.40], [5.70, 5.65, 5.55], [6.30, 6.30, 6.25],
-])  # fmt: skip
 # R 4, ?wilcox.test: depression of nine patients at two visits [Hollander, Wolfe 1973, p. 29]
 FIRST = np.array([1.83, 0.50, 1.62, 2.48, 1.68, 1.88, 1.55, 3.06, 1.30])
 SECOND = np.array([0.878, 0.647, 0.598, 2.05, 1.06, 1.29, 1.06, 3.14, 1.29])
-
-
-def test_friedmans_test_is_that_of_r() -> None:
-    """friedman.test(RoundingTimes): Friedman chi-squared = 11.143, df = 2, p-value = 0.003805. There are ties."""
-    found = rank_tests.friedman(rank_tests.rank_within_blocks(ROUNDING))
-    assert found.chi2 == pytest.approx(11.143, abs=5e-4)
-    assert found.p == pytest.approx(0.003805, abs=5e-7)
 
 
 def test_wilcoxons_test_is_that_of_r() -> None:

@@ -10,18 +10,14 @@ import pytest
 import synthetic_results as synthetic
 from matplotlib.figure import Figure
 
-from pfbench.report import across_section, condition_section, cost, options, page, writers
+from pfbench.report import condition_section, cost, options, page, writers
 from pfbench.report.plots import comparison_figures
 from pfbench.report.plots.plotting import line_styles
-from pfbench.report.table_formats import format_number
 from pfbench.results import frame, store
-from pfbench.results.comparison import (
-    condition_blocks,
-    lost_run_sensitivity,
-    pairwise_results,
-    pairwise_tests,
-    rankings,
-)
+from pfbench.results.comparison import condition_blocks, pairwise_tests
+from pfbench.results.decisions.comparisons import TRACK
+from pfbench.results.decisions.filter_sets import FAMILY_ALL
+from pfbench.results.decisions.planned_pairs import FAMILY_1
 
 METHODS = (
     synthetic.Method("ekf", 2.0, 0.7, None, 0.4),
@@ -70,25 +66,23 @@ def report(results, tmp_path_factory):
 @pytest.mark.parametrize("name", ["index.html", "report.md"])
 def test_the_text_is_that_of_the_verdicts(report, name):
     text = (report / name).read_text()
-    (one,) = json.loads((report / "across.json").read_text())
-    assert len(one["cells"]) == 6
-    assert one["filters"] == ["apf", "ekf", "sir"]
-    assert (
-        f"Iman-Davenport F {format_number(float(one['f']))}, p = {format_number(one['p_f'])}"
-        in text
-    )
-    shown = [p for p in one["pairs"] if p["winner"] != pairwise_results.INCONCLUSIVE]
-    assert f"{len(shown)} of 3 pairs differ significantly" in text
-    beaten = {p["a"] if p["winner"] == p["b"] else p["b"] for p in shown}
-    assert f"Top group: {', '.join(f for f in one['filters'] if f not in beaten)}." in text
+    records = json.loads((report / "decisions.json").read_text())
+    planned = [r for r in records if r["family"] == FAMILY_1 and r["metric"] != TRACK]
+    assert {(r["a"], r["b"]) for r in planned} == {("apf", "ekf"), ("apf", "sir"), ("ekf", "sir")}
+    words = {q: [r["pair_word"] for r in planned if r["question"] == q] for q in "ab"}
+    count = sum(word in ("better", "worse") for word in words["a"])
+    assert count > 0
+    assert f"3 planned pairs: {count} decided in these worlds, 0 in a new world." in text
+    assert set(words["b"]) == {"not tested"}  # six regimes of one world are one world
+    every = [r for r in records if r["family"] == FAMILY_ALL and r["question"] == "a"]
+    worse = {r["b"] if r["word"] == "better" else r["a"]
+             for r in every if r["word"] in ("better", "worse")}  # fmt: skip
+    top = [label for label in ("apf", "ekf", "sir") if label not in worse]
+    assert f"Shown worse than no other in these worlds: {', '.join(top)}." in text
     decided = json.loads((report / "verdicts.json").read_text())
     assert {v["page"] for v in decided} == {18}
     many = sum(v["p_page"] <= 0.05 for v in decided)
     assert f"With correction over all 18 comparisons of the report, {many} are." in text
-    assert (
-        "under another rule (pairs with a lost run left out or largest finite error of the condition)"
-        in text
-    )
     assert "@software{pfbench," in text
     assert "year    = {2026}" in text
     runs = sorted(int(v["needed"]) for v in decided if v["noise"] == "surge")
@@ -110,7 +104,8 @@ def test_every_table_names_its_budget(report):
 def test_the_page_carries_its_figures_and_its_filter(report):
     drawn = json.loads((report / "drawn.json").read_text())
     assert {
-        "across_critical_difference_position",
+        "decisions_planned",
+        "across_map_position",
         "across_matrix_position",
         "across_profile_position",
     } <= set(drawn)
@@ -125,19 +120,12 @@ def test_the_page_carries_its_figures_and_its_filter(report):
 def test_pictures_across_cells_show_what_was_decided(results):
     table = frame.load_frame("many", results)
     decided = pairwise_tests.compare_pairs(table[table.group == "position"])
-    one, sources = (
-        rankings.rank_filters(table, "position"),
-        condition_blocks.ranking_blocks(table, "position"),
-    )
+    blocks = condition_blocks.ranking_blocks(table, "position")
     style = line_styles(sorted(set(table.label)))
-    found = {
-        d.name: d.make() for d in comparison_figures.study_figures([(one, sources)], decided, style)
-    }
+    found = {d.name: d.make() for d in comparison_figures.study_figures(blocks, decided, style)}
     assert all(
         isinstance(figure, Figure) and figure.get_figwidth() <= 3.6 for figure in found.values()
     )
-    ranks = {text.get_text() for text in found["critical_difference_position"].axes[0].texts}
-    assert all(any(f"{rank:.2f}" in text for text in ranks) for rank in one.ranks)
     axis = found["matrix_position"].axes[0]
     order = [tick.get_text() for tick in axis.get_yticklabels()]
     for text in axis.texts:
@@ -212,31 +200,6 @@ def test_a_budget_that_was_not_kept_is_not_claimed():
         cost.format_budget([job(1, budget="fair")])
 
 
-def test_rules_for_lost_runs_that_decide_otherwise_are_listed():
-    runs = np.arange(20)
-    a, b = np.linspace(1, 1.2, 20), np.linspace(1.3, 1.6, 20)
-    a[:14] = np.inf  # better where it survives, which is not often
-    rows = pd.concat([
-        pd.DataFrame({"label": label, "run": runs, "value": value, "lost": np.isinf(value)})
-        for label, value in (("a", a), ("b", b))
-    ])  # fmt: skip
-    rows = rows.assign(
-        scenario="s",
-        noise="n",
-        model="m",
-        seed=1,
-        group="position",
-        component="norm",
-        metric="rmse",
-        unit="m",
-    )
-    (found,) = lost_run_sensitivity.lost_rule_sensitivity(rows)
-    assert found.winners == ("b", "a", pairwise_results.INCONCLUSIVE)
-    assert lost_run_sensitivity.lost_rule_sensitivity(rows[~rows.lost]) == []
-    (verdict,) = pairwise_tests.compare_pairs(rows)
-    assert verdict.winner == "b"
-
-
 def test_a_study_too_large_to_show_all_says_what_it_shows(results, tmp_path):
     """As one of 33 filters in 28 cells, at the size of this one: limits are lowered."""
     drawn = []
@@ -254,7 +217,7 @@ def test_a_study_too_large_to_show_all_says_what_it_shows(results, tmp_path):
 
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
-            (writers, "render_figure", stub), (across_section, "PAIRS", 2), (condition_section, "PAIRS", 2),
+            (writers, "render_figure", stub), (condition_section, "PAIRS", 2),
             (page, "_ROWS", 30), (writers, "_MANY", 30), (options, "_NAMED", 1), (options, "_PLENTY", 17),
         ):  # fmt: skip
             patch.setattr(module, name, value)

@@ -225,6 +225,23 @@ def test_save_refuses_what_readers_could_not_use(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_repeated_run_numbers_are_refused(tmp_path):
+    numbers, path = np.arange(R), tmp_path / f"{meta()['key']}.npz"
+    store.write_result(path, meta(), {**arrays(), "run": numbers})
+    assert np.array_equal(store.read_result(path).data["run"], numbers)
+    numbers[1] = numbers[0]
+    with pytest.raises(ValueError, match=r"run must have distinct run numbers, got 0 2 times"):
+        store.write_result(path, meta(), {**arrays(), "run": numbers})
+    with pytest.MonkeyPatch.context() as patch:  # a file that another program wrote
+        patch.setattr(store, "check_arrays", lambda *_: None)
+        store.write_result(path, meta(), {**arrays(), "run": numbers})
+    with pytest.raises(ValueError, match="run must have distinct run numbers"):
+        store.read_result(path)
+    for first in (-1, 2**32 - R + 1, 0.5):
+        with pytest.raises(ValueError, match="first_run must be a whole number from 0"):
+            store.write_result(tmp_path / "b.npz", {**meta(), "first_run": first}, arrays())
+
+
 def test_failure_is_noted_until_a_success(tmp_path):
     path = tmp_path / "a.npz"
     try:

@@ -50,7 +50,15 @@ class PathStatistics(PathHistory):
         self, model: StateSpaceModel, belief: ParticleBelief, mean: Tensor, covariance: Tensor
     ) -> ParticleBelief:
         """Start with the information and score of the initial distribution."""
-        information = torch.cholesky_inverse(factor(covariance)[0])
+        root, ok = factor(covariance)
+        if not bool((ok & (root.diagonal(dim1=-2, dim2=-1) > 0.0).all(-1)).all()):
+            variance = covariance[0].diagonal().tolist()
+            raise ValueError(
+                "filter.moves: the initial covariance must be positive definite for kernels that use "
+                f"statistics of the path, got variances {variance} of the particles. Use "
+                "NoiseFlowKernel, or a larger initial standard deviation or number of particles."
+            )
+        information = torch.cholesky_inverse(root)
         score = -model.chart.subtract(belief.x, mean.unsqueeze(1)) @ information
         return belief._replace(window={"score": score, "information": information.unsqueeze(1)})
 

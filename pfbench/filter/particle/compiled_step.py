@@ -19,7 +19,7 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.particle_moments import StepSummary
-from pfbench.kernels import compilation, cpp
+from pfbench.kernels import compilation, step_table
 from pfbench.kernels.step_compiler import (
     NativeEntry,
     TensorFunction,
@@ -85,8 +85,8 @@ class CompiledStep:
         results: list[list[Tensor]] = []
         if self.entry is not None:
             width = carried + 3 + len(self.trace)
-            flat = cpp.run_steps(
-                self.entry.address, width, self.entry.constants, state, inputs, shared
+            flat = step_table.run_steps(
+                self.entry.step, self.entry.constants, state, inputs, shared
             )
             results = [flat[k : k + width] for k in range(0, len(flat), width)]
         else:

@@ -60,7 +60,7 @@ class FlooredWeightUpdate(WeightUpdate):
 
     The smallest double is e^-745. A particle 38 standard deviations from the measurement gets
     weight 0, so only the floor remains. If all particles are that far away, all weights become
-    equal.
+    equal. A run is lost if not even the logarithms distinguish its particles, see `is_resolved`.
 
     Attributes:
         weight_floor: Number added to each particle's weight before normalisation.
@@ -83,11 +83,21 @@ class FlooredWeightUpdate(WeightUpdate):
     def __call__(
         self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
     ) -> Tensor:
-        likelihood = torch.exp(
-            (model.log_likelihood(record.y, x, record.u) + log_ratio).double()
-        ).nan_to_num(nan=0.0)
+        log_likelihood = model.log_likelihood(record.y, x, record.u) + log_ratio
+        likelihood = torch.exp(log_likelihood.double()).nan_to_num(nan=0.0)
         weight = torch.log(torch.exp(log_w.double()) * likelihood + self.weight_floor)
-        return torch.where(torch.isneginf(log_w), -torch.inf, weight).to(log_w)
+        comparable = torch.where(log_likelihood == log_likelihood, log_likelihood, -torch.inf)
+        empty = torch.isneginf(log_w) | ~is_resolved(comparable.amax(1, keepdim=True))
+        return torch.where(empty, -torch.inf, weight).to(log_w)
+
+
+def is_resolved(maximum: Tensor) -> Tensor:
+    """Return whether log weights differ by more than rounding, from their maximum.
+
+    Below -1 / eps neighbouring numbers differ by 1 or more, so that the weights are noise: in double
+    precision at 1e8 standard deviations from the measurement.
+    """
+    return maximum > -1.0 / torch.finfo(maximum.dtype).eps
 
 
 def deactivate_invalid_particles(
@@ -118,7 +128,7 @@ def deactivate_invalid_particles(
 def normalise_updated_weights(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Normalise the log weights of a step.
 
-    A run without a finite weight gets equal weights.
+    A run without a finite weight gets equal weights, as one whose log weights are not resolved.
 
     Args:
         log_w: Log weights, [R, N].
@@ -129,10 +139,11 @@ def normalise_updated_weights(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Te
     """
     # one exponential per particle, because exponentials dominate the cost of a small step
     maximum = log_w.detach().amax(1, keepdim=True)
+    resolved = is_resolved(maximum)
     maximum = torch.where(torch.isfinite(maximum), maximum, 0.0)
     scaled_w = torch.exp(log_w - maximum)
     total, square_total = _totals(scaled_w)
-    lost = ~(torch.isfinite(total) & (total > 0.0))
+    lost = ~(torch.isfinite(total) & (total > 0.0) & resolved)
     total, slots = torch.where(lost, 1.0, total), log_w.shape[1]
     log_total = maximum + torch.log(total)
     log_w = torch.where(lost, -math.log(slots), log_w - log_total)

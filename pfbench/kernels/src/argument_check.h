@@ -1,5 +1,6 @@
-// Checks of an operator's arguments: device, type and shape, O(number of axes).
+// Checks of an operator's arguments: device, type and shape, O(number of axes), and ranges of values.
 #pragma once
+#include <algorithm>
 #include <cctype>
 #include <cstdint>
 #include <string>
@@ -34,7 +35,7 @@ class ArgumentCheck {
         return text + "]";
     }
 
-    void shape(const char* argument, const Tensor& a, const char* axes) {
+    void shape(const char* argument, const Tensor& a, const char* axes, const char* positive) {
         int32_t device;
         STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(a.get(), &device));
         if (device != aoti_torch_device_type_cpu()) fail(argument, "be on the CPU", "a tensor on another device");
@@ -50,7 +51,7 @@ class ArgumentCheck {
             if (std::islower(axes[k]) && size == 1) continue;
             int64_t& wanted = sizes[std::toupper(axes[k]) - 'A'];
             if (wanted < 0) wanted = size;
-            valid = size == wanted;
+            valid = size == wanted && (size > 0 || std::string(positive).find(axes[k]) == std::string::npos);
         }
         if (valid) return;
         std::string known;
@@ -66,28 +67,47 @@ class ArgumentCheck {
     }
 
     // float32 or float64, the same type for all real arguments
-    void real(const char* argument, const Tensor& a, const char* axes) {
+    void real(const char* argument, const Tensor& a, const char* axes, const char* positive = "") {
         const int32_t type = kind(a);
         if (real_type < 0) real_type = type;
         if (type != real_type || (type != kind<float>() && type != kind<double>()))
             fail(argument, "be float32 or float64 as the other real arguments", "another type");
-        shape(argument, a, axes);
+        shape(argument, a, axes, positive);
     }
 
-    void number(const char* argument, const Tensor& a, const char* axes) {
+    void number(const char* argument, const Tensor& a, const char* axes, const char* positive = "") {
         const int32_t type = kind(a);
         if (type != kind<float>() && type != kind<double>() && type != kind<int64_t>())
             fail(argument, "be float32, float64 or int64", "another type");
-        shape(argument, a, axes);
+        shape(argument, a, axes, positive);
     }
 
-    void int64(const char* argument, const Tensor& a, const char* axes) {
+    void int64(const char* argument, const Tensor& a, const char* axes, const char* positive = "") {
         if (kind(a) != kind<int64_t>()) fail(argument, "be int64", "another type");
-        shape(argument, a, axes);
+        shape(argument, a, axes, positive);
     }
 
     void integer(const char* argument, int64_t value) {
-        if (value < 0 || value >= MAX_SIZE * 4) fail(argument, "be from 0 to 2^32 - 1", std::to_string(value));
+        if (value < 0 || value >= MAX_SIZE * 4) fail(argument, "be a whole number from 0 to 2^32 - 1", std::to_string(value));
+    }
+
+    // Values from 0 to factor times the size of an axis, for indices minus 1.
+    void range(const char* argument, const Tensor& a, int64_t factor, char axis, bool is_index) {
+        const int64_t size = factor * (axis == '1' ? 1 : sizes[axis - 'A']);
+        bool valid = true;
+        if (kind(a) == kind<int64_t>()) {  // without a branch, so that many are compared at a time
+            const Packed<int64_t> values(a);
+            const int64_t count = a.numel();
+            uint64_t largest = 0;
+            for (int64_t i = 0; i < count; ++i) largest = std::max(largest, static_cast<uint64_t>(values.data[i]));
+            valid = count == 0 || largest < static_cast<uint64_t>(size + !is_index);
+        } else {
+            for (const double value : few<double>(a, a.size(0), a.size(1)))
+                valid &= value >= 0 && value <= static_cast<double>(size);  // a comparison with NaN is false
+        }
+        if (valid) return;
+        std::string text = axis == '1' ? std::to_string(factor) : (factor == 1 ? "" : std::to_string(factor) + " ") + axis;
+        fail(argument, "be from 0 to " + text + (is_index ? " - 1" : ""), "a value outside");
     }
 };
 

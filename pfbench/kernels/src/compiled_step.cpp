@@ -5,8 +5,9 @@
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/tensor.h>
 
+#include <dlfcn.h>
+
 #include <cstdint>
-#include <map>
 #include <mutex>
 #include <stdexcept>
 #include <string>
@@ -43,11 +44,15 @@ struct Flush {
 // What a compiled step takes as given: type, sizes and strides of each argument, and the number of its results. Its code was made
 // for these alone and does not look at them again.
 struct Signature {
+    Step step;
     int64_t outputs;
     std::vector<std::vector<int64_t>> layouts;
 };
-std::map<int64_t, Signature> signatures;  // by the address of the step
+std::vector<Signature> signatures;  // a step's number is its index plus one: Python never holds an address
 std::mutex signatures_lock;
+
+// The function that torch's compiler writes into the library of a step.
+constexpr const char* ENTRY = "_Z19inductor_entry_implPP16AtenTensorOpaqueS1_";
 
 // Type, sizes and strides of a tensor from an axis on. The stride of an axis of one entry has no meaning.
 std::vector<int64_t> layout(const Tensor& a, int64_t first = 0) {
@@ -61,21 +66,33 @@ std::vector<int64_t> layout(const Tensor& a, int64_t first = 0) {
     return numbers;
 }
 
-void register_step(int64_t step, int64_t outputs, std::vector<Tensor> arguments) {
-    Signature signature{outputs, {}};
+// Loads the library of a step; its path is given as bytes.
+int64_t register_step(Tensor library, int64_t outputs, std::vector<Tensor> arguments) {
+    int32_t type;
+    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_dtype(library.get(), &type));
+    if (type != aoti_torch_dtype_uint8() || library.dim() != 1 || (library.size(0) > 1 && library.stride(0) != 1))
+        throw std::runtime_error("register_step: library must be a path as bytes, uint8 [n].");
+    if (outputs < 0 || outputs > 1000000) throw std::runtime_error("register_step: outputs must be from 0 to 1000000.");
+    const std::string path(static_cast<const char*>(library.data_ptr()), static_cast<size_t>(library.size(0)));
+    void* const handle = path.empty() ? nullptr : dlopen(path.c_str(), RTLD_NOW);
+    void* const entry = handle ? dlsym(handle, ENTRY) : nullptr;
+    if (!entry) throw std::runtime_error("register_step: library must be a step of torch's compiler, got " + path + ".");
+    Signature signature{reinterpret_cast<Step>(entry), outputs, {}};
     for (const Tensor& a : arguments) signature.layouts.push_back(layout(a));
     const std::lock_guard<std::mutex> guard(signatures_lock);
-    signatures[step] = signature;
+    signatures.push_back(signature);
+    return static_cast<int64_t>(signatures.size());
 }
 
-// Raises unless a step is known and its first call gets what it was compiled for.
-void check_step(int64_t step, int64_t outputs, const std::vector<Tensor>& constants, const std::vector<Tensor>& state,
-                const std::vector<Tensor>& seen, const std::vector<Tensor>& shared) {
+// Raises unless a step has this number and its first call gets what it was compiled for.
+Signature check_step(int64_t step, const std::vector<Tensor>& constants, const std::vector<Tensor>& state,
+                     const std::vector<Tensor>& seen, const std::vector<Tensor>& shared) {
     const std::lock_guard<std::mutex> guard(signatures_lock);
-    const auto found = signatures.find(step);
-    if (found == signatures.end()) throw std::runtime_error("run_steps: step must be the address of a registered step.");
-    if (outputs != found->second.outputs || outputs < static_cast<int64_t>(state.size()))
-        throw std::runtime_error("run_steps: outputs must be the number of results of the step.");
+    if (step < 1 || step > static_cast<int64_t>(signatures.size()))
+        throw std::runtime_error("run_steps: step must be the number of a registered step, got " + std::to_string(step) + ".");
+    const Signature& found = signatures[step - 1];
+    if (found.outputs < static_cast<int64_t>(state.size()))
+        throw std::runtime_error("run_steps: state must have at most " + std::to_string(found.outputs) + " tensors, as the step returns.");
     if (seen.empty()) throw std::runtime_error("run_steps: inputs must have at least one tensor.");
     std::vector<std::vector<int64_t>> layouts;
     for (const Tensor& a : constants) layouts.push_back(layout(a));
@@ -86,13 +103,14 @@ void check_step(int64_t step, int64_t outputs, const std::vector<Tensor>& consta
         layouts.push_back(layout(a, 1));
     }
     for (const Tensor& a : shared) layouts.push_back(layout(a));
-    if (layouts.size() != found->second.layouts.size())
-        throw std::runtime_error("run_steps: the step must have " + std::to_string(found->second.layouts.size()) + " arguments, got " +
+    if (layouts.size() != found.layouts.size())
+        throw std::runtime_error("run_steps: the step must have " + std::to_string(found.layouts.size()) + " arguments, got " +
                                  std::to_string(layouts.size()) + ".");
     for (size_t k = 0; k < layouts.size(); ++k)
-        if (layouts[k] != found->second.layouts[k])
+        if (layouts[k] != found.layouts[k])
             throw std::runtime_error("run_steps: argument " + std::to_string(k) +
                                      " must have the type, shape and strides that the step was compiled for.");
+    return found;
 }
 
 AtenTensorHandle again(const Tensor& a) {
@@ -126,9 +144,9 @@ AtenTensorHandle particles_first(const Tensor& a) {
 
 // All that each step leaves, one step after the other, with the axes of particles first. A step is given `constants`, `state` (which is what the one before left
 // first), its part of `seen` [T, ...] and `shared`.
-std::vector<Tensor> follow(int64_t step, int64_t outputs, std::vector<Tensor> constants, std::vector<Tensor> state,
-                           std::vector<Tensor> seen, std::vector<Tensor> shared) {
-    check_step(step, outputs, constants, state, seen, shared);
+std::vector<Tensor> follow(int64_t number, std::vector<Tensor> constants, std::vector<Tensor> state, std::vector<Tensor> seen,
+                           std::vector<Tensor> shared) {
+    const auto [step, outputs, layouts] = check_step(number, constants, state, seen, shared);
     const Lock held;
     const Flush flushed;
     const int64_t steps = seen[0].size(0);
@@ -141,12 +159,16 @@ std::vector<Tensor> follow(int64_t step, int64_t outputs, std::vector<Tensor> co
         for (const Tensor& a : state) given.push_back(again(a));
         for (const Tensor& a : seen) given.push_back(at(a, t));
         for (const Tensor& a : shared) given.push_back(again(a));
-        reinterpret_cast<Step>(step)(given.data(), left.data());
+        step(given.data(), left.data());
         for (size_t k = 0; k < left.size(); ++k) {
             const Tensor a(left[k]);
             all.push_back(a.dim() > 2 ? Tensor(particles_first(a)) : a);
             if (k < state.size()) state[k] = a;
         }
+        // a step always leaves the same layouts, so the first one is enough
+        for (size_t k = 0; t == 0 && steps > 1 && k < state.size(); ++k)
+            if (layout(state[k]) != layouts[constants.size() + k])
+                throw std::runtime_error("run_steps: result " + std::to_string(k) + " must have the layout that the next step takes.");
     }
     return all;
 }

@@ -27,15 +27,18 @@ inline void philox_uniforms(const Tensor& seed, int64_t purpose, const Tensor& s
 
 inline void resample_systematic(const Tensor& a, const Tensor& n, const Tensor& u) {
     ArgumentCheck check("resample_systematic");
-    check.real("a", a, "RN");
+    check.real("a", a, "RN", "N");
     check.number("n", n, "r1");
     check.number("u", u, "R1");
+    check.range("n", n, 1, 'N', 0);
+    check.range("u", u, 1, '1', 0);
 }
 
 inline void gather_particles(const Tensor& x, const Tensor& ancestors) {
     ArgumentCheck check("gather_particles");
     check.real("x", x, "DRN");
     check.int64("ancestors", ancestors, "RM");
+    check.range("ancestors", ancestors, 1, 'N', 1);
 }
 
 inline void log_normal(const Tensor& y, const Tensor& mean, const Tensor& scale, const Tensor& constant) {
@@ -54,10 +57,24 @@ inline void propagate_affine(const Tensor& phi, const Tensor& x, const Tensor& g
     check.real("w", w, "RNW");
 }
 
+inline void gather_propagate(const Tensor& phi, const Tensor& x, const Tensor& ancestors, const Tensor& gain, const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs) {
+    ArgumentCheck check("gather_propagate");
+    check.real("phi", phi, "rDD");
+    check.real("x", x, "DRN");
+    check.int64("ancestors", ancestors, "RM");
+    check.real("gain", gain, "rDW");
+    check.int64("seed", seed, "");
+    check.integer("purpose", purpose);
+    check.int64("step", step, "");
+    check.int64("runs", runs, "R");
+    check.range("ancestors", ancestors, 1, 'N', 1);
+}
+
 inline void count_unique(const Tensor& ancestors, const Tensor& log_w) {
     ArgumentCheck check("count_unique");
     check.int64("ancestors", ancestors, "RN");
     check.real("log_w", log_w, "RN");
+    check.range("ancestors", ancestors, 2, 'N', 1);
 }
 
 inline void sum_and_squares(const Tensor& terms) {
@@ -73,7 +90,7 @@ inline void weighted_moments(const Tensor& x, const Tensor& w) {
 
 inline void cholesky_factor(const Tensor& covariance) {
     ArgumentCheck check("cholesky_factor");
-    check.real("covariance", covariance, "RDD");
+    check.real("covariance", covariance, "BDD");
 }
 
 inline void kalman_update(const Tensor& m, const Tensor& r, const Tensor& omega) {
@@ -96,18 +113,19 @@ inline void group_covariance(const Tensor& x, const Tensor& mean, const Tensor& 
     check.real("mean", mean, "RK");
     check.real("w", w, "RN");
     check.int64("groups", groups, "GS");
+    check.range("groups", groups, 1, 'K', 1);
 }
 
 inline void squared_mahalanobis(const Tensor& e, const Tensor& covariance) {
     ArgumentCheck check("squared_mahalanobis");
-    check.real("e", e, "RD");
-    check.real("covariance", covariance, "RDD");
+    check.real("e", e, "BD");
+    check.real("covariance", covariance, "BDD");
 }
 
 inline void marginal_scores(const Tensor& error, const Tensor& deviation, const Tensor& w) {
     ArgumentCheck check("marginal_scores");
     check.real("error", error, "RK");
-    check.real("deviation", deviation, "RNK");
+    check.real("deviation", deviation, "RNK", "N");
     check.real("w", w, "RN");
 }
 

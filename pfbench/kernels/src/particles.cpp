@@ -289,13 +289,6 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
 
 constexpr std::array<int64_t, 3> COMPONENTS_FIRST = {2, 0, 1};
 
-// Whether all indices are from 0 to size - 1; without a branch, so that many are compared at a time.
-bool within(const int64_t* index, int64_t count, int64_t size) {
-    uint64_t largest = 0;
-    for (int64_t i = 0; i < count; ++i) largest = std::max(largest, static_cast<uint64_t>(index[i]));
-    return count == 0 || largest < static_cast<uint64_t>(size);
-}
-
 template <class T, void (*DRAW)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t)>
 Tensor drawn(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
     if (std::is_same_v<T, float>) checks::philox_normals(seed, purpose, step, runs, components, quarters);
@@ -312,10 +305,6 @@ Tensor systematic_operator(Tensor a, Tensor n, Tensor u) {
     const int64_t runs = a.size(0), slots = a.size(1);
     const Tensor out = fresh<int64_t>({runs, slots});
     const auto wanted = few<double>(n, runs), uniform = few<double>(u, runs);
-    bool valid = slots > 0;  // a comparison with NaN is false
-    for (int64_t r = 0; r < runs; ++r)
-        valid &= wanted[r] >= 0 && wanted[r] <= static_cast<double>(slots) && uniform[r] >= 0 && uniform[r] <= 1;
-    require(valid, "resample_systematic: n must be from 0 to the number of slots, and u from 0 to 1. Change the particle count.");
     by_type(a, [&](auto one) {
         systematic(numbers<int64_t>(out), Packed<decltype(one)>(a).data, wanted.data(), uniform.data(), runs, slots);
     });
@@ -326,7 +315,6 @@ Tensor copied_operator(Tensor x, Tensor ancestors) {
     checks::gather_particles(x, ancestors);
     const int64_t components = x.size(0), runs = x.size(1), wanted = ancestors.size(1);
     const Packed<int64_t> from(ancestors);
-    require(within(from.data, runs * wanted, x.size(2)), "gather_particles: ancestors must be from 0 to N - 1.");
     return by_type(x, [&](auto one) {
         using T = decltype(one);
         const Tensor out = fresh<T>({components, runs, wanted});
@@ -378,7 +366,6 @@ Tensor distinct_operator(Tensor copy_of, Tensor log_w) {
     const int64_t runs = copy_of.size(0);
     const Tensor out = fresh<int64_t>({runs});
     const Packed<int64_t> ancestor(copy_of);
-    require(within(ancestor.data, runs * copy_of.size(1), 2 * copy_of.size(1)), "count_unique: ancestors must be from 0 to 2 N - 1.");
     by_type(log_w, [&](auto one) {
         distinct(numbers<int64_t>(out), ancestor.data, Packed<decltype(one)>(log_w).data, runs, copy_of.size(1));
     });
@@ -412,7 +399,6 @@ Tensor spread_operator(Tensor x, Tensor mean, Tensor w, Tensor groups) {
     checks::group_covariance(x, mean, w, groups);
     const int64_t runs = x.size(0), many = groups.size(0), size = groups.size(1);
     const Packed<int64_t> components(groups);
-    require(within(components.data, many * size, x.size(2)), "group_covariance: groups must be indices of components.");
     return by_type(x, [&](auto one) {
         using T = decltype(one);
         const Tensor out = fresh<T>({runs, many, size, size});

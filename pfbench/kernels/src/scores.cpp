@@ -106,7 +106,6 @@ void energy_score(T* out, const T* points, int64_t runs, int64_t size, int64_t n
 
 std::tuple<Tensor, Tensor> marginal_scores_operator(Tensor error, Tensor deviation, Tensor w) {
     checks::marginal_scores(error, deviation, w);
-    require(w.size(1) > 0, "marginal_scores: there must be at least one particle.");
     const int64_t runs = error.size(0), components = error.size(1);
     return by_type(error, [&](auto one) {
         using T = decltype(one);

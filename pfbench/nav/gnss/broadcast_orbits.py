@@ -11,21 +11,11 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.nav.gnss.ephemeris import (
-    CLOCK,
-    EPOCH,
-    ORBIT,
-    check_plausible,
-    parse_epochs,
-    read_ephemeris,
-)
-from pfbench.nav.gnss.orbits import (
-    GPS_OMEGA,
-    LIGHT,
-    Constellation,
-    OrbitalElements,
-    eccentric_anomaly,
-)
+from pfbench.nav.gnss.broadcast_elements import broadcast_elements, mean_motion
+from pfbench.nav.gnss.ephemeris import describe_unhealthy, parse_epochs, read_ephemeris
+from pfbench.nav.gnss.ephemeris_checks import EphemerisSelection, check_ephemerides
+from pfbench.nav.gnss.orbits import LIGHT, Constellation, eccentric_anomaly
+from pfbench.nav.gnss.rinex import CLOCK, EPOCH, ORBIT
 
 
 @dataclass(frozen=True)
@@ -36,7 +26,8 @@ class BroadcastConstellation(Constellation):
         root: Folder of all data sets (configuration key data.root).
         path: RINEX 2 or 3 navigation file in `root`, or a Parquet file with the RINEX names of the
             parameters as columns, `prn` and optionally `sys` (G or E). Satellites that are marked
-            unhealthy are ignored.
+            unhealthy are ignored, and ephemerides that are implausible or contradict their
+            neighbours; `notes` names them.
         start_s: GPS time of t = 0, in seconds since 1980-01-06 or as an ISO date such as
             2016-06-06T12:00:00.
         validity: Seconds before and after its time of ephemeris for which an ephemeris is used.
@@ -79,7 +70,7 @@ class BroadcastConstellation(Constellation):
     @override
     def at(self, time: Tensor) -> tuple[Tensor, Tensor]:
         eph, valid = self._select(time)
-        position, velocity = self._elements(eph).earth_fixed()
+        position, velocity = broadcast_elements(eph).earth_fixed()
         mask = valid[..., None]
         return torch.where(mask, position, torch.nan), torch.where(mask, velocity, torch.nan)
 
@@ -97,7 +88,7 @@ class BroadcastConstellation(Constellation):
         [IS-GPS-200, 20.3.3.3.3.1]
         """
         eph, valid = self._select(time)
-        anomaly, _ = eccentric_anomaly(eph["M0"] + self._motion(eph) * eph["tk"], eph["e"])
+        anomaly, _ = eccentric_anomaly(eph["M0"] + mean_motion(eph) * eph["tk"], eph["e"])
         term = -2 * torch.sqrt(eph["gm"]) / LIGHT**2 * eph["e"] * eph["sqrtA"] * torch.sin(anomaly)
         return torch.where(valid, term, torch.nan)
 
@@ -105,34 +96,6 @@ class BroadcastConstellation(Constellation):
         """Return the group delay [T, S] s to subtract from the clock offset (L1 users)."""
         eph, valid = self._select(time)
         return torch.where(valid, eph["tgd"], torch.nan)
-
-    @staticmethod
-    def _motion(eph: dict[str, Tensor]) -> Tensor:
-        """Corrected mean motion, rad/s."""
-        return torch.sqrt(eph["gm"]) / eph["sqrtA"] ** 3 + eph["deltan"]
-
-    def _elements(self, eph: dict[str, Tensor]) -> OrbitalElements:
-        """Evaluate the user algorithm [IS-GPS-200, table 20-IV] and its derivatives."""
-        e, tk, n = eph["e"], eph["tk"], self._motion(eph)
-        anomaly, near = eccentric_anomaly(eph["M0"] + n * tk, e)
-        anomaly1, root = n / near, torch.sqrt(1 - e * e)
-        turn = torch.atan2(root * torch.sin(anomaly), torch.cos(anomaly) - e) + eph["omega"]
-        turn1 = root * anomaly1 / near
-        s2, c2 = torch.sin(2 * turn), torch.cos(2 * turn)
-
-        def harmonic(sine: str, cosine: str) -> tuple[Tensor, Tensor]:
-            derivative = 2 * turn1 * (eph[sine] * c2 - eph[cosine] * s2)
-            return eph[sine] * s2 + eph[cosine] * c2, derivative
-
-        du, du1 = harmonic("cus", "cuc")
-        dr, dr1 = harmonic("crs", "crc")
-        di, di1 = harmonic("cis", "cic")
-        size, node1 = eph["sqrtA"] ** 2, eph["Omegadot"] - GPS_OMEGA
-        node = eph["Omega0"] + node1 * tk - GPS_OMEGA * eph["sow"]
-        radius1 = size * e * torch.sin(anomaly) * anomaly1 + dr1
-        inclination = eph["i0"] + eph["idot"] * tk + di
-        rates = (radius1, turn1 + du1, eph["idot"] + di1, node1)
-        return OrbitalElements(size * near + dr, turn + du, inclination, node, *rates)
 
     def _select(self, time: Tensor) -> tuple[dict[str, Tensor], Tensor]:
         """Return the current parameters [T, S], with `tk`, and a mask of valid ones."""
@@ -163,19 +126,13 @@ class BroadcastConstellation(Constellation):
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Messages about ignored ephemerides, for a report."""
-        table = self._healthy[~check_plausible(self._healthy)]
-        rows = zip(table["name"], table["toe"], table["sqrtA"], strict=True)
-        return tuple(
-            f"{self.path}: an ephemeris of {name} at t = {toe:.0f} s is ignored because its "
-            f"semi-major axis is {root**2:.0f} m"
-            for name, toe, root in rows
-        )
+        """Messages about ignored, changed and unconfirmed ephemerides, for a report."""
+        return (*self._selection.notes, *describe_unhealthy(self._file, self.path))
 
     @cached_property
     def _table(self) -> pd.DataFrame:
-        """The ephemerides in use, one row each."""
-        table = self._healthy[check_plausible(self._healthy)]
+        """The ephemerides in use, one row each. Of each `toe` the last transmission is used."""
+        table = self._healthy[self._selection.mask]
         if not (table["toe"].abs() <= self.validity).any():
             first, last = (self.epoch + table["toe"].agg(["min", "max"])).tolist()
             raise ValueError(
@@ -183,9 +140,17 @@ class BroadcastConstellation(Constellation):
                 f"(GPS time {first:.0f} to {last:.0f} s), got {self.start_s} "
                 f"(GPS time {self.epoch:.0f} s). Give a time near them."
             )
-        return table
+        return table.drop_duplicates(["name", "toe"], keep="last").reset_index(drop=True)
+
+    @cached_property
+    def _selection(self) -> EphemerisSelection:
+        return check_ephemerides(self._healthy, self.path)
 
     @cached_property
     def _healthy(self) -> pd.DataFrame:
         """Ephemerides of healthy satellites, times from t = 0."""
-        return parse_epochs(read_ephemeris(self.root, self.path), self.epoch)
+        return parse_epochs(self._file, self.epoch)
+
+    @cached_property
+    def _file(self) -> pd.DataFrame:
+        return read_ephemeris(self.root, self.path)

@@ -1,4 +1,4 @@
-"""Figures of comparisons: effects within a condition, ranks and decisions across conditions, Pareto fronts."""
+"""Figures of comparisons: effects within a condition, decisions and profiles across conditions, Pareto fronts."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ import numpy as np
 from pfbench.report.cost import ParetoFront
 from pfbench.report.plots.comparison_plots import (
     MATRIX_FILTERS,
-    order_by_rank,
+    order_by_decisions,
     plot_forest,
     plot_matrix,
+    plot_profiles,
 )
 from pfbench.report.plots.cost_plots import plot_pareto_fronts
 from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.plotting import LineStyle, format_slug
-from pfbench.report.plots.rank_plots import plot_critical_difference, plot_profiles
 from pfbench.results.comparison.condition_blocks import RankingBlocks
 from pfbench.results.comparison.pairwise_results import PairwiseTest
-from pfbench.results.comparison.ranking_results import RankingResult
 
 _PAIRS = 28  # pairs of a forest plot at most
 
@@ -63,64 +62,47 @@ def comparison_figures_of_condition(
 
 
 def study_figures(
-    rankings: Sequence[tuple[RankingResult, RankingBlocks]],
+    blocks: RankingBlocks,
     tests: Sequence[PairwiseTest],
     style: Mapping[str, LineStyle],
     note: str = "",
 ) -> list[FigureSpec]:
-    """List the figures across the conditions of a study.
+    """List the figures of a group across the conditions of a study.
 
     Args:
-        rankings: Ranking and its blocks by group.
+        blocks: Errors of the group by condition.
         tests: Pairwise tests of the study.
         style: Line styles by label.
         note: Sentence about grey filters for captions.
+
+    Returns:
+        The matrix of decisions and the performance profile, if the data allow them.
     """
+    group_tests = [v for v in tests if v.group == blocks.group]
     return [
-        figure
-        for ranking, blocks in rankings
-        for figure in (
-            *_rank_figures(ranking, style),
-            *_matrix_figures(ranking, [v for v in tests if v.group == ranking.group], style),
-            *_profile_figures(ranking.group, blocks, style, note),
-        )
+        *_matrix_figures(blocks.group, group_tests, style),
+        *_profile_figures(blocks.group, blocks, style, note),
     ]
 
 
-def _rank_figures(ranking: RankingResult, style: Mapping[str, LineStyle]) -> Iterator[FigureSpec]:
-    """Yield the critical-difference diagram of a ranking that was tested."""
-    if not ranking.refused:
-        text = (
-            f"Mean ranks of {ranking.group} over {len(ranking.cells)} conditions, 1 is best. "
-            "A bar joins filters whose comparison is inconclusive in Nemenyi's test "
-            f"(alpha {ranking.alpha:g}). CD: critical difference."
-        )
-        name = f"critical_difference_{format_slug(ranking.group)}"
-        yield FigureSpec(name, text, partial(plot_critical_difference, ranking, style))
-
-
 def _matrix_figures(
-    ranking: RankingResult, tests: Sequence[PairwiseTest], style: Mapping[str, LineStyle]
+    group: str, tests: Sequence[PairwiseTest], style: Mapping[str, LineStyle]
 ) -> Iterator[FigureSpec]:
     """Yield the matrix of decisions, if the tests of a group belong to several conditions."""
     if len({(v.scenario, v.noise, v.model) for v in tests}) < 2:
         return
     text = (
-        f"{ranking.group}: number of conditions in which the row filter is better than the column "
-        "filter, and in which it is worse, with Holm's correction within each condition."
+        f"{group}: number of conditions in which the row filter is better than the column filter, and in which it is worse. "
+        "Exploratory, with Holm's correction within each condition."
     )
-    labels, coloured = order_by_rank(tests, ranking), []
+    labels, coloured = order_by_decisions(tests), []
     if len(labels) > MATRIX_FILTERS:
         coloured = [label for label in labels if not style[label].quiet][:MATRIX_FILTERS]
-        best = "largest numbers of better minus worse comparisons"
-        best = "best mean ranks" if ranking.ranks else best
         rest = MATRIX_FILTERS - len(coloured)
         start = "the coloured filters, and of the others " if coloured else ""
-        text += f" Shown of {len(labels)} filters: {start}the {rest} with the {best}."
-    if ranking.shown:
-        text += f" Star: significant in Nemenyi's test across {len(ranking.cells)} conditions."
-    name = f"matrix_{format_slug(ranking.group)}"
-    yield FigureSpec(name, text, partial(plot_matrix, tests, ranking, coloured))
+        text += f" Shown of {len(labels)} filters: {start}the {rest} with the largest numbers of better minus worse comparisons."
+    name = f"matrix_{format_slug(group)}"
+    yield FigureSpec(name, text, partial(plot_matrix, tests, coloured))
 
 
 def _profile_figures(

@@ -1,8 +1,8 @@
-"""Plots of comparisons: RMSE ratios of pairs, and decisions across conditions."""
+"""Plots of comparisons: RMSE ratios of pairs, decisions and performance profiles across conditions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,27 +11,31 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from pfbench.report.plots.axis_ticks import set_plain_ticks
-from pfbench.report.plots.label_placement import break_settings, wrap_label
-from pfbench.report.plots.plotting import COLUMN, LETTER, SMALL, build_padded_layout
+from pfbench.report.plots.label_placement import name_pairs, wrap_label
+from pfbench.report.plots.plotting import (
+    COLUMN,
+    LETTER,
+    SMALL,
+    LineStyle,
+    add_legend,
+    build_padded_layout,
+    stacked_axes,
+)
+from pfbench.results.comparison.condition_blocks import RankingBlocks, performance_profile
 from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
-from pfbench.results.comparison.ranking_results import RankingResult
 
-_LONG = 34  # letters of a pair on one line
 MATRIX_FILTERS = 10  # filters of a matrix at most
 _BETTER, _WORSE = "#0072B2", "#E69F00"  # dark and light, distinct in grey
 
 
-def plot_matrix(
-    tests: Sequence[PairwiseTest], ranking: RankingResult, required_labels: Sequence[str] = ()
-) -> Figure:
+def plot_matrix(tests: Sequence[PairwiseTest], required_labels: Sequence[str] = ()) -> Figure:
     """Plot the numbers of conditions in which row filters are better and worse.
 
     Args:
         tests: Pairwise tests of a group.
-        ranking: Ranking of the group.
         required_labels: Filters that are always included; the best others fill the matrix.
     """
-    labels = _select_labels(order_by_rank(tests, ranking), required_labels)
+    labels = _select_labels(order_by_decisions(tests), required_labels)
     wins, counts = _count_wins(tests, labels)
     names = list(map(wrap_label, labels))
     row_height = max(0.27, 0.11 * (1 + max(name.count("\n") for name in names)))
@@ -40,14 +44,12 @@ def plot_matrix(
     axis = figure.subplots()
     share = np.divide(wins - wins.T, counts, out=np.full(counts.shape, np.nan), where=counts > 0)
     axis.imshow(share, cmap=_blue_and_orange(), vmin=-1, vmax=1, aspect="auto")
-    stars = {frozenset((p.a, p.b)) for p in ranking.pairs if p.winner != INCONCLUSIVE}
     label_width = LETTER * max(len(line) for name in names for line in name.split("\n"))
-    dash = _choose_dash(wins, counts, bool(stars), (72 * COLUMN - 20 - label_width) / len(labels))
+    dash = _choose_dash(wins, counts, (72 * COLUMN - 20 - label_width) / len(labels))
     font: Any = {"ha": "center", "va": "center", "fontsize": SMALL, "linespacing": 1.0}
     for i, j in zip(*np.nonzero(counts), strict=True):
-        star = "*" if frozenset((labels[i], labels[j])) in stars else ""
         ink = "white" if share[i, j] > 0.55 else "black"
-        axis.text(j, i, f"{wins[i, j]}{dash}{wins[j, i]}{star}", color=ink, **font)
+        axis.text(j, i, f"{wins[i, j]}{dash}{wins[j, i]}", color=ink, **font)
     ticks: Any = {"labels": names, "fontsize": SMALL, "linespacing": 1.0}
     axis.set_xticks(range(len(labels)), rotation=40, ha="right", rotation_mode="anchor", **ticks)
     axis.set_yticks(range(len(labels)), **ticks)
@@ -80,19 +82,17 @@ def _count_wins(
     return wins, counts
 
 
-def _choose_dash(wins: np.ndarray, counts: np.ndarray, has_stars: bool, width: float) -> str:
+def _choose_dash(wins: np.ndarray, counts: np.ndarray, width: float) -> str:
     """Return the dash between two numbers, with a line break in squares too narrow for both."""
     compared = counts > 0
     texts = [f"{a}–{b}" for a, b in zip(wins[compared], wins.T[compared], strict=True)]
-    longest = max(map(len, texts)) + has_stars if texts else 0
+    longest = max(map(len, texts)) if texts else 0
     return "–\n" if LETTER * longest > width - 1 else "–"
 
 
 def plot_forest(pairs: Sequence[PairwiseTest]) -> Figure:
     """Plot the RMSE ratio and its interval, a row per pair."""
-    names = [f"{v.a} / {v.b}" for v in pairs]
-    if max(map(len, names)) > _LONG:
-        names = [f"{break_settings(v.a, _LONG)}\n/ {break_settings(v.b, _LONG)}" for v in pairs]
+    names = name_pairs([(v.a, v.b) for v in pairs])
     figure = Figure(
         figsize=(COLUMN, 0.75 + 0.17 * sum(1 + name.count("\n") for name in names)),
         layout=build_padded_layout(),
@@ -123,21 +123,44 @@ def plot_forest(pairs: Sequence[PairwiseTest]) -> Figure:
     return figure
 
 
-def order_by_rank(tests: Sequence[PairwiseTest], ranking: RankingResult) -> list[str]:
-    """Order labels by mean rank, or by better minus worse comparisons.
+def order_by_decisions(tests: Sequence[PairwiseTest]) -> list[str]:
+    """Order labels by better minus worse comparisons, most first.
 
     Args:
         tests: Pairwise tests of a group.
-        ranking: Ranking of the group, whose ranks may be missing.
     """
     decided = [v for v in tests if v.winner != INCONCLUSIVE]
     labels = dict.fromkeys(label for v in tests for label in (v.a, v.b))
     losses = {label: sum(label in (v.a, v.b) for v in decided) for label in labels}
     losses = {label: n - 2 * sum(v.winner == label for v in tests) for label, n in losses.items()}
-    ranks = dict(zip(ranking.filters, ranking.ranks, strict=False))
-    return sorted(labels, key=lambda label: (ranks.get(label, float(len(ranks))), losses[label]))
+    return sorted(labels, key=losses.__getitem__)
 
 
 def _blue_and_orange() -> Any:
     """Return the colour map from worse to better."""
     return LinearSegmentedColormap.from_list("better", [_WORSE, "#ffffff", _BETTER])
+
+
+def plot_profiles(blocks: RankingBlocks, style: Mapping[str, LineStyle]) -> Figure:
+    """Plot the percentage of runs within a factor of the best filter.
+
+    Args:
+        blocks: Runs of the conditions.
+        style: Line styles by label.
+    """
+    reach = float(np.clip(max(_worst_ratio(errors) for errors in blocks.runs), 1.1, 100.0))
+    at = np.geomspace(1.0, reach, 200)
+    figure, (axis,) = stacked_axes(1, 2.1)
+    for label, share in zip(blocks.filters, performance_profile(blocks, at), strict=True):
+        axis.plot(at, 100 * share, **style[label].line(label))
+    axis.set(xscale="log", xlabel="RMSE / best RMSE of the run", ylabel="runs [%]", ylim=(0, 102))
+    set_plain_ticks(axis.xaxis, at)
+    add_legend(figure, axis)
+    return figure
+
+
+def _worst_ratio(errors: np.ndarray) -> float:
+    """Return the largest finite ratio to the best filter of a run."""
+    best = errors.min(axis=1, keepdims=True)
+    finite_mask = np.isfinite(errors) & (best > 0)
+    return float(np.divide(errors, best, out=np.ones(errors.shape), where=finite_mask).max())

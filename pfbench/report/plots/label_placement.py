@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 
 from pfbench.report.plots.plotting import LETTER, SMALL
 
+_LONG = 34  # letters of a pair on one line
 _CLOSE = 9  # points; marks closer than this get a line to their label
 _FRACTIONS = np.linspace(0, 1, 25)[:, None]  # positions along a line at which overlap is checked
 
@@ -96,6 +97,14 @@ def wrap_label(label: str, width: int = 18) -> str:
             lines.append("")
         lines[-1] += piece
     return "\n".join(lines)
+
+
+def name_pairs(pairs: Sequence[tuple[str, str]]) -> list[str]:
+    """Return the names of pairs of filters, on two or more lines if one is long."""
+    names = [f"{a} / {b}" for a, b in pairs]
+    if max(map(len, names), default=0) <= _LONG:
+        return names
+    return [f"{break_settings(a, _LONG)}\n/ {break_settings(b, _LONG)}" for a, b in pairs]
 
 
 def _build_obstacles(marks: np.ndarray, corners: np.ndarray, reach: np.ndarray) -> _Obstacles:

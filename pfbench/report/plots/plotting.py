@@ -38,6 +38,7 @@ RC: Any = {
     "ytick.labelsize": 7,
     "figure.dpi": 150,  # equal to savefig.dpi, so that text widths of the layout hold in the file
     "savefig.dpi": 150,
+    "text.parse_math": False,  # a label from a file may contain $ as a plain character
     "svg.hashsalt": "pfbench",  # SVG identifiers are random otherwise
     "svg.fonttype": "none",  # text stays text, which is searchable and smaller than outlines
 }

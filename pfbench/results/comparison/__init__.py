@@ -1,1 +1,1 @@
-"""Comparisons of filters: pairs within a condition, rankings across conditions, lost runs."""
+"""Exploratory comparisons of filters within a condition, and their input across conditions."""

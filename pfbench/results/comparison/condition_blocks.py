@@ -1,4 +1,4 @@
-"""Input of rankings: the conditions in which all filters ran, and their median errors."""
+"""Conditions in which all filters ran, and their median errors, for figures across conditions."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from pfbench.results.comparison.lost_run_rules import WORST_RANK, LostRunRule, rmse_by_run
+from pfbench.results.comparison.run_errors import rmse_by_run
 from pfbench.results.conditions import natural_sort_key
 from pfbench.results.error_measures import Array
 from pfbench.results.statistics.effect_sizes import LOG_TOLERANCE
 
-MIN_CONDITIONS, MIN_FILTERS = 5, 3  # required by a test across conditions [ours]
+MIN_CONDITIONS, MIN_FILTERS = 5, 3  # preferred by figures across conditions [ours]
 
 
 class RankingBlocks(NamedTuple):
-    """Input of a ranking across conditions.
+    """Errors of several filters in several conditions.
 
     Attributes:
         group: Group of the state.
@@ -38,25 +38,22 @@ class RankingBlocks(NamedTuple):
     shared: int
 
 
-def ranking_blocks(
-    table: pd.DataFrame, group: str, rule: LostRunRule = WORST_RANK
-) -> RankingBlocks:
+def ranking_blocks(table: pd.DataFrame, group: str) -> RankingBlocks:
     """Select the conditions in which all filters ran on the same episodes.
 
     If not every filter ran in every condition, filters are added by the number of their conditions.
-    The selection has the most values (conditions times filters) among those that allow a test, if
-    any does [ours].
+    The selection has the most values (conditions times filters) among those with three filters and
+    five conditions, if any has them [ours].
 
     Args:
         table: Rows of `load_frame`.
         group: Group of the state.
-        rule: Rule for lost runs.
 
     Returns:
         Values and runs of the selected conditions and filters.
     """
     by_condition = sorted(
-        rmse_by_run(table[table.group == group], rule),
+        rmse_by_run(table[table.group == group]),
         key=lambda item: [natural_sort_key(text) for text in item[0]],
     )
     errors = {" / ".join(key[:3]): wide.dropna(axis=1, how="all") for key, wide in by_condition}
@@ -81,11 +78,6 @@ def ranking_blocks(
     values = np.array(medians).reshape(len(names), len(filters))
     shared = len(pairs) - len(set(pairs))
     return RankingBlocks(group, filters, tuple(names), values, tuple(runs), tuple(left_out), shared)
-
-
-def list_scenarios(conditions: Sequence[str]) -> list[str]:
-    """List the distinct scenarios of conditions named `scenario / noise / model`, in order."""
-    return list(dict.fromkeys(name.split(" / ")[0] for name in conditions))
 
 
 def performance_profile(blocks: RankingBlocks, factors: Array) -> Array:
@@ -132,16 +124,3 @@ def _missing_filters(present: Mapping[str, set[str]], filters: Sequence[str]) ->
     excluded = sorted(set().union(*present.values()) - set(filters), key=natural_sort_key)
     count = {label: sum(label in names for names in present.values()) for label in excluded}
     return [f"{label} (ran in {n} of {len(present)} conditions)" for label, n in count.items()]
-
-
-def refuse_ranking(blocks: RankingBlocks) -> str:
-    """State why no test across conditions is possible; empty if it is."""
-    conditions, filters = len(blocks.cells), len(blocks.filters)
-    if filters < MIN_FILTERS:
-        have = f"{filters} {'filter' if filters == 1 else 'filters'} ran in the same conditions"
-        return f"it requires at least {MIN_FILTERS} filters, and {have}"
-    if conditions < MIN_CONDITIONS:
-        have = f"{conditions} {'condition' if conditions == 1 else 'conditions'}"
-        need = f"it requires at least {MIN_CONDITIONS} conditions"
-        return f"{need}, and these {filters} filters share {have}"
-    return ""

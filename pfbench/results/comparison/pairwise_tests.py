@@ -7,7 +7,7 @@ evenly [Demsar 2006], with Holm's correction over all pairs of one group of one 
 ratio has a bootstrap interval, and two one-sided tests show equivalence.
 
 A lost run takes the largest rank. Two lost runs are a tie, and so are two runs whose RMSE agree to
-the stored precision [ours]. `lost_rule_sensitivity` repeats the decisions with other rules.
+the stored precision [ours].
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pfbench.results.comparison.lost_run_rules import (
+from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest, decide_winner
+from pfbench.results.comparison.run_errors import (
     ConditionKey,
     PairErrors,
     pair_errors,
     rmse_by_run,
 )
-from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest, decide_winner
 from pfbench.results.error_measures import Array
 from pfbench.results.statistics import power
 from pfbench.results.statistics.effect_sizes import (

@@ -1,12 +1,9 @@
-"""Wilcoxon's signed-rank test, its equivalence and Bayesian versions, and Holm's correction.
-
-Tests across conditions that need ranks of all filters are in `rank_tests`.
-"""
+"""Wilcoxon's signed-rank test, its equivalence version, and Holm's correction."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import cache, lru_cache
+from functools import cache
 from itertools import product
 from typing import Literal, NamedTuple
 
@@ -18,8 +15,6 @@ from pfbench.results.error_measures import Array
 
 _SIGNS_ENUMERATED = 13  # tied differences up to which all signs are enumerated, as in scipy
 _EXACT = 50  # untied differences up to which the distribution is exact, as in scipy
-_DIRICHLET_DRAWS = 20_000
-_PRIOR_STRENGTH = 0.5  # pseudo-observation at zero [Benavoli et al. 2014], as in baycomp
 Alternative = Literal["two-sided", "greater", "less"]
 
 
@@ -159,30 +154,6 @@ def equivalence_samples(differences: Sequence[Array], margin: float) -> Array:
     return p
 
 
-def bayesian_signed_rank(d: Array, rope: float, seed: int = 0) -> tuple[float, float, float]:
-    """Compute posterior probabilities of the three positions of a centre [Benavoli et al. 2014].
-
-    The distribution of d is a Dirichlet process with half a pseudo-observation at zero. Each draw
-    decides for the position with the largest weight of means of two differences.
-
-    Args:
-        d: Differences, [B].
-        rope: Half width of the region of practical equivalence.
-        seed: Seed of the Dirichlet draws.
-
-    Returns:
-        Probabilities that the centre is below -rope, within the region, and above rope.
-    """
-    full = np.concatenate([[0.0], d])
-    sums = full[:, None] + full
-    below, above = (np.heaviside(side, 0.5) for side in (-sums - 2 * rope, sums - 2 * rope))
-    weight = _dirichlet_weights(d.size, seed)
-    low, high = (np.einsum("si,si->s", weight @ side, weight) for side in (below, above))
-    largest = np.argmax(np.column_stack([low, 1 - low - high, high]), axis=1)
-    first, second, third = np.bincount(largest, minlength=3) / _DIRICHLET_DRAWS
-    return float(first), float(second), float(third)
-
-
 def _exact_tails(n: int, above: Array) -> tuple[Array, Array]:
     """Return P(T >= above) and P(T <= above) of the rank sum of n untied differences."""
     cumulative = _rank_sum_cdf(n)
@@ -216,13 +187,6 @@ def _normal_score(ranks: Array, size: Array, above: Array) -> Array:
 def _all_signs(n: int) -> Array:
     """Enumerate the positive differences among n in all 2^n ways, [2^n, n]."""
     return np.array(list(product((0.0, 1.0), repeat=n)))
-
-
-@lru_cache(maxsize=2)
-def _dirichlet_weights(n: int, seed: int) -> Array:
-    """Draw Dirichlet weights of n differences and the pseudo-observation; shared by all pairs."""
-    concentration = np.concatenate([[_PRIOR_STRENGTH], np.ones(n)])
-    return np.random.default_rng([n, seed]).dirichlet(concentration, _DIRICHLET_DRAWS)
 
 
 def _by_length(differences: Sequence[Array]) -> Iterator[tuple[list[int], Array]]:

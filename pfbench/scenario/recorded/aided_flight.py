@@ -15,10 +15,16 @@ from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.model.strapdown.tuning import AidedTuning
 from pfbench.noise.base import NoiseRegime, check_unit_process
 from pfbench.noise.white import NominalNoise
-from pfbench.scenario.base import Scenario, check_added_sd, check_divergence_threshold
+from pfbench.scenario.base import Scenario, check_added_sd
+from pfbench.scenario.plausibility.column_checks import check_changes
 from pfbench.scenario.recorded.assembly import FixReceiver
 from pfbench.scenario.recorded.drive import RecordedDrive
-from pfbench.scenario.recorded.log_tables import Array, find_dataset, parse_numbers, read_table
+from pfbench.scenario.recorded.log_tables import (
+    Array,
+    find_dataset,
+    parse_numbers,
+    read_table,
+)
 from pfbench.scenario.recorded.navigation_log import swap_frd_rfu
 
 _COLUMNS = ("t", "p_static_kpa", "mx", "my", "mz")
@@ -77,8 +83,6 @@ class RecordedAidedFlight(Scenario):
             forward, right, down.
         tuning: Parameters that the filter assumes. `flight.tuning` is `tuning.motion`.
         instruments: Conversion of the readings to measurements.
-        divergence_threshold_m: Position error, m, beyond which a run counts as diverged. None if
-            the scenario does not define divergence.
 
     Raises:
         ValueError: If the threshold is not positive. `draw` raises it for errors of the flight and
@@ -89,10 +93,6 @@ class RecordedAidedFlight(Scenario):
     flight: RecordedDrive
     tuning: AidedTuning
     instruments: BaroMagSensors
-    divergence_threshold_m: float | None = None
-
-    def __post_init__(self) -> None:
-        check_divergence_threshold(self.divergence_threshold_m)
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
@@ -132,8 +132,14 @@ class RecordedAidedFlight(Scenario):
 
     def _read(self, time: Array) -> Array:
         """Read relative height, m, and magnetic field (right, forward, up), [T, 4]."""
-        table = read_table(find_dataset(self.root, self.flight.folder), self.flight.files.imu, {})
+        table = read_table(
+            find_dataset(self.root, self.flight.folder),
+            self.flight.files.imu,
+            {},
+            self.flight.limits,
+        )
         t, pressure, *field = parse_numbers(table, _COLUMNS).T
+        check_changes(table, _COLUMNS[1:], t, np.column_stack([pressure, *field]))
         after = np.searchsorted(t, time).clip(1, len(t) - 1)
         nearest_index = np.where(time - t[after - 1] < t[after] - time, after - 1, after)
         height = pressure_height(pressure[nearest_index])

@@ -16,8 +16,9 @@ from typing_extensions import override
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
 from pfbench.model.strapdown.tuning import StrapdownTuning
+from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.noise.base import NoiseRegime
-from pfbench.scenario.base import Scenario, check_divergence_threshold, check_duration
+from pfbench.scenario.base import Scenario, check_duration
 from pfbench.scenario.recorded.assembly import FixReceiver, assemble
 from pfbench.scenario.recorded.fix_holdout import FixHoldout
 from pfbench.scenario.recorded.log_reader import read_log
@@ -43,10 +44,9 @@ class RecordedDrive(Scenario):
         end_s: End, s of the log. None for the end of the data common to all tables.
         files: Names of the tables.
         origin: lat_deg, lon_deg, h_m of the local frame. None if the files contain it.
+        limits: Limits of the platform for the checks of the log. None for the default limits.
         holdout: Selection of withheld fixes, which are the truth instead of the reference. None
             withholds no fixes.
-        divergence_threshold_m: Position error, m, beyond which a run counts as diverged. None if
-            the scenario does not define divergence.
 
     Raises:
         ValueError: If a step, an interval or the threshold is not positive. `draw` raises it for a
@@ -62,11 +62,10 @@ class RecordedDrive(Scenario):
     end_s: float | None = None
     files: LogFiles = field(default_factory=LogFiles)
     origin: Sequence[float] | None = None
+    limits: PlausibleLimits | None = None
     holdout: FixHoldout | None = None
-    divergence_threshold_m: float | None = None
 
     def __post_init__(self) -> None:
-        check_divergence_threshold(self.divergence_threshold_m)
         check_duration("scenario.filter_step_s", self.filter_step_s)
 
     @override
@@ -75,7 +74,8 @@ class RecordedDrive(Scenario):
 
     def read(self) -> ResampledLog:
         """Read the log and resample it to filter steps."""
-        log = read_log(find_dataset(self.root, self.folder), self.files, origin=self.origin)
+        folder = find_dataset(self.root, self.folder)
+        log = read_log(folder, self.files, origin=self.origin, limits=self.limits)
         return resample_log(
             log,
             self.receiver.fix_interval_s,
@@ -123,8 +123,7 @@ class RecordedFlights(Scenario):
         imu_index: Number of the sensor in the column `imu`. `tuning` contains its nominal biases.
         files: Names of the tables.
         origin: lat_deg, lon_deg, h_m of the local frame. None if the files contain it.
-        divergence_threshold_m: Position error, m, beyond which a run counts as diverged. None if
-            the scenario does not define divergence.
+        limits: Limits of the platform for the checks of the log. None for the default limits.
 
     Raises:
         ValueError: If the step or the threshold is not positive, or no flight is selected. `draw`
@@ -141,10 +140,9 @@ class RecordedFlights(Scenario):
     imu_index: int = 1
     files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
     origin: Sequence[float] | None = None
-    divergence_threshold_m: float | None = None
+    limits: PlausibleLimits | None = None
 
     def __post_init__(self) -> None:
-        check_divergence_threshold(self.divergence_threshold_m)
         check_duration("scenario.filter_step_s", self.filter_step_s)
         if not self.flights:
             raise ValueError("scenario.flights must not be empty, got []. Select a flight.")
@@ -158,7 +156,8 @@ class RecordedFlights(Scenario):
         # only flights of the requested runs are read
         used = torch.unique(runs % len(self.flights)).tolist()
         logs = [
-            read_log(folder, self.files, self.flights[i], self.imu_index, self.origin) for i in used
+            read_log(folder, self.files, self.flights[i], self.imu_index, self.origin, self.limits)
+            for i in used
         ]
         legs = [
             resample_log(log, self.receiver.fix_interval_s, self.filter_step_s, velocity)

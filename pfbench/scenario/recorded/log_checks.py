@@ -13,7 +13,6 @@ from pfbench.scenario.recorded.navigation_log import ImuLog, ReferenceLog
 
 STANDARD_GRAVITY = 9.80665
 _DEGREE = math.pi / 180.0
-_MAX_RATE = 35.0  # rad/s: the range of the fastest common MEMS gyros, 2000 deg/s
 
 
 def check_force(force: Array, name: str) -> None:
@@ -42,24 +41,6 @@ def check_force(force: Array, name: str) -> None:
         raise ValueError(
             f"{name}: fz must be about -9.8 when level (forward-right-down axes), "
             f"got a median of {down:+.2f}. If axes are forward-left-up, negate fy, fz, wy, wz."
-        )
-
-
-def check_rate(rate: Array, name: str) -> None:
-    """Check the unit of the angular rate.
-
-    Args:
-        rate: Angular rate, [n, 3].
-        name: Name of the table, for the message.
-
-    Raises:
-        ValueError: If the rate is implausible in rad/s.
-    """
-    largest = float(np.abs(rate).max())
-    if largest > _MAX_RATE:
-        raise ValueError(
-            f"{name}: wx, wy, wz must be at most {_MAX_RATE} rad/s, got {largest:.1f}. "
-            f"If in deg/s, multiply by {_DEGREE:.10f}."
         )
 
 

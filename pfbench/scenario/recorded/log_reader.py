@@ -24,11 +24,18 @@ import numpy as np
 import torch
 
 from pfbench.nav import attitude, earth
+from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.scenario.plausibility.column_checks import check_changes
+from pfbench.scenario.plausibility.log_agreement import (
+    compare_fixes,
+    compare_inertial,
+    compare_reference,
+    compare_times,
+)
 from pfbench.scenario.recorded.log_checks import (
     STANDARD_GRAVITY,
     check_force,
     check_overlap,
-    check_rate,
     check_rotation,
 )
 from pfbench.scenario.recorded.log_tables import (
@@ -61,6 +68,7 @@ def read_log(
     path: int | None = None,
     imu: int | None = None,
     origin: Sequence[float] | None = None,
+    limits: PlausibleLimits | None = None,
 ) -> NavigationLog:
     """Read and check the log in a folder.
 
@@ -71,6 +79,7 @@ def read_log(
         imu: Number of the sensor, for tables with a column `imu`.
         origin: lat_deg, lon_deg, h_m of pn = pe = pd = 0. Required only if one table has lat_deg,
             another has pn, and the metadata of the files do not contain it.
+        limits: Limits of the platform. None for the default limits.
 
     Returns:
         The log in right-forward-up and East-North-Up axes.
@@ -78,29 +87,43 @@ def read_log(
     Raises:
         ValueError: If a check fails. The message names file, column, row, value and remedy.
     """
-    names = files or LogFiles()
+    names, limits = files or LogFiles(), limits or PlausibleLimits()
     select = {"path": path, "imu": imu}
     inertial, gnss, truth = (
-        read_table(Path(folder), name, select) for name in (names.imu, names.gnss, names.reference)
+        read_table(Path(folder), name, select, limits)
+        for name in (names.imu, names.gnss, names.reference)
     )
-    time, notes = _imu_time(inertial)
-    force, rate = (
-        parse_numbers(inertial, ("fx", "fy", "fz")),
-        parse_numbers(inertial, ("wx", "wy", "wz")),
-    )
-    check_force(force, inertial.name)
-    check_rate(rate, inertial.name)
+    sensors, notes = _samples(inertial)
     centre = _origin(origin, gnss, truth)
     fixes, reference = _fixes(gnss, centre), _motion(truth, centre)
-    check_overlap(inertial.name, time, gnss.name, fixes.time)
-    check_overlap(inertial.name, time, truth.name, reference.time)
-    sensors = ImuLog(time, swap_frd_rfu(force), swap_frd_rfu(rate))
+    check_overlap(inertial.name, sensors.time, gnss.name, fixes.time)
+    check_overlap(inertial.name, sensors.time, truth.name, reference.time)
     check_rotation(sensors, reference, inertial.name, truth.name)
+    gravity = STANDARD_GRAVITY
     if centre is None:
-        notes = (*notes, f"gravity {STANDARD_GRAVITY} m/s^2: the log does not contain its location")
-        return NavigationLog(sensors, fixes, reference, STANDARD_GRAVITY, notes)
-    latitude, height = torch.tensor([centre[0] * _DEGREE, centre[2]], dtype=torch.float64)
-    return NavigationLog(sensors, fixes, reference, float(earth.gravity(latitude, height)), notes)
+        notes += (f"gravity {gravity} m/s^2: the log does not contain its location",)
+    else:
+        latitude, height = torch.tensor([centre[0] * _DEGREE, centre[2]], dtype=torch.float64)
+        gravity = float(earth.gravity(latitude, height))
+    notes += compare_reference(truth, reference)
+    notes += compare_inertial(truth, sensors, reference, gravity)
+    fixes, fix_notes = compare_fixes(gnss, fixes, reference, limits)
+    tables = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
+    notes += (*fix_notes, *compare_times(tables))
+    dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
+    return NavigationLog(sensors, fixes, reference, gravity, (*dropped, *notes))
+
+
+def _samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
+    """Read and check the IMU samples."""
+    time, notes = _imu_time(table)
+    force, rate = (
+        parse_numbers(table, ("fx", "fy", "fz")),
+        parse_numbers(table, ("wx", "wy", "wz")),
+    )
+    check_force(force, table.name)
+    check_changes(table, ("fx", "fy", "fz", "wx", "wy", "wz"), time, np.hstack([force, rate]))
+    return ImuLog(time, swap_frd_rfu(force), swap_frd_rfu(rate)), notes
 
 
 def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
@@ -128,6 +151,12 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
             f"{table.name} must not have gaps, got a gap of {step[i]:.3f} s after {table.row(i)} "
             f"(t = {time[i]}), with samples every {typical:.4f} s. "
             "Cut the log there and use the longer part."
+        )
+    slow = np.flatnonzero(step > 3 * typical)
+    if slow.size:
+        notes += (
+            f"{table.name}: {slow.size} intervals are longer than 3 samples, the longest with "
+            f"{step[i]:.3f} s after {table.row(i)}. Samples were interpolated",
         )
     return time, notes
 
@@ -170,13 +199,6 @@ def _positions(table: LogTable, origin: tuple[float, ...] | None) -> Array:
     if table.has(_LOCAL) or not table.has(_GEODETIC):
         return swap_frd_rfu(parse_numbers(table, _LOCAL))
     pos = parse_numbers(table, _GEODETIC)
-    invalid = np.flatnonzero(np.abs(pos[:, 0]) > 90.0)
-    if invalid.size:
-        position = table.row(int(invalid[0]))
-        raise ValueError(
-            f"{table.name}: column lat_deg must be between -90 and 90, got {pos[invalid[0], 0]} in "
-            f"{position}. Correct or remove this row."
-        )
     scale = np.array([_DEGREE, _DEGREE, 1.0])
     return earth.local_enu(
         torch.from_numpy(pos * scale), torch.from_numpy(np.array(origin) * scale)
@@ -200,17 +222,14 @@ def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
     time = read_times(table, longest=100.0)
     derived = "vn" not in table.rows and "vn_d" in table.rows
     roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
-    max_pitch, max_roll = float(np.abs(pitch).max()), float(np.abs(roll).max())
-    if max_pitch > 1.001 * math.pi / 2 or max_roll > 1.001 * math.pi:
-        raise ValueError(
-            f"{table.name}: pitch and roll must be at most pi / 2 and pi rad, got {max_pitch:g} and "
-            f"{max_roll:g}. If in degrees, multiply roll, pitch, yaw by {_DEGREE:.10f}."
-        )
     euler = torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1))
     q = attitude.quaternion_from_dcm(attitude.dcm_from_euler(euler)).numpy()
+    columns = _DERIVED if derived else _VELOCITY
+    velocity = swap_frd_rfu(parse_numbers(table, columns))
+    check_changes(table, columns, time, swap_frd_rfu(velocity))
     return ReferenceLog(
         time,
         q,
-        swap_frd_rfu(parse_numbers(table, _DERIVED if derived else _VELOCITY)),
+        velocity,
         _positions(table, origin),
     )

@@ -1,6 +1,6 @@
 """Parquet and CSV tables with named columns.
 
-Error messages name the file, the column and the row.
+Error messages name the file, the column and the row. The file is long because of them.
 """
 
 from __future__ import annotations
@@ -12,6 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+
+from pfbench.files.table_file import read_table_file
+from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.scenario.plausibility.column_checks import check_range
 
 Array = NDArray[np.float64]
 
@@ -48,12 +52,16 @@ class LogTable(NamedTuple):
         name: Name of the file, for messages.
         lines: Whether messages count lines (CSV) instead of rows.
         stated: Metadata of a Parquet file.
+        limits: Limits of the platform.
+        notes: Rows that the reader dropped.
     """
 
     rows: pd.DataFrame
     name: str
     lines: bool
     stated: dict[str, str]
+    limits: PlausibleLimits = PlausibleLimits()
+    notes: tuple[str, ...] = ()
 
     def has(self, columns: Sequence[str]) -> bool:
         """Return whether the table has all of these columns."""
@@ -64,19 +72,25 @@ class LogTable(NamedTuple):
         return f"line {i + 2}" if self.lines else f"row {i} (from 0)"
 
 
-def read_table(folder: Path, name: str, select: dict[str, int | None]) -> LogTable:
+def read_table(
+    folder: Path,
+    name: str,
+    select: dict[str, int | None],
+    limits: PlausibleLimits | None = None,
+) -> LogTable:
     """Read a table and select rows.
 
     Args:
         folder: Folder of the table.
         name: File name without .parquet or .csv.
         select: Required value by column, for columns in the table. None accepts a single value.
+        limits: Limits of the platform. None for the default limits.
 
     Returns:
         The selected rows.
 
     Raises:
-        ValueError: If the file does not exist or is ambiguous, a selection is missing or not in the
+        ValueError: If the file does not exist, is ambiguous or damaged, a selection is missing or not in the
             file, or the table has fewer than two rows.
     """
     files = [
@@ -92,12 +106,15 @@ def read_table(folder: Path, name: str, select: dict[str, int | None]) -> LogTab
             f"{folder} must not contain both {name}.parquet and {name}.csv. Delete one of them."
         )
     file = files[0]
-    if file.suffix == ".csv":
-        table = LogTable(
-            pd.read_csv(file, skip_blank_lines=False, skipinitialspace=True), file.name, True, {}
-        )
-    else:
-        table = _parquet(file)
+    content = read_table_file(file)
+    table = LogTable(
+        content.rows,
+        file.name,
+        file.suffix == ".csv",
+        content.stated,
+        limits or PlausibleLimits(),
+        content.notes,
+    )
     for column, value in select.items():
         if column in table.rows:
             table = _selected(table, column, value)
@@ -108,20 +125,14 @@ def read_table(folder: Path, name: str, select: dict[str, int | None]) -> LogTab
     return table
 
 
-def _parquet(file: Path) -> LogTable:
-    try:
-        from pyarrow import parquet  # required only for Parquet logs
-    except ImportError as error:
-        raise ValueError(
-            f"{file.name} needs pyarrow. Run pip install 'pfbench[data]', or store the log as CSV."
-        ) from error
-    table = parquet.read_table(file)
-    stated = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
-    return LogTable(table.to_pandas(), file.name, False, stated)
-
-
 def _selected(table: LogTable, column: str, value: int | None) -> LogTable:
-    values = sorted(set(table.rows[column].tolist()))
+    numbers = parse_numbers(table, (column,))[:, 0]
+    values = [int(number) for number in np.unique(numbers)]
+    if np.any(numbers != np.rint(numbers)):
+        raise ValueError(
+            f"{table.name}: column {column} must have whole numbers, got "
+            f"{numbers[numbers != np.rint(numbers)][0]:g}. Correct or remove this row."
+        )
     if value is None and len(values) > 1:
         raise ValueError(
             f"{table.name}: column {column} must have one value, got {values}. "
@@ -132,7 +143,7 @@ def _selected(table: LogTable, column: str, value: int | None) -> LogTable:
             f"{table.name} must have rows with {column}={value}, got {values}. Select one of these."
         )
     selected = values[0] if value is None else value
-    rows = table.rows[table.rows[column] == selected].reset_index(drop=True)
+    rows = table.rows[numbers == selected].reset_index(drop=True)
     return table._replace(rows=rows, name=f"{table.name} ({column} {selected})")
 
 
@@ -147,7 +158,8 @@ def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
         Numbers, [n, k].
 
     Raises:
-        ValueError: If a column is missing, or contains text, NaN or infinity.
+        ValueError: If a column is missing, contains text, NaN or infinity, or leaves the range of
+            its quantity in `plausible_limits`.
     """
     missing = [column for column in columns if column not in table.rows]
     if missing:
@@ -159,7 +171,7 @@ def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
         )
     out = np.empty((len(table.rows), len(columns)))
     for i, column in enumerate(columns):
-        values = pd.to_numeric(table.rows[column], errors="coerce").to_numpy(dtype=np.float64)
+        values = convert_column(table, column)
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise ValueError(
@@ -167,8 +179,48 @@ def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
                 f"{table.rows[column].iloc[bad[0]]} in {table.row(int(bad[0]))} ({bad.size} such rows). "
                 "Remove rows without data."
             )
+        check_range(table, column, values)
         out[:, i] = values
     return out
+
+
+def convert_column(table: LogTable, column: str) -> Array:
+    """Convert a column to numbers.
+
+    Args:
+        table: Table.
+        column: Name of the column.
+
+    Returns:
+        Numbers, [n]. NaN where the column does not contain one.
+
+    Raises:
+        ValueError: If the column cannot be converted.
+    """
+    try:
+        return pd.to_numeric(table.rows[column], errors="coerce").to_numpy(dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(
+            f"{table.name}: column {column} must have numbers, got {table.rows[column].dtype} "
+            f"({error}). Convert this column to numbers."
+        ) from error
+
+
+def parse_systems(table: LogTable) -> list[str]:
+    """Return the letter of the satellite system of each row, G without a column `sys`.
+
+    Raises:
+        ValueError: If a value is not the letter of a system.
+    """
+    if "sys" not in table.rows:
+        return ["G"] * len(table.rows)
+    for i, value in enumerate(table.rows["sys"]):
+        if value not in ("G", "R", "E", "C", "J", "I", "S"):
+            raise ValueError(
+                f"{table.name}: column sys must be one of G, R, E, C, J, I, S, got {value!r} in "
+                f"{table.row(i)}. Correct or remove this row."
+            )
+    return [str(value) for value in table.rows["sys"]]
 
 
 def read_times(table: LogTable, longest: float) -> Array:

@@ -13,7 +13,13 @@ import torch
 from pfbench.model.strapdown.tight import TightMemsInputs
 from pfbench.nav import earth
 from pfbench.nav.preintegration import PreintegratedImu
-from pfbench.scenario.recorded.log_tables import Array, LogTable, parse_numbers, read_table
+from pfbench.scenario.recorded.log_tables import (
+    Array,
+    LogTable,
+    parse_numbers,
+    parse_systems,
+    read_table,
+)
 
 _SAME_EPOCH = 0.02  # s; the receiver clock is accurate to some milliseconds
 _MEASURED = (
@@ -48,6 +54,7 @@ class RawGnssLog(NamedTuple):
         velocity: Velocities of the satellites, m/s, [K, S, 3].
         azimuth: Azimuth, rad, [K, S].
         elevation: Elevation, rad, [K, S].
+        notes: Messages of the reader.
     """
 
     names: tuple[str, ...]
@@ -59,6 +66,7 @@ class RawGnssLog(NamedTuple):
     velocity: Array
     azimuth: Array
     elevation: Array
+    notes: tuple[str, ...] = ()
 
 
 def read_sky(
@@ -91,7 +99,7 @@ def read_sky(
             f"{table.name} does not contain a row above {mask_deg} degrees within {_SAME_EPOCH} s of the "
             "end of a step. Use the same clock for t in all tables."
         )
-    systems = table.rows["sys"] if "sys" in table.rows else ["G"] * len(row)
+    systems = parse_systems(table)
     row_names = np.array(
         [
             f"{system}{int(number):02d}"
@@ -120,9 +128,8 @@ def read_sky(
     )
     reported = value["sd_pr"], value["sd_prr"], (position - centre) @ axes.T, velocity @ axes.T
     angles = np.radians(value["az"]), np.radians(value["el"])
-    return RawGnssLog(
-        tuple(names.tolist()), *(fill(column) for column in (*corrected, *reported, *angles))
-    )
+    columns = [fill(column) for column in (*corrected, *reported, *angles)]
+    return RawGnssLog._make([tuple(names.tolist()), *columns, table.notes])
 
 
 def _local(table: LogTable, origin: Sequence[float] | None) -> tuple[Array, Array]:

@@ -17,14 +17,15 @@ from typing_extensions import override
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.strapdown.tuning import TightTuning
+from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.noise.base import NoiseRegime, check_unit_process
 from pfbench.noise.white import NominalNoise
 from pfbench.scenario.base import (
     Scenario,
     check_added_sd,
-    check_divergence_threshold,
     check_duration,
 )
+from pfbench.scenario.plausibility.sky_checks import check_sky
 from pfbench.scenario.recorded.assembly import FixReceiver, assemble, encode_names
 from pfbench.scenario.recorded.log_reader import read_log
 from pfbench.scenario.recorded.log_tables import find_dataset
@@ -99,8 +100,7 @@ class RecordedWalk(Scenario):
         end_s: End, s of the log. None for the end of the log.
         files: Names of the tables. Steps end at the times of `gnss`.
         origin: lat_deg, lon_deg, h_m of the local frame. None if the files contain it.
-        divergence_threshold_m: Position error, m, beyond which a run counts as diverged. None if
-            the scenario does not define divergence.
+        limits: Limits of the platform for the checks of the log. None for the default limits.
 
     Raises:
         ValueError: If the step or the threshold is not positive. `draw` raises it for a missing root
@@ -117,10 +117,9 @@ class RecordedWalk(Scenario):
     end_s: float | None = None
     files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
     origin: Sequence[float] | None = None
-    divergence_threshold_m: float | None = None
+    limits: PlausibleLimits | None = None
 
     def __post_init__(self) -> None:
-        check_divergence_threshold(self.divergence_threshold_m)
         check_duration("scenario.filter_step_s", self.filter_step_s)
 
     @override
@@ -177,7 +176,7 @@ class RecordedWalk(Scenario):
     def _read(self) -> tuple[ResampledLog, RawGnssLog]:
         """Read the log on filter steps and the raw measurements relative to the start."""
         folder = find_dataset(self.root, self.folder)
-        log = read_log(folder, self.files, origin=self.origin)
+        log = read_log(folder, self.files, origin=self.origin, limits=self.limits)
         leg = resample_log(
             log,
             self.receiver.fix_interval_s,
@@ -188,5 +187,9 @@ class RecordedWalk(Scenario):
         gnss_log = read_sky(
             folder, np.concatenate([[leg.start_s], leg.time]), self.receiver.mask_deg, self.origin
         )
-        start = interpolate(log.reference, np.array([leg.start_s]))[0, 7:]
+        time = np.concatenate([[leg.start_s], leg.time])
+        motion = interpolate(log.reference, time)
+        notes = check_sky(gnss_log, time, motion, self.limits or PlausibleLimits())
+        leg = leg._replace(notes=(*leg.notes, *notes))
+        start = motion[0, 7:]
         return leg, gnss_log._replace(satellite_position=gnss_log.satellite_position - start)

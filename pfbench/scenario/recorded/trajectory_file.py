@@ -14,8 +14,15 @@ import torch
 from pfbench.nav import attitude, earth
 from pfbench.nav.motion_spline import MotionSpline, RecordedMotion
 from pfbench.nav.trajectory import TrajectoryData
-from pfbench.scenario.recorded.log_tables import find_dataset, parse_numbers, read_table, read_times
-from pfbench.scenario.recorded.navigation_log import swap_frd_rfu
+from pfbench.scenario.plausibility.column_checks import check_changes
+from pfbench.scenario.plausibility.log_agreement import compare_reference
+from pfbench.scenario.recorded.log_tables import (
+    find_dataset,
+    parse_numbers,
+    read_table,
+    read_times,
+)
+from pfbench.scenario.recorded.navigation_log import ReferenceLog, swap_frd_rfu
 
 
 @dataclass(frozen=True)
@@ -115,12 +122,17 @@ def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> Recor
         for columns in (("pn", "pe", "pd"), ("vn", "ve", "vd"))
     )
     roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
-    if np.abs(pitch).max() > 1.001 * math.pi / 2:
-        raise ValueError(
-            f"{table.name}: pitch must be at most pi / 2 rad, got {np.abs(pitch).max():g}. "
-            "If in degrees, multiply angles by pi / 180."
-        )
+    check_changes(table, ("vn", "ve", "vd"), time.numpy(), swap_frd_rfu(vel.numpy()))
     dcm = attitude.dcm_from_euler(torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1)))
+    motion = ReferenceLog(
+        time.numpy(), attitude.quaternion_from_dcm(dcm).numpy(), vel.numpy(), enu.numpy()
+    )
+    contradictions = compare_reference(table, motion)
+    if contradictions:  # a truth is free of measurement errors
+        raise ValueError(
+            f"a trajectory must have positions and velocities that agree, got {contradictions[0]}. "
+            "Correct or remove this row."
+        )
     centre = torch.tensor(
         [math.radians(origin[0]), math.radians(origin[1]), origin[2]], dtype=torch.float64
     )

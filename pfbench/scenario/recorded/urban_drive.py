@@ -16,11 +16,11 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.pseudorange_errors import NormalRangeError
 from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning
+from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.noise.base import NoiseRegime, check_unit_process
 from pfbench.scenario.base import (
     Scenario,
     check_added_sd,
-    check_divergence_threshold,
     check_duration,
 )
 from pfbench.scenario.recorded.log_tables import find_dataset
@@ -75,8 +75,7 @@ class UrbanDrive(Scenario):
         receiver: Selection of pseudoranges, and standard deviation of added errors.
         start_s: Start, s of the drive. None for the start of the drive.
         end_s: End, s of the drive. None for the end of the drive.
-        divergence_threshold_m: Position error, m, beyond which a run counts as diverged. None if
-            the scenario does not define divergence.
+        limits: Limits of the platform for the checks of the log. None for the default limits.
 
     Raises:
         ValueError: If the threshold is not positive. `draw` raises it for a missing root or folder,
@@ -90,15 +89,12 @@ class UrbanDrive(Scenario):
     receiver: PseudorangeReceiver = field(default_factory=PseudorangeReceiver)
     start_s: float | None = None
     end_s: float | None = None
-    divergence_threshold_m: float | None = None
-
-    def __post_init__(self) -> None:
-        check_divergence_threshold(self.divergence_threshold_m)
+    limits: PlausibleLimits | None = None
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         drive = select_stretch(
-            read_drive(find_dataset(self.root, self.folder)), self.start_s, self.end_s
+            read_drive(find_dataset(self.root, self.folder), self.limits), self.start_s, self.end_s
         )
         draws = PhiloxStream(seed, runs)
         time, (reduced, inputs) = (
@@ -123,7 +119,7 @@ class UrbanDrive(Scenario):
         y[:, epochs] += noise.draw_errors(draws.at_step(0), channels, time[epochs])
         record = Record(y, inputs, self._draw_start(drive, draws))
         track = torch.cat([truth["position"], truth["height"]], -1)
-        notes = (f"clock: nominal drift {self.receiver.clock_drift} m/s subtracted",)
+        notes = (f"clock: nominal drift {self.receiver.clock_drift} m/s subtracted", *drive.notes)
         return Episode(record, time, truth, track, notes, line_of_sight_directions(drive))
 
     def _draw_start(self, drive: UrbanLog, draws: PhiloxStream) -> Tensor:

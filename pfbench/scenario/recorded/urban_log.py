@@ -2,7 +2,7 @@
 
 The log contains satellite positions in the Earth-fixed axes of transmission. They are rotated to the
 axes of reception at the start. A range is then a distance, accurate to a millimetre within a
-kilometre of the start.
+kilometre of the start. The file is long since it also checks the tables against each other.
 """
 
 from __future__ import annotations
@@ -18,8 +18,20 @@ from torch import Tensor
 from pfbench.model.pseudorange_errors import UrbanInputs
 from pfbench.nav import earth
 from pfbench.nav.gnss.orbits import azimuth_elevation
+from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.scenario.plausibility.column_checks import check_changes
+from pfbench.scenario.plausibility.log_agreement import compare_reference, compare_wheels
+from pfbench.scenario.plausibility.satellite_agreement import check_orbits, compare_ranges
 from pfbench.scenario.recorded.assembly import encode_names
-from pfbench.scenario.recorded.log_tables import Array, parse_numbers, read_table, read_times
+from pfbench.scenario.recorded.log_tables import (
+    Array,
+    LogTable,
+    parse_numbers,
+    parse_systems,
+    read_table,
+    read_times,
+)
+from pfbench.scenario.recorded.navigation_log import ReferenceLog
 
 LIGHT = 299792458.0  # m/s
 MOVING = 1.0  # m/s; smallest speed at which the velocity determines the heading
@@ -40,6 +52,7 @@ class UrbanLog(NamedTuple):
         sd: Standard deviation reported by the receiver, m, [T, S].
         cn0: Carrier-to-noise density, dB-Hz, [T, S].
         satellite_position: Satellite positions in the Earth-fixed axes of transmission, m, [T, S, 3].
+        notes: Messages of the checks.
     """
 
     time: Array
@@ -52,22 +65,25 @@ class UrbanLog(NamedTuple):
     sd: Array
     cn0: Array
     satellite_position: Array
+    notes: tuple[str, ...] = ()
 
 
-def read_drive(folder: Path) -> UrbanLog:
+def read_drive(folder: Path, limits: PlausibleLimits | None = None) -> UrbanLog:
     """Read the tables `pseudorange`, `odometry` and `truth` of a folder.
 
     Args:
         folder: Folder of the tables.
+        limits: Limits of the platform. None for the default limits.
 
     Returns:
         The drive.
 
     Raises:
-        ValueError: If a table or column is missing, or the tables have different epochs.
+        ValueError: If a table or column is missing, the tables have different epochs, or a check
+            fails.
     """
     pseudoranges, wheels, truth = (
-        read_table(folder, name, {}) for name in ("pseudorange", "odometry", "truth")
+        read_table(folder, name, {}, limits) for name in ("pseudorange", "odometry", "truth")
     )
     time = read_times(wheels, 1.0)
     reference = parse_numbers(truth, ("t", "lat_deg", "lon_deg", "h_m", "ve_d", "vn_d"))
@@ -87,16 +103,49 @@ def read_drive(folder: Path) -> UrbanLog:
         )
     names = [
         f"{system}{int(number):02d}"
-        for system, number in zip(pseudoranges.rows["sys"], svid, strict=True)
+        for system, number in zip(parse_systems(pseudoranges), svid, strict=True)
     ]
     satellites, slot = np.unique(names, return_inverse=True)
+    if len(set(zip(row, slot, strict=True))) < len(slot):
+        raise ValueError(
+            f"{pseudoranges.name} must have one row for each satellite and epoch, got two. Remove one."
+        )
     columns = np.full((6, len(time), len(satellites)), np.nan)
     columns[:, row, slot] = value, np.sqrt(variance), cn0, *positions
     position = np.column_stack([np.radians(reference[:, 1:3]), reference[:, 3]])
     speed, yaw_rate = parse_numbers(wheels, ("v_fwd", "yaw_rate_ned")).T
     sky_columns = columns[0], columns[1], columns[2], np.moveaxis(columns[3:], 0, -1)
-    return UrbanLog(
+    check_changes(wheels, ("v_fwd", "yaw_rate_ned"), time, np.column_stack([speed, yaw_rate]))
+    drive = UrbanLog(
         time, speed, yaw_rate, position, reference[:, 4:], tuple(satellites.tolist()), *sky_columns
+    )
+    return drive._replace(notes=_check_drive(drive, (pseudoranges, wheels, truth)))
+
+
+def _check_drive(drive: UrbanLog, tables: tuple[LogTable, LogTable, LogTable]) -> tuple[str, ...]:
+    """Check satellites, ranges, wheels and reference against each other; return notes."""
+    pseudoranges, wheels, truth = tables
+    receiver = earth.ecef(torch.from_numpy(drive.position)).numpy()
+    check_orbits(pseudoranges.name, drive.satellites, drive.time, drive.satellite_position)
+    distance = np.linalg.norm(
+        rotate_heading(drive.satellite_position, receiver[:, None]) - receiver[:, None], axis=-1
+    )
+    enu = earth.local_enu(torch.from_numpy(drive.position), torch.from_numpy(drive.position[0]))
+    velocity = np.column_stack([drive.velocity, np.gradient(enu[:, 2].numpy(), drive.time)])
+    check_changes(truth, ("ve_d", "vn_d"), drive.time, drive.velocity)
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(drive.time), 1))
+    motion = ReferenceLog(drive.time, level, velocity, enu.numpy())
+    return (
+        *(note for table in tables for note in table.notes),
+        *compare_reference(truth, motion),
+        *compare_wheels(wheels, drive.speed, drive.yaw_rate, motion),
+        *compare_ranges(
+            pseudoranges.name,
+            drive.satellites,
+            drive.time,
+            drive.range - distance,
+            pseudoranges.limits,
+        ),
     )
 
 
@@ -139,7 +188,9 @@ def select_stretch(drive: UrbanLog, start: float | None, end: float | None) -> U
             f"The drive covers {drive.time[0]} to {drive.time[-1]} s."
         )
     leaves = {
-        name: value[inside] for name, value in drive._asdict().items() if name != "satellites"
+        name: value[inside]
+        for name, value in drive._asdict().items()
+        if name not in ("satellites", "notes")
     }
     return drive._replace(**leaves)
 

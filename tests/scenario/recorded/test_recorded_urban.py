@@ -13,9 +13,9 @@ import pytest
 import torch
 from checkout import ROOT
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from recorded_data import DATA, recorded
 
+from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -355,7 +355,7 @@ def test_the_factor_is_found_again() -> None:
 def conf(*overrides: str) -> tuple[UrbanDrive, UrbanGnss]:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("config", overrides=["scenario=recorded_berlin", *overrides])
-    return tuple(instantiate(cfg[part], _convert_="all") for part in ("scenario", "model"))  # type: ignore[return-value]
+    return tuple(job.instantiate(cfg[part]) for part in ("scenario", "model"))  # type: ignore[return-value]
 
 
 @recorded

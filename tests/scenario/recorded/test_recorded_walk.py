@@ -13,11 +13,11 @@ import pytest
 import torch
 from checkout import ROOT
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from recorded_data import believed, recorded
 from synthetic_log import ORIGIN, drive, tables, write
 from torch import Tensor
 
+from pfbench import job
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -336,7 +336,7 @@ def test_faulty_tables_are_refused(tmp_path: Path, spoil: object, message: str) 
 def configured(noise: NoiseRegime, runs: int, *overrides: str) -> tuple[Episode, StrapdownTight]:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("config", overrides=["scenario=recorded_walk", *overrides])
-    scenario, model = (instantiate(cfg[part], _convert_="all") for part in ("scenario", "model"))
+    scenario, model = (job.instantiate(cfg[part]) for part in ("scenario", "model"))
     return scenario.draw(noise, torch.arange(runs), 1), model
 
 

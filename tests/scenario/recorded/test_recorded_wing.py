@@ -12,10 +12,10 @@ import pytest
 import torch
 from checkout import ROOT
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from recorded_data import DATA, believed, recorded
 from synthetic_log import tables, write
 
+from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -171,7 +171,7 @@ def test_what_cannot_be_scored_is_refused(root: Path, make: object, message: str
 def drawn(runs: int, *overrides: str) -> tuple[Episode, StrapdownTotal]:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("config", overrides=["scenario=recorded_fixed_wing", *overrides])
-    scenario, model = (instantiate(cfg[part], _convert_="all") for part in ("scenario", "model"))
+    scenario, model = (job.instantiate(cfg[part]) for part in ("scenario", "model"))
     assert isinstance(model, StrapdownTotal)
     return scenario.draw(NominalNoise(), torch.arange(runs), 1), model
 

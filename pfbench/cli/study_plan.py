@@ -1,0 +1,121 @@
+"""Jobs, worlds and pairs of a sweep, before it runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+from pfbench.cli.compose import given_keys, read_sweep
+from pfbench.config.composition import JobConfig, compose
+from pfbench.config.paper_block import PAPER
+from pfbench.config.sweep_check import expand_sweep
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """Jobs of a sweep.
+
+    Attributes:
+        alternatives: Alternatives of each key, each as an override.
+        first: Configuration of the first job.
+        experiments: Names of the experiments.
+    """
+
+    alternatives: tuple[tuple[str, ...], ...]
+    first: JobConfig
+    experiments: tuple[str, ...]
+
+    @property
+    def jobs(self) -> int:
+        """Number of jobs."""
+        jobs = 1
+        for options in self.alternatives:
+            jobs *= len(options)
+        return jobs
+
+    @property
+    def has_one_study(self) -> bool:
+        """Return whether all jobs belong to one study."""
+        return "study" not in self._swept_options() and len(self.experiments) < 2
+
+    def list_families(self) -> dict[str, str]:
+        """Return the family of each scenario of the sweep."""
+        families: dict[str, str] = {}
+        for k, options in enumerate(self.alternatives):
+            if len(options) > 1 and given_keys(options[:1]) == {"scenario"}:
+                for option in options:
+                    words = [values[0] for values in self.alternatives]
+                    words[k] = option
+                    families |= dict([_family(compose_words(words))])
+        return families or dict([_family(self.first)])
+
+    def count_pairs(self) -> int:
+        """Count the planned pairs of filters; at least 1, since one filter is compared later."""
+        from pfbench.results.comparison.baselines import list_planned_pairs
+
+        swept = self._swept_options()
+        names = [option.partition("=")[2] for option in swept.pop("filter", ("filter=one",))]
+        settings = [len(swept[key]) for key in swept if re.match(r"filter\.|particles$", key)]
+        variants = 1
+        for count in settings:
+            variants *= count
+        labels = names if variants == 1 else [f"{n} {k}" for n in names for k in range(variants)]
+        return max(1, len(list_planned_pairs(labels)))
+
+    def compose_jobs(self) -> list[JobConfig]:
+        """Compose the configurations of all jobs."""
+        return [compose_words(words) for words in product(*self.alternatives)]
+
+    def describe_size(self) -> str:
+        """Describe what the chosen runs and worlds can show; empty if the runs are not one number."""
+        from pfbench.results.statistics.study_size_sentence import describe_study_size
+
+        runs = self.first.values["runs"]
+        if type(runs) is not int or runs < 1 or "runs" in self._swept_options():
+            return ""
+        worlds = len(set(self.list_families().values()))
+        return f"plan: {describe_study_size(runs, worlds, self.count_pairs())}"
+
+    def _swept_options(self) -> dict[str, tuple[str, ...]]:
+        """Return the alternatives of each key that has several."""
+        several = [options for options in self.alternatives if len(options) > 1]
+        return {next(iter(given_keys(options[:1]))): options for options in several}
+
+
+def plan_study(overrides: Sequence[str]) -> StudyPlan:
+    """Plan a sweep, or a single job.
+
+    Args:
+        overrides: Overrides, some with several values, without flags.
+
+    Returns:
+        The plan.
+
+    Raises:
+        Exception: If an override or the configuration of the first job is not valid.
+    """
+    names = [word.partition("=")[2] for word in overrides if word.startswith("+experiment=")]
+    params = [word for name in names for word in read_sweep(name)]
+    alternatives = tuple(tuple(options) for options in expand_sweep([*params, *overrides]))
+    first = compose_words([options[0] for options in alternatives])
+    return StudyPlan(alternatives, first, tuple(names))
+
+
+def compose_words(words: Sequence[str]) -> JobConfig:
+    """Compose a configuration without the overrides of Hydra itself, except its search path.
+
+    Args:
+        words: Overrides of one value.
+    """
+    return compose([word for word in words if not re.match(r"[+~]*hydra[/.](?!searchpath)", word)])
+
+
+def _family(config: JobConfig) -> tuple[str, str]:
+    """Return the scenario of a job and its family, itself if none is set."""
+    name = config.choices["scenario"]
+    scenario: Any = config.values.get("scenario")
+    paper = scenario.get(PAPER) if isinstance(scenario, dict) else None
+    return name, str((paper or {}).get("family") or name)

@@ -1,0 +1,223 @@
+"""Sweep that adds runs until every planned pair of filters is decided: `runs=until-decided`."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pfbench.cli.study_plan import StudyPlan
+from pfbench.config.composition import JobConfig
+
+if TYPE_CHECKING:
+    from pfbench.results.until_decided.look_schedule import LookRecord, LookSchedule
+    from pfbench.results.until_decided.look_table import LookTable
+    from pfbench.results.until_decided.pair_states import PairState
+
+UNTIL_DECIDED = "until-decided"  # value of `runs`
+_HOUR = 3600.0
+
+
+def wants_until_decided(plan: StudyPlan) -> bool:
+    """Return whether a study adds runs until it is decided.
+
+    Args:
+        plan: Plan of the study.
+    """
+    return plan.first.values.get("runs") == UNTIL_DECIDED
+
+
+@dataclass(frozen=True)
+class GrowingSweep:
+    """Sweep whose runs grow from look to look.
+
+    Attributes:
+        study: Name of the study.
+        results: Folder of all studies.
+        jobs: Configurations of all jobs, whose `runs` is `until-decided`.
+        schedule: Looks.
+        max_hours: Computing time of all jobs at most, h; None for no limit.
+        repeats_jobs: Whether jobs run again although their results exist.
+    """
+
+    study: str
+    results: Path
+    jobs: tuple[JobConfig, ...]
+    schedule: LookSchedule
+    max_hours: float | None
+    repeats_jobs: bool
+
+    @classmethod
+    def from_plan(cls, plan: StudyPlan) -> GrowingSweep:
+        """Read the settings of a study.
+
+        Args:
+            plan: Plan of the study.
+
+        Raises:
+            ValueError: If a setting is not valid for a study that adds runs.
+        """
+        from pfbench.results.until_decided.look_schedule import LookSchedule
+
+        values = plan.first.values
+        settings = values["until_decided"]
+        hours = settings["max_hours"]
+        if hours is not None and (type(hours) not in (int, float) or hours <= 0):
+            raise ValueError(
+                f"until_decided.max_hours must be positive or null, got {hours}. Use null for no limit."
+            )
+        if not plan.has_one_study:
+            raise ValueError("study must be one name, got several. Run each study by itself.")
+        if values["budget"] != "particles":
+            raise ValueError(
+                "budget must be particles with runs=until-decided, since a budget would set another "
+                f"number of particles at each look, got {values['budget']}. Use budget=particles."
+            )
+        schedule = LookSchedule(settings["mode"], settings["max_runs"])
+        return cls(
+            str(values["study"]), Path(values["results_dir"]), tuple(plan.compose_jobs()),
+            schedule, hours, values["overwrite"] or values["pcrb"] is True,
+        )  # fmt: skip
+
+    def job_keys(self, number: int) -> set[str]:
+        """Return the keys of all jobs until a look.
+
+        Args:
+            number: Number of the look, from 1.
+        """
+        from pfbench.job.plan import job_key
+
+        keys = set()
+        for config in self.jobs:
+            values = copy.deepcopy(config.values)
+            for first, runs in self.schedule.parts(number):
+                numbers = {"first_run": config.values["first_run"] + first, "runs": runs}
+                keys.add(job_key({**values, **numbers}))
+        return keys
+
+    def has_results(self, number: int) -> bool:
+        """Return whether all jobs until a look have a file.
+
+        Args:
+            number: Number of the look, from 1.
+        """
+        folder = self.results / self.study
+        return all((folder / f"{key}.npz").exists() for key in self.job_keys(number))
+
+    def read(self, number: int) -> LookTable:
+        """Read the results until a look.
+
+        Args:
+            number: Number of the look, from 1.
+        """
+        from pfbench.results.until_decided.look_table import read_look_table
+
+        return read_look_table(self.study, self.results, self.job_keys(number))
+
+    def run(self, run_part: Callable[[Sequence[str]], None]) -> None:
+        """Run look after look until all pairs are decided or a cap is reached.
+
+        Args:
+            run_part: Runs the sweep with further overrides.
+
+        Raises:
+            ValueError: If the study was started with another plan, or a result is missing.
+        """
+        from pfbench.results.until_decided.look_lines import describe_end, format_look
+
+        record = self._open_record()
+        numbers = range(1, len(self.schedule.runs) + 1)
+        if record.state and self.has_results(len(record.looks)) and not self.repeats_jobs:
+            print(*record.looks, sep="\n")
+            print(f"study {self.study} is finished: {record.state}\n{self._next_command()}")
+            return
+        lines: list[str] = []
+        states: list[PairState] = []
+        seconds = 0.0
+        for number in numbers:
+            if number > 1 and (reason := self._exceeds_time(seconds, number)):
+                record.write(lines)
+                print(f"{reason}\n{self._next_command()}")
+                return
+            table = self._compute_look(number, run_part)
+            seconds = table.seconds
+            earlier, states = states, self._decide(table)
+            lines.append(format_look(number, self.schedule, states, earlier))
+            print(lines[-1], flush=True)
+            state = describe_end(number, self.schedule, states)
+            record.write(lines, state)
+            if state:
+                print(f"study {self.study} is finished: {state}\n{self._next_command()}")
+                return
+
+    def _open_record(self) -> LookRecord:
+        """Open the record of the study, with the settings that must not change between looks."""
+        from pfbench.results.until_decided.look_schedule import RECORD, LookRecord
+
+        request = {
+            "until_decided.mode": self.schedule.mode,
+            "until_decided.max_runs": self.schedule.max_runs,
+            "jobs": sorted(self.job_keys(1)),
+        }
+        return LookRecord(self.results / self.study / RECORD, request)
+
+    def _compute_look(self, number: int, run_part: Callable[[Sequence[str]], None]) -> LookTable:
+        """Run the jobs of a look without a result, and read all runs so far."""
+        start = self.jobs[0].values["first_run"]
+        parts = [
+            [f"runs={runs}", f"first_run={start + first}"]
+            for first, runs in self.schedule.parts(number)
+        ]
+        if self.repeats_jobs or not self.has_results(number):
+            run_part(parts[-1])
+        table = self.read(number)
+        if table.parts < len(self.job_keys(number)):  # damaged files were set aside
+            for words in parts:
+                run_part(words)
+            table = self.read(number)
+        return table
+
+    def _decide(self, table: LookTable) -> list[PairState]:
+        """Decide the planned pairs with the runs so far."""
+        from pfbench.results.until_decided.pair_states import decide_pairs
+
+        if not table.pairs:
+            raise ValueError(
+                "filter must be at least two filters with runs=until-decided, got one per condition. "
+                "Add a filter (filter=ekf,sir), or set a number of runs."
+            )
+        return decide_pairs(table.runs, table.pairs, self.schedule)
+
+    def _exceeds_time(self, seconds: float, number: int) -> str:
+        """Return why a look must not begin: its expected end exceeds the limit; empty if it may."""
+        before, after = self.schedule.runs[number - 2 : number]
+        expected = seconds * after / before / _HOUR
+        if self.max_hours is None or expected <= self.max_hours:
+            return ""
+        return (
+            f"stopped before look {number}: {after} runs would need {expected:.3g} h of computing "
+            f"time, the limit until_decided.max_hours is {self.max_hours:g} h. Raise it and repeat "
+            "the command to go on."
+        )
+
+    def _next_command(self) -> str:
+        """Format the next command."""
+        return f"Next: pfbench report study={self.study}"
+
+
+def check_has_sweep(flags: Sequence[str]) -> None:
+    """Check that `runs=until-decided` is used for a sweep.
+
+    Args:
+        flags: Flags of the command.
+
+    Raises:
+        ValueError: If the command runs a single job.
+    """
+    if not flags:
+        raise ValueError(
+            f"runs={UNTIL_DECIDED} must be a sweep over at least two filters, got one job. "
+            "Add -m and filter=NAME,NAME."
+        )

@@ -1,0 +1,193 @@
+"""A folder with a manifest of the files that pfbench wrote to it, the only ones that it may remove."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from types import TracebackType
+from typing import Any, Self
+
+from pfbench.files.atomic_write import set_aside, write_atomically
+from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+
+MANIFEST = "manifest.json"
+_SHOWN = 3  # names in a warning at most
+
+log = logging.getLogger("pfbench")
+
+
+class RecordedFolder:
+    """Folder whose files are written with a record, so that a later writer removes only these.
+
+    Use it as a context. At the end, files of the previous manifest that were not written again are
+    removed if their content is unchanged. After an error nothing is removed. A file that the manifest
+    does not list, or that was changed since, is never removed: it stays, or is renamed to `NAME.kept`
+    if its name is needed.
+
+    Args:
+        path: The folder. It is created with the first file.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._previous = _read_manifest(self.path / MANIFEST)
+        self._written: dict[str, str] = {}
+        self._renamed: list[str] = []
+
+    def __enter__(self) -> Self:
+        """Return the folder."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Remove the old files and write the manifest."""
+        if kind is None:
+            self._remove_old_files()
+        elif not self._written:
+            return
+        files = self._written if kind is None else {**self._previous, **self._written}
+        _write_manifest(self.path / MANIFEST, files)
+        self._report_other_files()
+
+    def write(self, name: str, content: str | bytes) -> Path:
+        """Write a file and record it.
+
+        Args:
+            name: Path relative to the folder, with `/`.
+            content: Content; text is encoded as UTF-8.
+
+        Returns:
+            Path of the file.
+
+        Raises:
+            ValueError: If the name leaves the folder, or a folder of the name is a link.
+        """
+        target = self.path / name
+        if not _is_plain_name(name):
+            raise ValueError(
+                f"name must be a path within {self.path}, got {name!r}. Use a relative path."
+            )
+        if not _has_own_parents(self.path, name):
+            raise ValueError(
+                f"{target.parent} must be a folder, got a link. Remove the link, or choose another folder."
+            )
+        plain = content.encode() if isinstance(content, str) else content
+        digest = hash_content(plain)
+        expected = (digest, self._previous.get(name), self._written.get(name))
+        if target.is_symlink() or (target.exists() and _hash_file(target) not in expected):
+            self._renamed.append(set_aside(target, "kept").relative_to(self.path).as_posix())
+        write_atomically(target, lambda file: file.write(plain))
+        self._written[name] = digest
+        return target
+
+    def _remove_old_files(self) -> None:
+        """Remove the unchanged files of the previous manifest that were not written again."""
+        for name in sorted(self._previous.keys() - self._written.keys()):
+            file = self.path / name
+            if not _has_own_parents(self.path, name) or file.is_symlink() or not file.is_file():
+                continue
+            if _hash_file(file) == self._previous[name]:
+                file.unlink()
+
+    def _report_other_files(self) -> None:
+        """Warn about files that are not of the manifest."""
+        if self._renamed:
+            log.warning(
+                "warning  %s: renamed before a new file of that name was written: %s",
+                self.path,
+                _list_names(self._renamed),
+            )
+        others = sorted(
+            name
+            for file in self.path.rglob("*")
+            if (file.is_symlink() or file.is_file())
+            and (name := file.relative_to(self.path).as_posix()) not in (MANIFEST, *self._written)
+            and name not in self._renamed
+        )
+        if others:
+            log.warning(
+                "warning  %s: not written by this command, so not removed: %s",
+                self.path,
+                _list_names(others),
+            )
+
+
+def record_change(file: Path) -> None:
+    """Record the new content of a file that a script of pfbench changed after it was written.
+
+    Args:
+        file: File next to the manifest. Without a manifest, or if it is not listed, nothing is done.
+    """
+    manifest = file.with_name(MANIFEST)
+    files = _read_manifest(manifest)
+    if file.name in files:
+        _write_manifest(manifest, {**files, file.name: _hash_file(file)})
+
+
+def _read_manifest(path: Path) -> dict[str, str]:
+    """Read the digests by name. A manifest that is damaged or names other folders is renamed."""
+    if not path.is_symlink() and not path.exists():
+        return {}
+    reason = "it is a link"
+    if not path.is_symlink():
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            reason = _find_fault(content)
+        except (OSError, ValueError, RecursionError) as error:
+            reason = f"it is damaged ({error})"
+        if not reason:
+            files: dict[str, str] = content["files"]
+            return files
+    log.warning(
+        "warning  %s is not used, since %s. Renamed to %s, and no file is removed",
+        path,
+        reason,
+        set_aside(path).name,
+    )
+    return {}
+
+
+def _find_fault(content: Any) -> str:
+    """Return why a manifest cannot be used, or an empty text."""
+    files = content.get("files") if isinstance(content, dict) else None
+    if not isinstance(files, dict) or not has_valid_digest(content):
+        return "its digest is not that of its content"
+    bad = [name for name in files if not _is_plain_name(name) or not isinstance(files[name], str)]
+    return f"{bad[0]!r} is not a file of this folder" if bad else ""
+
+
+def _write_manifest(path: Path, files: dict[str, str]) -> None:
+    """Write a manifest with its digest."""
+    content: dict[str, Any] = {"files": dict(sorted(files.items()))}
+    text = json.dumps({**content, DIGEST: hash_content(content)}, indent=1) + "\n"
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def _is_plain_name(name: str) -> bool:
+    """Return whether a name is a relative path without `..`, and not the manifest."""
+    parts = name.split("/")
+    is_relative = not PurePosixPath(name).is_absolute() and "\\" not in name and "\0" not in name
+    return is_relative and name != MANIFEST and not {"", ".", ".."} & set(parts)
+
+
+def _has_own_parents(folder: Path, name: str) -> bool:
+    """Return whether no folder between a folder and a file in it is a link."""
+    parents = [folder / parent for parent in PurePosixPath(name).parents if parent.name]
+    return not any(parent.is_symlink() for parent in parents)
+
+
+def _hash_file(path: Path) -> str:
+    """Compute the digest of a file; empty for a folder."""
+    return hash_content(path.read_bytes()) if path.is_file() else ""
+
+
+def _list_names(names: Sequence[str]) -> str:
+    """Format the first names and the number of the others."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return f"{', '.join(names[:_SHOWN])}{more}"

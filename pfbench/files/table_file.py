@@ -1,0 +1,187 @@
+"""Reading of CSV and Parquet tables: a damaged file gives an error with its place, never a partial table."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+_CONTROL = frozenset(map(chr, range(32))) - {"\t"}
+
+
+class TableFile(NamedTuple):
+    """Content of a table file.
+
+    Attributes:
+        rows: Rows.
+        stated: Metadata of a Parquet file.
+        notes: Rows that the reader dropped.
+    """
+
+    rows: pd.DataFrame
+    stated: dict[str, str]
+    notes: tuple[str, ...] = ()
+
+
+def read_table_file(file: Path) -> TableFile:
+    """Read a CSV or Parquet file.
+
+    Args:
+        file: File. The suffix .parquet selects Parquet.
+
+    Returns:
+        The table. Columns of a CSV file can contain text.
+
+    Raises:
+        ValueError: If the file is damaged, or pyarrow is not installed. The message names the file
+            and, for CSV, the line.
+    """
+    return _read_parquet(file) if file.suffix == ".parquet" else _read_csv(file)
+
+
+def _read_csv(file: Path) -> TableFile:
+    lines, notes = _whole_lines(file)
+    names = [name.strip().strip('"') for name in lines[0].split(",")]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated or not all(names):
+        problem = f"{', '.join(repeated)} twice" if repeated else "an empty name"
+        raise ValueError(
+            f"{file.name}: line 1 must have different names of columns, got {problem}. "
+            "Rename or remove a column."
+        )
+    for number, line in enumerate(lines, 1):
+        fields = line.count(",") + 1 if line.strip() else 0
+        if fields != len(names) or line.count('"') % 2:
+            raise ValueError(
+                f"{file.name}: line {number} must have {len(names)} fields separated by commas, "
+                f"got {fields} in {line[:80]!r}. Repair or remove this line."
+            )
+    try:
+        rows = pd.read_csv(
+            io.StringIO("\n".join(lines) + "\n"),
+            skip_blank_lines=False,
+            skipinitialspace=True,
+            index_col=False,
+            low_memory=False,
+        )
+    except (ValueError, OverflowError, IndexError) as error:
+        raise ValueError(
+            f"{file.name} must be a table of numbers separated by commas, got an error of the "
+            f"reader: {_first_line(error)}. Write the file again."
+        ) from error
+    if len(rows) != len(lines) - 1:
+        raise ValueError(
+            f"{file.name} must have one row in each line, got {len(rows)} rows in "
+            f"{len(lines) - 1} lines. Remove quotes and line breaks inside of fields."
+        )
+    rows.columns = pd.Index(names)
+    return TableFile(rows, {}, notes)
+
+
+def _whole_lines(file: Path) -> tuple[list[str], tuple[str, ...]]:
+    """Return the complete lines, and a note if the last one is not complete."""
+    content = file.read_bytes()
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        position = content[: error.start].count(b"\n") + 1
+        raise ValueError(
+            f"{file.name}: line {position} must be text in UTF-8, got the byte "
+            f"{content[error.start]:#04x}. Repair or remove this line."
+        ) from None
+    lines = text.replace("\r\n", "\n").split("\n")
+    for number, line in enumerate(lines, 1):
+        if not _CONTROL.isdisjoint(line):
+            raise ValueError(
+                f"{file.name}: line {number} must not contain control characters, "
+                f"got {line[:80]!r}. Repair or remove this line."
+            )
+    last = lines.pop()
+    if not lines:
+        raise ValueError(
+            f"{file.name} must have a line of column names, got {last[:80]!r} without a line end. "
+            "Write the file again."
+        )
+    if not last:
+        return lines, ()
+    return lines, (
+        f"{file.name}: line {len(lines) + 1} has no line end, so the file may be truncated. "
+        "This line was dropped",
+    )
+
+
+def _read_parquet(file: Path) -> TableFile:
+    try:
+        import pyarrow as pa  # required only for Parquet
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ValueError(
+            f"{file.name} needs pyarrow. Run pip install 'pfbench[data]', or store the log as CSV."
+        ) from error
+    try:
+        metadata = parquet.read_metadata(file)
+        table = parquet.read_table(file, page_checksum_verification=True, use_threads=False)
+        table.validate(full=True)
+        names = table.column_names
+        rows = table.to_pandas(ignore_metadata=True)
+        pairs = (table.schema.metadata or {}).items()
+        stated = {key.decode(): value.decode() for key, value in pairs}
+        damage = _disagreement(metadata, rows)
+    except (
+        pa.lib.ArrowException,
+        OSError,
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        OverflowError,
+        MemoryError,
+    ) as error:
+        raise ValueError(
+            f"{file.name} must be a Parquet file, got an error of its reader: "
+            f"{_first_line(error)}. Write the file again."
+        ) from error
+    if damage or len(set(names)) < len(names):
+        raise ValueError(
+            f"{file.name} must agree with the counts and limits stored in it, "
+            f"got {damage or 'a column twice'}. The file is damaged: write it again."
+        )
+    return TableFile(rows, stated)
+
+
+def _disagreement(metadata: Any, rows: pd.DataFrame) -> str:
+    """Describe the first column whose values leave the stored limits of a row group, or return ''."""
+    if metadata.num_rows != len(rows):
+        return f"{len(rows)} rows instead of {metadata.num_rows}"
+    start = 0
+    for group in (metadata.row_group(i) for i in range(metadata.num_row_groups)):
+        section = rows.iloc[start : start + group.num_rows]
+        start += group.num_rows
+        for chunk in (group.column(i) for i in range(group.num_columns)):
+            statistics, name = chunk.statistics, chunk.path_in_schema
+            if statistics is None or not statistics.has_min_max or name not in section:
+                continue
+            text = _outside(section[name].to_numpy(), statistics.min, statistics.max)
+            if text:
+                return f"{text} in column {name}"
+    return ""
+
+
+def _outside(values: Any, least: Any, largest: Any) -> str:
+    if values.dtype.kind not in "iuf" or not isinstance(least, int | float) or not len(values):
+        return ""
+    finite = values[np.isfinite(values)]
+    if finite.size and finite.min() == least and finite.max() == largest:
+        return ""
+    if not finite.size or np.isinf(values).any():
+        return ""  # rejected or accepted by the check of missing values
+    return f"values from {finite.min()} to {finite.max()} instead of {least} to {largest}"
+
+
+def _first_line(error: BaseException) -> str:
+    lines: Sequence[str] = str(error).splitlines()
+    return f"{type(error).__name__} {lines[0][:160] if lines else ''}".strip().rstrip(".")

@@ -1,0 +1,177 @@
+"""Epochs that all programs share, and their errors at these epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pfbench.judge.judge_options import JudgeOptions
+from pfbench.judge.readers.local_frame import wrap_to_half_turn
+from pfbench.judge.readers.trajectory_table import ATTITUDE, VELOCITY, TrajectoryTable
+from pfbench.judge.reference_track import ReferenceTrack
+from pfbench.results.error_measures import Array
+
+LEAST_EPOCHS = 10
+_CELL = 1.0  # s, coverage is a share of cells of this length
+
+
+class CommonEpochs(NamedTuple):
+    """Rows of each trajectory at the common epochs.
+
+    Attributes:
+        time: Epochs of the trajectory with the fewest rows, [T], s.
+        rows: Rows of each valid trajectory, [T] each; None for a lost one.
+        coverage: Share of the time that each trajectory covers.
+        unused: Rows of each trajectory within the scored time that are not common.
+    """
+
+    time: Array
+    rows: tuple[np.ndarray | None, ...]
+    coverage: tuple[float, ...]
+    unused: tuple[int, ...]
+
+
+def find_common_epochs(
+    tables: Sequence[TrajectoryTable], reference: ReferenceTrack, options: JudgeOptions
+) -> CommonEpochs:
+    """Find the epochs at which all valid trajectories have a row.
+
+    The trajectories are never interpolated. A trajectory that covers less than `coverage` of the
+    time that any of them covers is lost, and does not limit the epochs of the others.
+
+    Args:
+        tables: Trajectories of all programs and runs of a sequence.
+        reference: Reference of the sequence.
+        options: Options.
+
+    Returns:
+        The epochs.
+
+    Raises:
+        ValueError: If fewer than 10 epochs are common.
+    """
+    masks = [_scored(table.time, reference, options) for table in tables]
+    coverage = _shares_covered([t.time[m] for t, m in zip(tables, masks, strict=True)])
+    valid = [k for k, share in enumerate(coverage) if share >= options.coverage]
+    times = {k: tables[k].time[masks[k]] for k in valid}
+    base = min(valid, key=lambda k: len(times[k]), default=None)
+    grid = times[base] if base is not None else np.zeros(0)
+    nearest = {k: _nearest(times[k], grid) for k in valid}
+    common = np.ones(len(grid), dtype=bool)
+    for k in valid:
+        common &= np.abs(times[k][nearest[k]] - grid) <= options.tolerance
+    common &= _thinned(grid, common, options.every)
+    if common.sum() < LEAST_EPOCHS:
+        raise ValueError(
+            f"trajectories of {reference.file} must share at least {LEAST_EPOCHS} epochs within "
+            f"{options.tolerance:g} s, got {int(common.sum())} of "
+            f"{', '.join(f'{len(times[k])} ({tables[k].file})' for k in valid) or 'none'}. Set "
+            "tolerance=SECONDS, or let the programs write the same epochs."
+        )
+    rows = tuple(
+        np.flatnonzero(masks[k])[nearest[k][common]] if k in times else None
+        for k in range(len(tables))
+    )
+    unused = tuple(
+        int(m.sum()) - (0 if r is None else len(r)) for m, r in zip(masks, rows, strict=True)
+    )
+    return CommonEpochs(grid[common], rows, coverage, unused)
+
+
+def _scored(time: Array, reference: ReferenceTrack, options: JudgeOptions) -> np.ndarray:
+    inside = (time >= options.start) & (time <= options.end)
+    return np.asarray(inside & reference.is_bridged(time))
+
+
+def _shares_covered(times: Sequence[Array]) -> tuple[float, ...]:
+    """Return the share of the cells with an epoch, of the cells in which any trajectory has one."""
+    steps = [float(np.median(np.diff(time))) for time in times if len(time) > 1]
+    cell = max([_CELL, *(2 * step for step in steps)])
+    sets = [set(np.floor(time / cell).astype(np.int64).tolist()) for time in times]
+    every = set().union(*sets)
+    return tuple(len(cells) / max(len(every), 1) for cells in sets)
+
+
+def _nearest(time: Array, grid: Array) -> np.ndarray:
+    """Return the index of the nearest time for each epoch of a grid."""
+    right = np.clip(np.searchsorted(time, grid), 1, max(len(time) - 1, 1))
+    is_left = np.abs(time[right - 1] - grid) <= np.abs(
+        time[np.minimum(right, len(time) - 1)] - grid
+    )
+    return np.asarray(np.where(is_left, right - 1, np.minimum(right, len(time) - 1)))
+
+
+def _thinned(grid: Array, common: np.ndarray, every: float) -> np.ndarray:
+    """Return a mask of common epochs that are at least `every` seconds after the last one."""
+    mask, last = common.copy(), -np.inf
+    for k in np.flatnonzero(common) if every > 0 else ():
+        mask[k] = grid[k] >= last + every * (1 - 1e-9)
+        last = grid[k] if mask[k] else last
+    return mask
+
+
+def position_errors(
+    table: TrajectoryTable, reference: ReferenceTrack, rows: np.ndarray, align: str
+) -> Array:
+    """Compute position errors North, East, Down at rows of a trajectory.
+
+    Args:
+        table: Trajectory.
+        reference: Reference.
+        rows: Rows, [T].
+        align: "none", "offset" (the mean error is removed) or "yaw" (and a turn about the vertical).
+
+    Returns:
+        Estimate minus reference, [T, 3], m.
+    """
+    estimate = reference.locate(table)[rows]
+    truth = reference.interpolate_position(table.time[rows])
+    if align == "none":
+        return estimate - truth
+    mine, theirs = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
+    if align == "yaw":
+        cross = float((mine[:, 0] * theirs[:, 1] - mine[:, 1] * theirs[:, 0]).sum())
+        dot = float((mine[:, :2] * theirs[:, :2]).sum())
+        c, s = np.cos(np.arctan2(cross, dot)), np.sin(np.arctan2(cross, dot))
+        mine = mine @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+    return mine - theirs
+
+
+def column_errors(
+    table: TrajectoryTable, reference: ReferenceTrack, rows: np.ndarray, names: tuple[str, ...]
+) -> Array:
+    """Compute errors of velocities or angles at rows of a trajectory.
+
+    Args:
+        table: Trajectory.
+        reference: Reference.
+        rows: Rows, [T].
+        names: Columns of one group.
+
+    Returns:
+        Estimate minus reference, [T, C], m/s or rad.
+    """
+    truth = reference.interpolate_columns(names, table.time[rows])
+    difference = table.select(names)[rows] - truth
+    return np.asarray(wrap_to_half_turn(difference) if names[0] in ATTITUDE else difference)
+
+
+def common_columns(
+    tables: Sequence[TrajectoryTable], reference: ReferenceTrack
+) -> dict[str, tuple[str, ...]]:
+    """Return the columns of velocity and attitude that the reference and all tables have.
+
+    Args:
+        tables: Trajectories.
+        reference: Reference.
+
+    Returns:
+        Columns by group, without empty groups.
+    """
+    everywhere = [set(table.values) for table in (*tables, reference.table)]
+    shared = set.intersection(*everywhere)
+    groups = {"velocity": VELOCITY, "attitude": ATTITUDE}
+    names = {group: tuple(n for n in columns if n in shared) for group, columns in groups.items()}
+    return {group: columns for group, columns in names.items() if columns}

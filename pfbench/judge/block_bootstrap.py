@@ -1,0 +1,132 @@
+"""Stationary bootstrap of one long run: standard error of a mean of dependent values.
+
+The variance is the exact expectation over all resamples (Politis and Romano 1994, lemma 1), so that no
+random number is used. Blocks that are too short make it too small. The mean length is therefore the
+larger of the rule of Politis and White and of 8 correlation times [ours]. The variance has a correction
+for the number of blocks, and the reference distribution is Student's t [ours]. The share of false alarms
+for two equal programs is tested in `tests/judge/test_block_bootstrap.py`.
+
+References:
+    D. N. Politis and J. P. Romano (1994), The stationary bootstrap.
+    D. N. Politis and H. White (2004), Automatic block-length selection for the dependent bootstrap;
+        corrected by A. Patton, D. N. Politis and H. White (2009).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pfbench.results.error_measures import Array
+from pfbench.results.statistics.world_effects import EffectEstimate
+
+MIN_BLOCKS = 6  # blocks from which a test is made
+_CORRELATION_TIMES = 8.0  # least mean length of a block
+
+
+class BlockEstimate(NamedTuple):
+    """Effect along one run.
+
+    Attributes:
+        estimate: Log ratio of the root mean squares, with Student's distribution.
+        length: Mean length of a block, epochs.
+        blocks: Number of blocks: epochs divided by the length.
+    """
+
+    estimate: EffectEstimate
+    length: float
+    blocks: float
+
+    @property
+    def p(self) -> float:
+        """Two-sided p-value; NaN with fewer than 6 blocks."""
+        return float(self.estimate.p) if self.blocks >= MIN_BLOCKS else math.nan
+
+
+def compare_along_run(square_a: Array, square_b: Array, length: float = 0.0) -> BlockEstimate:
+    """Compare the mean squared errors of two programs along one run.
+
+    Args:
+        square_a: Squared errors of the first program at common epochs, [T].
+        square_b: Squared errors of the second program, [T].
+        length: Mean length of a block, epochs; 0 for the rule.
+
+    Returns:
+        Estimate, negative if the first program has the smaller error.
+    """
+    mean_a, mean_b = float(square_a.mean()), float(square_b.mean())
+    if mean_a == mean_b == 0.0 or np.array_equal(square_a, square_b):
+        zero = np.zeros(())
+        return BlockEstimate(EffectEstimate(zero, zero, np.full((), math.nan)), 1.0, square_a.size)
+    if min(mean_a, mean_b) == 0.0:
+        infinity = np.array(-math.inf if mean_a == 0.0 else math.inf)
+        infinite = EffectEstimate(infinity, np.full((), math.nan), np.full((), math.nan))
+        return BlockEstimate(infinite, 1.0, square_a.size)
+    ratio = 0.5 * math.log(mean_a / mean_b)
+    influence = 0.5 * (square_a / mean_a - square_b / mean_b)  # of the log ratio; its mean is 0
+    length = min(max(length or choose_block_length(influence), 1.0), influence.size / 2)
+    blocks = influence.size / length
+    correction = (1 + 1 / blocks) / (1 - 1 / blocks) ** 2
+    variance = correction * bootstrap_variance(influence, length)
+    error, df = np.array(math.sqrt(max(variance, 0.0))), np.array(blocks - 1)
+    return BlockEstimate(EffectEstimate(np.array(ratio), error, df), length, blocks)
+
+
+def bootstrap_variance(values: Array, length: float) -> float:
+    """Compute the variance of the mean over all resamples of the stationary bootstrap.
+
+    Args:
+        values: Series, [T].
+        length: Mean length of a block, epochs.
+
+    Returns:
+        Variance of the mean.
+    """
+    n = values.size
+    spectrum = np.abs(np.fft.rfft(values - values.mean())) ** 2
+    circular = np.fft.irfft(spectrum, n) / n
+    lag = np.arange(1, n)
+    weight = (1 - lag / n) * (1 - 1 / max(length, 1.0)) ** lag
+    return float((circular[0] + 2 * (weight * circular[1:]).sum()) / n)
+
+
+def choose_block_length(values: Array) -> float:
+    """Choose the mean length of a block, epochs.
+
+    Args:
+        values: Series, [T].
+
+    Returns:
+        The larger of the length of Politis and White and of 8 correlation times.
+    """
+    covariance = _autocovariance(values - values.mean())
+    if covariance[0] <= 0:
+        return 1.0
+    correlation = covariance / covariance[0]
+    below = correlation < math.exp(-1)
+    time = float(below.argmax()) if below.any() else float(values.size)
+    return max(_politis_white_length(covariance), _CORRELATION_TIMES * time)
+
+
+def _politis_white_length(covariance: Array) -> float:
+    """Return the length that minimises the error of the variance, with a flat-top window."""
+    n = covariance.size
+    limit = 2 * math.sqrt(math.log10(n) / n)
+    window = max(5, int(math.sqrt(math.log10(n))))
+    small = np.abs(covariance[1:] / covariance[0]) < limit
+    runs = np.convolve(small, np.ones(window), "valid") == window
+    first = int(runs.argmax()) if runs.any() else n // 4
+    bandwidth = min(2 * max(first, 1), n - 1)
+    lag = np.arange(-bandwidth, bandwidth + 1)
+    taper = np.clip(2 * (1 - np.abs(lag) / bandwidth), 0.0, 1.0)
+    density = float((taper * covariance[np.abs(lag)]).sum())
+    slope = float((taper * np.abs(lag) * covariance[np.abs(lag)]).sum())
+    return float((n * slope**2 / density**2) ** (1 / 3)) if density > 0 else n / 3
+
+
+def _autocovariance(values: Array) -> Array:
+    n = values.size
+    spectrum = np.abs(np.fft.rfft(values, 2 * n)) ** 2
+    return np.asarray(np.fft.irfft(spectrum, 2 * n)[:n] / n)

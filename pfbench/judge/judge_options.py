@@ -1,0 +1,88 @@
+"""Options of the command `judge`: sources of the trajectories and rules of the comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+FRAMES = ("", "ned", "enu")
+ALIGNMENTS = ("none", "offset", "yaw")
+HOLES = ("refuse", "skip")
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """Options of one program, `NAME.key=value` on the command line.
+
+    Attributes:
+        frame: Axes of a .tum file, "ned" or "enu".
+        shift: Time added to the clock of the file, s.
+        columns: Name in a CSV file by name of pfbench.
+        sd: Pattern of the KF-GINS file of standard deviations; empty for none.
+    """
+
+    frame: str = ""
+    shift: float = 0.0
+    columns: Mapping[str, str] = field(default_factory=dict)
+    sd: str = ""
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """Rules of the comparison.
+
+    Attributes:
+        start: First scored time on the clock of the reference, s. Key `from`.
+        end: Last scored time, s. Key `to`.
+        every: Least time between two scored epochs, s.
+        tolerance: Largest difference of two epochs that count as common, s.
+        largest_gap: Longest time between two rows of the reference, s; 0 for the larger of 1 s and
+            2.5 steps.
+        holes: "refuse" or "skip": epochs in longer gaps of the reference.
+        coverage: Least share of the time that a run must cover, else it is lost.
+        limit: Position error above which a run diverges, m; 0 for none.
+        align: "none", "offset" or "yaw": motion that is removed from positions.
+        origin: Latitude, longitude (deg) and height (m) of the local frame; empty for that of the
+            reference.
+        block: Mean length of the blocks of time, s; 0 for the rule.
+        baseline: Program that all others are compared with; empty for all pairs.
+        alpha: Error of a family of tests.
+        margin: Relative difference of errors within which programs are equivalent.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    start: float = -math.inf
+    end: float = math.inf
+    every: float = 0.0
+    tolerance: float = 0.01
+    largest_gap: float = 0.0
+    holes: str = "refuse"
+    coverage: float = 0.9
+    limit: float = 0.0
+    align: str = "none"
+    origin: Sequence[float] = ()
+    block: float = 0.0
+    baseline: str = ""
+    alpha: float = 0.05
+    margin: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("every", "largest_gap", "limit", "block"):
+            _require(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))
+        _require("tolerance", self.tolerance > 0, "positive", self.tolerance)
+        _require("coverage", 0 < self.coverage <= 1, "above 0 and at most 1", self.coverage)
+        _require("from", self.start < self.end, "before to", f"{self.start} and {self.end}")
+        _require("holes", self.holes in HOLES, " or ".join(HOLES), self.holes)
+        _require("align", self.align in ALIGNMENTS, " or ".join(ALIGNMENTS), self.align)
+        _require(
+            "origin", len(self.origin) in (0, 3), "lat_deg,lon_deg,h_m", list(self.origin) or "none"
+        )
+
+
+def _require(name: str, is_valid: bool, requirement: str, value: Any) -> None:
+    if not is_valid:
+        raise ValueError(f"{name} must be {requirement}, got {value}. Change {name}=...")

@@ -1,0 +1,115 @@
+"""Files of trajectories: patterns with sequence and run, and the reader of each format."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from pfbench.judge.judge_options import SourceOptions
+from pfbench.judge.readers.csv_trajectory import read_csv_trajectory
+from pfbench.judge.readers.nmea_trajectory import read_nmea_trajectory
+from pfbench.judge.readers.result_trajectory import read_result_trajectories
+from pfbench.judge.readers.text_trajectory import (
+    count_fields,
+    read_kf_gins_trajectory,
+    read_tum_trajectory,
+)
+from pfbench.judge.readers.trajectory_table import TrajectoryTable, check_trajectory
+
+ONE = "recording"  # name of the sequence of a pattern without {sequence}
+_FIELDS = {"sequence": r"(?P<sequence>[^/]+?)", "run": r"(?P<run>[^/]+?)"}
+_TABLES, _NMEA, _TEXT = (".csv", ".parquet"), (".nmea", ".ubx.nmea"), (".nav", ".txt")
+
+
+class TrajectoryFile(NamedTuple):
+    """File that a pattern names.
+
+    Attributes:
+        path: File.
+        sequence: Name of the sequence.
+        run: Name of the run.
+    """
+
+    path: Path
+    sequence: str
+    run: str
+
+
+def list_trajectory_files(pattern: str) -> list[TrajectoryFile]:
+    """List the files of a pattern such as out/{sequence}_{run}.csv.
+
+    Args:
+        pattern: Path, optionally with {sequence} and {run}, each within one folder or file name.
+
+    Returns:
+        Files in order of sequence and run.
+
+    Raises:
+        ValueError: If no file exists.
+    """
+    path = Path(pattern)
+    if "{" not in pattern:
+        if not path.is_file():
+            raise ValueError(f"{pattern} must be a file, got none. Check the path.")
+        return [TrajectoryFile(path, ONE, "")]
+    fixed = path
+    while "{" in str(fixed):
+        fixed = fixed.parent
+    expression = re.escape(path.as_posix())
+    for name, group in _FIELDS.items():
+        expression = expression.replace(re.escape(f"{{{name}}}"), group, 1)
+        expression = expression.replace(re.escape(f"{{{name}}}"), f"(?P={name})")
+    depth = "/".join("*" for _ in path.relative_to(fixed).parts)
+    files = []
+    for candidate in sorted(fixed.glob(depth)):
+        match = re.fullmatch(expression, candidate.as_posix())
+        if match and candidate.is_file():
+            values = match.groupdict()
+            files.append(
+                TrajectoryFile(candidate, values.get("sequence", ONE), values.get("run", ""))
+            )
+    if not files:
+        raise ValueError(
+            f"{pattern} must match a file, got none. Write {{sequence}} and {{run}} for the parts "
+            "that differ."
+        )
+    return sorted(files, key=lambda file: (file.sequence, file.run))
+
+
+def read_trajectories(
+    path: Path, options: SourceOptions, sd: Path | None = None
+) -> list[TrajectoryTable]:
+    """Read and check a file; the clock is shifted.
+
+    Args:
+        path: File: .csv, .parquet, .tum, .nmea, .npz, or text of KF-GINS.
+        options: Options of the program.
+        sd: KF-GINS file of standard deviations, or None.
+
+    Returns:
+        One table per run of the file.
+
+    Raises:
+        ValueError: If the format is unknown or a check fails.
+    """
+    suffix = path.suffix.lower()
+    tables: Sequence[TrajectoryTable]
+    if suffix in _TABLES:
+        tables = read_csv_trajectory(path, options)
+    elif suffix == ".tum":
+        tables = read_tum_trajectory(path, options)
+    elif suffix in _NMEA:
+        tables = read_nmea_trajectory(path, options)
+    elif suffix == ".npz":
+        tables = read_result_trajectories(path, options)
+    elif suffix in _TEXT and count_fields(path) == 11:
+        tables = read_kf_gins_trajectory(path, options, sd)
+    else:
+        raise ValueError(
+            f"{path.name} must be .csv, .parquet, .tum, .nmea, .npz, or .nav or .txt with the 11 columns "
+            f"of KF-GINS, got the suffix {suffix or 'none'}. Rename or convert the file."
+        )
+    return [replace(check_trajectory(t), time=t.time + options.shift) for t in tables]

@@ -1,0 +1,169 @@
+"""Trajectory of a program as a table, and the checks that every reader shares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pfbench.nav.plausible_limits import COLUMNS, QUANTITIES
+from pfbench.results.error_measures import Array
+
+LOCAL = ("pn", "pe", "pd")
+GEODETIC = ("lat_deg", "lon_deg", "h_m")
+VELOCITY = ("vn", "ve", "vd")
+ATTITUDE = ("roll", "pitch", "yaw")
+POSITION_SD = ("sd_pn", "sd_pe", "sd_pd")
+VELOCITY_SD = ("sd_vn", "sd_ve", "sd_vd")
+ATTITUDE_SD = ("sd_roll", "sd_pitch", "sd_yaw")
+COVARIANCE = ("cov_nn", "cov_ne", "cov_nd", "cov_ee", "cov_ed", "cov_dd")  # of the position, m^2
+GROUPS = (
+    LOCAL,
+    GEODETIC,
+    VELOCITY,
+    ATTITUDE,
+    POSITION_SD,
+    VELOCITY_SD,
+    ATTITUDE_SD,
+    COVARIANCE,
+)
+SD_GROUPS = (POSITION_SD, VELOCITY_SD, ATTITUDE_SD)
+ALL_COLUMNS = ("t", *(name for group in GROUPS for name in group))
+_SD_COLUMNS = {name for group in SD_GROUPS for name in group}
+
+
+@dataclass(frozen=True)
+class TrajectoryTable:
+    """Trajectory of one run of a program.
+
+    Attributes:
+        file: Name of the file, for messages.
+        time: Time, [T], s, increasing.
+        values: Columns by name, [T] each: groups of `GROUPS` in m, deg (latitude, longitude), m/s
+            and rad.
+        lines: Line of each row in the file, [T].
+        notes: Notes of the reader.
+        run: Number of the run within the file.
+        origin: Latitude, longitude, height of the local frame if the file states it; deg, deg, m.
+    """
+
+    file: str
+    time: Array
+    values: Mapping[str, Array]
+    lines: np.ndarray
+    notes: tuple[str, ...] = ()
+    run: int = 0
+    origin: tuple[float, ...] = ()
+
+    def select(self, group: tuple[str, ...]) -> Array:
+        """Return the columns of a group, [T, K]."""
+        return np.stack([self.values[name] for name in group], axis=-1)
+
+    def has(self, group: tuple[str, ...]) -> bool:
+        """Return whether a group of columns is present."""
+        return group[0] in self.values
+
+    def keep_rows(self, mask: np.ndarray) -> TrajectoryTable:
+        """Return the rows of a mask [T]."""
+        values = {name: value[mask] for name, value in self.values.items()}
+        return replace(self, time=self.time[mask], values=values, lines=self.lines[mask])
+
+
+def check_trajectory(table: TrajectoryTable) -> TrajectoryTable:
+    """Check groups, numbers, order of time and plausible ranges.
+
+    Args:
+        table: Table of a reader.
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: If a check fails. The message contains file, line, column, value and remedy.
+    """
+    if len(table.time) < 2:
+        raise ValueError(
+            f"{table.file} must have at least 2 rows, got {len(table.time)}. Write the file again."
+        )
+    for group in GROUPS:
+        present = [name for name in group if name in table.values]
+        if present and len(present) < len(group) and present != ["vn", "ve"]:
+            missing = ", ".join(name for name in group if name not in table.values)
+            raise ValueError(
+                f"{table.file}: columns {', '.join(group)} must be complete, got {', '.join(present)} "
+                f"without {missing}. Add the missing columns or rename all of the group."
+            )
+    if not (table.has(LOCAL) or table.has(GEODETIC)):
+        raise ValueError(
+            f"{table.file} must have the position columns pn, pe, pd or lat_deg, lon_deg, h_m, got "
+            f"{', '.join(table.values) or 'none'}. Rename columns with NAME.columns=pn:north,..."
+        )
+    for name, value in (("t", table.time), *table.values.items()):
+        _check_finite(table, name, value)
+    _check_order(table)
+    for name, value in table.values.items():
+        _check_range(table, name, value)
+    _check_covariance(table)
+    return table
+
+
+def _place(table: TrajectoryTable, row: int, name: str) -> str:
+    return f"{table.file}: line {table.lines[row]}, column {name}"
+
+
+def _check_finite(table: TrajectoryTable, name: str, value: Array) -> None:
+    bad = ~np.isfinite(value)
+    if bad.any():
+        row = int(bad.argmax())
+        raise ValueError(
+            f"{_place(table, row, name)} must be a finite number, got {value[row]} (in "
+            f"{int(bad.sum())} of {len(value)} rows). Remove these rows or repair the column."
+        )
+
+
+def _check_order(table: TrajectoryTable) -> None:
+    step = np.diff(table.time)
+    if (step <= 0).any():
+        row = int((step <= 0).argmax()) + 1
+        raise ValueError(
+            f"{_place(table, row, 't')} must be later than the row before, got {table.time[row]} "
+            f"after {table.time[row - 1]}. Sort the rows and remove repetitions."
+        )
+
+
+def _check_range(table: TrajectoryTable, name: str, value: Array) -> None:
+    for least, largest, unit, hint in _ranges(name):
+        bad = (value < least) | (value > largest)
+        if bad.any():
+            row = int(bad.argmax())
+            raise ValueError(
+                f"{_place(table, row, name)} must be from {least:g} to {largest:g} {unit}, got "
+                f"{value[row]:g}. {hint or 'Check the unit and the order of the columns.'}"
+            )
+
+
+def _ranges(name: str) -> Iterator[tuple[float, float, str, str]]:
+    if name in _SD_COLUMNS or name in ("cov_nn", "cov_ee", "cov_dd"):
+        yield np.nextafter(0.0, 1.0), 1e12, "", "Remove the uncertainty columns or repair them."
+    elif name in COLUMNS:
+        quantity = QUANTITIES[COLUMNS[name]]
+        yield quantity.least, quantity.largest, quantity.unit, quantity.hint
+
+
+def _check_covariance(table: TrajectoryTable) -> None:
+    if not table.has(COVARIANCE):
+        return
+    least = np.linalg.eigvalsh(covariance_matrices(table.select(COVARIANCE)))[:, 0]
+    if (least <= 0).any():
+        row = int((least <= 0).argmax())
+        raise ValueError(
+            f"{_place(table, row, 'cov_nn ... cov_dd')} must be a positive definite matrix, got the "
+            f"least eigenvalue {least[row]:.3g} m^2. Repair the columns or remove them."
+        )
+
+
+def covariance_matrices(entries: Array) -> Array:
+    """Return matrices [T, 3, 3] from the columns `COVARIANCE`, [T, 6]."""
+    upper = entries[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+    return upper.reshape(-1, 3, 3)

@@ -1,0 +1,156 @@
+"""Reference of a sequence: positions in one local frame, interpolated to the epochs of programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pfbench.judge.judge_options import JudgeOptions, SourceOptions
+from pfbench.judge.readers.local_frame import to_north_east_down, wrap_to_half_turn
+from pfbench.judge.readers.trajectory_files import read_trajectories
+from pfbench.judge.readers.trajectory_table import (
+    ATTITUDE,
+    GEODETIC,
+    LOCAL,
+    VELOCITY,
+    TrajectoryTable,
+)
+from pfbench.results.error_measures import Array
+
+_LEAST_GAP, _GAP_STEPS = 1.0, 2.5  # s, median steps
+
+
+@dataclass(frozen=True)
+class ReferenceTrack:
+    """Reference trajectory of a sequence.
+
+    Attributes:
+        table: Table of the file.
+        origin: Latitude, longitude, height of the local frame, deg, deg, m; empty if unknown.
+        is_local: Whether positions are compared in the local coordinates of both files.
+        largest_gap: Longest time between two rows that is interpolated, s.
+    """
+
+    table: TrajectoryTable
+    origin: tuple[float, ...]
+    is_local: bool
+    largest_gap: float
+
+    @property
+    def file(self) -> str:
+        """Name of the file."""
+        return self.table.file
+
+    @property
+    def position(self) -> Array:
+        """Positions North, East, Down, [T, 3], m."""
+        return self.locate(self.table)
+
+    def locate(self, table: TrajectoryTable) -> Array:
+        """Return the positions of a table in the local frame of the reference.
+
+        Args:
+            table: Trajectory of a program.
+
+        Returns:
+            North, East, Down, [T, 3], m.
+
+        Raises:
+            ValueError: If one file has local and the other geodetic positions, and the origin is unknown.
+        """
+        if table.has(LOCAL) and self.is_local:
+            return table.select(LOCAL)
+        if table.has(GEODETIC) and self.origin:
+            return to_north_east_down(table.select(GEODETIC), np.array(self.origin))
+        have = "lat_deg, lon_deg, h_m" if table.has(GEODETIC) else "pn, pe, pd"
+        raise ValueError(
+            f"{table.file} must have positions in the frame of {self.file}, got {have} and no origin "
+            "of the local frame. Set origin=LAT_DEG,LON_DEG,H_M of pn = pe = pd = 0."
+        )
+
+    def interpolate_position(self, time: Array) -> Array:
+        """Interpolate positions, [K, 3]: cubic with the velocities of the file, else linear.
+
+        Args:
+            time: Times, [K], s.
+        """
+        clock, position = self.table.time, self.position
+        linear = np.stack([np.interp(time, clock, p) for p in position.T], axis=-1)
+        if any(name not in self.table.values for name in VELOCITY):
+            return linear
+        velocity = self.table.select(VELOCITY)
+        k = np.clip(np.searchsorted(clock, time, side="right") - 1, 0, len(clock) - 2)
+        step = (clock[k + 1] - clock[k])[:, None]
+        s = (time - clock[k])[:, None] / step
+        slope = (position[k + 1] - position[k]) / step
+        start, end = velocity[k] - slope, velocity[k + 1] - slope
+        return linear + step * s * (1 - s) * ((1 - s) * start - s * end)
+
+    def interpolate_columns(self, names: tuple[str, ...], time: Array) -> Array:
+        """Interpolate velocities or angles linearly, [K, C]; angles along the shorter way.
+
+        Args:
+            names: Columns.
+            time: Times, [K], s.
+        """
+        columns = [self.table.values[name] for name in names]
+        columns = [
+            np.unwrap(c) if n in ATTITUDE else c for n, c in zip(names, columns, strict=True)
+        ]
+        values = np.stack([np.interp(time, self.table.time, c) for c in columns], axis=-1)
+        return np.asarray(wrap_to_half_turn(values) if names[0] in ATTITUDE else values)
+
+    def is_bridged(self, time: Array) -> np.ndarray:
+        """Return the times [K] that lie within the reference and in none of its long gaps."""
+        clock = self.table.time
+        k = np.clip(np.searchsorted(clock, time, side="right") - 1, 0, len(clock) - 2)
+        inside = (time >= clock[0]) & (time <= clock[-1])
+        is_exact = (time == clock[k]) | (time == clock[k + 1])
+        return np.asarray(inside & ((clock[k + 1] - clock[k] <= self.largest_gap) | is_exact))
+
+
+def read_reference(path: Path, options: JudgeOptions, source: SourceOptions) -> ReferenceTrack:
+    """Read the reference of a sequence and check its gaps in the scored time.
+
+    Args:
+        path: File.
+        options: Options of the comparison.
+        source: Options of the file.
+
+    Returns:
+        The reference.
+
+    Raises:
+        ValueError: If the file is not valid, has several runs, or has a hole.
+    """
+    tables = read_trajectories(path, source)
+    if len(tables) != 1:
+        raise ValueError(
+            f"reference must be one trajectory, got {len(tables)} runs in {path.name}. Use a .csv file."
+        )
+    table, step = tables[0], float(np.median(np.diff(tables[0].time)))
+    gap = options.largest_gap or max(_LEAST_GAP, _GAP_STEPS * step)
+    is_local = table.has(LOCAL)
+    origin = tuple(options.origin) or table.origin
+    if not is_local and not origin:
+        origin = tuple(float(table.values[name][0]) for name in GEODETIC)
+    reference = ReferenceTrack(table, origin, is_local, gap)
+    if options.holes == "refuse":
+        _refuse_holes(reference, options)
+    return reference
+
+
+def _refuse_holes(reference: ReferenceTrack, options: JudgeOptions) -> None:
+    time = reference.table.time
+    start, step = time[:-1], np.diff(time)
+    holes = (step > reference.largest_gap) & (start < options.end) & (start + step > options.start)
+    if holes.any():
+        k = int(holes.argmax())
+        raise ValueError(
+            f"{reference.file}: line {reference.table.lines[k + 1]}, column t must follow the row "
+            f"before within {reference.largest_gap:g} s, got a hole of {step[k]:.6g} s from "
+            f"{start[k]:.10g} s ({int(holes.sum())} holes). Set holes=skip to leave these epochs "
+            "out, or largest_gap=SECONDS to interpolate them."
+        )

@@ -1,0 +1,245 @@
+"""Plausibility of broadcast ephemerides: ranges of parameters, and agreement of neighbours.
+
+Merged files contain records with reception errors. Such a record is ignored, and a note names it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from pfbench.nav.gnss.broadcast_elements import broadcast_elements
+from pfbench.nav.gnss.rinex import CLOCK, ORBIT, WEEK
+
+_TURN = 2 * math.pi
+# parameter: least, largest, unit. Widths of the fields [IS-GPS-200, tables 20-I and 20-III;
+# OS SIS ICD, tables 60 and 62], and ranges of the orbits in use [ours]
+RANGES = {
+    "prn": (1.0, 63.0, "1"),
+    "toe": (0.0, WEEK, "s"),
+    "e": (0.0, 0.2, "1"),  # the Galileo satellites E14 and E18: 0.166
+    "i0": (0.8, 1.2, "rad"),
+    "M0": (-_TURN, _TURN, "rad"),
+    "Omega0": (-_TURN, _TURN, "rad"),
+    "omega": (-_TURN, _TURN, "rad"),
+    "deltan": (-1.2e-8, 1.2e-8, "rad/s"),
+    "Omegadot": (-2e-8, 2e-8, "rad/s"),
+    "idot": (-3e-9, 3e-9, "rad/s"),
+    **dict.fromkeys(("cuc", "cus"), (-3e-5, 3e-5, "rad")),  # the Earth's oblateness: 1.3e-5
+    **dict.fromkeys(("cic", "cis"), (-5e-6, 5e-6, "rad")),  # 0.8e-6, and 2.5e-6 for E14
+    **dict.fromkeys(("crc", "crs"), (-1024.0, 1024.0, "m")),
+    "af0": (-2e-2, 2e-2, "s"),
+    "af1": (-3.8e-9, 3.8e-9, "s/s"),
+    "af2": (-3.6e-15, 3.6e-15, "s/s^2"),
+    "tgd": (-1.3e-7, 1.3e-7, "s"),
+    "health": (0.0, 511.0, "1"),
+    "week": (0.0, 1e4, "1"),
+}
+SQRT_AXIS = {"G": (5100.0, 5200.0), "E": (5200.0, 5500.0)}  # m^(1/2), root of the semi-major axis
+TOE_STEP = {"G": 16.0, "E": 60.0}  # s; scale of the field
+_LONGEST = 14400.0  # s between compared neighbours
+POSITION_TOLERANCE = 30.0  # m; over one day of IGS files neighbours agree to 4.5 m
+CLOCK_TOLERANCE = 1e-7  # s, 30 m; over one day of IGS files neighbours agree to 9.3 ns
+DELAY_TOLERANCE = 1e-8  # s, 3 m; group delay
+_CLOCK_AGE = 7200.0  # s; longest time between toc and toe
+_LARGEST_SHARE = 0.2  # of records out of range in a merged file
+
+
+class EphemerisSelection(NamedTuple):
+    """Result of the checks.
+
+    Attributes:
+        mask: Mask of plausible ephemerides.
+        notes: Ignored ephemerides and changes of orbit.
+    """
+
+    mask: NDArray[np.bool_]
+    notes: tuple[str, ...]
+
+
+def check_numbers(table: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Convert the parameters to numbers.
+
+    Args:
+        table: Ephemerides with RINEX names.
+        name: Name of the file, for the message.
+
+    Returns:
+        Table with numeric columns. `week`, `health` and `ttx` may be NaN.
+
+    Raises:
+        ValueError: If a parameter is blank, text, or infinite. The message names column and row.
+    """
+    table = table.copy()
+    for column in ("prn", *CLOCK, *ORBIT, "tgd", "week", "health", "ttx"):
+        if column not in table:
+            continue
+        values = pd.to_numeric(table[column], errors="coerce").to_numpy(float)
+        blank_mask = (
+            table[column].isna().to_numpy()
+            if column in ("week", "health", "ttx")
+            else np.zeros(len(values), bool)
+        )
+        bad = np.flatnonzero(~np.isfinite(values) & ~blank_mask)
+        if bad.size:
+            raise ValueError(
+                f"{name}: column {column} must have finite numbers, got "
+                f"{table[column].iloc[bad[0]]} in row {bad[0]} (from 0, {bad.size} such rows). "
+                "Remove rows without data."
+            )
+        table[column] = values
+    return table
+
+
+def check_ephemerides(table: pd.DataFrame, name: str) -> EphemerisSelection:
+    """Select ephemerides with plausible parameters that agree with their neighbours.
+
+    Args:
+        table: Ephemerides of healthy satellites with `name`, `sow` and `gm`, and `toe` and `toc`
+            from a common epoch.
+        name: Name of the file, for messages.
+
+    Returns:
+        The selection.
+
+    Raises:
+        ValueError: If more than a fifth of the records is out of range, or the ephemerides of a
+            satellite contradict each other so that none of them is confirmed.
+    """
+    reasons = [_reason(row) for row in table.to_dict("records")]
+    share = sum(map(bool, reasons)) / max(len(reasons), 1)
+    if len(reasons) > 1 and share > _LARGEST_SHARE:
+        text = next(filter(None, reasons))
+        raise ValueError(
+            f"{name} must contain plausible ephemerides, got {share:.0%} out of range, "
+            f"the first with {text}. Check the units: rad, s, m."
+        )
+    notes = [
+        f"{name}: {_label(table, i)} is ignored because its {reason}"
+        for i, reason in enumerate(reasons)
+        if reason
+    ]
+    mask = np.array([not reason for reason in reasons], dtype=bool)
+    alone: list[str] = []
+    for satellite in sorted(set(table["name"][mask])):
+        rows = np.flatnonzero(mask & (table["name"] == satellite).to_numpy())
+        dropped, group_notes, compared = _compare(table, rows, name)
+        mask[dropped] = False
+        notes += group_notes
+        alone += [] if compared else [satellite]
+    if alone:
+        notes.append(f"{name}: ephemerides without a neighbour to compare with: {', '.join(alone)}")
+    return EphemerisSelection(mask, tuple(notes))
+
+
+def _reason(row: Mapping[Any, Any]) -> str:
+    """Describe the first parameter that is out of range, or return ''."""
+    least, largest = SQRT_AXIS[str(row["name"])[0]]
+    root = float(row["sqrtA"])
+    if not least <= root <= largest:
+        return f"semi-major axis is {root**2:.0f} m"
+    for parameter, (low, high, unit) in RANGES.items():
+        value = float(row["sow" if parameter == "toe" else parameter]) if parameter in row else 0.0
+        if not (low <= value <= high or (math.isnan(value) and parameter in ("week", "health"))):
+            return f"{parameter} is {value:g} {unit}, not between {low:g} and {high:g}"
+    if float(row["sow"]) % TOE_STEP[str(row["name"])[0]]:
+        return f"toe is {row['sow']} s, not a multiple of {TOE_STEP[str(row['name'])[0]]:.0f} s"
+    if abs(float(row["toc"]) - float(row["toe"])) > _CLOCK_AGE:
+        return f"toc is {float(row['toc']) - float(row['toe']):.0f} s from toe"
+    return ""
+
+
+def _label(table: pd.DataFrame, i: int) -> str:
+    row = table.iloc[i]
+    line = f" (line {row['line']:.0f})" if "line" in table else ""
+    return f"an ephemeris of {row['name']} at t = {row['toe']:.0f} s{line}"
+
+
+def _compare(
+    table: pd.DataFrame, rows: NDArray[np.intp], name: str
+) -> tuple[list[int], list[str], bool]:
+    """Compare the ephemerides of a satellite with up to two neighbours on each side.
+
+    Returns:
+        Rows to ignore, notes, and whether all rows have a neighbour.
+    """
+    toe = table["toe"].to_numpy()[rows]
+    pairs = [
+        (i, j)
+        for i in range(len(rows))
+        for j in range(i + 1, min(i + 3, len(rows)))
+        if toe[j] - toe[i] <= _LONGEST
+    ]
+    distances = _distances(table.iloc[rows], pairs)
+    agreeing, contradicted = np.zeros(len(rows), int), np.zeros(len(rows), int)
+    for (i, j), (distance, _) in zip(pairs, distances, strict=True):
+        agreeing[[i, j]] += distance <= 1.0
+        contradicted[[i, j]] += distance > 1.0
+    unconfirmed = (contradicted > 0) & (agreeing == 0)
+    notes: list[str] = []
+    for (i, j), (distance, text) in zip(pairs, distances, strict=True):
+        if distance <= 1.0:
+            continue
+        if unconfirmed[i] and unconfirmed[j] and agreeing.max(initial=0) == 0:
+            raise ValueError(
+                f"{name}: neighbouring ephemerides must agree, got {_label(table, rows[i])} and "
+                f"{_label(table, rows[j])} with {text}. Remove the wrong record."
+            )
+        if not (unconfirmed[i] or unconfirmed[j]) and j == i + 1:
+            notes.append(f"{name}: {_label(table, rows[j])} changes the orbit or clock: {text}")
+    dropped = np.flatnonzero(unconfirmed)
+    notes += [
+        f"{name}: {_label(table, rows[i])} is ignored because its neighbours contradict it"
+        for i in dropped
+    ]
+    return [int(rows[i]) for i in dropped], notes, bool((agreeing + contradicted > 0).all())
+
+
+def _distances(table: pd.DataFrame, pairs: Sequence[tuple[int, int]]) -> list[tuple[float, str]]:
+    """Compute the largest difference of each pair, relative to its tolerance, and describe it.
+
+    Orbits and clocks are compared at both times of ephemeris and half way between. The tolerance
+    grows with the time beyond two hours, since an ephemeris is fitted to four hours.
+    """
+    if not pairs:
+        return []
+    columns = [*dict.fromkeys([*CLOCK, *ORBIT, "tgd", "sow", "gm"])]
+    values = {c: torch.from_numpy(table[c].to_numpy(float, copy=True)) for c in columns}
+    first, second = (torch.tensor(side) for side in zip(*pairs, strict=True))
+    times = torch.stack(
+        [(1 - f) * values["toe"][first] + f * values["toe"][second] for f in (0.0, 0.5, 1.0)]
+    )
+    positions, clocks = [], []
+    for side in (first, second):
+        eph = {c: v[side] for c, v in values.items()}
+        eph["tk"] = times - eph["toe"]
+        positions.append(broadcast_elements(eph).earth_fixed()[0])
+        age = times - eph["toc"]
+        clocks.append(eph["af0"] + (eph["af1"] + eph["af2"] * age) * age)
+    span = values["toe"][second] - values["toe"][first]
+    slack = 1.0 + 3.0 * (span / 7200.0 - 1.0).clamp(min=0.0)
+    far = (positions[0] - positions[1]).norm(dim=-1).amax(0)
+    off = (clocks[0] - clocks[1]).abs().amax(0)
+    delay = (values["tgd"][first] - values["tgd"][second]).abs()
+    worst = torch.stack(
+        [
+            far / (POSITION_TOLERANCE * slack),
+            off / (CLOCK_TOLERANCE * slack),
+            delay / DELAY_TOLERANCE,
+        ]
+    ).amax(0)
+    return [
+        (
+            float(w),
+            f"positions {d:.0f} m, clocks {1e9 * c:.0f} ns and group delays {1e9 * g:.1f} ns apart",
+        )
+        for w, d, c, g in zip(
+            worst.tolist(), far.tolist(), off.tolist(), delay.tolist(), strict=True
+        )
+    ]

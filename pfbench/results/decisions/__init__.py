@@ -1,0 +1,1 @@
+"""Decisions of a study: estimates, tests of families, words, records and sentences."""

@@ -1,0 +1,96 @@
+"""Order of many filters: all pairs, the filters that none is better than, and intervals of ranks.
+
+Pairs are decided by their own data, so that another filter enters only through the size of the
+family. No test of mean ranks is used.
+
+References:
+    M. Mogstad, J. P. Romano, A. M. Shaikh and D. Wilhelm (2024), Inference for ranks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import pandas as pd
+
+from pfbench.results.decisions.comparisons import compare_metric
+from pfbench.results.decisions.decision import Decision, Question
+from pfbench.results.decisions.family_records import FamilyContext, record_family
+from pfbench.results.decisions.options import DecisionOptions, MetricRule
+from pfbench.results.decisions.study_runs import select_pair, to_study_runs
+from pfbench.results.decisions.words import BETTER, WORSE
+
+FAMILY_ALL = "all pairs, error"
+
+
+class FilterRanking(NamedTuple):
+    """Order of filters for one question.
+
+    Attributes:
+        question: "a" for the worlds of the study, "b" for a new world.
+        top_group: Filters that no filter was shown to be better than.
+        ranks: First and last rank of each filter. All intervals hold together with probability
+            1 - alpha.
+        decisions: Records of all pairs.
+    """
+
+    question: Question
+    top_group: tuple[str, ...]
+    ranks: dict[str, tuple[int, int]]
+    decisions: tuple[Decision, ...]
+
+
+def order_filters(
+    table: pd.DataFrame, rule: MetricRule | None = None, options: DecisionOptions | None = None
+) -> tuple[FilterRanking, FilterRanking]:
+    """Compare all pairs of filters for both questions.
+
+    Args:
+        table: Table as in `planned_pairs.decide_planned_pairs`.
+        rule: Rule of the metric, None for the log ratio of errors.
+        options: Options, None for the defaults.
+
+    Returns:
+        Orders for the questions (a) and (b).
+
+    Raises:
+        ValueError: if the table is not valid or two filters share no run.
+    """
+    rule, options = rule or MetricRule(), options or DecisionOptions()
+    study = to_study_runs(table)
+    comparisons = [
+        compare_metric(select_pair(study, a, b), rule, options)
+        for a, b in combinations(study.filters, 2)
+    ]
+    context = FamilyContext(FAMILY_ALL, study.regimes, options)
+    same_worlds = rank_by_decisions(study.filters, record_family(comparisons, "a", context), "a")
+    new = rank_by_decisions(study.filters, record_family(comparisons, "b", context), "b")
+    return same_worlds, new
+
+
+def rank_by_decisions(
+    filters: Sequence[str], decisions: Sequence[Decision], question: Question
+) -> FilterRanking:
+    """Derive the top group and rank intervals from decisions on all pairs.
+
+    Args:
+        filters: Labels.
+        decisions: Decisions on all pairs.
+        question: Question of the decisions.
+
+    Returns:
+        Order of the filters.
+    """
+    losses, gains = (dict.fromkeys(filters, 0) for _ in range(2))
+    for decision in decisions:
+        if decision.word in (BETTER, WORSE):
+            better, worse = (
+                (decision.a, decision.b) if decision.word == BETTER else (decision.b, decision.a)
+            )
+            gains[better] += 1
+            losses[worse] += 1
+    top_group = tuple(label for label in filters if not losses[label])
+    ranks = {label: (1 + losses[label], len(filters) - gains[label]) for label in filters}
+    return FilterRanking(question, top_group, ranks, tuple(decisions))

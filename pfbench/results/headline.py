@@ -1,0 +1,70 @@
+"""Headline of a job: error of the main group and status of its runs, in one line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pfbench.results import status
+from pfbench.results.error_measures import Array
+from pfbench.results.state_groups import main_component_group
+
+
+def main_rmse(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> float:
+    """Compute the RMSE of the main group over all valid runs.
+
+    Args:
+        outputs: Arrays of a result.
+        meta: Metadata of the result.
+
+    Returns:
+        RMSE in the displayed unit; infinite if no run is valid.
+    """
+    group = main_component_group(meta["state"])
+    errors = group.scale * outputs["error"][..., group.places].astype(float)
+    square = (errors**2).sum(-1)[~np.asarray(outputs["lost"], dtype=bool)]
+    return math.sqrt(np.nanmean(square)) if np.isfinite(square).any() else math.inf
+
+
+def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
+    """Describe error and status of the runs, such as "position RMSE 833 m; 100 of 100 runs diverged".
+
+    Args:
+        outputs: Arrays of a result.
+        meta: Metadata of the result.
+
+    Returns:
+        Magnitude with unit, counts of `status.count_statuses`, and the threshold.
+    """
+    group = main_component_group(meta["state"])
+    count = status.count_statuses(outputs, meta)
+    threshold = status.divergence_threshold(meta)
+    kinds = {
+        "lost": count.lost,
+        "diverged": count.diverged,
+        "collapsed": count.collapsed,
+        "overconfident": count.overconfident,
+    }
+    present = {name: number for name, number in kinds.items() if number}
+    value = main_rmse(outputs, meta)
+    rmse = f"{group.group} RMSE {value:.4g} {group.unit}".rstrip()
+    if not math.isfinite(value):
+        rmse = f"no finite {group.group} error"
+    if not present:
+        ending = (
+            "track kept in {0} of {0} runs" if threshold is not None else "{0} of {0} runs valid"
+        )
+        return f"{rmse}; {ending.format(count.runs)}"
+    if len(present) == 1:
+        (name,) = present
+        text = f"{present[name]} of {count.runs} runs {name}"
+    else:
+        text = ", ".join(f"{number} {name}" for name, number in present.items())
+        text += f" of {count.runs} runs"
+    if count.diverged and threshold is not None:
+        limit = f"{threshold * group.scale:.3g} {group.unit}".rstrip()
+        text += f" (diverged: error above {limit}, five times that of raw measurements)"
+    return f"{rmse}; {text}"

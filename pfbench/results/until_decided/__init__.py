@@ -1,0 +1,1 @@
+"""Studies that add runs until every planned pair is decided."""

@@ -1,0 +1,1 @@
+"""Agreement between the tables of recorded logs."""

@@ -1,0 +1,257 @@
+"""Agreement of IMU, fixes and reference of a log.
+
+A difference that no sensor can explain is an error. A smaller one, which can be a measurement error,
+stays in the data, and a note names its largest row. The file is long since all pairs of tables share
+one rule for notes and errors.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pfbench.core import quaternion
+from pfbench.nav import attitude
+from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.nav.preintegration import preintegrate
+from pfbench.scenario.recorded.log_tables import Array, LogTable
+from pfbench.scenario.recorded.navigation_log import GnssLog, ImuLog, ReferenceLog
+from pfbench.scenario.recorded.time_grid import interpolate, split_samples
+
+_WINDOW = 1.0  # s; IMU and reference are compared over windows of about this length
+_STRAIGHT = 1.5  # s; longest interval over which the velocity is taken as linear
+MOVING = 1.0  # m/s; smallest RMS velocity at which position and velocity have a common scale
+
+
+class Agreement(NamedTuple):
+    """Limits of a difference.
+
+    Attributes:
+        quantity: Name, with the compared tables.
+        unit: Unit.
+        noted: Difference beyond which a note names the row.
+        largest: Difference beyond which the log is rejected.
+    """
+
+    quantity: str
+    unit: str
+    noted: float
+    largest: float
+
+
+MOTION = Agreement("position change and integrated velocity of the reference", "m", 2.0, 200.0)
+VELOCITY = Agreement("velocity change of the reference and integrated force of the IMU", "m/s", 3.0, 30.0)  # fmt: skip
+ATTITUDE = Agreement("rotation of the reference and integrated rate of the IMU", "rad", 0.25, 1.5)
+FIX = Agreement("position of a fix and of the reference", "m", 20.0, math.inf)
+FIX_VELOCITY = Agreement("velocity of a fix and of the reference", "m/s", 5.0, math.inf)
+WHEELS = Agreement("wheel speed and speed of the reference", "m/s", 3.0, 50.0)
+YAW_RATE = Agreement("yaw rate and turn of the track", "rad/s", 1.0, 10.0)
+AGREEMENTS = (MOTION, VELOCITY, ATTITUDE, FIX, FIX_VELOCITY, WHEELS, YAW_RATE)
+COMMON_TIME = 2.0  # s at an end of a table that other tables do not cover, without a note
+
+
+def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ...]:
+    """Compare positions and velocities of a reference.
+
+    Args:
+        table: Table of the reference, for messages.
+        reference: Reference motion.
+
+    Returns:
+        Notes.
+
+    Raises:
+        ValueError: If positions and velocities contradict each other.
+    """
+    dt = np.diff(reference.time)
+    expected = 0.5 * dt[:, None] * (reference.velocity[1:] + reference.velocity[:-1])
+    displacement = np.diff(reference.position, axis=0)
+    straight = dt <= _STRAIGHT
+    for axis, name in enumerate(("East", "North", "Up")):
+        x, y = expected[straight, axis], displacement[straight, axis]
+        if not len(x) or np.sqrt(np.mean((x / dt[straight]) ** 2)) < MOVING:
+            continue
+        slope = float((x * y).sum() / (x * x).sum())
+        if not 0.7 < slope < 1.4:
+            raise ValueError(
+                f"{table.name}: the {name} position must change with the velocity, got {slope:.3g} "
+                "times the change. Check units (m, m/s, deg), signs and order of the columns."
+            )
+    # the error of the straight line grows with the square of the interval
+    slack = np.maximum(1.0, dt / _STRAIGHT) ** 2
+    difference = np.linalg.norm(displacement - expected, axis=1) / slack
+    return _judge(MOTION, difference, table, np.arange(1, len(reference.time)))
+
+
+def compare_inertial(table: LogTable, imu: ImuLog, reference: ReferenceLog, gravity: float) -> tuple[str, ...]:  # fmt: skip
+    """Compare dead reckoning of the IMU with the reference between rows, and over about a second.
+
+    Args:
+        table: Table of the reference, for messages.
+        imu: IMU samples.
+        reference: Reference motion.
+        gravity: Gravity, m/s^2.
+
+    Returns:
+        Notes.
+
+    Raises:
+        ValueError: If IMU and reference contradict each other.
+    """
+    inside = np.flatnonzero((reference.time >= imu.time[0]) & (reference.time <= imu.time[-1]))
+    stride = max(1, round(_WINDOW / float(np.median(np.diff(reference.time)))))
+    notes = [
+        note
+        for nodes in (inside, inside[::stride])
+        if len(nodes) > 1
+        for note in _compare_windows(table, imu, reference, gravity, nodes)
+    ]
+    return tuple(dict.fromkeys(notes))
+
+
+def _compare_windows(
+    table: LogTable, imu: ImuLog, reference: ReferenceLog, gravity: float, nodes: NDArray[np.intp]
+) -> tuple[str, ...]:
+    """Compare dead reckoning between the rows `nodes` of the reference."""
+    time = reference.time[nodes]
+    force, rate, spans = (torch.from_numpy(a) for a in split_samples(imu, time))
+    bias = spans.new_zeros(len(spans), 6)
+    rotation, velocity, _, _ = preintegrate(force, rate, spans, bias)
+    q = torch.from_numpy(reference.attitude[nodes])
+    inverse = q[1:] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
+    turned = quaternion.quaternion_multiply(q[:-1], rotation)
+    angle = quaternion.rotation_vector_from_quaternion(
+        quaternion.quaternion_multiply(inverse, turned)
+    ).norm(dim=-1)
+    level = (attitude.dcm_from_quaternion(q[:-1]) @ velocity[..., None])[..., 0].numpy()
+    dt = np.diff(time)
+    level[:, 2] -= gravity * dt
+    change = np.diff(reference.velocity[nodes], axis=0)
+    # errors of an unaided IMU grow with the window, which a gap of the reference extends
+    scale = np.maximum(1.0, dt / _WINDOW)
+    return (
+        *_judge(VELOCITY, np.linalg.norm(change - level, axis=1) / scale, table, nodes[1:]),
+        *_judge(ATTITUDE, angle.numpy() / scale, table, nodes[1:]),
+    )
+
+
+def compare_fixes(
+    table: LogTable, fixes: GnssLog, reference: ReferenceLog, limits: PlausibleLimits
+) -> tuple[GnssLog, tuple[str, ...]]:
+    """Compare fixes with the reference, and outside of it with the previous fix.
+
+    Args:
+        table: Table of the fixes, for messages.
+        fixes: Fixes.
+        reference: Reference motion.
+        limits: Limits of the platform.
+
+    Returns:
+        The fixes, without those that `limits.drop_fixes` drops, and notes.
+
+    Raises:
+        ValueError: If a fix is beyond the limits and is not to be dropped.
+    """
+    true = interpolate(reference, fixes.time)
+    position_error = np.linalg.norm(fixes.position - true[:, 7:], axis=1)
+    velocity_error = np.linalg.norm(fixes.velocity - true[:, 4:7], axis=1)
+    step = np.linalg.norm(np.diff(fixes.position, axis=0), axis=1)
+    reach = limits.speed_m_s * np.diff(fixes.time) + 2.0 * limits.fix_error_m
+    jump_mask = np.concatenate([[False], step > reach])
+    # a jump after a wrong fix is not an error of the next one, which the reference confirms
+    jump_mask &= np.isnan(position_error)
+    wrong_mask = (position_error > limits.fix_error_m) | jump_mask
+    notes: tuple[str, ...] = ()
+    if wrong_mask.any():
+        rows = np.flatnonzero(wrong_mask)
+        i = int(rows[0])
+        distance = position_error[i] if np.isfinite(position_error[i]) else step[i - 1]
+        text = f"{distance:.0f} m in {table.row(i)}"
+        if not limits.drop_fixes:
+            raise ValueError(
+                f"{table.name}: fixes must be at most {limits.fix_error_m:g} m from the reference "
+                f"and from neighbouring fixes at {limits.speed_m_s:g} m/s, got {text} "
+                f"({len(rows)} such rows). Correct or remove these rows, set "
+                "scenario.limits.fix_error_m, or set scenario.limits.drop_fixes=true."
+            )
+        notes = (f"{table.name}: {len(rows)} fixes dropped, the first off by {text}",)
+        position, velocity = fixes.position.copy(), fixes.velocity.copy()
+        position[wrong_mask] = velocity[wrong_mask] = np.nan
+        fixes = fixes._replace(position=position, velocity=velocity)
+    rows = np.arange(len(fixes.time))
+    position_error = np.where(wrong_mask | np.isnan(position_error), 0.0, position_error)
+    velocity_error = np.where(wrong_mask | np.isnan(velocity_error), 0.0, velocity_error)
+    notes += _judge(FIX, position_error, table, rows)
+    return fixes, (*notes, *_judge(FIX_VELOCITY, velocity_error, table, rows))
+
+
+def compare_wheels(
+    table: LogTable, speed: Array, yaw_rate: Array, reference: ReferenceLog
+) -> tuple[str, ...]:
+    """Compare wheel speed and yaw rate with the reference.
+
+    Args:
+        table: Table of the odometry, for messages.
+        speed: Wheel speed, m/s, [T].
+        yaw_rate: Yaw rate, clockwise from above, rad/s, [T].
+        reference: Reference motion at the same times.
+
+    Returns:
+        Notes.
+
+    Raises:
+        ValueError: If odometry and reference contradict each other.
+    """
+    east, north = reference.velocity[:, :2].T
+    true_speed = np.hypot(east, north)
+    rows, dt = np.arange(len(speed)), np.diff(reference.time)
+    # the track changes with the heading while the car moves
+    turn = np.angle(np.exp(1j * np.diff(np.arctan2(east, north)))) / dt
+    steady = np.minimum(true_speed[1:], true_speed[:-1]) > 2.0 * MOVING
+    off = np.where(steady, np.abs(turn - 0.5 * (yaw_rate[1:] + yaw_rate[:-1])), 0.0)
+    return (
+        *_judge(WHEELS, np.abs(np.abs(speed) - true_speed), table, rows),
+        *_judge(YAW_RATE, off, table, rows[1:]),
+    )
+
+
+def compare_times(tables: tuple[tuple[str, Array], ...]) -> tuple[str, ...]:
+    """Name tables that begin later or end earlier than the others.
+
+    Args:
+        tables: Names and times, s, [n] each.
+
+    Returns:
+        Notes.
+    """
+    first = min(time[0] for _, time in tables)
+    last = max(time[-1] for _, time in tables)
+    return tuple(
+        f"{name} covers t = {time[0]:.3f} to {time[-1]:.3f} s of {first:.3f} to {last:.3f} s"
+        for name, time in tables
+        if max(time[0] - first, last - time[-1]) > COMMON_TIME + 2 * np.median(np.diff(time))
+    )
+
+
+def _judge(agreement: Agreement, difference: Array, table: LogTable, rows: NDArray[np.intp]) -> tuple[str, ...]:  # fmt: skip
+    """Reject, note or accept differences [n] at rows [n] of a table."""
+    if not len(difference):
+        return ()
+    i = int(np.argmax(difference))
+    value = f"{difference[i]:.3g} {agreement.unit} at {table.row(int(rows[i]))}"
+    if not difference[i] <= agreement.largest:
+        raise ValueError(
+            f"{table.name}: {agreement.quantity} must agree to {agreement.largest:g} "
+            f"{agreement.unit}, got {value}. Correct this row, or check units, axes and clocks."
+        )
+    count = int((difference > agreement.noted).sum())
+    if not count:
+        return ()
+    return (
+        f"{table.name}: {agreement.quantity} differ by more than {agreement.noted:g} "
+        f"{agreement.unit} in {count} of {len(difference)} rows, at most {value}",
+    )

@@ -1,0 +1,103 @@
+"""Advice for mistakes that are easy to make on the command line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import pfbench
+
+from pfbench.cli import messages
+from pfbench.config.trust import split_trust
+from pfbench.results import store
+
+WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=20")
+
+
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        (("experiment=quickstart",), "Use +experiment=quickstart"),
+        (("filter=SIR",), "filter=SIR does not exist. Names are in lower case: filter=sir"),
+        (("filter=sir,ekf",), "filter=sir,ekf must be one value, got several. Add -m"),
+        (("-m", "scenario=linear_walk,flight_300s", "scenario.step=5"), "Similar: scenario.steps"),
+    ],
+)
+def test_advice(tmp_path: Path, words: tuple[str, ...], advice: str) -> None:
+    said = pfbench("run", "scenario=linear_walk", *words, home=tmp_path)
+    assert said.code == 1
+    assert advice in said.err
+    assert not list(tmp_path.rglob("*.npz"))
+
+
+def test_a_key_of_swept_scenarios_is_set_in_all_jobs(tmp_path: Path) -> None:
+    words = ("scenario=linear_walk,local_level", "scenario.steps=3", "filter=ekf", "runs=2")
+    said = pfbench("run", "-m", *words, home=tmp_path)
+    assert said.code == 0, said.err
+    files = list((tmp_path / "results" / "adhoc").glob("*.npz"))
+    assert [store.read_metadata(file)["steps"] for file in files] == [3, 3]
+
+
+def test_a_sweep_that_did_not_start_skips_no_job(tmp_path: Path) -> None:
+    said = pfbench("run", "-m", *WALK, "filter=ekf,ckff", home=tmp_path)
+    assert said.code == 1
+    assert "skipped" not in said.out + said.err
+
+
+def test_a_misspelt_study_suggests_existing_ones(tmp_path: Path) -> None:
+    said = pfbench("report", "study=quickstrat", home=tmp_path)
+    assert said.code == 1
+    assert "got quickstrat. Similar: quickstart." in said.err
+    assert "+experiment=quickstrat" not in said.err
+
+
+def test_a_copied_result_is_refused(tmp_path: Path) -> None:
+    assert pfbench("run", *WALK, "filter=ekf", home=tmp_path).code == 0
+    (file,) = (tmp_path / "results" / "adhoc").glob("*.npz")
+    copy = file.with_name("0123456789abcdef.npz")
+    with np.load(file) as content:
+        arrays = {name: content[name] for name in content.files if name not in ("meta", "digest")}
+        meta = json.loads(str(content["meta"]))
+    store.write_result(copy, {**meta, "key": copy.stem}, arrays)
+    said = pfbench("report", "study=adhoc", home=tmp_path)
+    assert said.code == 1
+    assert f"{copy.name} and {file.name} hold the same runs of ekf" in said.err or (
+        f"{file.name} and {copy.name} hold the same runs of ekf" in said.err
+    )
+    assert "Delete the copy" in said.err
+
+
+def test_trust_with_a_plus_sign_is_the_same() -> None:
+    assert split_trust(["+trust=[mylab]", "seed=1"]) == (["seed=1"], ("mylab",))
+    assert split_trust(["++trust=[mylab]"]) == ([], ("mylab",))
+
+
+def test_a_module_that_is_not_installed_is_named() -> None:
+    class InstantiationException(Exception):  # noqa: N818
+        """Error of Hydra's name."""
+
+    cause = ImportError(
+        "Error loading 'mylab.A':\nModuleNotFoundError(\"No module named 'mylib'\")"
+    )
+    error = InstantiationException("Error in call\nfull_key: filter")
+    error.__cause__ = cause
+    message = messages.format_error(error)
+    assert "filter._target_ must be importable, got mylab.A: the module mylib is not" in message
+    assert "PYTHONPATH" in message
+
+
+def test_a_closed_pipe_gives_no_traceback() -> None:
+    code = "import sys; sys.argv = ['pfbench', '--help']; from pfbench import cli; cli.main()"
+    run = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert run.stdout is not None
+    assert run.stderr is not None
+    run.stdout.close()
+    assert run.stderr.read() == ""
+    run.stderr.close()
+    assert run.wait() == 0

@@ -1,0 +1,132 @@
+"""Run the harness of faults and write its table: `make faults`.
+
+Batches are stored in results/faults, so that the same command continues after an interruption.
+`--only` selects classes by the start of their names, `--table` writes the table of the stored batches.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from functools import partial
+from typing import Any, NamedTuple
+
+from checkout import ROOT
+
+from faults import clock, damage, hostile, kills, numerics, page, parallel, readers, storage
+from faults.tally import Tally
+from pfbench.job.resumable import ResumableResults
+
+STORE = ROOT / "results" / "faults"
+
+
+class FaultClass(NamedTuple):
+    """One row of the table.
+
+    Attributes:
+        run: Function of number of trials and seed.
+        required: Number of trials of the whole harness.
+        batch: Number of trials of one batch.
+    """
+
+    run: Callable[[int, int], Tally]
+    required: int
+    batch: int
+
+
+CLASSES: dict[str, FaultClass] = {
+    **{
+        f"damaged files: {kind}": FaultClass(partial(damage.run, kind), 3000, 500)
+        for kind in damage.KINDS
+    },
+    "hostile files": FaultClass(hostile.run, hostile.CASES, hostile.BATCH),
+    **{
+        f"extreme numbers, {engine}": FaultClass(
+            partial(numerics.run, engine), numerics.number_of_trials(engine), numerics.BATCH
+        )
+        for engine in numerics.ENGINES
+    },
+    "kills, serial": FaultClass(kills.run, 200, 10),
+    **{
+        f"kills, launcher {name}": FaultClass(partial(kills.run_launcher, name), 20, 2)
+        for name in kills.LAUNCHERS
+    },
+    **{name: FaultClass(partial(storage.run, name), 30, 5) for name in storage.FAULTS},
+    "clock that jumps": FaultClass(clock.run, 30, 5),
+    "sweeps at the same time": FaultClass(parallel.run, 30, 5),
+    "damaged logs": FaultClass(readers.run, 3000, 3000),
+}
+
+
+def commit() -> str:
+    """Return the short commit of the checkout, with `+` if the package differs from it."""
+    words = ["git", "-C", str(ROOT)]
+    head = subprocess.run([*words, "rev-parse", "--short=10", "HEAD"], capture_output=True)
+    state = subprocess.run([*words, "status", "--short", "pfbench"], capture_output=True)
+    return head.stdout.decode().strip() + ("+" if state.stdout.strip() else "")
+
+
+def run_batch(fault: FaultClass, number: int) -> dict[str, Any]:
+    """Run one batch and return its tally with date and commit."""
+    date = datetime.now(UTC).date().isoformat()
+    size = min(fault.batch, fault.required - number * fault.batch)
+    return {"date": date, "commit": commit(), "tally": fault.run(size, number).to_dict()}
+
+
+def stored_parts(name: str) -> ResumableResults:
+    """Return the finished batches of a class."""
+    slug = name.replace(":", "").replace(",", "").replace(" ", "_")
+    return ResumableResults(STORE / f"{slug}.json", {"class": name, "batch": CLASSES[name].batch})
+
+
+def run_class(name: str) -> None:
+    """Run the missing batches of a class."""
+    fault, parts = CLASSES[name], stored_parts(name)
+    for number in range(-(-fault.required // fault.batch)):
+        start = time.perf_counter()
+        part = parts(f"batch {number}", partial(run_batch, fault, number))
+        tally = Tally.from_dict(part["tally"])
+        text = tally.skipped or f"{tally.trials} trials, {tally.bad or 'nothing'} bad"
+        print(f"{name}, batch {number}: {text}, {time.perf_counter() - start:.0f} s", flush=True)
+        if tally.skipped:
+            return
+
+
+def collect(name: str) -> dict[str, Any]:
+    """Return the row of a class from its finished batches."""
+    parts = stored_parts(name).state["done"].values()
+    joint = Tally(name)
+    for part in parts:
+        joint.merge(Tally.from_dict(part["tally"]))
+    dates, commits = ({part[key] for part in parts} for key in ("date", "commit"))
+    row = joint.to_dict() | {"required": CLASSES[name].required}
+    return row | {"date": max(dates, default=""), "commits": sorted(commits)}
+
+
+def main() -> int:
+    """Run the classes that are selected, or all, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="*", default=[""], help="starts of names of classes")
+    parser.add_argument("--table", action="store_true", help="only write the table")
+    options = parser.parse_args()
+    names = [name for name in CLASSES if name.startswith(tuple(options.only))]
+    if not names:
+        parser.error(f"--only must be the start of a class, got {options.only}: {list(CLASSES)}")
+    if not options.table:
+        for name in names:
+            run_class(name)
+    rows = [collect(name) for name in CLASSES]
+    page.write_table(rows)
+    bad = {row["name"]: Tally.from_dict(row).bad for row in rows}
+    for name, counts in bad.items():
+        if counts:
+            print(f"{name}: {counts}")
+    return int(any(bad.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,50 @@
+"""The page of the harness: docs/reliability.md, whose table is generated from reports/reliability.json."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from checkout import ROOT
+
+from faults.tally import BAD, Tally
+
+DATA = ROOT / "reports" / "reliability.json"
+PAGE = ROOT / "docs" / "reliability.md"
+_BLOCK = re.compile(r"<!-- numbers:reliability -->\n.*?<!-- numbers:end -->", re.DOTALL)
+
+
+def format_row(row: dict[str, Any]) -> list[str]:
+    """Return the cells of a class."""
+    tally, bad = Tally.from_dict(row), ["–"] * len(BAD)
+    if tally.trials:
+        bad = [str(tally.counts[name]) for name in BAD]
+        trials = str(tally.trials)
+        if tally.trials < row["required"]:
+            trials += f" of {row['required']}"
+    else:
+        trials = tally.skipped or "not run"
+    commits = ", ".join(f"`{commit}`" for commit in row["commits"]) or "–"
+    return [row["name"], trials, *bad, row["date"] or "–", commits]
+
+
+def format_block(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the generated block of the page."""
+    head = ["class", "trials", *BAD, "date", "commits"]
+    lines = [head, ["---"] * len(head), *map(format_row, rows)]
+    table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return f"<!-- numbers:reliability -->\n{table}\n<!-- numbers:end -->"
+
+
+def fill_page(text: str, rows: Sequence[dict[str, Any]]) -> str:
+    """Replace the block of a page."""
+    return _BLOCK.sub(lambda _: format_block(rows), text)
+
+
+def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE, data: Path = DATA) -> None:
+    """Write the data of all classes and the table of the page."""
+    data.write_text(json.dumps(rows, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
+    page.write_text(fill_page(page.read_text(), rows))

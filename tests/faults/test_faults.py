@@ -1,0 +1,227 @@
+"""The harness of faults in a short form, its power against planted faults, and the page of its counts."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import json
+import os
+import random
+import re
+import signal
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+import torch
+
+from faults import (
+    clock,
+    damage,
+    hostile,
+    kills,
+    main,
+    numeric_cases,
+    numerics,
+    page,
+    parallel,
+    storage,
+)
+from faults.sweeps import new_home, run_jobs, undisturbed
+from faults.tally import BAD, FINE, Tally
+from pfbench.filter.loop import FilterResult
+from pfbench.results import store
+
+SHORT = 25  # files of each kind
+
+
+def assert_fine(tally: Tally, trials: int) -> None:
+    if tally.skipped:
+        pytest.skip(tally.skipped)
+    assert tally.bad == {}, tally.examples
+    assert tally.trials >= trials
+
+
+# short form
+
+
+def test_killed_sweeps_lose_nothing() -> None:
+    assert_fine(kills.run(2, 3), 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", storage.FAULTS)
+def test_storage_that_refuses_is_named_and_costs_nothing(name: str) -> None:
+    assert_fine(storage.run(name, 1, 2), 1)
+
+
+@pytest.mark.slow
+def test_clocks_that_jump_change_nothing() -> None:
+    assert_fine(clock.run(1, 1), 1)
+
+
+@pytest.mark.slow
+def test_sweeps_at_the_same_time_agree() -> None:
+    assert_fine(parallel.run(1, 1), 1)
+
+
+@pytest.mark.parametrize("kind", damage.KINDS)
+def test_damaged_files_are_not_read_as_others(kind: str) -> None:
+    assert_fine(damage.run(kind, SHORT, 7), SHORT)
+
+
+def test_hostile_files_run_no_code() -> None:
+    undisturbed()
+    assert_fine(hostile.run(1, 0), 1)
+
+
+def test_a_kalman_filter_survives_extreme_numbers() -> None:
+    number = numerics.filters_of("eager").index("ckf")
+    assert_fine(numerics.run("eager", 0, number), len(numeric_cases.CASES) * numeric_cases.RUNS)
+    assert len(numeric_cases.CASES) >= 30
+
+
+# planted faults
+
+
+def write_in_place(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    with path.open("xb") as file:
+        fill(file)
+
+
+def test_a_writer_that_is_not_atomic_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    undisturbed()
+    monkeypatch.setattr(store, "write_atomically", write_in_place)
+    monkeypatch.setattr(kills, "MODES", ("byte",))
+    rng, outcomes = random.Random(1), []
+    while "lost" not in outcomes and len(outcomes) < 6:
+        with new_home() as home:
+            outcomes.append(kills.try_kills(home, run_jobs, 1, 3.0, rng)[1][0])
+    assert outcomes[-1] == "lost"
+
+
+def test_a_missing_digest_check_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pfbench.job.resumable.has_valid_digest", lambda _: True)
+    assert damage.run("resumable parts", 4 * SHORT, 7).counts["false"] > 0
+
+
+def test_a_raw_message_of_the_system_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = importlib.import_module("pfbench.cli.main")  # the door has a function of this name
+    monkeypatch.setattr(module, "format_error", lambda error, words: f"{error}")
+    tally = storage.run("limit of the file size", 3, 2)
+    assert tally.counts["unclear"] > 0
+
+
+def test_a_file_that_a_configuration_makes_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_code(words: Sequence[str]) -> None:
+        (folder,) = (re.search("file://(.*)/conf", word) for word in words if "searchpath" in word)
+        Path(folder[1] if folder else "", "new").touch()
+
+    monkeypatch.setattr("pfbench.cli.run.check_words", run_code)
+    words = ("noise", hostile.text_of(hostile.NODES["path_write"]), "run")
+    assert hostile.attempt(*words)[0] == "code run"
+
+
+def test_a_crash_is_counted_and_the_next_case_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    def die() -> Any:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    names = ("outlier of 1e6 sd", "H of zero")
+    cases = {"dies": numeric_cases.Extreme(die)} | {n: numeric_cases.CASES[n] for n in names}
+    monkeypatch.setattr(numerics, "CASES", cases)
+    tally = Tally("planted")
+    numerics.run_filter_cases("ckf", "eager", tally)
+    assert tally.counts == {"crash": numeric_cases.RUNS, FINE: 2 * numeric_cases.RUNS}
+
+
+def test_false_estimates_are_told_from_sane_ones() -> None:
+    case, bound = numeric_cases.CASES["dead sensor"], -3.0
+    mean, variance = torch.zeros(1, 2, 2), torch.ones(1, 2, 2)
+    evidence = torch.tensor([-4.0])
+
+    def outcome(marked: bool = False, certain: bool = False, **changes: torch.Tensor) -> str:
+        result = FilterResult(
+            mean, variance, evidence, {}, torch.zeros(1, dtype=torch.int8)
+        )._replace(**changes)
+        return numerics.class_of(result, 0, marked, bound, case._replace(is_certain=certain))[0]
+
+    assert outcome() == FINE
+    assert outcome(variance=0.0 * variance) == "false"
+    assert outcome(variance=0.0 * variance, marked=True) == FINE
+    assert outcome(variance=0.0 * variance, certain=True) == FINE
+    assert outcome(mean=mean * torch.nan) == "false"
+    assert outcome(log_evidence=evidence + 2.0) == "false"
+    assert numerics.classify_error(ValueError("r must be positive"))[0] == FINE
+    assert numerics.classify_error(RuntimeError("r must be positive"))[0] == "unclear"
+    assert numerics.classify_error(ValueError("bad"))[0] == "unclear"
+
+
+def test_marks_are_those_of_the_health_where_the_result_has_one() -> None:
+    class Health:
+        lost = torch.tensor([True, False, False])
+        health = torch.tensor([1, 0, 4])
+
+    assert numerics.marked_runs(Health()) == [True, False, True]  # type: ignore[arg-type]
+
+
+# the table
+
+
+def test_batches_are_run_once_and_joined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def run(count: int, seed: int) -> Tally:
+        calls.append((count, seed))
+        tally = Tally("planted")
+        for number in range(count):
+            tally.add("lost" if (seed, number) == (1, 0) else FINE, "tried", "why")
+        return tally
+
+    monkeypatch.setattr(main, "STORE", tmp_path)
+    monkeypatch.setattr(main, "CLASSES", {"planted": main.FaultClass(run, 5, 2)})
+    main.run_class("planted")
+    main.run_class("planted")
+    assert calls == [(2, 0), (2, 1), (1, 2)]
+    row = main.collect("planted")
+    assert row["counts"] == {FINE: 4, "lost": 1}
+    cells = page.format_row(row)
+    assert cells[:3] == ["planted", "5", "1"]
+    assert page.format_row({**row, "required": 9})[1] == "5 of 9"
+    empty = {**row, "counts": {}, "skipped": "not installed"}
+    assert page.format_row(empty)[1:3] == ["not installed", "–"]
+
+
+def test_the_page_states_the_stored_counts() -> None:
+    rows = json.loads(page.DATA.read_text())
+    assert [row["name"] for row in rows] == list(main.CLASSES)
+    text = page.PAGE.read_text()
+    assert page.fill_page(text, rows) == text
+    assert all(f"**{name}**" in text for name in BAD)
+
+
+# what the harness found
+
+
+def test_the_error_of_a_full_disk_names_the_file(tmp_path: Path) -> None:
+    from pfbench.cli.messages import format_error
+    from pfbench.files.atomic_write import write_atomically
+
+    def fill(file: IO[bytes]) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_atomically(tmp_path / "a.npz", fill)
+    text = format_error(caught.value)
+    assert text.startswith(f"{tmp_path / 'a.npz'} must be accessible")
+    assert "Free space, then repeat the command" in text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_another_process_has_set_aside_is_no_error(tmp_path: Path) -> None:
+    from pfbench.files.atomic_write import set_aside
+
+    assert set_aside(tmp_path / "a.npz").name == "a.npz.damaged"
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,135 @@
+"""Each kind of bad input gives one sentence with file, column, value and remedy; nothing is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import judge_cases as cases
+import numpy as np
+import pandas as pd
+import pytest
+from command_line import pfbench
+
+Change = Callable[[pd.DataFrame], pd.DataFrame]
+POSITION = ["pn", "pe", "pd"]
+
+
+def scale(columns: list[str], factor: float) -> Change:
+    return lambda table: table.assign(**{name: factor * table[name] for name in columns})
+
+
+BAD: dict[str, tuple[Change, str, str]] = {
+    "no overlap": (lambda d: d.assign(t=d.t + 1e5), "column t must overlap truth.csv", "mine.shift=-100000"),
+    "milliseconds": (lambda d: d.assign(t=d.t * 1e3 + 1e6), "column t must overlap", "in milliseconds"),
+    "leap seconds": (lambda d: d.assign(t=d.t + 18), "must have the clock of truth.csv", "mine.shift=-1"),
+    "unknown column": (lambda d: d.rename(columns={"pe": "east"}), "without pe", "Add the missing columns"),
+    "no time": (lambda d: d.rename(columns={"t": "time"}), "must have the column t", "mine.columns=t:"),
+    "NaN": (lambda d: d.assign(pe=d.pe.where(d.index != 7)), "line 9, column pe must be a finite", "Remove these rows"),
+    "text": (lambda d: d.assign(pe=d.pe.astype(object).where(d.index != 7, "x")), "line 9, column pe must be a number", "Repair"),
+    "repeated time": (lambda d: pd.concat([d[:5], d[4:]]), "line 7, column t must be later", "Sort the rows"),
+    "feet": (scale(POSITION, 3.28084), "column pn must be in m", "Multiply the column by 0.3048"),
+    "km/h": (scale(["vn", "ve", "vd"], 3.6), "column vn must be in m/s", "0.277778"),
+    "degrees": (scale(["roll", "pitch", "yaw"], 180 / np.pi), "column pitch must be", "0.017453"),
+    "negative deviation": (lambda d: d.assign(sd_pe=-1.0), "column sd_pe must be from", "Remove the uncertainty"),
+    "another place": (lambda d: d.assign(pn=d.pn + 3e5), "positions must come within", "origin of the columns"),
+    "other epochs": (lambda d: d.assign(t=d.t + 0.2), "must share at least 10 epochs", "tolerance=SECONDS"),
+}  # fmt: skip
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    truth = cases.drive()
+    cases.write(truth, tmp_path / "truth.csv")
+    cases.write(full(truth), tmp_path / "theirs.csv")
+    return tmp_path
+
+
+def full(truth: pd.DataFrame) -> pd.DataFrame:
+    """Position with errors and SD, velocity and attitude without."""
+    rest = truth.drop(columns=["t", *POSITION])
+    return pd.concat([cases.estimate(truth, 1.0, 1), rest], axis=1)
+
+
+def judge(home: Path, *words: str):
+    names = {"reference": "truth.csv", "mine": "mine.csv", "theirs": "theirs.csv"}
+    given = {word.partition("=")[0] for word in words}
+    files = [f"{name}={home / file}" for name, file in names.items() if name not in given]
+    return pfbench("judge", *files, f"reports_dir={home / 'reports'}", *words, home=home)
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_refused(home: Path, case: str) -> None:
+    change, problem, remedy = BAD[case]
+    cases.write(change(full(cases.drive())), home / "mine.csv")
+    said = judge(home)
+    assert said.code == 1
+    assert problem in said.err
+    assert remedy.replace("mine.columns", "NAME.columns") in said.err
+    assert "mine.csv" in said.err or "truth.csv" in said.err
+    assert not (home / "reports").exists()
+
+
+def test_the_remedies_help(home: Path) -> None:
+    truth = full(cases.drive())
+    cases.write(truth.assign(t=truth.t + 18).rename(columns={"pe": "east"}), home / "mine.csv")
+    said = judge(home, "mine.shift=-18", "mine.columns=pe:east")
+    assert said.code == 0, said.err
+    assert (home / "reports/judge/decisions.json").is_file()
+
+
+def test_radians_for_degrees(home: Path) -> None:
+    truth = cases.drive()
+    table = pd.DataFrame(cases.geodetic(truth), columns=["lat_deg", "lon_deg", "h_m"])
+    cases.write(table.assign(t=truth.t), home / "truth.csv")
+    cases.write(table.assign(t=truth.t, lat_deg=np.radians(table.lat_deg)), home / "mine.csv")
+    said = judge(home, f"theirs={home / 'mine.csv'}")
+    assert said.code == 1
+    assert "column lat_deg must be in deg" in said.err
+    assert "radians" in said.err
+
+
+def test_a_hole_of_the_reference(home: Path) -> None:
+    truth = cases.drive()
+    cases.write(full(truth), home / "mine.csv")
+    cases.write(truth[(truth.t < 40) | (truth.t > 60)], home / "truth.csv")
+    said = judge(home)
+    assert said.code == 1
+    assert "truth.csv: line 82, column t must follow the row before within 1.25 s" in said.err
+    assert "holes=skip" in said.err
+    said = judge(home, "holes=skip")
+    assert said.code == 0, said.err
+    assert "200 common epochs" in said.out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("hole=3",), "hole must be a program with a file, got hole=3. Similar: holes"),
+        (("from=abc",), "from must be a number, got abc"),
+        (("coverage=2",), "coverage must be above 0 and at most 1, got 2.0"),
+        (("baseline=other",), "baseline must be a program, got other"),
+        (("mine.speed=3",), "mine.speed must be an option of a program, got speed"),
+        (("other.shift=3",), "other must be a program with a file"),
+        (("theirs=no.csv",), "no.csv must be a file, got none"),
+        (("study=../x",), "study must be letters"),
+        (("theirs=theirs.xyz",), "must be a file"),
+    ],
+)
+def test_bad_words(home: Path, words: tuple[str, ...], message: str) -> None:
+    cases.write(full(cases.drive()), home / "mine.csv")
+    said = judge(home, *words)
+    assert said.code == 1
+    assert message in said.err
+    assert not (home / "reports").exists()
+
+
+def test_a_frame_of_a_tum_file_is_required(home: Path) -> None:
+    truth = cases.drive()
+    zero = np.zeros(len(truth))
+    np.savetxt(
+        home / "mine.tum", np.column_stack([truth.t, truth[POSITION], zero, zero, zero, zero + 1])
+    )
+    said = judge(home, f"mine={home / 'mine.tum'}")
+    assert said.code == 1
+    assert "frame must be ned or enu for mine.tum" in said.err

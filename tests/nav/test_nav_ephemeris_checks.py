@@ -1,0 +1,136 @@
+"""Ephemerides: blank and impossible parameters, and records that their neighbours contradict."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from ephemeris_cases import EPHEMERIDES, as_rinex, later_by_two_hours
+
+from pfbench.nav.gnss.broadcast_orbits import BroadcastConstellation
+from pfbench.nav.gnss.ephemeris_checks import POSITION_TOLERANCE, RANGES
+from pfbench.nav.gnss.rinex import read_rinex
+
+NOON = "2016-06-06T12:00:00"
+TIMES = torch.tensor([0.0, 3000.0, 9000.0], dtype=torch.float64)
+
+
+def three() -> pd.DataFrame:
+    """Three ephemerides of each of two satellites, two hours apart."""
+    second = later_by_two_hours(EPHEMERIDES)
+    return pd.concat([EPHEMERIDES, second, later_by_two_hours(second)], ignore_index=True)
+
+
+def constellation(folder: Path, table: pd.DataFrame) -> BroadcastConstellation:
+    table.to_parquet(folder / "eph.parquet")
+    return BroadcastConstellation(str(folder), "eph.parquet", NOON)
+
+
+def test_consistent_ephemerides_give_no_notes(tmp_path: Path) -> None:
+    assert constellation(tmp_path, three()).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("column", "change"),
+    [("M0", 3e-6), ("Omega0", 4e-6), ("i0", 4e-6), ("sqrtA", 0.01), ("af0", 1.5e-7), ("tgd", 2e-8)],
+)
+def test_a_record_that_its_neighbours_contradict_is_ignored_and_named(
+    tmp_path: Path, column: str, change: float
+) -> None:
+    table = three()
+    table.loc[2, column] += change
+    satellites = constellation(tmp_path, table)
+    assert [note for note in satellites.notes if "its neighbours contradict it" in note] == list(
+        satellites.notes
+    )
+    assert "an ephemeris of G07 at t = 7200 s" in satellites.notes[0]
+    clean = constellation(tmp_path, three()).at(TIMES)[0]
+    assert (satellites.at(TIMES)[0] - clean).norm(dim=-1).max() < POSITION_TOLERANCE
+
+
+def test_two_records_without_a_third_must_agree(tmp_path: Path) -> None:
+    table = three().iloc[:4].copy()
+    table.loc[2, "M0"] += 1e-4
+    with pytest.raises(
+        ValueError, match=r"must agree, got an ephemeris of G07 at t = 0 s .*positions \d{4} m"
+    ):
+        _ = constellation(tmp_path, table).names
+
+
+def test_a_manoeuvre_between_confirmed_orbits_is_a_note(tmp_path: Path) -> None:
+    table = pd.concat([three(), later_by_two_hours(three().iloc[4:])], ignore_index=True)
+    table.loc[(table["sys"] == "G") & (table["toe"] > 140000.0), "M0"] += 1e-5
+    notes = constellation(tmp_path, table).notes
+    assert len(notes) == 1
+    assert "G07 at t = 14400 s changes the orbit or clock" in notes[0]
+
+
+def test_a_single_ephemeris_is_named_as_not_compared(tmp_path: Path) -> None:
+    (note,) = constellation(tmp_path, EPHEMERIDES).notes
+    assert note.endswith("without a neighbour to compare with: E14, G07")
+
+
+@pytest.mark.parametrize("column", RANGES)
+def test_a_parameter_out_of_range_is_ignored_and_named(tmp_path: Path, column: str) -> None:
+    table = three().assign(health=0.0)
+    low, high, _ = RANGES[column]
+    if column == "toe":
+        return  # reduced to the week when read
+    table[column] = table[column].astype(float)
+    table.loc[2, column] = high + 0.1 * (high - low)
+    satellites = constellation(tmp_path, table)
+    if column == "health":
+        assert "marked unhealthy: G07" in satellites.notes[0]
+    else:
+        assert any("is ignored because its" in note for note in satellites.notes), satellites.notes
+
+
+def test_another_unit_of_all_records_is_an_error(tmp_path: Path) -> None:
+    degrees = three().assign(i0=lambda table: np.degrees(table["i0"]))
+    with pytest.raises(ValueError, match=r"100% out of range.*i0 is 49.*Check the units"):
+        _ = constellation(tmp_path, degrees).names
+
+
+@pytest.mark.parametrize("column", ["af0", "e", "tgd", "prn"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_blank_or_infinite_parameter_is_an_error(
+    tmp_path: Path, column: str, value: float
+) -> None:
+    table = three()
+    table[column] = table[column].astype(float)
+    table.loc[2, column] = value
+    with pytest.raises(ValueError, match=rf"column {column} must have finite .* in row 2"):
+        _ = constellation(tmp_path, table).names
+
+
+LINES = as_rinex(3).splitlines()
+SPOILT = {
+    "blank field": (4, LINES[4][:23] + " " * 19 + LINES[4][42:], "blank fields e"),
+    "missing exponent": (4, LINES[4].replace("D-02", "    ", 1), "expected a number like"),
+    "date": (2, LINES[2].replace("2016", "2015"), "week and toe must be near the date"),
+    "month": (2, LINES[2].replace("2016 06", "2016 16"), "month must be in"),
+    "system": (2, "X" + LINES[2][1:], "the system must be one of"),
+    "text after the numbers": (4, LINES[4] + "   1", "no text after the last number"),
+    "missing line": (5, None, "expected 8 lines, got 7"),
+    "repeated line": (5, LINES[5] + "\n" + LINES[5], "expected 8 lines, got 9"),
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_a_spoilt_rinex_record_is_an_error_with_its_line(tmp_path: Path, name: str) -> None:
+    number, line, message = SPOILT[name]
+    lines = list(LINES)
+    lines[number : number + 1] = [] if line is None else [line]
+    (tmp_path / "nav.rnx").write_text("\n".join(lines) + "\n")
+    with pytest.raises(ValueError, match=f"nav.rnx: line 3, .*{message}"):
+        read_rinex(tmp_path / "nav.rnx")
+
+
+def test_a_byte_that_is_not_text_is_named(tmp_path: Path) -> None:
+    (tmp_path / "nav.rnx").write_bytes("\n".join(LINES).encode().replace(b"G07", b"G\xff7"))
+    with pytest.raises(ValueError, match=r"got the byte 0xff in line 3"):
+        read_rinex(tmp_path / "nav.rnx")

@@ -1,0 +1,91 @@
+"""Names, units and messages of another person have no meaning in any file of a report, a datasheet or the claims."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+import synthetic_results as synthetic
+from hostile_cases import HOSTILE, faults_of_folder, find_faults
+
+from pfbench import job
+from pfbench.claims import claim_records
+from pfbench.claims import page as claims_page
+from pfbench.report import datasheet, page
+from pfbench.results import store
+
+SHORT = "=<img src=x onerror=evil()>"  # names that are part of the names of files
+UNIT = r"$\evil{$|<b>"  # texts in figures must leave space for the panels
+LABEL = rf"={UNIT}<img src=x onerror=e()>"
+STATE: dict[str, Any] = {
+    "names": [f"{HOSTILE}{i}" for i in range(9)],
+    "units": [UNIT] * 9,
+    "groups": {"attitude": [0, 1, 2], SHORT: [3, 4, 5], "position": [6, 7, 8]},
+}
+
+
+def disguise(path: Path) -> None:
+    """Replace all texts of a result by the hostile one."""
+    meta, data = store.read_result(path)
+    versions = {"pfbench": HOSTILE, "commit": "```\n# a"}
+    choices = {**meta["choices"], "noise": f"{SHORT}\n\n# b", "scenario": SHORT}
+    texts = {"host": HOSTILE, "modelling_choices": [HOSTILE, f"# {HOSTILE}"], "state": STATE}
+    full = {**meta, **texts, "choices": choices, "versions": {**meta["versions"], **versions}}
+    store.write_result(path, full, data)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("a.html", HOSTILE), ("a.html", f'<p title="{HOSTILE}" onclick="x">'), ("a.md", HOSTILE),
+     ("a.tex", HOSTILE), ("a.csv", f"a,{HOSTILE}"), ("a.svg", "<svg><img/></svg>")],
+)  # fmt: skip
+def test_the_faults_are_found_without_escapes(name: str, text: str) -> None:
+    assert find_faults(name, text)
+
+
+def test_report_of_a_study(tmp_path: Path) -> None:
+    results = tmp_path / "results" / "demo"
+    with mock.patch.object(synthetic, "STATE", STATE):
+        for size, name in enumerate((f"{LABEL}1", f"{LABEL}2", "sir[a=1]"), 1):
+            method = synthetic.Method(name, float(size), particles=20)
+            disguise(synthetic.write(results, method, runs=8, steps=20))
+    broken = {"scenario": HOSTILE, "noise": HOSTILE, "filter": HOSTILE, "model": HOSTILE}
+    store.write_failure(results / "00000000deadbeef.npz", broken, ValueError(f"{HOSTILE}\n# c"))
+    options = page.ReportOptions(figure_formats=("svg",))
+    made = page.write_report("demo", results.parent, tmp_path / "reports", options).parent
+    kinds = {file.suffix for file in made.rglob("*")}
+    assert kinds >= {".html", ".md", ".tex", ".csv", ".svg"}
+    assert faults_of_folder(made) == {}
+    text = (made / "report.md").read_text()
+    assert not [line for line in text.splitlines() if line in ("# a", "# b", "# c")]
+    assert "onerror" in text  # it is shown, as text
+
+
+def test_datasheet(tmp_path: Path) -> None:
+    path = synthetic.write(tmp_path, synthetic.Method(HOSTILE, 1.0), runs=6, steps=20)
+    disguise(path)
+    meta, data = store.read_result(path)
+    rng = np.random.default_rng(1)
+    more = {"residual": rng.standard_normal((6, 20, 2)), "seen": np.ones((20, 2))}
+    about = {"about": HOSTILE, "kinds": [HOSTILE] * 2, "pcrb": HOSTILE, "satellites": [],
+             "config": {"scenario": {HOSTILE: f"</pre>{HOSTILE}"}},
+             "seconds": {"world": 1.0, "measures": 1.0}}  # fmt: skip
+    store.write_result(path, {**meta, **about}, {**data, **more})
+    made = datasheet.write_datasheet(path, tmp_path / "reports", ("svg",)).parent
+    assert (made / "tables" / "residuals.csv").is_file()
+    assert faults_of_folder(made) == {}
+    assert "onerror" in (made / "index.html").read_text()
+
+
+def test_claims(tmp_path: Path) -> None:
+    claims = claim_records.read_claims(job.conf_dir(), job.experiments_dir())[:12]
+    texts = dict.fromkeys(("claim", "source", "printed", "note"), HOSTILE)
+    hostile = [replace(claim, **texts) for claim in claims]
+    with mock.patch.object(claims_page, "read_claims", return_value=hostile):
+        made = claims_page.write_claims(tmp_path, tmp_path / "reports", formats=("svg",)).parent
+    assert faults_of_folder(made) == {}
+    assert "onerror" in (made / "report.md").read_text()

@@ -1,0 +1,64 @@
+"""Line of a job: error with unit, and the status of its runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pfbench.results.headline import describe_runs
+
+RUNS, STEPS = 10, 20
+
+
+def job_result(threshold: float | None = 50.0) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    arrays = {
+        "error": np.full((RUNS, STEPS, 3), 3.0),
+        "nees": np.full((RUNS, STEPS, 1), 3.0),
+        "lost": np.zeros(RUNS, dtype=bool),
+        "health": np.zeros(RUNS, dtype=np.int8),
+    }
+    state = {
+        "names": ["north", "east", "up"],
+        "units": ["m"] * 3,
+        "groups": {"position": [0, 1, 2]},
+    }
+    paper = {} if threshold is None else {"paper": {"divergence_threshold": threshold}}
+    return arrays, {"state": state, "config": {"scenario": paper}}
+
+
+def test_healthy_runs_keep_the_track() -> None:
+    assert describe_runs(*job_result()) == "position RMSE 5.196 m; track kept in 10 of 10 runs"
+    assert describe_runs(*job_result(None)) == "position RMSE 5.196 m; 10 of 10 runs valid"
+
+
+def test_a_job_that_diverged_says_so_with_the_limit() -> None:
+    arrays, meta = job_result()
+    arrays["error"][:] = 480.0
+    line = describe_runs(arrays, meta)
+    assert line.startswith("position RMSE 831.4 m; 10 of 10 runs diverged (")
+    assert "error above 50 m" in line
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("lost", {"lost": np.arange(RUNS) < 2}),
+        ("collapsed", {"health": np.where(np.arange(RUNS) < 2, 2, 0)}),
+        ("overconfident", {"nees": np.where(np.arange(RUNS) < 2, 40.0, 3.0)[:, None, None]}),
+    ],
+)
+def test_each_kind_is_counted(kind: str, change: dict[str, np.ndarray]) -> None:
+    arrays, meta = job_result()
+    for name, value in change.items():
+        arrays[name] = np.broadcast_to(value, arrays[name].shape).copy()
+    assert f"; 2 of 10 runs {kind}" in describe_runs(arrays, meta)
+
+
+def test_several_kinds_are_listed_and_a_job_without_valid_runs_has_no_finite_error() -> None:
+    arrays, meta = job_result()
+    arrays["lost"][:3], arrays["error"][5] = True, 1e4
+    assert "; 3 lost, 1 diverged of 10 runs" in describe_runs(arrays, meta)
+    arrays["lost"][:] = True
+    assert describe_runs(arrays, meta) == "no finite position error; 10 of 10 runs lost"
