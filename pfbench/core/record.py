@@ -97,7 +97,9 @@ class SteppedModel(Protocol):
         """Return the model that describes step t."""
 
 
-def iterate_steps(model: SteppedModel, record: Record) -> Iterator[tuple[int, Any, Record]]:
+def iterate_steps(
+    model: SteppedModel, record: Record, steps: range | None = None
+) -> Iterator[tuple[int, Any, Record]]:
     """Iterate over the time steps of a record.
 
     All loops over a record use this function: filters, training, online inference, bounds and
@@ -106,12 +108,14 @@ def iterate_steps(model: SteppedModel, record: Record) -> Iterator[tuple[int, An
     Args:
         model: State-space model.
         record: Measurements [R, T, Dy] and inputs, prepared by the model.
+        steps: Steps of the record, counted from 0. None iterates over all.
 
     Yields:
-        Step number t from 0, the model of step t, and the record of step t.
+        Step number t, the model of step t, and the record of step t.
     """
     for t in range(record.y.shape[1]):
-        yield t, model.at_step(t), record.at_step(t)
+        if steps is None or t in steps:
+            yield t, model.at_step(t), record.at_step(t)
 
 
 def map_inputs(function: Any, u: Any) -> Any:

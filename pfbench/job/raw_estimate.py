@@ -160,8 +160,8 @@ def _stack_rows(problem: _Problem, first: int, last: int) -> _Rows:
     x = problem.truth[:, first].unsqueeze(1)
     sensitivity = torch.diag_embed(_WIDER * problem.prior_sd)
     slopes, residuals = [], []
-    for t in range(first, last + 1):
-        step, model = problem.record.at_step(t), problem.model.at_step(t)
+    steps = range(first, last + 1)
+    for t, model, step in iterate_steps(problem.model, problem.record, steps):
         if t > first:
             slope, x = _propagate(model, step, x)
             sensitivity = slope @ sensitivity

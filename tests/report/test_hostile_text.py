@@ -10,7 +10,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import synthetic_results as synthetic
-from hostile_cases import HOSTILE, faults_of_folder, find_faults
+from escape_cases import HOSTILE, faults_of_folder, find_faults
 
 from pfbench import job
 from pfbench.claims import claim_records

@@ -107,7 +107,10 @@ def test_a_compiled_filter_draws_weighs_and_counts_as_it_does_step_by_step() -> 
 def test_a_graph_whose_function_is_not_found_is_called_from_python(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(step_compiler, "_ENTRY", "of another version of torch")
+    def refuse(*_: object) -> None:
+        raise AttributeError("no function of this name, as in another version of torch")
+
+    monkeypatch.setattr(step_compiler, "_register_entry", refuse)
     model, method, record = (
         Failing(),
         ParticleFilter(150),
