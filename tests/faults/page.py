@@ -1,4 +1,4 @@
-"""The page of the harness: docs/reliability.md, whose table is generated from reports/reliability.json."""
+"""The page of the harness: docs/reliability.md, whose table is generated from docs/reliability.json."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from checkout import ROOT
 
 from faults.tally import BAD, Tally
 
-DATA = ROOT / "reports" / "reliability.json"
+DATA = ROOT / "docs" / "reliability.json"
 PAGE = ROOT / "docs" / "reliability.md"
 _BLOCK = re.compile(r"<!-- numbers:reliability -->\n.*?<!-- numbers:end -->", re.DOTALL)
 
