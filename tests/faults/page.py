@@ -44,7 +44,15 @@ def fill_page(text: str, rows: Sequence[dict[str, Any]]) -> str:
     return _BLOCK.sub(lambda _: format_block(rows), text)
 
 
+def keep_published(rows: Sequence[dict[str, Any]], data: Path) -> list[dict[str, Any]]:
+    """Replace rows without a trial by the published ones: another machine may have counted them."""
+    published = json.loads(data.read_text()) if data.is_file() else []
+    by_name = {row["name"]: row for row in published}
+    return [row if Tally.from_dict(row).trials else by_name.get(row["name"], row) for row in rows]
+
+
 def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE, data: Path = DATA) -> None:
     """Write the data of all classes and the table of the page."""
+    rows = keep_published(rows, data)
     data.write_text(json.dumps(rows, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
     page.write_text(fill_page(page.read_text(), rows))

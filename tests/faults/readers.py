@@ -1,7 +1,7 @@
 """Damaged logs of recorded flights: the mutations of tests/scenario/recorded, where a module offers them.
 
 A module of that folder may define `run_mutations(reader, count, seed)` and `READERS`, names of readers. It returns the
-number of mutated logs by outcome, in the words of `faults.tally`.
+number of mutated logs by outcome. Its words for bad outcomes begin with `SILENT` and `UNWRAPPED`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from types import ModuleType
 
 from checkout import TESTS
 
-from faults.tally import Tally
+from faults.tally import FINE, Tally
 
 FOLDER = TESTS / "scenario" / "recorded"
 
@@ -38,7 +38,22 @@ def run(count: int, seed: int) -> Tally:
         return tally
     for reader in module.READERS:
         counts = module.run_mutations(reader, count // len(module.READERS), seed)
-        for outcome, number in counts.items():
+        for text, number in counts.items():
+            outcome, remark = class_of(module, text)
             for _ in range(number):
-                tally.add(outcome, f"{reader}")
+                tally.add(outcome, f"{reader}: {remark}", text)
     return tally
+
+
+def class_of(module: ModuleType, text: str) -> tuple[str, str]:
+    """Return outcome and remark of an outcome of `run_mutations`, which may end with an example."""
+    for word, outcome in (
+        (module.SILENT, "false"),
+        (module.UNWRAPPED, "unclear"),
+        (module.ERROR, FINE),
+        (module.CLOSE, FINE),
+        (module.NOTED, FINE),
+    ):
+        if text == word or text.startswith(f"{word}:"):
+            return outcome, word
+    raise ValueError(f"the outcome must be a word of {module.__name__}, got {text}. Add it here.")

@@ -26,6 +26,7 @@ from faults import (
     numerics,
     page,
     parallel,
+    readers,
     storage,
 )
 from faults.sweeps import new_home, run_jobs, undisturbed
@@ -225,3 +226,26 @@ def test_a_file_that_another_process_has_set_aside_is_no_error(tmp_path: Path) -
 
     assert set_aside(tmp_path / "a.npz").name == "a.npz.damaged"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_class_without_trials_keeps_its_published_row(tmp_path: Path) -> None:
+    data = tmp_path / "reliability.json"
+    empty = Tally("kills").to_dict() | {"required": 2, "date": "", "commits": []}
+    counted = Tally("kills")
+    counted.add("fine", "finished")
+    published = counted.to_dict() | {"required": 2, "date": "2026-01-01", "commits": ["abc"]}
+    assert page.keep_published([empty], data) == [empty]
+    data.write_text(json.dumps([published]))
+    assert page.keep_published([empty], data) == [published]
+    assert page.keep_published([published | {"date": "new"}], data)[0]["date"] == "new"
+
+
+@pytest.mark.parametrize(
+    ("text", "outcome"),
+    [("error", FINE), ("within tolerance", FINE), ("noted", FINE),
+     ("silently wrong: 3 position", "false"), ("other exception: 3 KeyError", "unclear")],
+)  # fmt: skip
+def test_outcomes_of_the_mutations_are_classes_of_the_table(text: str, outcome: str) -> None:
+    module = readers.find_mutations()
+    assert module is not None
+    assert readers.class_of(module, text) == (outcome, text.split(":")[0])
