@@ -17,6 +17,7 @@ from pfbench.nav.trajectory import TrajectoryData
 from pfbench.scenario.plausibility.column_checks import check_changes
 from pfbench.scenario.plausibility.log_agreement import compare_reference
 from pfbench.scenario.recorded.log_tables import (
+    LogTable,
     find_dataset,
     parse_numbers,
     read_table,
@@ -127,6 +128,7 @@ def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> Recor
     motion = ReferenceLog(
         time.numpy(), attitude.quaternion_from_dcm(dcm).numpy(), vel.numpy(), enu.numpy()
     )
+    check_single_velocities(table, motion)
     contradictions = compare_reference(table, motion)
     if contradictions:  # a truth is free of measurement errors
         raise ValueError(
@@ -138,3 +140,32 @@ def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> Recor
     )
     plan = earth.from_local_enu(enu * enu.new_tensor([1.0, 1.0, 0.0]), centre)
     return RecordedMotion(time, torch.cat([plan[:, :2], centre[2] + enu[:, 2:]], -1), vel, dcm)
+
+
+def check_single_velocities(table: LogTable, motion: ReferenceLog) -> None:
+    """Check that no velocity is a single outlier among its neighbours.
+
+    The mean of both neighbours is as far from a single outlier as each of them. Smooth motion
+    leaves it by half of the change between rows at most, so the limit is half of that of a change:
+    5 m/s and 10 g [ours].
+
+    Args:
+        table: Table of the trajectory, for messages.
+        motion: Trajectory.
+
+    Raises:
+        ValueError: If a velocity leaves the mean of its neighbours by more than the limit.
+    """
+    if len(motion.time) < 3:
+        return
+    quantity = table.limits.select("velocity")
+    middle = 0.5 * (motion.velocity[2:] + motion.velocity[:-2])
+    off = np.abs(motion.velocity[1:-1] - middle).max(axis=1)
+    largest = 0.5 * (quantity.allowance + quantity.rate * (motion.time[2:] - motion.time[:-2]) / 2)
+    wrong = np.flatnonzero(off > largest)
+    if wrong.size:
+        i = int(wrong[0])
+        raise ValueError(
+            f"{table.name}: a velocity must agree with its neighbours to {largest[i]:.3g} m/s, got "
+            f"{off[i]:.3g} m/s in {table.row(i + 1)}. Correct or remove this row."
+        )

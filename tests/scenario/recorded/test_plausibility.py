@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from synthetic_log import tables, write
 from pfbench.nav.plausible_limits import COLUMNS, QUANTITIES, PlausibleLimits
 from pfbench.scenario.plausibility.log_agreement import AGREEMENTS
 from pfbench.scenario.recorded.log_reader import read_log
+from pfbench.scenario.recorded.trajectory_file import read_motion
 
 PAGE = ROOT / "docs" / "use_your_data.md"
 
@@ -113,6 +115,21 @@ def test_a_key_widens_a_limit_and_cannot_switch_it_off(tmp_path: Path) -> None:
     assert np.isfinite(read.fixes.position).all()
     with pytest.raises(ValueError, match=r"scenario\.limits\.speed_m_s must be a positive finite"):
         PlausibleLimits(speed_m_s=math.inf)
+
+
+@pytest.mark.parametrize(("factor", "is_refused"), [(-1.0, True), (0.9, False)])
+def test_a_single_velocity_of_a_trajectory_agrees_with_its_neighbours(
+    tmp_path: Path, factor: float, is_refused: bool
+) -> None:
+    reference = tables()["reference"]
+    reference.loc[48, "ve"] *= factor
+    write(tmp_path, {"reference": reference})
+    with (
+        pytest.raises(ValueError, match=r"a velocity must agree with its neighbours .* in line 50")
+        if is_refused
+        else nullcontext()
+    ):
+        read_motion(tmp_path, "reference", [40.0, -105.0, 1500.0])
 
 
 SPOILT_TEXT = {
