@@ -1,8 +1,8 @@
 """Divergence thresholds of all scenarios, and what they separate.
 
 For each scenario: the error of the raw estimate, of dead reckoning, the threshold, and the share of runs that diverge
-for the raw estimate's best user (an EKF), for an EKF that receives the measurements of another run, and for dead
-reckoning. Results are kept in a JSON file, so that a run that was stopped goes on.
+for an EKF, for an EKF that receives the measurements of another run, and for dead reckoning. Where the EKF diverges, a
+bootstrap filter of 5000 particles is tried too. A scenario whose threshold does not separate has none. Results are kept in a JSON file, so that a run that was stopped goes on.
 
 Run: python benchmarks/divergence.py [--runs 20] [names]; with --write the thresholds go into conf/scenario.
 """
@@ -23,7 +23,7 @@ from pfbench import job
 from pfbench.config.folders import conf_dir
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
-from pfbench.filter import GaussianFilter, TaylorLinearisation
+from pfbench.filter import Filter, GaussianFilter, ParticleFilter, TaylorLinearisation
 from pfbench.filter.loop import run_filter
 from pfbench.job.metadata import describe_state
 from pfbench.job.plan import build_plan
@@ -34,7 +34,9 @@ from pfbench.results.status import is_diverged
 
 HERE = Path(__file__).parent
 STORE = HERE / "divergence.json"
-FILTERS = ("ekf", "swapped", "dead_reckoning")  # columns of the table
+FILTERS = ("ekf", "sir", "swapped", "dead_reckoning")  # columns of the table
+MOST_CORRECT = 0.1  # share of diverged runs of the better correct filter [ours]
+LEAST_WRONG = 0.5  # share of diverged runs of the worse wrong one [ours]
 WITHOUT_TRUTH = ("user_log",)
 
 
@@ -60,22 +62,43 @@ def measure(name: str, runs: int) -> dict[str, Any]:
             diverged = is_diverged(error.numpy(), lost.numpy(), raw.threshold)
             return float((diverged | lost.numpy()).mean())
 
-        rows = {}
-        for key, shift in zip(FILTERS[:2], (0, 1), strict=True):
-            error, lost = filter_errors(model, episode, truth, shift)
+        ekf, rows = GaussianFilter(TaylorLinearisation()), {}
+        for key, method, shift in (
+            ("ekf", ekf, 0),
+            ("swapped", ekf, 1),
+            ("sir", ParticleFilter(5000), 0),
+        ):
+            if key == "sir" and rows["ekf"] <= MOST_CORRECT:
+                continue
+            error, lost = filter_errors(method, model, episode, truth, shift)
             rows[key] = share(error[..., group.places], lost)
         reckoning = compute_dead_reckoning(model, truth, episode.record)[..., group.places]
-        rows[FILTERS[2]] = share(reckoning, torch.zeros(len(reckoning), dtype=torch.bool))
+        rows["dead_reckoning"] = share(reckoning, torch.zeros(len(reckoning), dtype=torch.bool))
     unit = {"group": group.group, "unit": model.units[group.places[0]]}
     return raw._asdict() | {"threshold": raw.threshold, "runs": runs, "diverged": rows} | unit
 
 
-def filter_errors(
-    model: StateSpaceModel, episode: Episode, truth: Tensor, shift: int
-) -> tuple[Tensor, Tensor]:
-    """Run an EKF with the measurements of the run `shift` places away.
+def separates(diverged: dict[str, float]) -> bool:
+    """Whether a threshold tells a correct filter from a wrong one.
 
     Args:
+        diverged: Shares of diverged runs by filter.
+
+    Returns:
+        Whether the better correct filter is near 0 and the worse wrong one is not.
+    """
+    correct = min(diverged["ekf"], diverged.get("sir", 1.0))
+    wrong = max(diverged["swapped"], diverged["dead_reckoning"])
+    return correct <= MOST_CORRECT and wrong >= LEAST_WRONG
+
+
+def filter_errors(
+    method: Filter, model: StateSpaceModel, episode: Episode, truth: Tensor, shift: int
+) -> tuple[Tensor, Tensor]:
+    """Run a filter with the measurements of the run `shift` places away.
+
+    Args:
+        method: Filter.
         model: Model of the filter.
         episode: Episode of the runs.
         truth: True states, [R, T, D].
@@ -87,13 +110,20 @@ def filter_errors(
     record = episode.record._replace(feedback=None)
     record = record._replace(y=record.y.roll(shift, 0))
     draws = PhiloxStream(1, torch.arange(len(truth)))
-    result = run_filter(GaussianFilter(TaylorLinearisation()), model, record, draws)
+    result = run_filter(method, model, record, draws)
     return model.error(result.mean, truth), result.lost
 
 
 def round_up(value: float) -> float:
     """Round to two significant digits."""
     return float(f"{value:.2g}")
+
+
+def remove_threshold(name: str) -> None:
+    """Remove the threshold, and an empty node `paper`, from a scenario's file."""
+    path = conf_dir() / "scenario" / f"{name}.yaml"
+    text = re.sub(r"^  divergence_threshold:.*\n", "", path.read_text(), flags=re.M)
+    path.write_text(re.sub(r"^paper:\n(?! )", "", text, flags=re.M))
 
 
 def write_threshold(name: str, value: float) -> None:
@@ -119,19 +149,25 @@ def write_page(rows: dict[str, Any]) -> None:
         "raw estimate is five times better than dead reckoning, it is at most half of the error of dead reckoning. It is the",
         "same for all filters. Written by `benchmarks/divergence.py`.",
         "",
-        "Diverged runs in percent: an extended Kalman filter (EKF), the same filter with the measurements of another run, and",
-        "dead reckoning from the initial state. The threshold separates where the first is near 0 and the others near 100.",
+        "Diverged runs in percent: an extended Kalman filter (EKF), a bootstrap filter of 5000 particles (SIR) where the EKF",
+        "diverges, the EKF with the measurements of another run, and dead reckoning from the initial state. A threshold separates",
+        f"if the better of the first two has at most {100 * MOST_CORRECT:.0f} % and the worse of the last two at least {100 * LEAST_WRONG:.0f} %. A scenario whose threshold does not",
+        "separate has none, and its reports do not state divergence.",
         "",
-        "| scenario | group | raw estimate | window [steps] | dead reckoning | threshold | unit | runs | EKF | other run | dead reckoning |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| scenario | group | raw estimate | window [steps] | dead reckoning | threshold | unit | runs | EKF | SIR | other run | dead reckoning |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, row in sorted(rows.items()):
         shares = " | ".join(
-            f"{100 * value:.0f}" for value in (row["diverged"][key] for key in FILTERS)
+            f"{100 * row['diverged'][key]:.0f}" if key in row["diverged"] else "–"
+            for key in FILTERS
         )
+        threshold = f"{round_up(row['threshold']):g}"
+        if not separates(row["diverged"]):
+            threshold = f"none ({threshold})"
         head.append(
             f"| {name} | {row['group']} | {row['rmse']:.3g} | {row['steps'] or '–'} | {row['dead_reckoning']:.3g} "
-            f"| {round_up(row['threshold']):g} | {row['unit'] or '–'} | {row['runs']} | {shares} |"
+            f"| {threshold} | {row['unit'] or '–'} | {row['runs']} | {shares} |"
         )
     (HERE / "divergence.md").write_text("\n".join(head) + "\n")
 
@@ -155,7 +191,9 @@ def main() -> None:
         STORE.write_text(json.dumps(rows, indent=1, sort_keys=True, allow_nan=False) + "\n")
     if options.write:
         for name, row in rows.items():
-            if np.isfinite(row["threshold"]):
+            if not separates(row["diverged"]):
+                remove_threshold(name)
+            elif np.isfinite(row["threshold"]):
                 write_threshold(name, row["threshold"])
     write_page(rows)
 

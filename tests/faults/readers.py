@@ -49,6 +49,7 @@ def class_of(module: ModuleType, text: str) -> tuple[str, str]:
     """Return outcome and remark of an outcome of `run_mutations`, which may end with an example."""
     for word, outcome in (
         (module.SILENT, "false"),
+        (module.EVERY_ROW, "false"),
         (module.UNWRAPPED, "unclear"),
         (module.ERROR, FINE),
         (module.CLOSE, FINE),

@@ -44,6 +44,10 @@ def find_dataset(root: str | None, folder: str) -> Path:
     return path
 
 
+# largest satellite number of each system in its interface document; QZSS and SBAS count from 193 and 120, too
+_LARGEST_NUMBERS = {"G": 63, "R": 32, "E": 36, "C": 63, "J": 202, "I": 14, "S": 158}
+
+
 class LogTable(NamedTuple):
     """Rows of a table file.
 
@@ -206,21 +210,30 @@ def convert_column(table: LogTable, column: str) -> Array:
         ) from error
 
 
-def parse_systems(table: LogTable) -> list[str]:
-    """Return the letter of the satellite system of each row, G without a column `sys`.
+def parse_satellites(table: LogTable, numbers: Array) -> list[str]:
+    """Return the name of the satellite of each row, such as G07.
+
+    Args:
+        table: Table. Without a column `sys` all satellites are of GPS.
+        numbers: Satellite numbers, [n].
 
     Raises:
-        ValueError: If a value is not the letter of a system.
+        ValueError: If a value is not the letter of a system or not a number of this system.
     """
-    if "sys" not in table.rows:
-        return ["G"] * len(table.rows)
-    for i, value in enumerate(table.rows["sys"]):
-        if value not in ("G", "R", "E", "C", "J", "I", "S"):
+    systems = table.rows["sys"] if "sys" in table.rows else ["G"] * len(table.rows)
+    for i, (system, number) in enumerate(zip(systems, numbers, strict=True)):
+        if system not in _LARGEST_NUMBERS:
             raise ValueError(
-                f"{table.name}: column sys must be one of G, R, E, C, J, I, S, got {value!r} in "
+                f"{table.name}: column sys must be one of {', '.join(_LARGEST_NUMBERS)}, got "
+                f"{system!r} in {table.row(i)}. Correct or remove this row."
+            )
+        if not (1 <= number <= _LARGEST_NUMBERS[system] and number == int(number)):
+            raise ValueError(
+                f"{table.name}: column svid must be a whole number from 1 to "
+                f"{_LARGEST_NUMBERS[system]} for the system {system}, got {number:g} in "
                 f"{table.row(i)}. Correct or remove this row."
             )
-    return [str(value) for value in table.rows["sys"]]
+    return [f"{system}{int(number):02d}" for system, number in zip(systems, numbers, strict=True)]
 
 
 def read_times(table: LogTable, longest: float) -> Array:

@@ -17,7 +17,7 @@ from pfbench.scenario.recorded.log_tables import (
     Array,
     LogTable,
     parse_numbers,
-    parse_systems,
+    parse_satellites,
     read_table,
 )
 
@@ -99,13 +99,7 @@ def read_sky(
             f"{table.name} does not contain a row above {mask_deg} degrees within {_SAME_EPOCH} s of the "
             "end of a step. Use the same clock for t in all tables."
         )
-    systems = parse_systems(table)
-    row_names = np.array(
-        [
-            f"{system}{int(number):02d}"
-            for system, number in zip(systems, value["svid"], strict=True)
-        ]
-    )
+    row_names = np.array(parse_satellites(table, value["svid"]))
     names, slot = np.unique(row_names[selected_mask], return_inverse=True)
     index = (row[selected_mask], slot)
     if len(set(zip(*index, strict=True))) < len(slot):

@@ -27,7 +27,7 @@ from pfbench.scenario.recorded.log_tables import (
     Array,
     LogTable,
     parse_numbers,
-    parse_systems,
+    parse_satellites,
     read_table,
     read_times,
 )
@@ -101,10 +101,7 @@ def read_drive(folder: Path, limits: PlausibleLimits | None = None) -> UrbanLog:
             f"{folder}: {pseudoranges.name} must have only times t of {wheels.name}. "
             "Use the same epochs in both."
         )
-    names = [
-        f"{system}{int(number):02d}"
-        for system, number in zip(parse_systems(pseudoranges), svid, strict=True)
-    ]
+    names = parse_satellites(pseudoranges, svid)
     satellites, slot = np.unique(names, return_inverse=True)
     if len(set(zip(row, slot, strict=True))) < len(slot):
         raise ValueError(

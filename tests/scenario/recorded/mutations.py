@@ -7,6 +7,7 @@ Run: python tests/scenario/recorded/mutations.py [count] [readers]
 
 from __future__ import annotations
 
+import io
 import sys
 import tempfile
 from collections import Counter
@@ -33,6 +34,7 @@ from pfbench.scenario.recorded.urban_log import read_drive
 
 ERROR, CLOSE, NOTED = "error", "within tolerance", "noted"
 SILENT, UNWRAPPED = "silently wrong", "other exception"
+EVERY_ROW = "silently wrong in every row"  # one column, so that neighbours agree; docs/use_your_data.md says so
 SCALES = (np.pi / 180, 180 / np.pi, 1e3, 1e-3, 3.6, 1 / 3.6, 0.3048, 9.80665, -1.0)
 
 
@@ -318,9 +320,26 @@ def run_mutations(reader: str, count: int, seed: int) -> Counter[str]:
             rng = np.random.default_rng([seed, number])
             for file, content in files.items():
                 (folder / file).write_bytes(content)
-            damage_file(folder / list(files)[pick(rng, len(files))], rng)
-            outcomes[outcome_of(reader, folder, clean, set(clean_notes), number)] += 1
+            file = list(files)[pick(rng, len(files))]
+            damage_file(folder / file, rng)
+            outcome = outcome_of(reader, folder, clean, set(clean_notes), number)
+            if outcome.startswith(SILENT) and differs_everywhere(folder / file, files[file]):
+                outcome = EVERY_ROW + outcome.removeprefix(SILENT)
+            outcomes[outcome] += 1
     return outcomes
+
+
+def differs_everywhere(file: Path, undamaged: bytes) -> bool:
+    """Whether the values of a column changed in more than half of the rows of a table."""
+    read = pd.read_parquet if file.suffix == ".parquet" else pd.read_csv
+    before, after = read(io.BytesIO(undamaged)), read(file)
+    if len(before) != len(after) or list(before) != list(after):
+        return False
+    numbers = [c for c in before if before[c].dtype.kind in "fiu"]
+    changed = (before[numbers] != after[numbers]) & ~(
+        before[numbers].isna() & after[numbers].isna()
+    )
+    return bool((changed.mean() > 0.5).any())
 
 
 def outcome_of(
