@@ -12,6 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -157,7 +158,9 @@ def _check_node(key: str, node: Mapping[Any, Any], trusted: Sequence[str]) -> No
                 f"{key} must name the arguments of {target}, got _args_. Write them as keys."
             )
         if not _is_public(target):
-            raise UntrustedConfigError(requirement + "See pfbench.FOLDER.__all__ for the names.")
+            raise UntrustedConfigError(
+                f"{requirement}{_suggest_public(target)}See pfbench.FOLDER.__all__ for the names."
+            )
     elif not any(target.startswith(f"{package}.") for package in trusted):
         package = target.split(".")[0]
         is_library = package in BROAD or package in sys.stdlib_module_names
@@ -183,6 +186,17 @@ def _is_public(target: str) -> bool:
     folder, name = parts[1:]
     door = import_module(f"pfbench.{folder}")
     return name in door.__all__ and (name[0].isupper() or name in BUILDERS.get(folder, ()))
+
+
+def _suggest_public(target: str) -> str:
+    """Return a sentence with the public names that are similar to a name, or an empty text."""
+    names = [
+        f"pfbench.{folder}.{name}"
+        for folder in FOLDERS
+        for name in import_module(f"pfbench.{folder}").__all__
+    ]
+    similar = [name for name in get_close_matches(target, names, 1, 0.8) if _is_public(name)]
+    return f"Similar: {', '.join(similar)}. " if similar else ""
 
 
 def _is_defined_in(target: str, trusted: Sequence[str]) -> bool:

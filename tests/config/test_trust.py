@@ -72,6 +72,14 @@ def test_every_alternative_of_a_sweep_is_checked(tmp_path: Path) -> None:
             check_words([flag])
 
 
+def test_a_misspelt_class_is_compared_with_public_names() -> None:
+    with pytest.raises(UntrustedConfigError, match=r"Similar: pfbench\.filter\.ParticleFilter\."):
+        check_words(["filter=sir", "filter._target_=pfbench.filter.ParticelFilter"])
+    with pytest.raises(UntrustedConfigError) as raised:
+        check_words(["filter=sir", "filter._target_=pfbench.filter.run_filter"])
+    assert "Similar" not in str(raised.value)  # a function is not offered
+
+
 def test_studies_are_plain_names() -> None:
     for name in ("adhoc", "a-b_2.c+d", "2026", 2026, 1.0, True):
         trust.check_study(name)
