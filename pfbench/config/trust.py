@@ -158,9 +158,8 @@ def _check_node(key: str, node: Mapping[Any, Any], trusted: Sequence[str]) -> No
                 f"{key} must name the arguments of {target}, got _args_. Write them as keys."
             )
         if not _is_public(target):
-            raise UntrustedConfigError(
-                f"{requirement}{_suggest_public(target)}See pfbench.FOLDER.__all__ for the names."
-            )
+            remedy = _suggest_public(target) + "See pfbench.FOLDER.__all__ for the names."
+            raise UntrustedConfigError(requirement + remedy)
     elif not any(target.startswith(f"{package}.") for package in trusted):
         package = target.split(".")[0]
         is_library = package in BROAD or package in sys.stdlib_module_names
