@@ -227,9 +227,9 @@ def parse_satellites(table: LogTable, numbers: Array) -> list[str]:
                 f"{table.name}: column sys must be one of {', '.join(_LARGEST_NUMBERS)}, got "
                 f"{system!r} in {table.row(i)}. Correct or remove this row."
             )
-        if not (0 <= number <= _LARGEST_NUMBERS[system] and number == int(number)):
+        if not (1 <= number <= _LARGEST_NUMBERS[system] and number == int(number)):
             raise ValueError(
-                f"{table.name}: column svid must be a whole number from 0 to "
+                f"{table.name}: column svid must be a whole number from 1 to "
                 f"{_LARGEST_NUMBERS[system]} for the system {system}, got {number:g} in "
                 f"{table.row(i)}. Correct or remove this row."
             )

@@ -152,7 +152,7 @@ def test_a_spoilt_text_is_an_error_with_its_line(tmp_path: Path, name: str) -> N
         read_log(tmp_path)
 
 
-@pytest.mark.parametrize(("system", "number"), [("G", 120.0), ("E", -1.0), ("R", 2.5), ("X", 3.0)])
+@pytest.mark.parametrize(("system", "number"), [("G", 120.0), ("E", 0.0), ("R", 2.5), ("X", 3.0)])
 def test_a_satellite_that_no_system_has_is_an_error(system: str, number: float) -> None:
     table = LogTable(pd.DataFrame({"sys": ["S", system]}), "sky.csv", True, {})
     with pytest.raises(ValueError, match=r"sky\.csv: column (sys|svid) must be .* in line 3"):

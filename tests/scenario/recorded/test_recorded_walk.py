@@ -70,7 +70,7 @@ def sky(seconds: float = 20.0) -> pd.DataFrame:
         rows.append(
             pd.DataFrame(
                 {
-                    "t": t, "sys": "GE"[s % 2], "svid": s, "pr": signal.range[:, s].numpy() + offset - clock + tropo + iono,
+                    "t": t, "sys": "GE"[s % 2], "svid": s + 1, "pr": signal.range[:, s].numpy() + offset - clock + tropo + iono,
                     "prr": rate[:, s].numpy() - clock_drift, "sd_pr": 0.1 + 0.01 * s, "sd_prr": 0.05, "sclk": clock,
                     "sclkd": clock_drift, "tropo": tropo, "iono": iono,
                     "el": np.degrees(elevation[:, s].numpy()), "az": np.degrees(azimuth[:, s].numpy()),
