@@ -2,7 +2,8 @@
 
 For each scenario: the error of the raw estimate, of dead reckoning, the threshold, and the share of runs that diverge
 for an EKF, for an EKF that receives the measurements of another run, and for dead reckoning. Where the EKF diverges, a
-bootstrap filter of 5000 particles is tried too. A scenario whose threshold does not separate has none. Results are kept in a JSON file, so that a run that was stopped goes on.
+bootstrap filter of 5000 particles is tried too. A scenario whose threshold does not separate has none.
+Results are kept in a JSON file, so that a run that was stopped goes on.
 
 Run: python benchmarks/divergence.py [--runs 20] [names]; with --write the thresholds go into conf/scenario.
 """
