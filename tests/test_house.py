@@ -27,7 +27,7 @@ FLOORS = (
     ("results",),
     ("config",),
     ("report", "job", "learn", "ppl", "testing"),
-    ("claims", "judge"),
+    ("claims", "judge", "replay"),
     ("cli",),
     ("__main__",),
 )

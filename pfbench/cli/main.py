@@ -17,6 +17,7 @@ COMMANDS = {
     "report": ("report_study", "write the report of a study: figures, tables and tests"),
     "claims": ("report_claims", "write the page of the papers' claims and verdicts"),
     "datasheet": ("report_scenario", "write the datasheet of a scenario"),
+    "replay": ("replay_run", "compute one stored run again, with all its traces"),
     "judge": ("judge_trajectories", "compare trajectories of other programs with a reference"),
     "train": ("train_network", "train the network of a neural_* filter"),
     "list": ("list_options", "list what a configuration can choose"),

@@ -56,12 +56,20 @@ def report_study(words: Sequence[str]) -> None:
         raise ValueError(
             "study must be a study, got datasheets. Use: pfbench datasheet scenario=NAME"
         )
-    _check_existence(study, Path(config.values["results_dir"]))
+    check_study_exists(study, Path(config.values["results_dir"]))
     print(f"report: {_write_page(config).resolve()}")
 
 
-def _check_existence(study: str, results: Path) -> None:
-    """Check that a study has a folder of results or an experiment."""
+def check_study_exists(study: str, results: Path) -> None:
+    """Check that a study has a folder of results or an experiment.
+
+    Args:
+        study: Name of the study.
+        results: Folder of all studies.
+
+    Raises:
+        ValueError: If it has neither. The message names similar studies.
+    """
     experiments = {path.stem for path in experiments_dir().glob("*.yaml")}
     if study in experiments or (results / study).is_dir():
         return

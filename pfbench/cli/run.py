@@ -8,9 +8,9 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from pfbench.cli.study_plan import StudyPlan, plan_study
-from pfbench.cli.sweep_progress import SWEEP_JOBS, SweepProgress
-from pfbench.cli.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
+from pfbench.cli.sweep.study_plan import StudyPlan, plan_study
+from pfbench.cli.sweep.sweep_progress import SWEEP_JOBS, SweepProgress
+from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
 from pfbench.config.composition import register_experiments
 from pfbench.config.folders import conf_dir
 from pfbench.config.sweep_check import check_words

@@ -105,6 +105,23 @@ def join_arrays(
     return joint
 
 
+def select_run(result: store.JobResult, index: int) -> store.JobResult:
+    """Select one run of a result.
+
+    Args:
+        result: Result.
+        index: Index of the run on the axis of runs.
+
+    Returns:
+        The same metadata, and arrays whose axis of runs has length 1.
+    """
+    data = {
+        name: array if name in _SHARED else array[index : index + 1]
+        for name, array in result.data.items()
+    }
+    return store.JobResult(result.meta, data)
+
+
 def read_joined(paths: Sequence[Path]) -> store.JobResult:
     """Read the parts of a job that were computed one after the other.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pfbench.cli.study_plan import StudyPlan
+from pfbench.cli.sweep.study_plan import StudyPlan
 from pfbench.config.composition import JobConfig
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pfbench.cli.study_plan import StudyPlan
+from pfbench.cli.sweep.study_plan import StudyPlan
 
 SWEEP_JOBS = "PFBENCH_SWEEP_JOBS"  # environment variable: number of jobs, for the counter
 

@@ -1,0 +1,126 @@
+"""Command `pfbench replay`: one stored run, computed again with all its traces."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pfbench.cli.messages import suggest_similar
+from pfbench.cli.report import check_study_exists
+from pfbench.config.composition import compose
+
+HELP = """\
+pfbench replay study=NAME run=NUMBER filter=NAME [scenario=NAME] [noise=NAME] [model=NAME] [key=value ...]
+
+Compute one run of a stored job again, compare it with the stored numbers, print its status and metrics, and
+write its traces (errors, standard deviations, NEES, ESS, NIS, track) as CSV, as Parquet if pyarrow is installed,
+and as a figure.
+
+  pfbench replay study=quickstart run=7 filter=sir
+  pfbench replay study=mine run=3 filter=rpf scenario=flight_500s noise=outliers
+  pfbench replay study=mine run=3 'filter=sir[particles=100]'     a label of the report
+
+  scenario, noise, model     needed where the filter has results in several conditions
+  device=cpu threads=1       where to compute; by default as stored
+  results_dir, reports_dir   folders; files go to REPORTS/STUDY/replay/"""
+
+_CHOICES = ("scenario", "noise", "model")
+_REQUIRED = ("study", "run", "filter")
+_FOLDERS = ("results_dir", "reports_dir")
+_PLACES = ("device", "threads")
+
+
+def replay_run(words: Sequence[str]) -> None:
+    """Compute one stored run again, compare it and write its traces.
+
+    Args:
+        words: Words `key=value`.
+
+    Raises:
+        ValueError: If a word is not valid, or no job or several jobs match.
+    """
+    values = split_replay_words(words)
+    config = compose(
+        [f"{key}={values[key]}" for key in ("study", *_FOLDERS, *_PLACES) if key in values]
+    )
+    study, results = config.values["study"], Path(config.values["results_dir"])
+    check_study_exists(study, results)
+    from pfbench.replay import recomputation, replay_files
+    from pfbench.replay.agreement import compare_runs, describe_agreement
+    from pfbench.replay.run_selection import find_run
+
+    choices = {key: values[key] for key in _CHOICES if key in values}
+    stored = find_run(study, results, _run_number(values["run"]), values["filter"], choices)
+    changes: dict[str, Any] = {
+        key: config.values[key] for key in ("data", *_PLACES) if key in values or key == "data"
+    }
+    result = recomputation.recompute_run(stored, changes)
+    comparable = recomputation.select_stored_scores(result, stored.result)
+    meta = stored.result.meta
+    print(f"run {stored.run} of {stored.condition.name} / {stored.job.label}, seed {meta['seed']}")
+    print(f"status: {replay_files.describe_status(comparable)}")
+    print(describe_agreement(compare_runs(stored.result, comparable)))
+    _print_versions(meta["versions"], result.meta["versions"])
+    for name, old, new, unit in replay_files.tabulate_metrics(stored, comparable):
+        print(f"  {name:28} {_format(new):>12} {unit:8} stored {_format(old)}")
+    for path in replay_files.write_replay(stored, result, config.values["reports_dir"]):
+        print(f"{path.suffix[1:]}: {path.resolve()}")
+
+
+def split_replay_words(words: Sequence[str]) -> dict[str, str]:
+    """Split words into values by key and check the keys.
+
+    Args:
+        words: Words `key=value`.
+
+    Returns:
+        Values by key.
+
+    Raises:
+        ValueError: If a word is not `key=value`, a key is unknown or repeated, or one is missing.
+    """
+    keys = (*_REQUIRED, *_CHOICES, *_FOLDERS, *_PLACES)
+    values: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not value or key in values:
+            raise ValueError(
+                f"words must be key=value, each key once, got {word}. See pfbench replay --help."
+            )
+        if key not in keys:
+            raise ValueError(
+                f"key must be one of {', '.join(keys)}, got {key}.{suggest_similar(key, keys)} "
+                "See pfbench replay --help."
+            )
+        values[key] = value
+    for key in _REQUIRED:
+        if key not in values:
+            raise ValueError(
+                f"{key} must be set. Use: pfbench replay study=NAME run=NUMBER filter=NAME"
+            )
+    return values
+
+
+def _run_number(text: str) -> int:
+    """Convert the number of a run."""
+    if not text.isdecimal():
+        raise ValueError(f"run must be a whole number of at least 0, got {text}. Set run=0.")
+    return int(text)
+
+
+def _print_versions(stored: dict[str, str], current: dict[str, str]) -> None:
+    """Print the versions that differ from those of the stored job."""
+    changes = [
+        f"{name} {stored.get(name) or 'unknown'} to {current.get(name) or 'unknown'}"
+        for name in current
+        if stored.get(name) != current.get(name)
+    ]
+    if changes:
+        print(f"versions that changed since: {', '.join(changes)}")
+
+
+def _format(value: float) -> str:
+    """Format a metric with six digits."""
+    return f"{value:.6g}" if math.isfinite(value) else ("none" if math.isnan(value) else "infinite")

@@ -1,0 +1,1 @@
+"""Sweeps: plan, progress, and studies that add runs until they are decided."""

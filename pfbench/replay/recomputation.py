@@ -1,0 +1,97 @@
+"""Computation of one stored run with scores at all steps."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pfbench.config.composition import CHOICES, JobConfig
+from pfbench.job.run_job import compute_job
+from pfbench.replay.run_selection import StoredRun
+from pfbench.results import store
+
+_ENGINES = ("kernels", "compiled")  # engines that a job may have used; the others are eager
+
+
+def replay_config(stored: StoredRun, changes: Mapping[str, Any]) -> JobConfig:
+    """Return the configuration that computes one run of a stored job.
+
+    All settings that affect the numbers are those of the job. A number of particles that a budget chose is
+    set as such, so that nothing is measured again.
+
+    Args:
+        stored: Run.
+        changes: Values of top-level keys that replace the stored ones: the folder of the data, threads,
+            device.
+
+    Returns:
+        The configuration.
+
+    Raises:
+        ValueError: If the result was not computed by a job, or names what is not trusted.
+    """
+    meta = stored.result.meta
+    parts = ("scenario", "noise", "filter", "model")
+    values = copy.deepcopy(meta["config"])
+    if not all(isinstance(values.get(name), Mapping) for name in parts):
+        raise ValueError(
+            f"study must have results of pfbench run, got results without {', '.join(parts)} in "
+            f"{stored.job.path}. Choose another study."
+        )
+    values |= {
+        "first_run": stored.run,
+        "runs": 1,
+        "pcrb": False,
+        "score_steps": int(meta["steps"]),
+        "engine": meta["engine"] if meta.get("engine") in _ENGINES else "eager",
+        "memory_limit_gib": None,
+        "budget": store.SAME_N,
+        **changes,
+    }
+    if meta.get("budget_allocation"):
+        values["filter"]["particles"] = meta["particles"]
+    if "root" in values["scenario"] and values["scenario"]["root"] is not None:
+        values["scenario"]["root"] = values["data"]["root"]
+    return JobConfig(values, {group: str(meta["choices"][group]) for group in CHOICES})
+
+
+def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobResult:
+    """Compute one stored run again.
+
+    Args:
+        stored: Run.
+        changes: See `replay_config`.
+
+    Returns:
+        Result with one run, and scores at all steps.
+    """
+    config = replay_config(stored, changes)
+    choices = {group: config.choices[group] for group in CHOICES}
+    title = " / ".join(choices[group] for group in ("scenario", "noise", "filter"))
+    meta, outputs = compute_job(config, f"{title}, run {stored.run}")
+    head = {"key": stored.job.path.stem, "study": stored.result.meta["study"]}
+    full = {**head, "choices": choices, "config": config.values, **meta}
+    return store.JobResult(full, outputs)
+
+
+def select_stored_scores(result: store.JobResult, stored: store.JobResult) -> store.JobResult:
+    """Select the scores of a replay at the steps at which the stored run was scored.
+
+    Args:
+        result: Result with scores at all steps.
+        stored: Stored result.
+
+    Returns:
+        The replay with the arrays of scores that the stored run has.
+    """
+    steps = stored.data.get("score_steps")
+    names = ("crps", "pit", "energy_score", "nis", "nis_dof")
+    data = {k: v for k, v in result.data.items() if k not in (*names, "score_steps")}
+    if steps is not None:
+        index = np.searchsorted(result.data["score_steps"], steps)
+        data |= {k: result.data[k][:, index] for k in names if k in result.data}
+        data["score_steps"] = np.asarray(steps)
+    return store.JobResult(result.meta, data)

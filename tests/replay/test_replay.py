@@ -1,0 +1,137 @@
+"""One run computed again equals the run of the batch, a changed number is found, and mistakes have advice."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from command_line import Said, pfbench
+
+from pfbench import job
+from pfbench.replay.agreement import compare_runs, describe_agreement
+from pfbench.replay.traces import magnification
+from pfbench.results import store
+
+WALK = ("scenario=linear_walk", "scenario.steps=8", "runs=4", "first_run=10", "score_steps=2")
+STUDY = ("study=walks", "particles=30")
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study of two filters in two noise regimes, one of them with two numbers of particles."""
+    folder = tmp_path_factory.mktemp("replay")
+    jobs = [("ekf", "nominal"), ("ekf", "outliers"), ("sir", "nominal"), ("sir", "outliers")]
+    for name, noise in jobs:
+        run_job(folder, f"filter={name}", f"noise={noise}")
+    run_job(folder, "filter=sir", "noise=outliers", "filter.particles=40")
+    return folder
+
+
+def run_job(folder: Path, *words: str) -> None:
+    job.run(job.compose([*WALK, *STUDY, f"results_dir={folder}/results", *words]))
+
+
+def replay(folder: Path, *words: str) -> Said:
+    return pfbench("replay", "study=walks", f"reports_dir={folder}/reports", *words, home=folder)
+
+
+@pytest.mark.parametrize("name", ["ekf", "sir"])
+def test_a_run_alone_equals_the_run_of_the_batch(home: Path, name: str) -> None:
+    said = replay(home, "run=12", f"filter={name}", "scenario=linear_walk", "noise=nominal")
+    assert said.code == 0, said.err
+    assert f"run 12 of linear_walk / nominal / linear_walk / {name}, seed" in said.out
+    assert "equal in every digit" in said.out or "agree to" in said.out
+    file = next((home / "reports/walks/replay").glob(f"*nominal*_{name}_run_12/traces.csv"))
+    table = pd.read_csv(file)
+    (result,) = [
+        r
+        for r in store.list_results(home / "results/walks")
+        if (r.meta["label"], r.meta["choices"]["noise"]) == (name, "nominal")
+    ]
+    component, unit = result.meta["state"]["names"][0], result.meta["state"]["units"][0]
+    errors = table[f"error {component} [{unit}]"].to_numpy()
+    np.testing.assert_allclose(errors, result.data["error"][2, :, 0], rtol=1e-5, atol=1e-6)
+    assert table["nis"].notna().all()  # scored at all steps, the job at two of them
+    assert ("ess" in table) == (name == "sir")
+    assert file.with_name("traces.svg").read_text().startswith("<?xml")
+
+
+def test_a_changed_number_is_found_with_its_time(home: Path, tmp_path: Path) -> None:
+    results = list(store.list_results(home / "results/walks"))
+    (result,) = [
+        r for r in results if (r.meta["label"], r.meta["choices"]["noise"]) == ("ekf", "nominal")
+    ]
+    error = result.data["error"].copy()
+    error[1, 5] += 0.01
+    folder = tmp_path / "results" / "walks"
+    store.write_result(
+        folder / f"{result.meta['key']}.npz", result.meta, {**result.data, "error": error}
+    )
+    said = replay(tmp_path, "run=11", "filter=ekf")
+    assert said.code == 0, said.err
+    assert "do not agree: error differ in the first 4 digits, from 6 s on" in said.out
+    said = replay(tmp_path, "run=13", "filter=ekf")
+    assert "do not agree" not in said.out
+
+
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        (("study=wlaks", "run=12", "filter=ekf"), "got wlaks. Similar: walks."),
+        (("study=walks", "run=14", "filter=ekf", "noise=nominal"), "10 to 13, got 14"),
+        (("study=walks", "run=x", "filter=ekf"), "run must be a whole number of at least 0, got x"),
+        (("study=walks", "run=12", "filter=ukf"), "Choose from ekf, sir, sir[particles=30], sir["),
+        (
+            ("study=walks", "run=12", "filter=ekf"),
+            "noise must be set, since ekf has results in 2 conditions. Add noise",
+        ),
+        (("study=walks", "run=12", "filter=ekf", "noise=glint"), "Choose from nominal, outliers"),
+        (("study=walks", "run=12", "filter=sir", "noise=outliers"), "got sir with 2 settings"),
+        (("study=walks", "run=12", "filtre=sir"), "got filtre. Similar: filter."),
+        (("study=walks", "filter=sir"), "run must be set"),
+    ],
+)
+def test_advice_of_replay(home: Path, words: tuple[str, ...], advice: str) -> None:
+    said = pfbench("replay", *words, home=home)
+    assert said.code == 1
+    assert advice in said.err
+
+
+def make_result(error: np.ndarray) -> store.JobResult:
+    return store.JobResult({}, {"time": np.arange(1.0, 6.0), "error": error, "lost": np.zeros(1)})
+
+
+def test_digits_are_those_of_the_relative_difference() -> None:
+    error = np.linspace(1.0, 5.0, 5)[None, :, None] * np.ones(2)
+    same = compare_runs(make_result(error), make_result(error))
+    assert describe_agreement(same) == "All 2 stored arrays are equal in every digit."
+    close = error.copy()
+    close[0, 3, 1] += 5.0 * 3e-6  # relative to the largest value 5 of the component
+    worst = compare_runs(make_result(error), make_result(close))[0]
+    assert (worst.name, worst.digits, worst.agrees) == ("error", 5.0, True)
+    gone = error.copy()
+    gone[0, 2:] = np.nan
+    worst = compare_runs(make_result(error), make_result(gone))[0]
+    assert (worst.digits, worst.time_s, worst.agrees) == (0.0, 3.0, False)
+    both = compare_runs(make_result(gone), make_result(gone))[0]
+    assert np.isinf(both.digits)
+
+
+def test_magnification_is_a_power_of_ten_that_keeps_errors_below_the_track() -> None:
+    track = np.array([[0.0, 0.0], [3600.0, 100.0]])
+    assert magnification(track, np.full((2, 2), 2.0)) == 10
+    assert magnification(track, np.full((2, 2), 50.0)) == 1
+    assert magnification(track, np.full((2, 2), np.nan)) == 1
+
+
+def test_results_of_other_programs_are_refused(home: Path, tmp_path: Path) -> None:
+    result = next(iter(store.list_results(home / "results/walks")))
+    meta = {**result.meta, "config": json.loads("{}")}
+    store.write_result(tmp_path / "results/walks" / f"{meta['key']}.npz", meta, result.data)
+    label = meta["label"]
+    said = replay(tmp_path, "run=12", f"filter={label}")
+    assert said.code == 1
+    assert "study must have results of pfbench run" in said.err
