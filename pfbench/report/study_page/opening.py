@@ -1,0 +1,172 @@
+"""Sentence, table and decisions of a page before its script runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from decimal import ROUND_HALF_UP, Context, Decimal
+from typing import Any
+
+from markupsafe import Markup, escape
+
+SIGNS = {
+    "best": "★", "equal": "≈", "better": "▲", "open": "?", "worse": "▼", "lost": "✕", "missing": "–",
+}  # fmt: skip
+_DASH = "–"
+
+
+def format_short(value: float | None, digits: int = 3) -> str:
+    """Format a number with significant digits, as the script of the page does.
+
+    Args:
+        value: Number, or None for a dash.
+        digits: Number of significant digits.
+    """
+    if value is None:
+        return _DASH
+    rounded = Context(prec=digits, rounding=ROUND_HALF_UP).create_decimal(Decimal(value))
+    if rounded == 0:
+        return "0"
+    exponent = rounded.adjusted()
+    if not -4 <= exponent < 6:
+        return f"{rounded:.{digits - 1}e}".replace("e+", "e")
+    return f"{rounded:.{max(0, digits - 1 - exponent)}f}"
+
+
+def format_share(value: float | None) -> str:
+    """Format a share as percent.
+
+    Args:
+        value: Share, or None for a dash.
+    """
+    if value is None:
+        return _DASH
+    return f"{Decimal(100 * value).quantize(Decimal(1), ROUND_HALF_UP)} %"
+
+
+def format_interval(low: float | None, high: float | None) -> str:
+    """Format an interval in brackets, or nothing where it is missing.
+
+    Args:
+        low: Lower end.
+        high: Upper end.
+    """
+    return "" if low is None or high is None else f"[{format_short(low)}, {format_short(high)}]"
+
+
+def format_sentence(text: str) -> Markup:
+    """Escape a sentence and make [[names]] bold.
+
+    Args:
+        text: Sentence of the board.
+    """
+    return Markup(re.sub(r"\[\[(.*?)\]\]", r"<b>\1</b>", str(escape(text))))
+
+
+def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the sentence and the table of the opening view.
+
+    Args:
+        pack: Data of the page.
+    """
+    key, view = next(iter(pack["views"].items()))
+    metric, world, regime, baseline = key.split("/")
+    names = {f["key"]: f for f in pack["filters"]}
+    parts = (
+        _name(pack["metrics"], metric),
+        _scope(pack["worlds"], world, "world"),
+        _scope(pack["regimes"], regime, "noise regime"),
+        f"ratio to {names[baseline]['name']}",
+    )
+    return {
+        "sentence": format_sentence(view["sentence"]),
+        "text": view["sentence"].replace("[[", "").replace("]]", ""),
+        "small_print": view["small_print"],
+        "caption": f"{'; '.join(parts)}.",
+        "heads": _heads(names[baseline]["name"]),
+        "rows": [_row(row, names[row["filter"]]) for row in view["rows"]],
+    }
+
+
+def _heads(baseline: str) -> list[dict[str, str]]:
+    """Return the heads of the table."""
+    heads = [
+        ("#", "number", "", "ascending"), ("Filter", "", "", ""), ("Error", "desk", "with interval", ""),
+        (f"÷ {baseline}", "number", "with interval", ""), ("Against the best", "", "jointly", ""),
+        ("Track kept", "number", "", ""), ("Calibration", "desk", "90 % regions", ""),
+        ("ms/step", "number desk", "", ""),
+    ]  # fmt: skip
+    return [dict(zip(("text", "style", "small", "sort"), head, strict=True)) for head in heads]
+
+
+def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the texts of one row."""
+    value = ""
+    if row["value"] is not None:
+        unit, interval = row["unit"] or "", format_interval(row["low"], row["high"])
+        value = f"{format_short(row['value'])} {unit} {interval}"
+    calibration = row["calibration"] or ""
+    return {
+        "rank": _DASH if row["rank"] is None else f"{'=' if row['tied'] else ''}{row['rank']}",
+        "name": look["name"],
+        "proposed": look["proposed"],
+        "value": value,
+        "ratio": format_short(row["ratio"]),
+        "interval": format_interval(row["ratio_low"], row["ratio_high"]),
+        "verdict": row["verdict"],
+        "words": f"{SIGNS[row['verdict']]} {row['words']}",
+        "track": format_share(row["track"]),
+        "calibration": f"{format_share(row['coverage'])} {calibration}".strip(),
+        "ms": format_short(row["ms"]),
+    }
+
+
+def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the planned comparisons as texts.
+
+    Args:
+        pack: Data of the page.
+    """
+    names = {f["key"]: f["name"] for f in pack["filters"]}
+    return [
+        {
+            "pair": f"{names[pair['a']]} against {names[pair['b']]}",
+            "question": pair["question"],
+            "ratio": format_short(pair["estimate"]),
+            "interval": format_interval(pair["low"], pair["high"]),
+            "word": pair["word"],
+            "sentence": pair["sentence"].replace("[[", "").replace("]]", ""),
+        }
+        for pair in pack["planned"]
+    ]
+
+
+def find_front(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the filters that no other filter beats in both ratio and cost, by cost.
+
+    Args:
+        rows: Rows of a view.
+    """
+    points = sorted(
+        (row["ms"], row["ratio"], row["filter"])
+        for row in rows
+        if row["ms"] is not None and row["ratio"] is not None
+    )
+    front, least = [], float("inf")
+    for _, ratio, key in points:
+        if ratio < least:
+            least = ratio
+            front.append(key)
+    return front
+
+
+def _name(items: Sequence[Mapping[str, Any]], key: str) -> str:
+    """Return the name of a key."""
+    return next((str(item["name"]) for item in items if item["key"] == key), key)
+
+
+def _scope(items: Sequence[Mapping[str, Any]], key: str, noun: str) -> str:
+    """Return the name of a key, or how many there are."""
+    if key != "all":
+        return _name(items, key)
+    return str(items[0]["name"]) if len(items) == 1 else f"all {len(items)} {noun}s"

@@ -1,0 +1,124 @@
+"""Writer of the report page: index.html with all data, and report.md of one screen."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from pfbench.files.escapes import escape_markdown
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.study_page.encoding import encode_pack
+from pfbench.report.study_page.opening import describe_opening, describe_pairs, find_front
+
+PAGE_BYTES = 1_500_000
+_HERE = Path(__file__).parent
+_SCRIPTS = ("kit", "state", "board", "cost", "pairs", "worlds", "time", "runs", "main")
+_COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
+_SECTIONS = (
+    ("planned", "planned", "Planned comparisons"), ("cells", "worlds", "Worlds"), ("curves", "time", "Over time"),
+    ("calibration", "calibration", "Calibration"), ("runs", "runs", "Single runs"), ("sweeps", "sweeps", "Dose and response"),
+    ("cells", "table", "Table"), ("methods_paragraph", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
+)  # fmt: skip
+
+
+def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
+    """Write index.html and report.md of a study. Equal packs give equal bytes.
+
+    Args:
+        pack: Data of the page, as `pfbench.report.board` makes it.
+        folder: Target folder.
+
+    Returns:
+        Path of index.html.
+
+    Raises:
+        ValueError: If a colour is not of the form #rrggbb.
+    """
+    views = {
+        key: {**view, "front": find_front(view["rows"])} for key, view in pack["views"].items()
+    }
+    pack = {**pack, "views": views}
+    context = {
+        "pack": pack,
+        "opening": describe_opening(pack),
+        "planned": describe_pairs(pack),
+        "level": f"{100 * (1 - pack['alpha']):g}",
+        "methods": [text for text in pack["methods_paragraph"].split("\n\n") if text.strip()],
+        "files": _group_files(pack["downloads"]),
+        "sections": [
+            (anchor, title)
+            for key, anchor, title in _SECTIONS
+            if pack[key] and not (anchor == "worlds" and len(pack["cells"]) < 2)
+        ],
+        "css": Markup((_HERE / "page.css").read_text(encoding="utf-8")),
+        "colours": Markup(_format_colours(pack["filters"])),
+        "script": Markup("\n".join(_read_script(name) for name in _SCRIPTS)),
+        "data": "",
+    }
+    bare = _environment(is_html=True).get_template("page.html.jinja").render(context)
+    data = encode_pack(pack, PAGE_BYTES - len(bare.encode()))
+    html = _environment(is_html=True).get_template("page.html.jinja")
+    folder.write("index.html", html.render({**context, "data": Markup(data)}))
+    markdown = _environment(is_html=False).get_template("report.md.jinja")
+    folder.write("report.md", markdown.render(context))
+    return folder.path / "index.html"
+
+
+def _read_script(name: str) -> str:
+    """Return one file of the script."""
+    return (_HERE / f"{name}.js").read_text(encoding="utf-8")
+
+
+def _format_colours(filters: Sequence[Mapping[str, Any]]) -> str:
+    """Return the style rules of the colours of filters: on light, and on dark by system or by choice."""
+    for look in filters:
+        for colour in (look["colour"], look["dark"]):
+            if not _COLOUR.fullmatch(colour):
+                raise ValueError(
+                    f"paper.colour of {look['key']} must have the form #rrggbb, got {colour}."
+                )
+    light = "".join(f".c{i}{{--c:{f['colour']}}}" for i, f in enumerate(filters))
+    dark = [f"{{prefix}} .c{i}{{{{--c:{f['dark']}}}}}" for i, f in enumerate(filters)]
+    system = "".join(rule.format(prefix=":root:not([data-theme=light])") for rule in dark)
+    choice = "".join(rule.format(prefix=":root[data-theme=dark]") for rule in dark)
+    return f"{light}\n@media (prefers-color-scheme:dark){{{system}}}\n{choice}"
+
+
+def _group_files(downloads: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[dict[str, str]]]]:
+    """Return the downloads by group, with sizes as text."""
+    return [
+        (
+            group,
+            [
+                {**file, "size": f"{max(1, round(file['bytes'] / 1000))} kB"}
+                if file.get("bytes")
+                else {**file, "size": ""}
+                for file in files
+            ],
+        )
+        for group, files in itertools.groupby(downloads, lambda file: str(file["group"]))
+    ]
+
+
+def _environment(*, is_html: bool) -> jinja2.Environment:
+    """Return the template environment. Each value is escaped once, for its format."""
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_HERE),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        finalize=None if is_html else _escape_value,
+    )
+
+
+def _escape_value(value: Any) -> Markup:
+    """Escape a value of a Markdown template, unless a template made it."""
+    return value if hasattr(value, "__html__") else Markup(escape_markdown(str(value)))

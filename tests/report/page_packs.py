@@ -1,0 +1,292 @@
+"""Packs of report pages with invented numbers, of any size and with any gap."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+FAMILIES = ("kalman", "particle", "gaussian", "guided", "swarm")
+COLOURS = {
+    "kalman": ("#0b4f8a", "#4f9be8"),
+    "particle": ("#a33c00", "#f09050"),
+    "gaussian": ("#04703f", "#4cc38a"),
+    "guided": ("#5d3a9b", "#b093f0"),
+    "swarm": ("#a01266", "#f07ac0"),
+}
+MARKERS = "os^Dv<>Pp*"
+METRICS = (("rmse", "RMS error", "m"), ("final", "Last quarter", "m"), ("crps", "CRPS", "m"))
+
+
+def build_pack(
+    filters: int = 6,
+    worlds: int = 2,
+    regimes: int = 2,
+    runs: int = 20,
+    *,
+    seed: int = 1,
+    equal: bool = False,
+    lost: Collection[int] = (),
+    missing: Collection[tuple[int, int, int]] = (),
+    names: dict[int, str] | None = None,
+    instants: int = 60,
+    carried: int = 10,
+    plane: bool = True,
+) -> dict[str, Any]:
+    """Build a pack.
+
+    Args:
+        filters: Number of filters. Every third one is proposed.
+        worlds: Number of worlds.
+        regimes: Number of noise regimes.
+        runs: Runs of a cell.
+        seed: Seed of the invented numbers.
+        equal: Give all filters the same numbers.
+        lost: Filters that lose all runs.
+        missing: Filter, world and regime that were not run.
+        names: Names by number of the filter.
+        instants: Instants of a curve.
+        carried: Runs of a cell whose tracks are in the pack.
+        plane: Whether the worlds have a plane.
+    """
+    rng = np.random.default_rng(seed)
+    shape = (filters, worlds, regimes)
+    bias = np.zeros((filters, 1, 1)) if equal else rng.normal(0, 0.4, (filters, 1, 1))
+    level = bias + rng.normal(0, 0 if equal else 0.15, shape) + np.linspace(1, 5, worlds)[:, None]
+    noise = rng.normal(0, 0.3, (1 if equal else filters, worlds, regimes, runs))
+    errors = np.exp(level[..., None] + noise)
+    for i in lost:
+        errors[i] = np.nan
+    for i in missing:
+        errors[i] = np.nan
+    keys = [f"f{i}" for i in range(filters)]
+    built = _Numbers(keys, errors, set(lost), set(missing), rng)
+    cells = list(itertools.product(range(worlds), range(regimes)))
+    tracks = (
+        {_cell(c): built.tracks(c, min(carried, runs), plane) for c in cells} if carried else {}
+    )
+    return {
+        "study": "invented",
+        "title": "Invented study",
+        "generated": {"commit": "0" * 7, "date": "2026-01-31", "version": "0.0"},
+        "alpha": 0.05,
+        "filters": [_look(i, names or {}) for i in range(filters)],
+        "worlds": [
+            {"key": f"w{i}", "name": f"World {i}", "words": f"Words of world {i}.", "unit": "m",
+             "limit": 50.0, "family": f"w{i}"} for i in range(worlds)
+        ],
+        "regimes": [
+            {"key": f"r{i}", "name": ("Nominal", "Outliers", "Heavy tails", "Outage")[i % 4],
+             "words": ""} for i in range(regimes)
+        ],
+        "cells": [
+            {"key": _cell(c), "world": f"w{c[0]}", "regime": f"r{c[1]}", "model": "model", "runs": runs,
+             "particles": 100, "seed": 1} for c in cells
+        ],
+        "metrics": [
+            {"key": key, "name": name, "unit": unit, "direction": "lower", "caption": f"{name} of a run."}
+            for key, name, unit in METRICS
+        ],
+        "baselines": keys[:2],
+        "budgets": [
+            {"key": "particles", "name": "Same N", "reason_missing": None},
+            {"key": "time", "name": "Same time", "reason_missing": "This study has no runs of that budget."},
+        ],
+        "views": built.views(worlds, regimes),
+        "planned": built.planned(worlds, regimes),
+        "curves": {_cell(c): built.curves(c, instants) for c in cells},
+        "calibration": built.calibration(worlds, regimes),
+        "runs": {
+            _cell(c): {"unit": "m", "name": "RMS error", "numbers": list(range(runs)),
+                       "values": {k: [_short(v) for v in errors[i][c]] for i, k in enumerate(keys)
+                                  if (i, *c) not in missing}} for c in cells
+        },
+        "tracks": tracks,
+        "sweeps": [built.sweep()] if filters > 2 else [],
+        "replay": "pfbench replay study=invented scenario={world} noise={regime} filter={filter} run={run}",
+        "downloads": [{"name": "Verdicts (CSV)", "href": "verdicts.csv", "bytes": 1234, "group": "Numbers"}],
+        "methods_paragraph": "Filters were compared.\n\nOne seed was used.",
+        "bibtex": "@misc{a,\n title = {A},\n}",
+        "provenance": [["commit", "0" * 7], ["device", "cpu"]],
+    }  # fmt: skip
+
+
+class _Numbers:
+    """Invented numbers of all parts of a pack."""
+
+    def __init__(
+        self, keys: list[str], errors: Any, lost: set[int], missing: set[Any], rng: Any
+    ) -> None:
+        self.keys, self.errors, self.lost, self.missing, self.rng = keys, errors, lost, missing, rng
+        self.cost = np.exp(rng.normal(1, 1, len(keys)))
+        self.coverage = rng.uniform(0.3, 0.95, len(keys))
+
+    def views(self, worlds: int, regimes: int) -> dict[str, Any]:
+        scopes = itertools.product(["all", *range(worlds)], ["all", *range(regimes)])
+        views: dict[str, Any] = {}
+        scopes = list(scopes)
+        for (metric, *_), (w, r) in itertools.product(METRICS, scopes):
+            for b in range(min(2, len(self.keys))):
+                name = f"{metric}/{_key('w', w)}/{_key('r', r)}/{self.keys[b]}"
+                views[name] = self.view(w, r, b)
+        return views
+
+    def view(self, w: Any, r: Any, b: int) -> dict[str, Any]:
+        picked = self.errors
+        if w != "all":
+            picked = picked[:, w : w + 1]
+        if r != "all":
+            picked = picked[:, :, r : r + 1]
+        single = picked.shape[1] * picked.shape[2] == 1
+        with np.errstate(all="ignore"):
+            log = np.log(picked)
+            means = np.array([np.nan if np.isnan(v).all() else np.nanmean(v) for v in log])
+        sd = 0.3 / np.sqrt(picked.shape[3])
+        order = sorted(range(len(self.keys)), key=lambda i: (np.isnan(means[i]), means[i], i))
+        best = means[order[0]]
+        rows = [self.row(i, k, means, best, means[b], sd, single) for k, i in enumerate(order)]
+        names = [f"[[Filter {order[0]}]]", f"{100 * (np.exp(best - means[b]) - 1):.3g} %"]
+        return {
+            "sentence": f"{names[0]} has the smallest error: {names[1]} against Filter {b} "
+            "(95 % interval 18 to 33 %), at 1.2 times its cost. Best proposed method: [[Filter 0]].",
+            "small_print": f"{len(self.keys)} filters; intervals 95 %, jointly; one seed.",
+            "rows": rows,
+        }
+
+    def row(
+        self, i: int, k: int, means: Any, best: float, base: float, sd: float, single: bool
+    ) -> dict[str, Any]:
+        gap = means[i] - best
+        if np.isnan(gap):
+            word = "lost" if i in self.lost else "missing"
+        else:
+            word = "best" if k == 0 else "open" if gap < 4 * sd else "worse"
+        spread = np.exp(np.array([0, -2, 2]) * sd)
+        value = np.exp(means[i]) * spread if single else [np.nan] * 3
+        ratio = np.exp(means[i] - base) * spread
+        return {
+            "filter": self.keys[i], "rank": None if np.isnan(gap) else k + 1, "tied": word == "open",
+            "value": _short(value[0]), "low": _short(value[1]), "high": _short(value[2]),
+            "unit": "m" if single else None,
+            "ratio": _short(ratio[0]), "ratio_low": _short(ratio[1]), "ratio_high": _short(ratio[2]),
+            "verdict": word,
+            "words": {"best": "best", "open": f"{100 * (gap - 2 * sd):+.0f} to {100 * (gap + 2 * sd):+.0f} %",
+                      "worse": f"{100 * np.expm1(gap):+.0f} %", "lost": "all runs lost"}.get(word, "not run"),
+            "track": _short(0.0 if i in self.lost else 1 - 0.03 * i), "lost": 20 if i in self.lost else 0,
+            "coverage": None if word in ("lost", "missing") else _short(self.coverage[i]),
+            "nees": _short(1 / self.coverage[i]),
+            "calibration": None if word in ("lost", "missing") else
+            "overconfident" if self.coverage[i] < 0.85 else "consistent",
+            "ms": _short(self.cost[i]),
+        }  # fmt: skip
+
+    def planned(self, worlds: int, regimes: int) -> list[dict[str, Any]]:
+        pairs = [(i, i + 1) for i in range(0, len(self.keys) - 1, 3)]
+        found = []
+        for a, b in pairs:
+            gaps = np.log(self.errors[a] / self.errors[b]).mean(-1).mean(-1)
+            if np.isnan(gaps).any():
+                continue
+            mean, sd = gaps.mean(), 0.3 / np.sqrt(self.errors.shape[-1])
+            found.append({
+                "a": self.keys[a], "b": self.keys[b], "question": "Error in these worlds", "kind": "paper",
+                "sentence": f"In these worlds Filter {a} against Filter {b}.",
+                "estimate": _short(np.exp(mean)), "low": _short(np.exp(mean - 2 * sd)),
+                "high": _short(np.exp(mean + 2 * sd)), "p": 0.01, "word": "better" if mean < -2 * sd else "open",
+                "new_world": None if worlds < 2 else {"estimate": _short(np.exp(mean)),
+                    "low": _short(np.exp(mean - 0.5)), "high": _short(np.exp(mean + 0.5)), "word": "open"},
+                "prediction": None if worlds < 3 else [_short(np.exp(mean - 1)), _short(np.exp(mean + 1))],
+                "cells": [{"world": f"w{w}", "regime": "all", "name": f"World {w}", "estimate": _short(np.exp(g)),
+                           "low": _short(np.exp(g - sd)), "high": _short(np.exp(g + sd))}
+                          for w, g in enumerate(gaps)],
+            })  # fmt: skip
+        return found
+
+    def curves(self, cell: tuple[int, int], instants: int) -> dict[str, Any]:
+        t = np.linspace(0, 500, instants)
+        filters = {}
+        for i, key in enumerate(self.keys):
+            if np.isnan(self.errors[i][cell]).all():
+                continue
+            shape = (
+                np.nanmedian(self.errors[i][cell])
+                * (1 + 4 * np.exp(-t / 80))
+                * (1 + 0.1 * np.sin(t / 37 + i))
+            )
+            filters[key] = {name: [_short(v * factor) for v in shape]
+                            for name, factor in (("median", 1.0), ("q10", 0.6), ("q90", 1.7))}  # fmt: skip
+        return {"t": t.round(1).tolist(), "unit": "m", "group": "position", "filters": filters}
+
+    def calibration(self, worlds: int, regimes: int) -> dict[str, Any]:
+        scopes = itertools.product(["all", *range(worlds)], ["all", *range(regimes)])
+        return {
+            f"{_key('w', w)}/{_key('r', r)}": {
+                key: {"c50": _short(0.55 * c), "c90": _short(c), "nees_ratio": _short(1 / c)}
+                for i, (key, c) in enumerate(zip(self.keys, self.coverage, strict=True))
+                if i not in self.lost
+            }
+            for w, r in scopes
+        }
+
+    def sweep(self) -> dict[str, Any]:
+        return {
+            "name": "particles", "unit": "", "world": "w0", "regime": "r0", "value_unit": "m",
+            "caption": "RMS error against the number of particles.",
+            "filters": {key: [{"x": x, "value": 5 / x**0.3 * (i + 1), "low": 4.5 / x**0.3 * (i + 1),
+                               "high": 5.5 / x**0.3 * (i + 1)} for x in (50, 100, 200, 500, 1000)]
+                        for i, key in enumerate(self.keys[:3])},
+        }  # fmt: skip
+
+    def tracks(self, cell: tuple[int, int], carried: int, plane: bool) -> dict[str, Any]:
+        t = np.linspace(0, 500, 40)
+        truth = np.stack([3000 * np.sin(t / 150), 40 * t], -1)
+        keys = [k for i, k in enumerate(self.keys) if not np.isnan(self.errors[i][cell]).all()]
+        offset = {
+            k: {
+                str(j): self.rng.normal(0, self.errors[self.keys.index(k)][cell][j], (40, 2)).round(
+                    2
+                )
+                for j in range(carried)
+            }
+            for k in keys
+        }
+        error = {
+            k: {j: [_short(v) for v in np.linalg.norm(e, axis=-1)] for j, e in r.items()}
+            for k, r in offset.items()
+        }
+        built = {
+            "t": t.round(1).tolist(), "unit": "m", "numbers": list(range(carried)),
+            "note": f"The page carries {carried} runs of this cell.", "error": error,
+            "traces": [{"name": "ESS", "unit": "", "log": False,
+                        "filters": {k: {str(j): self.rng.uniform(5, 100, 40).round(1).tolist()
+                                        for j in range(carried)} for k in keys[:2]}}],
+        }  # fmt: skip
+        if plane:
+            built["truth"] = {"all": truth.round(1).tolist()}
+            built["plane"] = {k: {j: e.tolist() for j, e in r.items()} for k, r in offset.items()}
+        return built
+
+
+def _short(value: float) -> float | None:
+    """Round to four digits; None if it is not a number."""
+    return float(f"{value:.4g}") if np.isfinite(value) else None
+
+
+def _key(letter: str, index: Any) -> str:
+    return "all" if index == "all" else f"{letter}{index}"
+
+
+def _cell(cell: tuple[int, int]) -> str:
+    return f"w{cell[0]}/r{cell[1]}"
+
+
+def _look(i: int, names: dict[int, str]) -> dict[str, Any]:
+    family = FAMILIES[i % 5]
+    light, dark = COLOURS[family]
+    return {
+        "key": f"f{i}", "name": names.get(i, f"Filter {i}"), "long": f"Long name of filter {i}", "family": family,
+        "proposed": i % 3 == 0, "colour": light, "dark": dark, "marker": MARKERS[i // 5 % len(MARKERS)],
+        "cite": None,
+    }  # fmt: skip

@@ -1,0 +1,309 @@
+"""The page of a study in a real browser: nothing is fetched, nothing fails, every control does what it says."""
+
+import os
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import page_packs
+import pytest
+
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.study_page import write_page
+from pfbench.report.study_page.opening import format_short
+
+playwright = pytest.importorskip(
+    "playwright.sync_api", reason="playwright is not installed: pip install 'pfbench[browser]'"
+)
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+BROWSER = next(filter(None, map(shutil.which, NAMES)), None)
+AXE = Path(__file__).parents[2] / ".cache/axe/node_modules/axe-core/axe.min.js"
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt-get install chromium"),
+]
+HOSTILE = {0: "</script><script>alert(1)</script>", 1: 'A "long" & <b>bold</b> name of a filter'}
+PACKS = {
+    "usual": page_packs.build_pack(12, 3, 2, 20, carried=4),
+    "gaps": page_packs.build_pack(8, 3, 2, 12, lost=(2,), missing=[(3, 0, 0), (4, 1, 0), *((5, w, r) for w in range(3) for r in range(2))], names=HOSTILE, plane=False),
+    "single": page_packs.build_pack(1, 1, 1, 1),
+    "lost": page_packs.build_pack(4, 2, 1, 6, lost=range(4)),
+    "equal": page_packs.build_pack(5, 2, 2, 8, equal=True),
+    "many": page_packs.build_pack(33, 7, 4, 4, carried=0, instants=10),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("pages")
+    for name, pack in PACKS.items():
+        with RecordedFolder(root / name) as target:
+            write_page(pack, target)
+    return root
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with playwright.sync_playwright() as tool:
+        browser = tool.chromium.launch(
+            executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu"]
+        )
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def visit(chromium, folder):
+    contexts, faults = [], []
+
+    def open_page(name="usual", width=1440, height=900, address="", script=True, **settings):
+        context = chromium.new_context(
+            viewport={"width": width, "height": height}, java_script_enabled=script, **settings
+        )
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda message: faults.append(f"console: {message.text}"))
+        page.on("pageerror", lambda error: faults.append(f"error: {error}"))
+        page.on("request", lambda request: note_request(request.url))
+        page.goto(f"file://{folder / name}/index.html{address}")
+        if script:
+            page.wait_for_selector("html[data-ready]", state="attached")
+        return page
+
+    def note_request(url):
+        if not url.startswith(("file://", "data:")):
+            faults.append(f"request: {url}")
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert faults == []
+
+
+def board(page):
+    """Return the texts of the leaderboard as rows of cells."""
+    return page.evaluate(
+        "() => [...document.querySelectorAll('#rows > tr')].map((row) => [...row.cells].map((cell) => cell.textContent.trim()))"
+    )
+
+
+@pytest.mark.parametrize("name", PACKS)
+def test_every_page_is_whole_and_never_wider_than_the_window(visit, name):
+    page = visit(name)
+    for width in (1440, 768, 390):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.wait_for_timeout(170)  # figures follow a new width after 150 ms
+        page.evaluate("refresh(true)")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    drawn = page.evaluate("figures.filter((figure) => !figure.part.innerHTML).length")
+    assert drawn == 0
+    assert "NaN" not in page.evaluate("document.querySelector('main').innerHTML")
+    anchors = page.evaluate(
+        "[...document.links].map((a) => a.getAttribute('href')).filter((h) => h.startsWith('#') && !document.getElementById(h.slice(1)))"
+    )
+    assert anchors == []
+
+
+def test_the_first_screen_has_the_answer(visit):
+    page = visit("usual", 390, 844)
+    rows = page.evaluate(
+        "[...document.querySelectorAll('#rows > tr')].filter((row) => row.getBoundingClientRect().bottom <= innerHeight).length"
+    )
+    assert rows >= 11
+    shown = page.evaluate(
+        "[...document.querySelector('#rows > tr').cells].filter((cell) => cell.offsetWidth).length"
+    )
+    assert shown == 5
+    page.set_viewport_size({"width": 1440, "height": 900})
+    page.wait_for_timeout(170)
+    for part in ("#answer", "#metric", "#rows > tr:nth-child(12)", "#cost svg"):
+        box = page.locator(part).bounding_box()
+        assert box["y"] + box["height"] <= 900, part
+
+
+EVERY_VIEW = """() => viewKeys.map((key) => {
+  const wish = key.split("/");
+  for (const id of ["metric", "world", "baseline"]) {
+    const select = document.getElementById(id);
+    select.value = wish[axes.indexOf(id)];
+    select.dispatchEvent(new Event("change", { bubbles: true }));
+  }
+  [...document.querySelectorAll("[data-regime]")].find((button) => button.dataset.regime === wish[2])?.click();
+  const rows = [...document.querySelectorAll("#rows > tr")].map((row) => [row.dataset.filter, ...[...row.cells].map((cell) => cell.textContent.trim())]);
+  return [key, location.hash, document.querySelector("#answer").textContent, rows];
+})"""
+
+
+def test_the_table_has_the_numbers_of_every_view(visit):
+    pack = PACKS["usual"]
+    shown = visit("usual").evaluate(EVERY_VIEW)
+    assert [key for key, *_ in shown] == list(pack["views"])
+    for key, address, sentence, rows in shown:
+        view = pack["views"][key]
+        metric, world, regime, baseline = key.split("/")
+        assert address == f"#metric={metric}&world={world}&regime={regime}&baseline={baseline}"
+        assert sentence == view["sentence"].replace("[[", "").replace("]]", "")
+        assert [row[0] for row in rows] == [row["filter"] for row in view["rows"]]
+        for cells, row in zip(rows, view["rows"], strict=True):
+            ratio = [float(text) for text in re.findall(r"[\d.e-]+", cells[4])]
+            expected = [row["ratio"], row["ratio_low"], row["ratio_high"]]
+            np.testing.assert_allclose(ratio, expected, rtol=5e-3)
+            assert cells[6].endswith(row["words"])
+            assert row["calibration"] in cells[8]
+            assert float(cells[7].rstrip(" %")) == pytest.approx(100 * row["track"], abs=0.51)
+            assert float(cells[9]) == pytest.approx(row["ms"], rel=5e-3)
+            if row["value"] is not None:
+                assert float(cells[3].split()[0]) == pytest.approx(row["value"], rel=5e-3)
+
+
+def test_numbers_of_script_and_writer_agree(visit):
+    rng = np.random.default_rng(3)
+    values = [float(f"{v:.4g}") for v in np.exp(rng.uniform(-12, 16, 4000))] + [1.125, 0.5, 9995.0]
+    texts = visit("single").evaluate("(values) => values.map((v) => short(v))", values)
+    assert texts == [format_short(v) for v in values]
+
+
+@pytest.mark.parametrize("name", ["usual", "gaps", "lost"])
+def test_the_page_is_complete_without_script(visit, name):
+    page = visit(name, script=False)
+    static = [[c.inner_text().strip() for c in row.locator("td, th").all()]
+              for row in page.locator("#rows > tr").all()]  # fmt: skip
+    scripted = board(visit(name))
+    assert len(static) == len(PACKS[name]["filters"])
+    for plain, full in zip(static, scripted, strict=True):
+        kept = [full[k] for k in (0, 1, 3, 5, 6, 7, 8)]
+        assert [plain[k] for k in (0, 1, 3, 4, 5, 6, 7)] == [text.strip() for text in kept]
+    assert page.locator("#answer").is_visible()
+    assert not page.locator(".switches").is_visible()
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.locator("html").bounding_box()["width"] <= 390
+
+
+def test_heads_sort(visit):
+    page = visit("gaps")
+    button = page.locator("[data-sort=ms]")
+    orders = []
+    for direction in ("ascending", "descending"):
+        button.press("Enter")
+        assert page.locator("th[aria-sort]").get_attribute("aria-sort") == direction
+        orders.append([float(row[8]) for row in board(page) if row[8] != "–"])
+    assert orders[0] == sorted(orders[0])
+    assert orders[1] == orders[0][::-1]
+    page.locator("[data-sort=ratio]").click()
+    ratios = [row[3] for row in board(page)]
+    assert ratios[-2:] == ["–", "–"]  # filters without an error stay last
+    page.locator("[data-sort=ratio]").click()
+    assert [row[3] for row in board(page)][-2:] == ["–", "–"]
+
+
+def test_a_name_opens_all_numbers(visit):
+    page = visit()
+    page.locator("[data-row]").nth(2).press("Enter")
+    assert page.locator(".all dd").count() > 10
+    assert page.locator("[aria-expanded=true]").count() == 1
+    page.locator("[data-row]").nth(2).click()
+    assert page.locator(".all").count() == 0
+
+
+def test_filters_are_toggled(visit):
+    page = visit()
+    page.locator("#time").scroll_into_view_if_needed()
+    lines = page.locator("#time > .figure path[stroke-dasharray], #time > .figure path[tabindex]")
+    before = lines.count()
+    page.locator("[data-toggle][aria-pressed=false]").first.click()
+    assert lines.count() > before
+    page.locator("[data-toggle='*none']").click()
+    assert "Select a filter" in page.locator("#time > .figure").inner_text()
+    page.locator("[data-toggle='*all']").click()
+    assert page.locator("#time > .figure path[tabindex]").count() == 12
+
+
+def test_runs_are_selected_by_keys_and_clicks(visit):
+    page = visit()
+    page.locator("#runs").scroll_into_view_if_needed()
+    dot = page.locator("#dot")
+    dot.focus()
+    names = [dot.get_attribute("aria-label")]
+    for key in ("ArrowRight", "ArrowDown", "ArrowLeft", "ArrowUp"):
+        page.keyboard.press(key)
+        names.append(page.evaluate("document.activeElement.getAttribute('aria-label')"))
+    assert len(set(names[:4])) == 4
+    assert page.locator("#tip").is_visible()
+    page.locator("[data-dot='3 1']").dispatch_event("click")
+    words = page.locator("#runwords").inner_text()
+    assert "Run 1 of World 0, Nominal" in words
+    key = page.evaluate("state.filter")
+    assert f"pfbench replay study=invented scenario=w0 noise=r0 filter={key} run=1" in words
+    assert page.locator("#plane svg").count() == 1
+    assert page.locator("#runtimes svg").count() >= 1
+    page.locator("[data-dot='3 15']").dispatch_event("click")
+    assert "No track of this run" in page.locator("#planenote").inner_text()
+
+
+def test_curves_and_runs_of_the_page_are_those_of_the_pack(visit):
+    pack = PACKS["usual"]
+    decoded = visit().evaluate(
+        "() => ['w1/r0'].map((key) => [decode(data.curves[key].filters.f2), decode(data.runs[key].values.f2), decode(data.tracks[key].plane.f2['1'])])[0]"
+    )
+    curve = pack["curves"]["w1/r0"]["filters"]["f2"]
+    np.testing.assert_allclose(
+        decoded[0], curve["median"] + curve["q10"] + curve["q90"], rtol=0.015
+    )
+    np.testing.assert_allclose(decoded[1], pack["runs"]["w1/r0"]["values"]["f2"], rtol=1e-3)
+    truth = np.ravel(pack["tracks"]["w1/r0"]["plane"]["f2"]["1"])
+    np.testing.assert_allclose(decoded[2], truth, rtol=0.06, atol=1e-3 * np.abs(truth).max())
+
+
+def test_the_address_holds_the_view(visit):
+    address = "#metric=crps&world=w2&regime=r1&baseline=f1&sort=-ms"
+    page = visit(address=address)
+    assert page.evaluate("location.hash") == address
+    rows = board(page)
+    assert [row[8] for row in rows] == sorted((row[8] for row in rows), key=float, reverse=True)
+    assert page.locator("#caption").inner_text() == "CRPS; World 2; Outliers; ratio to Filter 1."
+    strange = visit(address="#metric=none&world=<img>&sort=__proto__")
+    assert strange.evaluate("viewKey()") == next(iter(PACKS["usual"]["views"]))
+
+
+def test_dark_colours_follow_the_system_and_the_button(visit):
+    colour = "getComputedStyle(document.body).backgroundColor"
+    light, dark = visit(), visit(color_scheme="dark")
+    paper = light.evaluate(colour)
+    assert paper == "rgb(255, 255, 255)" != dark.evaluate(colour)
+    mark = "getComputedStyle(document.querySelector('#rows .c0')).stroke"
+    assert light.evaluate(mark) != dark.evaluate(mark)
+    light.locator("#theme").click()
+    dark.locator("#theme").click()
+    assert light.evaluate(colour) != paper == dark.evaluate(colour)
+
+
+def test_the_print_has_every_figure_and_no_switch(visit):
+    page = visit()
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert not page.locator(".switches").is_visible()
+    assert page.evaluate("[...document.querySelectorAll('details')].every((part) => part.open)")
+    assert page.evaluate("figures.every((figure) => figure.part.innerHTML)")
+    assert page.pdf().startswith(b"%PDF")
+
+
+def test_nothing_moves_where_the_system_asks_for_rest(visit):
+    page = visit(reduced_motion="reduce")
+    moving = "[...document.querySelectorAll('*')].filter((part) => getComputedStyle(part).transitionDuration !== '0s').length"
+    assert page.evaluate(moving) == 0
+
+
+@pytest.mark.skipif(
+    not AXE.exists(), reason="no axe-core: npm install --prefix .cache/axe axe-core"
+)
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_has_no_serious_finding(visit, scheme):
+    page = visit(color_scheme=scheme, bypass_csp=True)
+    page.evaluate("refresh(true)")
+    page.locator("[data-row]").first.click()
+    page.add_script_tag(path=os.fspath(AXE))
+    findings = page.evaluate(
+        "axe.run(document, { resultTypes: ['violations'] }).then((result) => result.violations.map((v) => [v.impact, v.id, v.nodes.slice(0, 3).map((n) => n.html.slice(0, 200))]))"
+    )
+    assert [finding for finding in findings if finding[0] in ("serious", "critical")] == []

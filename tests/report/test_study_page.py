@@ -1,0 +1,198 @@
+"""The page of a study without a browser: its data, its escapes, its size and its text."""
+
+import base64
+import gzip
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import page_packs
+import pytest
+
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.study_page import write_page
+from pfbench.report.study_page.encoding import encode_levels, encode_pack
+from pfbench.report.study_page.opening import find_front, format_short
+
+
+def write(pack, path):
+    with RecordedFolder(path) as folder:
+        return write_page(pack, folder)
+
+
+def read_levels(code):
+    """Decode levels by the rule of the format, value by value."""
+    raw = base64.b64decode(code["b"])
+    bits = code.get("w", 8)
+    levels = list(raw)
+    if bits > 8:
+        half = len(raw) // 2
+        levels = [256 * high + low for high, low in zip(raw[:half], raw[half:], strict=True)]
+    if code.get("d"):
+        total, sums = 0, []
+        for level in levels:
+            total = (total + level) % 2**bits
+            sums.append(total)
+        levels = sums
+    middle = 2 ** (bits - 1) if code.get("s") else 0
+    top = 2 ** (bits - 1) - 1 if code.get("s") else 2**bits - 1
+    step = (code["h"] / code["l"]) ** (1 / (top - 1))
+    numbers = []
+    for level in levels:
+        size = abs(level - middle)
+        value = code["l"] * step ** (size - 1) if size else 0.0
+        numbers.append(np.nan if level == 0 else value * np.sign(level - middle))
+    return np.array(numbers)
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+@pytest.mark.parametrize("is_smooth", [False, True])
+def test_levels_keep_numbers_to_half_a_step(bits, is_smooth):
+    rng = np.random.default_rng(1)
+    numbers = np.exp(rng.normal(0, 2, 400))
+    numbers[[3, 50]] = np.nan
+    code = encode_levels(numbers, bits, is_smooth=is_smooth)
+    ratio = np.log(read_levels(code) / numbers)
+    half = np.log(code["h"] / code["l"]) / (2**bits - 2) / 2
+    assert np.nanmax(np.abs(ratio)) < half + 2e-3  # the ends are rounded to four digits
+    assert np.isnan(ratio).sum() == 2
+
+
+def test_signed_levels_keep_sign_and_zero():
+    numbers = np.array([0.0, 3.0, -3.0, 120.0, -0.5, np.nan])
+    decoded = read_levels(encode_levels(numbers, is_signed=True))
+    assert decoded[0] == 0
+    assert np.isnan(decoded[5])
+    np.testing.assert_allclose(decoded[1:5], numbers[1:5], rtol=0.04)
+
+
+@pytest.mark.parametrize("values", [[None], [2.0, 2.0], [None, None, 1e-9]])
+def test_levels_of_few_numbers(values):
+    decoded = read_levels(encode_levels(values))
+    np.testing.assert_allclose(decoded, np.array(values, float), rtol=1e-3)
+
+
+def unpack(page):
+    text = re.search(r'id="data">([^<]*)<', page).group(1)
+    return json.loads(gzip.decompress(base64.b64decode(text)))
+
+
+def test_views_come_back_from_their_columns(tmp_path):
+    pack = page_packs.build_pack(5, 2, 2, 8)
+    views = unpack(write(pack, tmp_path).read_text())["views"]
+    found = 0
+    for key, view in pack["views"].items():
+        scope, _, baseline = key.rpartition("/")
+        own = views[scope]["baselines"][baseline]
+        columns = views[scope]["shared"] | own["columns"]
+        for k, row in enumerate(view["rows"]):
+            assert {name: column[k] for name, column in columns.items()} == row
+            found += 1
+        assert own["sentence"] == view["sentence"]
+    assert found == 5 * len(pack["views"])
+
+
+def test_a_page_carries_fewer_tracks_rather_than_too_many_bytes():
+    pack = page_packs.build_pack(6, 2, 2, 12)
+    whole = len(encode_pack(pack, 10**8))
+    text = encode_pack(pack, whole // 2)
+    tracks = json.loads(gzip.decompress(base64.b64decode(text)))["tracks"]
+    assert len(text) <= whole // 2
+    for part in tracks.values():
+        assert 1 <= len(part["numbers"]) < 10
+        assert all(len(runs) == len(part["numbers"]) for runs in part["error"].values())
+
+
+@pytest.mark.slow
+def test_the_largest_page_stays_under_its_size(tmp_path):
+    path = write(page_packs.build_pack(33, 7, 4, 100), tmp_path)
+    assert path.stat().st_size < 1_500_000
+    assert unpack(path.read_text())["tracks"]
+
+
+class Elements(HTMLParser):
+    """Counts elements and collects the text of the leaderboard."""
+
+    def __init__(self):
+        super().__init__()
+        self.counts, self.texts, self.inside = {}, [], False
+
+    def handle_starttag(self, tag, attrs):
+        self.counts[tag] = self.counts.get(tag, 0) + 1
+        self.inside = self.inside or dict(attrs).get("id") == "rows"
+
+    def handle_endtag(self, tag):
+        self.inside = self.inside and tag != "tbody"
+
+    def handle_data(self, data):
+        if self.inside and data.strip():
+            self.texts.append(data.strip())
+
+
+def test_names_stay_text(tmp_path):
+    hostile = {0: "</script><script>alert(1)</script>", 1: '"><img src=x>', 2: "[[a]] & <b>"}
+    pack = page_packs.build_pack(4, 1, 1, 5, names=hostile)
+    pack["views"][next(iter(pack["views"]))]["sentence"] = f"[[{hostile[0]}]] is first."
+    elements = Elements()
+    elements.feed(write(pack, tmp_path).read_text())
+    assert elements.counts["script"] == 2
+    assert "img" not in elements.counts
+    assert set(hostile.values()) <= set(elements.texts)
+    markdown = (tmp_path / "report.md").read_text()
+    assert "<script>" not in markdown.replace("\\<", "")
+
+
+def test_equal_packs_give_equal_bytes(tmp_path):
+    pages = [write(page_packs.build_pack(), tmp_path / name).read_bytes() for name in "ab"]
+    assert pages[0] == pages[1]
+
+
+@pytest.mark.parametrize("colour", ["red", "#12345", "#123456;}body{display:none"])
+def test_a_colour_must_be_a_colour(tmp_path, colour):
+    pack = page_packs.build_pack()
+    pack["filters"][0]["dark"] = colour
+    with pytest.raises(ValueError, match=r"colour of f0 must have the form #rrggbb"):
+        write(pack, tmp_path)
+
+
+def test_sections_without_data_are_absent(tmp_path):
+    pack = page_packs.build_pack(3, 1, 1, 4, carried=0)
+    pack |= {"curves": {}, "calibration": {}, "runs": {}, "sweeps": [], "planned": []}
+    page = write(pack, tmp_path).read_text()
+    for anchor in ("planned", "worlds", "time", "calibration", "runs", "sweeps"):
+        assert f'<section id="{anchor}"' not in page
+        assert f'href="#{anchor}"' not in page
+    assert '<section id="table"' in page
+
+
+def test_report_md_is_one_screen_with_every_filter(tmp_path):
+    pack = page_packs.build_pack(6, 2, 2, 8, names={1: "A|B"})
+    write(pack, tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert len(text.splitlines()) < 50
+    assert all(f["name"].replace("|", "\\|") in text for f in pack["filters"])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (0.0, "0"), (1.125, "1.13"), (0.6449, "0.645"), (999.9, "1000"), (12345.6, "12300"),
+     (1.5e6, "1.50e6"), (2e-5, "2.00e-5"), (-0.0123, "-0.0123"), (0.9996, "1.00")],
+)  # fmt: skip
+def test_numbers_have_three_digits(value, text):
+    assert format_short(value) == text
+
+
+def test_the_front_has_all_that_no_other_beats():
+    rng = np.random.default_rng(2)
+    rows = [
+        {"filter": str(i), "ms": m, "ratio": r}
+        for i, (m, r) in enumerate(rng.uniform(0, 1, (40, 2)))
+    ]
+    expected = {
+        row["filter"]
+        for row in rows
+        if not any(o["ms"] < row["ms"] and o["ratio"] < row["ratio"] for o in rows)
+    }  # fmt: skip
+    rows.append({"filter": "lost", "ms": 0.0, "ratio": None})
+    assert set(find_front(rows)) == expected
