@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from config_cases import GROUPS, RECORDED, composed, truncated, world
+from config_cases import CONF, GROUPS, RECORDED, composed, truncated, world
 from filter_cases import NAMES, SLOTS, TEXTS, method_of, refusal
 from recorded_data import DATA
 from torch import Tensor
@@ -76,13 +76,34 @@ def three_steps(name: str, model: StateSpaceModel, record: Record) -> None:
     assert bool((estimate.variance >= 0).all()), name
 
 
+# one of each model, with and without feedback: test_configs runs the others with their default filter
+WORLDS = (
+    *("linear_walk", "local_level", "benes", "growth", "lorenz63", "pendulum"),
+    *("stochastic_volatility", "passive_1", "gps_ins", "flight_500s", "sar_flight", "anshun_fit"),
+    *("anshun_nl", "azimuth", "azimuth_closed_loop", "azimuth_small", "flight_300s_closed_loop"),
+    *("recorded_berlin", "recorded_car_drive", "recorded_fixed_wing_aided", "recorded_walk"),
+)
+
+
+def model_of(scenario: str) -> str:
+    """Return the default model of a scenario, as its file or the one it extends names it."""
+    text = (CONF / "scenario" / f"{scenario}.yaml").read_text()
+    if named := re.search(r"override /model@_global_\.model: (\w+)", text):
+        return named[1]
+    base = re.search(r"^  - (?!_self_)(\w+)$", text, re.MULTILINE)
+    assert base
+    return model_of(base[1])
+
+
+def test_the_worlds_have_every_default_model() -> None:
+    assert {model_of(name) for name in WORLDS} == {model_of(name) for name in GROUPS["scenario"]}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario", GROUPS["scenario"])
+@pytest.mark.parametrize("scenario", WORLDS)
 def test_every_filter_runs_on_every_world_or_says_why_not(scenario: str) -> None:
     if scenario in RECORDED and DATA is None:
         pytest.skip("PFBENCH_DATA does not name the folder of the recorded data sets")
-    if scenario == "user_log":
-        pytest.skip("it is the user's log: scenario.folder says which")
     model, episode = job.instantiate(composed(f"scenario={scenario}").model), world(scenario)
     record = truncated(episode, STEPS).record
     for name in NAMES:
