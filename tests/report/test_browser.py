@@ -159,7 +159,7 @@ def test_a_report_opens_whole_and_its_filter_filters(report: Path, dark: bool) -
     assert found["noted"] == []
     assert found["resources"] == []
     assert found["dark"] is dark
-    assert found["paper"] == ("rgb(20, 24, 28)" if dark else "rgb(255, 255, 255)")
+    assert found["paper"] == ("rgb(17, 22, 27)" if dark else "rgb(255, 255, 255)")
     assert found["anchors"] == 0  # links to a place on the page that is not there
     figures = len(list((report.parent / "figures").glob("*.png")))
     assert len(found["images"]) == len(found["captions"]) == figures > 20
@@ -209,7 +209,7 @@ def test_a_picture_of_a_report_is_not_blank(report: Path, dark: bool, tmp_path: 
     )
     seen = np.asarray(Image.open(file).convert("RGB")).astype(int)
     assert seen.shape == (2400, 1280, 3)
-    paper = np.array([20, 24, 28] if dark else [255, 255, 255])
+    paper = np.array([17, 22, 27] if dark else [255, 255, 255])
     ink = np.abs(seen - paper).max(-1) > 60
     assert (seen[:5, :5] == paper).all()
     for part in np.split(ink, 6):  # text, tables or figures all the way down

@@ -56,7 +56,12 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
             for key, anchor, title in _SECTIONS
             if pack[key] and not (anchor == "worlds" and len(pack["cells"]) < 2)
         ],
-        "css": Markup((_HERE / "page.css").read_text(encoding="utf-8")),
+        "css": Markup(
+            "\n".join(
+                path.read_text(encoding="utf-8")
+                for path in (_HERE.parent / "style.css", _HERE / "page.css")
+            )
+        ),
         "colours": Markup(_format_colours(pack["filters"])),
         "script": Markup("\n".join(_read_script(name) for name in _SCRIPTS)),
         "data": "",
