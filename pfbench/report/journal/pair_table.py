@@ -1,0 +1,137 @@
+"""Table of the planned pairs of a paper, and table of cost and reliability."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from pfbench.files.escapes import escape_latex
+from pfbench.report.journal.main_table import format_error_value
+from pfbench.report.journal.study_pack import (
+    Pack,
+    Row,
+    filters_by_family,
+    filters_by_key,
+    find_rows,
+    is_number,
+    name_with_star,
+)
+from pfbench.report.journal.table_layout import (
+    SIZE,
+    Column,
+    LatexCell,
+    LatexTable,
+    number_column,
+    text_cell,
+)
+from pfbench.report.journal.text_width import text_width
+
+_LEAST_P = 0.001
+
+
+def make_planned_table(pack: Pack) -> LatexTable | None:
+    """Build the table of the planned pairs; None without a pair.
+
+    Args:
+        pack: Data of the report.
+    """
+    pairs = [pair for pair in pack["planned"] if is_number(pair["estimate"])]
+    if not pairs:
+        return None
+    looks = filters_by_key(pack)
+    rows, last = [], ""
+    for pair in pairs:
+        a, b = str(pair["a"]), str(pair["b"])
+        name = text_cell("" if a == last else str(looks[a]["name"]))
+        interval = f"[{_ratio(pair['low'])}, {_ratio(pair['high'])}]"
+        word = str(pair["word"])
+        rows.append([
+            name, text_cell(str(looks[b]["name"])), _ratio_cell(pair["estimate"], word),
+            text_cell(interval), text_cell(_p_value(pair.get("p"))), text_cell(word),
+        ])  # fmt: skip
+        last = a
+    head = [["Method", "baseline", "ratio", "interval", "p", "decision"]]
+    heads = [[text_cell(text) for text in line] for line in head]
+    columns = [Column("l"), Column("l"), Column("r"), Column("l"), Column("r"), Column("l")]
+    worlds = len(pack["worlds"])
+    caption = (
+        r"Planned pairs: error of the method divided by that of the baseline, mean over "
+        rf"{'these ' + str(worlds) + ' worlds' if worlds > 1 else 'the runs of this world'} on a log scale, with "
+        r"simultaneous intervals and Holm's correction of \textit{p} over all pairs. Decisions are for these worlds."
+    )
+    return LatexTable("planned", caption, columns, heads, [rows])
+
+
+def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
+    """Build the table of cost and reliability of each filter over all conditions.
+
+    Args:
+        pack: Data of the report.
+        particles: Number of particles by filter, as text; several numbers as a range.
+    """
+    rows = find_rows(pack)
+    columns = [
+        Column("l"), Column("r"),
+        number_column(_whole_digits(rows, "ms"), 2), number_column(3, 0), number_column(_whole_digits(rows, "lost"), 0),
+        number_column(3, 0),
+    ]  # fmt: skip
+    head = ["Method", "N", "ms/step", "track (%)", "lost", "coverage (%)"]
+    groups = [
+        [
+            [text_cell(name_with_star(pack, key)), *_cost_cells(rows[key], particles.get(key, ""))]
+            for key in family
+            if key in rows
+        ]
+        for family in filters_by_family(pack)
+    ]
+    runs = sum(int(cell["runs"]) for cell in pack["cells"])
+    caption = (
+        r"Cost and reliability over all conditions: particles \textit{N}, time per step of a batch of runs, share of runs "
+        rf"that keep track, lost runs of {runs}, coverage of 90\,\% regions. \textsuperscript{{*}}: proposed methods."
+    )
+    return LatexTable("cost", caption, columns, [[_head_cell(text) for text in head]], groups)
+
+
+def _cost_cells(row: Row, particles: str) -> list[LatexCell]:
+    """Return the cells of a filter."""
+    track, coverage = (
+        f"{100 * row[name]:.0f}" if is_number(row[name]) else "--" for name in ("track", "coverage")
+    )
+    cost = f"{row['ms']:.2f}" if is_number(row["ms"]) else "--"
+    values = (cost, track, str(int(row["lost"] or 0)), coverage)
+    cells = [LatexCell("{--}" if text == "--" else text, text_width(text, SIZE)) for text in values]
+    return [text_cell(particles or "--"), *cells]
+
+
+def _head_cell(text: str) -> LatexCell:
+    """Return a cell of the head, protected from siunitx."""
+    return LatexCell(f"{{{escape_latex(text)}}}", text_width(text, SIZE))
+
+
+def _whole_digits(rows: dict[str, Row], name: str) -> int:
+    """Return the number of digits before the point of the largest value."""
+    values = [float(row[name]) for row in rows.values() if is_number(row[name])]
+    return max(1, len(str(int(max(values, default=0.0)))))
+
+
+def _ratio(value: Any) -> str:
+    """Format a ratio with two places, or two digits if it is large."""
+    if not is_number(value):
+        return r"--"
+    return f"{value:.2f}" if 0.095 <= value < 9.995 else format_error_value(value, 2)
+
+
+def _ratio_cell(value: Any, word: str) -> LatexCell:
+    """Return the cell of a ratio: bold if better, with a dagger if worse."""
+    text = _ratio(value)
+    tex = rf"\textbf{{{text}}}" if word == "better" else text
+    tex += r"\rlap{\textsuperscript{\textdagger}}" if word == "worse" else ""
+    return LatexCell(tex, text_width(text, SIZE, is_bold=word == "better"))
+
+
+def _p_value(value: Any) -> str:
+    """Format a p-value with three places."""
+    if not is_number(value) or math.isnan(value):
+        return "--"
+    return f"<{_LEAST_P:g}" if value < _LEAST_P else f"{value:.3f}"

@@ -1,0 +1,182 @@
+"""Tables of a paper: cells with known widths, and the LaTeX of a table that fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pfbench.files.escapes import escape_latex
+from pfbench.report.journal.text_width import text_width
+
+SIZE, SMALL = 8.0, 6.0  # of entries and of intervals, points
+THIN_SPACE = SIZE / 6
+_SEPARATIONS = (6.0, 5.0, 4.0, 3.0, 2.4)  # candidates of \tabcolsep, points
+_SLACK = 1.5  # points of rounding
+LINE = 9.6  # points, distance of rows
+
+
+class LatexCell(NamedTuple):
+    """Entry of a table.
+
+    Attributes:
+        tex: LaTeX.
+        width: Width in points.
+        span: Number of columns.
+    """
+
+    tex: str
+    width: float
+    span: int = 1
+
+
+class Column(NamedTuple):
+    """Column of a table.
+
+    Attributes:
+        spec: Column type of LaTeX.
+        is_close: Whether a thin space separates it from the column before.
+        width: Least width in points, of a column of numbers with fixed places.
+    """
+
+    spec: str
+    is_close: bool = False
+    width: float = 0.0
+
+
+class LatexTable(NamedTuple):
+    """Table before its width is known.
+
+    Attributes:
+        name: Name of the file and the label.
+        caption: Caption, LaTeX.
+        columns: Columns.
+        head: Rows of the head.
+        groups: Groups of rows, with a rule between them.
+        rules: Rules below the first row of the head: first and last column of each, from 1.
+    """
+
+    name: str
+    caption: str
+    columns: Sequence[Column]
+    head: Sequence[Sequence[LatexCell]]
+    groups: Sequence[Sequence[Sequence[LatexCell]]]
+    rules: Sequence[tuple[int, int]] = ()
+
+    @property
+    def rows(self) -> int:
+        """Number of rows with the head."""
+        return len(self.head) + sum(map(len, self.groups))
+
+
+def text_cell(text: str, *, size: float = SIZE, is_bold: bool = False, span: int = 1) -> LatexCell:
+    """Return a cell with a text, which is escaped.
+
+    Args:
+        text: Text.
+        size: Size of its font.
+        is_bold: Whether it is bold.
+        span: Number of columns, centred if there are several.
+    """
+    tex = rf"\textbf{{{escape_latex(text)}}}" if is_bold else escape_latex(text)
+    return LatexCell(tex, text_width(text, size, is_bold=is_bold), span)
+
+
+def number_column(digits: int, places: int, is_close: bool = False) -> Column:
+    """Return a column of siunitx with numbers aligned at the decimal point.
+
+    Args:
+        digits: Digits before the point.
+        places: Digits after the point.
+        is_close: Whether a thin space separates it from the column before.
+    """
+    text = "0" * (digits + places) + ("." if places else "")
+    return Column(f"S[table-format={digits}.{places}]", is_close, text_width(text, SIZE))
+
+
+def measure_table(table: LatexTable, separation: float) -> float:
+    r"""Compute the width of a table.
+
+    Args:
+        table: Table.
+        separation: \\tabcolsep in points.
+
+    Returns:
+        Width in points.
+    """
+    widths = [column.width for column in table.columns]
+    gaps = [_gap(column, separation) if i else 0.0 for i, column in enumerate(table.columns)]
+    rows = [*table.head, *(row for group in table.groups for row in group)]
+    for spanning in (False, True):
+        for row in rows:
+            start = 0
+            for cell in row:
+                end = start + cell.span
+                if spanning and cell.span > 1:
+                    inside = sum(widths[start:end]) + sum(gaps[start + 1 : end])
+                    widths[end - 1] += max(0.0, cell.width - inside)
+                elif not spanning and cell.span == 1:
+                    widths[start] = max(widths[start], cell.width)
+                start = end
+    return sum(widths) + sum(gaps)
+
+
+def fit_table(table: LatexTable, width: float) -> float | None:
+    """Return the largest separation of columns with which a table fits, or None.
+
+    Args:
+        table: Table.
+        width: Available width in points.
+    """
+    fitting = (s for s in _SEPARATIONS if measure_table(table, s) <= width - _SLACK)
+    return next(fitting, None)
+
+
+def format_table(table: LatexTable, separation: float, *, is_wide: bool) -> str:
+    r"""Format a table as LaTeX.
+
+    Args:
+        table: Table.
+        separation: \\tabcolsep in points.
+        is_wide: Whether it spans both columns of the page.
+
+    Returns:
+        The environment `table`, for booktabs, siunitx and xcolor.
+    """
+    star = "*" if is_wide else ""
+    specs = "".join((r"@{\,}" if column.is_close else "") + column.spec for column in table.columns)
+    head = [_format_row(row) for row in table.head]
+    if table.rules:
+        head.insert(1, " ".join(rf"\cmidrule(lr){{{a}-{b}}}" for a, b in table.rules))
+    body = "\n\\midrule\n".join(
+        "\n".join(map(_format_row, group)) for group in table.groups if group
+    )
+    lines = [
+        f"% {table.rows} rows, {measure_table(table, separation):.1f} pt wide; needs booktabs, siunitx, xcolor",
+        rf"\begin{{table{star}}}[t]\centering",
+        rf"\caption{{{table.caption}}}",
+        rf"\label{{tab:{table.name}}}",
+        rf"\fontsize{{{SIZE:g}}}{{{LINE:g}}}\selectfont\setlength{{\tabcolsep}}{{{separation:g}pt}}%",
+        rf"\begin{{tabular}}{{@{{}}{specs}@{{}}}}",
+        r"\toprule",
+        *head,
+        r"\midrule",
+        body,
+        r"\bottomrule",
+        r"\end{tabular}",
+        rf"\end{{table{star}}}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _gap(column: Column, separation: float) -> float:
+    """Return the space before a column."""
+    return THIN_SPACE if column.is_close else 2 * separation
+
+
+def _format_row(row: Sequence[LatexCell]) -> str:
+    """Format a row."""
+    cells = [
+        cell.tex if cell.span == 1 else rf"\multicolumn{{{cell.span}}}{{c}}{{{cell.tex}}}"
+        for cell in row
+    ]
+    return " & ".join(cells) + r" \\"

@@ -1,0 +1,161 @@
+"""Figures of errors over time and of calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pfbench.report.journal.figure_style import (
+    MARGIN,
+    ROW,
+    FigureSetting,
+    label_rows,
+    line_style,
+    mark_style,
+)
+from pfbench.report.journal.study_pack import (
+    ALL,
+    Pack,
+    filters_by_key,
+    find_rows,
+    is_number,
+    name_of,
+)
+from pfbench.report.plots.axis_ticks import use_log_if_wide
+
+_CURVES = 9  # filters at most
+_PANELS = 6  # worlds at most
+_MARKS = 6  # marks of a curve
+_WIDE = 4.0  # inches, width from which a legend has four columns
+
+
+def select_curves(pack: Pack) -> list[str]:
+    """Select the filters whose curves are shown: proposed ones, the first of the board, and baselines.
+
+    Args:
+        pack: Data of the report.
+
+    Returns:
+        Keys in the order of the report, nine at most.
+    """
+    looks = filters_by_key(pack)
+    rows = list(find_rows(pack))
+    proposed = [key for key in rows if looks[key]["proposed"]]
+    priority = dict.fromkeys([*proposed, *rows[:1], *map(str, pack["baselines"][:2]), *rows])
+    selection = set(list(priority)[:_CURVES])
+    return [key for key in looks if key in selection]
+
+
+def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
+    """Plot the median error over time in each world under the first noise regime.
+
+    Args:
+        pack: Data of the report.
+        setting: Setting of the figures.
+    """
+    regime, looks = str(pack["regimes"][0]["key"]), filters_by_key(pack)
+    worlds = [str(world["key"]) for world in pack["worlds"]]
+    worlds = [world for world in worlds if f"{world}/{regime}" in pack["curves"]][:_PANELS]
+    is_wide = setting.page.has_columns and len(worlds) > 1
+    across = max(1, min(len(worlds), 3 if is_wide or setting.page.column > 320 else 1))
+    down = -(-len(worlds) // across)
+    keys = select_curves(pack)
+    figure = setting.make_figure(0.35 + 1.35 * down, is_wide=is_wide)
+    axes = figure.subplots(down, across, squeeze=False).ravel()
+    curve_keys: dict[str, None] = {}
+    for axis, world in zip(axes, worlds, strict=False):
+        curves = pack["curves"][f"{world}/{regime}"]
+        curve_keys |= dict.fromkeys(_plot_curves(axis, curves, keys, looks, setting))
+        axis.set_title(setting.escape(name_of(pack, "worlds", world)))
+        axis.set_xlabel("time [s]")
+    for axis in axes[len(worlds) :]:
+        axis.remove()
+    for axis in axes[::across]:
+        if axis.figure is not None:
+            axis.set_ylabel(setting.escape(_quantity(pack, worlds, regime)))
+    _add_legend(figure, axes[0], [looks[key] for key in curve_keys], setting)
+    return figure
+
+
+def plot_calibration(pack: Pack, setting: FigureSetting) -> Figure:
+    """Plot the coverage of 50 and 90 % regions, and NEES relative to its expectation.
+
+    Args:
+        pack: Data of the report.
+        setting: Setting of the figures.
+    """
+    looks, values = filters_by_key(pack), pack["calibration"].get(f"{ALL}/{ALL}", {})
+    keys = [key for key in find_rows(pack) if key in values] or [
+        key for key in looks if key in values
+    ]
+    figure = setting.make_figure(MARGIN + 0.1 + ROW * max(len(keys), 2))
+    coverage_axis, nees_axis = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
+    label_rows(coverage_axis, [str(looks[key]["name"]) for key in keys], setting)
+    label_rows(nees_axis, [str(looks[key]["name"]) for key in keys], setting)
+    nees_axis.tick_params(labelleft=False)
+    for level in (50, 90):
+        coverage_axis.axvline(level, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
+    ratios: list[float] = []
+    for y, key in enumerate(keys):
+        ratios += _plot_calibration_row((coverage_axis, nees_axis), y, values[key], looks[key])
+    coverage_axis.set_xlim(-2, 102)
+    coverage_axis.set_xticks([0, 25, 50, 75, 90])
+    coverage_axis.set_xlabel("coverage [%]".replace("%", setting.escape("%")))
+    use_log_if_wide(nees_axis, nees_axis.xaxis, [np.array([1.0, *ratios])])
+    nees_axis.axvline(1.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
+    nees_axis.set_xlabel("NEES / expectation")
+    return figure
+
+
+def _plot_calibration_row(axes: tuple[Axes, Axes], y: int, values: Pack, look: Pack) -> list[float]:
+    """Plot coverage and NEES of a filter; return the ratio of the NEES if there is one."""
+    shares = [values[name] for name in ("c50", "c90")]
+    if all(map(is_number, shares)):
+        axes[0].plot(
+            [100 * share for share in shares], [y, y], lw=0.8, zorder=2, **mark_style(look)
+        )
+    ratio = values["nees_ratio"]
+    if not is_number(ratio) or ratio <= 0:
+        return []
+    axes[1].plot([ratio], [y], zorder=3, **{**mark_style(look), "linestyle": "none"})
+    return [float(ratio)]
+
+
+def _plot_curves(
+    axis: Axes, curves: Pack, keys: list[str], looks: Pack, setting: FigureSetting
+) -> list[str]:
+    """Plot the curves of one panel; return the filters that have one."""
+    time, lines = np.asarray(curves["t"], dtype=np.float64), []
+    present = [key for key in keys if key in curves["filters"]]
+    for i, key in enumerate(present):
+        median = np.array([np.nan if v is None else v for v in curves["filters"][key]["median"]])
+        step = max(1, len(time) // _MARKS)
+        start = (i * step) // max(1, len(present))
+        order = 3 if looks[key]["proposed"] else 2
+        axis.plot(time, median, zorder=order, markevery=(start, step), **line_style(looks[key]))
+        lines.append(median)
+    use_log_if_wide(axis, axis.yaxis, lines)
+    axis.set_xlim(float(time[0]), float(time[-1]))
+    return present
+
+
+def _quantity(pack: Pack, worlds: list[str], regime: str) -> str:
+    """Return the label of the y axis: quantity and unit, without a unit that differs by world."""
+    curves = [pack["curves"][f"{world}/{regime}"] for world in worlds]
+    groups, units = ({str(curve.get(name, "")) for curve in curves} for name in ("group", "unit"))
+    group = f"{groups.pop()} error" if len(groups) == 1 else "error"
+    unit = units.pop() if len(units) == 1 else ""
+    return f"median {group} [{unit}]" if unit else f"median {group}"
+
+
+def _add_legend(figure: Figure, axis: Axes, looks: list[Pack], setting: FigureSetting) -> None:
+    """Add a legend below a figure and make the figure higher by it."""
+    if not looks:
+        return
+    handles = [axis.plot([], [], **line_style(look))[0] for look in looks]
+    names = [setting.escape(str(look["name"])) for look in looks]
+    columns = min(len(names), 4 if figure.get_size_inches()[0] > _WIDE else 3)
+    figure.legend(handles, names, loc="outside lower center", ncols=columns, handlelength=2.4)
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + 0.15 * -(-len(names) // columns))

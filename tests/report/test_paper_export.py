@@ -1,0 +1,224 @@
+"""Figures have exact widths and TrueType fonts, tables fit by computed and by TeX's widths, the paper compiles."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+from page_packs import build_pack
+from synthetic_results import study
+
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.journal import paper_folder
+from pfbench.report.journal.figure_style import FigureSetting
+from pfbench.report.journal.main_table import format_error_value, make_main_tables, make_supplement
+from pfbench.report.journal.methods_text import describe_methods
+from pfbench.report.journal.page_format import JOURNALS, find_page_format
+from pfbench.report.journal.paper_folder import draw_paper_figure, render_pdf, select_figures
+from pfbench.report.journal.table_layout import (
+    Column,
+    LatexTable,
+    fit_table,
+    format_table,
+    measure_table,
+    text_cell,
+)
+from pfbench.report.journal.text_width import text_width
+from pfbench.results.conditions import Condition, load_conditions
+
+HOSTILE = {0: r"A_b%$#&{}~^\x", 1: "Kürzel α [2]", 2: "$x^2$ <b>|"}
+needs_tex = pytest.mark.skipif(
+    shutil.which("pdflatex") is None or shutil.which("kpsewhich") is None,
+    reason="TeX is not installed: texlive-latex-recommended, -science, -publishers",
+)
+
+
+@pytest.fixture(scope="module")
+def conditions(tmp_path_factory: pytest.TempPathFactory) -> list[Condition]:
+    folder = tmp_path_factory.mktemp("paper")
+    study(folder / "invented", runs=4, steps=5)
+    return load_conditions("invented", folder)
+
+
+def write(
+    folder: Path, pack: dict[str, Any], conditions: list[Condition], journal: str, width: str = ""
+) -> list[str]:
+    page = find_page_format(journal, width)
+    with RecordedFolder(folder) as target:
+        methods = describe_methods(conditions, pairs=len(pack["planned"]))
+        return paper_folder.write_paper(pack, conditions, methods, page, target)
+
+
+@pytest.mark.parametrize(
+    ("journal", "width", "points"),
+    [
+        ("ieee", "", (252.0, 516.0)),
+        ("elsevier", "", (256.07, 540.6)),
+        ("", "300pt", (300.0, 300.0)),
+    ],
+)
+def test_pdf_has_the_exact_width_and_truetype_fonts(
+    journal: str, width: str, points: tuple[float, float]
+) -> None:
+    page = find_page_format(journal, width)
+    pack = build_pack(4, 2, 1, runs=5, instants=10, carried=0, names=HOSTILE)
+    plots = select_figures(pack)
+    for name, expected in (("leaderboard", points[0]), ("over_time", points[1])):
+        figure = draw_paper_figure(plots[name], pack, FigureSetting(page))
+        content = render_pdf(figure, page)
+        box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ", content)
+        assert box
+        assert float(box[1]) / 72 * 72.27 == pytest.approx(expected, abs=0.01)
+        assert b"/Type3" not in content
+        assert b"/CIDFontType2" in content
+        again = draw_paper_figure(plots[name], pack, FigureSetting(page))
+        assert content == render_pdf(again, page)
+
+
+def test_millimetres_are_converted() -> None:
+    assert find_page_format(width="254mm").column == pytest.approx(722.7)
+    assert JOURNALS["springer"].text == pytest.approx(174 / 25.4 * 72.27)
+
+
+@pytest.mark.parametrize(
+    ("journal", "width", "advice"),
+    [
+        (
+            "nature",
+            "",
+            "journal must be one of ieee, elsevier, springer, got nature. Use width=120mm",
+        ),
+        ("", "", "journal or width must be set, got none"),
+        ("ieee", "90mm", "got journal=ieee and width=90mm"),
+        ("", "120", "width must be 60mm to 400mm, in mm or pt, got 120"),
+        ("", "5mm", "got 5mm"),
+    ],
+)
+def test_advice_of_page_formats(journal: str, width: str, advice: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(advice)):
+        find_page_format(journal, width)
+
+
+def test_tables_split_by_regime_and_move_intervals_to_a_supplement() -> None:
+    def sizes(worlds: int, regimes: int) -> tuple[int, int, int]:
+        pack = build_pack(3, worlds, regimes, runs=3, instants=4, carried=0)
+        main = make_main_tables(pack)
+        return len(main), len(main[0].columns), len(make_supplement(pack))
+
+    assert sizes(4, 2) == (1, 17, 0)
+    assert sizes(5, 2) == (2, 11, 0)
+    assert sizes(6, 3) == (3, 7, 3)
+
+
+def test_a_table_that_does_not_fit_is_refused_with_advice(
+    conditions: list[Condition], tmp_path: Path
+) -> None:
+    wide = build_pack(3, 8, 1, runs=3, instants=4, carried=0)
+    with pytest.raises(ValueError, match=r"table_main must fit 252 pt, got \d+ pt. Choose fewer"):
+        write(tmp_path / "paper", wide, conditions, "", "252pt")
+    assert not list(tmp_path.rglob("*.tex"))
+    high = build_pack(70, 1, 1, runs=3, instants=4, carried=0)
+    with pytest.raises(ValueError, match=r"at most 63 rows, got 71. Choose fewer filters"):
+        write(tmp_path / "paper", high, conditions, "ieee")
+
+
+def test_bold_is_the_smallest_printed_number_and_worse_has_a_dagger() -> None:
+    pack = build_pack(3, 1, 1, runs=3, instants=4, carried=0)
+    rows = pack["views"]["rmse/w0/r0/f0"]["rows"]
+    values = [(1.2344, "best"), (1.2341, "open"), (9.0, "worse")]
+    for row, (value, verdict) in zip(rows, values, strict=True):
+        row |= {"value": value, "low": value / 2, "high": 2 * value, "verdict": verdict}
+    rows[2]["lost"] = 4
+    table = make_main_tables(pack)[0]
+    cells = {row[0].tex: row[1].tex for group in table.groups for row in group}
+    assert sum(tex.startswith(r"\textbf{1.23}") for tex in cells.values()) == 2
+    (worse,) = (tex for tex in cells.values() if "textdagger}}}" in tex and "black!62" in tex)
+    assert r"\num{9.00}" in worse
+    name = next(f["name"] for f in pack["filters"] if f["key"] == rows[2]["filter"])
+    assert f"Lost runs, counted as the largest errors: {name} 4." in table.caption
+
+
+def test_lost_and_missing_entries_are_words() -> None:
+    pack = build_pack(4, 2, 1, runs=3, instants=4, carried=0, lost=[3], missing=[(1, 0, 0)])
+    text = format_table(make_main_tables(pack)[0], 3.0, is_wide=True)
+    assert "lost" in text
+    assert "--" in text
+    assert "nan" not in text
+    assert "None" not in text
+
+
+def test_errors_have_three_digits() -> None:
+    values = [0.0123456, 1.0, 12.34, 99.96, 123.4, 123456.0, 2.5e7, None, float("inf")]
+    printed = [format_error_value(value) for value in values]
+    assert printed == ["0.0123", "1.00", "12.3", "100", "123", "123000", "2.50e+07", "--", "--"]
+
+
+def test_a_spanning_head_widens_the_last_column() -> None:
+    wide = text_cell("M" * 20, span=2)
+    rows = [[[text_cell("a"), text_cell("b"), text_cell("c")]]]
+    table = LatexTable("t", "", [Column("l")] * 3, [[text_cell(""), wide]], rows)
+    separation = 4.0
+    assert wide.width == pytest.approx(20 * 0.889 * 8, rel=1e-3)
+    a = text_width("a", 8.0)
+    assert measure_table(table, separation) == pytest.approx(a + 2 * separation + wide.width)
+    assert fit_table(table, 20.0) is None
+
+
+@needs_tex
+def test_the_paper_compiles_without_overfull_boxes(
+    conditions: list[Condition], tmp_path: Path
+) -> None:
+    """IEEE with hostile names, and TeX's width of the main table against the computed one."""
+    pack = build_pack(6, 3, 2, runs=5, instants=10, carried=0, names=HOSTILE, lost=[5])
+    for look, key in zip(pack["filters"], ("gordon1993", "cofm2024", "musso2001"), strict=False):
+        look["cite"] = key
+    write(tmp_path, pack, conditions, "ieee")
+    table = (tmp_path / "table_main.tex").read_text()
+    (computed,) = re.findall(r"rows, ([\d.]+) pt wide", table)
+    tabular = re.search(r"(\\fontsize.*\\end\{tabular\})", table, re.DOTALL)
+    assert tabular
+    paper = (tmp_path / "paper.tex").read_text()
+    measure = f"\\begin{{document}}\n\\sbox0{{{tabular[1]}}}\\typeout{{WIDTH \\the\\wd0}}\n"
+    (tmp_path / "paper.tex").write_text(paper.replace("\\begin{document}", measure, 1))
+    for program in ("pdflatex", "bibtex", "pdflatex", "pdflatex"):
+        words = [program, "-interaction=nonstopmode"] if program != "bibtex" else [program]
+        subprocess.run(
+            [*words, "paper"], cwd=tmp_path, capture_output=True, check=False, timeout=60
+        )
+    log = (tmp_path / "paper.log").read_text(errors="replace")
+    assert "Output written on paper.pdf" in log
+    assert [line for line in log.splitlines() if line.startswith(("Overfull", "!"))] == []
+    assert "Citation" not in log
+    width = re.search(r"WIDTH ([\d.]+)pt", log)
+    assert width
+    assert float(width[1]) == pytest.approx(float(computed), rel=0.01)
+
+
+@needs_tex
+@pytest.mark.slow
+@pytest.mark.parametrize(("journal", "width"), [("elsevier", ""), ("springer", ""), ("", "120mm")])
+def test_other_formats_compile(
+    conditions: list[Condition], tmp_path: Path, journal: str, width: str
+) -> None:
+    write(tmp_path, build_pack(9, 2, 2, runs=5, names=HOSTILE), conditions, journal, width)
+    for _ in range(2):
+        subprocess.run(
+            ["pdflatex", "-interaction=nonstopmode", "paper"],
+            cwd=tmp_path, capture_output=True, check=False, timeout=60,
+        )  # fmt: skip
+    log = (tmp_path / "paper.log").read_text(errors="replace")
+    assert [line for line in log.splitlines() if line.startswith(("Overfull", "!"))] == []
+
+
+def test_methods_list_what_was_not_done(conditions: list[Condition]) -> None:
+    done, limits = describe_methods(conditions, pairs=2)
+    assert "4 filters with pfbench in 1 world" in done
+    assert "4 Monte Carlo runs of 5 steps" in done
+    assert "commit 0123abc" in done
+    assert limits.startswith("Not done: one seed (5)")
+    assert "simulated" in limits
+    assert "4 runs per condition are fewer than the 10" in limits
