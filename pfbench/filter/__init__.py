@@ -120,6 +120,11 @@ __getattr__, __dir__ = lazy_attributes(
             "TransitionRatioCorrection",
             "MarginalRatioCorrection",
         ),
+        "robust.innovation_gate": ("InnovationGate",),
+        "robust.m_estimation": ("HuberUpdate", "CorrentropyUpdate"),
+        "robust.scaled_noise": ("ScaledNoise",),
+        "robust.student_update": ("StudentUpdate",),
+        "robust.weighted_likelihood": ("WeightedLikelihoodUpdate",),
         "smoothing": ("smooth", "sample_trajectories"),
         "swarm.chaotic_sequences": (
             "SwarmStart",

@@ -36,3 +36,36 @@ def _is_stated_exact(key: str, stage: object) -> bool:
         stacklevel=4,
     )
     return False
+
+
+def has_evidence(method: object) -> bool:
+    """Return whether the log evidence of a filter is a log density of the measurements.
+
+    It is not if a weight or a noise covariance of a step depends on the measurement of that step.
+
+    Args:
+        method: Filter. It or its stages may define `has_evidence: bool`; nothing means True.
+
+    Returns:
+        True if no part states the opposite.
+    """
+    stages = (getattr(method, name, None) for name in ("proposal", "weight_update"))
+    return all(getattr(stage, "has_evidence", True) for stage in (method, *stages))
+
+
+def check_has_evidence(method: object, user: str) -> None:
+    """Check that a filter may serve a parameter inference.
+
+    Args:
+        method: Filter.
+        user: Function or class that uses the evidence, for the message.
+
+    Raises:
+        ValueError: If its evidence is not a density of the measurements.
+    """
+    if not has_evidence(method):
+        raise ValueError(
+            f"{user} must have a filter whose evidence is a density of the measurements, got "
+            f"{type(method).__name__} with weights or noise that depend on the measurement. "
+            "Remove its adaptation, or use a model with another noise distribution."
+        )

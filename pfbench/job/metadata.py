@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 import pfbench
+from pfbench.filter.exactness import has_evidence
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.job.plan import JobPlan
 from pfbench.model.base import StateSpaceModel
@@ -46,6 +47,7 @@ def make_metadata(
         "device": device if device == "cpu" else torch.cuda.get_device_name(device),
         "threads": values["threads"],
         "is_exact": method.is_exact or is_exact_kalman,
+        "has_evidence": has_evidence(method),
         "oracle_noise": values["oracle_noise"],
         "modelling_choices": [*model.choices, *notes],
         "state": describe_state(model),

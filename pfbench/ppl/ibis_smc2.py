@@ -17,6 +17,7 @@ from pfbench.core.derived_stream import relabel
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
+from pfbench.filter.exactness import check_has_evidence
 from pfbench.filter.loop import FilterPass, prepare_record
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.model.base import StateSpaceModel
@@ -104,6 +105,7 @@ class _ParameterSampler:
     def __init__(
         self, unknown: ParameterisedModel, method: Filter, record: Record, particles: int, seed: int
     ) -> None:
+        check_has_evidence(method, "smc2")
         self.unknown, self.method, self.seed = unknown, method, seed
         self.particles, self.runs = particles, len(record.y)
         self.record = repeat_runs(record, particles)

@@ -14,6 +14,7 @@ from pfbench.core.covariance import distribution_covariance
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
+from pfbench.filter.exactness import check_has_evidence
 from pfbench.filter.loop import run_filter
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.ppl.model_batch import ModelBatch
@@ -48,10 +49,16 @@ class FilterLikelihood(MarginalLikelihood):
     Attributes:
         method: The filter.
         seed: Seed of its random numbers, the same at every call.
+
+    Raises:
+        ValueError: If the evidence of the filter is not a density, as with a robust update.
     """
 
     method: Filter
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_has_evidence(self.method, "FilterLikelihood")
 
     @override
     def __call__(self, model: StateSpaceModel, record: Record) -> Tensor:

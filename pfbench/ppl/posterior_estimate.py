@@ -11,6 +11,7 @@ from pfbench.core.derived_stream import relabel
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import Filter
+from pfbench.filter.exactness import check_has_evidence
 from pfbench.filter.loop import run_filter
 from pfbench.ppl.correlated_numbers import CorrelatedStream, StoredNumbers
 from pfbench.ppl.parameterised_model import ParameterisedModel, Values
@@ -43,6 +44,7 @@ class PosteriorEstimator:
         separate_parameters: bool,
         rho: float,
     ) -> None:
+        check_has_evidence(method, "pmmh")
         self.unknown, self.method = unknown, method
         self.seed, self.separate_parameters, self.rho = seed, separate_parameters, rho
         runs = len(record.y)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pfbench.report.table_formats import format_number
-from pfbench.results import consistency, error_measures, metrics, status, store
+from pfbench.results import consistency, error_measures, metric_values, metrics, status, store
 from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
@@ -109,7 +109,7 @@ def _overview_row(label: str, result: store.JobResult, alpha: float) -> dict[str
         **metrics.table_columns(result, "job"),
         "mean NIS per component (expected 1)": nis,
         "NIS 95 % interval": band,
-        "log evidence": _mean(data["log_evidence"][~lost]),
+        "log evidence": _mean(metric_values.run_log_evidence(result)),
     }
 
 

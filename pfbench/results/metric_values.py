@@ -169,9 +169,37 @@ def compute_acceptance(data: MetricInput) -> ByComponent:
     return _job_value(data, mean_acceptance)
 
 
+def run_log_evidence(result: store.JobResult) -> Array:
+    """Return the log evidence [R]; NaN for lost runs, and for a filter without an evidence."""
+    hidden = result.data["lost"] | (not result.meta.get("has_evidence", True))
+    return np.where(hidden, np.nan, result.data["log_evidence"])
+
+
 def compute_log_evidence(data: MetricInput) -> ByComponent:
-    """Return the log evidence of each run."""
-    return {"": np.where(data.lost, np.nan, data.result.data["log_evidence"])}
+    """Return the log evidence of each run; empty for a filter without an evidence."""
+    is_density = data.result.meta.get("has_evidence", True)
+    return {"": run_log_evidence(data.result)} if is_density else {}
+
+
+def count_trace(result: store.JobResult, name: str) -> Array:
+    """Sum a trace of counts over time.
+
+    Args:
+        result: Job.
+        name: Name of the trace.
+
+    Returns:
+        Sum of each run, [R]; NaN for lost runs, and without the trace.
+    """
+    lost, trace = result.data["lost"], result.data.get(name)
+    if trace is None:
+        return np.full(lost.size, np.nan)
+    return np.where(lost, np.nan, np.asarray(trace, dtype=np.float64).sum(-1))
+
+
+def sum_trace(name: str) -> Callable[[MetricInput], ByComponent]:
+    """Return the function that sums a trace of counts over time."""
+    return partial(_job_value, compute=partial(count_trace, name=name))
 
 
 def compute_seconds_per_step(data: MetricInput) -> ByComponent:

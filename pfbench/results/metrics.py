@@ -30,6 +30,7 @@ from pfbench.results.metric_values import (
     compute_mean_nis,
     compute_rmse,
     compute_seconds_per_step,
+    sum_trace,
 )
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
@@ -198,13 +199,25 @@ METRICS: tuple[Metric, ...] = (
         "Iterations of a particle swarm, mean over time.",
     ),
     Metric(
+        "rejected", sum_trace("rejected"), "job", "", "target",
+        "Fixes that a gate rejected, sum over the run. A fix is one group of components.",
+        head="rejected fixes",
+    ),
+    Metric(
+        "downweighted", sum_trace("downweighted"), "job", "", "target",
+        "Fixes whose weight in a robust update is below 1/2, sum over the run. A fix is one group "
+        "of components.",
+        head="downweighted fixes",
+    ),
+    Metric(
         "nis", compute_mean_nis, "job", "", "target",
         "Normalised innovation squared per observed component. Its expectation is 1.",
         scored_names=("nis", "nis_dof"),
     ),
     Metric(
         "log_evidence", compute_log_evidence, "job", "", "higher",
-        "Logarithm of the estimated marginal likelihood of a run.",
+        "Logarithm of the estimated marginal likelihood of a run. A filter whose weights or noise "
+        "depend on the measurement does not estimate it.",
     ),
     Metric(
         "seconds_per_step", compute_seconds_per_step, "job", "s", "lower",

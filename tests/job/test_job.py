@@ -99,6 +99,7 @@ def test_a_job_leaves_one_file_that_numpy_reads(twice: Any) -> None:
     assert meta["seconds"]["filter"] > 0
     assert {"pfbench", "commit", "python", "torch", "numpy"} == meta["versions"].keys()
     assert meta["is_exact"] is True
+    assert meta["has_evidence"] is True
 
 
 def test_the_line_printed_is_the_error_stored(twice: Any) -> None:

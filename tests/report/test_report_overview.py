@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 
 from pfbench.report import tables
-from pfbench.results.metric_values import mean_trace
+from pfbench.results.metric_values import MetricInput, mean_trace
+from pfbench.results.metrics import compute_metric
 from pfbench.results.store import JobResult
 
 NAN = np.nan
@@ -64,3 +65,17 @@ def test_what_no_filter_tells_has_no_column() -> None:
     assert "distinct ancestors [%]" not in row
     assert row["MCMC acceptance [%]"].tolist()[1] == pytest.approx(100 * (0.4 + 0.2) / 2)
     assert np.isnan(row["MCMC acceptance [%]"].tolist()[0])
+
+
+def test_fixes_are_counted_over_the_run_and_a_filter_without_evidence_shows_none() -> None:
+    gated = told(rejected=[[0, 1, 0, 1], [2, 0, 0, 2], [9, 9, 9, 9]])
+    gated.meta["has_evidence"] = False
+    table = tables.overview_table({"plain": told(), "gated": gated})
+    assert table["rejected fixes"].tolist()[1] == pytest.approx(3.0)
+    assert np.isnan(table["rejected fixes"].tolist()[0])
+    assert "downweighted fixes" not in table
+    assert table["log evidence"].tolist()[0] == pytest.approx(-2.0)
+    assert np.isnan(table["log evidence"].tolist()[1])
+    assert compute_metric("log_evidence", MetricInput(gated)) == {}
+    assert compute_metric("log_evidence", MetricInput(told()))[""].tolist()[:2] == [-1.0, -3.0]
+    assert compute_metric("rejected", MetricInput(gated))[""].tolist()[:2] == [2.0, 4.0]

@@ -90,6 +90,7 @@ class MatrixNoiseAdaptation(NoiseAdaptation):
     """
 
     forgetting_factor: float = 0.99
+    has_evidence = True  # R and Q of a step follow from the steps before it
 
     def __post_init__(self) -> None:
         check_weight("MatrixNoiseAdaptation.forgetting_factor", self.forgetting_factor)

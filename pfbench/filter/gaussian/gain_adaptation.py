@@ -87,6 +87,7 @@ class BoundedRatioGain(GainAdaptation):
     max_ratio: float = 1.0
     min_ratio: float = 0.0
     groups: Sequence[int] | None = None
+    has_evidence = True
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.min_ratio <= self.max_ratio:

@@ -13,6 +13,11 @@ from pfbench.core.covariance import distribution_covariance, factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, StepInfo
+from pfbench.filter.gaussian.adaptation_chain import (
+    adapt_innovation,
+    check_adaptations,
+    states_evidence,
+)
 from pfbench.filter.gaussian.innovation import (
     GainAdaptation,
     Innovation,
@@ -61,7 +66,7 @@ class GaussianFilter:
 
     Raises:
         ValueError: If iterations is below 1, or above 1 with adaptations or gains, which evaluate
-            the first innovation. On use, if a mean or variance of a distribution is not finite.
+            the first innovation, or if two noise adaptations use the innovation. On use, if a mean or variance of a distribution is not finite.
     """
 
     linearisation: LinearisationRule
@@ -77,16 +82,12 @@ class GaussianFilter:
         return not self.noise_adaptations and not self.gain_adaptations
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError(
-                f"filter.iterations must be at least 1, got {self.iterations}. Use 1 for a single "
-                "update."
-            )
-        if self.iterations > 1 and (self.noise_adaptations or self.gain_adaptations):
-            raise ValueError(
-                "filter.iterations must be 1 with noise_adaptations or gain_adaptations, got "
-                f"{self.iterations}. Set filter.iterations=1."
-            )
+        check_adaptations(self.noise_adaptations, self.gain_adaptations, self.iterations)
+
+    @property
+    def has_evidence(self) -> bool:
+        """True if the log evidence is a log density of the measurements."""
+        return all(states_evidence(a) for a in (*self.noise_adaptations, *self.gain_adaptations))
 
     def init(
         self,
@@ -166,7 +167,9 @@ class GaussianFilter:
         innovation = compute_innovation(
             self.linearisation, model, state_at, prior, record
         )._replace(root=root)
-        innovation, memory, trace = self._adapt(innovation, belief)
+        innovation, memory, trace = adapt_innovation(
+            self.noise_adaptations, self.gain_adaptations, innovation, belief
+        )
         shift, updated, log_like, repaired_update, innovation = self._update(
             model, prior, innovation, record
         )
@@ -176,26 +179,6 @@ class GaussianFilter:
         mean = model.chart.add(prior, (root @ shift.unsqueeze(-1)).squeeze(-1))
         log_like = torch.where(has_root & is_positive & log_like.isfinite(), log_like, -torch.inf)
         return GaussianStep(prior, root, mean, root @ updated, innovation, log_like, memory, trace)
-
-    def _adapt(
-        self, innovation: Innovation, belief: GaussianBelief
-    ) -> tuple[Innovation, dict[str, Tensor], dict[str, Tensor]]:
-        """Apply all adaptations; return the innovation, the values for the next step, the trace."""
-        memory: dict[str, Tensor] = {}
-        for adaptation in self.noise_adaptations:
-            innovation, carried = adaptation.noise_adapt(innovation, belief)
-            memory |= carried
-        trace = {
-            name: value if value.dim() == 1 else value.amax(1)
-            for name, value in memory.items()
-            if value.dim() <= 2
-        }
-        if self.gain_adaptations:
-            widening = torch.ones_like(belief.mean[:, 0])
-            for gain in self.gain_adaptations:
-                widening = gain(innovation, widening)
-            innovation, trace["widening"] = innovation.inflate(widening), widening
-        return innovation, memory, trace
 
     def predict(
         self, model: StateSpaceModel, belief: GaussianBelief, u: Any

@@ -20,6 +20,8 @@ from pfbench.filter.gaussian.linearisation_rules import (
 from pfbench.filter.linearisation import check_moments
 from pfbench.model.base import StateSpaceModel
 
+_SMALLEST_WEIGHT = 1e-12  # of a reweighted component: R times 1e12
+
 
 class Innovation(NamedTuple):
     """Innovation r = M xi + e with unknown xi ~ N(0, I), Cov e = Omega.
@@ -58,6 +60,38 @@ class Innovation(NamedTuple):
         )
         return self._replace(omega=self.omega + (noise - self.noise), noise=noise)
 
+    def reweight(self, weight: Tensor, group_mask: Tensor) -> Innovation:
+        """Divide the measurement noise of groups of components by weights.
+
+        R of a group is divided by its weight. The additional noise of a group is independent of the
+        others, so that a large error of one group does not reach another [ours].
+
+        Args:
+            weight: Weights, [R, k], equal within a group.
+            group_mask: 1 where two components belong to one group, [R, k, k].
+
+        Returns:
+            The innovation. A weight of 0 is the smallest that leaves R finite.
+        """
+        factor = 1.0 / weight.clamp(min=_SMALLEST_WEIGHT)
+        shared = factor.clamp(max=1.0).sqrt()
+        cross = shared.unsqueeze(-1) * shared.unsqueeze(-2)
+        return self.with_noise(self.noise * (cross + group_mask * (factor.unsqueeze(-1) - cross)))
+
+    def reject(self, rejected_mask: Tensor) -> Innovation:
+        """Turn components [R, k] into missing ones: exactly as if y were NaN there."""
+        observed_mask = self.observed_mask & ~rejected_mask
+        pair_mask = observed_mask.unsqueeze(-1) & observed_mask.unsqueeze(-2)
+        eye = torch.eye(self.r.shape[-1], dtype=self.r.dtype, device=self.r.device)
+        omega, noise = (torch.where(pair_mask, a, eye) for a in (self.omega, self.noise))
+        return self._replace(
+            r=torch.where(observed_mask, self.r, 0.0),
+            observed_mask=observed_mask,
+            m=torch.where(observed_mask.unsqueeze(-1), self.m, 0.0),
+            omega=omega,
+            noise=noise,
+        )
+
     def inflate(self, factor: Tensor) -> Innovation:
         """Multiply the predicted covariance by `factor` [R]."""
         f = factor[:, None, None]
@@ -66,7 +100,14 @@ class Innovation(NamedTuple):
 
 
 class NoiseAdaptation(Protocol):
-    """A change of the filter's noise covariances; both hooks may be the identity."""
+    """A change of the filter's noise covariances; both hooks may be the identity.
+
+    Attributes:
+        has_evidence: True if R and Q of a step do not depend on its measurement. Otherwise the
+            evidence of the filter is not a density of the measurements.
+    """
+
+    has_evidence: bool = False
 
     def predict_scale(
         self, predicted: AffineApproximation, belief: GaussianBelief
@@ -98,7 +139,13 @@ class NoiseAdaptation(Protocol):
 
 
 class GainAdaptation(Protocol):
-    """A change of the gain: it maps the factor on the predicted covariance [R] to a new one."""
+    """A change of the gain: it maps the factor on the predicted covariance [R] to a new one.
+
+    Attributes:
+        has_evidence: True if the factor does not depend on the measurement of the step.
+    """
+
+    has_evidence: bool = False
 
     def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:
         """Return the new factor [R].

@@ -35,6 +35,7 @@ class FadingMemory(NoiseAdaptation):
     """
 
     fading_factor: float = 1.002
+    has_evidence = True
 
     def __post_init__(self) -> None:
         if not self.fading_factor >= 1.0:

@@ -75,6 +75,11 @@ class SharedGuideProposal(Proposal):
     points: PointSet = field(default_factory=IidPoints)
     is_exact = False
 
+    @property
+    def has_evidence(self) -> bool:
+        """True unless the weights use an R or P- that depends on the measurement of the step."""
+        return self.weight_model == "nominal" or self.guide_filter.has_evidence
+
     def __post_init__(self) -> None:
         options = {"weight_model": ("adapted", "nominal"), "guide_state": ("gauss", "moments")}
         for key, (first, second) in options.items():
@@ -169,12 +174,16 @@ class SharedGuideProposal(Proposal):
 def _adapted_noise_ratio(
     model: StateSpaceModel, innovation: Innovation, x: Tensor, record: Record
 ) -> Tensor:
-    """Return log N(r; 0, adapted R) - log N(r; 0, nominal R), r = y - h(x), [R, N]."""
+    """Return log N(r; 0, adapted R) - log N(r; 0, nominal R), r = y - h(x), [R, N].
+
+    The adapted density omits rejected components.
+    """
+    masks = innovation.observed_mask, ~torch.isnan(record.y)
     noises = [
-        mask_covariance(noise, innovation.observed_mask)
-        for noise in (innovation.noise, innovation.nominal)
+        mask_covariance(noise, mask)
+        for noise, mask in zip((innovation.noise, innovation.nominal), masks, strict=True)
     ]
-    if torch.equal(*noises):
+    if torch.equal(*noises) and torch.equal(*masks):
         return torch.zeros_like(x[..., 0])
     if not is_normal(model.observation(x, record.u)):
         raise ValueError(
@@ -183,8 +192,10 @@ def _adapted_noise_ratio(
             "Choose weight_model=nominal, or a guide that does not adapt R."
         )
     r, values = innovation_at(model, x, record), []
-    for noise in noises:
+    for noise, mask in zip(noises, masks, strict=True):
         root, ok = factor(noise)
-        value = -compute_half_square(whiten(r, root)) - log_determinant(root).unsqueeze(-1)
+        value = -compute_half_square(whiten(r * mask.unsqueeze(1), root)) - log_determinant(
+            root
+        ).unsqueeze(-1)
         values.append(torch.where(ok.unsqueeze(-1), value, torch.nan))
     return values[0] - values[1]

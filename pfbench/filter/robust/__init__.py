@@ -1,0 +1,1 @@
+"""Robust and adaptive updates of Gaussian filters, and filters of several hypotheses."""

@@ -1,0 +1,138 @@
+"""Weights of standardised distances, and their thresholds for an efficiency at the normal law.
+
+A weight w(d) multiplies the information of a measurement at the distance d. Its asymptotic
+efficiency in k components with normal errors is A^2 / B with A = E[w d^2] / k and
+B = E[w^2 d^2] / k, d ~ chi_k [Huber and Ronchetti 2009]. A follows from Stein's lemma, so it
+holds for rejection too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor
+
+_NODES = 4000  # of the quadrature over the distance
+_HALVINGS = 40
+
+
+def huber_weight(squared: Tensor, threshold: Tensor) -> Tensor:
+    """Compute min(1, c / d).
+
+    Args:
+        squared: Squared distances d^2.
+        threshold: Thresholds c.
+    """
+    return (threshold / squared.clamp(min=1e-300).sqrt()).clamp(max=1.0)
+
+
+def cauchy_weight(squared: Tensor, threshold: Tensor) -> Tensor:
+    """Compute 1 / (1 + d^2 / c^2).
+
+    Args:
+        squared: Squared distances d^2.
+        threshold: Thresholds c.
+    """
+    return 1.0 / (1.0 + squared / threshold.square())
+
+
+def welsch_weight(squared: Tensor, threshold: Tensor) -> Tensor:
+    """Compute exp(-d^2 / (2 c^2)).
+
+    Args:
+        squared: Squared distances d^2.
+        threshold: Thresholds c.
+    """
+    return torch.exp(-0.5 * squared / threshold.square())
+
+
+WeightFunction = Callable[[Tensor, Tensor], Tensor]
+
+
+def compute_efficiency(weight: WeightFunction, threshold: float, k: int) -> float:
+    """Compute the asymptotic efficiency of a weight at the normal law.
+
+    Args:
+        weight: Function of squared distances and thresholds.
+        threshold: Threshold c.
+        k: Number of components.
+
+    Returns:
+        Variance of the optimal estimate divided by that of the weighted one, at most 1.
+    """
+    squared, probability = _chi_nodes(k)
+    values = weight(squared, torch.tensor(threshold, dtype=torch.float64))
+    a = (values * squared * probability).sum() / k
+    b = (values.square() * squared * probability).sum() / k
+    return float(a * a / b)
+
+
+@lru_cache(maxsize=64)
+def _chi_nodes(k: int) -> tuple[Tensor, Tensor]:
+    """Return squared distances and their probabilities for d ~ chi_k."""
+    d = np.linspace(0.0, math.sqrt(k) + 12.0, _NODES + 1)[1:]
+    probability = stats.chi.pdf(d, k) * (d[1] - d[0])
+    return torch.from_numpy(d * d), torch.from_numpy(probability)
+
+
+@lru_cache(maxsize=256)
+def threshold_for_efficiency(weight: WeightFunction, efficiency: float, k: int) -> float:
+    """Compute the threshold c at which a weight has an efficiency.
+
+    Args:
+        weight: Function of squared distances and thresholds, increasing in c.
+        efficiency: Efficiency in (0, 1).
+        k: Number of components.
+
+    Returns:
+        The threshold.
+    """
+    low, high = 1e-3, 1e3
+    for _ in range(_HALVINGS):
+        middle = math.sqrt(low * high)
+        is_above = compute_efficiency(weight, middle, k) > efficiency
+        low, high = (low, middle) if is_above else (middle, high)
+    return math.sqrt(low * high)
+
+
+def threshold_table(
+    weight: WeightFunction, threshold: float | None, efficiency: float, count: Tensor
+) -> Tensor:
+    """Return the threshold of each group, [R, k].
+
+    Args:
+        weight: Function of squared distances and thresholds.
+        threshold: Threshold of all groups; None for that of the efficiency.
+        efficiency: Efficiency in (0, 1).
+        count: Number of observed components of the group, [R, k].
+    """
+    if threshold is not None:
+        return torch.full_like(count, threshold)
+    values = [threshold_for_efficiency(weight, efficiency, n) for n in _counts(count)]
+    return _look_up(values, count)
+
+
+def quantile_table(probability: float, count: Tensor) -> Tensor:
+    """Return the quantile of chi-square for the size of each group, [R, k].
+
+    Args:
+        probability: Probability of a smaller value.
+        count: Degrees of freedom, [R, k].
+    """
+    return _look_up([float(stats.chi2.ppf(probability, n)) for n in _counts(count)], count)
+
+
+def _counts(count: Tensor) -> range:
+    """Return all possible numbers of components of a group, from 1."""
+    return range(1, count.shape[-1] + 1)
+
+
+def _look_up(values: list[float], count: Tensor) -> Tensor:
+    """Gather values for 1, 2, ... components; an empty group takes the first."""
+    table = torch.tensor(values, dtype=count.dtype, device=count.device)
+    return table[(count.long() - 1).clamp(min=0)]
