@@ -36,6 +36,12 @@ from tqdm import tqdm
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.files.markdown import (
+    markdown_bullets,
+    markdown_head,
+    markdown_paragraph,
+    markdown_row,
+)
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import instantiate
@@ -55,19 +61,13 @@ from pfbench.ppl.parameter_posterior import WELL_MIXED, ParameterPosterior, plot
 from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
 from pfbench.ppl.posterior_estimate import repeat_runs
-from pfbench.report.markdown import (
-    markdown_bullets,
-    markdown_head,
-    markdown_paragraph,
-    markdown_row,
-)
+from pfbench.report.plots.figure_files import render_palette_png
 from pfbench.report.plots.plotting import (
     COLUMN,
     RC,
     add_legend,
     compute_jitter,
     line_styles,
-    render_palette_png,
 )
 from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
 from pfbench.scenario.recorded.log_tables import find_dataset

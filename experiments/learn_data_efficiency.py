@@ -56,7 +56,8 @@ from pfbench.learn.training_job import train
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.textbook import StochasticVolatility
 from pfbench.noise.white import NominalNoise
-from pfbench.report.plots.plotting import COLUMN, RC, add_legend, line_styles, render_palette_png
+from pfbench.report.plots.figure_files import render_palette_png
+from pfbench.report.plots.plotting import COLUMN, RC, add_legend, line_styles
 from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
 from pfbench.scenario.base import Scenario
 from pfbench.scenario.model_simulation import ModelSimulation

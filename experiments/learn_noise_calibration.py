@@ -35,7 +35,7 @@ from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
 from pfbench.ppl.pyro_program import program
 from pfbench.ppl.sbc import SbcRanks, sbc_histograms, simulation_based_calibration
-from pfbench.report.plots.plotting import render_palette_png
+from pfbench.report.plots.figure_files import render_palette_png
 
 WRONG = 1.5
 BINS = 10

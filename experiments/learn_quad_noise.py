@@ -31,6 +31,12 @@ from scipy.stats import bootstrap
 from tqdm import tqdm
 
 from pfbench.core.random_stream import PhiloxStream
+from pfbench.files.markdown import (
+    markdown_bullets,
+    markdown_head,
+    markdown_paragraph,
+    markdown_row,
+)
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import (
     CubaturePoints,
@@ -46,13 +52,8 @@ from pfbench.noise.white import NominalNoise
 from pfbench.ppl.parameter_posterior import WELL_MIXED, ParameterPosterior, plot_posterior
 from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
-from pfbench.report.markdown import (
-    markdown_bullets,
-    markdown_head,
-    markdown_paragraph,
-    markdown_row,
-)
-from pfbench.report.plots.plotting import COLUMN, RC, add_legend, line_styles, render_palette_png
+from pfbench.report.plots.figure_files import render_palette_png
+from pfbench.report.plots.plotting import COLUMN, RC, add_legend, line_styles
 from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
 from pfbench.scenario.recorded.drive import RecordedFlights
 

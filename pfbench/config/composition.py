@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
-from pfbench.config.paper_block import check_paper_blocks
+from pfbench.config.paper_block import check_paper_blocks, remove_nested_blocks
 from pfbench.config.protected_keys import check_protected_keys
 from pfbench.config.trust import check_configuration, check_study, split_trust
 
@@ -143,7 +143,8 @@ def resolve_config(
     assert isinstance(values, dict)
     names = {str(group): str(name) for group, name in (choices or {}).items()}
     _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
-    return JobConfig({str(key): value for key, value in values.items()}, names, is_shared, packages)
+    values = remove_nested_blocks({str(key): value for key, value in values.items()})
+    return JobConfig(values, names, is_shared, packages)
 
 
 def list_groups() -> dict[str, list[Path]]:

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from pfbench.config.paper_files import plan_installed_pairs
 from pfbench.report import writers
 from pfbench.report.options import ReportContext
 from pfbench.report.plots.decision_plots import plot_planned_pairs
 from pfbench.report.plots.figure_files import FigureSpec
-from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.conditions import natural_sort_key
 from pfbench.results.decisions.comparisons import TRACK
 from pfbench.results.decisions.decision import Decision
@@ -45,7 +45,7 @@ def write_decisions(
     options = DecisionOptions(context.options.alpha, context.options.equivalence_margin)
     tidy = tidy_runs(table, group=group)
     labels = sorted(tidy["filter"].unique(), key=natural_sort_key)
-    pairs = [pair for pair in list_planned_pairs(labels) if _share_runs(tidy, *pair)]
+    pairs = [pair for pair in plan_installed_pairs(labels) if _share_runs(tidy, *pair)]
     rule = MetricRule(f"{group} error", group=group)
     planned = decide_planned_pairs(tidy, pairs, rule, options) if pairs else []
     secondary = _decide_secondary(table, group, pairs, options)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report.plots.plotting import LineStyle, line_styles, mute_others
+from pfbench.report.plots.plotting import LineStyle, mute_others
 from pfbench.results.conditions import Condition, natural_sort_key
 
 _PLENTY = 50  # filters times conditions above which a report is brief [ours]
@@ -135,15 +135,5 @@ def select_line_styles(
             view.style, selected
         ), f" Coloured: {', '.join(selected)}. Grey: the other {others}."
     top = sorted(best[:_NAMED], key=natural_sort_key)
-    text = (
-        f" Coloured: the {_NAMED} filters with {by}, in colours of this figure. "
-        f"Grey: the other {len(labels) - len(top)}."
-    )
-    quiet = mute_others(view.style, top)
-    return {
-        **quiet,
-        **{
-            label: look._replace(instants=quiet[label].instants)
-            for label, look in line_styles(top).items()
-        },
-    }, text
+    text = f" Coloured: the {_NAMED} filters with {by}. Grey: the other {len(labels) - len(top)}."
+    return mute_others(view.style, top), text

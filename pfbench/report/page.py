@@ -13,6 +13,7 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import comparison_tables, cost, provenance, writers
 from pfbench.report.across_section import write_comparison
 from pfbench.report.condition_section import write_condition_section
+from pfbench.report.looks import study_looks
 from pfbench.report.options import ReportContext, ReportOptions, is_brief, order_by_highlight
 from pfbench.report.plots.paper import paper_figures
 from pfbench.report.plots.plotting import line_styles
@@ -107,7 +108,8 @@ def _make_context(
     groups = _select_groups(conditions, options)
     jobs = [job for condition in conditions for job in condition.jobs]
     labels = sorted({job.label for job in jobs}, key=natural_sort_key)
-    style = line_styles(order_by_highlight(labels, options.highlight_filters))
+    ordered = order_by_highlight(labels, options.highlight_filters)
+    style = line_styles(ordered, study_looks(conditions))
     return ReportContext(groups, style, folder, options, is_brief(conditions, options))
 
 

@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from pfbench.job.resumable import ResumableResults
-from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.report.markdown import (
+from pfbench.files.markdown import (
     WIDTH,
     markdown_bullets,
     markdown_head,
     markdown_paragraph,
     markdown_row,
 )
+from pfbench.job.resumable import ResumableResults
+from pfbench.ppl.parameter_posterior import ParameterPosterior
 
 
 def never() -> None:

@@ -18,9 +18,10 @@ from pfbench import job
 from pfbench.report import across_section, condition_section, page
 from pfbench.report.plots import filter_plots
 from pfbench.report.plots.axis_ticks import format_ticks
+from pfbench.report.plots.figure_files import render_palette_png
 from pfbench.report.plots.paper import experiment_plots, paper_figures, time_plots
 from pfbench.report.plots.paper.paper_catalogue import FIGURES
-from pfbench.report.plots.plotting import line_styles, mute_others, render_palette_png
+from pfbench.report.plots.plotting import line_styles, mute_others
 from pfbench.results import error_measures, store
 from pfbench.results.conditions import load_conditions
 from pfbench.results.frame import load_frame

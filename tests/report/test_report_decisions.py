@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
+from pfbench.config.paper_files import plan_installed_pairs
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import page
 from pfbench.report.decision_section import write_decisions
@@ -19,7 +20,6 @@ from pfbench.report.options import ReportContext, ReportOptions
 from pfbench.report.plots.decision_plots import plot_planned_pairs
 from pfbench.report.plots.plotting import line_styles
 from pfbench.results import frame, store
-from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs
 from pfbench.results.decisions.tidy_table import tidy_runs
 
@@ -76,12 +76,14 @@ def write_scenario(
 
 
 def test_planned_pairs_of_a_study() -> None:
-    assert list_planned_pairs(sorted(EFFECTS)) == PAIRS
-    assert list_planned_pairs(["ckf", "ukf"]) == [("ckf", "ukf")]
+    assert plan_installed_pairs(sorted(EFFECTS)) == PAIRS
+    assert plan_installed_pairs(["ckf", "ukf"]) == [("ckf", "ukf")]
     many = [f"filter_{k}" for k in range(6)]
-    assert list_planned_pairs([*many, "ekf", "sir"]) == [(label, "ekf") for label in [*many, "sir"]]
-    assert list_planned_pairs([*many, "sir"]) == [(label, "sir") for label in many]
-    assert list_planned_pairs(many) == []
+    assert plan_installed_pairs([*many, "ekf", "sir"]) == [
+        (label, "ekf") for label in [*many, "sir"]
+    ]
+    assert plan_installed_pairs([*many, "sir"]) == [(label, "sir") for label in many]
+    assert plan_installed_pairs(many) == []
 
 
 @pytest.mark.parametrize("worlds", [("flight",), ("drive", "flight", "walk")])

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
+from pfbench.config.paper_files import plan_installed_pairs
 from pfbench.report import cost, summary
 from pfbench.report.cost import ParetoFront
 from pfbench.report.plots import (
@@ -33,7 +34,7 @@ from pfbench.report.plots import (
 )
 from pfbench.report.plots.figure_files import FigureSpec, write_figure
 from pfbench.results import store
-from pfbench.results.comparison import baselines, condition_blocks
+from pfbench.results.comparison import condition_blocks
 from pfbench.results.comparison.pairwise_tests import compare_pairs
 from pfbench.results.conditions import load_conditions
 from pfbench.results.decisions import planned_pairs, tidy_table
@@ -112,7 +113,7 @@ def test_letters_of_figures_of_many_filters_can_be_read_and_are_not_cut(
     some = table[table.label.isin([*BASES, "dmc_reconstructed_printed"])]
     _, decided, name = summary.select_main_rows(some, compare_pairs(some), of)
     source = condition_blocks.ranking_blocks(table, name)
-    pairs = baselines.list_planned_pairs(sorted(set(table.label)))
+    pairs = plan_installed_pairs(sorted(set(table.label)))
     assert len(pairs) > 4
     planned = planned_pairs.decide_planned_pairs(tidy_table.tidy_runs(table), pairs)
     errors = [d for d in planned if d.metric == "error"]

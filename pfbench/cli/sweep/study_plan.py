@@ -54,7 +54,7 @@ class StudyPlan:
 
     def count_pairs(self) -> int:
         """Count the planned pairs of filters; at least 1, since one filter is compared later."""
-        from pfbench.results.comparison.baselines import list_planned_pairs
+        from pfbench.config.paper_files import plan_installed_pairs
 
         swept = self._swept_options()
         names = [option.partition("=")[2] for option in swept.pop("filter", ("filter=one",))]
@@ -63,7 +63,7 @@ class StudyPlan:
         for count in settings:
             variants *= count
         labels = names if variants == 1 else [f"{n} {k}" for n in names for k in range(variants)]
-        return max(1, len(list_planned_pairs(labels)))
+        return max(1, len(plan_installed_pairs(labels)))
 
     def compose_jobs(self) -> list[JobConfig]:
         """Compose the configurations of all jobs."""

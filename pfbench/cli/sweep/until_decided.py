@@ -112,9 +112,12 @@ class GrowingSweep:
         Args:
             number: Number of the look, from 1.
         """
+        from pfbench.config.paper_files import plan_installed_pairs
         from pfbench.results.until_decided.look_table import read_look_table
 
-        return read_look_table(self.study, self.results, self.job_keys(number))
+        return read_look_table(
+            self.study, self.results, self.job_keys(number), plan_installed_pairs
+        )
 
     def run(self, run_part: Callable[[Sequence[str]], None]) -> None:
         """Run look after look until all pairs are decided or a cap is reached.

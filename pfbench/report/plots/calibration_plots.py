@@ -75,8 +75,8 @@ def plot_rank_histograms(
         for label, (pit, lost) in _select_pit(results, group).items():
             histogram = consistency.rank_histogram(pit, lost, _BINS)
             look = style[label]
-            marker = "" if look.quiet else look.marker
-            axis.plot(centres, 100 * histogram.value, marker=marker, ms=2.5, **look.line(label))
+            mark = {} if look.quiet else look.mark()
+            axis.plot(centres, 100 * histogram.value, ms=2.5, **mark, **look.line(label))
             runs.append(histogram.runs)
         low, high = intervals.binomial_interval(1 / _BINS, max(runs), alpha)
         axis.axhspan(100 * low, 100 * high, color="0.88", lw=0, zorder=0)

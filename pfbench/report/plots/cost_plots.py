@@ -83,9 +83,10 @@ def _plot_filter(axis: Axes, point: tuple[float, float], look: LineStyle, on_fro
     if look.quiet:
         colour = "0.45" if on_front else look.colour
         mark: Any = {"s": 9, "color": colour, "marker": "o", "zorder": 2.5, "lw": 0}
-    else:  # white edges separate overlapping marks
-        mark = {"s": 26, "color": look.colour, "marker": look.marker, "zorder": 3, "lw": 0.4}
-        mark["edgecolors"] = "white"
+    else:  # white edges separate overlapping filled marks
+        face, edge = (look.colour, "white") if look.filled else ("white", look.colour)
+        mark = {"s": 26, "facecolors": face, "edgecolors": edge, "marker": look.marker}
+        mark |= {"zorder": 3, "lw": 0.4 if look.filled else 1.0}
     axis.scatter(*point, **mark)
     if on_front:
         axis.scatter(*point, s=80, facecolors="none", edgecolors="0.2", lw=0.9, zorder=2)
@@ -131,8 +132,7 @@ def plot_cost(results: Results, style: Mapping[str, LineStyle]) -> Figure:
     for axis, (name, values) in zip(panels, panels_data.items(), strict=True):
         for row, (label, value) in enumerate(zip(labels, values, strict=True)):
             axis.plot([0, value], [row, row], color="0.8", lw=0.8, zorder=1)
-            mark = {"marker": style[label].marker, "color": style[label].colour}
-            axis.plot(value, row, ls="none", ms=4, **mark)
+            axis.plot(value, row, ls="none", ms=4, **style[label].mark())
         positive = values[values > 0]
         axis.set_xlim(0, 1.1 * positive.max(initial=1e-9))
         axis.set(xlabel=name, yticks=range(len(labels)), yticklabels=names)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib
+import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 
-from pfbench.report.plots.plotting import RC, render_palette_png
+from pfbench.report.looks import installed_colours
+from pfbench.report.plots.plotting import PLAIN_COLOURS, RC, SHADES
 
 
 class FigureSpec(NamedTuple):
@@ -68,3 +72,32 @@ def _render(figure: Figure, suffix: str) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})  # equal bytes
     return buffer.getvalue()
+
+
+def render_palette_png(figure: Figure) -> bytes:
+    """Render a PNG with 256 colours at most, about a quarter of the size of full colour."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    image = Image.open(buffer).convert("RGB")
+    image = image.quantize(palette=_palette(), dither=Image.Dither.NONE)
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+@cache
+def _palette() -> Image.Image:
+    """Build the palette: colours of methods in steps to white, the shades of maps, and greys."""
+    plain = [colour for colour in PLAIN_COLOURS if colour != "#000000"]
+    colours = list(dict.fromkeys([*installed_colours(), *plain, "#B35900"]))
+    pure = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours])
+    fractions = np.linspace(0, 1, 5, endpoint=False)[:, None]
+    tints = pure[:, None] + (255 - pure[:, None]) * fractions
+    shades = np.array([[int(shade[i : i + 2], 16) for i in (1, 3, 5)] for shade in SHADES])
+    # Greys are so dense that no tint is the nearest colour of a grey.
+    greys = np.repeat(np.minimum(np.arange(0, 257, 8), 255)[:, None], 3, axis=1)
+    steps = np.round(np.concatenate([tints.reshape(-1, 3), shades, greys])).astype(np.uint8)
+    padding = np.repeat(steps[-1:], 256 - len(steps), axis=0)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate([steps, padding]).tobytes())
+    return palette

@@ -171,8 +171,8 @@ def plot_nis(results: Results, style: Mapping[str, LineStyle], alpha: float = 0.
         if innovations is not None:
             time, squared, dof = innovations
             look = style[label]
-            marker = "" if look.quiet else look.marker
-            axis.plot(time, squared / dof, marker=marker, ms=2.5, **look.line(label))
+            mark = {} if look.quiet else look.mark()
+            axis.plot(time, squared / dof, ms=2.5, **mark, **look.line(label))
             lines.append(squared / dof)
             bands.append((float(dof.sum()), time, *consistency.nees_band(1, dof, alpha)))
     _, time, low, high = max(bands, key=lambda band: band[0])

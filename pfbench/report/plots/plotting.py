@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
 from itertools import cycle
 from typing import Any, NamedTuple
 
@@ -12,7 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from PIL import Image
+
+from pfbench.config.paper_block import MARKERS
+from pfbench.report.looks import MethodLook, find_looks
 
 COLUMN = 3.5  # inches, width of a column of print
 INSTANTS = 180  # points of a curve at most: a column of print is 250 points wide
@@ -42,8 +42,8 @@ RC: Any = {
     "svg.hashsalt": "pfbench",  # SVG identifiers are random otherwise
     "svg.fonttype": "none",  # text stays text, which is searchable and smaller than outlines
 }
-# Okabe and Ito 2008, without yellow, which has too little contrast on white.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
+# Okabe and Ito 2008, without yellow, which has too little contrast on white; for lines of no method.
+PLAIN_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
 # Tints and shades of one blue in equal steps of lightness, which stay distinct in grey print.
 SHADES = (
     "#dfedf5", "#aad0e5", "#74b2d5", "#3e94c5", "#0474b3", "#005788", "#003c5d", "#002235",
@@ -69,6 +69,7 @@ class LineStyle(NamedTuple):
         width: Line width in points.
         quiet: Whether the filter is drawn in grey and without a label.
         instants: Points of a curve over time at most.
+        filled: Whether marks are filled.
     """
 
     colour: str
@@ -77,6 +78,12 @@ class LineStyle(NamedTuple):
     width: float
     quiet: bool = False
     instants: int = INSTANTS
+    filled: bool = True
+
+    def mark(self) -> dict[str, Any]:
+        """Return the keyword arguments of `Axes.plot` for its marks; hollow unless proposed."""
+        face = self.colour if self.filled else "white"
+        return {"marker": self.marker, "mfc": face, "mec": self.colour, "mew": 0.8}
 
     def line(self, label: str = "") -> dict[str, Any]:
         """Return the keyword arguments of `Axes.plot`, with the label unless the filter is grey."""
@@ -91,11 +98,18 @@ class LineStyle(NamedTuple):
         }
 
 
-def line_styles(labels: Sequence[str]) -> dict[str, LineStyle]:
-    """Assign each filter a colour, a dash and a marker.
+def line_styles(
+    labels: Sequence[str], looks: Mapping[str, MethodLook] | None = None
+) -> dict[str, LineStyle]:
+    """Return the line style of each filter, by the look of its method.
 
-    All three differ for neighbours, so that any of them suffices in grey print. Later lines are
-    thinner: where filters agree exactly, the earlier lines remain visible on both sides.
+    Proposed methods have solid lines and filled marks, others dashed lines and hollow marks. Labels
+    that name no method differ in colour, dash and marker. Later lines are thinner: where filters agree
+    exactly, the earlier lines remain visible on both sides.
+
+    Args:
+        labels: Labels of filters, or names of other curves.
+        looks: Looks by label, None for those of the installed methods.
     """
     names = list(dict.fromkeys(labels))
     first = min(len(names), 8)
@@ -103,11 +117,31 @@ def line_styles(labels: Sequence[str]) -> dict[str, LineStyle]:
     if first > 1:
         thick = np.linspace(1.0 + min(0.25 * first, 1.0), 1.0, first)
         widths = [*thick, *[1.0] * (len(names) - first)]
-    rows = zip(names, cycle(_COLOURS), cycle(_DASHES), cycle(_MARKERS), widths, strict=False)
-    return {
+    rows = zip(names, cycle(PLAIN_COLOURS), cycle(_DASHES), cycle(_MARKERS), widths, strict=False)
+    styles = {
         name: LineStyle(colour, dash, mark, float(width))
         for name, colour, dash, mark, width in rows
     }
+    method_looks = find_looks(names) if looks is None else looks
+    return {
+        name: _style_of_look(method_looks[name], style.width)
+        if method_looks.get(name) and method_looks[name].family
+        else style
+        for name, style in styles.items()
+    }
+
+
+def _style_of_look(look: MethodLook, width: float) -> LineStyle:
+    """Return the line style of a look; the dash of a baseline follows its marker."""
+    dashes = _DASHES[1:]
+    dash = dashes[MARKERS.index(look.marker) % len(dashes)]
+    return LineStyle(
+        look.colour,
+        "-" if look.proposed else dash,
+        look.marker,
+        width,
+        filled=look.proposed,
+    )
 
 
 def mute_others(style: Mapping[str, LineStyle], highlighted: Iterable[str]) -> dict[str, LineStyle]:
@@ -159,34 +193,6 @@ def add_legend(figure: Figure, axis: Axes, columns: int = 2) -> None:
     width, height = figure.get_size_inches()
     figure.set_size_inches(width, height + 0.1 + 0.16 * -(-len(labels) // columns))
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
-
-
-def render_palette_png(figure: Figure) -> bytes:
-    """Render a PNG with 97 colours, about a quarter of the size of full colour."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    image = Image.open(buffer).convert("RGB")
-    image = image.quantize(palette=_palette(), dither=Image.Dither.NONE)
-    buffer = io.BytesIO()
-    image.save(buffer, "PNG", optimize=True)
-    return buffer.getvalue()
-
-
-@cache
-def _palette() -> Image.Image:
-    """Build the palette: filter colours in steps to white, the shades of maps, and greys."""
-    colours = [*(colour for colour in _COLOURS if colour != "#000000"), "#B35900"]
-    pure = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours])
-    fractions = np.linspace(0, 1, 8, endpoint=False)[:, None]
-    tints = pure[:, None] + (255 - pure[:, None]) * fractions
-    shades = np.array([[int(shade[i : i + 2], 16) for i in (1, 3, 5)] for shade in SHADES])
-    # Greys are so dense that no tint is the nearest colour of a grey.
-    greys = np.repeat(np.minimum(np.arange(0, 257, 8), 255)[:, None], 3, axis=1)
-    steps = np.round(np.concatenate([tints.reshape(-1, 3), shades, greys])).astype(np.uint8)
-    padding = np.repeat(steps[-1:], 256 - len(steps), axis=0)
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(np.concatenate([steps, padding]).tobytes())
-    return palette
 
 
 def format_axis_label(quantity: str, unit: str) -> str:

@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from itertools import combinations
 
 from pfbench.results.conditions import natural_sort_key
-
-BASELINES: Mapping[str, tuple[str, ...]] = {
-    "mcmc_rpf": ("sir", "rpf"),  # Yan et al. 2016
-    "qmc_polymerised": ("sir", "gpf", "qmc_gpf"),  # Pu and Qin
-    "fm_mssrckf": ("mssrckf",),  # COFM-AMSSRCPF 2024, as the next two
-    "cofm_mssrckf": ("mssrckf", "fm_mssrckf"),
-    "cofm_amssrcpf": ("cpf", "fmcpf"),
-    "dmc_reconstructed": ("sir", "ukf"),  # The DMC particle filter
-    "cpso_escape": ("sir", "pso_pf", "cpso_pf"),  # Tian et al.
-}
 
 _FEW = 5  # filters up to which all pairs are planned if no proposed method is compared
 _REFERENCES = ("ekf", "sir")  # of larger studies without a proposed method
 
 
-def list_planned_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
+def list_planned_pairs(
+    labels: Collection[str], baselines: Mapping[str, Sequence[str]]
+) -> list[tuple[str, str]]:
     """List the planned pairs of a study.
 
     Args:
         labels: Filters of the study.
+        baselines: Baselines of the paper of each proposed method, by label.
 
     Returns:
         Proposed methods with each baseline of their paper. Without such a pair: all pairs of at most
@@ -34,9 +27,9 @@ def list_planned_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
     labels = sorted(set(labels), key=natural_sort_key)
     pairs = [
         (method, baseline)
-        for method, baselines in BASELINES.items()
-        for baseline in baselines
-        if method in labels and baseline in labels
+        for method in labels
+        for baseline in baselines.get(method, ())
+        if baseline in labels
     ]
     if pairs:
         return pairs

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
 
-from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.conditions import Condition, load_conditions
 from pfbench.results.decisions.tidy_table import tidy_runs
 from pfbench.results.frame import to_long_rows
@@ -31,13 +30,19 @@ class LookTable(NamedTuple):
     seconds: float
 
 
-def read_look_table(study: str, results: Path, keys: Collection[str]) -> LookTable:
+def read_look_table(
+    study: str,
+    results: Path,
+    keys: Collection[str],
+    list_pairs: Callable[[Collection[str]], list[tuple[str, str]]],
+) -> LookTable:
     """Read the main error of the jobs of a look.
 
     Args:
         study: Name of the study.
         results: Folder of all studies.
         keys: Keys of all jobs until the look.
+        list_pairs: Function that lists the planned pairs of labels.
 
     Returns:
         The table and its pairs.
@@ -52,7 +57,7 @@ def read_look_table(study: str, results: Path, keys: Collection[str]) -> LookTab
     labels_by_condition = [{job.label for job in condition.jobs} for condition in conditions]
     pairs = [
         pair
-        for pair in list_planned_pairs(labels)
+        for pair in list_pairs(labels)
         if any(set(pair) <= names for names in labels_by_condition)
     ]
     jobs = [job for condition in conditions for job in condition.jobs]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from decision_cases import make_study
 
-from pfbench.results.comparison.baselines import list_planned_pairs
+from pfbench.config.paper_files import plan_installed_pairs
 from pfbench.results.decisions.growing_study import decide_at_looks, is_complete
 from pfbench.results.decisions.study_runs import select_pair, to_study_runs
 from pfbench.results.statistics.sequential_looks import LookPlan
@@ -123,16 +123,16 @@ def test_the_record_keeps_its_plan(tmp_path: Path) -> None:
 
 
 def test_planned_pairs_are_those_of_the_papers() -> None:
-    assert list_planned_pairs(["rpf", "mcmc_rpf", "sir"]) == [
+    assert plan_installed_pairs(["rpf", "mcmc_rpf", "sir"]) == [
         ("mcmc_rpf", "sir"),
         ("mcmc_rpf", "rpf"),
     ]
-    assert list_planned_pairs(["sir", "ekf", "ukf"]) == [
+    assert plan_installed_pairs(["sir", "ekf", "ukf"]) == [
         ("ekf", "sir"),
         ("ekf", "ukf"),
         ("sir", "ukf"),
     ]
-    assert list_planned_pairs(["sir"]) == []
+    assert plan_installed_pairs(["sir"]) == []
 
 
 def test_the_sentence_before_a_study() -> None:

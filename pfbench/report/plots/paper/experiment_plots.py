@@ -132,6 +132,6 @@ def _draw_points(
         low, middle, high = np.quantile(finite, BAND_QUANTILES)
         axis.plot([x, x], [low, high], color=look.colour, lw=1.0, zorder=2)
         axis.plot(
-            x, middle, ls="none", marker=look.marker, ms=4.5, color=look.colour, mfc="white" if open_ else look.colour,
+            x, middle, ls="none", ms=4.5, **look.mark() | ({"mfc": "white"} if open_ else {}),
             label=label if k == 0 and label else "", zorder=3,
         )  # fmt: skip

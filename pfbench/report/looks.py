@@ -1,0 +1,215 @@
+"""Names and looks of methods, scenarios and regimes: one look per method in every figure and page.
+
+They come from the node `paper` of the configuration files. Hue shows the family, shade and marker
+for the method. Marks of proposed methods are filled and their lines solid. Marks of other methods
+are hollow and their lines dashed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pfbench.config.paper_block import MARKERS
+from pfbench.config.paper_files import list_named_parts, read_paper_block
+from pfbench.results.comparison.baselines import list_planned_pairs
+from pfbench.results.conditions import Condition
+
+# Colours on white and on dark ground of methods that state none, by family.
+_GREY = ("#5f6b76", "#a9b4be")
+FAMILY_COLOURS: Mapping[str, tuple[str, str]] = {
+    "kalman": ("#44617c", "#9fb8d0"),
+    "particle": ("#7c5a44", "#d0b09f"),
+    "gaussian": ("#4b6b58", "#a5c4b1"),
+    "guided": ("#66578a", "#bcb0d8"),
+    "swarm": ("#8a4f70", "#d8aac4"),
+    "learned": ("#6b6a3c", "#c2c093"),
+}
+
+
+@dataclass(frozen=True)
+class MethodLook:
+    """Name and look of a method.
+
+    Attributes:
+        key: Label of the filter in results.
+        name: Name in tables and figures.
+        long_name: Name in full.
+        family: Family of the method; empty if it is not stated.
+        proposed: Whether a paper of the study proposes the method: filled marks, solid lines.
+        colour: Colour on white ground.
+        dark_colour: Colour on dark ground.
+        marker: Marker of matplotlib.
+        cite: Key of the reference, empty without one.
+        baselines: Labels of the methods with which its paper compares it.
+    """
+
+    key: str
+    name: str
+    long_name: str
+    family: str = ""
+    proposed: bool = False
+    colour: str = _GREY[0]
+    dark_colour: str = _GREY[1]
+    marker: str = MARKERS[0]
+    cite: str = ""
+    baselines: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PartName:
+    """Name of a scenario or a noise regime.
+
+    Attributes:
+        key: Key in results.
+        name: Name in tables and figures.
+        words: Description for a sentence.
+        unit: Unit of the main group; empty for a regime.
+        limit: Error above which a run has lost the track, in `unit`; None without a limit.
+        family: Scenarios of one trajectory have the same family.
+    """
+
+    key: str
+    name: str
+    words: str
+    unit: str = ""
+    limit: float | None = None
+    family: str = ""
+
+
+def find_looks(
+    labels: Sequence[str], blocks: Mapping[str, Mapping[str, Any]] | None = None
+) -> dict[str, MethodLook]:
+    """Return the looks of filters.
+
+    Labels of one method with different settings share colour and differ in marker. A label without
+    a node `paper` has its label as name, the grey of its family, and the next free marker.
+
+    Args:
+        labels: Labels such as "sir" or "sir[particles=100]".
+        blocks: Nodes `paper` that results store, by label, for methods that are not installed.
+
+    Returns:
+        Looks by label, in the order of the labels.
+    """
+    looks = {}
+    for label in dict.fromkeys(labels):
+        method, _, setting = label.partition("[")
+        block = read_paper_block("filter", method) or _own_block(label, blocks or {})
+        name = str(block.get("name", method))
+        look = _parse_look(label, block)
+        looks[label] = replace(look, name=f"{name} [{setting}") if setting else look
+    return _separate_markers(looks)
+
+
+def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
+    """Return the looks of all filters of a study, also of a user's own filters.
+
+    Args:
+        conditions: Conditions of the study.
+    """
+    blocks = {job.label: _stored_block(job.meta, "filter") for c in conditions for job in c.jobs}
+    return find_looks(sorted(blocks), blocks)
+
+
+def study_part_names(conditions: Sequence[Condition], group: str) -> dict[str, PartName]:
+    """Return the names of the scenarios or regimes of a study.
+
+    Args:
+        conditions: Conditions of the study.
+        group: "scenario" or "noise".
+
+    Returns:
+        Names by key, in the order of the conditions.
+    """
+    names = {}
+    for condition in conditions:
+        key = condition.scenario if group == "scenario" else condition.noise
+        block = read_paper_block(group, key) or _stored_block(condition.jobs[0].meta, group)
+        stored = _stored_block(condition.jobs[0].meta, group)  # limits that the jobs had
+        limit = stored.get("divergence_threshold")
+        names[key] = PartName(
+            key,
+            str(block.get("name", key)),
+            str(block.get("words", key)),
+            str(block.get("unit", "")),
+            None if limit is None else float(limit),
+            str(stored.get("family") or key),
+        )
+    return names
+
+
+def plan_look_pairs(looks: Mapping[str, MethodLook]) -> list[tuple[str, str]]:
+    """List the planned pairs of a study.
+
+    Args:
+        looks: Looks by label.
+    """
+    return list_planned_pairs(looks, {key: look.baselines for key, look in looks.items()})
+
+
+def _parse_look(label: str, block: Mapping[str, Any]) -> MethodLook:
+    """Build the look of a label from its node."""
+    family = str(block.get("family", ""))
+    colours = block.get("colour") or FAMILY_COLOURS.get(family, _GREY)
+    return MethodLook(
+        key=label,
+        name=str(block.get("name", label)),
+        long_name=str(block.get("long_name", block.get("name", label))),
+        family=family,
+        proposed=bool(block.get("proposed", False)),
+        colour=str(colours[0]),
+        dark_colour=str(colours[1]),
+        marker=str(block.get("marker", "")),
+        cite=str(block.get("cite", "")),
+        baselines=tuple(map(str, block.get("baselines", ()))),
+    )
+
+
+def _stored_block(meta: Mapping[str, Any], group: str) -> Mapping[str, Any]:
+    """Return the node `paper` that a result stores."""
+    node = meta.get("config", {}).get(group)
+    block = node.get("paper") if isinstance(node, Mapping) else None
+    return block if isinstance(block, Mapping) else {}
+
+
+def _own_block(label: str, blocks: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Return the stored node of a label, empty if it has the name of another method.
+
+    A file without a node inherits that of the file on which it builds.
+    """
+    block = blocks.get(label, {})
+    names = Counter(
+        str(node.get("name")) for node in {k.partition("[")[0]: v for k, v in blocks.items()}.values()
+    )  # fmt: skip
+    name = str(block.get("name", ""))
+    is_inherited = names[name] > 1 or name in _installed_names()
+    return {} if is_inherited else block
+
+
+def installed_colours() -> list[str]:
+    """List the colours of the installed methods on white ground."""
+    blocks = [read_paper_block("filter", key) for key in list_named_parts("filter")]
+    return sorted({str(block["colour"][0]) for block in blocks if "colour" in block})
+
+
+def _installed_names() -> Collection[str]:
+    """Return the names of the installed methods."""
+    blocks = [read_paper_block("filter", key) for key in list_named_parts("filter")]
+    return {str(block.get("name")) for block in blocks}
+
+
+def _separate_markers(looks: Mapping[str, MethodLook]) -> dict[str, MethodLook]:
+    """Give a free marker to looks without one, or with colour and marker of an earlier look."""
+    used: set[tuple[str, str]] = set()
+    separated = {}
+    first = [look for look in looks.values() if look.marker]
+    for look in [*first, *(look for look in looks.values() if not look.marker)]:
+        free = [m for m in MARKERS if (look.colour, m) not in used]
+        is_free = look.marker in free
+        marker = look.marker if is_free else (free or list(MARKERS))[0]
+        used.add((look.colour, marker))
+        separated[look.key] = replace(look, marker=marker)
+    return {key: separated[key] for key in looks}
