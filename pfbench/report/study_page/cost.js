@@ -16,28 +16,49 @@ function drawCost(part) {
   const y = logarithmic(low, high, height - bottom, top);
   const inside = (v) => Math.min(height - bottom, Math.max(top, y(v)));
   const [xLow, xHigh] = [Math.min(...costs) / 1.25, Math.max(...costs) * 1.35];
-  let content = xAxis(logTicks(xLow, xHigh, 6), x, top, height - bottom) + yAxis(logTicks(low, high, 8), y, left, width - right);
+  let content =
+    xAxis(logTicks(xLow, xHigh, 6), x, top, height - bottom) + yAxis(logTicks(low, high, 8), y, left, width - right);
   content += line(left, y(1), width - right, y(1), ' class="rule"');
-  content += label((left + width - right) / 2, height - 6, "ms per step (log) → dearer", ' class="axis" text-anchor="middle"');
+  content += label(
+    (left + width - right) / 2,
+    height - 6,
+    "ms per step (log) → dearer",
+    ' class="axis" text-anchor="middle"',
+  );
   content += `<text class="axis" transform="translate(11 ${(top + height - bottom) / 2}) rotate(-90)" text-anchor="middle">${esc(`error ÷ ${cut(looks[state.baseline].name, 20)} (log) → worse`)}</text>`;
-  const front = view().front.map((key) => rows.find((row) => row.filter === key)).filter(Boolean);
+  const front = view()
+    .front.map((key) => rows.find((row) => row.filter === key))
+    .filter(Boolean);
   if (front.length) {
-    const path = front.map((row, k) => (k ? `H${px(x(row.ms))}V${px(inside(row.ratio))}` : `M${px(x(row.ms))} ${px(inside(row.ratio))}`)).join("");
+    const path = front
+      .map((row, k) =>
+        k ? `H${px(x(row.ms))}V${px(inside(row.ratio))}` : `M${px(x(row.ms))} ${px(inside(row.ratio))}`,
+      )
+      .join("");
     content += `<path d="${path}H${px(width - right)}" fill="none" stroke="var(--faint)" stroke-dasharray="1.5 3"/>`;
   }
   const boxes = rows.map((row) => [x(row.ms) - 6, inside(row.ratio) - 6, x(row.ms) + 6, inside(row.ratio) + 6]);
   for (const row of rows) {
     const look = looks[row.filter];
-    if (row.ratio_low > 0) content += `<line class="c${look.index}" x1="${px(x(row.ms))}" x2="${px(x(row.ms))}" y1="${px(inside(row.ratio_low))}" y2="${px(inside(row.ratio_high))}" stroke="var(--c)" stroke-opacity=".4" stroke-width="2"/>`;
+    if (row.ratio_low > 0)
+      content += `<line class="c${look.index}" x1="${px(x(row.ms))}" x2="${px(x(row.ms))}" y1="${px(inside(row.ratio_low))}" y2="${px(inside(row.ratio_high))}" stroke="var(--c)" stroke-opacity=".4" stroke-width="2"/>`;
   }
   for (const row of rows) {
     const words = `${looks[row.filter].name}: ratio ${short(row.ratio)} ${interval(row.ratio_low, row.ratio_high)}, ${short(row.ms)} ms per step`;
     content += `<g${spoken(words)}>${mark(looks[row.filter], x(row.ms), inside(row.ratio), 5)}</g>`;
   }
-  const important = (row) => (looks[row.filter].proposed ? 0 : view().front.includes(row.filter) || row.filter === state.baseline ? 1 : 2);
-  for (const row of [...rows].sort((a, b) => important(a) - important(b))) content += nameBeside(row, x(row.ms), inside(row.ratio), y(row.ratio), boxes, [left, top, width, height - bottom]);
+  const important = (row) =>
+    looks[row.filter].proposed ? 0 : view().front.includes(row.filter) || row.filter === state.baseline ? 1 : 2;
+  for (const row of [...rows].sort((a, b) => important(a) - important(b)))
+    content += nameBeside(row, x(row.ms), inside(row.ratio), y(row.ratio), boxes, [left, top, width, height - bottom]);
   const first = looks[view().rows[0].filter].name;
-  part.innerHTML = svg(width, height, content, `Error ratio against milliseconds per step of ${rows.length} filters. The smallest error has ${first}.`, "group");
+  part.innerHTML = svg(
+    width,
+    height,
+    content,
+    `Error ratio against milliseconds per step of ${rows.length} filters. The smallest error has ${first}.`,
+    "group",
+  );
 }
 
 // The name where it covers nothing, or not at all: the tooltip has it too.
@@ -45,7 +66,16 @@ function nameBeside(row, x, y, wanted, boxes, [left, top, right, bottom]) {
   const look = looks[row.filter];
   const text = cut(look.name, 18) + (Math.abs(y - wanted) > 1 ? ` ${short(row.ratio)} ${wanted < y ? "↑" : "↓"}` : "");
   const length = text.length * (look.proposed ? 7 : 6.3);
-  const places = [[8, 4, 0], [-8 - length, 4, 0], [-length / 2, -9, 0], [-length / 2, 18, 0], [7, -7, 0], [7, 15, 0], [-7 - length, -7, 0], [-7 - length, 15, 0]];
+  const places = [
+    [8, 4, 0],
+    [-8 - length, 4, 0],
+    [-length / 2, -9, 0],
+    [-length / 2, 18, 0],
+    [7, -7, 0],
+    [7, 15, 0],
+    [-7 - length, -7, 0],
+    [-7 - length, 15, 0],
+  ];
   for (const [dx, dy] of places) {
     const box = [x + dx, y + dy - 10, x + dx + length, y + dy + 2];
     if (box[0] < left || box[2] > right || box[1] < top - 12 || box[3] > bottom) continue;

@@ -16,9 +16,13 @@ function short(value, digits = 3) {
   if (exponent < -4 || exponent >= 6) return rounded.toExponential(digits - 1).replace("e+", "e");
   return rounded.toFixed(Math.max(0, digits - 1 - exponent));
 }
-const tidy = (value) => short(value, 6).replace(/(\.\d*?)0+$/, "$1").replace(/\.$/, "");
+const tidy = (value) =>
+  short(value, 6)
+    .replace(/(\.\d*?)0+$/, "$1")
+    .replace(/\.$/, "");
 const percent = (share) => (share === null || share === undefined ? "–" : `${(100 * share).toFixed(0)} %`);
-const interval = (low, high) => (low === null || high === null || low === undefined ? "" : `[${short(low)}, ${short(high)}]`);
+const interval = (low, high) =>
+  low === null || high === null || low === undefined ? "" : `[${short(low)}, ${short(high)}]`;
 const change = (ratio) => {
   const value = 100 * (ratio - 1);
   return ratio >= 2 ? `${short(ratio)} ×` : `${value > 0 ? "+" : value < 0 ? "−" : ""}${short(Math.abs(value))} %`;
@@ -53,7 +57,7 @@ function logTicks(low, high, count) {
   }
   const every = Math.ceil(ticks.length / Math.max(2, count));
   if (every > 1) ticks = ticks.filter((_, k) => k % every === 0);
-  return ticks.length > 1 ? ticks : [low, high];
+  return ticks.length > 1 ? ticks : linearTicks(low, high, Math.min(count, 4));
 }
 
 // Marks: one path a shape, of half the size 1.
@@ -61,15 +65,28 @@ const star = [...Array(10).keys()].map((k) => {
   const r = k % 2 ? 0.5 : 1.25;
   return `${(r * Math.sin((k * Math.PI) / 5)).toFixed(2)} ${(-r * Math.cos((k * Math.PI) / 5)).toFixed(2)}`;
 });
-const polygon = (corners) => `M${[...Array(corners).keys()].map((k) => {
-  const angle = (2 * Math.PI * k) / corners;
-  return `${(1.1 * Math.sin(angle)).toFixed(2)} ${(-1.1 * Math.cos(angle)).toFixed(2)}`;
-}).join("L")}Z`;
+const polygon = (corners) =>
+  `M${[...Array(corners).keys()]
+    .map((k) => {
+      const angle = (2 * Math.PI * k) / corners;
+      return `${(1.1 * Math.sin(angle)).toFixed(2)} ${(-1.1 * Math.cos(angle)).toFixed(2)}`;
+    })
+    .join("L")}Z`;
 const shapes = {
-  o: "M-1 0A1 1 0 1 1 1 0A1 1 0 1 1 -1 0Z", s: "M-.9-.9H.9V.9H-.9Z", D: "M0-1.25 1.25 0 0 1.25-1.25 0Z", d: "M0-1.35.8 0 0 1.35-.8 0Z",
-  "^": "M0-1.15 1.15.9H-1.15Z", v: "M0 1.15 1.15-.9H-1.15Z", "<": "M-1.15 0 .9-1.15V1.15Z", ">": "M1.15 0-.9-1.15V1.15Z",
-  "*": `M${star.join("L")}Z`, p: polygon(5), h: polygon(6), 8: polygon(8),
-  P: "M-.4-1.1H.4V-.4H1.1V.4H.4V1.1H-.4V.4H-1.1V-.4H-.4Z", X: "M-1.1-.6-.6-1.1 0-.5.6-1.1 1.1-.6.5 0 1.1.6.6 1.1 0 .5-.6 1.1-1.1.6-.5 0Z",
+  o: "M-1 0A1 1 0 1 1 1 0A1 1 0 1 1 -1 0Z",
+  s: "M-.9-.9H.9V.9H-.9Z",
+  D: "M0-1.25 1.25 0 0 1.25-1.25 0Z",
+  d: "M0-1.35.8 0 0 1.35-.8 0Z",
+  "^": "M0-1.15 1.15.9H-1.15Z",
+  v: "M0 1.15 1.15-.9H-1.15Z",
+  "<": "M-1.15 0 .9-1.15V1.15Z",
+  ">": "M1.15 0-.9-1.15V1.15Z",
+  "*": `M${star.join("L")}Z`,
+  p: polygon(5),
+  h: polygon(6),
+  8: polygon(8),
+  P: "M-.4-1.1H.4V-.4H1.1V.4H.4V1.1H-.4V.4H-1.1V-.4H-.4Z",
+  X: "M-1.1-.6-.6-1.1 0-.5.6-1.1 1.1-.6.5 0 1.1.6.6 1.1 0 .5-.6 1.1-1.1.6-.5 0Z",
 };
 // A filter's mark: filled if proposed, hollow if not.
 function mark(look, x, y, size = 5, more = "") {
@@ -91,10 +108,22 @@ const widthOf = (part) => Math.max(280, part.clientWidth || 640);
 
 // Axes with lines across the figure.
 function xAxis(ticks, scale, top, bottom, format = tidy) {
-  return ticks.map((v) => line(scale(v), top, scale(v), bottom, ' class="grid"') + label(scale(v), bottom + 14, format(v), ' class="axis" text-anchor="middle"')).join("");
+  return ticks
+    .map(
+      (v) =>
+        line(scale(v), top, scale(v), bottom, ' class="grid"') +
+        label(scale(v), bottom + 14, format(v), ' class="axis" text-anchor="middle"'),
+    )
+    .join("");
 }
 function yAxis(ticks, scale, left, right, format = tidy) {
-  return ticks.map((v) => line(left, scale(v), right, scale(v), ' class="grid"') + label(left - 6, scale(v) + 4, format(v), ' class="axis" text-anchor="end"')).join("");
+  return ticks
+    .map(
+      (v) =>
+        line(left, scale(v), right, scale(v), ' class="grid"') +
+        label(left - 6, scale(v) + 4, format(v), ' class="axis" text-anchor="end"'),
+    )
+    .join("");
 }
 
 // Names cut to a width, with the whole name in the tooltip of the mark.

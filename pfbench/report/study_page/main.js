@@ -1,8 +1,15 @@
 // The first screen is drawn at once, each figure when it comes near, and after a switch only what is visible.
 const figures = [
-  ["#planned .figure", drawForest, false], ["#worlds .panels", drawWorlds, true], ["#time > .figure", drawTime, true],
-  ["#calibration .figure", drawCalibration, true], ["#dots", drawRuns, true], ["#sweeps .panels", drawSweeps, false], ["#table table", drawTable, true],
-].map(([selector, draw, follows]) => ({ part: find(selector), draw, follows, stale: true, near: false })).filter((figure) => figure.part);
+  ["#planned .figure", drawForest, false],
+  ["#worlds .panels", drawWorlds, true],
+  ["#time > .figure", drawTime, true],
+  ["#calibration .figure", drawCalibration, true],
+  ["#dots", drawRuns, true],
+  ["#sweeps .panels", drawSweeps, false],
+  ["#table table", drawTable, true],
+]
+  .map(([selector, draw, follows]) => ({ part: find(selector), draw, follows, stale: true, near: false }))
+  .filter((figure) => figure.part);
 
 function refresh(everything = false) {
   for (const figure of figures) {
@@ -16,7 +23,13 @@ function drawView(changed = true) {
   drawBoard();
   drawCost(find("#cost .figure"));
   for (const select of findAll("select.cell")) {
-    select.innerHTML = data.cells.filter((cell) => data.curves[keyOf(cell)] || data.runs[keyOf(cell)]).map((cell) => `<option value="${esc(keyOf(cell))}"${keyOf(cell) === state.cell ? " selected" : ""}>${esc(cellName(cell))}</option>`).join("");
+    select.innerHTML = data.cells
+      .filter((cell) => data.curves[keyOf(cell)] || data.runs[keyOf(cell)])
+      .map(
+        (cell) =>
+          `<option value="${esc(keyOf(cell))}"${keyOf(cell) === state.cell ? " selected" : ""}>${esc(cellName(cell))}</option>`,
+      )
+      .join("");
   }
   for (const figure of figures) figure.stale ||= changed && figure.follows;
   refresh();
@@ -47,7 +60,9 @@ function press(target) {
   } else if (row !== undefined) {
     state.open = state.open === row ? null : row;
     drawBoard();
-    findAll("[data-row]").find((button) => button.dataset.row === row).focus();
+    findAll("[data-row]")
+      .find((button) => button.dataset.row === row)
+      .focus();
   } else if (regime) {
     choose("regime", regime);
     drawView();
@@ -67,7 +82,9 @@ function press(target) {
     if (navigator.clipboard) navigator.clipboard.writeText(text).then(done, () => selectText(copy));
     else selectText(copy);
   } else if (target.id === "theme") {
-    const dark = document.documentElement.dataset.theme ? document.documentElement.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+    const dark = document.documentElement.dataset.theme
+      ? document.documentElement.dataset.theme === "dark"
+      : matchMedia("(prefers-color-scheme: dark)").matches;
     document.documentElement.dataset.theme = dark ? "light" : "dark";
   }
 }
@@ -77,7 +94,9 @@ function selectText(id) {
 
 function listen() {
   document.addEventListener("click", (event) => {
-    const target = event.target.closest("[data-sort],[data-row],[data-regime],[data-toggle],[data-dot],[data-copy],#theme");
+    const target = event.target.closest(
+      "[data-sort],[data-row],[data-regime],[data-toggle],[data-dot],[data-copy],#theme",
+    );
     if (target) press(target);
   });
   document.addEventListener("change", (event) => {
@@ -136,10 +155,13 @@ async function start() {
   if (innerWidth <= 640) for (const fold of findAll(".fold")) fold.open = false;
   listen();
   drawView();
-  const watch = new IntersectionObserver((entries) => {
-    for (const entry of entries) figures.find((figure) => figure.part === entry.target).near = entry.isIntersecting;
-    refresh();
-  }, { rootMargin: "400px" });
+  const watch = new IntersectionObserver(
+    (entries) => {
+      for (const entry of entries) figures.find((figure) => figure.part === entry.target).near = entry.isIntersecting;
+      refresh();
+    },
+    { rootMargin: "400px" },
+  );
   for (const figure of figures) watch.observe(figure.part);
   document.documentElement.dataset.ready = Math.round(performance.now());
 }

@@ -1,5 +1,6 @@
 // Planned comparisons as a forest, and curves over a parameter.
-const verdictStyle = (word) => (/better/.test(word) ? "better" : /worse/.test(word) ? "worse" : /equal|equivalent/.test(word) ? "equal" : "open");
+const verdictStyle = (word) =>
+  /better/.test(word) ? "better" : /worse/.test(word) ? "worse" : /equal|equivalent/.test(word) ? "equal" : "open";
 
 function drawForest(part) {
   const pairs = data.planned.filter((pair) => pair.estimate > 0);
@@ -7,7 +8,15 @@ function drawForest(part) {
   const width = widthOf(part);
   const narrow = width < 700;
   const [left, right] = narrow ? [8, 8] : [Math.min(310, width * 0.27), Math.min(290, width * 0.25)];
-  const ends = pairs.flatMap((pair) => [pair.low, pair.high, pair.estimate, ...pair.cells.map((cell) => cell.estimate), ...(pair.new_world ? [pair.new_world.low, pair.new_world.high] : [])]).filter((v) => v > 0);
+  const ends = pairs
+    .flatMap((pair) => [
+      pair.low,
+      pair.high,
+      pair.estimate,
+      ...pair.cells.map((cell) => cell.estimate),
+      ...(pair.new_world ? [pair.new_world.low, pair.new_world.high] : []),
+    ])
+    .filter((v) => v > 0);
   const low = Math.min(0.9, Math.max(1 / 30, Math.min(...ends))) / 1.05;
   const high = Math.max(1.1, Math.min(30, Math.max(...ends))) * 1.05;
   const x = logarithmic(low, high, left, width - right);
@@ -30,12 +39,36 @@ function drawForest(part) {
     const step = Math.min(5, 40 / Math.max(1, small.length));
     const height = Math.max(30, 20 + step * small.length) + rise;
     const middle = y + rise + 11;
-    if (narrow) content += label(left, y + 12, cut(names, Math.floor((width - 110) / 6.2)), ' style="font-size:11.5px"') + label(width, y + 12, `${change(pair.estimate)} ${pair.word}`, ` text-anchor="end" style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`);
-    else content += label(left - 12, middle + 4, cut(names, Math.floor(left / 6.6)), ' text-anchor="end"') + label(width - right + 12, middle + 4, `${words} ${pair.word}`, ` style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`);
+    if (narrow)
+      content +=
+        label(left, y + 12, cut(names, Math.floor((width - 110) / 6.2)), ' style="font-size:11.5px"') +
+        label(
+          width,
+          y + 12,
+          `${change(pair.estimate)} ${pair.word}`,
+          ` text-anchor="end" style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`,
+        );
+    else
+      content +=
+        label(left - 12, middle + 4, cut(names, Math.floor(left / 6.6)), ' text-anchor="end"') +
+        label(
+          width - right + 12,
+          middle + 4,
+          `${words} ${pair.word}`,
+          ` style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`,
+        );
     content += `<g${spoken(`${group}. ${names}: ${words}, ${pair.word}. ${plain(pair.sentence)}`)}><rect x="${left}" y="${px(y + rise)}" width="${px(width - left - right)}" height="${px(height - rise - 4)}" fill="transparent"/>`;
-    if (pair.prediction) content += line(inside(pair.prediction[0]), middle, inside(pair.prediction[1]), middle, ' stroke="var(--faint)" stroke-width="1"');
+    if (pair.prediction)
+      content += line(
+        inside(pair.prediction[0]),
+        middle,
+        inside(pair.prediction[1]),
+        middle,
+        ' stroke="var(--faint)" stroke-width="1"',
+      );
     if (pair.new_world) content += bar(inside(pair.new_world.low), inside(pair.new_world.high), middle, 3, a, 0.45);
-    content += bar(inside(pair.low), inside(pair.high), middle, 6, a, 0.85) + mark(a, inside(pair.estimate), middle, 6) + "</g>";
+    content +=
+      bar(inside(pair.low), inside(pair.high), middle, 6, a, 0.85) + mark(a, inside(pair.estimate), middle, 6) + "</g>";
     small.forEach((cell, k) => {
       const level = middle + 10 + step * (k + 0.5);
       const text = `${cell.name || cellName(cell)}: ${change(cell.estimate)} [${change(cell.low)}, ${change(cell.high)}]`;
@@ -43,8 +76,18 @@ function drawForest(part) {
     });
     y += height;
   }
-  const frame = xAxis(logTicks(low, high, narrow ? 5 : 9), x, 10, y) + line(x(1), 10, x(1), y, ' class="rule"') + label(inside(low), y + 30, "← smaller error", ' class="axis"') + label(width - right, y + 30, "larger error →", ' class="axis" text-anchor="end"');
-  part.innerHTML = svg(width, y + 36, frame + content, `Planned comparisons: ${pairs.map((pair) => `${looks[pair.a].name} against ${looks[pair.b].name}: ${pair.word}`).join("; ")}.`, "group");
+  const frame =
+    xAxis(logTicks(low, high, narrow ? 5 : 9), x, 10, y) +
+    line(x(1), 10, x(1), y, ' class="rule"') +
+    label(inside(low), y + 30, "← smaller error", ' class="axis"') +
+    label(width - right, y + 30, "larger error →", ' class="axis" text-anchor="end"');
+  part.innerHTML = svg(
+    width,
+    y + 36,
+    frame + content,
+    `Planned comparisons: ${pairs.map((pair) => `${looks[pair.a].name} against ${looks[pair.b].name}: ${pair.word}`).join("; ")}.`,
+    "group",
+  );
 }
 
 function drawSweeps(part) {
@@ -55,7 +98,9 @@ function drawSweep(panel, sweep) {
   const width = widthOf(panel);
   const height = 260;
   const [left, right, top, bottom] = [48, 110, 24, 38];
-  const points = Object.values(sweep.filters).flat().filter((point) => point.value > 0);
+  const points = Object.values(sweep.filters)
+    .flat()
+    .filter((point) => point.value > 0);
   if (!points.length) return;
   const xs = points.map((point) => point.x);
   const logX = Math.min(...xs) > 0 && Math.max(...xs) / Math.min(...xs) >= 20;
@@ -66,18 +111,41 @@ function drawSweep(panel, sweep) {
   const y = logarithmic(yLow, yHigh, height - bottom, top);
   const ticks = [...new Set(xs)].length <= 7 ? [...new Set(xs)] : (logX ? logTicks : linearTicks)(xLow, xHigh, 6);
   let content = xAxis(ticks, x, top, height - bottom) + yAxis(logTicks(yLow, yHigh, 6), y, left, width - right);
-  content += label(0, 12, cut(`${named(data.worlds, sweep.world)}${sweep.regime ? `, ${named(data.regimes, sweep.regime)}` : ""}`, 60), ' class="strong"');
-  content += label((left + width - right) / 2, height - 6, `${sweep.name}${sweep.unit ? ` [${sweep.unit}]` : ""}${logX ? " (log)" : ""}`, ' class="axis" text-anchor="middle"');
-  const lines = Object.entries(sweep.filters).map(([key, values]) => [looks[key], values.filter((point) => point.value > 0)]).filter(([look, values]) => look && values.length);
-  const heights = spread(lines.map(([, values]) => y(values[values.length - 1].value)), 13, top, height - bottom);
+  content += label(
+    0,
+    12,
+    cut(`${named(data.worlds, sweep.world)}${sweep.regime ? `, ${named(data.regimes, sweep.regime)}` : ""}`, 60),
+    ' class="strong"',
+  );
+  content += label(
+    (left + width - right) / 2,
+    height - 6,
+    `${sweep.name}${sweep.unit ? ` [${sweep.unit}]` : ""}${logX ? " (log)" : ""}`,
+    ' class="axis" text-anchor="middle"',
+  );
+  const lines = Object.entries(sweep.filters)
+    .map(([key, values]) => [looks[key], values.filter((point) => point.value > 0)])
+    .filter(([look, values]) => look && values.length);
+  const heights = spread(
+    lines.map(([, values]) => y(values[values.length - 1].value)),
+    13,
+    top,
+    height - bottom,
+  );
   lines.forEach(([look, values], k) => {
     const path = values.map((point, i) => `${i ? "L" : "M"}${px(x(point.x))} ${px(y(point.value))}`).join("");
     content += `<path class="c${look.index}" d="${path}" fill="none" stroke="var(--c)" stroke-width="1.6"${look.proposed ? "" : ' stroke-dasharray="5 3"'}/>`;
     for (const point of values) {
-      if (point.low > 0) content += `<line class="c${look.index}" x1="${px(x(point.x))}" x2="${px(x(point.x))}" y1="${px(y(point.low))}" y2="${px(y(point.high))}" stroke="var(--c)" stroke-opacity=".5"/>`;
+      if (point.low > 0)
+        content += `<line class="c${look.index}" x1="${px(x(point.x))}" x2="${px(x(point.x))}" y1="${px(y(point.low))}" y2="${px(y(point.high))}" stroke="var(--c)" stroke-opacity=".5"/>`;
       content += `<g${spoken(`${look.name}, ${sweep.name} ${tidy(point.x)}: ${short(point.value)} ${sweep.value_unit || ""} ${interval(point.low, point.high)}`)}>${mark(look, x(point.x), y(point.value), 4)}</g>`;
     }
-    content += label(width - right + 8, heights[k] + 4, cut(look.name, 16), ` style="font-size:11px"${look.proposed ? ' class="strong"' : ""}`);
+    content += label(
+      width - right + 8,
+      heights[k] + 4,
+      cut(look.name, 16),
+      ` style="font-size:11px"${look.proposed ? ' class="strong"' : ""}`,
+    );
   });
   panel.innerHTML = `${svg(width, height, content, sweep.caption || `${sweep.name} and error`, "group")}<p class="note">${esc(sweep.caption || "")}</p>`;
 }

@@ -4,7 +4,11 @@ let dots = null; // geometry of the dots that are drawn: condition, filters, sca
 const currentCell = () => data.cells.find((cell) => keyOf(cell) === state.cell);
 const runValues = (key) => decode(data.runs[state.cell].values[key]);
 const runFilters = () => order().filter((look) => data.runs[state.cell] && data.runs[state.cell].values[look.key]);
-const byError = (key) => runValues(key).map((v, k) => [v === null ? Infinity : v, k]).sort((a, b) => a[0] - b[0] || a[1] - b[1]).map(([, k]) => k);
+const byError = (key) =>
+  runValues(key)
+    .map((v, k) => [v === null ? Infinity : v, k])
+    .sort((a, b) => a[0] - b[0] || a[1] - b[1])
+    .map(([, k]) => k);
 
 function drawRuns(part) {
   const cell = data.runs[state.cell];
@@ -17,20 +21,48 @@ function drawRuns(part) {
   const width = widthOf(part);
   const [left, right, top, rowHeight] = [124, 46, 8, 19];
   const bottom = top + rowHeight * filters.length;
-  const values = filters.flatMap((look) => runValues(look.key)).filter((v) => v > 0).sort((a, b) => a - b);
+  const values = filters
+    .flatMap((look) => runValues(look.key))
+    .filter((v) => v > 0)
+    .sort((a, b) => a - b);
   const low = (values[0] || 1) / 1.15;
-  const high = Math.max(Math.min((values[values.length - 1] || 1) * 1.2, (values[Math.floor(values.length / 2)] || 1) * 200), low * 1.5);
+  const high = Math.max(
+    Math.min((values[values.length - 1] || 1) * 1.2, (values[Math.floor(values.length / 2)] || 1) * 200),
+    low * 1.5,
+  );
   const x = logarithmic(low, high, left, width - right);
-  const place = (v) => (v === null ? width - right + 24 : Math.min(width - right, Math.max(left, x(Math.max(v, 1e-12)))));
+  const place = (v) =>
+    v === null ? width - right + 24 : Math.min(width - right, Math.max(left, x(Math.max(v, 1e-12))));
   const level = (k) => top + rowHeight * (k + 0.5);
-  let content = xAxis(logTicks(low, high, 7), x, top, bottom) + label((left + width - right) / 2, bottom + 30, `${cell.name || "error"} of a run [${cell.unit}] (log)`, ' class="axis" text-anchor="middle"');
-  if (filters.some((look) => runValues(look.key).includes(null))) content += label(width - right + 24, bottom + 14, "lost", ' class="axis" text-anchor="middle"');
+  let content =
+    xAxis(logTicks(low, high, 7), x, top, bottom) +
+    label(
+      (left + width - right) / 2,
+      bottom + 30,
+      `${cell.name || "error"} of a run [${cell.unit}] (log)`,
+      ' class="axis" text-anchor="middle"',
+    );
+  if (filters.some((look) => runValues(look.key).includes(null)))
+    content += label(width - right + 24, bottom + 14, "lost", ' class="axis" text-anchor="middle"');
   filters.forEach((look, k) => {
-    content += label(left - 8, level(k) + 4, cut(look.name, 18), ` text-anchor="end" style="font-size:11.5px"${look.proposed ? ' class="strong"' : ""}`);
-    const circles = runValues(look.key).map((v, j) => `<circle cx="${px(place(v))}" cy="${px(level(k))}" r="3.4" data-dot="${k} ${j}"/>`).join("");
+    content += label(
+      left - 8,
+      level(k) + 4,
+      cut(look.name, 18),
+      ` text-anchor="end" style="font-size:11.5px"${look.proposed ? ' class="strong"' : ""}`,
+    );
+    const circles = runValues(look.key)
+      .map((v, j) => `<circle cx="${px(place(v))}" cy="${px(level(k))}" r="3.4" data-dot="${k} ${j}"/>`)
+      .join("");
     content += `<g class="c${look.index}" fill="var(--c)" fill-opacity=".3">${circles}</g>`;
   });
-  part.innerHTML = svg(width, bottom + 36, `${content}<g id="chosen"></g>`, `All runs of ${filters.length} filters in ${cellName(currentCell())}.`, "group");
+  part.innerHTML = svg(
+    width,
+    bottom + 36,
+    `${content}<g id="chosen"></g>`,
+    `All runs of ${filters.length} filters in ${cellName(currentCell())}.`,
+    "group",
+  );
   dots = { filters, place, level };
   if (state.run === null || !filters.some((look) => look.key === state.filter)) {
     const best = byError(filters[0].key);
@@ -48,35 +80,52 @@ function drawRun(focus) {
   const value = runValues(state.filter)[state.run];
   const number = cell.numbers[state.run];
   const error = (key) => runValues(key)[state.run];
-  const path = dots.filters.map((item, k) => `${k ? "L" : "M"}${px(dots.place(error(item.key)))} ${px(dots.level(k))}`).join("");
+  const path = dots.filters
+    .map((item, k) => `${k ? "L" : "M"}${px(dots.place(error(item.key)))} ${px(dots.level(k))}`)
+    .join("");
   const row = dots.filters.indexOf(look);
   const text = value === null ? "lost" : `${short(value, 2)} ${cell.unit}`;
   const words = `${look.name}, run ${number}: ${text}`;
-  find("#chosen").innerHTML = `<path d="${path}" fill="none" stroke="var(--ink)" stroke-opacity=".4" pointer-events="none"/>` +
+  find("#chosen").innerHTML =
+    `<path d="${path}" fill="none" stroke="var(--ink)" stroke-opacity=".4" pointer-events="none"/>` +
     `<circle class="c${look.index}" id="dot" cx="${px(dots.place(value))}" cy="${px(dots.level(row))}" r="6" fill="var(--c)" stroke="var(--ink)" stroke-width="1.5" tabindex="0" role="button" aria-label="${esc(words)}"${tip(words)}/>`;
   if (focus) find("#dot").focus();
   const place = currentCell();
-  const rank = 1 + dots.filters.filter((item) => error(item.key) !== null && (value === null || error(item.key) < value)).length;
+  const rank =
+    1 + dots.filters.filter((item) => error(item.key) !== null && (value === null || error(item.key) < value)).length;
   const fill = { world: place.world, regime: place.regime, filter: look.key, run: number, model: place.model };
-  const command = data.replay ? data.replay.replace(/\{(\w+)\}/g, (all, name) => (name in fill ? fill[name] : all)) : "";
-  find("#runwords").innerHTML = `Run ${esc(number)} of ${esc(cellName(place))}: ${icon(look)}<b>${esc(look.name)}</b> ${esc(text)}, rank ${rank} of ${dots.filters.length} in this run.${command ? ` Repeat it: <code>${esc(command)}</code>` : ""}`;
+  const command = data.replay
+    ? data.replay.replace(/\{(\w+)\}/g, (all, name) => (name in fill ? fill[name] : all))
+    : "";
+  find("#runwords").innerHTML =
+    `Run ${esc(number)} of ${esc(cellName(place))}: ${icon(look)}<b>${esc(look.name)}</b> ${esc(text)}, rank ${rank} of ${dots.filters.length} in this run.${command ? ` Repeat it: <code>${esc(command)}</code>` : ""}`;
   drawTrack(look, number, cell);
 }
 
 function drawTrack(look, number, cell) {
   const part = data.tracks[state.cell];
   const carried = part && part.numbers.includes(number) && part.error[look.key] && part.error[look.key][number];
-  const few = part && part.numbers.length < cell.numbers.length ? ` The page carries tracks of ${part.numbers.length} of ${cell.numbers.length} runs of this condition: ${[...part.numbers].sort((a, b) => a - b).join(", ")}.` : "";
+  const few =
+    part && part.numbers.length < cell.numbers.length
+      ? ` The page carries tracks of ${part.numbers.length} of ${cell.numbers.length} runs of this condition: ${[...part.numbers].sort((a, b) => a - b).join(", ")}.`
+      : "";
   find("#plane").innerHTML = "";
   find("#runtimes").innerHTML = "";
-  find("#planenote").textContent = carried ? `${part.note || ""}${few}` : part ? `No track of this run is in the page.${few} The command shows it.` : "No tracks are in the page. The command shows them.";
+  find("#planenote").textContent = carried
+    ? `${part.note || ""}${few}`
+    : part
+      ? `No track of this run is in the page.${few} The command shows it.`
+      : "No tracks are in the page. The command shows them.";
   if (!carried) return;
   const truth = part.truth && (part.truth[number] || part.truth.all);
   if (truth && part.plane[look.key]) drawPlane(find("#plane"), look, truth, decode(part.plane[look.key][number]));
   const times = [];
   const add = (filters, head, unit, isLog) => {
-    const lines = order().filter((item) => (item === look || state.on.has(item.key)) && filters[item.key] && filters[item.key][number]).map((item) => ({ look: item, values: decode(filters[item.key][number]), bold: item === look }));
-    if (lines.length) times.push({ t: part.t, lines, head, unit, isLog, height: 210, caption: `${head} of run ${number} over time` });
+    const lines = order()
+      .filter((item) => (item === look || state.on.has(item.key)) && filters[item.key] && filters[item.key][number])
+      .map((item) => ({ look: item, values: decode(filters[item.key][number]), bold: item === look }));
+    if (lines.length)
+      times.push({ t: part.t, lines, head, unit, isLog, height: 210, caption: `${head} of run ${number} over time` });
   };
   add(part.error, "error of the run", part.unit, true);
   for (const trace of part.traces) add(trace.filters, trace.name, trace.unit, trace.log !== false);
@@ -86,7 +135,9 @@ function drawTrack(look, number, cell) {
 
 function drawPlane(part, look, truth, flat) {
   const errors = truth.map((_, k) => [flat[2 * k], flat[2 * k + 1]]);
-  const usable = errors.map((error, k) => [error, truth[k]]).filter(([error]) => error[0] !== null && error[1] !== null);
+  const usable = errors
+    .map((error, k) => [error, truth[k]])
+    .filter(([error]) => error[0] !== null && error[1] !== null);
   if (!usable.length) return;
   const extent = (points, axis) => Math.max(...points.map((p) => p[axis])) - Math.min(...points.map((p) => p[axis]));
   const span = Math.max(extent(truth, 0), extent(truth, 1));
@@ -100,24 +151,31 @@ function drawPlane(part, look, truth, flat) {
   const [left, right, top, bottom] = [52, 12, 10, 36];
   const points = [...truth, ...track];
   const mid = (axis) => (Math.max(...points.map((p) => p[axis])) + Math.min(...points.map((p) => p[axis]))) / 2;
-  const scale = Math.max(extent(points, 0) / (width - left - right), extent(points, 1) / (height - top - bottom)) * 1.1 || 1;
+  const scale =
+    Math.max(extent(points, 0) / (width - left - right), extent(points, 1) / (height - top - bottom)) * 1.1 || 1;
   const [cx, cy] = [mid(0), mid(1)];
   const x = (v) => (left + width - right) / 2 + (v - cx) / scale;
   const y = (v) => (top + height - bottom) / 2 - (v - cy) / scale;
   const half = [((width - left - right) / 2) * scale, ((height - top - bottom) / 2) * scale];
   const inKm = Math.max(...half) > 3000;
   const format = (v) => tidy(v / (inKm ? 1000 : 1));
-  let content = xAxis(linearTicks(cx - half[0], cx + half[0], 5), x, top, height - bottom, format) + yAxis(linearTicks(cy - half[1], cy + half[1], 5), y, left, width - right, format);
+  let content =
+    xAxis(linearTicks(cx - half[0], cx + half[0], 5), x, top, height - bottom, format) +
+    yAxis(linearTicks(cy - half[1], cy + half[1], 5), y, left, width - right, format);
   const path = (list) => `M${list.map((p) => `${px(x(p[0]))} ${px(y(p[1]))}`).join("L")}`;
   const unit = inKm ? "km" : "m";
   track.forEach((p, k) => {
-    if (k % 3 === 0) content += `<line class="c${look.index}" x1="${px(x(usable[k][1][0]))}" y1="${px(y(usable[k][1][1]))}" x2="${px(x(p[0]))}" y2="${px(y(p[1]))}" stroke="var(--c)" stroke-opacity=".3"/>`;
+    if (k % 3 === 0)
+      content += `<line class="c${look.index}" x1="${px(x(usable[k][1][0]))}" y1="${px(y(usable[k][1][1]))}" x2="${px(x(p[0]))}" y2="${px(y(p[1]))}" stroke="var(--c)" stroke-opacity=".3"/>`;
   });
   content += `<path d="${path(truth)}" fill="none" stroke="var(--ink)" stroke-width="2.4"/><path class="c${look.index}" d="${path(track)}" fill="none" stroke="var(--c)" stroke-width="1.8" stroke-dasharray="7 2"/>`;
-  content += mark(look, x(track[track.length - 1][0]), y(track[track.length - 1][1]), 5.5) + label((left + width - right) / 2, height - 4, `East [${unit}]`, ' class="axis" text-anchor="middle"');
+  content +=
+    mark(look, x(track[track.length - 1][0]), y(track[track.length - 1][1]), 5.5) +
+    label((left + width - right) / 2, height - 4, `East [${unit}]`, ' class="axis" text-anchor="middle"');
   content += `<text class="axis" transform="translate(11 ${px((top + height - bottom) / 2)}) rotate(-90)" text-anchor="middle">North [${unit}]</text>`;
   part.innerHTML = svg(width, height, content, `Track of ${look.name} on the plane with the true track.`);
-  find("#planenote").textContent = `Plain line: truth. Dashed line: ${look.name}, with its mark at the end.${factor > 1 ? ` The errors are drawn ${factor} times as large.` : ""} ${find("#planenote").textContent}`;
+  find("#planenote").textContent =
+    `Plain line: truth. Dashed line: ${look.name}, with its mark at the end.${factor > 1 ? ` The errors are drawn ${factor} times as large.` : ""} ${find("#planenote").textContent}`;
 }
 
 // Arrow keys: left and right along the runs of a filter, up and down between filters.

@@ -1,5 +1,17 @@
 // The data of the page and the view that is shown.
-const state = { metric: "", world: "", regime: "", baseline: "", sort: "rank", down: false, open: null, on: new Set(), cell: "", run: null, filter: null };
+const state = {
+  metric: "",
+  world: "",
+  regime: "",
+  baseline: "",
+  sort: "rank",
+  down: false,
+  open: null,
+  on: new Set(),
+  cell: "",
+  run: null,
+  filter: null,
+};
 const axes = ["metric", "world", "regime", "baseline"];
 let data = null;
 let looks = {};
@@ -12,7 +24,9 @@ async function unpack() {
   data = await new Response(stream).json();
   data.filters.forEach((look, index) => (look.index = index));
   looks = Object.fromEntries(data.filters.map((look) => [look.key, look]));
-  viewKeys = Object.entries(data.views).flatMap(([scope, part]) => Object.keys(part.baselines).map((baseline) => `${scope}/${baseline}`));
+  viewKeys = Object.entries(data.views).flatMap(([scope, part]) =>
+    Object.keys(part.baselines).map((baseline) => `${scope}/${baseline}`),
+  );
 }
 
 // Numbers from levels of equal ratio (encoding.py). Level 0 is a missing value.
@@ -60,9 +74,13 @@ function viewOf(key) {
 }
 const metricOf = () => data.metrics.find((metric) => metric.key === state.metric);
 const named = (items, key) => (items.find((item) => item.key === key) || { name: key }).name;
-const cellName = (cell) => (data.regimes.length > 1 ? `${named(data.worlds, cell.world)}, ${named(data.regimes, cell.regime)}` : named(data.worlds, cell.world));
+const cellName = (cell) =>
+  data.regimes.length > 1
+    ? `${named(data.worlds, cell.world)}, ${named(data.regimes, cell.regime)}`
+    : named(data.worlds, cell.world);
 const keyOf = (cell) => `${cell.world}/${cell.regime}`;
-const cellsInView = () => data.cells.filter((cell) => ["world", "regime"].every((axis) => state[axis] === "all" || cell[axis] === state[axis]));
+const cellsInView = () =>
+  data.cells.filter((cell) => ["world", "regime"].every((axis) => state[axis] === "all" || cell[axis] === state[axis]));
 const order = () => view().rows.map((row) => looks[row.filter]);
 
 // Choose a value of a switch. If the study has no such view, the nearest that exists is shown.

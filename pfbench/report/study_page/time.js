@@ -12,8 +12,12 @@ function curveFigure(part, { t, lines, band = null, head, unit, height = 360, ca
   else [low, high] = [Math.min(0, low), high * 1.05 || 1];
   const x = linear(t[0], t[t.length - 1] === t[0] ? t[0] + 1 : t[t.length - 1], left, width - right);
   const y = (isLog ? logarithmic : linear)(low, high, height - bottom, top);
-  let content = xAxis(linearTicks(t[0], t[t.length - 1], narrow ? 4 : 8), x, top, height - bottom) + yAxis((isLog ? logTicks : linearTicks)(low, high, 7), y, left, width - right);
-  content += label(0, 12, `${head}${unit ? ` [${unit}]` : ""}${isLog ? " (log)" : ""}`, ' class="axis"') + label((left + width - right) / 2, height - 4, "time [s]", ' class="axis" text-anchor="middle"');
+  let content =
+    xAxis(linearTicks(t[0], t[t.length - 1], narrow ? 4 : 8), x, top, height - bottom) +
+    yAxis((isLog ? logTicks : linearTicks)(low, high, 7), y, left, width - right);
+  content +=
+    label(0, 12, `${head}${unit ? ` [${unit}]` : ""}${isLog ? " (log)" : ""}`, ' class="axis"') +
+    label((left + width - right) / 2, height - 4, "time [s]", ' class="axis" text-anchor="middle"');
   const trace = (values) => {
     let path = "";
     let pen = "M";
@@ -25,7 +29,11 @@ function curveFigure(part, { t, lines, band = null, head, unit, height = 360, ca
     return path;
   };
   if (band) {
-    const back = [...t.keys()].reverse().filter((k) => usable(band.low[k])).map((k) => `L${px(x(t[k]))} ${px(y(band.low[k]))}`).join("");
+    const back = [...t.keys()]
+      .reverse()
+      .filter((k) => usable(band.low[k]))
+      .map((k) => `L${px(x(t[k]))} ${px(y(band.low[k]))}`)
+      .join("");
     content += `<path class="c${band.look.index}" d="${trace(band.high)}${back}Z" fill="var(--c)" fill-opacity=".14"/>`;
   }
   const last = shown.map((item) => [...item.values].reverse().find(usable));
@@ -36,22 +44,36 @@ function curveFigure(part, { t, lines, band = null, head, unit, height = 360, ca
     content += `<path class="c${item.look.index}" d="${trace(item.values)}" fill="none" stroke="var(--c)" stroke-width="${item.bold ? 3 : 1.7}"${dash}${spoken(words)}/>`;
     const end = item.values.length - 1 - [...item.values].reverse().findIndex(usable);
     content += mark(item.look, x(t[end]), y(last[k]), 3.6);
-    if (shown.length <= 40) content += `<text class="${item.look.proposed ? "strong" : ""}" x="${px(width - right + 12)}" y="${px(heights[k] + 4)}" style="font-size:11px">${esc(cut(item.look.name, narrow ? 12 : 21))}</text>`;
+    if (shown.length <= 40)
+      content += `<text class="${item.look.proposed ? "strong" : ""}" x="${px(width - right + 12)}" y="${px(heights[k] + 4)}" style="font-size:11px">${esc(cut(item.look.name, narrow ? 12 : 21))}</text>`;
   });
   content += `<line class="cross" y1="${top}" y2="${height - bottom}" stroke="var(--faint)" visibility="hidden"/>`;
-  part.innerHTML = svg(width, height, content, `${caption}. At the end: ${shown.map((item, k) => `${item.look.name} ${short(last[k], 2)}`).slice(0, 8).join(", ")} ${unit}.`, "group");
+  part.innerHTML = svg(
+    width,
+    height,
+    content,
+    `${caption}. At the end: ${shown
+      .map((item, k) => `${item.look.name} ${short(last[k], 2)}`)
+      .slice(0, 8)
+      .join(", ")} ${unit}.`,
+    "group",
+  );
   part.firstChild.onpointermove = (event) => {
     const box = part.firstChild.getBoundingClientRect();
     const ratio = width / box.width;
-    const time = t[0] + (((event.clientX - box.left) * ratio - left) / (width - right - left)) * (t[t.length - 1] - t[0]);
+    const time =
+      t[0] + (((event.clientX - box.left) * ratio - left) / (width - right - left)) * (t[t.length - 1] - t[0]);
     const k = t.reduce((best, value, i) => (Math.abs(value - time) < Math.abs(t[best] - time) ? i : best), 0);
     const height = (event.clientY - box.top) * ratio;
-    const near = shown.filter((item) => usable(item.values[k])).reduce((a, b) => (!a || Math.abs(y(b.values[k]) - height) < Math.abs(y(a.values[k]) - height) ? b : a), null);
+    const near = shown
+      .filter((item) => usable(item.values[k]))
+      .reduce((a, b) => (!a || Math.abs(y(b.values[k]) - height) < Math.abs(y(a.values[k]) - height) ? b : a), null);
     const cross = find(".cross", part);
     cross.setAttribute("x1", x(t[k]));
     cross.setAttribute("x2", x(t[k]));
     cross.setAttribute("visibility", "visible");
-    if (near) showTip(`${near.look.name}, ${tidy(t[k])} s: ${short(near.values[k], 2)} ${unit}`, event.clientX, event.clientY);
+    if (near)
+      showTip(`${near.look.name}, ${tidy(t[k])} s: ${short(near.values[k], 2)} ${unit}`, event.clientX, event.clientY);
   };
   part.firstChild.onpointerleave = () => {
     find(".cross", part).setAttribute("visibility", "hidden");
@@ -69,19 +91,35 @@ function drawTime(part) {
   const lines = chosen.map((look) => ({ look, values: quantile(look, 0) }));
   const best = chosen[0];
   const band = best && { look: best, low: quantile(best, 1), high: quantile(best, 2) };
-  curveFigure(part, { t: cell.t, lines, band, head: `median ${cell.group} error`, unit: cell.unit, caption: `Median error over time of ${chosen.length} filters`, height: part.clientWidth < 560 ? 300 : 400 });
+  curveFigure(part, {
+    t: cell.t,
+    lines,
+    band,
+    head: `median ${cell.group} error`,
+    unit: cell.unit,
+    caption: `Median error over time of ${chosen.length} filters`,
+    height: part.clientWidth < 560 ? 300 : 400,
+  });
 }
 function drawChips() {
-  const chip = (key, text, pressed) => `<button type="button" data-toggle="${esc(key)}"${pressed === null ? "" : ` aria-pressed="${pressed}"`}>${text}</button>`;
+  const chip = (key, text, pressed) =>
+    `<button type="button" data-toggle="${esc(key)}"${pressed === null ? "" : ` aria-pressed="${pressed}"`}>${text}</button>`;
   const focus = document.activeElement && document.activeElement.dataset.toggle;
-  find("#time .chips").innerHTML = chip("*all", "all", null) + chip("*proposed", "proposed", null) + chip("*none", "none", null) +
-    order().map((look) => chip(look.key, icon(look) + esc(look.name), state.on.has(look.key))).join("");
+  find("#time .chips").innerHTML =
+    chip("*all", "all", null) +
+    chip("*proposed", "proposed", null) +
+    chip("*none", "none", null) +
+    order()
+      .map((look) => chip(look.key, icon(look) + esc(look.name), state.on.has(look.key)))
+      .join("");
   find("#time summary").textContent = `Filters: ${state.on.size} of ${data.filters.length} in the figure`;
-  if (focus) (findAll("#time .chips button").find((button) => button.dataset.toggle === focus) || { focus() {} }).focus();
+  if (focus)
+    (findAll("#time .chips button").find((button) => button.dataset.toggle === focus) || { focus() {} }).focus();
 }
 function toggle(key) {
   if (key === "*all") state.on = new Set(data.filters.map((look) => look.key));
   else if (key === "*none") state.on = new Set();
-  else if (key === "*proposed") state.on = new Set(data.filters.filter((look) => look.proposed).map((look) => look.key));
+  else if (key === "*proposed")
+    state.on = new Set(data.filters.filter((look) => look.proposed).map((look) => look.key));
   else if (!state.on.delete(key)) state.on.add(key);
 }

@@ -2,7 +2,8 @@
 function drawWorlds(part) {
   const worlds = data.worlds.filter((world) => data.cells.some((cell) => cell.world === world.key && single(cell)));
   const regimes = data.regimes.map((regime) => regime.name).join(", ");
-  find("#worldnote").textContent = `${metricOf().name} with its interval, in the order of the leaderboard.${data.regimes.length > 1 ? ` The marks of a row, from top to bottom: ${regimes}.` : ""} Arrows: outside of the figure.`;
+  find("#worldnote").textContent =
+    `${metricOf().name} with its interval, in the order of the leaderboard.${data.regimes.length > 1 ? ` The marks of a row, from top to bottom: ${regimes}.` : ""} Arrows: outside of the figure.`;
   part.innerHTML = worlds.map(() => '<div class="panel"></div>').join("");
   findAll(".panel", part).forEach((panel, k) => drawWorld(panel, worlds[k]));
 }
@@ -20,7 +21,13 @@ function drawWorld(panel, world) {
   const values = sorted(all.map((row) => row.value));
   const ends = sorted(all.flatMap((row) => [row.value, row.low, row.high]));
   let content = label(0, 12, cut(world.name, Math.floor(width / 8)), ' class="strong"');
-  if (!values.length) return void (panel.innerHTML = svg(width, 40, `${content}${label(0, 32, "No run has an error here.")}`, `${world.name}: no errors`));
+  if (!values.length)
+    return void (panel.innerHTML = svg(
+      width,
+      40,
+      `${content}${label(0, 32, "No run has an error here.")}`,
+      `${world.name}: no errors`,
+    ));
   const low = ends[0] / 1.05;
   const high = Math.min(ends[ends.length - 1] * 1.05, Math.max(values[Math.floor(values.length / 2)] * 30, low * 1.5));
   const x = logarithmic(low, high, left, width - right);
@@ -28,7 +35,12 @@ function drawWorld(panel, world) {
   content += xAxis(logTicks(low, high, 5), x, top - 4, bottom);
   filters.forEach((look, k) => {
     const y = top + rowHeight * (k + 0.5);
-    content += label(left - 8, y + 4, cut(look.name, 17), ` text-anchor="end" style="font-size:11px"${look.proposed ? ' class="strong"' : ""}`);
+    content += label(
+      left - 8,
+      y + 4,
+      cut(look.name, 17),
+      ` text-anchor="end" style="font-size:11px"${look.proposed ? ' class="strong"' : ""}`,
+    );
     rows.forEach((row, r) => {
       const item = row[look.key];
       const level = y + step * (r - (rows.length - 1) / 2);
@@ -40,8 +52,18 @@ function drawWorld(panel, world) {
     });
   });
   const unit = (Object.values(rows[0])[0] || {}).unit || world.unit;
-  content += label((left + width - right) / 2, bottom + 30, `${metricOf().name} [${unit}] (log)`, ' class="axis" text-anchor="middle"');
-  panel.innerHTML = svg(width, bottom + 36, content, `${world.name}: ${metricOf().name} of ${filters.length} filters. Smallest: ${short(values[0])} ${unit}.`);
+  content += label(
+    (left + width - right) / 2,
+    bottom + 30,
+    `${metricOf().name} [${unit}] (log)`,
+    ' class="axis" text-anchor="middle"',
+  );
+  panel.innerHTML = svg(
+    width,
+    bottom + 36,
+    content,
+    `${world.name}: ${metricOf().name} of ${filters.length} filters. Smallest: ${short(values[0])} ${unit}.`,
+  );
 }
 
 function drawCalibration(part) {
@@ -54,39 +76,74 @@ function drawCalibration(part) {
   if (!filters.length) return void (part.innerHTML = '<p class="note">This view has no regions.</p>');
   const x = linear(0, 1, left, width - right);
   let content = xAxis([0, 0.25, 0.5, 0.75, 0.9, 1], x, top, bottom, (v) => `${100 * v}`);
-  for (const share of [0.5, 0.9]) content += line(x(share), top, x(share), bottom, ' class="rule"') + label(x(share), top - 8, `${100 * share} % region`, ' class="axis" text-anchor="middle"');
-  content += label((left + width - right) / 2, bottom + 30, "share of true values inside, %", ' class="axis" text-anchor="middle"');
+  for (const share of [0.5, 0.9])
+    content +=
+      line(x(share), top, x(share), bottom, ' class="rule"') +
+      label(x(share), top - 8, `${100 * share} % region`, ' class="axis" text-anchor="middle"');
+  content += label(
+    (left + width - right) / 2,
+    bottom + 30,
+    "share of true values inside, %",
+    ' class="axis" text-anchor="middle"',
+  );
   const rows = view().byFilter;
   filters.forEach((look, k) => {
     const y = top + rowHeight * (k + 0.5);
     const { c50, c90, nees_ratio: nees } = shares[look.key];
     const word = rows[look.key].calibration || "";
     const words = `${look.name}: the 50 % regions contain ${percent(c50)}, the 90 % regions ${percent(c90)}; NEES per degree of freedom ${short(nees)}; ${word}`;
-    content += label(left - 8, y + 4, cut(look.name, 20), ` text-anchor="end" style="font-size:11.5px"${look.proposed ? ' class="strong"' : ""}`);
+    content += label(
+      left - 8,
+      y + 4,
+      cut(look.name, 20),
+      ` text-anchor="end" style="font-size:11.5px"${look.proposed ? ' class="strong"' : ""}`,
+    );
     if (c50 === null || c90 === null) return;
     content += `<g${spoken(words)}>${bar(x(c50), x(c90), y, 2, look, 0.5)}<circle class="c${look.index}" cx="${px(x(c50))}" cy="${px(y)}" r="3.4" fill="var(--paper)" stroke="var(--c)" stroke-width="1.6"/>${mark(look, x(c90), y, 4.5)}</g>`;
-    if (!narrow) content += label(width - right + 14, y + 4, word, ' style="font-size:11.5px"') + label(width, y + 4, `NEES/dof ${short(nees)}`, ' class="axis" text-anchor="end"');
+    if (!narrow)
+      content +=
+        label(width - right + 14, y + 4, word, ' style="font-size:11.5px"') +
+        label(width, y + 4, `NEES/dof ${short(nees)}`, ' class="axis" text-anchor="end"');
   });
-  part.innerHTML = svg(width, bottom + 36, content, `Calibration of ${filters.length} filters: share of true values in their 50 and 90 % regions.`, "group");
+  part.innerHTML = svg(
+    width,
+    bottom + 36,
+    content,
+    `Calibration of ${filters.length} filters: share of true values in their 50 and 90 % regions.`,
+    "group",
+  );
 }
 
 function drawTable(part) {
   const cells = data.cells.filter(single);
   const rows = cells.map((cell) => single(cell).byFilter);
   const unit = (r) => (Object.values(rows[r]).find((row) => row.unit) || { unit: "" }).unit;
-  const groups = data.worlds.map((world) => [world, cells.filter((cell) => cell.world === world.key)]).filter(([, list]) => list.length);
+  const groups = data.worlds
+    .map((world) => [world, cells.filter((cell) => cell.world === world.key)])
+    .filter(([, list]) => list.length);
   let html = `<thead><tr><th scope="col" rowspan="2">Filter</th>${groups.map(([world, list]) => `<th scope="colgroup" colspan="${list.length}">${esc(world.name)}, ${esc(unit(cells.indexOf(list[0])))}</th>`).join("")}</tr>`;
-  html += `<tr>${groups.flatMap(([, list]) => list).map((cell) => `<th scope="col" class="number">${esc(named(data.regimes, cell.regime))}</th>`).join("")}</tr></thead><tbody>`;
+  html += `<tr>${groups
+    .flatMap(([, list]) => list)
+    .map((cell) => `<th scope="col" class="number">${esc(named(data.regimes, cell.regime))}</th>`)
+    .join("")}</tr></thead><tbody>`;
   const sequence = groups.flatMap(([, list]) => list).map((cell) => cells.indexOf(cell));
   for (const look of order()) {
-    const bold = (row, r) => row.verdict === "best" || short(row.value) === short(Math.min(...Object.values(rows[r]).map((item) => item.value ?? Infinity)));
-    html += `<tr><th scope="row"${look.proposed ? ' class="proposed"' : ""}>${icon(look)}${esc(look.name)}</th>${sequence.map((r) => {
-      const row = rows[r][look.key];
-      if (!row || row.value === null) return `<td class="number faint">${row ? esc(row.words) : "–"}</td>`;
-      const text = short(row.value);
-      const shown = bold(row, r) ? `<b>${text}</b>` : row.verdict === "worse" ? `<span class="faint">${text}†</span>` : text;
-      return `<td class="number">${shown}<br><span class="faint">${interval(row.low, row.high)}</span></td>`;
-    }).join("")}</tr>`;
+    const bold = (row, r) =>
+      row.verdict === "best" ||
+      short(row.value) === short(Math.min(...Object.values(rows[r]).map((item) => item.value ?? Infinity)));
+    html += `<tr><th scope="row"${look.proposed ? ' class="proposed"' : ""}>${icon(look)}${esc(look.name)}</th>${sequence
+      .map((r) => {
+        const row = rows[r][look.key];
+        if (!row || row.value === null) return `<td class="number faint">${row ? esc(row.words) : "–"}</td>`;
+        const text = short(row.value);
+        const shown = bold(row, r)
+          ? `<b>${text}</b>`
+          : row.verdict === "worse"
+            ? `<span class="faint">${text}†</span>`
+            : text;
+        return `<td class="number">${shown}<br><span class="faint">${interval(row.low, row.high)}</span></td>`;
+      })
+      .join("")}</tr>`;
   }
   part.innerHTML = `${html}</tbody>`;
 }
