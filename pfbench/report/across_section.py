@@ -37,6 +37,7 @@ def write_comparison(
         Variables `decisions`, `across` and `said`.
     """
     mains = {section["key"]: section["main"] for section in sections}
+    every_group = table
     rows, main_tests, name = summary.select_main_rows(table, tests, mains)
     if name == summary.MAIN:
         table, tests = pd.concat([rows, table], ignore_index=True), [*main_tests, *tests]
@@ -51,7 +52,7 @@ def write_comparison(
     counts = [count for section in sections for count in section["status_counts"]]
     formats = context.options.figure_formats
     return {
-        "decisions": write_decisions(rows, name, context, note) if len(rows) else None,
+        "decisions": write_decisions(rows, name, context, note, every_group) if len(rows) else None,
         "across": {"drawings": writers.render_figures(figures, "across", context.folder, formats)},
         "said": summary.summarise_study(main_tests, rows, mains, counts),
     }

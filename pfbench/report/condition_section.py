@@ -109,7 +109,9 @@ def _load_condition(condition: Condition, context: ReportContext) -> _ConditionD
     runs = pd.concat(rows)
     groups = [group for group in context.groups if _has_scores(results, group)]
     fronts = [cost.pareto_front(condition.name, runs, group) for group in groups]
-    runs = runs[runs.group.isin(groups)]
+    # with the metrics of a job, and those of a state's group of mixed units
+    names = {*groups, *(group.partition(" [")[0] for group in groups), ""}
+    runs = runs[runs.group.isin(names)]
     tests = compare_pairs(runs, options.alpha, options.equivalence_margin, options.target_effect)
     main = select_main_group(groups)
     return _ConditionData(full_results, results, runs, fronts, tests, main)

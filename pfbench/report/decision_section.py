@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,53 +19,68 @@ from pfbench.results.conditions import natural_sort_key
 from pfbench.results.decisions.comparisons import TRACK
 from pfbench.results.decisions.decision import Decision
 from pfbench.results.decisions.filter_sets import FilterRanking, order_filters
-from pfbench.results.decisions.options import DecisionOptions, MetricRule
+from pfbench.results.decisions.options import DecisionOptions
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs, decide_secondary_metrics
 from pfbench.results.decisions.sentences import describe_pair, describe_ranking, describe_total
-from pfbench.results.decisions.tidy_table import tidy_runs
+from pfbench.results.study_decisions.common_conditions import select_common_runs
+from pfbench.results.study_decisions.consistency_bands import ConsistencyBand, decide_consistency
+from pfbench.results.study_decisions.main_metrics import (
+    RULES,
+    main_rule,
+    tidy_main,
+    tidy_secondary,
+)
 
-# metrics of the second family: name in the table of runs, and in sentences
-SECONDARY = {"max_error": "largest error", "energy": "energy score"}
 _LARGEST_PERCENT = 10.0  # ratio from which an effect is a factor, not percent
 
 
 def write_decisions(
-    table: pd.DataFrame, group: str, context: ReportContext, note: str
+    table: pd.DataFrame,
+    group: str,
+    context: ReportContext,
+    note: str,
+    all_groups: pd.DataFrame | None = None,
 ) -> dict[str, Any]:
     """Decide planned pairs and all pairs, and write their tables, figure and records.
 
     Args:
-        table: Rows of `load_frame` for the main groups, under one name.
-        group: That name.
+        table: Rows of `select_main_metrics`.
+        group: Name of the main group in these rows.
         context: Context of the report.
         note: Budget, below the tables.
+        all_groups: Rows of all groups, for the consistency of the filters; None for those of the table.
 
     Returns:
         Template variables: sentences, tables and drawings.
     """
     options = DecisionOptions(context.options.alpha, context.options.equivalence_margin)
-    tidy = tidy_runs(table, group=group)
+    metric = context.options.metric
+    tidy = tidy_main(table, metric, group)
     labels = sorted(tidy["filter"].unique(), key=natural_sort_key)
     pairs = [pair for pair in plan_installed_pairs(labels) if _share_runs(tidy, *pair)]
-    rule = MetricRule(f"{group} error", group=group)
+    rule = main_rule(metric, group)
     planned = decide_planned_pairs(tidy, pairs, rule, options) if pairs else []
-    secondary = _decide_secondary(table, group, pairs, options)
-    orders = order_filters(tidy, rule, options) if _is_complete(tidy, labels) else ()
+    secondary = _decide_secondary(table, group, pairs, context)
+    common, scope = select_common_runs(tidy)
+    orders = order_filters(common, rule, options, planned) if len(common) else ()
+    bands = decide_consistency(table if all_groups is None else all_groups, options)
     folder = context.folder
     tables = {
         "planned": planned_table(planned),
         "secondary": planned_table(secondary),
-        "ranks": rank_table(orders, tidy),
+        "ranks": rank_table(orders, common),
+        "consistency": consistency_table(bands),
     }
     for name, rows in tables.items():
         if len(rows):
             writers.write_table(folder, f"decisions_{name}", rows, note)
-    records = [*planned, *secondary, *(d for order in orders for d in order.decisions)]
-    writers.write_json(folder, "decisions", records)
+    pairwise = [d for order in orders for d in order.decisions if d not in planned]
+    writers.write_json(folder, "decisions", [*planned, *secondary, *pairwise])
+    writers.write_json(folder, "consistency", bands)
     figures = [_planned_figure(planned, tidy, options)] if planned else []
     return {
         **tables,
-        "sentences": list_sentences(planned, orders),
+        "sentences": [*list_sentences(planned, orders), *([scope] if scope else [])],
         "drawings": writers.render_figures(
             figures, "decisions", folder, context.options.figure_formats
         ),
@@ -161,16 +177,38 @@ def rank_table(orders: Sequence[FilterRanking], tidy: pd.DataFrame) -> pd.DataFr
     )
 
 
+def consistency_table(bands: Sequence[ConsistencyBand]) -> pd.DataFrame:
+    """Build the table of mean NEES and NIS over their expectation, a row per filter and group."""
+    return pd.DataFrame(
+        [
+            {
+                "filter": band.label,
+                "quantity": band.quantity,
+                "group": band.group,
+                "mean / expectation": band.estimate,
+                "lower": band.low,
+                "upper": band.high,
+                "adjusted p (Holm)": band.p_corrected,
+                "decision": band.word,
+                "lost runs": band.lost,
+                "reason": band.reason,
+            }
+            for band in bands
+        ]
+    )
+
+
 def _decide_secondary(
-    table: pd.DataFrame, group: str, pairs: Sequence[tuple[str, str]], options: DecisionOptions
+    table: pd.DataFrame, group: str, pairs: Sequence[tuple[str, str]], context: ReportContext
 ) -> list[Decision]:
-    """Decide the metrics of the second family that all rows of the main groups have."""
-    present = set(table["metric"])
-    names = [name for name in SECONDARY if name in present]
-    if not pairs or not names:
+    """Decide the metrics of the second family: all that have values, except the main one."""
+    options = DecisionOptions(context.options.alpha, context.options.equivalence_margin)
+    metrics = tidy_secondary(table, group)
+    metrics.pop(context.options.metric, None)
+    if not pairs or not metrics:
         return []
-    tables = {SECONDARY[name]: tidy_runs(table, name, group) for name in names}
-    rules = [MetricRule(SECONDARY[name], group=group) for name in names]
+    rules = [replace(RULES[name], group=group) for name in metrics]
+    tables = {rule.name: rows for rule, rows in zip(rules, metrics.values(), strict=True)}
     return decide_secondary_metrics(tables, pairs, rules, options)
 
 
@@ -181,13 +219,6 @@ def _share_runs(tidy: pd.DataFrame, a: str, b: str) -> bool:
         for label in (a, b)
     ]
     return bool(conditions[0] & conditions[1])
-
-
-def _is_complete(tidy: pd.DataFrame, labels: Sequence[str]) -> bool:
-    """Return whether there are several filters, and all have all conditions."""
-    conditions = tidy[["filter", "scenario", "regime"]].drop_duplicates()
-    counts = conditions["filter"].value_counts()
-    return len(labels) > 1 and counts.nunique() == 1
 
 
 def _format_effect(decision: Decision, value: float) -> str:

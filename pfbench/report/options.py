@@ -9,6 +9,7 @@ from typing import NamedTuple
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.plots.plotting import LineStyle, mute_others
 from pfbench.results.conditions import Condition, natural_sort_key
+from pfbench.results.study_decisions.main_metrics import check_main_metric
 
 _PLENTY = 50  # filters times conditions above which a report is brief [ours]
 _NAMED = 7  # coloured filters at most; with more than eight filters the others are grey [ours]
@@ -34,6 +35,8 @@ class ReportOptions:
         show_all: Whether to show all figures and comparisons. None shows all if filters times
             conditions are at most 50.
         planned: Number of jobs of the experiment, if known.
+        metric: Metric of the main group that decides, one of `main_metrics.MAIN_METRICS`. The others are
+            in the second family.
 
     Raises:
         ValueError: If a value is out of range.
@@ -51,8 +54,10 @@ class ReportOptions:
     highlight_filters: tuple[str, ...] | None = None
     show_all: bool | None = None
     planned: int | None = None
+    metric: str = "rmse"
 
     def __post_init__(self) -> None:
+        check_main_metric(self.metric)
         if not 0 < self.alpha < 1:
             raise ValueError(f"report.alpha must be between 0 and 1, got {self.alpha}. Use 0.05.")
         for name in ("equivalence_margin", "target_effect"):

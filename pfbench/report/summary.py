@@ -17,6 +17,7 @@ from pfbench.results import store
 from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
 from pfbench.results.conditions import natural_sort_key
 from pfbench.results.status import StatusCounts, count_statuses
+from pfbench.results.study_decisions.main_metrics import select_main_metrics
 
 MAIN = "main group"
 CellName = tuple[str, str, str]
@@ -77,10 +78,7 @@ def select_main_rows(
     """
     names = {group for group in mains.values() if group}
     name = names.pop() if len(names) == 1 else MAIN
-    main_groups = pd.Series(
-        list(zip(table.scenario, table.noise, table.model, strict=True)), index=table.index
-    ).map(mains)
-    rows = table[(table.group == main_groups) & (table.component == "norm")].assign(group=name)
+    rows = select_main_metrics(table, mains, name)
     main_tests = [
         replace(v, group=name)
         for v in tests

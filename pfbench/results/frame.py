@@ -33,8 +33,8 @@ def load_frame(
         start_time_s: Time before which steps are ignored, in seconds.
         allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a
             condition.
-        convergence_threshold: Bounds by group in displayed units. They add the metric "converged",
-            in seconds.
+        convergence_threshold: Bounds by group in displayed units. They add the metrics "converged",
+            in seconds, and "time_to_converge", the same as a share of the record and at most 1.
 
     Returns:
         Columns study, key, scenario, family, noise, model, filter, label, particles, seed, run, lost,
@@ -171,6 +171,8 @@ def _convergence(result: store.JobResult, converged: Mapping[str, float]) -> Ite
             time, lost = result.data["time"], result.data["lost"]
             when = convergence_time(time, error, lost, converged[group.group])
             yield _column("converged", when, group.group, "norm", "s")
+            share = np.minimum(when, time[-1]) / time[-1]
+            yield _column("time_to_converge", share, group.group, "norm", "")
 
 
 def _column(metric: str, value: np.ndarray, group: str, component: str, unit: str) -> pd.DataFrame:

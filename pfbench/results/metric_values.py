@@ -19,6 +19,7 @@ from pfbench.results.error_measures import (
     rmse_per_run,
 )
 from pfbench.results.state_groups import ComponentGroup
+from pfbench.results.status import is_overconfident
 
 _PARTICLE_COUNTS = ("ess", "ancestors", "unique")  # divided by the number of particles
 
@@ -45,6 +46,11 @@ class MetricInput(NamedTuple):
     def group_index(self) -> int:
         """Index of the group in arrays with one entry per group of the state."""
         return list(self.result.meta["state"]["groups"]).index(self.state_group)
+
+    @property
+    def group_size(self) -> int:
+        """Number of components of the group of the state."""
+        return len(self.result.meta["state"]["groups"][self.state_group])
 
     def select(self, name: str) -> Array:
         """Return the components of the group of an array [..., D], in displayed units."""
@@ -145,6 +151,18 @@ def compute_mean_nees(data: MetricInput) -> ByComponent:
     return {"norm": mean_per_run(data.result.data["nees"][..., data.group_index], data.lost)}
 
 
+def compute_nees_ratio(data: MetricInput) -> ByComponent:
+    """Compute the mean NEES of a group over its expectation, the number of components."""
+    return {"norm": compute_mean_nees(data)["norm"] / data.group_size}
+
+
+def compute_overconfidence(data: MetricInput) -> ByComponent:
+    """Return 1 for an overconfident run, 0 for another one, NaN for a lost one."""
+    nees = data.result.data["nees"][..., data.group_index]
+    flags = is_overconfident(nees, data.group_size, data.lost)
+    return {"norm": np.where(data.lost, np.nan, flags.astype(np.float64))}
+
+
 def compute_mean_nis(data: MetricInput) -> ByComponent:
     """Compute the mean NIS per observed component."""
     if "nis" not in data.result.data:
@@ -200,6 +218,16 @@ def count_trace(result: store.JobResult, name: str) -> Array:
 def sum_trace(name: str) -> Callable[[MetricInput], ByComponent]:
     """Return the function that sums a trace of counts over time."""
     return partial(_job_value, compute=partial(count_trace, name=name))
+
+
+def compute_log_score(data: MetricInput) -> ByComponent:
+    """Return the log evidence per step of the record; empty for a filter without evidence."""
+    return _job_value(data, lambda result: _log_score(result, data.lost))
+
+
+def _log_score(result: store.JobResult, lost: Flags) -> Array:
+    steps = result.meta.get("steps", len(result.data["time"]))
+    return np.where(lost, np.nan, result.data["log_evidence"] / steps)
 
 
 def compute_seconds_per_step(data: MetricInput) -> ByComponent:

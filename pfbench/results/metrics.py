@@ -25,9 +25,12 @@ from pfbench.results.metric_values import (
     compute_energy_score,
     compute_interval_coverage,
     compute_log_evidence,
+    compute_log_score,
     compute_max_error,
     compute_mean_nees,
     compute_mean_nis,
+    compute_nees_ratio,
+    compute_overconfidence,
     compute_rmse,
     compute_seconds_per_step,
     sum_trace,
@@ -175,6 +178,14 @@ METRICS: tuple[Metric, ...] = (
         "number of components.",
     ),
     Metric(
+        "nees_ratio", compute_nees_ratio, "group", "", "target",
+        "Mean NEES over its expectation, the number of components.",
+    ),
+    Metric(
+        "overconfident", compute_overconfidence, "group", "", "lower",
+        "1 for a run whose mean NEES exceeds the 0.999 chi-square quantile, else 0.",
+    ),
+    Metric(
         "ess", average_trace("ess"), "job", "", "higher",
         "Effective sample size, mean over time.",
         head="ESS [% of particles]", factor=100.0,
@@ -218,6 +229,9 @@ METRICS: tuple[Metric, ...] = (
         "log_evidence", compute_log_evidence, "job", "", "higher",
         "Logarithm of the estimated marginal likelihood of a run. A filter whose weights or noise "
         "depend on the measurement does not estimate it.",
+    ),
+    Metric(
+        "log_score", compute_log_score, "job", "", "higher", "Log evidence per step of the record.",
     ),
     Metric(
         "seconds_per_step", compute_seconds_per_step, "job", "s", "lower",

@@ -177,19 +177,22 @@ def test_scenarios_of_one_family_are_one_world(
     assert (new["decision on the pair"].item() == "not tested") == (worlds == 1)
 
 
-def test_without_some_conditions_pairs_are_decided_and_filters_are_not_ranked(
+def test_without_some_conditions_pairs_are_decided_and_complete_filters_are_ranked(
     tmp_path: Path,
 ) -> None:
     table = rows(worlds=("drive", "flight"))
     partial = table[(table.label != "sir") | (table.scenario != "drive")]
     made, _ = decide(partial, tmp_path / "partial")
-    assert len(made["ranks"]) == 0
-    assert not any("Rank of" in sentence for sentence in made["sentences"])
+    assert list(made["ranks"]["filter"]) == ["mcmc_rpf", "rpf"]
+    assert (
+        made["sentences"][-1] == "Order of the 2 filters that have all 2 conditions. Without sir."
+    )
     errors = made["planned"].query("question == 'in these worlds' and metric == 'position error'")
     assert dict(zip(errors.b, errors.worlds, strict=True)) == {"sir": 1, "rpf": 2}
     complete, _ = decide(table, tmp_path / "complete")
     assert list(complete["ranks"]["filter"]) == ["mcmc_rpf", "rpf", "sir"]
     assert any("Rank of mcmc_rpf" in sentence for sentence in complete["sentences"])
+    assert not any("Order of" in sentence for sentence in complete["sentences"])
 
 
 def test_the_order_of_rows_does_not_change_a_byte(tmp_path: Path) -> None:

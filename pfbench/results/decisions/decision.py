@@ -105,10 +105,11 @@ class Decision:
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON can store: numbers that are not finite become text."""
-        return {name: _plain(value) for name, value in asdict(self).items()}
+        return {name: plain_value(value) for name, value in asdict(self).items()}
 
 
-def _plain(value: Any) -> Any:
+def plain_value(value: Any) -> Any:
+    """Return a value that JSON can store; a number that is not finite becomes text."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

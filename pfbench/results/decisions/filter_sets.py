@@ -1,7 +1,8 @@
 """Order of many filters: all pairs, the filters that none is better than, and intervals of ranks.
 
 Pairs are decided by their own data, so that another filter enters only through the size of the
-family. No test of mean ranks is used.
+family. A planned pair keeps the word of its own family, so that a pair has one word in a study. No test of
+mean ranks is used.
 
 References:
     M. Mogstad, J. P. Romano, A. M. Shaikh and D. Wilhelm (2024), Inference for ranks.
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from pfbench.results.decisions.comparisons import compare_metric
+from pfbench.results.decisions.comparisons import TRACK, compare_metric
 from pfbench.results.decisions.decision import Decision, Question
 from pfbench.results.decisions.family_records import FamilyContext, record_family
 from pfbench.results.decisions.options import DecisionOptions, MetricRule
@@ -32,7 +33,7 @@ class FilterRanking(NamedTuple):
         question: "a" for the worlds of the study, "b" for a new world.
         top_group: Filters that no filter was shown to be better than.
         ranks: First and last rank of each filter. All intervals hold together with probability
-            1 - alpha.
+            1 - alpha, or 1 - 2 alpha if planned pairs keep their words.
         decisions: Records of all pairs.
     """
 
@@ -43,7 +44,10 @@ class FilterRanking(NamedTuple):
 
 
 def order_filters(
-    table: pd.DataFrame, rule: MetricRule | None = None, options: DecisionOptions | None = None
+    table: pd.DataFrame,
+    rule: MetricRule | None = None,
+    options: DecisionOptions | None = None,
+    planned: Sequence[Decision] = (),
 ) -> tuple[FilterRanking, FilterRanking]:
     """Compare all pairs of filters for both questions.
 
@@ -51,6 +55,7 @@ def order_filters(
         table: Table as in `planned_pairs.decide_planned_pairs`.
         rule: Rule of the metric, None for the log ratio of errors.
         options: Options, None for the defaults.
+        planned: Records of planned pairs, whose words stay. The other pairs are a family.
 
     Returns:
         Orders for the questions (a) and (b).
@@ -60,14 +65,24 @@ def order_filters(
     """
     rule, options = rule or MetricRule(), options or DecisionOptions()
     study = to_study_runs(table)
+    fixed = {(d.question, frozenset((d.a, d.b))): d for d in planned if d.metric != TRACK}
     comparisons = [
         compare_metric(select_pair(study, a, b), rule, options)
         for a, b in combinations(study.filters, 2)
+        if ("a", frozenset((a, b))) not in fixed
     ]
     context = FamilyContext(FAMILY_ALL, study.regimes, options)
-    same_worlds = rank_by_decisions(study.filters, record_family(comparisons, "a", context), "a")
-    new = rank_by_decisions(study.filters, record_family(comparisons, "b", context), "b")
-    return same_worlds, new
+
+    def rank(question: Question) -> FilterRanking:
+        records = record_family(comparisons, question, context)
+        records += [
+            d
+            for (asked, pair), d in fixed.items()
+            if asked == question and pair <= set(study.filters)
+        ]
+        return rank_by_decisions(study.filters, records, question)
+
+    return rank("a"), rank("b")
 
 
 def rank_by_decisions(

@@ -23,7 +23,12 @@ from pfbench.results.decisions.decision import Decision, Question
 from pfbench.results.decisions.family_records import ONE_WORLD, FamilyContext, record_family
 from pfbench.results.decisions.family_tests import correct_p_values
 from pfbench.results.decisions.options import DecisionOptions, MetricRule
-from pfbench.results.decisions.study_runs import StudyRuns, select_pair, to_study_runs
+from pfbench.results.decisions.study_runs import (
+    StudyRuns,
+    have_common_runs,
+    select_pair,
+    to_study_runs,
+)
 from pfbench.results.decisions.words import combine_words
 from pfbench.results.statistics.world_spread import moderated_p_values
 
@@ -88,7 +93,8 @@ def decide_secondary_metrics(
         options: Options, None for the defaults.
 
     Returns:
-        Records of question (a), then of question (b).
+        Records of question (a), then of question (b). A pair has no record of a metric that it has
+        no common run of.
 
     Raises:
         ValueError: if a table or a pair is not valid.
@@ -99,7 +105,11 @@ def decide_secondary_metrics(
     for rule in rules:
         study = to_study_runs(tables[rule.name])
         regimes = max(regimes, study.regimes)
-        comparisons += [compare_metric(select_pair(study, a, b), rule, options) for a, b in pairs]
+        comparisons += [
+            compare_metric(select_pair(study, a, b), rule, options)
+            for a, b in pairs
+            if have_common_runs(study, a, b)
+        ]
     context = FamilyContext(FAMILY_2, regimes, options)
     return [
         decision
@@ -158,7 +168,7 @@ def _add_moderated(
     effects = {
         (a, b): compare_metric(select_pair(study, a, b), rule, options)
         for a, b in (combinations(study.filters, 2) if enough else ())
-        if (study.present[study.filters.index(a)] & study.present[study.filters.index(b)]).any()
+        if have_common_runs(study, a, b)
     }
     names, means, sds = [], [], []
     for name, comparison in effects.items():

@@ -149,7 +149,7 @@ def select_pair(study: StudyRuns, a: str, b: str) -> PairRuns:
         )
     i, j = study.filters.index(a), study.filters.index(b)
     present = study.present[i] & study.present[j]
-    weights = _condition_weights(study.scenario, present.any(axis=-1))
+    weights = condition_weights(study.scenario, present.any(axis=-1))
     used = np.asarray(weights.any(axis=-1))
     if not used.any():
         raise ValueError(f"pairs must share a run, got {a} and {b} without one. Run both filters.")
@@ -162,6 +162,20 @@ def select_pair(study: StudyRuns, a: str, b: str) -> PairRuns:
         present,
     )
     return PairRuns(a, b, worlds, weights[used], *(column[used] for column in columns))
+
+
+def have_common_runs(study: StudyRuns, a: str, b: str) -> bool:
+    """Return whether two filters share a run.
+
+    Args:
+        study: Arrays of the study.
+        a: Label of the first filter.
+        b: Label of the second filter.
+    """
+    if a not in study.filters or b not in study.filters:
+        return False
+    i, j = study.filters.index(a), study.filters.index(b)
+    return bool((study.present[i] & study.present[j]).any())
 
 
 def first_runs(study: StudyRuns, runs: int) -> StudyRuns:
@@ -199,8 +213,13 @@ def _index_conditions(
     return index, scenario
 
 
-def _condition_weights(scenario: np.ndarray, present: Flags) -> Array:
-    """Compute weights [W, C]: equal for scenarios of a world, and for regimes of a scenario."""
+def condition_weights(scenario: np.ndarray, present: Flags) -> Array:
+    """Compute weights [W, C]: equal for scenarios of a world, and for regimes of a scenario.
+
+    Args:
+        scenario: Index of the scenario of each condition within its world, [W, C].
+        present: Conditions with a run, [W, C].
+    """
     weights = np.zeros(scenario.shape)
     for row, used, names in zip(weights, present, scenario, strict=True):
         scenarios = np.unique(names[used])

@@ -34,6 +34,15 @@ def tidy_runs(
             f"metric and group must have results, got {metric} and {group}. Choose from "
             f"{sorted(map(str, frame['metric'].unique()))} and {sorted(map(str, frame['group'].unique()))}."
         )
+    return tidy_rows(rows)
+
+
+def tidy_rows(rows: pd.DataFrame) -> pd.DataFrame:
+    """Arrange the rows of one metric and component in the form of `to_study_runs`.
+
+    Args:
+        rows: Rows of `load_frame`, one per run of a filter in a condition.
+    """
     models = rows.groupby("scenario")["model"].transform("nunique")
     regime = rows["noise"].astype(str).where(models == 1, rows["noise"] + " / " + rows["model"])
     scenario = rows["scenario"].astype(str)
