@@ -77,8 +77,8 @@ def order_filters(
         records = record_family(comparisons, question, context)
         records += [
             d
-            for (asked, pair), d in fixed.items()
-            if asked == question and pair <= set(study.filters)
+            for (name, pair), d in fixed.items()
+            if name == question and pair <= set(study.filters)
         ]
         return rank_by_decisions(study.filters, records, question)
 
