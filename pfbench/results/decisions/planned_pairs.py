@@ -93,8 +93,8 @@ def decide_secondary_metrics(
         options: Options, None for the defaults.
 
     Returns:
-        Records of question (a), then of question (b). A pair has no record of a metric that it has
-        no common run of.
+        Records of question (a), then of question (b). A pair without a common
+        run of a metric lacks its record.
 
     Raises:
         ValueError: if a table or a pair is not valid.

@@ -2,8 +2,8 @@
 
 The unit is a run: NEES is averaged over the time, regimes and worlds of a run, since these share random
 numbers. The mean over runs is divided by its expectation. Its logarithm has a Student interval, whose
-error follows from the spread over runs, so that no independence over time is assumed [ours]. A lost
-run has no covariance to check. It is left out and counted.
+error follows from the spread over runs, so that no independence over time is assumed [ours]. Lost
+runs are left out and counted.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ConsistencyBand:
         runs: Valid runs per condition, at least.
         lost: Lost runs of all conditions.
         word: overconfident, underconfident, no deviation shown, or not tested.
-        reason: Reason why there is no test; empty otherwise.
+        reason: Reason of a missing test; empty otherwise.
     """
 
     label: str

@@ -102,7 +102,7 @@ def tidy_main(rows: pd.DataFrame, metric: str, group: str) -> pd.DataFrame:
         Table with the columns of `study_runs.to_study_runs`.
 
     Raises:
-        ValueError: if the metric is not one of `MAIN_METRICS`, or a condition has no value of it.
+        ValueError: if the metric is not one of `MAIN_METRICS`, or a condition lacks its values.
     """
     check_main_metric(metric)
     conditions = ["scenario", "noise", "model", "label"]
@@ -126,7 +126,7 @@ def tidy_secondary(rows: pd.DataFrame, group: str) -> dict[str, pd.DataFrame]:
         group: Name of the main group.
 
     Returns:
-        Table by name of the metric. A run that keeps track and has no value is left out. For a share
+        Table by name of the metric. A run that keeps track without a value is left out. For a share
         of runs, lost runs are left out, too.
     """
     tables = {}
