@@ -148,8 +148,7 @@ METRICS: tuple[Metric, ...] = (
         "Root mean square over time of the error of a component, or of the norm of a group.",
     ),
     Metric(
-        "max_error", compute_max_error, "components", GROUP_UNIT, "lower",
-        "Maximum over time of the norm of the error of a group.",
+        "max_error", compute_max_error, "components", GROUP_UNIT, "lower", "Maximum of the norm of the error.",
     ),
     Metric(
         "crps", compute_crps, "components", GROUP_UNIT, "lower",
@@ -177,14 +176,8 @@ METRICS: tuple[Metric, ...] = (
         "Normalised estimation error squared of a group, mean over time. Its expectation is the "
         "number of components.",
     ),
-    Metric(
-        "nees_ratio", compute_nees_ratio, "group", "", "target",
-        "Mean NEES over its expectation, the number of components.",
-    ),
-    Metric(
-        "overconfident", compute_overconfidence, "group", "", "lower",
-        "1 for a run whose mean NEES exceeds the 0.999 chi-square quantile, else 0.",
-    ),
+    Metric("nees_ratio", compute_nees_ratio, "group", "", "target", "Mean NEES over its expectation."),
+    Metric("overconfident", compute_overconfidence, "group", "", "lower", "1 if NEES is above its 0.999 quantile."),
     Metric(
         "ess", average_trace("ess"), "job", "", "higher",
         "Effective sample size, mean over time.",
@@ -230,12 +223,9 @@ METRICS: tuple[Metric, ...] = (
         "Logarithm of the estimated marginal likelihood of a run. A filter whose weights or noise "
         "depend on the measurement does not estimate it.",
     ),
+    Metric("log_score", compute_log_score, "job", "", "higher", "Log evidence per step."),
     Metric(
-        "log_score", compute_log_score, "job", "", "higher", "Log evidence per step of the record.",
-    ),
-    Metric(
-        "seconds_per_step", compute_seconds_per_step, "job", "s", "lower",
-        "Time per step of one job, all its runs together.",
+        "seconds_per_step", compute_seconds_per_step, "job", "s", "lower", "Time per step of all runs.",
     ),
 )  # fmt: skip
 
