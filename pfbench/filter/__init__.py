@@ -122,6 +122,7 @@ __getattr__, __dir__ = lazy_attributes(
         ),
         "robust.innovation_gate": ("InnovationGate",),
         "robust.m_estimation": ("HuberUpdate", "CorrentropyUpdate"),
+        "robust.noise_learning": ("SageHusaAdaptation", "VariationalNoiseAdaptation"),
         "robust.scaled_noise": ("ScaledNoise",),
         "robust.student_update": ("StudentUpdate",),
         "robust.weighted_likelihood": ("WeightedLikelihoodUpdate",),
