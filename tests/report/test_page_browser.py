@@ -305,7 +305,7 @@ def test_nothing_moves_where_the_system_asks_for_rest(visit):
     not AXE.exists(), reason="no axe-core: npm install --prefix .cache/axe axe-core"
 )
 def test_axe_has_no_serious_finding(visit):
-    page = visit(bypass_csp=True)
+    page = visit(bypass_csp=True, reduced_motion="reduce")  # colours of a transition are not final
     page.evaluate("refresh(true)")
     page.locator("[data-row]").first.click()
     page.add_script_tag(path=os.fspath(AXE))
