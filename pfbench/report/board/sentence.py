@@ -1,0 +1,140 @@
+"""The sentence of a view, and its small print."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from pfbench.report.board.view import EQUAL, IDENTICAL, LOST, MISSING, OPEN, BoardRow, percent
+from pfbench.report.looks import MethodLook
+
+_LOST_SHARE = 0.2  # share of runs off track from which a filter is counted
+
+
+def describe_view(
+    rows: Sequence[BoardRow],
+    looks: Mapping[str, MethodLook],
+    baseline: str,
+    scope: str,
+    metric: str,
+) -> str:
+    """Describe a view: failures, the best filter, the best proposed method, ties.
+
+    Args:
+        rows: Rows ordered by level.
+        looks: Looks by label.
+        baseline: Label of the baseline.
+        scope: Worlds and regimes in words, such as "in these 3 worlds".
+        metric: Name of the metric in a sentence.
+
+    Returns:
+        Sentences. Names of filters are enclosed in double square brackets.
+    """
+    ranked = [row for row in rows if row.rank is not None]
+    failures = _describe_failures(rows, looks)
+    if not ranked:
+        return f"{failures} No filter has an error to compare {scope}.".strip()
+    if len(rows) == 1:
+        row = rows[0]
+        value = "" if math.isnan(row.value) else f" of {row.value:.3g} {row.unit}".rstrip()
+        return f"{failures} {_name(row, looks)} has a {metric}{value} {scope}. It is the only filter.".strip()
+    return " ".join(
+        filter(
+            None,
+            [
+                failures,
+                _describe_best(ranked, rows, looks, baseline, f"{metric} {scope}"),
+                _describe_proposed(ranked, looks),
+                _describe_ties(ranked),
+            ],
+        )
+    )
+
+
+def count_words(number: int, noun: str) -> str:
+    """Format a count with its noun.
+
+    Args:
+        number: Count.
+        noun: Noun, singular.
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _name(row: BoardRow, looks: Mapping[str, MethodLook]) -> str:
+    return f"[[{looks[row.filter].name}]]"
+
+
+def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]) -> str:
+    """Count the filters that lose the track in many runs, or were not run."""
+    off = [r for r in rows if r.verdict != MISSING and 1 - r.track > _LOST_SHARE]
+    missing = sum(row.verdict == MISSING for row in rows)
+    text = ""
+    if off:
+        worst = min(off, key=lambda row: row.track)
+        share = f"{100 * (1 - worst.track):.0f} %"
+        if len(off) == 1:
+            text = f"{_name(worst, looks)} loses the track in {share} of runs."
+        else:
+            text = (
+                f"{len(off)} of {len(rows)} filters lose the track in over a fifth of runs "
+                f"({_name(worst, looks)}: {share})."
+            )
+    if missing:
+        verb = "was" if missing == 1 else "were"
+        text += f" {count_words(missing, 'filter')} {verb} not run in all conditions."
+    return text.strip()
+
+
+def _describe_best(
+    ranked: Sequence[BoardRow],
+    rows: Sequence[BoardRow],
+    looks: Mapping[str, MethodLook],
+    baseline: str,
+    where: str,
+) -> str:
+    """State the filter of the smallest error against the baseline."""
+    best = ranked[0]
+    base = next(row for row in rows if row.filter == baseline)
+    twins = [row for row in ranked if row.words == IDENTICAL]
+    names = " and ".join(_name(row, looks) for row in [best, *twins][:2])
+    names += f" and {count_words(len(twins) - 1, 'more filter')}" if len(twins) > 1 else ""
+    head = f"{names} {'have' if twins else 'has'} the smallest {where}"
+    if twins:
+        head += " (identical results)"
+    if baseline in (best.filter, *(row.filter for row in twins)):
+        return f"{head}. It is the baseline."
+    if math.isnan(best.ratio):
+        state = "lost track" if base.verdict == LOST else "missing runs"
+        return f"{head}. The baseline {_name(base, looks)} has no error because of {state}."
+    size = f"{percent(math.log(best.ratio))} % below {_name(base, looks)}"
+    if not math.isfinite(best.ratio_low) or not math.isfinite(best.ratio_high):
+        return f"{head}, {size}, without an interval from so few runs."
+    ends = [100 * (1 - end) for end in (best.ratio_high, best.ratio_low)]
+    interval = f"95 % interval {ends[0]:.3g} to {ends[1]:.3g} %"
+    cost = f"at {best.ms / base.ms:.2g} times its cost" if base.ms > 0 else ""
+    if best.ratio_high >= 1 > best.ratio_low or best.ratio == 1:
+        return (
+            f"No difference to {_name(base, looks)} is decided: the interval of the best filter contains 0. "
+            f"{head}, {size} ({interval}), {cost}."
+        )
+    return f"{head}: {size} ({interval}), {cost}."
+
+
+def _describe_proposed(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook]) -> str:
+    """State the best proposed method, unless it is the best filter."""
+    proposed = [row for row in ranked if looks[row.filter].proposed]
+    if not proposed or proposed[0] is ranked[0]:
+        return ""
+    row = proposed[0]
+    state = {EQUAL: "equal to the best", OPEN: "not decided against the best"}
+    return f"Best proposed method: {_name(row, looks)}, {state.get(row.verdict, 'worse')} ({row.words})."
+
+
+def _describe_ties(ranked: Sequence[BoardRow]) -> str:
+    """Count the filters that are not decided against the best."""
+    tied = sum(row.verdict in (OPEN, EQUAL) for row in ranked)
+    if not tied:
+        return ""
+    verb = "is" if tied == 1 else "are"
+    return f"{tied} of {len(ranked) - 1} others {verb} not shown to be worse."

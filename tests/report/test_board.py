@@ -1,0 +1,164 @@
+"""The board: verdicts, ratios and sentences of invented studies, recomputed without its code."""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.board import write_verdict_files
+from pfbench.report.board.levels import RunArrays, arrange_runs, compute_levels
+from pfbench.report.board.sentence import describe_view
+from pfbench.report.board.view import BoardRow, ViewOptions, build_rows
+from pfbench.report.looks import find_looks
+
+EFFECTS = {"mcmc_rpf": -0.3, "sir": 0.0, "ukf": 0.5}
+
+
+def table(
+    effects: dict[str, float] | None = None, worlds: int = 2, runs: int = 30, seed: int = 1
+) -> pd.DataFrame:
+    """Errors of filters that share the difficulty of each run."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for w in range(worlds):
+        for noise in ("nominal", "outliers"):
+            hard = rng.normal(0, 0.5, runs)
+            for label, effect in (EFFECTS if effects is None else effects).items():
+                error = np.exp(w + effect + hard + 0.1 * rng.standard_t(3, runs))
+                rows.append(pd.DataFrame({
+                    "filter": label, "scenario": f"w{w}", "family": f"w{w}", "regime": noise, "model": "m",
+                    "particles": 100.0, "seed": 1, "run": np.arange(runs), "lost": False, "keeps_track": True,
+                    "unit": "m", "group": "position", "rmse": error, "coverage_50": 0.5,
+                    "coverage_90": rng.uniform(0.5, 0.9, runs), "nees_ratio": 1.5, "ms": 2.0,
+                }))  # fmt: skip
+    return pd.concat(rows, ignore_index=True)
+
+
+def board(data: pd.DataFrame, baseline: str = "sir", **options: object) -> dict[str, BoardRow]:
+    labels = tuple(sorted(data["filter"].unique()))
+    rows = build_rows(data, "rmse", baseline, labels, ViewOptions(**options))  # type: ignore[arg-type]
+    return {row.filter: row for row in rows}
+
+
+def trimmed_level(data: pd.DataFrame, label: str) -> float:
+    """Mean over conditions of scipy's trimmed mean of the log error."""
+    cells = data[data["filter"] == label].groupby(["scenario", "regime"])["rmse"]
+    return float(np.mean([stats.trim_mean(np.log(values), 0.2) for _, values in cells]))
+
+
+def test_ratios_are_those_of_scipy_and_transitive() -> None:
+    data = table()
+    by_baseline = {base: board(data, base) for base in EFFECTS}
+    for base in EFFECTS:
+        for label in EFFECTS:
+            expected = math.exp(trimmed_level(data, label) - trimmed_level(data, base))
+            assert by_baseline[base][label].ratio == pytest.approx(expected)
+    chain = by_baseline["ukf"]["sir"].ratio * by_baseline["sir"]["mcmc_rpf"].ratio
+    assert chain == pytest.approx(by_baseline["ukf"]["mcmc_rpf"].ratio)
+    ranks = [{label: row.rank for label, row in rows.items()} for rows in by_baseline.values()]
+    assert ranks[0] == ranks[1] == ranks[2] == {"mcmc_rpf": 1, "sir": 2, "ukf": 3}
+
+
+def test_shared_runs_make_the_interval_of_a_difference_short() -> None:
+    runs = arrange_runs(table(worlds=1), "rmse", ("mcmc_rpf", "sir", "ukf"))
+    levels = compute_levels(runs)
+    paired = float(levels.difference(0, 1).standard_error)
+    alone = math.hypot(*(float(levels.single(k).standard_error) for k in (0, 1)))
+    assert paired < 0.5 * alone
+
+
+def test_intervals_cover_and_equal_filters_are_rarely_called_worse() -> None:
+    """Size and coverage over 300 studies of three equal filters; 3.1 standard errors."""
+    worse, outside, studies = 0, 0, 300
+    for k in range(studies):
+        rng = np.random.default_rng(k)
+        error = np.exp(0.5 * rng.normal(size=(1, 1, 20)) + 0.1 * rng.standard_t(3, (3, 1, 20)))
+        ones = np.ones(error.shape, dtype=bool)
+        levels = compute_levels(RunArrays(("a", "b", "c"), np.ones(1), error, ones, ones))
+        low, high = levels.difference(0, 1).interval(0.05)
+        outside += not low <= 0 <= high
+        best = int(np.argmin(levels.level))
+        lows = [levels.difference(i, best).interval(0.05 / 3)[0] for i in range(3) if i != best]
+        worse += any(end > 0 for end in lows)
+    limit = 0.05 + 3.1 * math.sqrt(0.05 * 0.95 / studies)
+    assert worse / studies <= limit
+    assert outside / studies <= limit
+
+
+def test_verdicts() -> None:
+    rows = board(table())
+    assert [rows[k].verdict for k in ("mcmc_rpf", "sir", "ukf")] == ["best", "worse", "worse"]
+    few = board(table(runs=4))
+    assert few["sir"].verdict == "open"
+    assert few["sir"].words == "4 runs"
+    data = table()
+    twin = data[data["filter"] == "mcmc_rpf"].assign(filter="ekf")
+    same = board(pd.concat([data, twin]))
+    assert {same[k].rank for k in ("ekf", "mcmc_rpf")} == {1}
+    assert {same[k].words for k in ("ekf", "mcmc_rpf")} == {"smallest", "identical"}
+
+
+def test_lost_runs_and_missing_conditions() -> None:
+    data = table()
+    off = (data["filter"] == "mcmc_rpf") & (data["run"] < 12)
+    data.loc[off, "keeps_track"] = False
+    rows = board(data)
+    assert rows["mcmc_rpf"].verdict == "lost"
+    assert rows["mcmc_rpf"].words == "decided by lost track"
+    assert rows["mcmc_rpf"].track == pytest.approx(0.6)
+    assert rows["sir"].verdict == "best"
+    few = table()
+    few.loc[(few["filter"] == "mcmc_rpf") & (few["run"] < 5), "keeps_track"] = False
+    assert board(few)["mcmc_rpf"].verdict == "best"  # fewer than the trimmed fifth
+    part = table()
+    part = part[(part["filter"] != "ukf") | (part["scenario"] == "w0")]
+    assert board(part)["ukf"].verdict == "missing"
+    assert board(part)["ukf"].rank is None
+
+
+def test_the_planned_word_decides() -> None:
+    data = table({"mcmc_rpf": -0.02, "sir": 0.0, "ukf": 0.0}, worlds=1, runs=12)
+    best = next(row.filter for row in board(data).values() if row.verdict == "best")
+    rest = next(k for k in EFFECTS if k != best)
+    assert board(data, planned={(rest, best): "worse"})[rest].verdict == "worse"
+    data = table()
+    assert board(data, planned={("sir", "mcmc_rpf"): "best"})["sir"].verdict == "open"
+
+
+@pytest.mark.parametrize("runs", [1, 4, 30])
+@pytest.mark.parametrize("labels", [["sir"], ["sir", "mcmc_rpf"], list(EFFECTS)])
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_sentences_of_small_studies(runs: int, labels: list[str], is_lost: bool) -> None:
+    data = table({k: EFFECTS[k] for k in labels}, worlds=1, runs=runs)
+    if is_lost:
+        data = data.assign(keeps_track=False, lost=True, rmse=np.nan)
+    rows = list(board(data).values())
+    text = describe_view(rows, find_looks(labels), "sir", "in Flight", "position error")
+    assert text.endswith(".")
+    assert "nan" not in text
+    assert "  " not in text
+    assert "None" not in text
+    assert ("No filter has an error to compare" in text) == is_lost
+    if not is_lost and len(labels) > 1 and runs == 30:
+        assert text.startswith("[[MCMC-RPF]] has the smallest position error in Flight: 2")
+
+
+def test_files_hold_what_the_board_shows(tmp_path: Path) -> None:
+    data = table()
+    rows = [{"filter": k, "ratio": row.ratio} for k, row in board(data).items()]
+    pack = {"views": {"rmse/all/all/sir": {"rows": rows}}}
+    with RecordedFolder(tmp_path / "report") as folder:
+        downloads = write_verdict_files(pack, data, folder)
+    stored = pd.read_parquet(io.BytesIO((tmp_path / "report" / "runs.parquet").read_bytes()))
+    verdicts = pd.read_csv(tmp_path / "report" / "verdicts.csv").set_index("filter")
+    for label in EFFECTS:
+        expected = math.exp(trimmed_level(stored, label) - trimmed_level(stored, "sir"))
+        assert verdicts.loc[label, "ratio"] == pytest.approx(expected)
+    assert [entry["href"] for entry in downloads] == ["verdicts.csv", "runs.parquet"]
