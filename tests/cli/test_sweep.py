@@ -137,29 +137,23 @@ def test_a_half_written_file_is_never_taken_for_a_result(tmp_path: Path) -> None
     assert not half.exists()
 
 
-def test_several_processes_give_the_bits_of_one(tmp_path: Path, undisturbed: Path) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    said = process(
-        *SWEEP, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", home=tmp_path, cwd=tmp_path
-    )
-    assert said.code == 0, said.err
-    assert same(arrays(tmp_path), arrays(undisturbed))
-
-
-def test_a_bad_cell_among_several_processes_fails_alone(tmp_path: Path) -> None:
+def test_several_processes_give_the_bits_of_one_and_a_bad_cell_fails_alone(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = (
-        "run",
-        "-m",
-        "scenario=linear_walk",
-        "scenario.steps=5",
-        "runs=2",
-        "filter.particles=0,50,60",
+        *("run", "-m", "scenario=linear_walk", "scenario.steps=30", "runs=4"),
+        *("filter=sir", "filter.particles=0,50,60"),
     )
-    said = process(
-        *words, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", home=tmp_path, cwd=tmp_path
-    )
+    several, alone = tmp_path / "several", tmp_path / "alone"
+    several.mkdir()
+    launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+    said = process(*words, *launcher, home=several, cwd=several)
     assert said.code == 1
     assert "filter.particles must be at least 2, got 0" in said.err
-    assert len(files(tmp_path)) == 2
-    assert len(list((tmp_path / "results" / "adhoc").glob("*.failed.json"))) == 1
+    assert len(list((several / "results" / "adhoc").glob("*.failed.json"))) == 1
+    assert pfbench(*words, home=alone).code == 1
+    ours, theirs = (
+        {file.name: store.read_result(file).data for file in files(home)}
+        for home in (several, alone)
+    )
+    assert len(ours) == 2
+    assert same(ours, theirs)

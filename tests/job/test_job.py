@@ -49,7 +49,7 @@ def identical(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
     )
 
 
-# a real process, twice: once to compute, once to find that it is done
+# a real process, and then another one to find that it is done
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def twice(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Said, S
     first = process(*words, home=home, cwd=home)
     files = list((home / "results" / "adhoc").iterdir())
     stamps = [file.stat().st_mtime_ns for file in files]
-    second = process(*words, home=home, cwd=home)
+    second = pfbench(*words, home=home)
     stamps += [file.stat().st_mtime_ns for file in (home / "results" / "adhoc").iterdir()]
     return home, files[0], first, second, stamps
 
