@@ -4,8 +4,10 @@ The definitions need no truth:
 
 - **lost**: the filter failed numerically. Its evidence is not finite.
 - **collapsed**: the innovations are impossible, and the spread or the effective sample size is at
-  its floor, so that the measurements cannot correct the estimate any more. Moments that are not
-  finite count as collapsed, too.
+  its floor, so that the measurements cannot correct the estimate any more. A single step is enough
+  if the spread is at its floor and the estimate is farther from the raw measurement than five of
+  its standard deviations. Moments that are not finite count as collapsed, too, and so does a
+  spread that the number type does not resolve, see `pfbench.filter.resolution`.
 - **diverged**: the estimate is farther from the raw measurements than five times their standard
   deviation, in more than half of the checked steps or in the last four.
 - **overconfident**: the normalised innovation squared (NIS) exceeds the 0.999 quantile of its
@@ -29,6 +31,7 @@ from torch import Tensor
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.particle.particle_moments import compute_nis
+from pfbench.filter.resolution import is_coarse, is_ill_conditioned
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 
 HEALTH = ("ok", "lost", "collapsed", "diverged", "overconfident")
@@ -49,6 +52,7 @@ class HealthCheck(NamedTuple):
         observed: Number of observed components.
         has_spread: Whether spread and effective sample size are above their floor.
         is_finite: Whether mean and variance are finite and no variance is negative.
+        is_coarse: Whether the number type does not resolve a standard deviation.
     """
 
     nis: Tensor
@@ -56,6 +60,7 @@ class HealthCheck(NamedTuple):
     observed: Tensor
     has_spread: Tensor
     is_finite: Tensor
+    is_coarse: Tensor
 
 
 class HealthMonitor:
@@ -82,6 +87,8 @@ class HealthMonitor:
             device=record.y.device,
         )
         self._checks: list[HealthCheck] = []
+        self._collapsed = torch.zeros(len(record.y), dtype=torch.bool, device=record.y.device)
+        self._first = observed[0] if observed else -1
 
     def check(self, t: int, model: StateSpaceModel, record: Record, info: StepInfo) -> None:
         """Check a step, if it is one of `steps`.
@@ -94,6 +101,28 @@ class HealthMonitor:
         """
         if t in self.steps:
             self._check(model.at_step(t), record.at_step(t), info)
+        # the prior is widest before the first measurement, so that this step is decisive
+        is_judged = info.cloud is None and info.mean.dtype != torch.float64
+        if is_judged and (t in self.steps or t == self._first):
+            self._collapsed |= is_ill_conditioned(info.covariance())
+
+    def check_spreads(
+        self, model: StateSpaceModel, record: Record, mean: Tensor, variance: Tensor
+    ) -> None:
+        """Mark runs whose spread is at its floor in a step with an impossible measurement.
+
+        The floor is checked in all steps at once. The measurement is evaluated only where it decides.
+
+        Args:
+            model: State-space model; `at_step` gives the model of a step.
+            record: Prepared record of all steps.
+            mean: Estimates, [R, T, D].
+            variance: Variances, [R, T, d].
+        """
+        at_floor = ~_has_spread(model, mean, variance)
+        for t in (at_floor & torch.isfinite(mean).all(-1)).any(0).nonzero().flatten().tolist():
+            misfit, observed = _compute_misfit(model.at_step(t), record.at_step(t), mean[:, t])
+            self._collapsed |= at_floor[:, t] & _is_far(misfit, observed)
 
     def classify(self, lost: Tensor) -> Tensor:
         """Return the health of each run.
@@ -106,17 +135,17 @@ class HealthMonitor:
         """
         health = torch.zeros(lost.shape, dtype=torch.int8, device=lost.device)
         if self._checks:
-            nis, misfit, observed, has_spread, is_finite = (
+            nis, misfit, observed, has_spread, is_finite, coarse = (
                 torch.stack(rows) for rows in zip(*self._checks, strict=True)
             )
             limit = self._limits[observed]
             is_impossible = _in_majority(nis.double() > limit, ~torch.isnan(nis))
-            is_far = misfit.double() > _MISFIT**2 * observed
+            is_far = _is_far(misfit, observed)
             valid = ~torch.isnan(misfit) & (observed > 0)
             diverged = _in_majority(is_far, valid) | (is_far | ~valid)[-_LAST:].all(0) & valid[-1]
             at_floor = ~has_spread & (observed > 0)
             collapsed = (is_impossible | diverged) & _in_majority(at_floor, observed > 0)
-            collapsed |= ~is_finite.all(0)
+            collapsed |= ~is_finite.all(0) | _in_majority(coarse, is_finite) | self._collapsed
             for name, mask in (
                 ("overconfident", is_impossible),
                 ("diverged", diverged),
@@ -129,18 +158,16 @@ class HealthMonitor:
     def _check(self, model: StateSpaceModel, record: Record, info: StepInfo) -> None:
         """Compute the numbers of a step."""
         mean, variance = info.mean, info.variance
+        misfit, observed = _compute_misfit(model, record, mean)
         with uncounted_observation(model):
-            point = torch.zeros_like(mean[:, :1])
-            misfit, observed = compute_nis(model, mean.unsqueeze(1), point, record)
             nis = info.nis()[0] if info.nis is not None else torch.full_like(misfit, torch.nan)
-        scale = model.error(mean, torch.zeros_like(mean)).abs()
-        floor = _ROUNDING * torch.finfo(variance.dtype).eps * scale
-        has_spread = (variance > floor * floor).any(-1)
+        has_spread = _has_spread(model, mean, variance)
         if (ess := info.trace.get("ess")) is not None:
             has_spread = has_spread & (ess >= _MIN_ESS)
         is_finite = torch.isfinite(mean).all(-1) & (variance >= 0.0).all(-1)
         is_finite &= torch.isfinite(variance).all(-1)
-        self._checks.append(HealthCheck(nis, misfit, observed, has_spread, is_finite))
+        coarse = is_coarse(_distance(model, mean), variance).any(-1)
+        self._checks.append(HealthCheck(nis, misfit, observed, has_spread, is_finite, coarse))
 
 
 def with_cached_nis(info: StepInfo) -> StepInfo:
@@ -185,3 +212,25 @@ def count_health(health: Tensor) -> dict[str, int]:
 def _in_majority(mask: Tensor, valid: Tensor) -> Tensor:
     """Return the runs [R] in which more than half of the valid steps [C, R] are marked."""
     return 2 * (mask & valid).sum(0) > valid.sum(0)
+
+
+def _distance(model: StateSpaceModel, mean: Tensor) -> Tensor:
+    """Return the absolute size of each component of states [..., D], [..., d]."""
+    return model.error(mean, torch.zeros_like(mean)).abs()
+
+
+def _has_spread(model: StateSpaceModel, mean: Tensor, variance: Tensor) -> Tensor:
+    """Return where a component of estimates [..., D] has a variance [..., d] above rounding."""
+    floor = _ROUNDING * torch.finfo(variance.dtype).eps * _distance(model, mean)
+    return (variance > floor * floor).any(-1)
+
+
+def _compute_misfit(model: StateSpaceModel, record: Record, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the NIS of estimates [R, D] under the measurement noise alone, and its components."""
+    with uncounted_observation(model):
+        return compute_nis(model, mean.unsqueeze(1), torch.zeros_like(mean[:, :1]), record)
+
+
+def _is_far(misfit: Tensor, observed: Tensor) -> Tensor:
+    """Return where an estimate is farther from the raw measurement than the limit."""
+    return misfit.double() > _MISFIT**2 * observed

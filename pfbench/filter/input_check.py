@@ -10,6 +10,7 @@ from torch import Tensor
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
+from pfbench.filter.resolution import check_measurement_resolution
 from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law
 
 _STATES = 4  # of each run that the model is tried with
@@ -70,7 +71,8 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
 
     Raises:
         ValueError: If states have another shape, if none is finite, or if the model
-            observes another number of components than `record.y` has.
+            observes another number of components than `record.y` has, or if the number type does
+            not resolve the measurements.
     """
     first, step_model = record.at_step(0), model.at_step(0)
     runs, width = first.y.shape
@@ -104,6 +106,7 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
             f"{[runs, _STATES]}, got {list(observed.batch_shape)}. Compute it from the states x, and "
             "expand what all particles share."
         )
+    check_measurement_resolution(observed, record.y, name)
 
 
 def _check_independence(

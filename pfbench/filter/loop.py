@@ -230,5 +230,6 @@ def run_filter(
     mean, variance = (
         torch.where(valid, torch.stack(rows, 1), torch.nan) for rows in (means, variances)
     )
+    monitor.check_spreads(model, prepared, mean, variance)
     health = monitor.classify(~torch.isfinite(evidences[-1]))
     return FilterResult(mean, variance, evidences[-1], trace, health)

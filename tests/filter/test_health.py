@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -14,7 +15,7 @@ from pfbench.filter import (
     Systematic,
     TaylorLinearisation,
 )
-from pfbench.filter.health import HEALTH, count_health
+from pfbench.filter.health import HEALTH, HealthMonitor, count_health
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model import LinearGaussian, linear_walk
 from pfbench.ppl.prior_predictive import simulate
@@ -75,6 +76,29 @@ def test_particles_without_spread_that_cannot_follow_are_collapsed() -> None:
     health = count_health(filtered(PARTICLES, y, frozen).health)
     assert health["collapsed"] + health["lost"] == RUNS
     assert health["collapsed"] > 0
+
+
+def test_a_single_step_without_spread_and_with_an_impossible_measurement_is_a_collapse(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    y = measurements()[:20]
+    y[:10, 17] = 1e6  # between the checked steps
+    result = filtered(PARTICLES, y)
+    assert count_health(result.health)["collapsed"] == 10
+    assert (result.health[10:] == HEALTH.index("ok")).all()
+    assert (result.variance[:10, 17] == 0.0).all()  # the fault that is to be seen
+    assert count_health(filtered(KALMAN, y).health)["collapsed"] == 0  # its spread is as before
+    monkeypatch.setattr(HealthMonitor, "check_spreads", lambda *_: None)
+    assert count_health(filtered(PARTICLES, y).health)["ok"] == 20
+
+
+def test_a_state_that_is_known_exactly_is_no_collapse() -> None:
+    exact = LinearGaussian([[1.0]], [[0.0]], [[1.0]], [1.0], [2.0], [[0.0]])
+    y = simulate(exact, Record(torch.zeros(RUNS, STEPS, 1, dtype=torch.float64)), 3)[0].y
+    for method in (KALMAN, PARTICLES):
+        result = filtered(method, y, exact)
+        assert (result.variance < 1e-28).all()  # rounding of the mean of equal particles
+        assert count_health(result.health)["ok"] == RUNS
 
 
 def test_an_impossible_measurement_never_leaves_a_run_ok() -> None:
