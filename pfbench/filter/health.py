@@ -52,7 +52,7 @@ class HealthCheck(NamedTuple):
         observed: Number of observed components.
         has_spread: Whether spread and effective sample size are above their floor.
         is_finite: Whether mean and variance are finite and no variance is negative.
-        is_coarse: Whether the number type does not resolve a standard deviation.
+        is_coarse: Whether the number type does not resolve a standard deviation of a Gaussian filter.
     """
 
     nis: Tensor
@@ -166,7 +166,9 @@ class HealthMonitor:
             has_spread = has_spread & (ess >= _MIN_ESS)
         is_finite = torch.isfinite(mean).all(-1) & (variance >= 0.0).all(-1)
         is_finite &= torch.isfinite(variance).all(-1)
-        coarse = is_coarse(_distance(model, mean), variance).any(-1)
+        coarse = torch.zeros_like(is_finite)
+        if info.cloud is None:
+            coarse = is_coarse(_distance(model, mean), variance).any(-1)
         self._checks.append(HealthCheck(nis, misfit, observed, has_spread, is_finite, coarse))
 
 

@@ -71,8 +71,8 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
 
     Raises:
         ValueError: If states have another shape, if none is finite, or if the model
-            observes another number of components than `record.y` has, or if the number type does
-            not resolve the measurements.
+            observes another number of components than `record.y` has. If the number type does not
+            resolve the measurements.
     """
     first, step_model = record.at_step(0), model.at_step(0)
     runs, width = first.y.shape

@@ -9,8 +9,8 @@ standard deviations (measured for EKF, CKF and UKF on linear models, see `tests/
   reciprocal of the condition of the correlations.
 
 The limit is a tenth of a standard deviation [ours]. A component of zero variance is known exactly and is left out. Double
-precision is not judged: the same particles differ from their mean by its rounding, which looks like a spread that is too
-small.
+precision is not judged. Of particle filters only the measurements are judged: after resampling, constant components such as
+sensor biases may be equal in all particles, in any number type.
 """
 
 from __future__ import annotations
