@@ -9,7 +9,7 @@ standard deviations (measured for EKF, CKF and UKF on linear models, see `tests/
   reciprocal of the condition of the correlations.
 
 The limit is a tenth of a standard deviation [ours]. A component of zero variance is known exactly and is left out. Double
-precision is not judged. Of particle filters only the measurements are judged: after resampling, constant components such as
+precision always passes. Of particle filters only the measurements are checked: after resampling, constant components such as
 sensor biases may be equal in all particles, in any number type.
 """
 
@@ -24,7 +24,7 @@ from pfbench.core.density import has_finite_moments
 
 LIMIT = 0.1  # standard deviations
 
-_LARGE = 0.9  # quantile of the measurements that is judged: outliers are no reason to refuse a type
+_LARGE = 0.9  # quantile of the measurements that decides, so that outliers do not
 _STEPS = 10
 _PIVOT_SCALE = 4.0  # the error of the narrowest direction is a quarter of eps / pivot
 
@@ -33,7 +33,7 @@ def is_coarse(value: Tensor, variance: Tensor) -> Tensor:
     """Return where the spacing of numbers exceeds the limit.
 
     Args:
-        value: Numbers in the type that is judged.
+        value: Numbers in the type of the computation.
         variance: Their variances.
 
     Returns:
