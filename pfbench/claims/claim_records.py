@@ -15,6 +15,7 @@ from pfbench.claims.schema import (
     FORMS,
     GROUPED,
     GROUPS,
+    MARKS,
     METRICS,
     PAPERS,
     REASONS,
@@ -28,7 +29,7 @@ SHOWN = ("holds", "fails")
 _NUMBERS = ("start", "end", "settled", "printed", "low", "high", "margin")
 _FIELD_OF_KEY = {"is": "statistic", "from": "start", "to": "end"}
 _REQUIRED_KEYS = {"id", "paper", "claim", "source"}
-_OPTIONAL_KEYS = {"printed", "forms", "why", "shown", "all", "tests", "note"}
+_OPTIONAL_KEYS = {"printed", "forms", "why", "shown", "all", "tests", "note", "mark"}
 
 
 def read_claims(
@@ -87,12 +88,14 @@ def _parse_claim(row: Mapping[str, Any]) -> Claim:
     texts = {key: str(row[key]).strip() for key in ("id", "paper", "claim", "source")}
     printed = "" if row.get("printed") is None else str(row["printed"])
     note = str(row.get("note", "")).strip()
+    mark = _parse_reason(name, "mark", row["mark"], MARKS) if "mark" in row else ("", "")
     return Claim(
         **texts,
         printed=printed,
         tests=tests or reported,
         reasons=reasons,
         note=note,
+        mark=mark,
         evidence=evidence,
     )
 

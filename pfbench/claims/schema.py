@@ -30,6 +30,7 @@ PAPERS = {
 NOT_STATED, NOT_RUN = "not specified in the paper", "not run"
 NO_POWER, LOST = "too few runs", "too many lost runs"
 REASONS = (NOT_STATED, NOT_RUN, NO_POWER, LOST)
+MARKS = ("circular", "vacuous")
 
 
 # Fields that each statistic requires besides a.
@@ -155,6 +156,8 @@ class Claim:
             the paper.
         reasons: By form, or "", a reason and its explanation why that form cannot be decided.
         note: Interpretation of the words [ours].
+        mark: "circular" or "vacuous" and its explanation, if the tests cannot support the claim;
+            empty texts otherwise.
         evidence: By form, or "", "holds" or "fails" and the evidence, if no runs are needed.
     """
 
@@ -166,6 +169,7 @@ class Claim:
     tests: Mapping[str, tuple[ClaimTest, ...]]
     reasons: Mapping[str, tuple[str, str]]
     note: str = ""
+    mark: tuple[str, str] = ("", "")
     evidence: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     @property

@@ -50,7 +50,7 @@ class ClaimVerdict:
     Attributes:
         claim: Record.
         verdict: One of `VERDICTS`.
-        reason: Reason of an undecided claim, one of `schema.REASONS`; else empty.
+        reason: Reason of an undecided claim, one of `schema.REASONS` or `schema.MARKS`; else empty.
         note: Further remarks.
         findings: Results of the tests, by form of the method.
     """
@@ -148,6 +148,8 @@ def _required_runs(result: ClaimTestResult, alpha: float) -> float:
 
 def _decide(claim: Claim, results: Mapping[str, _Results]) -> ClaimVerdict:
     """Decide a claim from the results of each form of the method."""
+    if claim.mark[0]:
+        return ClaimVerdict(claim, UNDECIDED, *claim.mark, results)
     if "" in claim.reasons:
         return ClaimVerdict(claim, UNDECIDED, *claim.reasons[""], results)
     outcomes = {form: _combine(values) for form, values in results.items()}

@@ -450,6 +450,19 @@ def test_a_claim_that_a_test_shows_is_decided_without_runs() -> None:
     )
 
 
+def test_a_circular_or_vacuous_claim_is_not_reproduced_whatever_its_tests_show() -> None:
+    marked = {claim.id: claim.mark[0] for claim in ALL if claim.mark[0]}
+    circular = {"002-25": "circular", **{f"004-C{k}": "circular" for k in (1, 2, 3)}}
+    assert marked == {"002-08": "vacuous", **circular}
+    holds = frame(LESS, **normal(-1.0, 0.1, 40))
+    assert verdicts.decide_claims([claim(LESS)], holds)[0].verdict == YES  # the control
+    record = replace(claim(LESS), mark=("circular", "set from the claim"))
+    (verdict,) = verdicts.decide_claims([record], holds)
+    assert (verdict.verdict, verdict.reason) == ("undecided", "circular")
+    assert verdict.note == "set from the claim"
+    assert verdict.findings[""][0].outcome == "holds"
+
+
 def normal(middle: float, scatter: float, runs: int, seed: int = 0) -> dict[str, np.ndarray]:
     """Ratios whose logarithms have this median and deviation exactly."""
     d = np.random.default_rng(seed).standard_normal(runs)
