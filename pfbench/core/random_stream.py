@@ -1,33 +1,27 @@
-"""Counter-based random streams: Philox4x32-10.
+"""Counter-based random streams.
 
 Each number is a pure function of (seed, run, step, purpose, component, particle). A run therefore
-gets the same numbers alone, in any batch and on any device. More filters, runs or stages do not
-change the numbers of the others. The generator is stateless.
-
-References:
-    J. Salmon, M. Moraes, R. Dror and D. Shaw (2011), Parallel random numbers: as easy as 1, 2, 3.
+gets the same numbers alone, in any batch, in every engine and on any device, bit by bit. More filters,
+runs or stages do not change the numbers of the others. The generator is stateless.
 """
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import torch
 from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.parameter_checks import check_run_numbers
-from pfbench.kernels import cpp, cuda
+from pfbench.kernels import cpp, cuda, philox
 from pfbench.kernels.compilation import compilable
 
-_MULTIPLY = (0xD2511F53, 0xCD9E8D57)
-_WEYL = (0x9E3779B9, 0xBB67AE85)
-_WORD = 0xFFFFFFFF
-_BLOCK = 16384  # words whose temporaries fit the second-level cache: 7 instead of 19 ms for 750 000 normals
-
-Words: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor]
+Draw: TypeAlias = Callable[..., Tensor]
+"""(seed [], purpose, step [], runs [R], components w, quarters q) -> [w, R, 4 q]."""
 
 
 class RandomStream(Protocol):
@@ -78,87 +72,53 @@ class BatchRandomStream(RandomStream, Protocol):
         """Return the stream of some runs."""
 
 
-def draw_normals_blocked(
-    seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
-) -> Tensor:
-    """Draw the numbers of `draw_normals` in blocks of components that fit the cache.
-
-    Args:
-        seed: Seed, [].
-        purpose: Hash of the label.
-        step: Time step, [].
-        runs: Run numbers, [R].
-        components: Number of components w.
-        quarters: Number of particles divided by 4, q.
-
-    Returns:
-        Standard normal numbers, float32, [w, R, 4 q].
-    """
-    size = max(1, _BLOCK // max(1, runs.shape[0] * quarters))
-    blocks = torch.arange(components, device=runs.device).split(size)
-    return torch.cat(
-        [_box_muller(_words((seed, purpose), step, runs, block, quarters)) for block in blocks]
-    )
-
-
 def _normals(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
-    """Draw standard normal numbers by Box and Muller, float32 [w, R, 4 q].
+    """Draw standard normal numbers, float32 [w, R, 4 q].
 
     Seed and purpose are the key. (quarter, component, step, run) is the counter of four numbers.
     """
-    return _box_muller(
-        _words((seed, purpose), step, runs, torch.arange(components, device=runs.device), quarters)
-    )
+    return philox.compute_normals((seed, purpose, step, runs, components, quarters), philox.SINGLE)
 
 
-def _box_muller(words: Words) -> Tensor:
-    """Transform random words to standard normal numbers."""
-    numbers = []
-    a, b, c, d = words
-    for radial, angular in ((a, b), (c, d)):
-        # + 1/2 avoids log(0); a word that rounds up to 1 gives radius 0, which is harmless
-        radius = torch.sqrt(-2.0 * torch.log((radial.float() + 0.5) * 2.0**-32))
-        angle = angular.float() * (2.0 * torch.pi * 2.0**-32)
-        numbers += [radius * torch.cos(angle), radius * torch.sin(angle)]
-    return torch.cat(numbers, dim=-1)
-
-
-def _eager_normals(
+def _normals_float64(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
-    """Use the CUDA kernel if there is one: separate operations would take 90 % of a step."""
-    args = seed, purpose, step, runs, components, quarters
-    return (
-        (cuda.find_kernel("philox_normals", args) if runs.is_cuda else None) or draw_normals_blocked
-    )(*args)
-
-
-draw_normals = compilable(_normals, eager=_eager_normals, operator=cpp.philox_normals)
+    """Draw standard normal numbers, float64 [w, R, 4 q]."""
+    return philox.compute_normals((seed, purpose, step, runs, components, quarters), philox.DOUBLE)
 
 
 def _uniforms(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
     """Draw uniform numbers on the open interval (0, 1), float64 [w, R, 4 q]."""
-    words = _words(
-        (seed, purpose), step, runs, torch.arange(components, device=runs.device), quarters
+    return philox.compute_uniforms((seed, purpose, step, runs, components, quarters))
+
+
+def _prefer_kernel(name: str, function: Draw) -> Draw:
+    """Use the CUDA kernel if there is one: separate operations would take 90 % of a step."""
+
+    def draw(*args: Any) -> Tensor:
+        kernel = cuda.find_kernel(name, args) if args[3].is_cuda else None
+        return (kernel or function)(*args)
+
+    return draw
+
+
+def _make_draw(function: Draw, operator: Draw) -> Draw:
+    """Return the fastest form of a draw. All forms draw the same bits."""
+    return compilable(
+        function,
+        eager=_prefer_kernel(operator.__name__, function),
+        operator=operator,
+        use_torch_compiler=False,
     )
-    return (torch.cat(words, dim=-1).double() + 0.5) * 2.0**-32
 
 
-def _eager_uniforms(
-    seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
-) -> Tensor:
-    """Use the CUDA kernel if there is one."""
-    args = seed, purpose, step, runs, components, quarters
-    return ((cuda.find_kernel("philox_uniforms", args) if runs.is_cuda else None) or _uniforms)(
-        *args
-    )
-
-
-draw_uniforms = compilable(_uniforms, eager=_eager_uniforms, operator=cpp.philox_uniforms)
+draw_normals = _make_draw(_normals, cpp.philox_normals)
+draw_normals_float64 = _make_draw(_normals_float64, cpp.philox_normals_float64)
+draw_uniforms = _make_draw(_uniforms, cpp.philox_uniforms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +129,9 @@ class PhiloxStream(BatchRandomStream):
         seed: Integer from 0 to 2**32 - 1. In a recorded step a tensor [], as `step`.
         runs: Run numbers, int64, [R]. The number of a run, not its index in the batch, decides its
             random numbers. From 0 to 2**32 - 1.
-        dtype: Type of the normals. They are drawn in single precision (24 bits, largest value 6.7)
-            and converted, which takes a sixth of the time of double precision.
+        dtype: Type of the normals. float32 has 24 bits and a largest value of 6.7. float64 has 52
+            bits and a largest value of 8.6, and takes 2.5 times as long; rounded, it is the
+            number of float32 to about 1e-5.
         step: Time step. 0 is the step of the initial distribution.
 
     Raises:
@@ -183,7 +144,7 @@ class PhiloxStream(BatchRandomStream):
     step: int | Tensor = 0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.seed, Tensor) and not 0 <= self.seed <= _WORD:
+        if not isinstance(self.seed, Tensor) and not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be from 0 to 2**32 - 1, got {self.seed}. Change the seed.")
         if isinstance(self.step, int) and self.step == 0:  # later steps have the same runs
             check_run_numbers(self.runs)
@@ -198,7 +159,8 @@ class PhiloxStream(BatchRandomStream):
 
     @override
     def normal(self, purpose: str, n: int, w: int) -> Tensor:
-        return draw_normals(*self._counter(purpose, n, w))[..., :n].to(self.dtype).permute(1, 2, 0)
+        draw = draw_normals if self.dtype == torch.float32 else draw_normals_float64
+        return draw(*self._counter(purpose, n, w))[..., :n].to(self.dtype).permute(1, 2, 0)
 
     @override
     def uniform(self, purpose: str, n: int, w: int) -> Tensor:
@@ -209,41 +171,3 @@ class PhiloxStream(BatchRandomStream):
     ) -> tuple[Tensor, int, Tensor, Tensor, int, int]:
         seed, step = torch.as_tensor(self.seed), torch.as_tensor(self.step)
         return seed, zlib.crc32(purpose.encode()), step, self.runs, w, -(-n // 4)
-
-
-def _words(
-    key: tuple[Tensor, int], step: Tensor, runs: Tensor, component: Tensor, quarters: int
-) -> Words:
-    """Return four random words for each component, run and quarter of the particles, [w, R, q]."""
-    particle = torch.arange(quarters, device=runs.device)
-    step, seed = step.to(runs.device), key[0].to(runs.device)
-    counter = particle, component[:, None, None], step, runs[:, None]
-    c0, c1, c2, c3 = (word.expand(len(component), len(runs), quarters) for word in counter)
-    return philox((c0, c1, c2, c3), (seed, key[1]))
-
-
-def philox(counter: Words, key: tuple[Tensor | int, Tensor | int], rounds: int = 10) -> Words:
-    """Compute random words by Philox4x32.
-
-    The results agree with the published known-answer vectors. A product of two 32-bit words wraps
-    around in int64. The sign bits of the arithmetic shift and the high half of the other product
-    are masked after the exclusive or.
-
-    Args:
-        counter: Four 32-bit words in int64 tensors.
-        key: Two 32-bit words.
-        rounds: Number of rounds.
-
-    Returns:
-        Four 32-bit random words in int64 tensors.
-    """
-    c0, c1, c2, c3 = counter
-    index = torch.arange(rounds, device=counter[0].device)
-    keys = zip(
-        *(((k + weyl * index) & _WORD).unbind(0) for k, weyl in zip(key, _WEYL, strict=True)),
-        strict=True,
-    )
-    for k0, k1 in keys:
-        p0, p1 = c0 * _MULTIPLY[0], c2 * _MULTIPLY[1]
-        c0, c1, c2, c3 = ((p1 >> 32) ^ c1 ^ k0) & _WORD, p1, ((p0 >> 32) ^ c3 ^ k1) & _WORD, p0
-    return c0, c1 & _WORD, c2, c3 & _WORD

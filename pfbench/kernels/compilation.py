@@ -23,7 +23,6 @@ from typing import Any, TypeVar, cast
 
 import torch
 from torch.autograd import forward_ad
-from torch.utils import _pytree as pytree
 
 from pfbench.kernels import cuda, manifest
 from pfbench.kernels.private_folder import use_private_cache
@@ -89,42 +88,37 @@ def compilable(
     Args:
         function: Function to compile.
         eager: Function for eager mode, if separate operations have a faster method.
-        operator: Hand-written kernel. It replaces the compiled function on the CPU with one thread,
-            and on a CUDA device if a kernel of its name exists. It is not used with gradients.
+        operator: Hand-written kernel. It replaces the function on the CPU, where it runs in one
+            thread, and on a CUDA device if a kernel of its name exists. It is not used with
+            gradients.
         keep_in_graph: Whether (or for which tensors) a compiled step on the CPU uses the kernel as
             one operator. False if torch's compiler does it as well.
-        use_torch_compiler: Whether torch's compiler is used without a kernel. Linear algebra does
-            not gain from it.
+        use_torch_compiler: Whether torch's compiler is used on a CUDA device without a kernel.
+            Linear algebra does not gain from it, and the generator takes minutes to compile.
 
     Returns:
         The compilable function.
     """
     run_eagerly = eager or function
     in_graph = operator if operator is not None and keep_in_graph else None
-    if in_graph is not None:
-        _register_shapes(in_graph, function)
     fits_graph = keep_in_graph if callable(keep_in_graph) else lambda *_: True
 
     compiled = cache(partial(_compile_by_torch, function))
 
     def run_compiled(*args: Any) -> Any:
+        if not _plain(args):
+            _check(operator, args)
+            return run_eagerly(*args)
         if _on_cuda(args):
-            return (
-                _find_cuda_kernel(operator, args)
-                or (compiled() if use_torch_compiler else run_eagerly)
-            )(*args)
-        if (
-            operator is not None
-            and operator not in _failed
-            and torch.get_num_threads() == 1
-            and _plain(args)
-        ):
+            kernel = _find_cuda_kernel(operator, args)
+            return (kernel or (compiled() if use_torch_compiler else run_eagerly))(*args)
+        if operator is not None and operator not in _failed:
             try:
                 return operator(*args)
             except (OSError, subprocess.CalledProcessError) as error:
-                _note_failure(operator, error, use_torch_compiler)
+                _note_failure(operator, error)
         _check(operator, args)
-        return (compiled() if use_torch_compiler else run_eagerly)(*args)
+        return run_eagerly(*args)
 
     @wraps(function)
     def call(*args: Any) -> Any:
@@ -155,13 +149,10 @@ def _find_cuda_kernel(
     return kernel
 
 
-def _note_failure(
-    operator: Callable[..., Any], error: BaseException, use_torch_compiler: bool
-) -> None:
+def _note_failure(operator: Callable[..., Any], error: BaseException) -> None:
     """Log that a kernel does not compile, and do not try it again."""
-    fallback = "torch's compiler" if use_torch_compiler else "eager mode"
     name, kind = operator.__name__, type(error).__name__
-    log.warning("%s does not compile here (%s). Using %s", name, kind, fallback)
+    log.warning("%s does not compile here (%s). Using eager mode", name, kind)
     _failed.add(operator)
 
 
@@ -189,12 +180,3 @@ def _compile_by_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     use_private_cache()
     with kept_validation():
         return torch.compile(function, dynamic=True)
-
-
-def _register_shapes(operator: Callable[..., Any], template: Callable[..., Any]) -> None:
-    """Register an operator's results for torch's compiler: contiguous, shapes as the template's."""
-
-    def shapes(*args: Any) -> Any:
-        return pytree.tree_map(lambda a: a.new_empty(a.shape), template(*args))
-
-    torch.library.register_fake(f"pfbench::{operator.__name__}", shapes)

@@ -19,6 +19,7 @@ from torch import Tensor
 from pfbench.kernels import cuda
 from pfbench.kernels.cpp_library import load_library
 from pfbench.kernels.operator_door import explain_errors
+from pfbench.kernels.operator_results import register_shapes
 
 _operators = torch.library.Library("pfbench", "DEF")
 
@@ -29,7 +30,7 @@ def philox_normals(
 ) -> Tensor:
     """Draw standard normal numbers.
 
-    They equal those of `random_stream.draw_normals` to 5e-6.
+    They equal those of `philox.compute_normals` bit for bit.
 
     Args:
         seed: Seed, an integer tensor [].
@@ -46,12 +47,20 @@ def philox_normals(
 
 
 @explain_errors
+def philox_normals_float64(
+    seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
+) -> Tensor:
+    """Draw standard normal numbers in double precision, float64 [w, R, 4 q], as `philox_normals`."""
+    return _operator("philox_normals_float64")(seed, purpose, step, runs, components, quarters)
+
+
+@explain_errors
 def philox_uniforms(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
     """Draw uniform numbers on (0, 1).
 
-    They equal those of `random_stream.draw_uniforms` bit for bit.
+    They equal those of `philox.compute_uniforms` bit for bit.
 
     Args:
         seed: Seed, an integer tensor [].
@@ -303,6 +312,7 @@ def energy_score(points: Tensor) -> Tensor:
 
 _STEP = (
     philox_normals,
+    philox_normals_float64,
     philox_uniforms,
     resample_systematic,
     gather_particles,
@@ -318,11 +328,8 @@ _REPORT = group_covariance, squared_mahalanobis, marginal_scores, energy_score
 for _kernel in _STEP + _GAUSSIAN + _REPORT:
     _schema = torch.library.infer_schema(unwrap(_kernel), mutates_args=())
     _operators.define(_kernel.__name__ + _schema)
+    register_shapes(_kernel.__name__)
 cuda.register(_operators)
-torch.library.register_fake(
-    "pfbench::gather_propagate",
-    lambda phi, x, ancestors, *_: x.new_empty(x.shape[0], *ancestors.shape),
-)
 
 
 @cache

@@ -23,7 +23,9 @@ _COMMON = ("-O3", "-march=native", "-fopenmp-simd", "-fPIC", "-std=c++17", "-c")
 _MATHS = ("-fno-math-errno", "-fno-trapping-math")
 _SUMS = ("-fno-signed-zeros", "-fassociative-math")
 _FLAGS = {
-    "random_normal": (*_COMMON, "-ffast-math", "-mno-recip"),
+    # each operation rounds once, as in torch: all engines draw the same bits and choose the same ancestors
+    "random_normal": (*_COMMON, *_MATHS, "-ffp-contract=off"),
+    "resampling": (*_COMMON, *_MATHS, "-ffp-contract=off"),
     "compiled_step": _COMMON,
     "particles": (*_COMMON, *_MATHS, *_SUMS),
     "linear_algebra": (*_COMMON, *_MATHS),
@@ -66,7 +68,6 @@ def load_library() -> None:
             ]
             with ThreadPoolExecutor() as pool:
                 list(pool.map(partial(subprocess.run, check=True, capture_output=True), commands))
-            # -ffast-math at linking would flush denormal numbers to zero in the whole process
             libraries = [f"-L{_TORCH / 'lib'}", "-ltorch_cpu", "-lm", "-ldl"]
             if sys.platform == "darwin":  # resolve symbols of Python at loading
                 libraries.append("-Wl,-undefined,dynamic_lookup")

@@ -5,20 +5,18 @@ If they do not compile, a warning is logged and torch's own compiler is used.
 
 from __future__ import annotations
 
-import ctypes
 import logging
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from pfbench.kernels.cuda_launch import compile_kernel, launch_kernel
 from pfbench.kernels.operator_door import check_first
 
 log = logging.getLogger("pfbench")
-_SOURCE = Path(__file__).parent / "src" / "particles.cu"
 _REAL = {torch.float32: "float", torch.float64: "double"}
 _ROWS = 65535  # blocks along the second axis of a grid
 _SHARED = 48 * 1024  # bytes of shared memory of a block without a special attribute
@@ -39,7 +37,7 @@ def is_cuda_available() -> bool:
 def _compiles() -> bool:
     """Return whether torch compiles CUDA C++ here, which needs headers of a CUDA toolkit."""
     try:
-        _kernel("uniforms", torch.cuda.current_device())
+        compile_kernel("uniforms", torch.cuda.current_device())
     except Exception as error:  # torch raises many kinds
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         log.warning("CUDA kernels do not compile here (%s). Using torch's compiler", reason)
@@ -70,14 +68,14 @@ def _draw(
     runs: Tensor,
     components: int,
     quarters: int,
-    dtype: torch.dtype,
+    name: str,
+    dtype: torch.dtype = torch.float64,
 ) -> Tensor:
     out = runs.new_empty(components, len(runs), 4 * quarters, dtype=dtype)
-    name = "normals" if dtype == torch.float32 else "uniforms"
-    threads = min(256, 32 * -(-quarters // 32))
+    threads = max(32, min(256, 32 * -(-quarters // 32)))
     grid = -(-quarters // threads), min(_ROWS, components * len(runs)), 1
     numbers = int(seed), purpose, int(step), components, len(runs), quarters
-    _launch(name, grid, threads, out, runs.contiguous(), *numbers)
+    launch_kernel(name, grid, threads, out, runs.contiguous(), *numbers)
     return out
 
 
@@ -96,7 +94,7 @@ def _affine(
     per_run = (len(phi) > 1) + 2 * (len(gain) > 1)
     grid = -(-m // 512), min(_ROWS, runs), 1
     tensors = out, x, parent, w, phi, gain
-    _launch(name, grid, 128, *tensors, per_run, numbers, seed, purpose, step, runs, n, m)
+    launch_kernel(name, grid, 128, *tensors, per_run, numbers, seed, purpose, step, runs, n, m)
     return out
 
 
@@ -104,14 +102,22 @@ def _philox_normals(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
     """Draw standard normal numbers of blocks."""
-    return _draw(seed, purpose, step, runs, components, quarters, torch.float32)
+    args = seed, purpose, step, runs, components, quarters
+    return _draw(*args, "normals<float>", torch.float32)
+
+
+def _philox_normals_float64(
+    seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
+) -> Tensor:
+    """Draw standard normal numbers of blocks in double precision."""
+    return _draw(seed, purpose, step, runs, components, quarters, "normals<double>")
 
 
 def _philox_uniforms(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
     """Draw uniform numbers of blocks."""
-    return _draw(seed, purpose, step, runs, components, quarters, torch.float64)
+    return _draw(seed, purpose, step, runs, components, quarters, "uniforms")
 
 
 def _gather_particles(x: Tensor, ancestors: Tensor) -> Tensor:
@@ -120,7 +126,7 @@ def _gather_particles(x: Tensor, ancestors: Tensor) -> Tensor:
     out = x.new_empty(d, runs, m)
     grid = -(-m // 256), min(_ROWS, runs), 1
     name, sources = f"copied<{_REAL[x.dtype]}>", (x.contiguous(), ancestors.contiguous())
-    _launch(name, grid, 256, out, *sources, d, runs, n, m)
+    launch_kernel(name, grid, 256, out, *sources, d, runs, n, m)
     return out
 
 
@@ -156,10 +162,10 @@ def _resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     inside = 4 * slots <= _SHARED - 1024
     blocks = min(runs, _ROWS)
     marks = out if inside else a.new_empty(blocks, slots, dtype=torch.int32)
-    counts, uniforms = n.to(a.dtype).contiguous(), u.to(torch.float64).contiguous()
+    counts, uniforms = n.double().contiguous(), u.double().contiguous()
     args = a.contiguous(), counts, int(len(n) > 1), uniforms, marks, int(inside), runs, slots
     name, shared = f"systematic<{_REAL[a.dtype]}>", 4 * slots if inside else 0
-    _launch(name, (blocks, 1, 1), _BLOCK, out, *args, shared=shared)
+    launch_kernel(name, (blocks, 1, 1), _BLOCK, out, *args, shared=shared)
     return out
 
 
@@ -168,7 +174,7 @@ def _count_unique(ancestors: Tensor, log_w: Tensor) -> Tensor:
     (runs, slots), bytes_ = log_w.shape, 4 * -(-2 * log_w.shape[1] // 4)
     out, sources = ancestors.new_empty(runs), (ancestors.contiguous(), log_w.contiguous())
     name, grid = f"distinct<{_REAL[log_w.dtype]}>", (min(runs, _ROWS), 1, 1)
-    _launch(name, grid, _BLOCK, out, *sources, runs, slots, shared=bytes_)
+    launch_kernel(name, grid, _BLOCK, out, *sources, runs, slots, shared=bytes_)
     return out
 
 
@@ -177,7 +183,9 @@ def _weighted_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     runs, slots, d = x.shape
     mean, variance = x.new_empty(runs, d), x.new_empty(runs, d)
     args = x.permute(2, 0, 1).contiguous(), w.contiguous(), runs, slots
-    _launch(f"moments<{_REAL[x.dtype]}, {d}>", (min(runs, _ROWS), 1, 1), 256, mean, variance, *args)
+    launch_kernel(
+        f"moments<{_REAL[x.dtype]}, {d}>", (min(runs, _ROWS), 1, 1), 256, mean, variance, *args
+    )
     return mean, variance
 
 
@@ -199,14 +207,15 @@ def _is_square(phi: Tensor) -> bool:
 KERNELS: dict[str, Callable[..., Any]] = {
     kernel.__name__.removeprefix("_"): check_first(kernel)
     for kernel in (
-        _philox_normals, _philox_uniforms, _gather_particles, _propagate_affine, _gather_propagate,
-        _resample_systematic, _count_unique, _weighted_moments,
+        _philox_normals, _philox_normals_float64, _philox_uniforms, _gather_particles,
+        _propagate_affine, _gather_propagate, _resample_systematic, _count_unique, _weighted_moments,
     )
 }  # fmt: skip
 """Operators of `pfbench.kernels.cpp` on a CUDA device. They do not check values: the host would wait."""
 
 _ACCEPTS: dict[str, Callable[..., bool]] = {
     "philox_normals": lambda *_: True,
+    "philox_normals_float64": lambda *_: True,
     "philox_uniforms": lambda *_: True,
     "gather_particles": lambda x, ancestors: x.dtype in _REAL,
     "propagate_affine": lambda phi, x, gain, w: _fits_registers(x) and _is_square(phi),
@@ -214,34 +223,6 @@ _ACCEPTS: dict[str, Callable[..., bool]] = {
     "count_unique": lambda ancestors, log_w: _fills_device(log_w, (_SHARED - 1024) // 2),
     "weighted_moments": lambda x, w: _fills_device(w, 1 << 20) and _fits_registers(x),
 }
-
-
-def _launch(
-    name: str, grid: tuple[int, int, int], threads: int, *args: Tensor | int, shared: int = 0
-) -> None:
-    """Launch a kernel of particles.cu in the current stream of its first argument's device."""
-    assert isinstance(args[0], Tensor)
-    if 0 in grid:  # the driver rejects empty grids
-        return None
-    device = args[0].device
-    if torch.cuda.current_device() != device.index:
-        with torch.cuda.device(device):
-            return _launch(name, grid, threads, *args, shared=shared)
-    function, driver = _kernel(name, device.index)
-    values = [
-        ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_int(a) for a in args
-    ]
-    pointers = (ctypes.c_void_p * len(values))(*map(ctypes.addressof, values))
-    stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
-    code = driver.cuLaunchKernel(function, *grid, threads, 1, 1, shared, stream, pointers, None)
-    if code:
-        raise RuntimeError(f"{name} cannot run: the CUDA driver returned error {code}.")
-
-
-@cache
-def _kernel(name: str, device: int) -> tuple[Any, Any]:
-    """Return a compiled kernel and the driver, which torch would open again at each call."""
-    return torch.cuda._compile_kernel(_SOURCE.read_text(), name).func, ctypes.CDLL("libcuda.so.1")
 
 
 def register(operators: torch.library.Library) -> None:

@@ -28,7 +28,8 @@ log = logging.getLogger("pfbench")
 TensorFunction = Callable[[list[Tensor]], Sequence[Tensor]]
 _KINDS = {"T": "AtenTensorHandle", "i": "int64_t"}
 _SIGNATURES = {  # arguments and results
-    "philox_normals": ("TiTTii", "T"), "philox_uniforms": ("TiTTii", "T"), "resample_systematic": ("TTT", "T"), "gather_particles": ("TT", "T"),
+    "philox_normals": ("TiTTii", "T"), "philox_normals_float64": ("TiTTii", "T"), "philox_uniforms": ("TiTTii", "T"),
+    "resample_systematic": ("TTT", "T"), "gather_particles": ("TT", "T"),
     "propagate_affine": ("TTTT", "T"), "count_unique": ("TT", "T"), "sum_and_squares": ("T", "TT"), "weighted_moments": ("TT", "TT"),
 }  # fmt: skip
 
@@ -115,13 +116,21 @@ def compile_function(
 
 
 def _fuse_propagation(graph: Operations) -> None:
-    """Fuse the copy of parents, their noise and `affine` into one operator of a CUDA device."""
+    """Fuse the copy of parents, their noise and `affine` into one operator of a CUDA device.
+
+    The operator draws noise of the type of the particles.
+    """
+    normals = {
+        torch.float32: torch.ops.pfbench.philox_normals.default,
+        torch.float64: torch.ops.pfbench.philox_normals_float64.default,
+    }
     for node in graph.find_nodes(
         op="call_function", target=torch.ops.pfbench.propagate_affine.default
     ):
         phi, x, gain, w = node.args
         copied = _find_source(x, torch.ops.pfbench.gather_particles.default)
-        noise = _find_source(w, torch.ops.pfbench.philox_normals.default)
+        draw = normals.get(x.meta["val"].dtype)
+        noise = _find_source(w, draw) if draw is not None else None
         if copied is None or noise is None:
             continue
         seed, purpose, step, runs, *_ = noise.args

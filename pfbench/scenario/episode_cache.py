@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pfbench.files.atomic_write import set_aside, write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+from pfbench.kernels.generator_version import GENERATOR_VERSION
 
 Arrays = dict[str, Tensor]
 log = logging.getLogger("pfbench")
@@ -35,7 +36,8 @@ def load_or_build(folder: str | Path | None, recipe: object, build: Callable[[],
     """
     if folder is None:
         return build()
-    key = hashlib.sha256(f"episodes 2 {recipe!r}".encode()).hexdigest()[:16]
+    head = f"episodes 2 generator {GENERATOR_VERSION}"
+    key = hashlib.sha256(f"{head} {recipe!r}".encode()).hexdigest()[:16]
     path = Path(folder) / f"{key}.npz"
     if path.exists():
         try:

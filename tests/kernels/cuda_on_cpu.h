@@ -1,4 +1,4 @@
-// As much of CUDA as loops.cu needs, for a C++ compiler: blocks one after the other, of one thread each.
+// As much of CUDA as particles.cu needs, for a C++ compiler: blocks one after the other, of one thread each.
 #include <cmath>
 #include <cstring>
 #include <utility>
@@ -8,9 +8,6 @@
 #define __shared__ static
 #define __launch_bounds__(...)
 #define LANES 1
-#define __logf(value) std::log(value)
-#define __cosf(value) std::cos(value)
-#define __sinf(value) std::sin(value)
 
 struct Index { int x, y; };
 static const Index threadIdx{0, 0}, blockDim{1, 1};
@@ -24,9 +21,6 @@ template <typename T> static T __shfl_sync(unsigned, T value, int) { return valu
 static int __popc(unsigned value) { return __builtin_popcount(value); }
 static unsigned __float_as_uint(float value) { unsigned bits; std::memcpy(&bits, &value, 4); return bits; }
 static float __int_as_float(unsigned bits) { float value; std::memcpy(&value, &bits, 4); return value; }
-static float __uint2float_rn(unsigned value) { return (float)value; }
-static float __int2float_rn(int value) { return (float)value; }
-static float rsqrtf(float value) { return 1.0f / std::sqrt(value); }
 template <typename T> static T min(T a, T b) { return b < a ? b : a; }
 template <typename T> static T max(T a, T b) { return a < b ? b : a; }
 

@@ -97,7 +97,6 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
 @pytest.mark.filterwarnings("ignore")  # the compiler's own
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_fused_functions_agree_with_eager_ones(dtype: torch.dtype) -> None:
-    # the draws are made once: fused and eager normals differ by roundings of float32 (test below)
     x, z = DRAWS.normal("x", N, D).to(dtype), DRAWS.normal("w", N, 1)[..., 0].to(dtype)
     eager = results(x, z)
     with compilation.use_compiled():
@@ -118,9 +117,8 @@ def test_a_filter_runs_alike_fused_and_eagerly() -> None:
     eager = run()
     with compilation.use_compiled(), torch.no_grad():
         fused = run()
-    # normals agree to 1e-5 and a slot of a resampling may fall to a neighbour: far below the Monte Carlo error
-    assert torch.allclose(fused.log_evidence, eager.log_evidence, rtol=0, atol=2e-2)
-    assert torch.allclose(fused.mean, eager.mean, rtol=0, atol=2e-2)
+    assert torch.allclose(fused.log_evidence, eager.log_evidence, rtol=1e-9, atol=0.0)
+    assert torch.allclose(fused.mean, eager.mean, rtol=1e-9, atol=1e-12)
 
 
 @compiler
@@ -433,7 +431,6 @@ def test_what_no_compiler_improves_runs_eagerly_where_its_loop_does_not_compile(
                     separate,
                     operator=sum_and_squares,
                     keep_in_graph=False,
-                    use_torch_compiler=False,
                 )(torch.ones(1, 1))
             )
             == 2.0
@@ -508,15 +505,17 @@ def test_a_compiled_job_gives_the_numbers_of_an_eager_one(tmp_path: Path, dtype:
     for engine in ("eager", "kernels"):
         said = pfbench(*WALK, f"engine={engine}", f"dtype={dtype}", home=tmp_path)
         assert said.code == 0, said.err
-        (file,) = (tmp_path / "results" / "adhoc").glob(
-            "*.npz"
-        )  # one key: an engine changes no result
-        found[engine] = store.read_result(file)
-        assert found[engine].meta["engine"] == engine
-    # the same draws, to 1e-5; a particle in a few thousand falls to a neighbouring slot
+        files = list((tmp_path / "results" / "adhoc").glob("*.npz"))
+        for file in files:
+            result = store.read_result(file)
+            found[result.meta["engine"]] = result
+        assert engine in found
+    assert len(files) == (1 if dtype == "float64" else 2)  # keys: one, or one for each engine
+    # stored in single precision; a particle in a few thousand falls to a neighbouring slot in float32
+    tolerance = 1e-6 if dtype == "float64" else 2e-2
     eager, compiled = (found[engine].data for engine in ("eager", "kernels"))
     for name in ("error", "sd", "log_evidence"):
-        assert np.allclose(compiled[name], eager[name], rtol=0, atol=2e-2), name
+        assert np.allclose(compiled[name], eager[name], rtol=tolerance, atol=tolerance), name
 
 
 def test_where_nothing_compiles_one_line_says_so(

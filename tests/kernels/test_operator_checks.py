@@ -86,6 +86,7 @@ def eager_function(name: str) -> Callable[..., Any]:
     """The function that pfbench calls for an operator."""
     return {
         "philox_normals": random_stream.draw_normals,
+        "philox_normals_float64": random_stream.draw_normals_float64,
         "philox_uniforms": random_stream.draw_uniforms,
         "resample_systematic": resampling_schemes._systematic,
         "gather_particles": belief._gather_components,

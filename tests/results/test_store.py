@@ -13,7 +13,7 @@ from checkout import TESTS
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pfbench.results import store
+from pfbench.results import config_key, store
 from pfbench.results.config_key import compute_config_key
 
 R, T, D = 3, 5, 2
@@ -94,6 +94,22 @@ def test_ignored_paths_change_nothing_and_others_do():
     )
     assert compute_config_key(here, ("data",)) == compute_config_key(
         {k: v for k, v in here.items() if k != "data"}
+    )
+
+
+def test_the_generator_is_part_of_the_key_and_the_engine_in_single_precision(monkeypatch):
+    """Engines agree to rounding in double precision only."""
+    keys = {
+        (dtype, engine): compute_config_key({"dtype": dtype, "engine": engine}, ("engine",))
+        for dtype in ("float64", "float32")
+        for engine in ("eager", "kernels")
+    }
+    assert keys["float64", "eager"] == keys["float64", "kernels"]
+    assert len(set(keys.values())) == 3
+    monkeypatch.setattr(config_key, "GENERATOR_VERSION", 0)
+    assert (
+        compute_config_key({"dtype": "float64", "engine": "eager"}, ("engine",))
+        not in keys.values()
     )
 
 

@@ -1,8 +1,9 @@
 """Resampling schemes: ancestors drawn by probabilities.
 
 Every scheme gives a particle n a copies on average for probabilities a. All are batched and use
-counting or sorted search. Indices stay in range: cumulative sums are float64 from N = 1e5, and
-their last value is set to 1.
+counting or sorted search. Probabilities are cut to multiples of 2^-52, whose sums are exact in double
+precision. Cumulative sums are therefore the same in any order of summation, so that all engines and
+devices choose the same ancestors by the same probabilities.
 """
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ from pfbench.filter.particle.resampling import ResamplingScheme
 from pfbench.kernels import cpp
 from pfbench.kernels.compilation import compilable
 
-# particles from which sums are float64: in float32 one ancestor in 500 would be wrong
-_DOUBLE_FROM = 100_000
+_GRID = 2.0**52  # multiples of its inverse are summed without rounding, up to a sum of 2
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,16 @@ class Systematic(ResamplingScheme):
 
     @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
-        return _systematic(_precise(a), n, draws.uniform("resample", 1, 1).squeeze(1))
+        return _systematic(a, n, draws.uniform("resample", 1, 1).squeeze(1))
 
 
 def _eager_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     """Return ancestors [R, N] by the positions (j + u) / n of slots j, u [R, 1]."""
-    reach = _cumulative(a) * n
-    # where, since n - u may round to n - 1 in float32, which gives the last slot to a weight of 0
-    return _ancestors(torch.where(reach < n, torch.ceil(reach - u.to(reach.dtype)), n).long(), n)
+    sums, wanted = _exact_sums(a), n.double()
+    total = sums[:, -1:]
+    ends = torch.minimum(torch.ceil(sums * (wanted / total) - u.double()), wanted)
+    # where, since the last sum may round below n, which gives the last slot to a weight of 0
+    return _ancestors(torch.where(sums < total, ends, wanted).long(), n)
 
 
 _systematic = compilable(_eager_systematic, operator=cpp.resample_systematic)
@@ -169,15 +171,15 @@ def _expected_copies(a: Tensor, n: Tensor) -> Tensor:
     return a.double() * (n / a.sum(1, keepdim=True, dtype=torch.float64))
 
 
+def _exact_sums(a: Tensor) -> Tensor:
+    """Return cumulative sums [R, N] in units of 2^-52, float64. They do not depend on their order."""
+    return torch.trunc(a.double() * _GRID).cumsum(1)
+
+
 def _cumulative(a: Tensor) -> Tensor:
-    """Return cumulative sums [R, N] whose last value is exactly 1."""
-    sums = _precise(a).cumsum(1)
+    """Return cumulative sums [R, N] whose last value is exactly 1, float64."""
+    sums = _exact_sums(a)
     return sums / sums[:, -1:]
-
-
-def _precise(a: Tensor) -> Tensor:
-    """Convert to float64 for many particles."""
-    return a.double() if a.shape[1] >= _DOUBLE_FROM else a
 
 
 def _invert(cumulative: Tensor, u: Tensor) -> Tensor:

@@ -106,7 +106,8 @@ def nearest_neighbours(z: Tensor, active_mask: Tensor, m: int) -> Tensor:
         m: Number of neighbours.
 
     Returns:
-        Indices, [R, N, m].
+        Indices in ascending order, [R, N, m]. Copies of a particle are equally near, and rounding
+        decides between them; in this order that does not matter.
     """
     block = max(1, _PAIRS // max(1, z.shape[0] * z.shape[1]))
     penalty = torch.where(active_mask, 0.0, torch.inf).unsqueeze(1)
@@ -114,4 +115,4 @@ def nearest_neighbours(z: Tensor, active_mask: Tensor, m: int) -> Tensor:
         (torch.cdist(points, z) + penalty).topk(m, largest=False, sorted=False).indices
         for points in z.split(block, 1)
     ]
-    return torch.cat(indices, 1)
+    return torch.cat(indices, 1).sort(-1).values

@@ -15,6 +15,16 @@ inline void philox_normals(const Tensor& seed, int64_t purpose, const Tensor& st
     check.integer("quarters", quarters);
 }
 
+inline void philox_normals_float64(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
+    ArgumentCheck check("philox_normals_float64");
+    check.int64("seed", seed, "");
+    check.integer("purpose", purpose);
+    check.int64("step", step, "");
+    check.int64("runs", runs, "R");
+    check.integer("components", components);
+    check.integer("quarters", quarters);
+}
+
 inline void philox_uniforms(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
     ArgumentCheck check("philox_uniforms");
     check.int64("seed", seed, "");

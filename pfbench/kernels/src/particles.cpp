@@ -13,41 +13,20 @@
 
 #include "operator_checks.h"
 
-// of normals.cpp
-extern "C" void normals(float*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
+// of random_normal.cpp
+extern "C" void normals_float(float*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
+extern "C" void normals_double(double*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
 extern "C" void uniforms(double*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
+// of resampling.cpp
+extern "C" void systematic_float(int64_t*, const float*, const double*, const double*, int64_t, int64_t);
+extern "C" void systematic_double(int64_t*, const double*, const double*, const double*, int64_t, int64_t);
 
 namespace {
-// One uniform u for all slots, positions (j + u) / n: slot j goes to the first particle whose sum of weights lies beyond its position.
-template <class T>
-void systematic(int64_t* ancestor, const T* weight, const double* wanted, const double* uniform, int64_t runs, int64_t slots) {
-    constexpr int64_t PARTS = 4;  // are summed side by side: one sum alone would wait for itself
-    const int64_t part = slots / PARTS;
-    const std::unique_ptr<double[]> sums(new double[slots]);
-    const std::unique_ptr<int32_t[]> ends(new int32_t[slots]), first(new int32_t[slots + 1]);
-    for (int64_t r = 0; r < runs; ++r, weight += slots, ancestor += slots) {
-        double sum[PARTS] = {};
-        for (int64_t i = 0; i < part; ++i)
-            for (int64_t k = 0; k < PARTS; ++k) sums[k * part + i] = sum[k] += weight[k * part + i];
-        for (int64_t i = PARTS * part; i < slots; ++i) sums[i] = sum[PARTS - 1] += weight[i];
-        for (int64_t k = 1; k < PARTS; ++k) sum[k] += sum[k - 1];
-        const T whole = static_cast<T>(sum[PARTS - 1]), n = static_cast<T>(wanted[r]), u = static_cast<T>(uniform[r]);
-        for (int64_t k = 0; k < PARTS; ++k) {
-            const double before = k ? sum[k - 1] : 0.0;
-            for (int64_t i = k * part; i < (k < PARTS - 1 ? (k + 1) * part : slots); ++i) {
-                const T reach = static_cast<T>(before + sums[i]) / whole * n;
-                // not simply ceil: n - u rounds to n - 1 in float32 and the last slot would go to a last particle of weight 0;
-                // the last sum is n exactly, being divided by itself, and NaN is not below n
-                const T end = reach < n ? std::ceil(reach - u) : n;
-                ends[i] = static_cast<int32_t>(end < 0 ? 0 : end);
-            }
-        }
-        // a particle's slots begin where its predecessor's end; of several that begin at a slot, the last one has it
-        std::fill(first.get(), first.get() + slots + 1, 0);
-        for (int64_t i = 1; i < slots; ++i) first[ends[i - 1]] = static_cast<int32_t>(i);
-        int32_t latest = 0;
-        for (int64_t j = 0; j < slots; ++j) ancestor[j] = latest = std::max(latest, first[j]);
-    }
+inline void systematic(int64_t* ancestor, const float* weight, const double* n, const double* u, int64_t runs, int64_t slots) {
+    systematic_float(ancestor, weight, n, u, runs, slots);
+}
+inline void systematic(int64_t* ancestor, const double* weight, const double* n, const double* u, int64_t runs, int64_t slots) {
+    systematic_double(ancestor, weight, n, u, runs, slots);
 }
 
 template <class T>
@@ -289,15 +268,29 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
 
 constexpr std::array<int64_t, 3> COMPONENTS_FIRST = {2, 0, 1};
 
-template <class T, void (*DRAW)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t)>
-Tensor drawn(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
-    if (std::is_same_v<T, float>) checks::philox_normals(seed, purpose, step, runs, components, quarters);
-    else checks::philox_uniforms(seed, purpose, step, runs, components, quarters);
+template <class T>
+Tensor drawn(void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t), const Tensor& seed, int64_t purpose,
+             const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
     require(components * runs.size(0) < MAX_SIZE && quarters < MAX_SIZE, "philox: more than 2^30 numbers of a kind");
     const Tensor out = fresh<T>({components, runs.size(0), 4 * quarters});
     const Packed<int64_t> run(runs);
-    DRAW(numbers<T>(out), run.data, runs.size(0), components, quarters, *numbers<int64_t>(step), *numbers<int64_t>(seed), purpose);
+    draw(numbers<T>(out), run.data, runs.size(0), components, quarters, *numbers<int64_t>(step), *numbers<int64_t>(seed), purpose);
     return out;
+}
+
+Tensor normals_operator(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
+    checks::philox_normals(seed, purpose, step, runs, components, quarters);
+    return drawn(normals_float, seed, purpose, step, runs, components, quarters);
+}
+
+Tensor normals_float64_operator(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
+    checks::philox_normals_float64(seed, purpose, step, runs, components, quarters);
+    return drawn(normals_double, seed, purpose, step, runs, components, quarters);
+}
+
+Tensor uniforms_operator(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
+    checks::philox_uniforms(seed, purpose, step, runs, components, quarters);
+    return drawn(uniforms, seed, purpose, step, runs, components, quarters);
 }
 
 Tensor systematic_operator(Tensor a, Tensor n, Tensor u) {
@@ -446,10 +439,13 @@ AOTITorchError both_directly(Work work, Out first, Out second, Given... given) {
 
 extern "C" {
 AOTITorchError aoti_torch_cpu_philox_normals(In seed, int64_t purpose, In step, In runs, int64_t components, int64_t quarters, Out out) {
-    return directly(drawn<float, normals>, out, seed, purpose, step, runs, components, quarters);
+    return directly(normals_operator, out, seed, purpose, step, runs, components, quarters);
+}
+AOTITorchError aoti_torch_cpu_philox_normals_float64(In seed, int64_t purpose, In step, In runs, int64_t components, int64_t quarters, Out out) {
+    return directly(normals_float64_operator, out, seed, purpose, step, runs, components, quarters);
 }
 AOTITorchError aoti_torch_cpu_philox_uniforms(In seed, int64_t purpose, In step, In runs, int64_t components, int64_t quarters, Out out) {
-    return directly(drawn<double, uniforms>, out, seed, purpose, step, runs, components, quarters);
+    return directly(uniforms_operator, out, seed, purpose, step, runs, components, quarters);
 }
 AOTITorchError aoti_torch_cpu_resample_systematic(In a, In n, In u, Out out) { return directly(systematic_operator, out, a, n, u); }
 AOTITorchError aoti_torch_cpu_gather_particles(In x, In ancestors, Out out) { return directly(copied_operator, out, x, ancestors); }
@@ -462,8 +458,9 @@ AOTITorchError aoti_torch_cpu_weighted_moments(In x, In w, Out mean, Out varianc
 }
 
 STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
-    library.impl("philox_normals", TORCH_BOX((&drawn<float, normals>)));
-    library.impl("philox_uniforms", TORCH_BOX((&drawn<double, uniforms>)));
+    library.impl("philox_normals", TORCH_BOX(&normals_operator));
+    library.impl("philox_normals_float64", TORCH_BOX(&normals_float64_operator));
+    library.impl("philox_uniforms", TORCH_BOX(&uniforms_operator));
     library.impl("resample_systematic", TORCH_BOX(&systematic_operator));
     library.impl("gather_particles", TORCH_BOX(&copied_operator));
     library.impl("log_normal", TORCH_BOX(&log_normal_operator));

@@ -8,51 +8,43 @@
 #define LANES 32  // threads of a warp
 #endif
 
-typedef unsigned int word;
-typedef unsigned long long wide;
+#include "generator.h"  // put in its place before NVRTC sees it
 
-struct Words { word a, b, c, d; };
+using generator::word;
+using generator::Words;
+using generator::wide;
 
-// Philox4x32-10: counter, key
-__device__ inline Words philox(word c0, word c1, word c2, word c3, word k0, word k1) {
-#pragma unroll
-    for (int turn = 0; turn < 10; ++turn) {
-        wide p0 = (wide)c0 * 0xD2511F53u, p1 = (wide)c2 * 0xCD9E8D57u;
-        c0 = (word)(p1 >> 32) ^ c1 ^ k0;
-        c2 = (word)(p0 >> 32) ^ c3 ^ k1;
-        c1 = (word)p1;
-        c3 = (word)p0;
-        k0 += 0x9E3779B9u;
-        k1 += 0xBB67AE85u;
+// The words of a counter: with those of low order in double precision
+template <typename T> struct Counters;
+template <> struct Counters<float> {
+    Words high;
+    __device__ Counters(word k, word component, word step, word run, word seed, word purpose)
+        : high(generator::philox(k, component, step, run, seed, purpose)) {}
+    __device__ void normals(float* n) const {
+        generator::normal_pair(generator::unit(high.a), generator::half_turns(high.b), n[0], n[1]);
+        generator::normal_pair(generator::unit(high.c), generator::half_turns(high.d), n[2], n[3]);
     }
-    return {c0, c1, c2, c3};
-}
-
-// By Box and Muller, with the device's own approximations, each to some 3e-7: normals to 3e-6. That of the logarithm would do
-// badly where the radius is small, so there it is a series. The angle is taken from -pi to pi, where sine and cosine are best.
-__device__ inline void normal(word radial, word angular, float& one, float& other) {
-    float u = (__uint2float_rn(radial) + 0.5f) * 0x1p-32f, left = 1.0f - u, radius;
-    float series = left * (1.0f + left * (0.5f + left * (0.33333334f + left * 0.25f)));
-    float square = 2.0f * (left < 0.03125f ? series : -__logf(u));
-    radius = square * rsqrtf(fmaxf(square, 1e-30f));
-    float angle = __int2float_rn((int)angular) * 1.4629180792671596e-9f;  // 2 pi / 2^32
-    one = radius * __cosf(angle);
-    other = radius * __sinf(angle);
-}
-
-__device__ inline void four_normals(Words of, float* n) {
-    normal(of.a, of.b, n[0], n[1]);
-    normal(of.c, of.d, n[2], n[3]);
-}
+};
+template <> struct Counters<double> {
+    Words high, low;
+    __device__ Counters(word k, word component, word step, word run, word seed, word purpose)
+        : high(generator::philox(k, component, step, run, seed, purpose)),
+          low(generator::philox(k, component + generator::LOW, step, run, seed, purpose)) {}
+    __device__ void normals(double* n) const {
+        generator::normal_pair(generator::unit(high.a, low.a), generator::half_turns(high.b, low.b), n[0], n[1]);
+        generator::normal_pair(generator::unit(high.c, low.c), generator::half_turns(high.d, low.d), n[2], n[3]);
+    }
+};
 
 // [components, runs, 4 q]
-__global__ void normals(float* out, const long long* runs, word seed, word purpose, word step, int components, int R, int q) {
+template <typename T>
+__global__ void normals(T* out, const long long* runs, word seed, word purpose, word step, int components, int R, int q) {
     int k = blockIdx.x * blockDim.x + threadIdx.x;
     if (k >= q) return;
     for (int row = blockIdx.y; row < components * R; row += gridDim.y) {
-        float n[4];
-        four_normals(philox(k, row / R, step, (word)runs[row % R], seed, purpose), n);
-        float* to = out + (size_t)row * 4 * q + k;
+        T n[4];
+        Counters<T>(k, row / R, step, (word)runs[row % R], seed, purpose).normals(n);
+        T* to = out + (size_t)row * 4 * q + k;
 #pragma unroll
         for (int m = 0; m < 4; ++m) to[(size_t)m * q] = n[m];
     }
@@ -62,12 +54,12 @@ __global__ void uniforms(double* out, const long long* runs, word seed, word pur
     int k = blockIdx.x * blockDim.x + threadIdx.x;
     if (k >= q) return;
     for (int row = blockIdx.y; row < components * R; row += gridDim.y) {
-        Words of = philox(k, row / R, step, (word)runs[row % R], seed, purpose);
+        Counters<double> of(k, row / R, step, (word)runs[row % R], seed, purpose);
         double* to = out + (size_t)row * 4 * q + k;
-        to[0] = (of.a + 0.5) * 0x1p-32;
-        to[q] = (of.b + 0.5) * 0x1p-32;
-        to[2 * (size_t)q] = (of.c + 0.5) * 0x1p-32;
-        to[3 * (size_t)q] = (of.d + 0.5) * 0x1p-32;
+        to[0] = generator::unit(of.high.a, of.low.a);
+        to[q] = generator::unit(of.high.b, of.low.b);
+        to[2 * (size_t)q] = generator::unit(of.high.c, of.low.c);
+        to[3 * (size_t)q] = generator::unit(of.high.d, of.low.d);
     }
 }
 
@@ -148,10 +140,7 @@ __global__ void __launch_bounds__(128) affine(
                 }
             if (j < W) {
                 if (DRAW) {
-                    float n[4];
-                    four_normals(philox(k, j, step, run, seed, purpose), n);
-#pragma unroll
-                    for (int m = 0; m < 4; ++m) noise[m] = n[m];
+                    Counters<T>(k, j, step, run, seed, purpose).normals(noise);
                 } else {
 #pragma unroll
                     for (int m = 0; m < 4; ++m) noise[m] = w[((size_t)j * R + r) * M + min(k + m * q, M - 1)];
@@ -219,44 +208,50 @@ template <typename T> __device__ Rows<T> four(const T* from, int left, bool alig
     return rows;
 }
 
-// Ancestors [R, N] by the positions (j + u) / n. Marks where each particle's slots begin, and fills up from there, so that what
-// rounding leaves at the end goes to the last particle that weighs anything. `marks` are [R, N] in global memory, where those of a
-// run do not fit into the block's own (`inside`).
+// A weight as a multiple of 2^-52: sums of them are exact in double precision, and so the same in any order and in every engine.
+template <typename T> __device__ double on_grid(T weight) { return trunc((double)weight * 0x1p52); }
+
+// Ancestors [R, N] by the positions (j + u) / n. Marks where each particle's slots begin, and fills up from there. A particle of
+// weight 0 marks nothing. `marks` are [R, N] in global memory, where those of a run do not fit into the block's own (`inside`).
 template <typename T>
 __global__ void systematic(
-    long long* out, const T* a, const T* n, int n_stride, const double* u, int* marks, int inside, int R, int N) {
+    long long* out, const T* a, const double* n, int n_stride, const double* u, int* marks, int inside, int R, int N) {
     extern __shared__ int own[];
-    __shared__ T parts[32];
+    __shared__ double parts[32];
     __shared__ int whole[32];
     int* mark = inside ? own : marks + (size_t)blockIdx.x * N;
     bool aligned = N % 4 == 0;
     for (int r = blockIdx.x; r < R; r += gridDim.x) {
         const T* weight = a + (size_t)r * N;
-        T total = 0, wanted = n[(size_t)r * n_stride], offset = (T)u[r];
+        double total = 0, wanted = n[(size_t)r * n_stride], offset = u[r];
 #pragma unroll 4
         for (int i = 4 * threadIdx.x; i < N; i += 4 * blockDim.x) {
             Rows<T> value = four(weight + i, N - i, aligned);
-            total += (value.v[0] + value.v[1]) + (value.v[2] + value.v[3]);
+#pragma unroll
+            for (int v = 0; v < 4; ++v) total += on_grid(value.v[v]);
         }
         for (int i = threadIdx.x; i < N; i += blockDim.x) mark[i] = 0;
         total = over_block(total, Sum(), parts);
-        T carried = 0, scale = wanted / total;
+        double carried = 0, scale = generator::div(wanted, total);
         int last = 0, end = (int)wanted;
         for (int first = 0; first < N; first += 4 * blockDim.x) {
             int i = first + 4 * threadIdx.x;
             Rows<T> value = four(weight + i, N - i, aligned);
-            T all, sum = (value.v[0] + value.v[1]) + (value.v[2] + value.v[3]);
-            T reach = carried + before(sum, Sum(), T(0), parts, all);
+            double all, each[4], sum = 0;
+#pragma unroll
+            for (int v = 0; v < 4; ++v) sum += each[v] = on_grid(value.v[v]);
+            double reach = carried + before(sum, Sum(), 0.0, parts, all);
             int ends[4], most = 0, every;
 #pragma unroll
             for (int v = 0; v < 4; ++v) {
-                reach += value.v[v];
-                ends[v] = value.v[v] > T(0) ? min((int)ceil(reach * scale - offset), end) : 0;
+                reach += each[v];
+                int stop = reach < total ? min((int)ceil(generator::add(generator::mul(reach, scale), -offset)), end) : end;
+                ends[v] = each[v] > 0.0 ? stop : 0;
                 most = max(most, ends[v]);
             }
             int begun = max(last, before(most, Most(), 0, whole, every));
 #pragma unroll
-            for (int v = 0; v < 4; ++v) {  // sums that are not made in one order may fall by a rounding
+            for (int v = 0; v < 4; ++v) {
                 if (ends[v] > begun) mark[begun] = i + v;
                 begun = max(begun, ends[v]);
             }
