@@ -320,7 +320,7 @@ def test_copies_noise_and_move_are_joined_where_nothing_comes_between(
     """As for a CUDA device; here `driven` is what it stands for."""
 
     def driven(phi: Tensor, x: Tensor, ancestors: Tensor, gain: Tensor, *key: Any) -> Tensor:
-        noise = cpp.philox_normals(*key, gain.shape[-1], -(-ancestors.shape[1] // 4))[
+        noise = cpp.philox_normals_float64(*key, gain.shape[-1], -(-ancestors.shape[1] // 4))[
             ..., : ancestors.shape[1]
         ]
         return cpp.propagate_affine(
