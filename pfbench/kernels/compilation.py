@@ -105,33 +105,40 @@ def compilable(
 
     compiled = cache(partial(_compile_by_torch, function))
 
-    def run_compiled(*args: Any) -> Any:
-        if not _plain(args):
-            _check(operator, args)
-            return run_eagerly(*args)
-        if _on_cuda(args):
-            kernel = _find_cuda_kernel(operator, args)
-            return (kernel or (compiled() if use_torch_compiler else run_eagerly))(*args)
-        if operator is not None and operator not in _failed:
-            try:
-                return operator(*args)
-            except (OSError, subprocess.CalledProcessError) as error:
-                _note_failure(operator, error)
+    def check_and_run(*args: Any) -> Any:
         _check(operator, args)
         return run_eagerly(*args)
 
+    def run_compiled(*args: Any) -> Any:
+        if not _plain(args):
+            return check_and_run(*args)
+        if _on_cuda(args):
+            kernel = _find_cuda_kernel(operator, args)
+            return (kernel or (compiled() if use_torch_compiler else run_eagerly))(*args)
+        found = _run_kernel(operator, args)
+        return check_and_run(*args) if found is None else found
+
     @wraps(function)
     def call(*args: Any) -> Any:
-        if _graph.get():
-            if _on_cuda(args):
-                return (_find_cuda_kernel(operator, args) or function)(*args)
-            _check(operator, args)
-            return (function if in_graph is None or not fits_graph(*args) else in_graph)(*args)
-        if not _fused.get():
-            _check(operator, args)
-        return (run_compiled if _fused.get() else run_eagerly)(*args)
+        if not _graph.get():
+            return (run_compiled if _fused.get() else check_and_run)(*args)
+        if _on_cuda(args):
+            return (_find_cuda_kernel(operator, args) or function)(*args)
+        _check(operator, args)
+        return (function if in_graph is None or not fits_graph(*args) else in_graph)(*args)
 
     return cast(F, call)
+
+
+def _run_kernel(operator: Callable[..., Any] | None, args: tuple[Any, ...]) -> Any:
+    """Return the results of a C++ kernel, or None if there is none or it does not compile."""
+    if operator is None or operator in _failed:
+        return None
+    try:
+        return operator(*args)
+    except (OSError, subprocess.CalledProcessError) as error:
+        _note_failure(operator, error)
+    return None
 
 
 def _find_cuda_kernel(
