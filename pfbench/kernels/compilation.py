@@ -115,8 +115,8 @@ def compilable(
         if _on_cuda(args):
             kernel = _find_cuda_kernel(operator, args)
             return (kernel or (compiled() if use_torch_compiler else run_eagerly))(*args)
-        found = _run_kernel(operator, args)
-        return check_and_run(*args) if found is None else found
+        result = _run_kernel(operator, args)
+        return check_and_run(*args) if result is None else result
 
     @wraps(function)
     def call(*args: Any) -> Any:

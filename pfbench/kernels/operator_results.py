@@ -17,7 +17,7 @@ _RESULT = re.compile(r"(real|float32|float64|int64|bool) \[(.*)\]")
 _TERM = re.compile(r"(?:(\d+) )?(\w+)")
 
 
-class Result(NamedTuple):
+class OperatorResult(NamedTuple):
     """A result of an operator.
 
     Attributes:
@@ -30,7 +30,7 @@ class Result(NamedTuple):
 
 
 @cache
-def read_results() -> dict[str, tuple[Result, ...]]:
+def read_results() -> dict[str, tuple[OperatorResult, ...]]:
     """Read the results of all operators from operators.toml.
 
     Raises:
@@ -54,7 +54,7 @@ def make_empty_results(name: str, *arguments: Any) -> Any:
         A tensor, or a tuple of several.
     """
     sizes: dict[str, Any] = {"1": 1}
-    like, real = next(a for a in arguments if isinstance(a, Tensor)), None
+    template, real = next(a for a in arguments if isinstance(a, Tensor)), None
     for argument, value in zip(read_operators()[name], arguments, strict=True):
         if argument.kind == "int":
             sizes[argument.name] = value
@@ -62,7 +62,7 @@ def make_empty_results(name: str, *arguments: Any) -> Any:
         if argument.kind == "real" and real is None:
             real = value.dtype
         if value.dim():
-            like = value
+            template = value
         for axis, size in zip(argument.axes, value.shape, strict=True):
             if axis.isupper():
                 sizes[axis] = size
@@ -72,7 +72,7 @@ def make_empty_results(name: str, *arguments: Any) -> Any:
     for kind, axes in read_results()[name]:
         shape = [sum(factor * sizes[axis] for factor, axis in terms) for terms in axes]
         dtype = real if kind == "real" else getattr(torch, kind)
-        results.append(like.new_empty(shape, dtype=dtype))
+        results.append(template.new_empty(shape, dtype=dtype))
     return results[0] if len(results) == 1 else tuple(results)
 
 
@@ -86,7 +86,7 @@ def register_shapes(name: str) -> None:
     torch.library.register_fake(f"pfbench::{name}", function)
 
 
-def _parse_result(operator: str, text: str) -> Result:
+def _parse_result(operator: str, text: str) -> OperatorResult:
     """Parse a result such as `float32 [components, R, 4 quarters]`."""
     match = _RESULT.fullmatch(text)
     words = [axis.strip() for axis in match[2].split(",") if axis.strip()] if match else []
@@ -95,4 +95,4 @@ def _parse_result(operator: str, text: str) -> Result:
     if match is None or any(term is None for axis in terms for term in axis):
         raise ValueError(f"{operator}: a result must be 'kind [axes]', got {text!r}.")
     axes = tuple(tuple((int(term[1] or 1), term[2]) for term in axis if term) for axis in terms)
-    return Result(match[1], axes)
+    return OperatorResult(match[1], axes)

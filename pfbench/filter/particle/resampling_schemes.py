@@ -38,11 +38,11 @@ class Systematic(ResamplingScheme):
 
 def _eager_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     """Return ancestors [R, N] by the positions (j + u) / n of slots j, u [R, 1]."""
-    sums, wanted = _exact_sums(a), n.double()
+    sums, count = _exact_sums(a), n.double()
     total = sums[:, -1:]
-    ends = torch.minimum(torch.ceil(sums * (wanted / total) - u.double()), wanted)
+    ends = torch.minimum(torch.ceil(sums * (count / total) - u.double()), count)
     # where, since the last sum may round below n, which gives the last slot to a weight of 0
-    return _ancestors(torch.where(sums < total, ends, wanted).long(), n)
+    return _ancestors(torch.where(sums < total, ends, count).long(), n)
 
 
 _systematic = compilable(_eager_systematic, operator=cpp.resample_systematic)
