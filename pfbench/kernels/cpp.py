@@ -50,7 +50,19 @@ def philox_normals(
 def philox_normals_float64(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
-    """Draw standard normal numbers in double precision, float64 [w, R, 4 q], as `philox_normals`."""
+    """Draw standard normal numbers in double precision.
+
+    Args:
+        seed: Seed, an integer tensor [].
+        purpose: Integer code of the label of the random numbers.
+        step: Time step, an integer tensor [].
+        runs: Run numbers, int64, [R].
+        components: Number of components w.
+        quarters: A quarter q of the numbers of a component.
+
+    Returns:
+        Numbers, float64, [w, R, 4 q].
+    """
     return _operator("philox_normals_float64")(seed, purpose, step, runs, components, quarters)
 
 
