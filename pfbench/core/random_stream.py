@@ -129,9 +129,9 @@ class PhiloxStream(BatchRandomStream):
         seed: Integer from 0 to 2**32 - 1. In a recorded step a tensor [], as `step`.
         runs: Run numbers, int64, [R]. The number of a run, not its index in the batch, decides its
             random numbers. From 0 to 2**32 - 1.
-        dtype: Type of the normals. float32 has 24 bits and a largest value of 6.7. float64 has 52
-            bits and a largest value of 8.6, and takes 2.5 times as long; rounded, it is the
-            number of float32 to about 1e-5.
+        dtype: Type of the normals. Single precision has 24 bits and a largest value of 6.7. Double
+            precision has 52 bits and a largest value of 8.6, and takes 2.5 times as long. The
+            numbers of both agree to about 1e-5.
         step: Time step. 0 is the step of the initial distribution.
 
     Raises:
