@@ -60,19 +60,27 @@ def remove_nested_blocks(values: Mapping[str, Any]) -> dict[str, Any]:
         Configuration with the nodes of scenario, noise and filter themselves only.
     """
     return {
-        key: {k: v if k == PAPER else _without_blocks(v) for k, v in node.items()}
+        key: {k: v if k == PAPER else remove_all_blocks(v) for k, v in node.items()}
         if key in PARTS and isinstance(node, Mapping)
         else node
         for key, node in values.items()
     }
 
 
-def _without_blocks(node: Any) -> Any:
+def remove_all_blocks(node: Any) -> Any:
+    """Remove all nodes `paper` from a part, those of parts inside it included.
+
+    Args:
+        node: Part of a resolved configuration.
+
+    Returns:
+        The part without these nodes.
+    """
     if isinstance(node, list):
-        return [_without_blocks(item) for item in node]
+        return [remove_all_blocks(item) for item in node]
     if not isinstance(node, Mapping):
         return node
-    return {key: _without_blocks(value) for key, value in node.items() if key != PAPER}
+    return {key: remove_all_blocks(value) for key, value in node.items() if key != PAPER}
 
 
 def _check_key(group: str, key: str, value: Any) -> None:

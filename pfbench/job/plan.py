@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from pfbench.config.composition import CHOICES, JobConfig
-from pfbench.config.paper_block import PAPER, PARTS
+from pfbench.config.paper_block import PAPER, PARTS, remove_all_blocks
 from pfbench.config.source_digest import hash_user_code
 from pfbench.config.trust import check_configuration, trusted_packages
 from pfbench.core.record import Episode
@@ -168,9 +168,9 @@ def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:
     """
     is_config = OmegaConf.is_config(node)
     values = OmegaConf.to_container(node, resolve=True) if is_config else node
-    if isinstance(values, dict) and PAPER in values:
-        node = values = {key: value for key, value in values.items() if key != PAPER}
-        is_config = False
+    bare = remove_all_blocks(values)
+    if bare != values:
+        node, values, is_config = bare, bare, False
     check_configuration(values, (*trusted, *trusted_packages()))
     if is_config and OmegaConf.to_container(node, resolve=False) != values:
         node = values  # what was checked: a resolver may give another value next time

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -115,8 +116,11 @@ def test_the_auxiliary_filter_is_unbiased(preference: str, threshold: float) -> 
     check_evidence(method, WALK, WALK_Y, reference_moments(WALK, WALK_Y))
 
 
-@pytest.mark.parametrize("preference", PREFERENCES)
-@pytest.mark.parametrize("case", CASES)
+# Without tempering, the weights of the growth model have no bound: their standard error is no measure.
+@pytest.mark.parametrize(
+    ("case", "preference"),
+    [pair for pair in product(CASES, PREFERENCES) if pair != ("growth", "look ahead")],
+)
 def test_unbiased_on_models_with_an_answer(case: str, preference: str) -> None:
     model, y, exact = CASES[case]()
     check_evidence(
