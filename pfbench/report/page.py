@@ -1,4 +1,4 @@
-"""The report of a study: an offline HTML page, Markdown, figures, tables and decisions."""
+"""The report of a study: an offline page, all details, figures, tables and decisions."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from tqdm import tqdm
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import comparison_tables, cost, provenance, writers
 from pfbench.report.across_section import write_comparison
+from pfbench.report.board import write_report_data
 from pfbench.report.condition_section import write_condition_section
 from pfbench.report.looks import study_looks
 from pfbench.report.options import ReportContext, ReportOptions, is_brief, order_by_highlight
 from pfbench.report.plots.paper import paper_figures
 from pfbench.report.plots.plotting import line_styles
+from pfbench.report.study_page import write_page
 from pfbench.results import store
 from pfbench.results.comparison.pairwise_results import INCONCLUSIVE, PairwiseTest
 from pfbench.results.comparison.pairwise_tests import correct_over_report
@@ -24,6 +26,7 @@ from pfbench.results.conditions import Condition, load_conditions, natural_sort_
 from pfbench.results.metrics import metric_definitions
 from pfbench.results.state_groups import component_groups
 
+_DETAILS = ("details.md", "details.html")
 _ROWS = 2000  # rows of the table of all comparisons at most
 
 
@@ -35,8 +38,9 @@ def write_report(
 ) -> Path:
     """Write the report of a study to `<out>/<study>/`.
 
-    The folder contains index.html, report.md, verdicts.json, decisions.json, pfbench.bib, figures/ and
-    tables/. Equal results give equal bytes. Files that an earlier report wrote are removed if this one
+    The folder contains the page (index.html, report.md) with its numbers (verdicts.csv, runs.parquet),
+    all figures and tables (details.html, details.md, figures/, tables/), verdicts.json, decisions.json
+    and pfbench.bib. Equal results give equal bytes. Files that an earlier report wrote are removed if this one
     does not write them and they are unchanged (manifest.json). Other files stay.
 
     Args:
@@ -64,7 +68,21 @@ def write_report(
             "paper": writers.render_figures(drawings, "paper", folder, options.figure_formats),
             "failures": store.list_failures(Path(results) / study),
         }
-        return writers.render_template("page", folder, variables)
+        writers.render_template("page", folder, variables, names=_DETAILS)
+        pack = write_report_data(study, conditions, options, folder)
+        pack["downloads"].append(_describe_details(folder))
+        return write_page(pack, folder)
+
+
+def _describe_details(folder: RecordedFolder) -> dict[str, Any]:
+    """Return the entry of all figures and tables among the downloads of the page."""
+    size = (folder.path / _DETAILS[1]).stat().st_size
+    return {
+        "name": "All figures and tables",
+        "href": _DETAILS[1],
+        "bytes": size,
+        "group": "Figures",
+    }
 
 
 def _write_parts(
@@ -75,7 +93,6 @@ def _write_parts(
     sections, tests, table = _write_sections(study, conditions, context)
     note = cost.format_budget([job.meta for condition in conditions for job in condition.jobs])
     bibtex = provenance.format_bibtex(conditions)
-    folder.write("pfbench.bib", bibtex)
     return {
         "study": study,
         "options": options,

@@ -27,28 +27,33 @@ _MANY = 2000  # entries above which a JSON file is compressed
 
 
 def render_template(
-    template: str, folder: RecordedFolder, context: Mapping[str, Any], home: Path = _HERE
+    template: str,
+    folder: RecordedFolder,
+    context: Mapping[str, Any],
+    home: Path = _HERE,
+    names: tuple[str, str] = ("report.md", "index.html"),
 ) -> Path:
-    """Write index.html and report.md from templates.
+    """Write a page as Markdown and HTML from templates.
 
     Args:
         template: Name of the templates without suffixes.
         folder: Target folder.
         context: Variables of the templates.
         home: Folder of the templates.
+        names: Names of both files.
 
     Returns:
-        Path of index.html.
+        Path of the HTML page.
     """
     css = (_HERE / "style.css").read_text(encoding="utf-8")
-    for kind, name in (("md", "report.md"), ("html", "index.html")):
+    for kind, name in zip(("md", "html"), names, strict=True):
         page = (
             _environment(kind == "html", home)
             .get_template(f"{template}.{kind}.jinja")
             .render({**context, "css": css})
         )
         folder.write(name, page)
-    return folder.path / "index.html"
+    return folder.path / names[1]
 
 
 def write_json(folder: RecordedFolder, name: str, typed: Sequence[Any]) -> str:

@@ -13,6 +13,7 @@ _TAG = re.compile(r"(?<!\\)<(img|/?script)", re.IGNORECASE)
 _MARKDOWN = re.compile(
     r"(?<!\\)<img|</script|(?<!\\)\|&lt;|\]\(javascript|\*\*b\*\*|(?<!\\)`c|\s\$\\"
 )
+_FILES = ("verdicts.csv", "runs.parquet", "pfbench.bib", "details.html")  # beside the page
 _LATEX = re.compile(r"(?<!\\)(\\evil|<img|\|<|&lt)")
 
 
@@ -26,7 +27,7 @@ class _Tags(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         for name, value in attrs:
             is_address = name in ("src", "href") and not (value or "").startswith(
-                ("data:", "#", "../")
+                ("data:", "#", "../", *_FILES)
             )
             if name.startswith("on") or is_address:
                 self.faults.append(f"{tag} {name}={value}")
@@ -56,6 +57,8 @@ def find_faults(name: str, text: str) -> list[str]:
 
 def faults_of_folder(folder: Path) -> dict[str, list[str]]:
     """Return the faults of all files of a report by name."""
-    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
+    files = [
+        file for file in sorted(folder.rglob("*")) if file.is_file() and file.suffix != ".parquet"
+    ]
     found = {file.name: find_faults(file.name, file.read_text()) for file in files}
     return {name: faults for name, faults in found.items() if faults}

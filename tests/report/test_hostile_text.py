@@ -60,7 +60,7 @@ def test_report_of_a_study(tmp_path: Path) -> None:
     kinds = {file.suffix for file in made.rglob("*")}
     assert kinds >= {".html", ".md", ".tex", ".csv", ".svg"}
     assert faults_of_folder(made) == {}
-    text = (made / "report.md").read_text()
+    text = (made / "details.md").read_text()
     assert not [line for line in text.splitlines() if line in ("# a", "# b", "# c")]
     assert "onerror" in text  # it is shown, as text
 

@@ -50,7 +50,7 @@ def report(results, tmp_path_factory):
 
 
 def test_every_figure_and_table_is_there_and_on_the_page(report):
-    html, text = (report / "index.html").read_text(), (report / "report.md").read_text()
+    html, text = (report / "details.html").read_text(), (report / "details.md").read_text()
     names = {path.stem for path in (report / "figures").iterdir()}
     kinds = {name.removeprefix("flight_surge_ins_gnss_") for name in names}
     assert kinds == {
@@ -84,13 +84,13 @@ def test_every_figure_and_table_is_there_and_on_the_page(report):
 
 
 def test_the_page_needs_nothing_but_itself(report):
-    html = (report / "index.html").read_text()
+    html = (report / "details.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:|#)', html)
     assert "http" not in re.sub(r'"data:[^"]+"', "", html)
     assert "prefers-color-scheme: dark" in html
 
 
-@pytest.mark.parametrize("name", ["index.html", "report.md"])
+@pytest.mark.parametrize("name", ["details.html", "details.md"])
 def test_the_text_says_what_ran_what_failed_and_what_was_lost(report, name):
     text = (report / name).read_text()
     for said in (
@@ -124,7 +124,7 @@ def test_text_tables_and_json_render_the_same_verdicts(report):
     unbeaten = [
         label for label in accuracy.index if accuracy.loc[label, "worse than [filters]"] == 0
     ]
-    lines = (report / "report.md").read_text().splitlines()
+    lines = (report / "details.md").read_text().splitlines()
     line = next(
         row for row in lines if row.startswith("- Top group in") and "RMSE of position" in row
     )
@@ -195,7 +195,9 @@ def test_a_toy_without_map_particles_or_rival(tmp_path):
         p.stem.removeprefix("flight_surge_ins_gnss_") for p in (made.parent / "figures").iterdir()
     }
     assert kinds == {"error_state", "rmse", "front", "nees", "spread_kalman"}
-    assert "has one filter. Required: 2; available: 1." in made.read_text()
+    assert (
+        "has one filter. Required: 2; available: 1." in made.with_name("details.html").read_text()
+    )
     assert json.loads((made.parent / "verdicts.json").read_text()) == []
 
 
@@ -206,14 +208,15 @@ def test_a_filter_that_lost_every_run_is_reported(tmp_path):
     made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     (verdict,) = json.loads((made.parent / "verdicts.json").read_text())
     assert (verdict["winner"], verdict["lost_a"], verdict["ratio"]) == ("ekf", 8, "inf")
-    assert "doomed lost 8 of 8 runs" in made.read_text()
-    table = (made.parent / "report.md").read_text()
+    assert "doomed lost 8 of 8 runs" in made.with_name("details.html").read_text()
+    assert "loses the track in 100 % of runs" in (made.parent / "report.md").read_text()
+    table = (made.parent / "details.md").read_text()
     assert re.search(r"\| doomed +\| +0 \| +– \|", table)
 
 
 def test_the_page_says_what_its_jobs_took_and_how_many_were_asked_for(results, tmp_path):
     page.write_report("demo", results, tmp_path, replace(QUICK, planned=6))
-    text = (tmp_path / "demo" / "report.md").read_text()
+    text = (tmp_path / "demo" / "details.md").read_text()
     seconds = sum(
         1.0 + 1e-3 * method.milliseconds * 40 for method in synthetic.METHODS
     )  # a world each, and 40 steps
@@ -230,7 +233,7 @@ def test_the_time_to_converge_is_a_column_of_groups_that_have_a_bound(results, t
         tmp_path,
         replace(QUICK, convergence_threshold={"position": 1e9}, start_time_s=20.0),
     )
-    text = (tmp_path / "demo" / "report.md").read_text()
+    text = (tmp_path / "demo" / "details.md").read_text()
     assert "median time to 1e+09 m [s]" in text
     with pytest.raises(
         ValueError,
@@ -253,7 +256,7 @@ def test_cells_whose_worlds_differ_by_name_say_so(tmp_path):
             arrays,
         )
     page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
-    text = (tmp_path / "reports" / "demo" / "report.md").read_text()
+    text = (tmp_path / "reports" / "demo" / "details.md").read_text()
     assert (
         "Jobs of this condition differ in scenario.gps_sd: their runs share random numbers, but not the data."
         in text
@@ -279,8 +282,8 @@ def test_text_of_a_stranger_is_not_markup(tmp_path):
     for size, name in enumerate(("<b>sir</b>|x", "<b>sir</b>|y", "<b>sir</b>|z"), 1):
         synthetic.write(tmp_path / "demo", synthetic.Method(name, float(size)), runs=20, steps=20)
     made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
-    assert "<b>sir" not in made.read_text()
-    assert r"&lt;b>sir&lt;/b>\|x" in (made.parent / "report.md").read_text()
+    assert all("<b>sir" not in path.read_text() for path in made.parent.glob("*.html"))
+    assert r"&lt;b>sir&lt;/b>\|x" in (made.parent / "details.md").read_text()
 
 
 @pytest.mark.parametrize(

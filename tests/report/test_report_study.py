@@ -63,7 +63,7 @@ def report(results, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("name", ["index.html", "report.md"])
+@pytest.mark.parametrize("name", ["details.html", "details.md"])
 def test_the_text_is_that_of_the_verdicts(report, name):
     text = (report / name).read_text()
     records = json.loads((report / "decisions.json").read_text())
@@ -96,7 +96,7 @@ def test_every_table_names_its_budget(report):
         latex = path.with_suffix(".tex").read_text()
         assert said in latex
         assert latex.rstrip().endswith("\\end{tabular}")
-    html = (report / "index.html").read_text()
+    html = (report / "details.html").read_text()
     noted = re.findall(r"</table></div>(?:\n</div>)?\n<p class=\"note\">Budget: particles", html)
     assert html.count('<table class="plain">') == len(noted)
 
@@ -110,7 +110,7 @@ def test_the_page_carries_its_figures_and_its_filter(report):
         "across_profile_position",
     } <= set(drawn)
     assert sum(name.endswith("_front") for name in drawn) == 6
-    html = (report / "index.html").read_text()
+    html = (report / "details.html").read_text()
     sift = html[html.index('<div class="sift">') :]
     assert sift[: sift.index("</table>")].count("<tr>") == 1 + 18
     assert html.count("<script>") == 1
@@ -222,7 +222,7 @@ def test_a_study_too_large_to_show_all_says_what_it_shows(results, tmp_path):
         ):  # fmt: skip
             patch.setattr(module, name, value)
         made = page.write_report("many", results, tmp_path)
-    html = made.read_text()
+    html = made.with_name("details.html").read_text()
     decided = json.loads(gzip.decompress((made.parent / "verdicts.json.gz").read_bytes()))
     assert len(decided) == 6 * 3 * 3
     assert not (made.parent / "verdicts.json").exists()

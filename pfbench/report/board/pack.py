@@ -90,7 +90,7 @@ def build_pack(
         "baselines": baselines,
         "budgets": [{"key": "particles", "name": "Same N", "reason_missing": None}],
         "views": views,
-        "planned": planned_entries(planned),
+        "planned": planned_entries(planned, looks),
         "curves": list_curves(conditions),
         "calibration": list_calibration(table),
         "runs": list_runs(table),

@@ -33,7 +33,9 @@ def planned_words(planned: Sequence[Decision]) -> dict[tuple[str, str], str]:
     return {pair: {"better": "best"}.get(word, word) for pair, word in words.items()}
 
 
-def planned_entries(planned: Sequence[Decision]) -> list[dict[str, Any]]:
+def planned_entries(
+    planned: Sequence[Decision], looks: Mapping[str, MethodLook]
+) -> list[dict[str, Any]]:
     """Return the entries of planned pairs, in ratios."""
     errors = {(d.question, d.a, d.b): d for d in planned if d.metric != TRACK}
     entries = []
@@ -44,7 +46,7 @@ def planned_entries(planned: Sequence[Decision]) -> list[dict[str, Any]]:
         track = next(t for t in planned if (t.a, t.b, t.question, t.metric) == (a, b, "a", TRACK))
         ratios = {k: _ratio(d, getattr(d, k)) for k in ("estimate", "low", "high")}
         entry = {
-            "a": a, "b": b, "question": "Error in these worlds", "kind": "paper",
+            "a": a, "b": b, "question": "Error in these worlds", "kind": "paper" if b in looks[a].baselines else "",
             "sentence": describe_pair(track, d), **ratios, "p": d.p_corrected, "word": d.pair_word,
             "cells": [],
             "new_world": None if new.worlds < 2 else {

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pfbench.report.board.view import EQUAL, IDENTICAL, LOST, MISSING, OPEN, BoardRow, percent
 from pfbench.report.looks import MethodLook
 
+_MOST_NAMES = 3  # in a sentence
 _LOST_SHARE = 0.2  # share of runs off track from which a filter is counted
 
 
@@ -65,6 +66,14 @@ def _name(row: BoardRow, looks: Mapping[str, MethodLook]) -> str:
     return f"[[{looks[row.filter].name}]]"
 
 
+def _join(names: Sequence[str]) -> str:
+    """List up to three names in words, and count the others."""
+    if len(names) > _MOST_NAMES:
+        others = count_words(len(names) - _MOST_NAMES + 1, "more filter")
+        names = [*names[: _MOST_NAMES - 1], others]
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
 def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]) -> str:
     """Count the filters that lose the track in many runs, or were not run."""
     off = [r for r in rows if r.verdict != MISSING and 1 - r.track > _LOST_SHARE]
@@ -97,8 +106,7 @@ def _describe_best(
     best = ranked[0]
     base = next(row for row in rows if row.filter == baseline)
     twins = [row for row in ranked if row.words == IDENTICAL]
-    names = " and ".join(_name(row, looks) for row in [best, *twins][:2])
-    names += f" and {count_words(len(twins) - 1, 'more filter')}" if len(twins) > 1 else ""
+    names = _join([_name(row, looks) for row in (best, *twins)])
     head = f"{names} {'have' if twins else 'has'} the smallest {where}"
     if twins:
         head += " (identical results)"

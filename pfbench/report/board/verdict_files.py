@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.table_formats import format_csv
 
 
 def write_verdict_files(
@@ -29,7 +30,7 @@ def write_verdict_files(
         for key, view in pack["views"].items()
         for row in view["rows"]
     ]
-    verdicts = pd.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    verdicts = format_csv(pd.DataFrame(rows))
     buffer = io.BytesIO()
     table.to_parquet(buffer, index=False, compression="zstd")
     contents: list[tuple[str, str, str | bytes]] = [

@@ -119,7 +119,7 @@ def _describe_decisions(alpha: float, margin: float, pairs: int) -> list[str]:
     )
     return [
         "The metric is the root mean square error over time of a run; a lost run counts as the largest error.",
-        f"Medians over runs have {level} intervals; ratios are relative to a baseline and averaged over worlds on a log scale.",
+        f"Values are 20 % trimmed means over runs on the logarithmic scale, averaged over conditions; ratios to a baseline are paired by run, with {level} intervals.",
         f"{tests}intervals are simultaneous ({level}), and filters within {100 * margin:g} % are called equivalent.",
     ]
 

@@ -31,7 +31,7 @@ def describe_columns(
         else ""
     )
     return (
-        f"{metric}: median over runs{interval}{where}. Bold: smallest. "
+        f"{metric}: trimmed mean over runs on the logarithmic scale{interval}{where}. Bold: smallest. "
         r"\textsuperscript{\textdagger}: shown to be worse than the smallest, jointly for all comparisons "
         r"of the column; the others are not told apart from it. \textsuperscript{*}: proposed methods."
         + _describe_lost(pack, cells)
