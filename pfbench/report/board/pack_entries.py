@@ -36,7 +36,12 @@ def planned_words(planned: Sequence[Decision]) -> dict[tuple[str, str], str]:
 def planned_entries(
     planned: Sequence[Decision], looks: Mapping[str, MethodLook]
 ) -> list[dict[str, Any]]:
-    """Return the entries of planned pairs, in ratios."""
+    """Return the entries of planned pairs, in ratios.
+
+    Args:
+        planned: Decisions on the planned pairs.
+        looks: Looks by label of the filter.
+    """
     errors = {(d.question, d.a, d.b): d for d in planned if d.metric != TRACK}
     entries = []
     for (question, a, b), d in errors.items():
