@@ -150,7 +150,8 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for method in synthetic.METHODS[1:]:
             synthetic.write(root / "results" / "demo", method, noise=noise, runs=12, steps=30)
     options = page.ReportOptions(figure_formats=("png",), groups=("velocity", "position"))
-    return page.write_report("demo", root / "results", root / "reports", options)
+    made = page.write_report("demo", root / "results", root / "reports", options)
+    return made.with_name("details.html")
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
@@ -182,6 +183,7 @@ def test_a_brief_report_in_its_usual_formats_opens_whole(tmp_path: Path) -> None
             synthetic.write(tmp_path / "results" / "demo", method, noise=noise, runs=8, steps=12)
     options = page.ReportOptions(groups=("velocity", "position"), show_all=False)
     made = page.write_report("demo", tmp_path / "results", tmp_path / "reports", options)
+    made = made.with_name("details.html")
     text = made.read_text()
     assert re.search(r'src="data:image/(svg\+xml|png);base64,', text)
     found = facts(made, "(facts) => {}", dark=False, width=420)

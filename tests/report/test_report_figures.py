@@ -32,7 +32,7 @@ from pfbench.report.plots import (
     plotting,
     summary_figures,
 )
-from pfbench.report.plots.figure_files import FigureSpec, write_figure
+from pfbench.report.plots.figure_files import FigureSpec, render_palette_png, write_figure
 from pfbench.results import store
 from pfbench.results.comparison import condition_blocks
 from pfbench.results.comparison.pairwise_tests import compare_pairs
@@ -216,9 +216,7 @@ def pixels(colours: list[tuple[float, float, float]]) -> set[tuple[int, ...]]:
     axis = figure.add_axes((0, 0, 1, 1))
     axis.imshow(np.array(colours)[:, None], aspect="auto", interpolation="nearest")
     axis.set_axis_off()
-    found = (
-        Image.open(io.BytesIO(plotting.render_palette_png(figure))).convert("RGB").getcolors(2**16)
-    )
+    found = Image.open(io.BytesIO(render_palette_png(figure))).convert("RGB").getcolors(2**16)
     return {colour for _, colour in found}
 
 
