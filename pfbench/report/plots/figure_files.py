@@ -92,11 +92,12 @@ def _palette() -> Image.Image:
     colours = list(dict.fromkeys([*installed_colours(), *plain, "#B35900"]))
     pure = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours])
     fractions = np.linspace(0, 1, 5, endpoint=False)[:, None]
-    tints = pure[:, None] + (255 - pure[:, None]) * fractions
+    tints = (pure[:, None] + (255 - pure[:, None]) * fractions).reshape(-1, 3)
+    tints = tints[np.ptp(tints, axis=1) > 16]  # paler ones would be nearest to greys
     shades = np.array([[int(shade[i : i + 2], 16) for i in (1, 3, 5)] for shade in SHADES])
     # Greys are so dense that no tint is the nearest colour of a grey.
     greys = np.repeat(np.minimum(np.arange(0, 257, 8), 255)[:, None], 3, axis=1)
-    steps = np.round(np.concatenate([tints.reshape(-1, 3), shades, greys])).astype(np.uint8)
+    steps = np.round(np.concatenate([tints, shades, greys])).astype(np.uint8)
     padding = np.repeat(steps[-1:], 256 - len(steps), axis=0)
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.concatenate([steps, padding]).tobytes())
