@@ -347,7 +347,7 @@ def test_pictures_keep_the_colours_of_the_filters() -> None:
 
 
 def test_rows_of_many_filters_are_in_the_order_of_their_medians(tmp_path: Path) -> None:
-    size = {f"f{k}": 1.0 + (5 * k) % 14 for k in range(14)}
+    size = {f"f{k}": 1.3 ** ((5 * k) % 14) for k in range(14)}
     for label, large in size.items():
         synthetic.write(
             tmp_path / "many",

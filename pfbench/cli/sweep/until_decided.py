@@ -175,8 +175,14 @@ class GrowingSweep:
         ]
         if self.repeats_jobs or not self.has_results(number):
             run_part(parts[-1])
-        table = self.read(number)
-        if table.parts < len(self.job_keys(number)):  # damaged files were set aside
+        try:
+            table = self.read(number)
+            is_complete = table.parts == len(self.job_keys(number))
+        except (
+            ValueError
+        ):  # parts without their neighbours do not fit; other reasons come again below
+            is_complete = False
+        if not is_complete:  # damaged files were set aside
             for words in parts:
                 run_part(words)
             table = self.read(number)

@@ -438,7 +438,7 @@ def test_corrected_versions_approach_kalman_with_the_root_of_the_number(name: st
         errors.append(0.5 * total.std() / total.mean() / math.sqrt(some))
     x = np.log(sizes) - np.log(sizes).mean()
     slope_, error = x @ logs / (x @ x), math.sqrt((x**2) @ np.square(errors)) / (x @ x)
-    assert error < 0.06
+    assert error < 0.08  # a slope of 0 would be more than four standard errors away
     assert abs(slope_ + 0.5) < 4 * error, f"{slope_:.3f} +- {error:.3f}"
     assert np.all(np.abs(ratio.mean(0) - 1) < 4 * ratio.std(0) / math.sqrt(runs[-1]) + 0.01)
 

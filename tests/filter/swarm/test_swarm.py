@@ -661,7 +661,7 @@ def test_the_printed_weights_do_not_converge() -> None:
     """Their distance to the Kalman filter is there to stay."""
     few, many = distances(dataclasses.replace(CORRECTED, weighting=PrintedWeighting()), (60, 240))
     assert many > 0.2
-    assert few / many < 1.4
+    assert few / many < 1.5  # below the band of the corrected weights
 
 
 def test_the_corrected_evidence_converges() -> None:

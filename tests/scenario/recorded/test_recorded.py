@@ -11,7 +11,6 @@ import pytest
 import torch
 from checkout import ROOT
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from recorded_data import DATA, believed, recorded
 from synthetic_log import drive, tables, write
 
@@ -25,6 +24,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     TaylorLinearisation,
 )
 from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.job.plan import instantiate
 from pfbench.model.strapdown.total import StrapdownTotal
 from pfbench.nav.preintegration import PreintegratedImu
 from pfbench.noise.outage import MeasurementOutage
@@ -331,7 +331,7 @@ def run(
 ) -> tuple[Episode, StrapdownTotal, FilterResult]:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("config", overrides=list(overrides))
-    scenario, model = (instantiate(cfg[part], _convert_="all") for part in ("scenario", "model"))
+    scenario, model = (instantiate(cfg[part]) for part in ("scenario", "model"))
     episode = scenario.draw(NominalNoise(), torch.arange(runs), 1)
     return (
         episode,

@@ -11,7 +11,6 @@ import pytest
 import torch
 from checkout import ROOT
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 from recorded_data import DATA, recorded
 from synthetic_log import GRAVITY, ORIGIN, drive, write
 
@@ -19,6 +18,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
+from pfbench.job.plan import instantiate
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.nav import attitude, earth
 from pfbench.noise.white import NominalNoise
@@ -148,7 +148,7 @@ def composed(*overrides: str) -> tuple[SimulatedFlight, object]:
         cfg = compose(
             "config", overrides=["scenario=recorded_boreas", "episode_cache_dir=null", *overrides]
         )
-    return tuple(instantiate(cfg[part], _convert_="all") for part in ("scenario", "model"))
+    return tuple(instantiate(cfg[part]) for part in ("scenario", "model"))
 
 
 @recorded
