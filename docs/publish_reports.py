@@ -90,7 +90,9 @@ def reduce_markdown(text: str, folder: Path, stem: str) -> str:
 
     text = _IMAGE.sub(replace, text)
     text = re.sub(
-        r"\[(?:figure of )?([^\]]*)\]\((\.\./\w+)/index\.html[^)]*\)", r"[\1](\2/report.md)", text
+        r"\[(?:figure of )?([^\]]*)\]\((\.\./\w+)/(?:index|details)\.html[^)]*\)",
+        r"[\1](\2/report.md)",
+        text,
     )
     return _without_empty_sections(text)
 

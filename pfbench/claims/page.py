@@ -95,7 +95,7 @@ def report_anchors(studies: Iterable[str], out: str | Path) -> dict[str, set[str
         studies: Names of the studies.
         out: Folder of all reports.
     """
-    pages = {study: Path(out) / study / "index.html" for study in sorted(studies)}
+    pages = {study: Path(out) / study / "details.html" for study in sorted(studies)}
     pattern = r'<(?:section|figure|h3) id="([^"]+)"'
     return {
         study: set(re.findall(pattern, path.read_text(encoding="utf-8")))
@@ -189,7 +189,7 @@ def _test_line(
         "outcome": "measured" if test.statistic == "report" else result.outcome,
         "where": test.cell.replace("/", " / "),
         "study": test.study,
-        "link": f"../{test.study}/index.html#{anchor}" if anchor else "",
+        "link": f"../{test.study}/details.html#{anchor}" if anchor else "",
         "drawn": is_figure,
     }
 

@@ -294,9 +294,9 @@ def test_the_page_links_to_each_of_them(results: Path, tmp_path: Path) -> None:
         )
         patch.setattr(across_section.comparison_figures, "study_figures", lambda *_: [])
         made = page.write_report("paper_004", results, tmp_path, options)
-    text = made.read_text()
+    text = made.with_name("details.html").read_text()
     assert '<figure id="paper_004_iterations_flight_nominal_ins_gnss_iterations">' in text
-    assert "004-iterations_flight" in (made.parent / "report.md").read_text()
+    assert "004-iterations_flight" in (made.parent / "details.md").read_text()
     assert (
         made.parent / "figures" / "paper_004-iterations_flight_nominal_ins_gnss_iterations.png"
     ).exists()

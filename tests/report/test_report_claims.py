@@ -818,7 +818,7 @@ def test_the_page_has_the_numbers_and_a_link_to_the_cell(study: Path) -> None:
     (line,) = claims_page.rows_by_paper(found, {"s": {"flight_surge_ins_gnss"}})[0]["rows"][0][
         "lines"
     ]
-    assert (line["link"], line["drawn"]) == ("../s/index.html#flight_surge_ins_gnss", False)
+    assert (line["link"], line["drawn"]) == ("../s/details.html#flight_surge_ins_gnss", False)
     assert re.fullmatch(r"0\.6\d+ \[0\.\d+, 0\.\d+\], printed 0\.600", line["said"])
     assert (
         claims_page.rows_by_paper(found)[0]["rows"][0]["lines"][0]["link"] == ""
@@ -896,7 +896,9 @@ def test_each_claim_links_to_a_figure_that_is_there(study: Path, tmp_path: Path)
     )[0]["rows"]
     for line, (metric, figure) in zip(rows[0]["lines"], shown_in.items(), strict=True):
         wanted = f"flight_surge_ins_gnss_{figure}".rstrip("_")
-        assert (line["link"], line["drawn"]) == (f"../s/index.html#{wanted}", bool(figure)), metric
+        assert (line["link"], line["drawn"]) == (f"../s/details.html#{wanted}", bool(figure)), (
+            metric
+        )
         assert wanted in there["s"]
 
 
