@@ -336,4 +336,7 @@ def test_the_bound_and_the_range_are_drawn_and_tabled_where_there_are_any(tmp_pa
     assert table["horizontal error [% of range], last 20 steps"][0] == pytest.approx(
         100 * flat[:, -20:].mean()
     )
-    assert "flight / surge / ins_gnss: posterior Cramer-Rao bound of the model." in made.read_text()
+    assert (
+        "flight / surge / ins_gnss: posterior Cramer-Rao bound of the model."
+        in made.with_name("details.html").read_text()
+    )

@@ -265,7 +265,7 @@ def test_a_page_without_enough_data_states_why(case: str, tmp_path: Path) -> Non
     records = json.loads((made.parent / "decisions.json").read_text())
     words = {r["word"] for r in records}
     assert not words & {"better", "worse"}
-    text = (made.parent / "report.md").read_text()
+    text = (made.parent / "details.md").read_text()
     sentence = {
         "one run": "ekf and ukf are not tested",
         "all lost": "ekf 12 of 12",
