@@ -71,7 +71,15 @@ def write_report(
         writers.render_template("page", folder, variables, names=_DETAILS)
         pack = write_report_data(study, conditions, options, folder)
         pack["downloads"].append(_describe_details(folder))
+        _state_failures(pack, len(variables["failures"]))
         return write_page(pack, folder)
+
+
+def _state_failures(pack: dict[str, Any], number: int) -> None:
+    """Put the number of failed jobs before the sentence of each view."""
+    jobs = "1 job failed and is" if number == 1 else f"{number} jobs failed and are"
+    for view in pack["views"].values() if number else ():
+        view["sentence"] = f"{jobs} missing from all tables. {view['sentence']}"
 
 
 def _describe_details(folder: RecordedFolder) -> dict[str, Any]:
