@@ -15,8 +15,8 @@ HELP = """\
 pfbench replay study=NAME run=NUMBER filter=NAME [scenario=NAME] [noise=NAME] [model=NAME] [key=value ...]
 
 Compute one run of a stored job again, compare it with the stored numbers, print its status and metrics, and
-write its traces (errors, standard deviations, NEES, ESS, NIS, track) as CSV, as Parquet if pyarrow is installed,
-and as a figure.
+write its traces (errors, standard deviations, NEES, ESS, NIS, track) as CSV and Parquet, and as
+a figure.
 
   pfbench replay study=quickstart run=7 filter=sir
   pfbench replay study=mine run=3 filter=rpf scenario=flight_500s noise=outliers

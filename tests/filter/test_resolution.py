@@ -110,7 +110,7 @@ def test_the_offsets_without_the_criteria_are_large(monkeypatch: pytest.MonkeyPa
 def test_outliers_are_no_reason_to_refuse_a_type() -> None:
     y = draw_measurements({})
     y[:, 7] = 1e9
-    filtered("ekf", {}, y, torch.float32)
+    assert not bool(filtered("ekf", {}, y, torch.float32).lost.any())
 
 
 def test_a_component_without_variance_is_known_exactly() -> None:

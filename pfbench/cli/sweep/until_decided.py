@@ -178,9 +178,7 @@ class GrowingSweep:
         try:
             table = self.read(number)
             is_complete = table.parts == len(self.job_keys(number))
-        except (
-            ValueError
-        ):  # parts without their neighbours do not fit; other reasons come again below
+        except ValueError:  # parts without their neighbours; another reason is raised again below
             is_complete = False
         if not is_complete:  # damaged files were set aside
             for words in parts:

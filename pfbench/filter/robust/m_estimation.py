@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,7 +32,7 @@ from pfbench.filter.robust.weight_functions import (
 
 
 @dataclass(frozen=True)
-class MEstimationUpdate(RobustUpdate):
+class MEstimationUpdate(RobustUpdate, ABC):
     """Iterated reweighting by the residual after the update.
 
     It minimises |xi|^2 / 2 + sum rho(d) over the groups of components, with d the distance of the
@@ -67,9 +68,9 @@ class MEstimationUpdate(RobustUpdate):
             raise ValueError(f"{name}.iterations must be at least 1, got {self.iterations}. Use 4.")
 
     @property
+    @abstractmethod
     def weight(self) -> WeightFunction:
         """Weight as a function of squared distances and thresholds."""
-        raise NotImplementedError
 
     @override
     def noise_adapt(

@@ -144,5 +144,7 @@ def _describe_ties(ranked: Sequence[BoardRow]) -> str:
     tied = sum(row.verdict in (OPEN, EQUAL) for row in ranked)
     if not tied:
         return ""
+    if len(ranked) == 2:
+        return "The other filter is not shown to be worse."
     verb = "is" if tied == 1 else "are"
     return f"{tied} of {len(ranked) - 1} others {verb} not shown to be worse."
