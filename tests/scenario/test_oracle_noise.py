@@ -624,8 +624,7 @@ def test_the_switch_reaches_the_result(tmp_path: Path) -> None:
     )
     assert report.code == 0, report.err
     page = (tmp_path / "reports" / "adhoc" / "report.md").read_text()
-    assert "ekf[oracle_noise=True]" in page
-    assert "Oracle noise: the filter receives the true noise regime" in page
+    assert "EKF [oracle_noise=True]" in page
 
 
 @pytest.mark.parametrize(
