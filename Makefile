@@ -1,8 +1,9 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
+STUDY  ?= quickstart
 
-.PHONY: demo report test test-fast test-slow mutants faults format lint bench clean
+.PHONY: demo report test test-fast test-slow mutants recompute faults format lint bench clean
 
 # Python compiles modules at first import. Compiling all installed packages took half of the set-up time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -32,6 +33,9 @@ test-slow: $(VENV)/.installed
 
 mutants: $(VENV)/.installed     ## plant each fault of tests/mutants.toml and check that a test fails
 	$(BIN)/python tests/mutants.py
+
+recompute: $(VENV)/.installed      ## compute the decisions of a report a second time, without code of pfbench
+	$(BIN)/python tests/decision_oracle.py results/$(STUDY) reports/$(STUDY)/decisions.json
 
 faults: $(VENV)/.installed      ## disturb pfbench and count the outcomes in docs/reliability.md: hours; repeat to continue
 	PYTHONPATH=tests $(BIN)/python -m faults.main
