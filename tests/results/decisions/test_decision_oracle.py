@@ -9,10 +9,15 @@ import command_line as cli
 import pytest
 from decision_oracle import find_differences, read_runs, recompute
 
-STUDY = (
-    "scenario=linear_walk,passive_1,passive_2 scenario.steps=40 noise=nominal,outliers "
-    "filter=ekf,ukf,sir,rpf,gpf particles=100 runs=20 study=oracle"
-).split()
+STUDY = [
+    "scenario=linear_walk,passive_1,passive_2",
+    "scenario.steps=40",
+    "noise=nominal,outliers",
+    "filter=ekf,ukf,sir,rpf,gpf",
+    "particles=100",
+    "runs=20",
+    "study=oracle",
+]
 
 
 @pytest.mark.slow  # 30 jobs and a report: a study of two worlds, two regimes and ten pairs
