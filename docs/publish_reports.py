@@ -8,10 +8,9 @@ Git stores report.md, verdicts.json and one figure of each study. The command co
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
-from pfbench.files.recorded_folder import record_change
+from pfbench.files.recorded_folder import RecordedFolder
 
 REPORTS = Path(__file__).parents[1] / "reports"
 
@@ -59,14 +58,15 @@ def publish_report(folder: Path) -> None:
         folder: Folder of the report. Its name is the study.
     """
     stem = HEADLINES[folder.name]
-    source = next((p for s in (".svg", ".png") if (p := folder / f"{stem}{s}").exists()), None)
-    if source is not None:
-        for old in folder.glob("headline.*"):
-            old.unlink()
-        shutil.copyfile(source, folder / f"headline{source.suffix}")
-    page = folder / "report.md"
-    page.write_text(reduce_markdown(page.read_text(), folder, stem))
-    record_change(page)
+    suffixes = (".svg", ".png")
+    suffix = next((s for s in suffixes if (folder / f"{stem}{s}").exists()), None)
+    with RecordedFolder(folder, is_complete=False) as target:
+        if suffix is not None:
+            for other in suffixes:
+                target.remove(f"headline{other}")
+            target.write(f"headline{suffix}", (folder / f"{stem}{suffix}").read_bytes())
+        page = (folder / "report.md").read_text(encoding="utf-8")
+        target.write("report.md", reduce_markdown(page, folder, stem))
 
 
 def reduce_markdown(text: str, folder: Path, stem: str) -> str:

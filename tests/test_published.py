@@ -83,6 +83,23 @@ def test_a_report_keeps_its_headline_figure_only(tmp_path: Path) -> None:
     )
 
 
+def test_publishing_removes_only_headlines_that_it_made(tmp_path: Path) -> None:
+    publish = load("publish_reports")
+    folder = tmp_path / "claims"
+    figure = folder / f"{publish.HEADLINES['claims']}.png"
+    figure.parent.mkdir(parents=True)
+    figure.write_bytes(b"png")
+    for name in ("report.md", "headline.mine", "headline.svg"):
+        (folder / name).write_text("of the user\n")
+    publish.publish_report(folder)
+    figure.with_suffix(".svg").write_text("<svg/>")
+    publish.publish_report(folder)
+    names = {path.name for path in folder.iterdir() if path.is_file()} - {"manifest.json"}
+    assert names == {"report.md", "headline.mine", "headline.svg", "headline.svg.kept"}
+    assert (folder / "headline.svg.kept").read_text() == "of the user\n"
+    assert (folder / "headline.svg").read_text() == "<svg/>"
+
+
 def test_the_numbers_of_the_readme_are_those_of_the_published_files() -> None:
     numbers = load("readme_numbers")
     text = numbers.README.read_text()

@@ -28,10 +28,13 @@ class RecordedFolder:
 
     Args:
         path: The folder. It is created with the first file.
+        is_complete: Whether the writer makes all files of the folder. If not, old files stay, unless
+            `remove` names them.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, is_complete: bool = True) -> None:
         self.path = Path(path)
+        self._is_complete = is_complete
         self._previous = _read_manifest(self.path / MANIFEST)
         self._written: dict[str, str] = {}
         self._renamed: list[str] = []
@@ -47,11 +50,12 @@ class RecordedFolder:
         trace: TracebackType | None,
     ) -> None:
         """Remove the old files and write the manifest."""
-        if kind is None:
-            self._remove_old_files()
+        if kind is None and self._is_complete:
+            for name in sorted(self._previous.keys() - self._written.keys()):
+                self.remove(name)
         elif not self._written:
             return
-        files = self._written if kind is None else {**self._previous, **self._written}
+        files = {**self._previous, **self._written}
         _write_manifest(self.path / MANIFEST, files)
         self._report_other_files()
 
@@ -86,14 +90,18 @@ class RecordedFolder:
         self._written[name] = digest
         return target
 
-    def _remove_old_files(self) -> None:
-        """Remove the unchanged files of the previous manifest that were not written again."""
-        for name in sorted(self._previous.keys() - self._written.keys()):
-            file = self.path / name
-            if not _has_own_parents(self.path, name) or file.is_symlink() or not file.is_file():
-                continue
-            if _hash_file(file) == self._previous[name]:
-                file.unlink()
+    def remove(self, name: str) -> None:
+        """Remove a file of the previous manifest, if its content is unchanged.
+
+        Args:
+            name: Path relative to the folder, with `/`. A file that is not listed stays.
+        """
+        digest = self._previous.pop(name, None)
+        file = self.path / name
+        if digest is None or file.is_symlink() or not file.is_file():
+            return
+        if _has_own_parents(self.path, name) and _hash_file(file) == digest:
+            file.unlink()
 
     def _report_other_files(self) -> None:
         """Warn about files that are not of the manifest."""
@@ -107,27 +115,16 @@ class RecordedFolder:
             name
             for file in self.path.rglob("*")
             if (file.is_symlink() or file.is_file())
-            and (name := file.relative_to(self.path).as_posix()) not in (MANIFEST, *self._written)
+            and (name := file.relative_to(self.path).as_posix())
+            not in (MANIFEST, *self._written, *self._previous)
             and name not in self._renamed
         )
-        if others:
+        if others and self._is_complete:
             log.warning(
                 "warning  %s: not written by this command, so not removed: %s",
                 self.path,
                 _list_names(others),
             )
-
-
-def record_change(file: Path) -> None:
-    """Record the new content of a file that a script of pfbench changed after it was written.
-
-    Args:
-        file: File next to the manifest. Without a manifest, or if it is not listed, nothing is done.
-    """
-    manifest = file.with_name(MANIFEST)
-    files = _read_manifest(manifest)
-    if file.name in files:
-        _write_manifest(manifest, {**files, file.name: _hash_file(file)})
 
 
 def _read_manifest(path: Path) -> dict[str, str]:

@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from pfbench.files.atomic_write import set_aside, write_atomically
 
 
 def write_losses(path: Path, lines: list[dict[str, float]]) -> None:
     """Write the log lines of all epochs to a CSV file.
 
+    A file of this name that is no such log is renamed to `NAME.kept`.
+
     Args:
         path: The file.
         lines: Log line of each epoch, all with the same names.
     """
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(lines[0]))
-        writer.writeheader()
-        writer.writerows(lines)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(lines[0]))
+    writer.writeheader()
+    writer.writerows(lines)
+    head = ",".join(lines[0]).encode()
+    if path.is_symlink() or (path.exists() and not path.read_bytes().startswith(head)):
+        set_aside(path, "kept")
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
 
 
 def open_tensorboard(path: Path) -> Callable[[dict[str, float]], None]:

@@ -11,7 +11,7 @@ from checkout import ROOT
 
 from pfbench.files.atomic_write import remove_temporary_files
 from pfbench.files.digest import DIGEST, hash_content
-from pfbench.files.recorded_folder import MANIFEST, RecordedFolder, record_change
+from pfbench.files.recorded_folder import MANIFEST, RecordedFolder
 
 OLD = {"page.md": "old page", "figures/a.svg": "a", "figures/b.svg": "b", "tables/t.csv": "1"}
 
@@ -199,13 +199,17 @@ def test_an_error_before_the_first_file_leaves_no_folder(tmp_path: Path) -> None
     assert not (tmp_path / "new").exists()
 
 
-def test_a_change_by_a_script_of_pfbench_is_recorded(folder: Path) -> None:
-    (folder / "page.md").write_text("reduced")
-    record_change(folder / "page.md")
-    (folder / "other.md").write_text("mine")
-    record_change(folder / "other.md")
+def test_a_script_that_writes_some_files_removes_only_recorded_ones(folder: Path) -> None:
+    (folder / "mine.md").write_text("mine")
+    with RecordedFolder(folder, is_complete=False) as recorded:
+        recorded.write("page.md", "reduced")
+        recorded.remove("mine.md")
+        recorded.remove("figures/a.svg")
+    left = {**OLD, "page.md": "reduced", "mine.md": "mine"}
+    left.pop("figures/a.svg")
+    assert content(folder) == left
     write(folder, {"page.md": "new page"})
-    assert content(folder) == {"page.md": "new page", "other.md": "mine"}
+    assert content(folder) == {"page.md": "new page", "mine.md": "mine"}
 
 
 def test_only_own_temporary_files_are_removed(tmp_path: Path) -> None:
