@@ -15,7 +15,7 @@ from pfbench.files.atomic_write import set_aside, write_atomically
 def write_losses(path: Path, lines: list[dict[str, float]]) -> None:
     """Write the log lines of all epochs to a CSV file.
 
-    A file of this name that is no such log is renamed to `NAME.kept`.
+    Another kind of file under this name is renamed to `NAME.kept`.
 
     Args:
         path: The file.
