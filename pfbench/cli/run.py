@@ -11,7 +11,7 @@ from typing import Any
 from pfbench.cli.sweep.study_plan import StudyPlan, plan_study
 from pfbench.cli.sweep.sweep_progress import SWEEP_JOBS, SweepProgress
 from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
-from pfbench.config.composition import register_experiments
+from pfbench.config.composition import JobConfig, register_experiments
 from pfbench.config.folders import conf_dir
 from pfbench.config.sweep_check import check_words
 
@@ -50,11 +50,11 @@ def run_jobs(words: Sequence[str]) -> None:
     flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
     overrides = [word for word in words if word not in flags]
     overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
-    check_words([*flags, *overrides])
+    first = check_words([*flags, *overrides])
     decorate = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
     application = decorate(run_task)
     is_printed = any(word.partition("=")[0] in _PRINTING_FLAGS for word in words)
-    plan = None if is_printed else plan_or_none(overrides)
+    plan = None if is_printed else plan_or_none(overrides, first)
     if plan and wants_until_decided(plan):
         check_has_sweep(flags)
         sweep = GrowingSweep.from_plan(plan)
@@ -69,14 +69,16 @@ def run_jobs(words: Sequence[str]) -> None:
     application()
 
 
-def plan_or_none(overrides: Sequence[str]) -> StudyPlan | None:
+def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:
     """Plan a study; None if its configuration is not valid, which Hydra reports.
 
     Args:
         overrides: Overrides and flags of Hydra.
+        first: Configuration of the first job, None if it is not known.
     """
+    words = [word for word in overrides if not word.startswith("-")]
     try:
-        return plan_study([word for word in overrides if not word.startswith("-")])
+        return plan_study(words, first if len(words) == len(overrides) else None)
     except Exception:
         return None
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from pfbench.config.composition import compose, compose_tree
+from pfbench.config.composition import JobConfig, compose, compose_tree
 from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.trust import UntrustedConfigError, check_study
 
 
-def check_words(words: Sequence[str]) -> None:
+def check_words(words: Sequence[str]) -> JobConfig | None:
     """Check the words of `pfbench run`, those of all jobs of a sweep included.
 
     A job whose configuration is invalid for another reason fails by itself later, and the other jobs
@@ -18,6 +18,9 @@ def check_words(words: Sequence[str]) -> None:
 
     Args:
         words: Overrides and flags of Hydra, without `trust`.
+
+    Returns:
+        Configuration of the first job, None if it is not valid.
 
     Raises:
         UntrustedConfigError: If a file sets what only the command line may set, or names what is
@@ -35,10 +38,7 @@ def check_words(words: Sequence[str]) -> None:
     if args.config_dir:
         overrides.append(f"hydra.searchpath=[file://{args.config_dir}]")
     check_files(overrides)
-    if args.multirun:
-        _check_sweep(overrides)
-    else:
-        _check_composition(overrides)
+    return _check_sweep(overrides) if args.multirun else _check_composition(overrides)
 
 
 def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
@@ -63,18 +63,21 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
     return list(alternatives.values())
 
 
-def _check_composition(words: list[str]) -> Mapping[str, object]:
+def _check_composition(words: list[str]) -> JobConfig | None:
     """Compose a configuration for its checks. Other errors are left to the job."""
     try:
-        return compose(words).values
+        return compose(words)
     except UntrustedConfigError:
         raise
     except Exception:
-        return {}
+        return None
 
 
-def _check_sweep(overrides: list[str]) -> None:
-    """Check the first job of a sweep, and all values that can choose a file that is not pfbench's."""
+def _check_sweep(overrides: list[str]) -> JobConfig | None:
+    """Check the first job of a sweep, and all values that can choose a file that is not pfbench's.
+
+    Returns the configuration of the first job, None if it is not valid.
+    """
     try:
         tree = compose_tree([options[0] for options in expand_sweep(overrides)])
         params = tree.hydra.sweeper.params or {}
@@ -83,9 +86,10 @@ def _check_sweep(overrides: list[str]) -> None:
     except UntrustedConfigError:
         raise
     except Exception:  # Hydra reports an invalid override
-        return
+        return None
     first = [options[0] for options in alternatives]
-    values = _check_composition(first)
+    config = _check_composition(first)
+    values: Mapping[str, object] = config.values if config else {}
     for index, options in enumerate(alternatives):
         for option in options[1:]:
             key, _, value = option.lstrip("+").partition("=")
@@ -94,6 +98,7 @@ def _check_sweep(overrides: list[str]) -> None:
             is_plain = key in values and not isinstance(values[key], Mapping)
             if not is_plain and not _is_own_file(key, value):
                 _check_composition([*first[:index], option, *first[index + 1 :]])
+    return config
 
 
 def _is_own_file(group: str, name: str) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from pyro.distributions import Independent, MultivariateNormal, Normal
 from torch import Tensor
+from torch.distributions import Distribution
 
 
 class StandardNormal(Normal):
@@ -42,6 +43,8 @@ def normal_batch(runs: int, sd: Tensor, mean: Tensor | None = None) -> Independe
 def dense_normal(mean: Tensor, factor: Tensor) -> MultivariateNormal:
     """Build a normal distribution from its mean and Cholesky factor, without checks.
 
+    As `MultivariateNormal(mean, scale_tril=factor)`, whose constructor imports SymPy for the shape.
+
     Args:
         mean: Means, [..., d].
         factor: Lower triangular roots of the covariance, [..., d, d].
@@ -49,4 +52,9 @@ def dense_normal(mean: Tensor, factor: Tensor) -> MultivariateNormal:
     Returns:
         Distribution with event [d].
     """
-    return MultivariateNormal(mean, scale_tril=factor, validate_args=False)
+    batch = torch.broadcast_tensors(mean[..., 0], factor[..., 0, 0])[0].shape
+    normal = MultivariateNormal.__new__(MultivariateNormal)
+    normal.loc, normal.scale_tril = mean.expand(*batch, -1), factor.expand(*batch, -1, -1)
+    normal._unbroadcasted_scale_tril = factor
+    Distribution.__init__(normal, batch, mean.shape[-1:], validate_args=False)
+    return normal

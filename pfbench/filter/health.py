@@ -25,7 +25,7 @@ from functools import cache
 from typing import NamedTuple
 
 import torch
-from scipy import stats
+from scipy.special import chdtri
 from torch import Tensor
 
 from pfbench.core.record import Record
@@ -82,7 +82,7 @@ class HealthMonitor:
             if (k + 1) * count >= _CHECKS
         )
         self._limits = torch.tensor(
-            [torch.inf, *stats.chi2.ppf(0.999, range(1, record.y.shape[2] + 1))],
+            [torch.inf, *chdtri(range(1, record.y.shape[2] + 1), 0.001)],
             dtype=torch.float64,
             device=record.y.device,
         )

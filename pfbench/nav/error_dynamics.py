@@ -213,9 +213,9 @@ def _euler_rate(alpha: Tensor, w: Tensor) -> Tensor:
 
 def _scale_position(x: Tensor, scale: Tensor) -> Tensor:
     """Multiply components 6 to 8 of x [..., D] by scale [..., 3]."""
-    shape = torch.broadcast_shapes(x.shape[:-1], scale.shape[:-1])
-    x, scale = x.expand(*shape, x.shape[-1]), scale.expand(*shape, 3)
-    return torch.cat([x[..., :6], x[..., 6:9] * scale, x[..., 9:]], dim=-1)
+    position = x[..., 6:9] * scale
+    x = x.expand(*position.shape[:-1], x.shape[-1])
+    return torch.cat([x[..., :6], position, x[..., 9:]], dim=-1)
 
 
 def _matrix(*entries: Tensor) -> Tensor:

@@ -100,6 +100,6 @@ def rotate(q: Tensor, a: Tensor) -> Tensor:
         q: Unit quaternions, [..., 4].
         a: Vectors, [..., 3].
     """
-    axis = q[..., 1:].expand(torch.broadcast_shapes(q[..., 1:].shape, a.shape))
-    twice = 2.0 * torch.linalg.cross(axis, a.expand_as(axis))
+    axis, a = torch.broadcast_tensors(q[..., 1:], a)
+    twice = 2.0 * torch.linalg.cross(axis, a)
     return a + q[..., :1] * twice + torch.linalg.cross(axis, twice)

@@ -116,7 +116,7 @@ def navigate(
     """
     n, per_interval = dtheta.shape[-2], samples_per_interval
     _check_samples(n, dv.shape[-2], per_interval, samples_per_step)
-    runs = torch.broadcast_shapes(ins.vel.shape[:-1], dtheta.shape[:-2], dv.shape[:-2])
+    runs = torch.broadcast_tensors(ins.vel[..., 0], dtheta[..., 0, 0], dv[..., 0, 0])[0].shape
     d = torch.as_tensor(dt, dtype=dv.dtype, device=dv.device)
     d = d.expand(n)[None] if d.dim() < 2 else d
     state = _start(ins, runs)

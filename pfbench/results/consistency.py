@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtri
 
 from pfbench.results.error_measures import Array, Flags, RunMean, count_runs, finite_mean
 
@@ -71,7 +71,7 @@ def nees_band(dof: int, runs: int | NDArray[np.intp], alpha: float = 0.05) -> tu
         Lower and upper limit, in the shape of `runs`.
     """
     n = np.where(np.asarray(runs) > 0, runs, np.nan)
-    low, high = (stats.chi2.ppf(q, dof * n) / n for q in (alpha / 2, 1 - alpha / 2))
+    low, high = (chdtri(dof * n, q) / n for q in (1 - alpha / 2, alpha / 2))
     return low, high
 
 

@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from pfbench.results.consistency import NeesConsistency, nees_band
 from pfbench.results.error_measures import Array, Flags, RunMean, finite_mean
@@ -90,7 +90,7 @@ def is_overconfident(nees: Array, dof: int, lost: Flags) -> Flags:
     """
     with np.errstate(over="ignore"):
         mean = finite_mean(np.asarray(nees, dtype=np.float64), axis=1)
-    return (mean > stats.chi2.ppf(0.999, dof)) & ~np.asarray(lost, dtype=bool)
+    return (mean > chdtri(dof, 0.001)) & ~np.asarray(lost, dtype=bool)
 
 
 def is_severely_overconfident(

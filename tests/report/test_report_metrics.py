@@ -66,8 +66,9 @@ def test_signed_rank_tests_of_many_pairs_are_those_of_scipy(n, alternative):
     d[3:6] = np.round(d[3:6], 1)  # some ties and zeros
     d[6:] = np.round(d[6:])  # many
     statistic, p = signed_rank.wilcoxon_signed_rank_rows(d, alternative)
-    for row, t, value in zip(d, statistic, p, strict=True):
-        if row.any():
+    permuted = n == 13  # scipy permutes ties of few differences: one row of each kind is enough
+    for k, (row, t, value) in enumerate(zip(d, statistic, p, strict=True)):
+        if row.any() and not (permuted and k % 3):
             expected = stats.wilcoxon(row, alternative=alternative, zero_method="zsplit")
             assert (t, value) == pytest.approx((expected.statistic, expected.pvalue), rel=1e-11)
         assert signed_rank.wilcoxon_signed_rank(row, alternative) == (

@@ -85,11 +85,12 @@ class StudyPlan:
         return {next(iter(given_keys(options[:1]))): options for options in several}
 
 
-def plan_study(overrides: Sequence[str]) -> StudyPlan:
+def plan_study(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan:
     """Plan a sweep, or a single job.
 
     Args:
         overrides: Overrides, some with several values, without flags.
+        first: Configuration of the first job; None composes it.
 
     Returns:
         The plan.
@@ -100,7 +101,7 @@ def plan_study(overrides: Sequence[str]) -> StudyPlan:
     names = [word.partition("=")[2] for word in overrides if word.startswith("+experiment=")]
     params = [word for name in names for word in read_sweep(name)]
     alternatives = tuple(tuple(options) for options in expand_sweep([*params, *overrides]))
-    first = compose_words([options[0] for options in alternatives])
+    first = first or compose_words([options[0] for options in alternatives])
     return StudyPlan(alternatives, first, tuple(names))
 
 

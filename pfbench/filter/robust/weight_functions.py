@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from scipy import stats
+from scipy.special import chdtri, gammaln
 from torch import Tensor
 
 _NODES = 4000  # of the quadrature over the distance
@@ -76,7 +76,10 @@ def compute_efficiency(weight: WeightFunction, threshold: float, k: int) -> floa
 def _chi_nodes(k: int) -> tuple[Tensor, Tensor]:
     """Return squared distances and their probabilities for d ~ chi_k."""
     d = np.linspace(0.0, math.sqrt(k) + 12.0, _NODES + 1)[1:]
-    probability = stats.chi.pdf(d, k) * (d[1] - d[0])
+    probability = np.exp(
+        (k - 1) * np.log(d) - d * d / 2 - (k / 2 - 1) * math.log(2.0) - gammaln(k / 2)
+    )
+    probability *= d[1] - d[0]
     return torch.from_numpy(d * d), torch.from_numpy(probability)
 
 
@@ -124,7 +127,7 @@ def quantile_table(probability: float, count: Tensor) -> Tensor:
         probability: Probability of a smaller value.
         count: Degrees of freedom, [R, k].
     """
-    return _look_up([float(stats.chi2.ppf(probability, n)) for n in _counts(count)], count)
+    return _look_up([float(chdtri(n, 1.0 - probability)) for n in _counts(count)], count)
 
 
 def _counts(count: Tensor) -> range:

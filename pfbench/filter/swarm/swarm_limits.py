@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import torch
-from scipy import stats
+from scipy.special import chdtri
 from torch import Tensor
 
 from pfbench.core.record import Record
@@ -120,4 +120,4 @@ class ChiSquareStopping:
 @cache
 def _quantiles(p: float, maximum: int) -> list[float]:
     """Return chi-square quantiles for 0 to `maximum` degrees of freedom."""
-    return [0.0, *(float(stats.chi2.ppf(p, k)) for k in range(1, maximum + 1))]
+    return [0.0, *(float(chdtri(k, 1.0 - p)) for k in range(1, maximum + 1))]
