@@ -18,6 +18,9 @@ from checkout import ROOT
 from command_line import Said, environment, process
 
 from pfbench import job
+from pfbench.kernels import library_build
+
+COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 
 # a project of somebody else, in two files and a folder
 
@@ -120,7 +123,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     leave = shutil.ignore_patterns("__pycache__")
     for name in ("pfbench", "conf", "experiments"):
         shutil.copytree(ROOT / name, source / name, ignore=leave)
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
     command = [
         sys.executable,
@@ -137,6 +140,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         [*command, *isolation, str(source)], capture_output=True, text=True, check=False
     )
     assert build.returncode == 0, build.stderr
+    for library in (source / "pfbench" / "kernels").glob("operators_*.so"):
+        library.unlink()  # of the checkout, which the build copies
     (built,) = (home / "dist").glob("pfbench-*.whl")
     return built
 
@@ -161,8 +166,16 @@ def installed(wheel: Path) -> Path:
 
 
 def elsewhere(installed: Path, cwd: Path, *words: str) -> Said:
-    """The installed command line; `cwd` is no checkout."""
-    return process(*words, home=cwd, cwd=cwd, PYTHONPATH=str(installed))
+    """The installed command line without a compiler; `cwd` is no checkout."""
+    outside = {"PYTHONPATH": str(installed), "PATH": str(cwd), "XDG_CACHE_HOME": str(cwd / "cache")}
+    return process(*words, home=cwd, cwd=cwd, **outside)
+
+
+def engine_of_job(home: Path) -> str:
+    """The engine of the one job in a results folder."""
+    (file,) = (home / "results" / "adhoc").glob("*.npz")
+    with np.load(file, allow_pickle=False) as stored:
+        return str(json.loads(str(stored["meta"]))["engine"])
 
 
 @pytest.mark.slow
@@ -185,10 +198,16 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     assert len(data) > 10
     wanted |= {f"pfbench/{file.relative_to(ROOT / 'pfbench')}" for file in data}
     wanted |= {"pfbench/py.typed"}
+    if COMPILER is not None:
+        wanted |= {
+            f"pfbench/kernels/{library_build.name_library(variant)}"
+            for variant in library_build.find_variants()
+        }
     wanted |= {"pfbench/conf/__init__.py"} | {
         f"pfbench/{file.relative_to(ROOT)}" for file in (ROOT / "experiments").glob("*.py")
     }
     assert wanted <= names
+    assert wheel.name.split("-")[2:4] == ["py3", "none"]  # for every version of Python
     rest = {name for name in names - wanted if ".dist-info/" not in name}
     assert rest == set()  # no tests, no results, no caches
     assert any(name.endswith("licenses/LICENSE") for name in names)
@@ -228,9 +247,10 @@ def test_the_installed_package_needs_no_checkout(installed: Path, tmp_path: Path
         "scenario.steps=5",
         "runs=2",
         "particles=50",
+        "engine=kernels",
     )
     assert ran.code == 0, ran.err
-    assert len(list((tmp_path / "results" / "adhoc").glob("*.npz"))) == 1
+    assert engine_of_job(tmp_path) == ("eager" if COMPILER is None else "kernels")
 
     env = os.environ | environment(tmp_path) | {"PYTHONPATH": str(installed)}
     words = ("list", "report study=adhoc report.figure_formats=[svg]", "check")
@@ -248,6 +268,16 @@ def test_the_installed_package_needs_no_checkout(installed: Path, tmp_path: Path
     assert (tmp_path / "reports" / "adhoc" / "index.html").is_file()
     files = [*job.conf_dir().glob("*/*.yaml"), *job.experiments_dir().glob("*.yaml")]
     assert re.search(rf"configurations +{len(files)} of {len(files)} +ok", checked)
+
+
+@pytest.mark.slow
+def test_sources_without_a_compiler_say_what_is_lost(wheel: Path, tmp_path: Path) -> None:
+    """Neither a library nor a compiler: the job runs in torch operations, and one line says so."""
+    small = ("scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=50")
+    ran = elsewhere(wheel.parents[1] / "source", tmp_path, "run", *small, "engine=kernels")
+    assert ran.code == 0, ran.err
+    assert engine_of_job(tmp_path) == "eager"
+    assert (ran.out + ran.err).count("C++ operators: not available (a C++ compiler must be") == 1
 
 
 PROGRAM = """

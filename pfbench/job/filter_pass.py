@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
-from pfbench.filter.belief import ParticleBelief, StepInfo, gather_ancestors
+from pfbench.filter.belief import StepInfo
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.loop import FilterResult, Watch, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
@@ -23,6 +23,7 @@ from pfbench.job.plan import JobPlan
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder
 from pfbench.job.system_memory import MemoryTrimmer, peak_above, start_peak_measurement
 from pfbench.kernels import compilation
+from pfbench.kernels.cpp_library import is_library_loaded
 from pfbench.model.base import StateSpaceModel
 
 log = logging.getLogger("pfbench")
@@ -159,10 +160,9 @@ def _filter_episode(
 
 
 def should_compile(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> bool:
-    """Decide whether inner loops are compiled, and compile them.
+    """Decide whether the C++ operators are used, and load them.
 
-    They are if the engine requires it, or if the job is large enough for the compilation to pay.
-    Compiled code is stored on disk for later jobs.
+    They are if the engine requires it, or if the job is large enough.
 
     Args:
         engine: Engine of the job.
@@ -171,7 +171,7 @@ def should_compile(engine: str, method: Any, model: StateSpaceModel, run_steps: 
         run_steps: Number of runs times number of steps.
 
     Returns:
-        Whether compiled loops are used. False if no C++ compiler works.
+        Whether they are used. False if they cannot be loaded.
     """
     numbers = 0
     if isinstance(method, ParticleFilter):
@@ -181,24 +181,7 @@ def should_compile(engine: str, method: Any, model: StateSpaceModel, run_steps: 
         numbers = run_steps * 8 * model.chart.dimension**2
     if engine == "eager" or (engine == "auto" and numbers < _COMPILE_FROM):
         return False
-    start_time = time.perf_counter()
-    try:
-        with compilation.use_compiled(), torch.no_grad():
-            draws = PhiloxStream(0, torch.arange(2, device=model.anchor.device))
-            draws.uniform("compiles", 2, 2)
-            x = draws.normal("compiles", 2, 2)
-            ancestors = torch.zeros(2, 2, dtype=torch.int64, device=x.device)
-            gather_ancestors(ParticleBelief(x, x[..., 0], x[:, 0, 0]), ancestors)
-    except Exception as error:  # torch raises many kinds of errors without a C++ compiler
-        reason = type(error).__name__
-        log.warning("engine=%s: compilation failed (%s). Using eager mode", engine, reason)
-        return False
-    elapsed = time.perf_counter() - start_time
-    if elapsed > 0.5:
-        log.info(
-            "engine=%s: inner loops compiled in %.1f s. Later jobs reuse them", engine, elapsed
-        )
-    return True
+    return model.anchor.is_cuda or is_library_loaded()
 
 
 def _compile_step(

@@ -13,8 +13,6 @@ torch's compiler would compute the noise again for each state component.
 
 from __future__ import annotations
 
-import logging
-import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -24,13 +22,12 @@ from typing import Any, TypeVar, cast
 import torch
 from torch.autograd import forward_ad
 
-from pfbench.kernels import cuda, manifest
+from pfbench.kernels import cuda
+from pfbench.kernels.cpp_library import is_library_loaded
+from pfbench.kernels.operator_checks import check_arguments
 from pfbench.kernels.private_folder import use_private_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-log = logging.getLogger("pfbench")
-_failed: set[Callable[..., Any]] = set()  # kernels that did not compile
 
 _fused: ContextVar[bool] = ContextVar("fused", default=False)
 _graph: ContextVar[bool] = ContextVar("graph", default=False)
@@ -115,8 +112,9 @@ def compilable(
         if _on_cuda(args):
             kernel = _find_cuda_kernel(operator, args)
             return (kernel or (compiled() if use_torch_compiler else run_eagerly))(*args)
-        result = _run_kernel(operator, args)
-        return check_and_run(*args) if result is None else result
+        if operator is None or not is_library_loaded():
+            return check_and_run(*args)
+        return operator(*args)
 
     @wraps(function)
     def call(*args: Any) -> Any:
@@ -128,17 +126,6 @@ def compilable(
         return (function if in_graph is None or not fits_graph(*args) else in_graph)(*args)
 
     return cast(F, call)
-
-
-def _run_kernel(operator: Callable[..., Any] | None, args: tuple[Any, ...]) -> Any:
-    """Return the results of a C++ kernel, or None if there is none or it does not compile."""
-    if operator is None or operator in _failed:
-        return None
-    try:
-        return operator(*args)
-    except (OSError, subprocess.CalledProcessError) as error:
-        _note_failure(operator, error)
-    return None
 
 
 def _find_cuda_kernel(
@@ -156,17 +143,10 @@ def _find_cuda_kernel(
     return kernel
 
 
-def _note_failure(operator: Callable[..., Any], error: BaseException) -> None:
-    """Log that a kernel does not compile, and do not try it again."""
-    name, kind = operator.__name__, type(error).__name__
-    log.warning("%s does not compile here (%s). Using eager mode", name, kind)
-    _failed.add(operator)
-
-
 def _check(operator: Callable[..., Any] | None, args: tuple[Any, ...]) -> None:
     """Check arguments as the operator does. A recorded step has shapes and no values."""
     if operator is not None and not torch.compiler.is_compiling():
-        manifest.check_arguments(operator.__name__, args, with_values=not _graph.get())
+        check_arguments(operator.__name__, args, with_values=not _graph.get())
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pfbench.kernels.cuda_launch import compile_kernel, launch_kernel
-from pfbench.kernels.operator_door import check_first
+from pfbench.kernels.operator_checks import check_first
 
 log = logging.getLogger("pfbench")
 _REAL = {torch.float32: "float", torch.float64: "double"}

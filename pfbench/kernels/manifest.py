@@ -1,32 +1,18 @@
-"""Manifest of the operators: their arguments, and the checks that are made from it.
-
-`operators.toml` states kind, axes and range of each argument. The C++ operators check them by
-`src/operator_checks.h`, which `python -m pfbench.kernels.manifest` writes. Eager functions and CUDA
-kernels check them by `check_arguments`.
-"""
+"""Manifest of the operators: name, purpose, arguments and results of each, as `operators.toml` states them."""
 
 from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import torch
-from torch import Tensor
+from typing import NamedTuple
 
 FOLDER = Path(__file__).parent
-HEADER = FOLDER / "src" / "operator_checks.h"
-LARGEST_SIZE = (1 << 30) - 1  # of an axis: counters of particles have 32 bits
-LARGEST_INTEGER = (1 << 32) - 1
 _ARGUMENT = re.compile(r"(\w+): (\w+)(?: \[(.*)\])?(?: (below|to) (?:(\d+) )?([A-Z]|1))?")
-_KINDS = {
-    "real": (torch.float32, torch.float64),
-    "number": (torch.float32, torch.float64, torch.int64),
-    "int64": (torch.int64,),
-}
+_RESULT = re.compile(r"(real|float32|float64|int64|bool) \[(.*)\]")
+_TERM = re.compile(r"(?:(\d+) )?(\w+)")
+_KINDS = ("real", "number", "int64", "int")
 
 
 class Limit(NamedTuple):
@@ -80,125 +66,73 @@ class Argument(NamedTuple):
         return f"[{', '.join(['...', *words[1:]] if self.has_batch else words)}]"
 
 
+class OperatorResult(NamedTuple):
+    """A result of an operator.
+
+    Attributes:
+        kind: Type, or `real` for that of the real arguments.
+        axes: Size of each axis: sums of sizes with factors, as (factor, name) pairs.
+    """
+
+    kind: str
+    axes: tuple[tuple[tuple[int, str], ...], ...]
+
+
+class Operator(NamedTuple):
+    """An operator of the kernels.
+
+    Attributes:
+        name: Name.
+        summary: What it computes, one sentence.
+        arguments: Its arguments, in order.
+        results: Its results, in order.
+        is_on_cpu: Whether it has a C++ function for the CPU.
+        text: Arguments and results as they are written in the manifest.
+    """
+
+    name: str
+    summary: str
+    arguments: tuple[Argument, ...]
+    results: tuple[OperatorResult, ...]
+    is_on_cpu: bool
+    text: tuple[str, ...]
+
+    @property
+    def schema(self) -> str:
+        """Arguments and results as torch writes them, for instance `(Tensor x, SymInt n) -> Tensor`."""
+        words = ("SymInt" if a.kind == "int" else "Tensor" for a in self.arguments)
+        parameters = ", ".join(f"{w} {a.name}" for w, a in zip(words, self.arguments, strict=True))
+        result_types = ", ".join(["Tensor"] * len(self.results))
+        return (
+            f"({parameters}) -> {result_types if len(self.results) == 1 else f'({result_types})'}"
+        )
+
+
 @cache
-def read_operators() -> dict[str, tuple[Argument, ...]]:
-    """Read the arguments of all operators from operators.toml.
+def read_operators() -> dict[str, Operator]:
+    """Read all operators from operators.toml.
 
     Raises:
-        ValueError: If an argument is not written as the head of the file says.
+        ValueError: If an argument or a result is not written as the head of the file says.
     """
     content = tomllib.loads((FOLDER / "operators.toml").read_text())
     return {
-        name: tuple(_parse_argument(name, text) for text in operator["arguments"])
-        for name, operator in content.items()
+        name: Operator(
+            name,
+            entry["summary"],
+            tuple(_parse_argument(name, text) for text in entry["arguments"]),
+            tuple(_parse_result(name, text) for text in entry["results"]),
+            entry.get("device") != "cuda",
+            (*entry["arguments"], *entry["results"]),
+        )
+        for name, entry in content.items()
     }
-
-
-def check_arguments(name: str, arguments: Sequence[Any], with_values: bool = True) -> None:
-    """Check the arguments of an operator.
-
-    Args:
-        name: Name of the operator.
-        arguments: Its arguments, in order.
-        with_values: Check the ranges of values, too. Those of tensors on another device than the
-            CPU are never checked, because the host would wait for them.
-
-    Raises:
-        ValueError: If the number, a type, a device, a shape or a value is wrong. The message names
-            the argument.
-    """
-    expected = read_operators()[name]
-    if len(arguments) != len(expected):
-        raise ValueError(f"{name} must have {len(expected)} arguments, got {len(arguments)}.")
-    sizes: dict[str, int] = {}
-    real: torch.dtype | None = None
-    device: torch.device | None = None
-    for argument, value in zip(expected, arguments, strict=True):
-        if argument.kind == "int":
-            _check_integer(name, argument, value)
-            continue
-        _check_type(name, argument, value, real)
-        real = value.dtype if argument.kind == "real" else real
-        if value.shape:  # a number [] may lie on the host
-            device = device or value.device
-            if value.device != device:
-                raise ValueError(
-                    f"{name}: {argument.name} must be on {device}, got {value.device}."
-                )
-        _check_shape(name, argument, value.shape, sizes)
-    if with_values:
-        for argument, value in zip(expected, arguments, strict=True):
-            if argument.limit is not None:
-                _check_values(name, argument, value, sizes)
-
-
-def _check_integer(name: str, argument: Argument, value: Any) -> None:
-    """Check a plain integer."""
-    if not isinstance(value, int | torch.SymInt) or not 0 <= value <= LARGEST_INTEGER:
-        raise ValueError(
-            f"{name}: {argument.name} must be a whole number from 0 to 2^32 - 1, got {value!r}."
-        )
-
-
-def _check_type(name: str, argument: Argument, value: Any, real: torch.dtype | None) -> None:
-    """Check the type of a tensor."""
-    if not isinstance(value, Tensor):
-        raise ValueError(f"{name}: {argument.name} must be a tensor, got {type(value).__name__}.")
-    kinds = _KINDS[argument.kind] if argument.kind != "real" or real is None else (real,)
-    if value.dtype not in kinds:
-        words = " or ".join(str(kind).removeprefix("torch.") for kind in kinds)
-        raise ValueError(f"{name}: {argument.name} must be {words}, got {value.dtype}.")
-
-
-def _check_shape(
-    name: str, argument: Argument, shape: Sequence[int], sizes: dict[str, int]
-) -> None:
-    """Check the shape of a tensor against the sizes that earlier arguments have."""
-    axes, last = argument.axes, list(shape)
-    if argument.has_batch:
-        axes = axes[1:]
-        last = last[max(0, len(last) - len(axes)) :]
-    is_valid = len(last) == len(axes)
-    for axis, size in zip(axes, last, strict=False):
-        if axis.islower() and size == 1:
-            continue
-        expected_size = 1 if axis == "1" else sizes.setdefault(axis.upper(), size)
-        is_valid = (
-            is_valid and size == expected_size and (size > 0 or axis not in argument.positive)
-        )
-    if is_valid and max(shape, default=0) <= LARGEST_SIZE:
-        return
-    text = ", ".join(f"{axis} = {size}" for axis, size in sizes.items())
-    bound = "".join(f" and {axis} at least 1" for axis in argument.positive)
-    raise ValueError(
-        f"{name}: {argument.name} must have shape {argument.shape}{bound}, got {list(shape)}"
-        f"{f' with {text}' if text else ''}. Sizes must be below 2^30."
-    )
-
-
-def _check_values(name: str, argument: Argument, value: Tensor, sizes: dict[str, int]) -> None:
-    """Check the range of the values of a tensor on the CPU."""
-    if value.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(value):
-        return
-    assert argument.limit is not None
-    largest = argument.limit.largest(sizes)
-    if value.numel() == 0:
-        return
-    # one pass over the values; NaN passes through, and its comparison is false
-    low, high = torch.aminmax(value)
-    if low.item() >= 0 and high.item() <= largest:
-        return
-    wrong = value[~((value >= 0) & (value <= largest))][0].item()
-    raise ValueError(
-        f"{name}: {argument.name} must be from 0 to {argument.limit.text}, got {wrong:g} with "
-        f"{', '.join(f'{axis} = {size}' for axis, size in sizes.items())}."
-    )
 
 
 def _parse_argument(operator: str, text: str) -> Argument:
     """Parse an argument such as `n: number [R|1, 1] to N`."""
     match = _ARGUMENT.fullmatch(text)
-    if match is None or match[2] not in (*_KINDS, "int"):
+    if match is None or match[2] not in _KINDS:
         raise ValueError(f"{operator}: an argument must be 'name: kind [axes]', got {text!r}.")
     axes = [axis.strip() for axis in (match[3] or "").split(",") if axis.strip()]
     has_batch = axes[:1] == ["..."]
@@ -213,37 +147,13 @@ def _parse_argument(operator: str, text: str) -> Argument:
     return Argument(match[1], match[2], letters, positive, limit, has_batch)
 
 
-def make_header() -> str:
-    """Make the C++ checks of all operators."""
-    lines = [
-        "// Checks of the operators' arguments. Written by `python -m pfbench.kernels.manifest` from operators.toml.",
-        "#pragma once",
-        '#include "argument_check.h"',
-        "",
-        "namespace {",
-        "namespace checks {",
-    ]
-    for name, arguments in read_operators().items():
-        types = {"int": "int64_t"}
-        signature = ", ".join(f"{types.get(a.kind, 'const Tensor&')} {a.name}" for a in arguments)
-        lines += ["", f"inline void {name}({signature}) {{", f'    ArgumentCheck check("{name}");']
-        lines += [f"    check.{_cpp_call(a)};" for a in arguments]
-        ranges = ((a.name, a.limit) for a in arguments if a.limit is not None)
-        for name_, (factor, axis, is_index) in ranges:
-            largest = f"{factor}, '{axis}', {int(is_index)}"
-            lines.append(f'    check.range("{name_}", {name_}, {largest});')
-        lines.append("}")
-    return "\n".join([*lines, "", "}  // namespace checks", "}  // namespace", ""])
-
-
-def _cpp_call(argument: Argument) -> str:
-    """Return the C++ check of type and shape of an argument."""
-    name, kind, axes, positive, *_ = argument
-    if kind == "int":
-        return f'integer("{name}", {name})'
-    more = f', "{positive}"' if positive else ""
-    return f'{kind}("{name}", {name}, "{axes}"{more})'
-
-
-if __name__ == "__main__":
-    HEADER.write_text(make_header())
+def _parse_result(operator: str, text: str) -> OperatorResult:
+    """Parse a result such as `float32 [components, R, 4 quarters]`."""
+    match = _RESULT.fullmatch(text)
+    words = [axis.strip() for axis in match[2].split(",") if axis.strip()] if match else []
+    words = ["B" if axis == "..." else axis for axis in words]
+    terms = [[_TERM.fullmatch(term) for term in axis.split(" + ")] for axis in words]
+    if match is None or any(term is None for axis in terms for term in axis):
+        raise ValueError(f"{operator}: a result must be 'kind [axes]', got {text!r}.")
+    axes = tuple(tuple((int(term[1] or 1), term[2]) for term in axis if term) for axis in terms)
+    return OperatorResult(match[1], axes)

@@ -21,17 +21,12 @@ from torch.fx import Node
 from pfbench.kernels import step_table
 from pfbench.kernels.compilation import kept_validation
 from pfbench.kernels.cpp_library import load_library
+from pfbench.kernels.manifest import Operator, read_operators
 from pfbench.kernels.private_folder import use_private_cache
 
 log = logging.getLogger("pfbench")
 
 TensorFunction = Callable[[list[Tensor]], Sequence[Tensor]]
-_KINDS = {"T": "AtenTensorHandle", "i": "int64_t"}
-_SIGNATURES = {  # arguments and results
-    "philox_normals": ("TiTTii", "T"), "philox_normals_float64": ("TiTTii", "T"), "philox_uniforms": ("TiTTii", "T"),
-    "resample_systematic": ("TTT", "T"), "gather_particles": ("TT", "T"),
-    "propagate_affine": ("TTTT", "T"), "count_unique": ("TT", "T"), "sum_and_squares": ("T", "TT"), "weighted_moments": ("TT", "TT"),
-}  # fmt: skip
 
 
 class NativeEntry(NamedTuple):
@@ -56,13 +51,18 @@ class OperatorRegistry(dict[str, list[str]]):
 def declare_shims() -> OperatorRegistry:
     """Return C declarations of the operators that compiled code calls directly."""
 
-    def declare(name: str, arguments: str, results: str) -> str:
-        words = [*(_KINDS[kind] for kind in arguments), *(f"{_KINDS[kind]}*" for kind in results)]
-        return f"AOTITorchError aoti_torch_cpu_{name}({', '.join(words)})"
+    def declare(operator: Operator) -> str:
+        words = ["int64_t" if a.kind == "int" else "AtenTensorHandle" for a in operator.arguments]
+        words += ["AtenTensorHandle*"] * len(operator.results)
+        return f"AOTITorchError aoti_torch_cpu_{operator.name}({', '.join(words)})"
 
     load_library()
     return OperatorRegistry(
-        {f"pfbench.{name}.default": [declare(name, *kinds)] for name, kinds in _SIGNATURES.items()}
+        {
+            f"pfbench.{name}.default": [declare(operator)]
+            for name, operator in read_operators().items()
+            if operator.is_on_cpu
+        }
     )
 
 

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import random
 import sys
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pfbench.kernels import cpp, cpp_library, manifest
-from pfbench.kernels.manifest import Argument
+from pfbench.kernels import cpp, cpp_library, library_build
+from pfbench.kernels.manifest import Argument, read_operators
+from pfbench.kernels.operator_checks import check_arguments
 
-OPERATORS = manifest.read_operators()
-ON_CPU = [name for name in OPERATORS if name != "gather_propagate"]  # that one is on CUDA only
+OPERATORS = {name: operator.arguments for name, operator in read_operators().items()}
+ON_CPU = [name for name, operator in read_operators().items() if operator.is_on_cpu]
 REALS = (torch.float32, torch.float64)
 
 
@@ -122,7 +124,7 @@ def wrong_values(argument: Argument, value: Any) -> list[Any]:
 def is_valid(name: str, arguments: list[Any]) -> bool:
     """Whether the Python check accepts a call."""
     try:
-        manifest.check_arguments(name, arguments)
+        check_arguments(name, arguments)
     except ValueError:
         return False
     return True
@@ -130,7 +132,7 @@ def is_valid(name: str, arguments: list[Any]) -> bool:
 
 def run(calls: int, seed: int) -> dict[str, int]:
     """Make random calls and count what became of them."""
-    cpp.sum_and_squares(torch.rand(1, 1))  # compiles and loads the operators
+    cpp.sum_and_squares(torch.rand(1, 1))  # loads the operators
     rng = random.Random(seed)
     torch.manual_seed(seed)
     counts = dict.fromkeys(("computed", "refused", "wrong but computed", "valid but refused"), 0)
@@ -157,6 +159,9 @@ if __name__ == "__main__":
             "-g",
             "-O1",
         )
-        cpp_library._FLAGS = {name: (*given, *flags) for name, given in cpp_library._FLAGS.items()}  # type: ignore[assignment]
+        cpp_library.name_library = lambda variant: (
+            f"sanitized_{library_build.name_library(variant)}"
+        )  # type: ignore[assignment]
+        cpp_library.build_library = partial(library_build.build_library, flags=flags)  # type: ignore[assignment]
     torch.set_num_threads(1)
     print(run(int(sys.argv[1]), int(sys.argv[2])))

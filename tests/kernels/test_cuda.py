@@ -20,7 +20,7 @@ from pfbench.core import affine_map, random_stream
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter import belief
 from pfbench.filter.particle import particle_moments, resampling_schemes
-from pfbench.kernels import cpp, cuda, cuda_launch, manifest
+from pfbench.kernels import cpp, cuda, cuda_launch
 
 COMPILER = next(
     (found for name in ("c++", "g++", "clang++") if (found := shutil.which(name))), None
@@ -267,7 +267,7 @@ def test_the_door_on_a_device_checks_types_and_shapes_before_anything_is_launche
         valid = random_calls.make_call(name, rng, {axis: 3 for axis in "DRNMWE"})
         cuda.KERNELS[name](*valid)
         assert len(launched) == 1, name
-        for place, argument in enumerate(manifest.read_operators()[name]):
+        for place, argument in enumerate(random_calls.OPERATORS[name]):
             for value in random_calls.wrong_values(argument, valid[place]):
                 call = [*valid[:place], value, *valid[place + 1 :]]
                 with pytest.raises(ValueError, match=f"^{name}: \\w+ must "):

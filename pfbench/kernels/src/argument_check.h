@@ -8,8 +8,6 @@
 #include "tensors.h"
 
 namespace {
-constexpr int64_t MAX_SIZE = int64_t{1} << 30;  // of an axis: counters of particles have 32 bits
-
 class ArgumentCheck {
     const char* operator_name;
     int64_t sizes[26];  // of the axes A to Z; -1 as long as no argument has one
@@ -36,9 +34,7 @@ class ArgumentCheck {
     }
 
     void shape(const char* argument, const Tensor& a, const char* axes, const char* positive) {
-        int32_t device;
-        STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(a.get(), &device));
-        if (device != aoti_torch_device_type_cpu()) fail(argument, "be on the CPU", "a tensor on another device");
+        if (a.device_type() != aoti_torch_device_type_cpu()) fail(argument, "be on the CPU", "a tensor on another device");
         const int64_t count = static_cast<int64_t>(std::char_traits<char>::length(axes));
         bool valid = a.dim() == count;
         for (int64_t k = 0; valid && k < count; ++k) {
@@ -110,9 +106,4 @@ class ArgumentCheck {
         fail(argument, "be from 0 to " + text + (is_index ? " - 1" : ""), "a value outside");
     }
 };
-
-// Raises where a condition on the values of an argument does not hold.
-inline void require(bool condition, const char* message) {
-    if (!condition) throw std::runtime_error(message);
-}
 }  // namespace

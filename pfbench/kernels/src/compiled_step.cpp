@@ -1,10 +1,6 @@
 // The loop over the steps of a filter, when torch's compiler has made one function of a step (see pfbench/filter/compiled.py).
 //
-// A small step takes a fraction of what Python takes to call it. Through torch's stable interface, as loops.cpp.
-#include <torch/csrc/inductor/aoti_torch/c/shim.h>
-#include <torch/csrc/stable/library.h>
-#include <torch/csrc/stable/tensor.h>
-
+// A small step takes a fraction of what Python takes to call it.
 #include <dlfcn.h>
 
 #include <cstdint>
@@ -12,6 +8,8 @@
 #include <stdexcept>
 #include <string>
 #include <vector>
+
+#include "torch_interface.h"
 
 #ifdef __SSE2__
 #include <immintrin.h>
@@ -21,7 +19,7 @@ extern "C" int PyGILState_Ensure();
 extern "C" void PyGILState_Release(int);
 
 namespace {
-using torch::stable::Tensor;
+using pfbench::Tensor;
 
 typedef void (*Step)(AtenTensorHandle*, AtenTensorHandle*);  // takes its inputs over, leaves its outputs
 
@@ -56,9 +54,7 @@ constexpr const char* ENTRY = "_Z19inductor_entry_implPP16AtenTensorOpaqueS1_";
 
 // Type, sizes and strides of a tensor from an axis on. The stride of an axis of one entry has no meaning.
 std::vector<int64_t> layout(const Tensor& a, int64_t first = 0) {
-    int32_t type;
-    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_dtype(a.get(), &type));
-    std::vector<int64_t> numbers{type};
+    std::vector<int64_t> numbers{a.dtype()};
     for (int64_t k = first; k < a.dim(); ++k) {
         numbers.push_back(a.size(k));
         numbers.push_back(a.size(k) > 1 ? a.stride(k) : 0);
@@ -68,9 +64,7 @@ std::vector<int64_t> layout(const Tensor& a, int64_t first = 0) {
 
 // Loads the library of a step; its path is given as bytes.
 int64_t register_step(Tensor library, int64_t outputs, std::vector<Tensor> arguments) {
-    int32_t type;
-    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_dtype(library.get(), &type));
-    if (type != aoti_torch_dtype_uint8() || library.dim() != 1 || (library.size(0) > 1 && library.stride(0) != 1))
+    if (library.dtype() != aoti_torch_dtype_uint8() || library.dim() != 1 || (library.size(0) > 1 && library.stride(0) != 1))
         throw std::runtime_error("register_step: library must be a path as bytes, uint8 [n].");
     if (outputs < 0 || outputs > 1000000) throw std::runtime_error("register_step: outputs must be from 0 to 1000000.");
     const std::string path(static_cast<const char*>(library.data_ptr()), static_cast<size_t>(library.size(0)));
@@ -113,18 +107,13 @@ Signature check_step(int64_t step, const std::vector<Tensor>& constants, const s
     return found;
 }
 
-AtenTensorHandle again(const Tensor& a) {
-    AtenTensorHandle made;
-    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_new_tensor_handle(a.get(), &made));
-    return made;
-}
+AtenTensorHandle again(const Tensor& a) { return pfbench::make_handle(a.get()); }
 
 // a[t], which shares its memory.
 AtenTensorHandle at(const Tensor& a, int64_t t) {
-    const auto size = a.sizes(), stride = a.strides();
-    AtenTensorHandle made;
-    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(
-        a.get(), a.dim() - 1, size.data() + 1, stride.data() + 1, t * stride[0], &made));  // beyond where `a` itself begins
+    const int64_t *const size = a.sizes(), *const stride = a.strides();
+    AtenTensorHandle made;  // it begins beyond where `a` itself begins
+    TORCH_CALL(aoti_torch__reinterpret_tensor, a.get(), a.dim() - 1, size + 1, stride + 1, t * stride[0], &made);
     return made;
 }
 
@@ -138,7 +127,7 @@ AtenTensorHandle particles_first(const Tensor& a) {
         stride.push_back(a.stride(from));
     }
     AtenTensorHandle made;
-    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch__reinterpret_tensor(a.get(), axes, size.data(), stride.data(), 0, &made));
+    TORCH_CALL(aoti_torch__reinterpret_tensor, a.get(), axes, size.data(), stride.data(), 0, &made);
     return made;
 }
 
@@ -172,9 +161,6 @@ std::vector<Tensor> follow(int64_t number, std::vector<Tensor> constants, std::v
     }
     return all;
 }
-}  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
-    library.impl("run_steps", TORCH_BOX(&follow));
-    library.impl("register_step", TORCH_BOX(&register_step));
-}
+const pfbench::Registration registration(pfbench::entry<&follow>("run_steps"), pfbench::entry<&register_step>("register_step"));
+}  // namespace

@@ -7,7 +7,7 @@
 #include <tuple>
 #include <vector>
 
-#include "operator_checks.h"
+#include "operators.h"
 
 namespace {
 // Numbers of as many runs as fill a register.
@@ -191,9 +191,9 @@ Lanes<T> squared_length(Lanes<T>* e, Lanes<T>* covariance, int64_t d) {
     }
     return sum;
 }
+}  // namespace
 
-Tensor squared_length_operator(Tensor e, Tensor covariance) {
-    checks::squared_mahalanobis(e, covariance);
+Tensor operators::squared_mahalanobis(const Tensor& e, const Tensor& covariance) {
     const int64_t systems = e.size(0), d = e.size(1);
     return by_type(e, [&](auto one) {
         using T = decltype(one);
@@ -210,8 +210,7 @@ Tensor squared_length_operator(Tensor e, Tensor covariance) {
     });
 }
 
-std::tuple<Tensor, Tensor> rooted_operator(Tensor covariance) {
-    checks::cholesky_factor(covariance);
+std::tuple<Tensor, Tensor> operators::cholesky_factor(const Tensor& covariance) {
     const int64_t runs = covariance.size(0), d = covariance.size(1);
     return by_type(covariance, [&](auto one) {
         using T = decltype(one);
@@ -228,8 +227,7 @@ std::tuple<Tensor, Tensor> rooted_operator(Tensor covariance) {
     });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> updated_operator(Tensor m, Tensor r, Tensor omega) {
-    checks::kalman_update(m, r, omega);
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> operators::kalman_update(const Tensor& m, const Tensor& r, const Tensor& omega) {
     const int64_t runs = m.size(0), k = m.size(1), d = m.size(2), width = d + 1;
     return by_type(m, [&](auto one) {
         using T = decltype(one);
@@ -277,8 +275,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> updated_operator(Tensor m, Te
     });
 }
 
-std::tuple<Tensor, Tensor> fitted_operator(Tensor r, Tensor xi, Tensor w) {
-    checks::fit_affine(r, xi, w);
+std::tuple<Tensor, Tensor> operators::fit_affine(const Tensor& r, const Tensor& xi, const Tensor& w) {
     const int64_t runs = r.size(0), points = r.size(1), k = r.size(2), d = xi.size(1);
     return by_type(r, [&](auto one) {
         using T = decltype(one);
@@ -304,12 +301,4 @@ std::tuple<Tensor, Tensor> fitted_operator(Tensor r, Tensor xi, Tensor w) {
         }
         return std::make_tuple(m, omega);
     });
-}
-}  // namespace
-
-STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
-    library.impl("squared_mahalanobis", TORCH_BOX(&squared_length_operator));
-    library.impl("cholesky_factor", TORCH_BOX(&rooted_operator));
-    library.impl("kalman_update", TORCH_BOX(&updated_operator));
-    library.impl("fit_affine", TORCH_BOX(&fitted_operator));
 }

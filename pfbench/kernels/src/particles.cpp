@@ -1,8 +1,7 @@
 // The loops over particles of a bootstrap filter's step, one run at a time, so that a run's particles stay in the first-level cache.
 //
 // Particles lie component by component: x [D, R, N]. Compiled without -ffinite-math-only: NaN and infinity keep their meaning.
-// At the end, each loop becomes an operator of torch's, since a small step would take longer to hand pointers over from Python
-// than to use them.
+// At the end are the operators, see operators.toml.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -11,7 +10,7 @@
 #include <tuple>
 #include <vector>
 
-#include "operator_checks.h"
+#include "operators.h"
 
 // of random_normal.cpp
 extern "C" void normals_float(float*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
@@ -277,24 +276,21 @@ Tensor drawn(void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t
     draw(numbers<T>(out), run.data, runs.size(0), components, quarters, *numbers<int64_t>(step), *numbers<int64_t>(seed), purpose);
     return out;
 }
+}  // namespace
 
-Tensor normals_operator(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
-    checks::philox_normals(seed, purpose, step, runs, components, quarters);
+Tensor operators::philox_normals(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
     return drawn(normals_float, seed, purpose, step, runs, components, quarters);
 }
 
-Tensor normals_float64_operator(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
-    checks::philox_normals_float64(seed, purpose, step, runs, components, quarters);
+Tensor operators::philox_normals_float64(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
     return drawn(normals_double, seed, purpose, step, runs, components, quarters);
 }
 
-Tensor uniforms_operator(Tensor seed, int64_t purpose, Tensor step, Tensor runs, int64_t components, int64_t quarters) {
-    checks::philox_uniforms(seed, purpose, step, runs, components, quarters);
+Tensor operators::philox_uniforms(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
     return drawn(uniforms, seed, purpose, step, runs, components, quarters);
 }
 
-Tensor systematic_operator(Tensor a, Tensor n, Tensor u) {
-    checks::resample_systematic(a, n, u);
+Tensor operators::resample_systematic(const Tensor& a, const Tensor& n, const Tensor& u) {
     const int64_t runs = a.size(0), slots = a.size(1);
     const Tensor out = fresh<int64_t>({runs, slots});
     const auto wanted = few<double>(n, runs), uniform = few<double>(u, runs);
@@ -304,8 +300,7 @@ Tensor systematic_operator(Tensor a, Tensor n, Tensor u) {
     return out;
 }
 
-Tensor copied_operator(Tensor x, Tensor ancestors) {
-    checks::gather_particles(x, ancestors);
+Tensor operators::gather_particles(const Tensor& x, const Tensor& ancestors) {
     const int64_t components = x.size(0), runs = x.size(1), wanted = ancestors.size(1);
     const Packed<int64_t> from(ancestors);
     return by_type(x, [&](auto one) {
@@ -316,18 +311,18 @@ Tensor copied_operator(Tensor x, Tensor ancestors) {
     });
 }
 
-Tensor log_normal_operator(Tensor y, Tensor mean, Tensor scale, Tensor constant) {
-    checks::log_normal(y, mean, scale, constant);
+Tensor operators::log_normal(const Tensor& y, const Tensor& mean, const Tensor& scale, const Tensor& constant) {
     const int64_t runs = mean.size(0), particles = mean.size(1), components = mean.size(2);
     return by_type(mean, [&](auto one) {
         using T = decltype(one);
         const Tensor out = fresh<T>({runs, particles});
-        log_normal(numbers<T>(out), few<T>(y, runs, components).data(), numbers<T>(mean), few<T>(scale, runs, components).data(),
-                   few<T>(constant, runs).data(), mean.strides().data(), runs, particles, components);
+        ::log_normal(numbers<T>(out), few<T>(y, runs, components).data(), numbers<T>(mean), few<T>(scale, runs, components).data(),
+                   few<T>(constant, runs).data(), mean.strides(), runs, particles, components);
         return out;
     });
 }
 
+namespace {
 // Whether all particles share one noise, of zeros: a prediction without noise.
 template <class T>
 bool quiet(const Tensor& w) {
@@ -336,9 +331,9 @@ bool quiet(const Tensor& w) {
         if (numbers<T>(w)[k * w.stride(2)] != 0) return false;
     return true;
 }
+}  // namespace
 
-Tensor affine_operator(Tensor phi, Tensor x, Tensor gain, Tensor w) {
-    checks::propagate_affine(phi, x, gain, w);
+Tensor operators::propagate_affine(const Tensor& phi, const Tensor& x, const Tensor& gain, const Tensor& w) {
     const int64_t runs = x.size(0), particles = x.size(1), rows = phi.size(1);
     const bool one = phi.size(0) == 1 && gain.size(0) == 1;  // runs then lie side by side as particles of one run do
     return by_type(x, [&](auto like) {
@@ -354,30 +349,27 @@ Tensor affine_operator(Tensor phi, Tensor x, Tensor gain, Tensor w) {
     });
 }
 
-Tensor distinct_operator(Tensor copy_of, Tensor log_w) {
-    checks::count_unique(copy_of, log_w);
-    const int64_t runs = copy_of.size(0);
+Tensor operators::count_unique(const Tensor& ancestors, const Tensor& log_w) {
+    const int64_t runs = ancestors.size(0);
     const Tensor out = fresh<int64_t>({runs});
-    const Packed<int64_t> ancestor(copy_of);
+    const Packed<int64_t> ancestor(ancestors);
     by_type(log_w, [&](auto one) {
-        distinct(numbers<int64_t>(out), ancestor.data, Packed<decltype(one)>(log_w).data, runs, copy_of.size(1));
+        distinct(numbers<int64_t>(out), ancestor.data, Packed<decltype(one)>(log_w).data, runs, ancestors.size(1));
     });
     return out;
 }
 
-std::tuple<Tensor, Tensor> totals_operator(Tensor part) {
-    checks::sum_and_squares(part);
-    const int64_t runs = part.size(0);
-    return by_type(part, [&](auto one) {
+std::tuple<Tensor, Tensor> operators::sum_and_squares(const Tensor& terms) {
+    const int64_t runs = terms.size(0);
+    return by_type(terms, [&](auto one) {
         using T = decltype(one);
         const Tensor whole = fresh<T>({runs, 1}), square = fresh<T>({runs, 1});
-        totals(numbers<T>(whole), numbers<T>(square), Packed<T>(part).data, runs, part.size(1));
+        totals(numbers<T>(whole), numbers<T>(square), Packed<T>(terms).data, runs, terms.size(1));
         return std::make_tuple(whole, square);
     });
 }
 
-std::tuple<Tensor, Tensor> moments_operator(Tensor x, Tensor w) {
-    checks::weighted_moments(x, w);
+std::tuple<Tensor, Tensor> operators::weighted_moments(const Tensor& x, const Tensor& w) {
     const int64_t runs = x.size(0), components = x.size(2);
     return by_type(x, [&](auto one) {
         using T = decltype(one);
@@ -388,85 +380,14 @@ std::tuple<Tensor, Tensor> moments_operator(Tensor x, Tensor w) {
     });
 }
 
-Tensor spread_operator(Tensor x, Tensor mean, Tensor w, Tensor groups) {
-    checks::group_covariance(x, mean, w, groups);
+Tensor operators::group_covariance(const Tensor& x, const Tensor& mean, const Tensor& w, const Tensor& groups) {
     const int64_t runs = x.size(0), many = groups.size(0), size = groups.size(1);
     const Packed<int64_t> components(groups);
     return by_type(x, [&](auto one) {
         using T = decltype(one);
         const Tensor out = fresh<T>({runs, many, size, size});
-        spread(numbers<T>(out), numbers<T>(x), Packed<T>(mean).data, Packed<T>(w).data, components.data, x.strides().data(), many,
+        spread(numbers<T>(out), numbers<T>(x), Packed<T>(mean).data, Packed<T>(w).data, components.data, x.strides(), many,
                size, runs, x.size(1), x.size(2));
         return out;
     });
-}
-
-// The same, called by what torch's compiler makes, which would take longer to look an operator up than a small loop takes.
-Tensor borrowed(AtenTensorHandle a) {
-    AtenTensorHandle own;
-    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_new_tensor_handle(a, &own));
-    return Tensor(own);
-}
-int64_t borrowed(int64_t a) { return a; }
-
-void handed(const Tensor& found, AtenTensorHandle* out) { STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_new_tensor_handle(found.get(), out)); }
-
-typedef AtenTensorHandle In;
-typedef AtenTensorHandle* Out;
-
-template <class Work, class... Given>
-AOTITorchError directly(Work work, Out out, Given... given) {
-    try {
-        handed(work(borrowed(given)...), out);
-        return AOTI_TORCH_SUCCESS;
-    } catch (...) {
-        return AOTI_TORCH_FAILURE;
-    }
-}
-
-template <class Work, class... Given>
-AOTITorchError both_directly(Work work, Out first, Out second, Given... given) {
-    try {
-        const auto found = work(borrowed(given)...);
-        handed(std::get<0>(found), first);
-        handed(std::get<1>(found), second);
-        return AOTI_TORCH_SUCCESS;
-    } catch (...) {
-        return AOTI_TORCH_FAILURE;
-    }
-}
-}  // namespace
-
-extern "C" {
-AOTITorchError aoti_torch_cpu_philox_normals(In seed, int64_t purpose, In step, In runs, int64_t components, int64_t quarters, Out out) {
-    return directly(normals_operator, out, seed, purpose, step, runs, components, quarters);
-}
-AOTITorchError aoti_torch_cpu_philox_normals_float64(In seed, int64_t purpose, In step, In runs, int64_t components, int64_t quarters, Out out) {
-    return directly(normals_float64_operator, out, seed, purpose, step, runs, components, quarters);
-}
-AOTITorchError aoti_torch_cpu_philox_uniforms(In seed, int64_t purpose, In step, In runs, int64_t components, int64_t quarters, Out out) {
-    return directly(uniforms_operator, out, seed, purpose, step, runs, components, quarters);
-}
-AOTITorchError aoti_torch_cpu_resample_systematic(In a, In n, In u, Out out) { return directly(systematic_operator, out, a, n, u); }
-AOTITorchError aoti_torch_cpu_gather_particles(In x, In ancestors, Out out) { return directly(copied_operator, out, x, ancestors); }
-AOTITorchError aoti_torch_cpu_propagate_affine(In phi, In x, In gain, In w, Out out) { return directly(affine_operator, out, phi, x, gain, w); }
-AOTITorchError aoti_torch_cpu_count_unique(In copy_of, In log_w, Out out) { return directly(distinct_operator, out, copy_of, log_w); }
-AOTITorchError aoti_torch_cpu_sum_and_squares(In part, Out whole, Out square) { return both_directly(totals_operator, whole, square, part); }
-AOTITorchError aoti_torch_cpu_weighted_moments(In x, In w, Out mean, Out variance) {
-    return both_directly(moments_operator, mean, variance, x, w);
-}
-}
-
-STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
-    library.impl("philox_normals", TORCH_BOX(&normals_operator));
-    library.impl("philox_normals_float64", TORCH_BOX(&normals_float64_operator));
-    library.impl("philox_uniforms", TORCH_BOX(&uniforms_operator));
-    library.impl("resample_systematic", TORCH_BOX(&systematic_operator));
-    library.impl("gather_particles", TORCH_BOX(&copied_operator));
-    library.impl("log_normal", TORCH_BOX(&log_normal_operator));
-    library.impl("propagate_affine", TORCH_BOX(&affine_operator));
-    library.impl("count_unique", TORCH_BOX(&distinct_operator));
-    library.impl("sum_and_squares", TORCH_BOX(&totals_operator));
-    library.impl("weighted_moments", TORCH_BOX(&moments_operator));
-    library.impl("group_covariance", TORCH_BOX(&spread_operator));
 }

@@ -7,7 +7,7 @@
 #include <tuple>
 #include <vector>
 
-#include "operator_checks.h"
+#include "operators.h"
 
 namespace {
 template <class T>
@@ -103,31 +103,24 @@ void energy_score(T* out, const T* points, int64_t runs, int64_t size, int64_t n
         out[r] = static_cast<T>(near / n - apart / (static_cast<double>(n) * n));
     }
 }
+}  // namespace
 
-std::tuple<Tensor, Tensor> marginal_scores_operator(Tensor error, Tensor deviation, Tensor w) {
-    checks::marginal_scores(error, deviation, w);
+std::tuple<Tensor, Tensor> operators::marginal_scores(const Tensor& error, const Tensor& deviation, const Tensor& w) {
     const int64_t runs = error.size(0), components = error.size(1);
     return by_type(error, [&](auto one) {
         using T = decltype(one);
         const Tensor crps = fresh<T>({runs, components}), below = fresh<T>({runs, components});
-        marginal_scores(numbers<T>(crps), numbers<T>(below), Packed<T>(error).data, numbers<T>(deviation), Packed<T>(w).data,
-                        deviation.strides().data(), runs, w.size(1), components);
+        ::marginal_scores(numbers<T>(crps), numbers<T>(below), Packed<T>(error).data, numbers<T>(deviation), Packed<T>(w).data,
+                        deviation.strides(), runs, w.size(1), components);
         return std::make_tuple(crps, below);
     });
 }
 
-Tensor energy_score_operator(Tensor points) {
-    checks::energy_score(points);
+Tensor operators::energy_score(const Tensor& points) {
     return by_type(points, [&](auto one) {
         using T = decltype(one);
         const Tensor out = fresh<T>({points.size(0)});
-        energy_score(numbers<T>(out), Packed<T>(points, {0, 2, 1}).data, points.size(0), points.size(2), points.size(1));
+        ::energy_score(numbers<T>(out), Packed<T>(points, {0, 2, 1}).data, points.size(0), points.size(2), points.size(1));
         return out;
     });
-}
-}  // namespace
-
-STABLE_TORCH_LIBRARY_IMPL(pfbench, CPU, library) {
-    library.impl("marginal_scores", TORCH_BOX(&marginal_scores_operator));
-    library.impl("energy_score", TORCH_BOX(&energy_score_operator));
 }

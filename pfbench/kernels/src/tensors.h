@@ -1,20 +1,21 @@
-// Torch's tensors as the loops want them: plain numbers, through torch's stable interface, whose headers are few.
+// Torch's tensors as the loops want them: plain numbers.
 #pragma once
-#include <torch/csrc/inductor/aoti_torch/c/shim.h>
-#include <torch/csrc/stable/library.h>
-#include <torch/csrc/stable/tensor.h>
-
 #include <array>
 #include <cstdint>
 #include <type_traits>
 #include <vector>
 
-#ifndef STABLE_TORCH_ERROR_CODE_CHECK  // it exists from torch 2.13 on, and keeps the message of an error
-#define STABLE_TORCH_ERROR_CODE_CHECK(call) TORCH_ERROR_CODE_CHECK(call)
-#endif
+#include "torch_interface.h"
 
 namespace {
-using torch::stable::Tensor;
+using pfbench::Tensor;
+
+constexpr int64_t MAX_SIZE = int64_t{1} << 30;  // of an axis: counters of particles have 32 bits
+
+// Raises where a condition on the values of an argument does not hold.
+inline void require(bool condition, const char* message) {
+    if (!condition) throw std::runtime_error(message);
+}
 
 // Of the processor: a compiler takes longer vectors apart badly.
 #if defined(__AVX512F__)
@@ -32,15 +33,11 @@ int32_t kind() {
     return std::is_same_v<T, bool> ? aoti_torch_dtype_bool() : aoti_torch_dtype_int64();
 }
 
-inline int32_t kind(const Tensor& a) {
-    int32_t found;
-    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_dtype(a.get(), &found));
-    return found;
-}
+inline int32_t kind(const Tensor& a) { return a.dtype(); }
 
 template <class T>
 T* numbers(const Tensor& a) {
-    STD_TORCH_CHECK(kind(a) == kind<T>(), "pfbench: a loop's tensors are of different types");
+    require(kind(a) == kind<T>(), "pfbench: a loop's tensors are of different types");
     return static_cast<T*>(a.data_ptr());
 }
 
@@ -50,8 +47,8 @@ Tensor fresh(const std::vector<int64_t>& size) {
     std::vector<int64_t> stride(size.size(), 1);
     for (size_t k = size.size() - 1; k > 0; --k) stride[k - 1] = stride[k] * size[k];
     AtenTensorHandle made;
-    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_empty_strided(
-        static_cast<int64_t>(size.size()), size.data(), stride.data(), kind<T>(), aoti_torch_device_type_cpu(), 0, &made));
+    TORCH_CALL(aoti_torch_empty_strided, static_cast<int64_t>(size.size()), size.data(), stride.data(), kind<T>(),
+               aoti_torch_device_type_cpu(), 0, &made);
     return Tensor(made);
 }
 
@@ -65,11 +62,11 @@ class Packed {
 
     explicit Packed(const Tensor& a, std::array<int64_t, 3> order = {0, 1, 2}) : data(numbers<T>(a)) {
         std::array<int64_t, 3> size, step;
-        const auto sizes = a.sizes(), strides = a.strides();
+        const int64_t *const sizes = a.sizes(), *const strides = a.strides(), axes = a.dim();
         int64_t count = 1;
         bool apart = false;
         for (int k = 2; k >= 0; --k) {
-            const bool there = order[k] < static_cast<int64_t>(sizes.size());
+            const bool there = order[k] < axes;
             size[k] = there ? sizes[order[k]] : 1;
             step[k] = there ? strides[order[k]] : 0;
             apart |= size[k] != 1 && step[k] != count;

@@ -1,0 +1,237 @@
+// Written by `python -m pfbench.kernels.operator_sources` from operators.toml.
+// The operators as torch calls them: checks of the arguments, calls by compiled steps, registration.
+#include "argument_check.h"
+#include "direct_call.h"
+#include "operators.h"
+
+namespace {
+Tensor philox_normals(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
+    ArgumentCheck check("philox_normals");
+    check.int64("seed", seed, "");
+    check.integer("purpose", purpose);
+    check.int64("step", step, "");
+    check.int64("runs", runs, "R");
+    check.integer("components", components);
+    check.integer("quarters", quarters);
+    return operators::philox_normals(seed, purpose, step, runs, components, quarters);
+}
+
+Tensor philox_normals_float64(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
+    ArgumentCheck check("philox_normals_float64");
+    check.int64("seed", seed, "");
+    check.integer("purpose", purpose);
+    check.int64("step", step, "");
+    check.int64("runs", runs, "R");
+    check.integer("components", components);
+    check.integer("quarters", quarters);
+    return operators::philox_normals_float64(seed, purpose, step, runs, components, quarters);
+}
+
+Tensor philox_uniforms(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
+    ArgumentCheck check("philox_uniforms");
+    check.int64("seed", seed, "");
+    check.integer("purpose", purpose);
+    check.int64("step", step, "");
+    check.int64("runs", runs, "R");
+    check.integer("components", components);
+    check.integer("quarters", quarters);
+    return operators::philox_uniforms(seed, purpose, step, runs, components, quarters);
+}
+
+Tensor resample_systematic(const Tensor& a, const Tensor& n, const Tensor& u) {
+    ArgumentCheck check("resample_systematic");
+    check.real("a", a, "RN", "N");
+    check.number("n", n, "r1");
+    check.number("u", u, "R1");
+    check.range("n", n, 1, 'N', 0);
+    check.range("u", u, 1, '1', 0);
+    return operators::resample_systematic(a, n, u);
+}
+
+Tensor gather_particles(const Tensor& x, const Tensor& ancestors) {
+    ArgumentCheck check("gather_particles");
+    check.real("x", x, "DRN");
+    check.int64("ancestors", ancestors, "RM");
+    check.range("ancestors", ancestors, 1, 'N', 1);
+    return operators::gather_particles(x, ancestors);
+}
+
+Tensor log_normal(const Tensor& y, const Tensor& mean, const Tensor& scale, const Tensor& constant) {
+    ArgumentCheck check("log_normal");
+    check.number("y", y, "rk");
+    check.real("mean", mean, "RNK");
+    check.number("scale", scale, "rk");
+    check.number("constant", constant, "r");
+    return operators::log_normal(y, mean, scale, constant);
+}
+
+Tensor propagate_affine(const Tensor& phi, const Tensor& x, const Tensor& gain, const Tensor& w) {
+    ArgumentCheck check("propagate_affine");
+    check.real("phi", phi, "rED");
+    check.real("x", x, "RND");
+    check.real("gain", gain, "rEW");
+    check.real("w", w, "RNW");
+    return operators::propagate_affine(phi, x, gain, w);
+}
+
+Tensor count_unique(const Tensor& ancestors, const Tensor& log_w) {
+    ArgumentCheck check("count_unique");
+    check.int64("ancestors", ancestors, "RN");
+    check.real("log_w", log_w, "RN");
+    check.range("ancestors", ancestors, 2, 'N', 1);
+    return operators::count_unique(ancestors, log_w);
+}
+
+std::tuple<Tensor, Tensor> sum_and_squares(const Tensor& terms) {
+    ArgumentCheck check("sum_and_squares");
+    check.real("terms", terms, "RN");
+    return operators::sum_and_squares(terms);
+}
+
+std::tuple<Tensor, Tensor> weighted_moments(const Tensor& x, const Tensor& w) {
+    ArgumentCheck check("weighted_moments");
+    check.real("x", x, "RND");
+    check.real("w", w, "RN");
+    return operators::weighted_moments(x, w);
+}
+
+std::tuple<Tensor, Tensor> cholesky_factor(const Tensor& covariance) {
+    ArgumentCheck check("cholesky_factor");
+    check.real("covariance", covariance, "BDD");
+    return operators::cholesky_factor(covariance);
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> kalman_update(const Tensor& m, const Tensor& r, const Tensor& omega) {
+    ArgumentCheck check("kalman_update");
+    check.real("m", m, "RKD");
+    check.real("r", r, "RK");
+    check.real("omega", omega, "RKK");
+    return operators::kalman_update(m, r, omega);
+}
+
+std::tuple<Tensor, Tensor> fit_affine(const Tensor& r, const Tensor& xi, const Tensor& w) {
+    ArgumentCheck check("fit_affine");
+    check.real("r", r, "RPK");
+    check.real("xi", xi, "PD");
+    check.real("w", w, "P");
+    return operators::fit_affine(r, xi, w);
+}
+
+Tensor group_covariance(const Tensor& x, const Tensor& mean, const Tensor& w, const Tensor& groups) {
+    ArgumentCheck check("group_covariance");
+    check.real("x", x, "RNK");
+    check.real("mean", mean, "RK");
+    check.real("w", w, "RN");
+    check.int64("groups", groups, "GS");
+    check.range("groups", groups, 1, 'K', 1);
+    return operators::group_covariance(x, mean, w, groups);
+}
+
+Tensor squared_mahalanobis(const Tensor& e, const Tensor& covariance) {
+    ArgumentCheck check("squared_mahalanobis");
+    check.real("e", e, "BD");
+    check.real("covariance", covariance, "BDD");
+    return operators::squared_mahalanobis(e, covariance);
+}
+
+std::tuple<Tensor, Tensor> marginal_scores(const Tensor& error, const Tensor& deviation, const Tensor& w) {
+    ArgumentCheck check("marginal_scores");
+    check.real("error", error, "RK");
+    check.real("deviation", deviation, "RNK", "N");
+    check.real("w", w, "RN");
+    return operators::marginal_scores(error, deviation, w);
+}
+
+Tensor energy_score(const Tensor& points) {
+    ArgumentCheck check("energy_score");
+    check.real("points", points, "RNS");
+    return operators::energy_score(points);
+}
+
+const pfbench::Registration registration(
+    pfbench::entry<&philox_normals>("philox_normals"),
+    pfbench::entry<&philox_normals_float64>("philox_normals_float64"),
+    pfbench::entry<&philox_uniforms>("philox_uniforms"),
+    pfbench::entry<&resample_systematic>("resample_systematic"),
+    pfbench::entry<&gather_particles>("gather_particles"),
+    pfbench::entry<&log_normal>("log_normal"),
+    pfbench::entry<&propagate_affine>("propagate_affine"),
+    pfbench::entry<&count_unique>("count_unique"),
+    pfbench::entry<&sum_and_squares>("sum_and_squares"),
+    pfbench::entry<&weighted_moments>("weighted_moments"),
+    pfbench::entry<&cholesky_factor>("cholesky_factor"),
+    pfbench::entry<&kalman_update>("kalman_update"),
+    pfbench::entry<&fit_affine>("fit_affine"),
+    pfbench::entry<&group_covariance>("group_covariance"),
+    pfbench::entry<&squared_mahalanobis>("squared_mahalanobis"),
+    pfbench::entry<&marginal_scores>("marginal_scores"),
+    pfbench::entry<&energy_score>("energy_score"));
+}  // namespace
+
+DIRECT_CALL aoti_torch_cpu_philox_normals(AtenTensorHandle seed, int64_t purpose, AtenTensorHandle step, AtenTensorHandle runs, int64_t components, int64_t quarters, AtenTensorHandle* result_0) {
+    return call_directly<&philox_normals>({result_0}, seed, purpose, step, runs, components, quarters);
+}
+
+DIRECT_CALL aoti_torch_cpu_philox_normals_float64(AtenTensorHandle seed, int64_t purpose, AtenTensorHandle step, AtenTensorHandle runs, int64_t components, int64_t quarters, AtenTensorHandle* result_0) {
+    return call_directly<&philox_normals_float64>({result_0}, seed, purpose, step, runs, components, quarters);
+}
+
+DIRECT_CALL aoti_torch_cpu_philox_uniforms(AtenTensorHandle seed, int64_t purpose, AtenTensorHandle step, AtenTensorHandle runs, int64_t components, int64_t quarters, AtenTensorHandle* result_0) {
+    return call_directly<&philox_uniforms>({result_0}, seed, purpose, step, runs, components, quarters);
+}
+
+DIRECT_CALL aoti_torch_cpu_resample_systematic(AtenTensorHandle a, AtenTensorHandle n, AtenTensorHandle u, AtenTensorHandle* result_0) {
+    return call_directly<&resample_systematic>({result_0}, a, n, u);
+}
+
+DIRECT_CALL aoti_torch_cpu_gather_particles(AtenTensorHandle x, AtenTensorHandle ancestors, AtenTensorHandle* result_0) {
+    return call_directly<&gather_particles>({result_0}, x, ancestors);
+}
+
+DIRECT_CALL aoti_torch_cpu_log_normal(AtenTensorHandle y, AtenTensorHandle mean, AtenTensorHandle scale, AtenTensorHandle constant, AtenTensorHandle* result_0) {
+    return call_directly<&log_normal>({result_0}, y, mean, scale, constant);
+}
+
+DIRECT_CALL aoti_torch_cpu_propagate_affine(AtenTensorHandle phi, AtenTensorHandle x, AtenTensorHandle gain, AtenTensorHandle w, AtenTensorHandle* result_0) {
+    return call_directly<&propagate_affine>({result_0}, phi, x, gain, w);
+}
+
+DIRECT_CALL aoti_torch_cpu_count_unique(AtenTensorHandle ancestors, AtenTensorHandle log_w, AtenTensorHandle* result_0) {
+    return call_directly<&count_unique>({result_0}, ancestors, log_w);
+}
+
+DIRECT_CALL aoti_torch_cpu_sum_and_squares(AtenTensorHandle terms, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {
+    return call_directly<&sum_and_squares>({result_0, result_1}, terms);
+}
+
+DIRECT_CALL aoti_torch_cpu_weighted_moments(AtenTensorHandle x, AtenTensorHandle w, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {
+    return call_directly<&weighted_moments>({result_0, result_1}, x, w);
+}
+
+DIRECT_CALL aoti_torch_cpu_cholesky_factor(AtenTensorHandle covariance, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {
+    return call_directly<&cholesky_factor>({result_0, result_1}, covariance);
+}
+
+DIRECT_CALL aoti_torch_cpu_kalman_update(AtenTensorHandle m, AtenTensorHandle r, AtenTensorHandle omega, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3, AtenTensorHandle* result_4) {
+    return call_directly<&kalman_update>({result_0, result_1, result_2, result_3, result_4}, m, r, omega);
+}
+
+DIRECT_CALL aoti_torch_cpu_fit_affine(AtenTensorHandle r, AtenTensorHandle xi, AtenTensorHandle w, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {
+    return call_directly<&fit_affine>({result_0, result_1}, r, xi, w);
+}
+
+DIRECT_CALL aoti_torch_cpu_group_covariance(AtenTensorHandle x, AtenTensorHandle mean, AtenTensorHandle w, AtenTensorHandle groups, AtenTensorHandle* result_0) {
+    return call_directly<&group_covariance>({result_0}, x, mean, w, groups);
+}
+
+DIRECT_CALL aoti_torch_cpu_squared_mahalanobis(AtenTensorHandle e, AtenTensorHandle covariance, AtenTensorHandle* result_0) {
+    return call_directly<&squared_mahalanobis>({result_0}, e, covariance);
+}
+
+DIRECT_CALL aoti_torch_cpu_marginal_scores(AtenTensorHandle error, AtenTensorHandle deviation, AtenTensorHandle w, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {
+    return call_directly<&marginal_scores>({result_0, result_1}, error, deviation, w);
+}
+
+DIRECT_CALL aoti_torch_cpu_energy_score(AtenTensorHandle points, AtenTensorHandle* result_0) {
+    return call_directly<&energy_score>({result_0}, points);
+}

@@ -1,0 +1,86 @@
+"""The C++ library: what it takes of torch, and its variants."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from pfbench.kernels import cpp_library, library_build
+
+COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+compiler = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler")
+
+
+def compiles_beside_torch(declarations: str) -> subprocess.CompletedProcess[str]:
+    """Check declarations of C functions against those of torch's headers."""
+    assert COMPILER is not None
+    headers = "#include <torch/csrc/stable/c/shim.h>\n"
+    command = [COMPILER, "-std=c++17", "-fsyntax-only", "-x", "c++", "-"]
+    command += [f"-I{Path(torch.__file__).parent / 'include'}"]
+    return subprocess.run(
+        command, input=headers + declarations, text=True, capture_output=True, check=False
+    )
+
+
+@compiler
+def test_the_declarations_of_torchs_functions_are_those_of_its_headers() -> None:
+    text = (library_build.FOLDER / "torch_interface.h").read_text()
+    done = compiles_beside_torch(text.replace("#pragma once", ""))
+    assert done.returncode == 0, done.stderr
+    wrong = text.replace("aoti_torch_get_dim(AtenTensorHandle tensor, int64_t*", "aoti_torch_get_dim(AtenTensorHandle tensor, int32_t*")  # fmt: skip
+    assert wrong != text
+    assert "aoti_torch_get_dim" in compiles_beside_torch(wrong.replace("#pragma once", "")).stderr
+
+
+def test_the_variant_follows_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    for capability, variant in {"DEFAULT": "baseline", "AVX2": "avx2", "AVX512": "avx2"}.items():
+        monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda name=capability: name)
+        assert cpp_library.choose_variant() == variant
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    assert cpp_library.choose_variant() == "baseline"
+
+
+DRAW = """
+import hashlib
+import torch
+from pfbench.kernels import cpp
+from pfbench.kernels.cpp_library import choose_variant
+
+torch.set_num_threads(1)
+key = torch.tensor(3), 99, torch.tensor(7), torch.arange(50), 15, 130
+values = [cpp.philox_normals(*key), cpp.philox_normals_float64(*key), cpp.philox_uniforms(*key)]
+weights = torch.softmax(values[1][0], 1)
+uniforms = values[2][0, :, :1].clone()
+values.append(cpp.resample_systematic(weights, torch.full((50, 1), 520.0), uniforms))
+values.append(cpp.resample_systematic(weights.float(), torch.full((50, 1), 520.0), uniforms))
+print(choose_variant(), *(hashlib.sha256(a.numpy().tobytes()).hexdigest() for a in values))
+"""
+
+
+@compiler
+@pytest.mark.slow
+def test_every_variant_draws_the_same_bits_and_chooses_the_same_ancestors() -> None:
+    rows = {}
+    for capability in ("default", "avx2"):
+        environment = {**os.environ, "ATEN_CPU_CAPABILITY": capability, "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(
+            [sys.executable, "-c", DRAW],
+            env=environment,
+            text=True,
+            capture_output=True,
+            check=True,
+        )
+        variant, *hashes = done.stdout.split()
+        rows[variant] = hashes
+    if len(rows) == 1:
+        pytest.skip("the processor has one variant")
+    assert rows["baseline"] == rows["avx2"]
+    assert len(set(rows["avx2"])) > 3
