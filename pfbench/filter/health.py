@@ -5,8 +5,9 @@ The definitions need no truth:
 - **lost**: the filter failed numerically. Its evidence is not finite.
 - **collapsed**: the innovations are impossible, and the spread or the effective sample size is at
   its floor, so that the measurements cannot correct the estimate any more. A single step is enough
-  if the spread is at its floor and the estimate is farther from the raw measurement than five of
-  its standard deviations. Moments that are not finite count as collapsed, too, and so does a
+  in two cases. The spread is at its floor and the estimate is farther from the raw measurement than
+  five of its standard deviations. Or no component has a variance (in float64: above rounding), and
+  the initial state was uncertain. Moments that are not finite count as collapsed, too, and so does a
   spread that the number type does not resolve, see `pfbench.filter.resolution`.
 - **diverged**: the estimate is farther from the raw measurements than five times their standard
   deviation, in more than half of the checked steps or in the last four.
@@ -31,7 +32,7 @@ from torch import Tensor
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.particle.particle_moments import compute_nis
-from pfbench.filter.resolution import is_coarse, is_ill_conditioned
+from pfbench.filter.resolution import is_coarse, is_ill_conditioned, starts_certain
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 
 HEALTH = ("ok", "lost", "collapsed", "diverged", "overconfident")
@@ -112,6 +113,7 @@ class HealthMonitor:
         """Mark runs whose spread is at its floor in a step with an impossible measurement.
 
         The floor is checked in all steps at once. The measurement is evaluated only where it decides.
+        Without an impossible measurement it is a collapse unless the initial state was certain.
 
         Args:
             model: State-space model; `at_step` gives the model of a step.
@@ -123,6 +125,10 @@ class HealthMonitor:
         for t in (at_floor & torch.isfinite(mean).all(-1)).any(0).nonzero().flatten().tolist():
             misfit, observed = _compute_misfit(model.at_step(t), record.at_step(t), mean[:, t])
             self._collapsed |= at_floor[:, t] & _is_far(misfit, observed)
+        is_point = at_floor if variance.dtype == torch.float64 else (variance == 0.0).all(-1)
+        is_point = (is_point & torch.isfinite(mean).all(-1)).any(-1)
+        if bool(is_point.any()):
+            self._collapsed |= is_point & ~starts_certain(model, len(mean), record.spread)
 
     def classify(self, lost: Tensor) -> Tensor:
         """Return the health of each run.
@@ -145,13 +151,14 @@ class HealthMonitor:
             diverged = _in_majority(is_far, valid) | (is_far | ~valid)[-_LAST:].all(0) & valid[-1]
             at_floor = ~has_spread & (observed > 0)
             collapsed = (is_impossible | diverged) & _in_majority(at_floor, observed > 0)
-            collapsed |= ~is_finite.all(0) | _in_majority(coarse, is_finite) | self._collapsed
+            collapsed |= ~is_finite.all(0) | _in_majority(coarse, is_finite)
             for name, mask in (
                 ("overconfident", is_impossible),
                 ("diverged", diverged),
                 ("collapsed", collapsed),
             ):
                 health[mask] = HEALTH.index(name)
+        health[self._collapsed] = HEALTH.index("collapsed")
         health[lost] = HEALTH.index("lost")
         return health
 

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.density import has_finite_moments
+from pfbench.model.base import StateSpaceModel, initial_law
 
 LIMIT = 0.1  # standard deviations
 
@@ -65,6 +66,23 @@ def is_ill_conditioned(covariance: Tensor) -> Tensor:
     eps = torch.finfo(covariance.dtype).eps
     is_finite = torch.isfinite(covariance).flatten(1).all(1)
     return is_finite & ((info > 0) | (eps > _PIVOT_SCALE * LIMIT * pivot))
+
+
+def starts_certain(model: StateSpaceModel, runs: int, spread: Tensor | None) -> Tensor:
+    """Return the runs whose initial state is known exactly.
+
+    Args:
+        model: State-space model.
+        runs: Number of runs R.
+        spread: Cholesky factor of each run's initial covariance, [R, d, d]; None uses the model.
+
+    Returns:
+        Mask, [R]. False where the variance of the initial distribution does not exist.
+    """
+    initial = initial_law(model, runs, spread)
+    if not has_finite_moments(initial):
+        return torch.zeros(runs, dtype=torch.bool, device=model.anchor.device)
+    return (initial.variance == 0.0).all(-1).expand(runs)
 
 
 def check_measurement_resolution(distribution: Any, y: Tensor, model: str) -> None:

@@ -92,6 +92,20 @@ def test_a_single_step_without_spread_and_with_an_impossible_measurement_is_a_co
     assert count_health(filtered(PARTICLES, y).health)["ok"] == 20
 
 
+@pytest.mark.parametrize(("initial_sd", "expected"), [(1.0, "collapsed"), (0.0, "ok")])
+def test_a_point_that_agrees_with_the_measurement_is_a_collapse_unless_the_state_was_known(
+    initial_sd: float, expected: str
+) -> None:
+    model = LinearGaussian([[1.0]], [[0.3]], [[1.0]], [1.0], [0.0], [[initial_sd]])
+    record = Record(measurements()[:2, :20])
+    mean, variance = record.y.clone(), torch.ones_like(record.y)
+    variance[0, 17] = 0.0  # in one run and one step
+    monitor = HealthMonitor(record)
+    monitor.check_spreads(model, record, mean, variance)
+    health = monitor.classify(torch.zeros(2, dtype=torch.bool))
+    assert [HEALTH[value] for value in health.tolist()] == [expected, "ok"]
+
+
 def test_a_state_that_is_known_exactly_is_no_collapse() -> None:
     exact = LinearGaussian([[1.0]], [[0.0]], [[1.0]], [1.0], [2.0], [[0.0]])
     y = simulate(exact, Record(torch.zeros(RUNS, STEPS, 1, dtype=torch.float64)), 3)[0].y
