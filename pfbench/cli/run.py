@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,6 +15,7 @@ from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants
 from pfbench.config.composition import JobConfig, register_experiments
 from pfbench.config.folders import conf_dir
 from pfbench.config.sweep_check import check_words
+from pfbench.config.trust import ENVIRONMENT
 
 HELP = """\
 pfbench run [-m] key=value ...
@@ -32,6 +34,11 @@ Finished jobs are skipped: repeat an interrupted command to resume.
   pfbench run --cfg job      all keys with their values"""
 
 _RETRIES = 3  # of a sweep that lost a process, as many as Ray allows
+# errors of joblib and Ray about a process that another program ended
+_LOST_PROCESS = {
+    "TerminatedWorkerError", "LocalRayletDiedError", "NodeDiedError", "ObjectLostError",
+    "OwnerDiedError", "RaySystemError", "WorkerCrashedError",
+}  # fmt: skip
 _FLAGS = ("-m", "--multirun")
 _PRINTING_FLAGS = {"--cfg", "-c", "--info", "-i", "--hydra-help", "--version", "--resolve"}
 
@@ -167,7 +174,7 @@ def run_task(cfg: Any) -> float:
 
 
 def run_with_retries(sweep: Callable[[], Any]) -> None:
-    """Run a sweep, and repeat it if joblib lost one of its processes.
+    """Run a sweep, and repeat it if joblib or Ray lost one of its processes.
 
     Args:
         sweep: Runs all jobs.
@@ -180,13 +187,19 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
             sweep()
             return
         except Exception as error:
-            if type(error).__name__ != "TerminatedWorkerError":
+            if not _LOST_PROCESS & {parent.__name__ for parent in type(error).__mro__}:
                 raise
             if not remaining:
+                packages = os.environ.get(ENVIRONMENT)
+                trusted = [f"trust=[{packages}]"] if packages else []
                 raise RuntimeError(
                     "memory must be enough for all processes of the sweep, got a process that was "
                     f"killed {_RETRIES + 1} times. Finished jobs are kept. Use fewer processes "
-                    "(hydra.launcher.n_jobs=2) or limit each job by memory_limit_gib=... (GiB)."
+                    "(hydra.launcher.n_jobs=2 or hydra.launcher.ray.init.num_cpus=2) or limit each "
+                    "job by memory_limit_gib=... (GiB). Then repeat the command: "
+                    f"{shlex.join(['pfbench', 'run', *sys.argv[1:], *trusted])}"
                 ) from error
             message = "warning run: a process of the sweep was killed. Running the remaining jobs"
             print(message, file=sys.stderr)
+            if "ray" in sys.modules:
+                sys.modules["ray"].shutdown()  # the next attempt starts new processes of Ray

@@ -140,10 +140,14 @@ class TerminatedWorkerError(Exception):
     """Called as joblib's own is."""
 
 
+class LocalRayletDiedError(Exception):
+    """Called as Ray's own is."""
+
+
 def test_a_sweep_that_lost_a_process_goes_on_and_gives_up_in_the_end(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    answers: list[Exception | None] = [TerminatedWorkerError(), TerminatedWorkerError(), None]
+    answers: list[Exception | None] = [TerminatedWorkerError(), LocalRayletDiedError(), None]
 
     def sweep() -> None:
         answer = answers.pop(0)
@@ -159,7 +163,9 @@ def test_a_sweep_that_lost_a_process_goes_on_and_gives_up_in_the_end(
         == 2
     )
     answers += [TerminatedWorkerError()] * 9
-    with pytest.raises(RuntimeError, match=r"killed 4 times.*hydra.launcher.n_jobs=2"):
+    words = ["pfbench run", "-m", "filter=sir,rpf", "scenario=a b"]
+    again = r"killed 4 times.*n_jobs=2.*: pfbench run -m filter=sir,rpf 'scenario=a b'$"
+    with mock.patch.object(sys, "argv", words), pytest.raises(RuntimeError, match=again):
         run_with_retries(sweep)
     assert len(answers) == 5
     answers[:] = [ValueError("a bad cell")] * 2
@@ -229,6 +235,25 @@ def test_a_killed_worker_of_ray_costs_its_own_cell_which_is_done_again(
     assert sweep.returncode == 0, err
     assert_same(numbers(tmp_path), alone)
     assert {file: file.stat().st_mtime_ns for file in done} == done
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not Path("/proc/self/environ").exists(), reason="workers are looked up in /proc"
+)
+def test_a_killed_scheduler_of_ray_is_started_again(
+    tmp_path: Path, alone: dict[str, dict[str, np.ndarray]]
+) -> None:
+    pytest.importorskip("ray", reason='needs Ray: pip install "pfbench[ray]"')
+    words = ("hydra/launcher=ray_local", "hydra.launcher.ray.init.num_cpus=2")
+    with started(tmp_path, *words) as sweep:
+        wait(lambda: numbers(tmp_path), sweep)
+        victim = wait(lambda: processes_of(tmp_path, "raylet/raylet"), sweep)[0]
+        os.kill(victim, signal.SIGKILL)
+        _, err = sweep.communicate(timeout=180)
+    assert sweep.returncode == 0, err
+    assert "a process of the sweep was killed" in err
+    assert_same(numbers(tmp_path), alone)
 
 
 @pytest.mark.slow
