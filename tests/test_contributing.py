@@ -105,21 +105,6 @@ def test_the_metric_appears_in_the_table(
         np.testing.assert_allclose(group_rows.value, np.median(error, -1))
 
 
-def test_the_figure_is_written(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from pfbench.report.plots.figure_files import write_figure
-    from pfbench.report.plots.plotting import line_styles
-
-    scope = follow("Add a figure to the report", folder)
-    small_study(tmp_path)
-    jobs = results(tmp_path, "small")
-    figure = scope["make_mean_nees_figure"](jobs, line_styles(list(jobs)))
-    (path,) = write_figure(figure, tmp_path, ["svg"])
-    assert path.name == "mean_nees.svg"
-    assert path.stat().st_size > 1000
-
-
 def small_study(home: Path) -> None:
     """Run two filters for five steps."""
     words = "run -m scenario=local_level scenario.steps=5 runs=3 particles=50 filter=sir,ekf study=small"
@@ -129,7 +114,7 @@ def small_study(home: Path) -> None:
 
 def test_every_kind_of_part_has_a_recipe() -> None:
     kinds = ("resampler", "filter", "model", "scenario", "noise regime", "metric")
-    assert list(RECIPES) == [*(f"Add a {kind}" for kind in kinds), "Add a figure to the report"]
+    assert list(RECIPES) == [f"Add a {kind}" for kind in kinds]
 
 
 def test_named_files_exist() -> None:

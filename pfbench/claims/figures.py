@@ -19,35 +19,18 @@ from pfbench.report.plots.paper.paper_catalogue import FIGURES
 from pfbench.report.plots.plotting import COLUMN, SMALL, format_slug
 
 _COLOURS = {HOLDS: "#0072B2", FAILS: "#D55E00"}  # open results are grey
-_FIGURE_OF_METRIC = {  # figures of a condition
-    "rmse": "rmse",
-    "max_error": "error_{}",
-    "mean_abs": "error_{}",
-    "settled": "error_{}",
-    "growth": "error_{}",
-    "sd": "error_{}",
-    "nees": "nees",
-    "severely_overconfident": "nees",
-    "ess": "ess",
-    "effective": "ess",
-    "accepted": "accepted_0",
-    "seconds_per_step": "front",
-}
 
 
-def figure_link(claim: Claim, test: ClaimTest, anchors: Collection[str]) -> tuple[str, bool]:
-    """Find the anchor of a study's page that shows a test.
-
-    The figure of the paper is preferred, then the figure of the condition and metric, then the
-    condition.
+def figure_anchor(claim: Claim, test: ClaimTest, anchors: Collection[str]) -> str:
+    """Find the anchor of the figure of the paper that shows a test.
 
     Args:
         claim: Claim, whose source names the figures of its paper.
         test: Test of the claim.
-        anchors: Anchors of the page.
+        anchors: Anchors of the figures on the page of the study.
 
     Returns:
-        The anchor, empty without one, and whether it is a figure.
+        The anchor, empty without one.
     """
     condition = format_slug(test.cell.replace("/", "_"))
     for name, figure in FIGURES.items():
@@ -60,12 +43,8 @@ def figure_link(claim: Claim, test: ClaimTest, anchors: Collection[str]) -> tupl
             any_group = not test.group or not figure.groups
             suffix = f"_{format_slug(test.group)}"
             if matches := [a for a in candidates if any_group or a.endswith(suffix)]:
-                return matches[0], True
-    metric = _FIGURE_OF_METRIC.get(test.metric, test.metric)
-    target = f"{condition}_{metric.format(format_slug(test.group))}"
-    if target in anchors:
-        return target, True
-    return (condition if condition in anchors else ""), False
+                return matches[0]
+    return ""
 
 
 def figure_numbers(source: str) -> set[int]:

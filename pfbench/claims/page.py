@@ -89,14 +89,14 @@ def write_claims(
 
 
 def report_anchors(studies: Iterable[str], out: str | Path) -> dict[str, set[str]]:
-    """Read the anchors of the pages of studies that have a page.
+    """Read the anchors of the paper figures on the pages of studies that have a page.
 
     Args:
         studies: Names of the studies.
         out: Folder of all reports.
     """
-    pages = {study: Path(out) / study / "details.html" for study in sorted(studies)}
-    pattern = r'<(?:section|figure|h3) id="([^"]+)"'
+    pages = {study: Path(out) / study / "index.html" for study in sorted(studies)}
+    pattern = r'<figure id="([^"]+)"'
     return {
         study: set(re.findall(pattern, path.read_text(encoding="utf-8")))
         for study, path in pages.items()
@@ -169,7 +169,8 @@ def _test_line(
 ) -> dict[str, Any]:
     """Collect the line of a test for the templates."""
     test = result.comparison
-    anchor, is_figure = claims_figures.figure_link(claim, test, reports.get(test.study, ()))
+    anchor = claims_figures.figure_anchor(claim, test, reports.get(test.study, ()))
+    page = f"../{test.study}/index.html" if test.study in reports else ""
     lost = result.lost_a + result.lost_b
     details = (
         f"{result.pairs} runs" if result.pairs else "",
@@ -189,8 +190,8 @@ def _test_line(
         "outcome": "measured" if test.statistic == "report" else result.outcome,
         "where": test.cell.replace("/", " / "),
         "study": test.study,
-        "link": f"../{test.study}/details.html#{anchor}" if anchor else "",
-        "drawn": is_figure,
+        "link": f"{page}#{anchor}" if anchor else page,
+        "drawn": bool(anchor),
     }
 
 

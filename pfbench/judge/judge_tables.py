@@ -51,7 +51,7 @@ def _accuracy(result: JobResult) -> dict[str, float]:
             largest = compute_metric("max_error", data)["norm"]
             row |= _position_columns(data.select("error"), lost)
             row["position maximum [m]"] = _mean(largest, lost)
-            row |= table_columns(result, "components", group)
+            row |= table_columns(result, group)
     for data in data_by_scope(result, "group"):
         nees = _mean(compute_metric("nees", data)["norm"], lost)
         count = len(result.meta["state"]["groups"][data.state_group])

@@ -8,40 +8,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from pfbench.results.error_measures import Array
 from pfbench.results.store import BUDGETS, SAME_N, SAME_TIME
 
 _NAMED = 4  # filters that are listed by name if their number of particles differs
 _CLOSE = 1.25  # ratio of times per step below which budgets count as equal: times vary between jobs [ours]
-
-
-@dataclass(frozen=True)
-class ParetoFront:
-    """Accuracy and time of the filters for one group in one condition.
-
-    Attributes:
-        cell: Name of the condition.
-        group: Name of the component group.
-        unit: Unit of the group.
-        filters: Labels, ordered by time.
-        seconds: Time per step, s.
-        rmse: Median over runs of the RMSE; a lost run counts as infinite.
-        on_front: Whether the filter is on the Pareto front.
-    """
-
-    cell: str
-    group: str
-    unit: str
-    filters: tuple[str, ...]
-    seconds: tuple[float, ...]
-    rmse: tuple[float, ...]
-    on_front: tuple[bool, ...]
 
 
 def format_budget(metadata: Sequence[Mapping[str, Any]]) -> str:
@@ -58,48 +32,6 @@ def format_budget(metadata: Sequence[Mapping[str, Any]]) -> str:
         return f"Budget: differs between jobs ({', '.join(kinds)})."
     (kind,) = kinds
     return f"Budget: {kind}{_format_measured(kind, metadata)}."
-
-
-def pareto_front(cell: str, rows: pd.DataFrame, group: str) -> ParetoFront:
-    """Compute accuracy and time of the filters for one group in one condition.
-
-    Args:
-        cell: Name of the condition.
-        rows: Rows of `load_frame` of the condition.
-        group: Name of the component group.
-    """
-    group_rows = rows[(rows.metric == "rmse") & (rows.component == "norm") & (rows.group == group)]
-    error = group_rows.groupby("label").value.median()
-    time = (
-        rows[rows.metric == "seconds_per_step"].groupby("label").value.median().reindex(error.index)
-    )
-    order = sorted(error.index, key=lambda label: (time[label], error[label], label))
-    seconds, rmse = time[order].to_numpy(dtype=np.float64), error[order].to_numpy(dtype=np.float64)
-    unit = str(group_rows.unit.iloc[0]) if len(group_rows) else ""
-    return ParetoFront(
-        cell,
-        group,
-        unit,
-        tuple(map(str, order)),
-        tuple(map(float, seconds)),
-        tuple(map(float, rmse)),
-        tuple(map(bool, pareto_mask(seconds, rmse))),
-    )
-
-
-def pareto_mask(cost: Array, loss: Array) -> np.ndarray:
-    """Return the mask [n] of points that are not dominated in cost and loss.
-
-    A point with an infinite or missing loss is never on the front.
-
-    Args:
-        cost: Cost, [n].
-        loss: Loss, [n].
-    """
-    cost, loss = np.asarray(cost, dtype=np.float64), np.asarray(loss, dtype=np.float64)
-    no_worse = (cost[:, None] <= cost) & (loss[:, None] <= loss)
-    less = (cost[:, None] < cost) | (loss[:, None] < loss)
-    return ~(no_worse & less).any(axis=0) & np.isfinite(loss)
 
 
 def _budget_kind(meta: Mapping[str, Any]) -> str:

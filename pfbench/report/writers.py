@@ -31,7 +31,6 @@ def render_template(
     folder: RecordedFolder,
     context: Mapping[str, Any],
     home: Path = _HERE,
-    names: tuple[str, str] = ("report.md", "index.html"),
 ) -> Path:
     """Write a page as Markdown and HTML from templates.
 
@@ -40,20 +39,16 @@ def render_template(
         folder: Target folder.
         context: Variables of the templates.
         home: Folder of the templates.
-        names: Names of both files.
 
     Returns:
         Path of the HTML page.
     """
     css = (_HERE / "style.css").read_text(encoding="utf-8")
-    for kind, name in zip(("md", "html"), names, strict=True):
-        page = (
-            _environment(kind == "html", home)
-            .get_template(f"{template}.{kind}.jinja")
-            .render({**context, "css": css})
-        )
+    for kind, name in (("md", "report.md"), ("html", "index.html")):
+        environment = template_environment(home, is_html=kind == "html")
+        page = environment.get_template(f"{template}.{kind}.jinja").render({**context, "css": css})
         folder.write(name, page)
-    return folder.path / names[1]
+    return folder.path / "index.html"
 
 
 def write_json(folder: RecordedFolder, name: str, typed: Sequence[Any]) -> str:
@@ -95,7 +90,6 @@ def render_figure(
         "source": min(itertools.starmap(_data_address, contents.items()), key=len),
         "name": drawing.name,
         "anchor": format_slug(f"{prefix}_{drawing.name}"),
-        "broad": drawing.name.startswith("spread_"),
     }
 
 
@@ -151,8 +145,13 @@ def to_json_types(value: Any, digits: int | None = None) -> Any:
     return value if digits is None else float(f"{value:.{digits}g}")
 
 
-def _environment(is_html: bool, home: Path = _HERE) -> jinja2.Environment:
-    """Return the template environment of HTML or Markdown pages. Each value is escaped once."""
+def template_environment(home: Path, *, is_html: bool) -> jinja2.Environment:
+    """Return the environment of templates of HTML or Markdown. Each value is escaped once.
+
+    Args:
+        home: Folder of the templates.
+        is_html: Whether pages are HTML.
+    """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(home),
         autoescape=True,

@@ -5,32 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import chdtri
 
-from pfbench.results.error_measures import Array, Flags, RunMean, count_runs, finite_mean
-
-
-class NeesConsistency(NamedTuple):
-    """NEES averaged over runs, and its interval for a consistent filter.
-
-    Attributes:
-        average: Mean over valid runs at each step, [T].
-        low: Lower limit at each step, [T].
-        high: Upper limit at each step, [T].
-        runs_at: Number of runs at each step, [T].
-        mean: Mean over runs and time; its expectation is dof.
-        inside: Share of the steps at which the average lies inside the interval.
-        runs: Number of runs included.
-    """
-
-    average: Array
-    low: Array
-    high: Array
-    runs_at: NDArray[np.intp]
-    mean: float
-    inside: float
-    runs: int
+from pfbench.results.error_measures import Array, Flags, finite_mean
 
 
 class WhitenessResult(NamedTuple):
@@ -55,46 +31,6 @@ class WhitenessResult(NamedTuple):
     lag_band: float
     outside_share: float
     numbers: int
-
-
-def nees_band(dof: int, runs: int | NDArray[np.intp], alpha: float = 0.05) -> tuple[Array, Array]:
-    """Compute the two-sided interval of the NEES averaged over independent runs.
-
-    Chi-square limits [Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2].
-
-    Args:
-        dof: Number of components of the group.
-        runs: Number of runs, of any shape; 0 gives NaN.
-        alpha: Probability outside the interval for a consistent filter.
-
-    Returns:
-        Lower and upper limit, in the shape of `runs`.
-    """
-    n = np.where(np.asarray(runs) > 0, runs, np.nan)
-    low, high = (chdtri(dof * n, q) / n for q in (1 - alpha / 2, alpha / 2))
-    return low, high
-
-
-def compute_consistency(nees: Array, lost: Flags, dof: int, alpha: float = 0.05) -> NeesConsistency:
-    """Compare the NEES averaged over runs with its chi-square interval.
-
-    Args:
-        nees: Normalised estimation error squared of one group, [R, T].
-        lost: Lost runs, [R].
-        dof: Number of components of the group.
-        alpha: Probability outside the interval for a consistent filter.
-
-    Returns:
-        Averages and limits.
-    """
-    valid = np.asarray(nees, dtype=np.float64)[~lost]
-    count = (~np.isnan(valid)).sum(axis=0)
-    average = finite_mean(valid, axis=0)
-    low, high = nees_band(dof, count, alpha)
-    inside = ((average >= low) & (average <= high))[count > 0]
-    share = float(inside.mean()) if inside.size else np.nan
-    mean = float(finite_mean(valid.ravel(), axis=0))
-    return NeesConsistency(average, low, high, count, mean, share, count_runs(valid))
 
 
 def compute_whiteness(z: Array) -> WhitenessResult:
@@ -144,25 +80,3 @@ def coverage_per_run(pit: Array, lost: Flags, level: float) -> Array:
     # Stored in single precision: a truth on the limit counts as inside.
     inside = np.where(np.isnan(pit), np.nan, np.abs(pit - 0.5) <= level / 2 + 1e-6)
     return np.where(lost, np.nan, finite_mean(inside.reshape(len(inside), -1), axis=1))
-
-
-def rank_histogram(pit: Array, lost: Flags, bins: int = 10) -> RunMean:
-    """Compute the share of truths in each bin of probability; runs have equal weight.
-
-    The shares are equal for a calibrated filter [Gneiting, Balabdaoui, Raftery 2007].
-
-    Args:
-        pit: Probability integral transform, [R, S, K]; NaN without truth.
-        lost: Lost runs, [R].
-        bins: Number of bins.
-
-    Returns:
-        Shares, value [bins].
-    """
-    valid = np.asarray(pit, dtype=np.float64)[~lost]
-    valid = valid.reshape(len(valid), -1)
-    has_truth = ~np.isnan(valid)
-    index = np.clip(np.where(has_truth, valid, 0.0) * bins, 0, bins - 1).astype(int)
-    shares = [finite_mean(np.where(has_truth, index == k, np.nan), axis=1) for k in range(bins)]
-    mean = finite_mean(np.stack(shares, axis=1), axis=0)
-    return RunMean(mean, int(has_truth.any(axis=1).sum()))

@@ -1,32 +1,16 @@
 """Error measures of a filter on arrays with leading axes [R, T]: R runs, T time steps.
 
-Three quantities are called RMSE in the literature, and each has its own name here. Errors are
-estimate minus truth, NaN without truth (runs of unequal length are padded with NaN). A
-step at which any component is NaN is left out. Averages exclude lost runs and state how many runs
-they include. The error of a lost run is infinite.
+Errors are estimate minus truth, NaN without truth (runs of unequal length are padded with NaN). A
+step at which any component is NaN is left out. The error of a lost run is infinite.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-
-
-class RunMean(NamedTuple):
-    """Average over runs.
-
-    Attributes:
-        value: Average, or one per component [K]; NaN without runs.
-        runs: Number of runs included. The others are lost or without truth.
-    """
-
-    value: Array
-    runs: int
 
 
 def rmse_per_run(error: Array, lost: Flags) -> Array:
@@ -40,42 +24,6 @@ def rmse_per_run(error: Array, lost: Flags) -> Array:
         RMSE, [R]; infinite for a lost run, NaN for a run without truth.
     """
     return _set_lost(np.sqrt(finite_mean(_squared_norm(error), axis=1)), lost)
-
-
-def rmse_run_mean(error: Array, lost: Flags) -> RunMean:
-    """Average the RMSE of each run over runs.
-
-    Args:
-        error: Components of one group, [R, T, K].
-        lost: Lost runs, [R].
-    """
-    by_run = rmse_per_run(error, lost)
-    used = ~np.isnan(by_run) & ~np.asarray(lost, dtype=bool)
-    return RunMean(finite_mean(by_run[used], axis=0), int(used.sum()))
-
-
-def rmse_norm(error: Array, lost: Flags) -> RunMean:
-    """Compute the root mean square over runs and time of the norm.
-
-    Args:
-        error: Components of one group, [R, T, K].
-        lost: Lost runs, [R].
-    """
-    square = _squared_norm(error)[~lost]
-    return RunMean(np.sqrt(finite_mean(square.ravel(), axis=0)), count_runs(square))
-
-
-def rmse_component(error: Array, lost: Flags) -> RunMean:
-    """Compute the root mean square over runs and time of each component, value [K].
-
-    Args:
-        error: Components of one group, [R, T, K].
-        lost: Lost runs, [R].
-    """
-    valid = np.asarray(error, dtype=np.float64)[~lost]
-    square = np.where(np.isnan(_squared_norm(valid))[..., None], np.nan, valid**2)
-    mean = finite_mean(square.reshape(-1, valid.shape[-1]), axis=0)
-    return RunMean(np.sqrt(mean), count_runs(square[..., 0]))
 
 
 def max_error(error: Array, lost: Flags) -> Array:
@@ -117,41 +65,6 @@ def mean_score_per_run(score: Array, lost: Flags) -> Array:
     return _set_lost(finite_mean(values.reshape(len(values), -1), axis=1), lost)
 
 
-def rmse_to_pcrb(error: Array, lost: Flags, bound: Array) -> float:
-    """Compute the ratio of the RMSE of the norm to the posterior Cramér-Rao bound.
-
-    Args:
-        error: Components of one group, [R, T, K].
-        lost: Lost runs, [R].
-        bound: Standard deviations of the bound, [T, K], equal for all runs.
-
-    Returns:
-        1 for a filter that attains the bound, NaN without runs.
-    """
-    square = _squared_norm(error)[~lost]
-    bound_square = np.where(np.isnan(square), np.nan, _squared_norm(bound))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = finite_mean(square.ravel(), axis=0) / finite_mean(bound_square.ravel(), axis=0)
-        return float(np.sqrt(ratio))
-
-
-def relative_error(error: Array, lost: Flags, distance: Array, last: int | None = None) -> RunMean:
-    """Average the norm of the error, divided by a distance, over runs and time.
-
-    Args:
-        error: Horizontal components of a location, [R, T, K].
-        lost: Lost runs, [R].
-        distance: Distance from the observer to the target, [T].
-        last: Number of final steps included; None for all.
-
-    Returns:
-        Mean relative error.
-    """
-    norm = np.sqrt(_squared_norm(error)[~lost]) / np.asarray(distance, dtype=np.float64)
-    used = norm if last is None else norm[:, -last:]
-    return RunMean(finite_mean(used.ravel(), axis=0), count_runs(used))
-
-
 def convergence_time(time: Array, error: Array, lost: Flags, bound: float) -> Array:
     """Find the first step from which on the norm of the error stays at or below a bound.
 
@@ -186,11 +99,6 @@ def finite_mean(values: Array, axis: int) -> Array:
     count = valid.sum(axis=axis)
     total = np.where(valid, values, 0.0).sum(axis=axis)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-def count_runs(values: Array) -> int:
-    """Count the runs of an array [R, T] that have any value."""
-    return int((~np.isnan(values)).any(axis=1).sum())
 
 
 def _squared_norm(error: Array) -> Array:

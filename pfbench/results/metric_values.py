@@ -13,6 +13,7 @@ from pfbench.results.consistency import coverage_per_run
 from pfbench.results.error_measures import (
     Array,
     Flags,
+    finite_mean,
     max_error,
     mean_per_run,
     mean_score_per_run,
@@ -111,6 +112,15 @@ def compute_rmse(data: MetricInput) -> ByComponent:
 def compute_max_error(data: MetricInput) -> ByComponent:
     """Compute the maximum error of the norm."""
     return {"norm": max_error(data.select("error"), data.lost)}
+
+
+def compute_pcrb(data: MetricInput) -> ByComponent:
+    """Compute the root mean square of the PCRB of the norm, over the steps with truth of each run."""
+    if "pcrb" not in data.result.data:
+        return {}
+    bound = (data.select("pcrb") ** 2).sum(axis=-1)
+    square = np.where(np.isnan(data.select("error")).any(axis=-1), np.nan, bound)
+    return {"norm": np.where(data.lost, np.nan, np.sqrt(finite_mean(square, axis=1)))}
 
 
 def compute_crps(data: MetricInput) -> ByComponent:

@@ -1,6 +1,6 @@
 """Table of metrics: name, function, unit, direction and caption of each, defined once.
 
-The table of a study (`frame`), the tables of a report with their definitions, and the claims read
+The table of a study (`frame`), metrics.csv with its definitions, judgements and the claims read
 `METRICS`. To add a metric, add one entry. If it needs an array that no job stores yet, record
 that array in the scoring of jobs too. Name it under `scored_names` if it exists at scored steps only.
 """
@@ -31,6 +31,7 @@ from pfbench.results.metric_values import (
     compute_mean_nis,
     compute_nees_ratio,
     compute_overconfidence,
+    compute_pcrb,
     compute_rmse,
     compute_seconds_per_step,
     sum_trace,
@@ -55,11 +56,10 @@ class Metric:
         unit: Unit of the value, `GROUP_UNIT` or empty.
         direction: Whether lower or higher is better, or a target value is best.
         caption: Definition shown to readers.
-        head: Column head in tables, without unit; empty for no column.
+        head: Column head in tables of judgements, without unit; empty for no column.
         component: Component shown in that column.
         factor: Factor of the shown value, 100 for percent.
         scored_names: Arrays that exist at scored steps only.
-        requires: Array without which the column is empty, though the value has a substitute.
     """
 
     name: str
@@ -72,7 +72,6 @@ class Metric:
     component: str = "norm"
     factor: float = 1.0
     scored_names: tuple[str, ...] = ()
-    requires: str = ""
 
     def column_head(self, group_unit: str = "") -> str:
         """Return the column head with its unit."""
@@ -99,31 +98,24 @@ def scored_arrays() -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for metric in METRICS for name in metric.scored_names))
 
 
-def table_columns(
-    result: store.JobResult, scope: Scope, group: ComponentGroup | None = None
-) -> dict[str, float]:
-    """Compute the columns that metrics of a scope add to a table, averaged over valid runs.
+def table_columns(result: store.JobResult, group: ComponentGroup) -> dict[str, float]:
+    """Compute the columns that metrics of a group add to a table, averaged over valid runs.
 
     Args:
         result: Job.
-        scope: Scope of the metrics, "components" or "job".
-        group: Group of the scope "components".
+        group: Group.
 
     Returns:
-        Values by column head, NaN without data.
+        Values by column head, without metrics that the job has no data for.
     """
-    data = MetricInput(result, group, group.state_group if group else "")
+    data = MetricInput(result, group, group.state_group)
     columns = {}
     for metric in METRICS:
-        if metric.scope == scope and metric.head:
-            values = metric.compute(data).get(metric.component if scope != "job" else "")
-            if values is None and scope != "job":
-                continue
-            if values is None or (metric.requires and metric.requires not in data.result.data):
-                value = np.nan
-            else:
-                value = _mean_of_valid(values, data.lost)
-            columns[metric.column_head(group.unit if group else "")] = metric.factor * value
+        if metric.scope == "components" and metric.head:
+            values = metric.compute(data).get(metric.component)
+            if values is not None:
+                mean = _mean_of_valid(values, data.lost)
+                columns[metric.column_head(group.unit)] = metric.factor * mean
     return columns
 
 
@@ -149,6 +141,10 @@ METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "max_error", compute_max_error, "components", GROUP_UNIT, "lower", "Maximum of the norm of the error.",
+    ),
+    Metric(
+        "pcrb", compute_pcrb, "components", GROUP_UNIT, "target",
+        "Posterior Cramér-Rao bound of the RMSE, from a norm of the standard deviations of the bound.",
     ),
     Metric(
         "crps", compute_crps, "components", GROUP_UNIT, "lower",
@@ -181,22 +177,18 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "ess", average_trace("ess"), "job", "", "higher",
         "Effective sample size, mean over time.",
-        head="ESS [% of particles]", factor=100.0,
     ),
     Metric(
         "ancestors", average_trace("ancestors"), "job", "", "higher",
         "Share of particles that are ancestors of others, mean over resampled steps.",
-        head="distinct ancestors", factor=100.0,
     ),
     Metric(
         "unique", average_trace("unique"), "job", "", "higher",
         "Share of particles that differ after resampling and moves, mean over resampled steps.",
-        head="unique particles after moves", factor=100.0, requires="unique",
     ),
     Metric(
         "accepted", compute_acceptance, "job", "", "target",
         "Share of accepted MCMC proposals, mean over resampled steps.",
-        head="MCMC acceptance", factor=100.0,
     ),
     Metric(
         "iterations", average_trace("iterations"), "job", "", "lower",
@@ -205,13 +197,11 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "rejected", sum_trace("rejected"), "job", "", "target",
         "Fixes that a gate rejected, sum over the run. A fix is one group of components.",
-        head="rejected fixes",
     ),
     Metric(
         "downweighted", sum_trace("downweighted"), "job", "", "target",
         "Fixes whose weight in a robust update is below 1/2, sum over the run. A fix is one group "
         "of components.",
-        head="downweighted fixes",
     ),
     Metric(
         "nis", compute_mean_nis, "job", "", "target",

@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from pfbench.results.consistency import NeesConsistency, nees_band
-from pfbench.results.error_measures import Array, Flags, RunMean, finite_mean
+from pfbench.results.error_measures import Array, Flags, finite_mean
 from pfbench.results.state_groups import main_component_group
 
 DIVERGED_SHARE = 0.1  # of the steps with truth, beyond the threshold
@@ -49,12 +48,6 @@ class StatusCounts(NamedTuple):
     runs: int
     overconfident: int = 0
     collapsed: int = 0
-
-
-def lost_fraction(lost: Flags) -> RunMean:
-    """Compute the fraction of lost runs [R]."""
-    mean = finite_mean(np.asarray(lost, dtype=np.float64), axis=0)
-    return RunMean(mean, int(np.size(lost)))
 
 
 def is_diverged(error: Array, lost: Flags, threshold: float) -> Flags:
@@ -113,28 +106,6 @@ def is_severely_overconfident(
         mean = finite_mean(np.asarray(nees, dtype=np.float64), axis=1)
     exceeds = (mean > factor * np.asarray(dofs, dtype=np.float64)).any(axis=-1)
     return exceeds & ~np.asarray(lost, dtype=bool)
-
-
-def classify_consistency(consistency: NeesConsistency, dof: int, alpha: float = 0.05) -> str:
-    """Name the consistency of a filter by its mean NEES.
-
-    The limits hold for the average over runs at one step. They are too wide for the mean over
-    time, so that a consistent filter is rarely called otherwise.
-
-    Args:
-        consistency: NEES averaged over runs.
-        dof: Number of components of the group.
-        alpha: Probability outside the limits.
-
-    Returns:
-        "overconfident", "underconfident" or "consistent"; empty without runs.
-    """
-    if not consistency.runs:
-        return ""
-    low, high = nees_band(dof, consistency.runs, alpha)
-    if consistency.mean > high:
-        return "overconfident"
-    return "underconfident" if consistency.mean < low else "consistent"
 
 
 def divergence_threshold(meta: Mapping[str, Any]) -> float | None:

@@ -13,7 +13,14 @@ _TAG = re.compile(r"(?<!\\)<(img|/?script)", re.IGNORECASE)
 _MARKDOWN = re.compile(
     r"(?<!\\)<img|</script|(?<!\\)\|&lt;|\]\(javascript|\*\*b\*\*|(?<!\\)`c|\s\$\\"
 )
-_FILES = ("verdicts.csv", "runs.parquet", "pfbench.bib", "details.html")  # beside the page
+_FILES = (
+    "verdicts.csv",
+    "metrics.csv",
+    "runs.parquet",
+    "decisions.json",
+    "consistency.json",
+    "pfbench.bib",
+)
 _LATEX = re.compile(r"(?<!\\)(\\evil|<img|\|<|&lt)")
 
 

@@ -162,4 +162,4 @@ def test_the_page_write_a_scenario_runs(tmp_path: Path, monkeypatch: pytest.Monk
             block(code, tmp_path)
     assert (tmp_path / "reports" / "datasheets" / "survey_nominal" / "index.html").exists()
     assert len(list(tmp_path.glob("results/mine/*.npz"))) == 2
-    assert "Cramer-Rao bound" in (tmp_path / "reports" / "mine" / "details.html").read_text()
+    assert "Cramer-Rao bound" in (tmp_path / "reports" / "mine" / "index.html").read_text()

@@ -58,9 +58,9 @@ def test_report_of_a_study(tmp_path: Path) -> None:
     options = page.ReportOptions(figure_formats=("svg",))
     made = page.write_report("demo", results.parent, tmp_path / "reports", options).parent
     kinds = {file.suffix for file in made.rglob("*")}
-    assert kinds >= {".html", ".md", ".tex", ".csv", ".svg"}
+    assert kinds >= {".html", ".md", ".csv", ".json", ".bib"}
     assert faults_of_folder(made) == {}
-    text = (made / "details.md").read_text()
+    text = (made / "report.md").read_text()
     assert not [line for line in text.splitlines() if line in ("# a", "# b", "# c")]
     assert "onerror" in text  # it is shown, as text
 

@@ -28,9 +28,6 @@ from pfbench.claims import (
 from pfbench.claims import figures as claims_figures
 from pfbench.claims import page as claims_page
 from pfbench.claims.schema import Claim, ClaimTest
-from pfbench.report import page as report_page
-from pfbench.report import writers
-from pfbench.report.plots.plotting import format_slug
 from pfbench.results import store
 from pfbench.results.statistics import intervals, power, signed_rank
 
@@ -807,7 +804,7 @@ def test_the_page_shows_every_claim(tmp_path: Path) -> None:
     assert {"verdicts.json", "tables"} <= {path.name for path in page.parent.iterdir()}
 
 
-def test_the_page_has_the_numbers_and_a_link_to_the_cell(study: Path) -> None:
+def test_the_page_has_the_numbers_and_a_link_to_the_study(study: Path) -> None:
     test = ClaimTest(
         "less", "s", CELL, "rmse", "cofm_amssrcpf", "ekf", group="position", printed=0.6
     )
@@ -815,10 +812,8 @@ def test_the_page_has_the_numbers_and_a_link_to_the_cell(study: Path) -> None:
         [claim(test)], measurements.load_claim_measurements([claim(test)], study)
     )
     assert found[0].verdict == YES
-    (line,) = claims_page.rows_by_paper(found, {"s": {"flight_surge_ins_gnss"}})[0]["rows"][0][
-        "lines"
-    ]
-    assert (line["link"], line["drawn"]) == ("../s/details.html#flight_surge_ins_gnss", False)
+    (line,) = claims_page.rows_by_paper(found, {"s": set()})[0]["rows"][0]["lines"]
+    assert (line["link"], line["drawn"]) == ("../s/index.html", False)
     assert re.fullmatch(r"0\.6\d+ \[0\.\d+, 0\.\d+\], printed 0\.600", line["said"])
     assert (
         claims_page.rows_by_paper(found)[0]["rows"][0]["lines"][0]["link"] == ""
@@ -872,42 +867,20 @@ def test_the_page_says_which_commit_each_study_ran_at_where_they_differ(
     assert line.startswith("s: 20 runs")
 
 
-def test_each_claim_links_to_a_figure_that_is_there(study: Path, tmp_path: Path) -> None:
-    """Of a study as it is published: every link of the ledger leads to an anchor of its page, and to the figure that shows it."""
-    out = tmp_path / "reports"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writers, "render_figure", lambda drawing, prefix, *_: {
-            "file": "", "caption": "", "source": "data:,", "name": drawing.name, "broad": False,
-            "anchor": format_slug(f"{prefix}_{drawing.name}"),
-        })  # fmt: skip
-        report_page.write_report("s", study, out, report_page.ReportOptions(groups=("position",)))
-    there = claims_page.report_anchors(["s", "t"], out)
-    assert set(there) == {"s"}
-    shown_in = {
-        "rmse": "rmse", "max_error": "error_position", "growth": "error_position", "nees": "nees", "ess": "ess",
-        "seconds_per_step": "front", "accepted": "",
-    }  # fmt: skip
-    tests = [ClaimTest("report", "s", CELL, metric, "sir", group="position") for metric in shown_in]
-    rows = claims_page.rows_by_paper(
-        verdicts.decide_claims(
-            [claim(*tests)], measurements.load_claim_measurements([claim(*tests)], study)
-        ),
-        there,
-    )[0]["rows"]
-    for line, (metric, figure) in zip(rows[0]["lines"], shown_in.items(), strict=True):
-        wanted = f"flight_surge_ins_gnss_{figure}".rstrip("_")
-        assert (line["link"], line["drawn"]) == (f"../s/details.html#{wanted}", bool(figure)), (
-            metric
-        )
-        assert wanted in there["s"]
+def test_anchors_are_those_of_the_figures_on_a_page_that_is_there(tmp_path: Path) -> None:
+    page = (
+        '<section id="table"><figure id="cost"></figure><figure id="paper_000_2_a_b"><img></figure>'
+    )
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "index.html").write_text(page)
+    there = claims_page.report_anchors(["s", "t"], tmp_path)
+    assert there == {"s": {"cost", "paper_000_2_a_b"}}
 
 
 def test_a_claim_links_to_the_papers_own_figure_where_it_is_drawn_anew() -> None:
     known = {one.id: one for one in ALL}
     cell = "sar_flight_nominal_sins_sar"
     page = {
-        cell,
-        f"{cell}_rmse",
         f"paper_000_2_{cell}_attitude",
         f"paper_000_3_{cell}_position",
         "paper_001_2",
@@ -916,7 +889,7 @@ def test_a_claim_links_to_the_papers_own_figure_where_it_is_drawn_anew() -> None
 
     def link(name: str, form: str) -> list[str]:
         return [
-            claims_figures.figure_link(known[name], test, page)[0]
+            claims_figures.figure_anchor(known[name], test, page)
             for test in known[name].tests[form]
         ]
 
@@ -928,9 +901,7 @@ def test_a_claim_links_to_the_papers_own_figure_where_it_is_drawn_anew() -> None
     ]
     assert set(link("C001-6", "")) == {"paper_001_2"}
     assert set(link("C001-4", "")) == {"paper_001_4"}
-    assert set(link("C001-7", "printed")) == {
-        ""
-    }  # the abstract: no figure, and no such cell on this page
+    assert set(link("C001-7", "printed")) == {""}  # the abstract: no figure
 
 
 def test_figures_are_read_from_a_source() -> None:

@@ -7,15 +7,13 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
 from pfbench.report import datasheet, scenario_data
-from pfbench.report.plots import error_plots, filter_plots, scenario_figures
-from pfbench.report.plots.plotting import RC, LineStyle
-from pfbench.results import consistency, error_measures, store
-from pfbench.results.state_groups import component_groups
+from pfbench.report.plots import scenario_figures
+from pfbench.report.plots.plotting import RC
+from pfbench.results import consistency, store
 
 STEPS, RUNS, SLOTS = 30, 6, 4
 META: dict[str, Any] = {
@@ -220,123 +218,3 @@ def test_neighbours_are_the_measurements_next_to_each_other() -> None:
     empty = consistency.compute_whiteness(z * np.nan)
     assert empty.numbers == 0
     assert np.isnan(empty.variance)
-
-
-def test_the_error_over_the_bound_is_over_the_same_runs_and_instants() -> None:
-    bound = np.array([[3.0, 4.0], [30.0, 40.0]])  # 5 and 50
-    error = np.array(
-        [[[10.0, 0.0], [np.nan, 0.0]], [[10.0, 0.0], [0.0, 100.0]], [[1e9, 0.0], [0.0, 0.0]]]
-    )
-    lost = np.array([False, False, True])
-    assert error_measures.rmse_to_pcrb(error, lost, bound) == pytest.approx(
-        np.sqrt((100 + 100 + 10000) / (25 + 25 + 2500))
-    )
-    assert np.isnan(error_measures.rmse_to_pcrb(error, np.ones(3, bool), bound))
-
-
-def test_the_relative_error_is_a_mean_of_shares() -> None:
-    error = np.array([[[3.0, 4.0], [6.0, 8.0]], [[0.0, 5.0], [0.0, 0.0]]])
-    distance = np.array([100.0, 50.0])
-    none = np.zeros(2, bool)
-    assert error_measures.relative_error(error, none, distance).value == pytest.approx(
-        (0.05 + 0.2 + 0.05 + 0.0) / 4
-    )
-    assert error_measures.relative_error(error, none, distance, 1).value == pytest.approx(0.1)
-
-
-# what a report of a study makes of rare truth and of the bound
-
-
-def changed(file: Path, **more: Any) -> store.JobResult:
-    """A job with other arrays, saved and read."""
-    found = store.read_result(file)
-    store.write_result(
-        file,
-        {**found.meta, "pcrb": "posterior Cramer-Rao bound of the model"},
-        {**found.data, **more},
-    )
-    return store.read_result(file)
-
-
-def test_steps_with_rare_truth_are_not_thinned_away(tmp_path: Path) -> None:
-    file = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=4, steps=1000)
-    found = store.read_result(file)
-    error, nees = (found.data[name].copy() for name in ("error", "nees"))
-    rare = np.zeros(1000, bool)
-    rare[[101, 355, 612, 990]] = True  # none of which a stride of three or so meets
-    error[:, ~rare, 6:] = nees[:, ~rare, 2] = np.nan
-    result = changed(file, error=error, nees=nees)
-    style = {"ekf": LineStyle("black", "-", "o", 1.0)}
-    block = next(b for b in component_groups(result.meta["state"]) if b.group == "position")
-    for line in error_plots.plot_error({"ekf": result}, block, style).axes[0].lines:
-        np.testing.assert_array_equal(line.get_xdata(), result.data["time"][rare])
-        assert np.isfinite(np.asarray(line.get_ydata())).all()
-    middle = np.median(np.abs(error[:, rare, 6].astype(float)), axis=0)
-    line = error_plots.plot_error({"ekf": result}, block, style).axes[0].lines[0]
-    np.testing.assert_allclose(line.get_ydata(), middle, rtol=1e-6)
-    line = filter_plots.plot_nees({"ekf": result}, ["position"], style).axes[0].lines[0]
-    np.testing.assert_array_equal(line.get_xdata(), result.data["time"][rare])
-    panels = {
-        axis.get_title(): axis
-        for axis in error_plots.plot_spread(result, ["attitude", "position"], style["ekf"]).axes
-    }
-    assert len(panels["position_E"].lines[0].get_xdata()) == 4
-    assert (
-        len(panels["attitude_E"].lines[0].get_xdata()) == 120
-    )  # where all is known, as many as ever
-    plan = error_plots.plot_track({"ekf": result}, 0, style).axes[0]
-    assert len(next(line for line in plan.lines if line.get_label() == "ekf").get_xdata()) == 4
-
-
-def test_one_instant_with_truth_is_a_dot(tmp_path: Path) -> None:
-    file = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=4, steps=50)
-    error = store.read_result(file).data["error"].copy()
-    error[:, np.arange(50) != 17] = np.nan
-    result = changed(file, error=error)
-    block = component_groups(result.meta["state"])[0]
-    (line,) = (
-        error_plots.plot_error({"ekf": result}, block, {"ekf": LineStyle("black", "-", "o", 1.0)})
-        .axes[0]
-        .lines
-    )
-    assert line.get_marker() == "."
-    assert len(line.get_xdata()) == 1
-
-
-def test_the_bound_and_the_range_are_drawn_and_tabled_where_there_are_any(tmp_path: Path) -> None:
-    from pfbench.report import page, tables
-
-    file = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=8, steps=40)
-    plain = tables.accuracy_table({"ekf": store.read_result(file)}, "position")
-    assert not [name for name in plain if "PCRB" in name or "range" in name]
-    bound = np.linspace(1.0, 2.0, 40)[:, None] * np.ones(9)
-    result = changed(file, pcrb=bound, range=np.linspace(1000.0, 2000.0, 40))
-    style = {"ekf": LineStyle("blue", "-", "o", 1.0)}
-    block = next(b for b in component_groups(result.meta["state"]) if b.group == "position")
-    line = error_plots.plot_error({"ekf": result}, block, style).axes[0].lines[-1]
-    assert (line.get_label(), line.get_color()) == ("PCRB", "black")
-    np.testing.assert_allclose(
-        line.get_ydata(), 0.6745 * bound[:, 6]
-    )  # the median of a normal error's absolute value
-    spread = {
-        axis.get_title(): axis
-        for axis in error_plots.plot_spread(result, ["position"], style["ekf"]).axes
-    }["position_E"]
-    np.testing.assert_allclose(
-        sorted(float(np.asarray(line.get_ydata())[0]) for line in spread.lines[-2:]), [-3.0, 3.0]
-    )
-    options = page.ReportOptions(figure_formats=("svg",), groups=("position",), start_time_s=21.0)
-    made = page.write_report("demo", tmp_path, tmp_path / "reports", options)
-    (table,) = (pd.read_csv(path) for path in (made.parent / "tables").glob("*_position.csv"))
-    error = result.data["error"][:, 20:, 6:].astype(float)
-    share = np.sqrt((error**2).sum(-1).mean() / (3 * (bound[20:, 0] ** 2).mean()))
-    assert table["RMSE / PCRB"][0] == pytest.approx(share)
-    flat = np.hypot(error[..., 0], error[..., 1]) / result.data["range"][20:]
-    assert table["horizontal error [% of range]"][0] == pytest.approx(100 * flat.mean())
-    assert table["horizontal error [% of range], last 20 steps"][0] == pytest.approx(
-        100 * flat[:, -20:].mean()
-    )
-    assert (
-        "flight / surge / ins_gnss: posterior Cramer-Rao bound of the model."
-        in made.with_name("details.html").read_text()
-    )

@@ -11,10 +11,10 @@ import synthetic_results as synthetic
 from scipy import stats
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report.decision_section import write_decisions
-from pfbench.report.options import ReportContext, ReportOptions
-from pfbench.report.plots.plotting import line_styles
+from pfbench.report.options import ReportOptions
+from pfbench.report.study_files import write_study_files
 from pfbench.results import store
+from pfbench.results.conditions import load_conditions
 from pfbench.results.frame import load_frame
 from pfbench.results.study_decisions.main_metrics import (
     MAIN_METRICS,
@@ -80,16 +80,11 @@ def test_each_metric_has_a_rule_and_a_table(results: Path) -> None:
 def test_the_main_metric_is_in_the_first_family_and_the_others_in_the_second(
     metric: str, results: Path, tmp_path: Path
 ) -> None:
-    options = ReportOptions(
-        figure_formats=("svg",), metric=metric, convergence_threshold={"position": 4.0}
-    )
-    table = load_frame("demo", results, convergence_threshold={"position": 4.0})
-    key = table.groupby(["scenario", "noise", "model"]).size().index[0]
-    rows = select_main_metrics(table, {key: "position"}, "position")
-    labels = [method.name for method in synthetic.METHODS]
+    options = ReportOptions(metric=metric, convergence_threshold={"position": 4.0})
     with RecordedFolder(tmp_path) as folder:
-        context = ReportContext(["position"], line_styles(labels), folder, options, False)
-        write_decisions(rows, "position", context, "Budget.", table)
+        downloads = write_study_files(load_conditions("demo", results), options, folder)
+    assert [d["href"] for d in downloads] == ["decisions.json", "consistency.json", "metrics.csv"]
+    assert all((tmp_path / d["href"]).stat().st_size == d["bytes"] for d in downloads)
     records = json.loads((tmp_path / "decisions.json").read_text())
     first = {r["metric"] for r in records if "track and error" in r["family"]}
     assert first == {"keeps track", f"position {RULES[metric].name}"}

@@ -8,9 +8,9 @@ import synthetic_results as synthetic
 from scipy import stats
 
 from pfbench.claims import schema
-from pfbench.report import tables
+from pfbench.report.study_files import summarise_metrics
 from pfbench.results import conditions, frame, metrics, status, store
-from pfbench.results.consistency import compute_consistency
+from pfbench.results.state_groups import component_groups
 from pfbench.results.statistics import signed_rank
 
 
@@ -21,7 +21,7 @@ def results(tmp_path_factory):
     return root
 
 
-def test_one_entry_adds_a_metric_to_the_frame_the_tables_and_the_definitions(results, monkeypatch):
+def test_one_entry_adds_a_metric_to_the_frame_the_summary_and_the_definitions(results, monkeypatch):
     def final_error(data):
         last = data.select("error")[:, -1]
         return {"norm": np.where(data.lost, np.inf, np.linalg.norm(last, axis=-1))}
@@ -41,11 +41,12 @@ def test_one_entry_adds_a_metric_to_the_frame_the_tables_and_the_definitions(res
     assert set(rows[rows.group == "attitude"].unit) == {"arcmin"}
     assert np.isinf(rows.value[rows.lost]).all()
     (condition,) = conditions.load_conditions("demo", results)
-    table = tables.accuracy_table(
-        {job.label: job.load() for job in condition.jobs}, "position"
-    ).set_index("filter")
+    sir = next(job.load() for job in condition.jobs if job.label == "sir")
+    group = next(g for g in component_groups(sir.meta["state"]) if g.group == "position")
     mean = rows[(rows.group == "position") & (rows.label == "sir") & ~rows.lost].value.mean()
-    assert table.loc["sir", "final error [m]"] == pytest.approx(mean)
+    assert metrics.table_columns(sir, group)["final error [m]"] == pytest.approx(mean)
+    summary = summarise_metrics(rows).set_index(["filter", "group"])
+    assert summary.loc[("sir", "position"), "mean"] == pytest.approx(mean)
     assert "final error: Error at the last step." in metrics.metric_definitions()
 
 
@@ -78,12 +79,6 @@ def test_signed_rank_tests_of_many_pairs_are_those_of_scipy(n, alternative):
     assert signed_rank.wilcoxon_signed_rank(np.zeros(n)).p == 1
 
 
-def test_equivalence_of_many_pairs_is_that_of_each():
-    d = np.random.default_rng(0).normal(0.0, 0.1, (5, 20))
-    each = [signed_rank.equivalence_p_value(row, 0.05) for row in d]
-    assert signed_rank.equivalence_p_values(d, 0.05).tolist() == each
-
-
 def test_a_run_is_diverged_if_its_error_exceeds_the_threshold_in_a_tenth_of_the_steps_or_at_the_end():
     error = np.zeros((7, 21, 2))
     error[0, 2:4] = 100.0  # 2 of 21 steps
@@ -98,25 +93,49 @@ def test_a_run_is_diverged_if_its_error_exceeds_the_threshold_in_a_tenth_of_the_
     assert diverged.tolist() == [False, True, True, False, False, True, True]
 
 
-def test_a_scenario_without_a_threshold_has_no_diverged_runs_but_a_dash(results):
+def test_a_scenario_without_a_threshold_has_no_diverged_runs(results):
     (condition,) = conditions.load_conditions("demo", results)
     result = condition.jobs[0].load()
     assert status.count_statuses(result.data, result.meta).diverged is None
-    assert tables.overview_table({"ekf": result})["diverged runs"].tolist() == ["–"]
     arrays = {**result.data, "error": result.data["error"].copy()}
     arrays["error"][:3, -4:, 6:] = 1e4
     config = {**result.meta["config"], "scenario": {"paper": {"divergence_threshold": 1e3}}}
     far = store.JobResult({**result.meta, "config": config}, arrays)
     count = status.count_statuses(far.data, far.meta)
     assert (count.lost, count.diverged, count.runs) == (0, 3, 8)
-    assert tables.overview_table({"ekf": far})["diverged runs"].tolist() == ["3"]
 
 
-@pytest.mark.parametrize(
-    ("factor", "word"), [(1.0, "consistent"), (2.0, "overconfident"), (0.5, "underconfident")]
-)
-def test_consistency_is_named_by_the_chi_square_limits(factor, word):
-    nees = factor * np.random.default_rng(1).chisquare(3, (60, 40))
-    lost = np.zeros(60, dtype=bool)
-    assert status.classify_consistency(compute_consistency(nees, lost, 3), 3) == word
-    assert status.classify_consistency(compute_consistency(nees, ~lost, 3), 3) == ""
+def test_the_summary_is_that_of_the_valid_runs(results):
+    table = frame.load_frame("demo", results)
+    summary = summarise_metrics(table)
+    keys = ["scenario", "noise", "model", "filter", "group", "component", "metric"]
+    assert not summary.duplicated(keys).any()
+    row = summary.set_index(keys).loc[
+        ("flight", "surge", "ins_gnss", "sir", "position", "norm", "rmse")
+    ]
+    (path,) = [p for p in (results / "demo").glob("*.npz") if store.read_result(p).meta["label"] == "sir"]  # fmt: skip
+    data = store.read_result(path).data
+    error = data["error"][~data["lost"]][..., 6:9].astype(float)
+    rmse = np.sqrt((error**2).sum(-1).mean(1))
+    assert data["lost"].sum() == 1
+    assert (row["runs"], row["runs_with_value"]) == (8, 7)
+    assert row["mean"] == pytest.approx(rmse.mean())
+    assert row["root_mean_square"] == pytest.approx(np.sqrt((error**2).sum(-1).mean()))
+    assert [row["quantile_10"], row["median"], row["quantile_90"]] == pytest.approx(
+        np.quantile(rmse, [0.1, 0.5, 0.9])
+    )
+
+
+def test_the_bound_is_over_the_steps_with_truth(results):
+    path = min((results / "demo").glob("*.npz"))
+    result = store.read_result(path)
+    bound = np.linspace(1.0, 2.0, 20)[:, None] * np.ones(9)
+    error = result.data["error"].copy()
+    error[1, 5:] = np.nan
+    result = store.JobResult(result.meta, {**result.data, "error": error, "pcrb": bound})
+    group = next(g for g in component_groups(result.meta["state"]) if g.group == "position")
+    values = metrics.compute_metric("pcrb", metrics.MetricInput(result, group, "position"))["norm"]
+    assert values[0] == pytest.approx(np.sqrt(3 * (bound[:, 0] ** 2).mean()))
+    assert values[1] == pytest.approx(np.sqrt(3 * (bound[:5, 0] ** 2).mean()))
+    without = store.JobResult(result.meta, {k: v for k, v in result.data.items() if k != "pcrb"})
+    assert metrics.compute_metric("pcrb", metrics.MetricInput(without, group, "position")) == {}

@@ -1,6 +1,5 @@
 """The report: whole, the same for the same results, and honest about what is missing."""
 
-import base64
 import json
 import re
 import shutil
@@ -12,16 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import synthetic_results as synthetic
-from matplotlib.figure import Figure
 
 from pfbench.report import page, table_formats
-from pfbench.report.plots import error_plots
-from pfbench.report.plots.axis_ticks import limit_to_late_values
-from pfbench.report.plots.plotting import line_styles
+from pfbench.report.board.curves import list_curves
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 
-QUICK = page.ReportOptions(figure_formats=("svg",), groups=("position",))
+QUICK = page.ReportOptions(figure_formats=("svg",))
 
 
 def everything(folder):
@@ -49,86 +45,35 @@ def report(results, tmp_path_factory):
     ).parent
 
 
-def test_every_figure_and_table_is_there_and_on_the_page(report):
-    html, text = (report / "details.html").read_text(), (report / "details.md").read_text()
-    names = {path.stem for path in (report / "figures").iterdir()}
-    kinds = {name.removeprefix("flight_surge_ins_gnss_") for name in names}
-    assert kinds == {
-        "track", "error_attitude", "error_velocity", "error_position", "rmse", "front", "nees", "cost", "ess", "calibration",
-        "forest_attitude", "forest_velocity", "forest_position", "decisions_planned",
-        "spread_ekf", "spread_ukf", "spread_sir", "spread_cofm_amssrcpf",
-    }  # fmt: skip
-    assert {path.suffix for path in (report / "figures").iterdir()} == {".svg", ".png"}
-    bitmaps = [
-        base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', html)
-    ]
-    vectors = [
-        base64.b64decode(data)
-        for data in re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', html)
-    ]
-    carried = [*bitmaps, *vectors]
-    assert len(carried) == len(names)
-    for path in (report / "figures").glob(
-        "*.svg"
-    ):  # each of the two files is whole, the page has the smaller, and the text one
-        assert f"](figures/{path.name})" in text
-        assert path.with_suffix(".png").read_bytes() in bitmaps or path.read_bytes() in vectors
-    for path in (report / "tables").glob("*.csv"):
-        table = pd.read_csv(path, keep_default_na=False)
-        assert path.with_suffix(".tex").read_text().startswith(r"\begin{tabular}")
-        assert f"| {table.columns[1]}" in text
-    own = [
-        path for path in (report / "tables").glob("*.csv") if not path.name.startswith("decisions_")
-    ]
-    assert len(own) == 10  # overview, and three for each of three groups
+def test_every_file_is_there_and_offered_by_the_page(report):
+    files = {path.relative_to(report).as_posix() for path in report.rglob("*") if path.is_file()}
+    numbers = {"verdicts.csv", "runs.parquet", "metrics.csv", "decisions.json", "consistency.json"}
+    assert files == {"index.html", "report.md", "manifest.json", "pfbench.bib", *numbers}
+    html = (report / "index.html").read_text()
+    for name in sorted(numbers | {"pfbench.bib"}):
+        assert f'<a href="{name}" download>' in html
 
 
 def test_the_page_needs_nothing_but_itself(report):
-    html = (report / "details.html").read_text()
-    assert not re.findall(r'(?:src|href)="(?!data:|#)', html)
-    assert "http" not in re.sub(r'"data:[^"]+"', "", html)
+    html = (report / "index.html").read_text()
+    needed = re.findall(r'(?:src|href)="(?!data:|#)[^"]*"(?! download)', html)
+    assert needed == []
+    assert "http:" not in html.replace("http://www.w3.org/2000/svg", "")
+    assert "https:" not in html
     assert "prefers-color-scheme: dark" in html
 
 
-@pytest.mark.parametrize("name", ["details.html", "details.md"])
-def test_the_text_says_what_ran_what_failed_and_what_was_lost(report, name):
-    text = (report / name).read_text()
-    for said in (
-        "0123abc",
-        "sir lost 1 of 12 runs",
-        "1 job failed",
-        "00000000deadbeef",
-        "covariance lost its positive eigenvalues",
-        "initial heading error drawn from the filter",
-        "adjusted p (Holm, 6 tests)",
-        "18 comparisons",
-    ):
+def test_the_page_says_what_ran_what_failed_and_what_was_lost(report):
+    html, text = (report / "index.html").read_text(), (report / "report.md").read_text()
+    for said in ("1 job failed", "00000000deadbeef", "covariance lost its positive eigenvalues"):
+        assert said in html, said
         assert said in text, said
-
-
-def test_text_tables_and_json_render_the_same_verdicts(report):
-    decided = json.loads((report / "verdicts.json").read_text())
-    assert len(decided) == 18
-    printed = pd.read_csv(report / "tables" / "flight_surge_ins_gnss_position_pairs.csv")
-    own = [v for v in decided if v["group"] == "position"]
-    decisions = [f"{v['winner']} better" if v["winner"] in (v["a"], v["b"]) else None for v in own]
-    assert [d if d.endswith("better") else None for d in printed["decision"]] == decisions
-    np.testing.assert_allclose(printed["adjusted p (Holm, 6 tests)"], [v["p_holm"] for v in own])
-    accuracy = pd.read_csv(report / "tables" / "flight_surge_ins_gnss_position.csv").set_index(
-        "filter"
-    )
-    for label in accuracy.index:
-        assert accuracy.loc[label, "better than [filters]"] == sum(
-            v["winner"] == label for v in own
-        )
-    unbeaten = [
-        label for label in accuracy.index if accuracy.loc[label, "worse than [filters]"] == 0
-    ]
-    lines = (report / "details.md").read_text().splitlines()
-    line = next(
-        row for row in lines if row.startswith("- Top group in") and "RMSE of position" in row
-    )
-    assert all(label in line for label in unbeaten)
+    for said in ("0123abc", "@software{pfbench,", "year    = {2026}", "N = 200 in each particle filter",
+                 "<code>pcrb</code>"):  # fmt: skip
+        assert said in html, said
+    lost = pd.read_csv(report / "verdicts.csv").query("world == 'all' and metric == 'rmse'")
+    assert set(lost.loc[lost["filter"] == "sir", "lost"]) == {1}
+    assert set(lost.loc[lost["filter"] == "ekf", "lost"]) == {0}
 
 
 def test_same_results_same_bytes_whatever_the_order_of_files(results, tmp_path, monkeypatch):
@@ -143,18 +88,32 @@ def test_same_results_same_bytes_whatever_the_order_of_files(results, tmp_path, 
     assert everything(first) == everything(second)
 
 
-def test_a_new_report_removes_the_figures_of_the_old_one_alone(results, tmp_path, caplog):
-    folder = tmp_path / "demo"
-    both = replace(QUICK, groups=("position", "velocity"))
-    page.write_report("demo", results, tmp_path, both)
+def test_a_new_report_removes_the_figures_of_the_old_one_alone(tmp_path, caplog):
+    for method in (
+        synthetic.Method("sir", 1.0, particles=9),
+        synthetic.Method("gpf", 2.0, particles=9),
+    ):
+        synthetic.write(tmp_path / "paper_001", method, runs=6, steps=8)
+    folder = tmp_path / "reports" / "paper_001"
+    page.write_report(
+        "paper_001",
+        tmp_path,
+        tmp_path / "reports",
+        replace(QUICK, paper_figures=("001-3", "001-4")),
+    )
     old = {path.name for path in (folder / "figures").iterdir()}
+    assert old == {"paper_001-3.svg", "paper_001-4.svg"}
     mine = [folder / "figures" / "photo.png", folder / "tables" / "mine.csv", folder / "notes.txt"]
     for path in mine:
+        path.parent.mkdir(exist_ok=True)
         path.write_text("mine")
-    page.write_report("demo", results, tmp_path, QUICK)
-    new = {path.name for path in (folder / "figures").iterdir()}
-    assert {name for name in old - new if "velocity" in name}
-    assert not {name for name in new if "velocity" in name}
+    page.write_report(
+        "paper_001", tmp_path, tmp_path / "reports", replace(QUICK, paper_figures=("001-3",))
+    )
+    assert {path.name for path in (folder / "figures").iterdir()} == {
+        "paper_001-3.svg",
+        "photo.png",
+    }
     assert all(path.read_text() == "mine" for path in mine)
     assert "figures/photo.png, notes.txt, tables/mine.csv" in caplog.text
     assert {path.name for path in folder.rglob("*.kept")} == set()
@@ -173,11 +132,30 @@ def test_mixed_versions_are_refused_and_named_when_allowed(tmp_path):
     with pytest.raises(ValueError, match=r"versions\.commit"):
         page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     assert not (tmp_path / "reports").exists()
-    mixed = page.ReportOptions(
-        figure_formats=("svg",), groups=("position",), allow_mixed_versions=True
-    )
+    mixed = page.ReportOptions(figure_formats=("svg",), allow_mixed_versions=True)
     path = page.write_report("demo", tmp_path, tmp_path / "reports", mixed)
     assert "0123abc, fff9999" in path.read_text()
+
+
+def test_the_page_says_what_its_jobs_took_and_how_many_were_asked_for(results, tmp_path):
+    page.write_report("demo", results, tmp_path, replace(QUICK, planned=6))
+    text = (tmp_path / "demo" / "index.html").read_text()
+    seconds = sum(
+        1.0 + 1e-3 * method.milliseconds * 40 for method in synthetic.METHODS
+    )  # a world each, and 40 steps
+    assert "4 of 6 in the experiment" in text
+    assert f"{seconds:.0f} s (filters {100 * (1 - 4 / seconds):.0f} %, data" in text
+
+
+def test_a_threshold_of_no_group_is_refused_before_anything_is_written(results, tmp_path):
+    with pytest.raises(
+        ValueError,
+        match=r"report\.convergence_threshold must name groups of the results, got height",
+    ):
+        page.write_report(
+            "demo", results, tmp_path, replace(QUICK, convergence_threshold={"height": 1.0})
+        )
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_toy_without_map_particles_or_rival(tmp_path):
@@ -188,60 +166,40 @@ def test_a_toy_without_map_particles_or_rival(tmp_path):
     toy = {name: arrays[name] for name in ("time", "log_evidence", "lost")}
     toy |= {name: arrays[name][..., :1] for name in ("error", "sd", "nees")}
     store.write_result(path, {**meta, "state": state}, toy)
-    made = page.write_report(
-        "demo", tmp_path, tmp_path / "reports", page.ReportOptions(figure_formats=("svg",))
-    )
-    kinds = {
-        p.stem.removeprefix("flight_surge_ins_gnss_") for p in (made.parent / "figures").iterdir()
-    }
-    assert kinds == {"error_state", "rmse", "front", "nees", "spread_kalman"}
-    assert (
-        "has one filter. Required: 2; available: 1." in made.with_name("details.html").read_text()
-    )
-    assert json.loads((made.parent / "verdicts.json").read_text()) == []
-
-
-def test_a_filter_that_lost_every_run_is_reported(tmp_path):
-    folder = tmp_path / "demo"
-    synthetic.write(folder, synthetic.METHODS[0], runs=8, steps=20)
-    synthetic.write(folder, synthetic.Method("doomed", 1.0, lost=tuple(range(8))), runs=8, steps=20)
     made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
-    (verdict,) = json.loads((made.parent / "verdicts.json").read_text())
-    assert (verdict["winner"], verdict["lost_a"], verdict["ratio"]) == ("ekf", 8, "inf")
-    assert "doomed lost 8 of 8 runs" in made.with_name("details.html").read_text()
+    assert "kalman" in made.read_text()
+    assert json.loads((made.parent / "decisions.json").read_text()) == []
+
+
+def test_a_filter_that_lost_every_run_is_worse_and_has_no_number(tmp_path):
+    folder = tmp_path / "demo"
+    synthetic.write(folder, synthetic.METHODS[0], runs=12, steps=20)
+    doomed = synthetic.Method("doomed", 1.0, lost=tuple(range(12)))
+    synthetic.write(folder, doomed, runs=12, steps=20)
+    made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
+    records = json.loads((made.parent / "decisions.json").read_text())
+    track = [r for r in records if r["metric"] == "keeps track" and r["question"] == "a"]
+    assert [(r["a"], r["b"], r["word"]) for r in track] == [("doomed", "ekf", "worse")]
     assert "loses the track in 100 % of runs" in (made.parent / "report.md").read_text()
-    table = (made.parent / "details.md").read_text()
-    assert re.search(r"\| doomed +\| +0 \| +– \|", table)
-
-
-def test_the_page_says_what_its_jobs_took_and_how_many_were_asked_for(results, tmp_path):
-    page.write_report("demo", results, tmp_path, replace(QUICK, planned=6))
-    text = (tmp_path / "demo" / "details.md").read_text()
-    seconds = sum(
-        1.0 + 1e-3 * method.milliseconds * 40 for method in synthetic.METHODS
-    )  # a world each, and 40 steps
-    assert "jobs: 4 of 6 in the experiment" in text
-    assert (
-        f"time of all jobs: {seconds:.0f} s (filters {100 * (1 - 4 / seconds):.0f} %, data" in text
+    row = pd.read_csv(made.parent / "metrics.csv").query(
+        "filter == 'doomed' and metric == 'rmse' and component == 'norm' and group == 'position'"
     )
+    assert row["runs_with_value"].tolist() == [0]
+    assert row["mean"].isna().all()
 
 
-def test_the_time_to_converge_is_a_column_of_groups_that_have_a_bound(results, tmp_path):
-    page.write_report(
-        "demo",
-        results,
-        tmp_path,
-        replace(QUICK, convergence_threshold={"position": 1e9}, start_time_s=20.0),
-    )
-    text = (tmp_path / "demo" / "details.md").read_text()
-    assert "median time to 1e+09 m [s]" in text
-    with pytest.raises(
-        ValueError,
-        match=r"report\.convergence_threshold must name groups of the results, got height",
-    ):
-        page.write_report(
-            "demo", results, tmp_path, replace(QUICK, convergence_threshold={"height": 1.0})
-        )
+def test_curves_have_the_rare_steps_with_truth(tmp_path):
+    path = synthetic.write(tmp_path / "demo", synthetic.METHODS[0], runs=4, steps=1000)
+    meta, arrays = store.read_result(path)
+    error = arrays["error"].copy()
+    rare = np.zeros(1000, bool)
+    rare[[101, 355, 612, 990]] = True  # none of which a stride meets
+    error[:, ~rare, 6:] = np.nan
+    store.write_result(path, meta, {**arrays, "error": error})
+    (curve,) = list_curves(load_conditions("demo", tmp_path)).values()
+    assert curve["t"] == arrays["time"][rare].tolist()
+    norm = np.linalg.norm(error[:, rare, 6:].astype(float), axis=-1)
+    np.testing.assert_allclose(curve["filters"]["ekf"]["median"], np.median(norm, 0), rtol=1e-3)
 
 
 def test_cells_whose_worlds_differ_by_name_say_so(tmp_path):
@@ -256,9 +214,9 @@ def test_cells_whose_worlds_differ_by_name_say_so(tmp_path):
             arrays,
         )
     page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
-    text = (tmp_path / "reports" / "demo" / "details.md").read_text()
+    text = (tmp_path / "reports" / "demo" / "report.md").read_text()
     assert (
-        "Jobs of this condition differ in scenario.gps_sd: their runs share random numbers, but not the data."
+        "Jobs of flight / surge / ins_gnss differ in scenario.gps_sd: their runs share random numbers, but not the data."
         in text
     )
 
@@ -268,22 +226,6 @@ def test_options_are_checked():
         page.ReportOptions(alpha=5)
     with pytest.raises(ValueError, match=r"formats must be a subset of svg, png, got .'gif'"):
         page.ReportOptions(figure_formats=("gif",))
-
-
-def test_unknown_group_is_refused(results, tmp_path):
-    message = (
-        r"report\.groups must be groups .* got height\. Choose from attitude, velocity, position"
-    )
-    with pytest.raises(ValueError, match=message):
-        page.write_report("demo", results, tmp_path, page.ReportOptions(groups=("height",)))
-
-
-def test_text_of_a_stranger_is_not_markup(tmp_path):
-    for size, name in enumerate(("<b>sir</b>|x", "<b>sir</b>|y", "<b>sir</b>|z"), 1):
-        synthetic.write(tmp_path / "demo", synthetic.Method(name, float(size)), runs=20, steps=20)
-    made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
-    assert all("<b>sir" not in path.read_text() for path in made.parent.glob("*.html"))
-    assert r"&lt;b>sir&lt;/b>\|x" in (made.parent / "details.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -308,39 +250,10 @@ def test_markdown_columns_line_up():
     ]
 
 
-def test_estimated_track_is_truth_plus_error(results):
-    (cell,) = load_conditions("demo", results)
-    loaded = {job.label: job.load() for job in cell.jobs}
-    style = line_styles(list(loaded))
-    plan, height = error_plots.plot_track(loaded, 2, style).axes
-    line = next(line for line in plan.lines if line.get_label() == "ekf")
-    arrays = loaded["ekf"].data
-    np.testing.assert_allclose(
-        line.get_xdata(), arrays["track"][2, :, 0] + arrays["error"][2, :, 6], rtol=1e-5
-    )
-    np.testing.assert_allclose(
-        line.get_ydata(), arrays["track"][2, :, 1] + arrays["error"][2, :, 7], rtol=1e-5
-    )
-    up = arrays["track"][2, :, 2] + arrays["error"][2, :, 8]
-    assert any(np.allclose(line.get_ydata(), up, rtol=1e-5) for line in height.lines)
-
-
-def test_a_late_divergence_is_never_cut_off():
-    axis = Figure().subplots()
-    curve = np.ones(100)
-    curve[0], curve[-1] = 1000.0, 500.0
-    axis.plot(curve)
-    limit_to_late_values(axis, [curve])
-    assert axis.get_ylim()[1] >= 500
-    curve[-1] = 1.0
-    limit_to_late_values(axis, [curve])
-    assert axis.get_ylim()[1] < 10
-
-
 def test_templates_are_packaged():
     here = Path(page.__file__).parent
     patterns = tomllib.loads((here.parents[1] / "pyproject.toml").read_text())["tool"][
         "setuptools"
     ]["package-data"]
     shipped = {path.name for pattern in patterns["pfbench.report"] for path in here.glob(pattern)}
-    assert {"page.html.jinja", "page.md.jinja", "text.jinja", "style.css"} <= shipped
+    assert {"datasheet.html.jinja", "datasheet.md.jinja", "style.css"} <= shipped

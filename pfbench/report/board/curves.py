@@ -29,23 +29,28 @@ def list_curves(conditions: Sequence[Condition]) -> dict[str, Any]:
         key = f"{condition.scenario}/{condition.noise}"
         if key in curves:  # another model of the scenario
             key += f" + {condition.model}"
-        filters, time, group = {}, np.zeros(0), None
+        norms, time, group = {}, np.zeros(0), None
         for job in condition.jobs:
             result = job.load()
             group = main_component_group(result.meta["state"])
-            steps = select_indices(len(result.data["time"]), INSTANTS)
-            time = result.data["time"][steps]
-            error = result.data["error"][:, steps][..., group.places].astype(np.float64)
-            norm = np.sqrt((error**2).sum(axis=-1)) * group.scale
-            norm[np.asarray(result.data["lost"], dtype=bool)] = np.nan
+            time = result.data["time"]
+            error = result.data["error"][..., group.places].astype(np.float64)
+            norms[job.label] = np.sqrt((error**2).sum(axis=-1)) * group.scale
+            norms[job.label][np.asarray(result.data["lost"], dtype=bool)] = np.nan
+        # steps without truth are dropped before thinning, which could miss rare steps with truth
+        steps = np.flatnonzero(np.any([np.isfinite(n).any(axis=0) for n in norms.values()], axis=0))
+        steps = steps if steps.size else np.arange(time.size)
+        steps = steps[select_indices(steps.size, INSTANTS)]
+        filters = {}
+        for label, norm in norms.items():
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # instants without a run
-                low, median, high = np.nanquantile(norm, [0.1, 0.5, 0.9], axis=0)
-            filters[job.label] = {
+                low, median, high = np.nanquantile(norm[:, steps], [0.1, 0.5, 0.9], axis=0)
+            filters[label] = {
                 "median": _numbers(median), "q10": _numbers(low), "q90": _numbers(high),
             }  # fmt: skip
         unit, name = (group.unit, group.group) if group else ("", "")
-        curves[key] = {"t": _numbers(time), "filters": filters, "unit": unit, "group": name}
+        curves[key] = {"t": _numbers(time[steps]), "filters": filters, "unit": unit, "group": name}
     return curves
 
 

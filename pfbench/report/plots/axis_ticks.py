@@ -61,20 +61,6 @@ def format_ticks(values: Sequence[float]) -> list[str]:
     return list(map(_format_power, values))
 
 
-def limit_to_late_values(axis: Axes, curves: Sequence[np.ndarray]) -> None:
-    """Set symmetric y limits that ignore the first fifth if it is much larger.
-
-    Values after the first fifth are never cut.
-
-    Args:
-        axis: Panel.
-        curves: Plotted curves, [T] each.
-    """
-    late = np.abs(_finite([curve[len(curve) // 5 :] for curve in curves])).max(initial=0.0)
-    if np.abs(_finite(curves)).max(initial=0.0) > 3 * late > 0:
-        axis.set_ylim(-1.1 * late, 1.1 * late)
-
-
 def _finite(values: Sequence[np.ndarray]) -> np.ndarray:
     """Return all finite values in one array."""
     if not values:

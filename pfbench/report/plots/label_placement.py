@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -12,7 +11,6 @@ from matplotlib.axes import Axes
 
 from pfbench.report.plots.plotting import LETTER, SMALL
 
-_LONG = 34  # letters of a pair on one line
 _CLOSE = 9  # points; marks closer than this get a line to their label
 _FRACTIONS = np.linspace(0, 1, 25)[:, None]  # positions along a line at which overlap is checked
 
@@ -69,42 +67,6 @@ def place_labels(
         distance = np.hypot(*(placement.end - placement.mark))
         is_crowded = (np.hypot(*(marks - marks[k]).T) < _CLOSE).sum() > 1
         _write(axis, labels[k], points[k], placement, bool(distance > reach[k] + 3 or is_crowded))
-
-
-def break_settings(label: str, width: int = 26) -> str:
-    """Break a long filter label before its settings in brackets.
-
-    Args:
-        label: Label.
-        width: Letters of a label on one line.
-    """
-    if len(label) <= width or "[" not in label:
-        return label
-    name, _, settings = label.partition("[")
-    return f"{name}\n[{settings}"
-
-
-def wrap_label(label: str, width: int = 18) -> str:
-    """Break a filter label after "_" or "." and before "[".
-
-    Args:
-        label: Label.
-        width: Letters of a line at most.
-    """
-    lines = [""]
-    for piece in re.findall(r"\[?[^_.\[]+[_.]*|\[", label):
-        if lines[-1] and len(lines[-1]) + len(piece) > width:
-            lines.append("")
-        lines[-1] += piece
-    return "\n".join(lines)
-
-
-def name_pairs(pairs: Sequence[tuple[str, str]]) -> list[str]:
-    """Return the names of pairs of filters, on two or more lines if one is long."""
-    names = [f"{a} / {b}" for a, b in pairs]
-    if max(map(len, names), default=0) <= _LONG:
-        return names
-    return [f"{break_settings(a, _LONG)}\n/ {break_settings(b, _LONG)}" for a, b in pairs]
 
 
 def _build_obstacles(marks: np.ndarray, corners: np.ndarray, reach: np.ndarray) -> _Obstacles:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from pfbench.config.paper_block import MARKERS
 from pfbench.report.looks import MethodLook, find_looks
@@ -67,8 +66,6 @@ class LineStyle(NamedTuple):
         dash: Dash pattern of matplotlib.
         marker: Marker of matplotlib.
         width: Line width in points.
-        quiet: Whether the filter is drawn in grey and without a label.
-        instants: Points of a curve over time at most.
         filled: Whether marks are filled.
     """
 
@@ -76,8 +73,6 @@ class LineStyle(NamedTuple):
     dash: _Dash
     marker: str
     width: float
-    quiet: bool = False
-    instants: int = INSTANTS
     filled: bool = True
 
     def mark(self) -> dict[str, Any]:
@@ -86,16 +81,9 @@ class LineStyle(NamedTuple):
         return {"marker": self.marker, "mfc": face, "mec": self.colour, "mew": 0.8}
 
     def line(self, label: str = "") -> dict[str, Any]:
-        """Return the keyword arguments of `Axes.plot`, with the label unless the filter is grey."""
-        labelled = {} if self.quiet or not label else {"label": label}
-        order = 1.5 if self.quiet else 2.0
-        return {
-            "color": self.colour,
-            "ls": self.dash,
-            "lw": self.width,
-            "zorder": order,
-            **labelled,
-        }
+        """Return the keyword arguments of `Axes.plot`."""
+        labelled = {"label": label} if label else {}
+        return {"color": self.colour, "ls": self.dash, "lw": self.width, "zorder": 2.0, **labelled}
 
 
 def line_styles(
@@ -144,22 +132,6 @@ def _style_of_look(look: MethodLook, width: float) -> LineStyle:
     )
 
 
-def mute_others(style: Mapping[str, LineStyle], highlighted: Iterable[str]) -> dict[str, LineStyle]:
-    """Return the line styles with all filters grey except the highlighted ones.
-
-    Args:
-        style: Line styles by label.
-        highlighted: Labels that keep their style.
-    """
-    selection = set(highlighted)
-    return {
-        label: look._replace(instants=2 * INSTANTS // 5)
-        if label in selection
-        else look._replace(colour="0.78", dash="-", width=0.6, quiet=True, instants=INSTANTS // 5)
-        for label, look in style.items()
-    }
-
-
 def stacked_axes(n: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
     """Create a figure of one column with n panels below each other.
 
@@ -170,11 +142,6 @@ def stacked_axes(n: int, height: float, sharex: bool = True) -> tuple[Figure, li
     """
     figure = Figure(figsize=(COLUMN, 0.3 + height * n), layout="constrained")
     return figure, list(figure.subplots(n, 1, squeeze=False, sharex=sharex)[:, 0])
-
-
-def build_padded_layout() -> ConstrainedLayoutEngine:
-    """Return a layout engine with padding for labels of full width."""
-    return ConstrainedLayoutEngine(w_pad=0.1)
 
 
 def add_legend(figure: Figure, axis: Axes, columns: int = 2) -> None:

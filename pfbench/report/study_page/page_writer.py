@@ -8,22 +8,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from markupsafe import Markup
 
-from pfbench.files.escapes import escape_markdown
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.study_page.encoding import encode_pack
 from pfbench.report.study_page.opening import describe_opening, describe_pairs, find_front
+from pfbench.report.writers import template_environment
 
 PAGE_BYTES = 1_500_000
 _HERE = Path(__file__).parent
 _SCRIPTS = ("kit", "state", "board", "cost", "pairs", "worlds", "time", "runs", "main")
+_STATIC = ("paper_figures", "failures", "definitions")  # not read by the script
 _COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
 _SECTIONS = (
     ("planned", "planned", "Planned comparisons"), ("cells", "worlds", "Worlds"), ("curves", "time", "Over time"),
     ("calibration", "calibration", "Calibration"), ("runs", "runs", "Single runs"), ("sweeps", "sweeps", "Dose and response"),
-    ("cells", "table", "Table"), ("methods_paragraph", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
+    ("paper_figures", "figures", "Figures of the paper"), ("cells", "table", "Table"), ("methods_paragraph", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
 )  # fmt: skip
 
 
@@ -43,7 +43,7 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
     views = {
         key: {**view, "front": find_front(view["rows"])} for key, view in pack["views"].items()
     }
-    pack = {**pack, "views": views}
+    pack = {**dict.fromkeys(_STATIC, ()), **pack, "views": views}
     context = {
         "pack": pack,
         "opening": describe_opening(pack),
@@ -66,11 +66,11 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
         "script": Markup("\n".join(_read_script(name) for name in _SCRIPTS)),
         "data": "",
     }
-    bare = _environment(is_html=True).get_template("page.html.jinja").render(context)
-    data = encode_pack(pack, PAGE_BYTES - len(bare.encode()))
-    html = _environment(is_html=True).get_template("page.html.jinja")
+    html = template_environment(_HERE, is_html=True).get_template("page.html.jinja")
+    shown = {key: value for key, value in pack.items() if key not in _STATIC}
+    data = encode_pack(shown, PAGE_BYTES - len(html.render(context).encode()))
     folder.write("index.html", html.render({**context, "data": Markup(data)}))
-    markdown = _environment(is_html=False).get_template("report.md.jinja")
+    markdown = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
     folder.write("report.md", markdown.render(context))
     return folder.path / "index.html"
 
@@ -109,21 +109,3 @@ def _group_files(downloads: Sequence[Mapping[str, Any]]) -> list[tuple[str, list
         )
         for group, files in itertools.groupby(downloads, lambda file: str(file["group"]))
     ]
-
-
-def _environment(*, is_html: bool) -> jinja2.Environment:
-    """Return the template environment. Each value is escaped once, for its format."""
-    return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_HERE),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        finalize=None if is_html else _escape_value,
-    )
-
-
-def _escape_value(value: Any) -> Markup:
-    """Escape a value of a Markdown template, unless a template made it."""
-    return value if hasattr(value, "__html__") else Markup(escape_markdown(str(value)))

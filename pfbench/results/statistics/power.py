@@ -88,25 +88,3 @@ def required_runs_proportion(
     distance = abs(proportion - limit)
     smooth = (spread / distance) ** 2
     return float(math.ceil(smooth / 4 * (1 + math.sqrt(1 + 2 / (smooth * distance))) ** 2))
-
-
-def detectable_effect(
-    sd: float, pairs: int, alpha: float = 0.05, power: float = POWER, efficiency: float = EFFICIENCY
-) -> float:
-    """Compute the smallest mean difference shown with a given power.
-
-    Args:
-        sd: Standard deviation of the differences.
-        pairs: Runs that both filters have.
-        alpha: Level.
-        power: Power required.
-        efficiency: Efficiency of the test relative to the t test.
-
-    Returns:
-        Difference in the unit of `sd`, infinite if no difference can be shown.
-    """
-    z = float(-ndtri(alpha / 2))
-    room = efficiency * pairs - z**2 / 2
-    if pairs < min_pairs(alpha) or room <= 0:
-        return math.inf
-    return float(sd * (z + ndtri(power)) / math.sqrt(room))

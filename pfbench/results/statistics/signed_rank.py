@@ -1,8 +1,8 @@
-"""Wilcoxon's signed-rank test, its equivalence version, and Holm's correction."""
+"""Wilcoxon's signed-rank test, and Holm's correction."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from itertools import product
 from typing import Literal, NamedTuple
@@ -98,62 +98,6 @@ def wilcoxon_signed_rank_rows(
     return np.where(constant, n * (n + 1) / 4, statistic), np.where(constant, 1.0, p)
 
 
-def equivalence_p_value(d: Array, margin: float) -> float:
-    """Test whether differences are centred within a margin.
-
-    Args:
-        d: Differences, [n].
-        margin: As in `equivalence_p_values`.
-    """
-    return float(equivalence_p_values(np.asarray(d, dtype=np.float64)[None], margin)[0])
-
-
-def equivalence_p_values(d: Array, margin: float) -> Array:
-    """Test whether each row of differences is centred within a margin.
-
-    Two one-sided signed-rank tests, against a centre at or below -margin and at or above +margin
-    [Schuirmann 1987; Wellek 2010, section 5.4]. The distribution of d is assumed to be symmetric.
-
-    Args:
-        d: Differences, [K, n].
-        margin: Half width of the region of equivalence, in the unit of d.
-
-    Returns:
-        The larger of both p-values, [K].
-
-    Raises:
-        ValueError: if the margin is not positive.
-    """
-    if not margin > 0:
-        raise ValueError(f"margin must be positive, got {margin}. Use 0.05 for five per cent.")
-    sides = (wilcoxon_signed_rank_rows(side, "greater")[1] for side in (d + margin, margin - d))
-    return np.maximum(*sides)
-
-
-def wilcoxon_samples(differences: Sequence[Array]) -> tuple[Array, Array]:
-    """Test several samples of paired differences, those of equal length at once."""
-    statistic, p = np.empty((2, len(differences)))
-    for index, d in _by_length(differences):
-        statistic[index], p[index] = wilcoxon_signed_rank_rows(d)
-    return statistic, p
-
-
-def equivalence_samples(differences: Sequence[Array], margin: float) -> Array:
-    """Test the equivalence of several samples, those of equal length at once.
-
-    Args:
-        differences: Samples, [n] each.
-        margin: Half width of the region of equivalence.
-
-    Returns:
-        p-values, [K].
-    """
-    p = np.empty(len(differences))
-    for index, d in _by_length(differences):
-        p[index] = equivalence_p_values(d, margin)
-    return p
-
-
 def _exact_tails(n: int, above: Array) -> tuple[Array, Array]:
     """Return P(T >= above) and P(T <= above) of the rank sum of n untied differences."""
     cumulative = _rank_sum_cdf(n)
@@ -187,10 +131,3 @@ def _normal_score(ranks: Array, size: Array, above: Array) -> Array:
 def _all_signs(n: int) -> Array:
     """Enumerate the positive differences among n in all 2^n ways, [2^n, n]."""
     return np.array(list(product((0.0, 1.0), repeat=n)))
-
-
-def _by_length(differences: Sequence[Array]) -> Iterator[tuple[list[int], Array]]:
-    """Yield the indices and the stack [K, n] of the samples of each length."""
-    for n in sorted({d.size for d in differences}):
-        index = [k for k, d in enumerate(differences) if d.size == n]
-        yield index, np.stack([differences[k] for k in index])

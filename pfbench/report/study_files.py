@@ -1,0 +1,137 @@
+"""Files of a study beside its page: decisions, consistency of the filters, and all metrics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pfbench.config.paper_files import plan_installed_pairs
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.options import ReportOptions
+from pfbench.report.table_formats import format_csv
+from pfbench.report.writers import write_json
+from pfbench.results.conditions import Condition, natural_sort_key
+from pfbench.results.decisions.decision import Decision
+from pfbench.results.decisions.filter_sets import order_filters
+from pfbench.results.decisions.options import DecisionOptions
+from pfbench.results.decisions.planned_pairs import decide_planned_pairs, decide_secondary_metrics
+from pfbench.results.frame import to_long_rows
+from pfbench.results.state_groups import main_component_group
+from pfbench.results.study_decisions.common_conditions import select_common_runs
+from pfbench.results.study_decisions.consistency_bands import decide_consistency
+from pfbench.results.study_decisions.main_metrics import (
+    RULES,
+    main_rule,
+    select_main_metrics,
+    tidy_main,
+    tidy_secondary,
+)
+
+MAIN = "main group"  # if scenarios differ in it
+_KEYS = ("scenario", "noise", "model", "label", "group", "component", "metric", "unit")
+
+
+def write_study_files(
+    conditions: Sequence[Condition], options: ReportOptions, folder: RecordedFolder
+) -> list[dict[str, Any]]:
+    """Write decisions.json, consistency.json and metrics.csv.
+
+    Args:
+        conditions: Conditions of the study.
+        options: Options of the report.
+        folder: Folder of the report.
+
+    Returns:
+        Entries of the downloads of the page.
+    """
+    start, converged = options.start_time_s, options.convergence_threshold
+    rows = [
+        to_long_rows(condition, job, job.load(), start, converged)
+        for condition in conditions
+        for job in condition.jobs
+    ]
+    table = pd.concat(rows, ignore_index=True)
+    mains = {
+        (c.scenario, c.noise, c.model): main_component_group(c.jobs[0].meta["state"]).group
+        for c in conditions
+    }
+    names = set(mains.values())
+    name = names.pop() if len(names) == 1 else MAIN
+    decisions = decide_study(select_main_metrics(table, mains, name), name, options)
+    bands = decide_consistency(table, DecisionOptions(options.alpha, options.equivalence_margin))
+    files = {
+        "Decisions on all pairs (JSON)": write_json(folder, "decisions", decisions),
+        "Bands of NEES and NIS (JSON)": write_json(folder, "consistency", bands),
+        "All metrics, summarised over runs (CSV)": folder.write(
+            "metrics.csv", format_csv(summarise_metrics(table))
+        ).name,
+    }
+    return [
+        {"name": title, "href": file, "bytes": (folder.path / file).stat().st_size, "group": "Numbers"}
+        for title, file in files.items()
+    ]  # fmt: skip
+
+
+def decide_study(rows: pd.DataFrame, group: str, options: ReportOptions) -> list[Decision]:
+    """Decide planned pairs, the metrics of the second family, and the other pairs.
+
+    Args:
+        rows: Rows of `select_main_metrics`.
+        group: Name of the main group in these rows.
+        options: Options of the report.
+    """
+    settings = DecisionOptions(options.alpha, options.equivalence_margin)
+    rule, tidy = main_rule(options.metric, group), tidy_main(rows, options.metric, group)
+    labels = sorted(tidy["filter"].unique(), key=natural_sort_key)
+    pairs = [pair for pair in plan_installed_pairs(labels) if _share_condition(tidy, *pair)]
+    planned = decide_planned_pairs(tidy, pairs, rule, settings) if pairs else []
+    metrics = tidy_secondary(rows, group)
+    metrics.pop(options.metric, None)
+    secondary = []
+    if pairs and metrics:
+        rules = [replace(RULES[name], group=group) for name in metrics]
+        tables = {rule.name: values for rule, values in zip(rules, metrics.values(), strict=True)}
+        secondary = decide_secondary_metrics(tables, pairs, rules, settings)
+    common, _ = select_common_runs(tidy)
+    orders = order_filters(common, rule, settings, planned) if len(common) else ()
+    return [
+        *planned, *secondary, *(d for order in orders for d in order.decisions if d not in planned)
+    ]  # fmt: skip
+
+
+def summarise_metrics(table: pd.DataFrame) -> pd.DataFrame:
+    """Summarise each metric and component of each filter over valid runs.
+
+    Args:
+        table: Rows of `load_frame`.
+
+    Returns:
+        A row per condition, filter, group, component and metric, with mean, root mean square and
+        quantiles over the valid runs. NaN without a value.
+    """
+    keys = list(_KEYS)
+    valid = table["value"].where(~table["lost"] & np.isfinite(table["value"]))
+    grouped = table.assign(value=valid, square=valid**2).groupby(keys, sort=False)
+    quantiles = grouped["value"].quantile(np.array([0.1, 0.5, 0.9])).unstack()
+    summary = pd.DataFrame({
+        "runs": grouped["value"].size(),
+        "runs_with_value": grouped["value"].count(),
+        "mean": grouped["value"].mean(),
+        "root_mean_square": grouped["square"].mean().map(math.sqrt),
+        "quantile_10": quantiles[0.1], "median": quantiles[0.5], "quantile_90": quantiles[0.9],
+    })  # fmt: skip
+    return summary.reset_index().rename(columns={"label": "filter"})
+
+
+def _share_condition(tidy: pd.DataFrame, a: str, b: str) -> bool:
+    """Return whether two filters have a condition in common."""
+    conditions = [
+        set(map(tuple, tidy.loc[tidy["filter"] == label, ["scenario", "regime"]].to_numpy()))
+        for label in (a, b)
+    ]
+    return bool(conditions[0] & conditions[1])
