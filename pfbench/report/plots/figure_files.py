@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib
@@ -48,21 +47,6 @@ def draw_figure(drawing: FigureSpec, formats: Sequence[str]) -> dict[str, bytes]
             engine.execute(figure)
             figure.set_layout_engine(None)
         return {suffix: _render(figure, suffix) for suffix in formats}
-
-
-def write_figure(drawing: FigureSpec, folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Draw a figure and write a file per format.
-
-    Args:
-        drawing: Figure.
-        folder: Target folder.
-        formats: File formats, svg or png.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    contents = draw_figure(drawing, formats)
-    for suffix, content in contents.items():
-        (folder / f"{drawing.name}.{suffix}").write_bytes(content)
-    return [folder / f"{drawing.name}.{suffix}" for suffix in contents]
 
 
 def _render(figure: Figure, suffix: str) -> bytes:
