@@ -63,7 +63,7 @@ def write_report(
     with RecordedFolder(Path(out) / study) as folder:
         pack = write_report_data(study, conditions, options, folder)
         pack["downloads"] += write_study_files(conditions, options, folder)
-        pack["provenance"] += describe_jobs(conditions, options.planned)
+        pack["provenance"] += list_job_settings(conditions, options.planned)
         pack |= {
             "paper_figures": writers.render_figures(
                 drawings, "paper", folder, options.figure_formats
@@ -75,7 +75,7 @@ def write_report(
         return write_page(pack, folder)
 
 
-def describe_jobs(conditions: Sequence[Condition], planned: int | None) -> list[list[str]]:
+def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> list[list[str]]:
     """Describe budget, PCRB, cost and training of the jobs.
 
     Args:

@@ -114,7 +114,7 @@ def compute_max_error(data: MetricInput) -> ByComponent:
     return {"norm": max_error(data.select("error"), data.lost)}
 
 
-def compute_pcrb(data: MetricInput) -> ByComponent:
+def compute_bound(data: MetricInput) -> ByComponent:
     """Compute the root mean square of the PCRB of the norm, over the steps with truth of each run."""
     if "pcrb" not in data.result.data:
         return {}

@@ -21,6 +21,7 @@ from pfbench.results.metric_values import (
     MetricInput,
     average_trace,
     compute_acceptance,
+    compute_bound,
     compute_crps,
     compute_energy_score,
     compute_interval_coverage,
@@ -31,7 +32,6 @@ from pfbench.results.metric_values import (
     compute_mean_nis,
     compute_nees_ratio,
     compute_overconfidence,
-    compute_pcrb,
     compute_rmse,
     compute_seconds_per_step,
     sum_trace,
@@ -143,7 +143,7 @@ METRICS: tuple[Metric, ...] = (
         "max_error", compute_max_error, "components", GROUP_UNIT, "lower", "Maximum of the norm of the error.",
     ),
     Metric(
-        "pcrb", compute_pcrb, "components", GROUP_UNIT, "target",
+        "pcrb", compute_bound, "components", GROUP_UNIT, "target",
         "Posterior Cramér-Rao bound of the RMSE, from a norm of the standard deviations of the bound.",
     ),
     Metric(
