@@ -67,8 +67,8 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
         "data": "",
     }
     html = template_environment(_HERE, is_html=True).get_template("page.html.jinja")
-    shown = {key: value for key, value in pack.items() if key not in _STATIC}
-    data = encode_pack(shown, PAGE_BYTES - len(html.render(context).encode()))
+    script_data = {key: value for key, value in pack.items() if key not in _STATIC}
+    data = encode_pack(script_data, PAGE_BYTES - len(html.render(context).encode()))
     folder.write("index.html", html.render({**context, "data": Markup(data)}))
     markdown = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
     folder.write("report.md", markdown.render(context))
