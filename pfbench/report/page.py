@@ -50,7 +50,7 @@ def write_report(
 
     Raises:
         FileNotFoundError: If results of the study are missing.
-        ValueError: If results do not belong together, or have no selected group or figure.
+        ValueError: If results cannot be compared, or a selected group or figure does not exist.
     """
     options = options or ReportOptions()
     conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)

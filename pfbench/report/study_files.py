@@ -1,4 +1,4 @@
-"""Files of a study beside its page: decisions, consistency of the filters, and all metrics."""
+"""Files of a study next to its page: decisions, consistency of the filters, and all metrics."""
 
 from __future__ import annotations
 

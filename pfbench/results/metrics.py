@@ -106,7 +106,7 @@ def table_columns(result: store.JobResult, group: ComponentGroup) -> dict[str, f
         group: Group.
 
     Returns:
-        Values by column head, without metrics that the job has no data for.
+        Values by column head, without metrics of missing data.
     """
     data = MetricInput(result, group, group.state_group)
     columns = {}
