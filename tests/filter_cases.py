@@ -5,11 +5,13 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+import torch
 from config_cases import CONF
 from hydra import compose, initialize_config_dir
 
 from pfbench import job
 from pfbench.core.record import Record
+from pfbench.filter.linearisation import compute_additive_gain
 from pfbench.model.base import StateSpaceModel
 
 SLOTS = 30
@@ -38,6 +40,8 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
     x, first = model.origin.expand(2, 1, -1), model.prepare(record).at_step(0)
     if name in DENSE and model.transition(x, first.u) is None:
         return "density of x_t given x_t-1"
+    if name.startswith("gauss_hermite") and _needs_many_points(name, model, first.u):
+        return "at most 20000 points"
     if name == "dmc_density" and model.noise_gain(first.u) is None:
         return "additive noise"
     if name == "rbpf" and not (model.linear or model.linear_given):
@@ -45,6 +49,15 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
     if record.feedback is not None and (method_past(name) or name == "rbpf"):
         return "scenario with feedback"
     return ""
+
+
+def _needs_many_points(name: str, model: StateSpaceModel, u: Any) -> bool:
+    """Return whether the tensor product of points is too large for a model."""
+    d = model.chart.dimension
+    root = torch.eye(d, dtype=model.origin.dtype)[None]
+    if compute_additive_gain(model, model.origin.expand(1, -1), root, u) is None:
+        d += model.noise_dim
+    return int(name[-1]) ** d > 20_000
 
 
 def method_past(name: str) -> bool:

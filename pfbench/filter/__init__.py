@@ -24,6 +24,7 @@ __getattr__, __dir__ = lazy_attributes(
             "CubaturePoints",
         ),
         "gaussian.noise_adaptation": ("FadingMemory", "ConstrainedNoiseAdaptation"),
+        "gaussian.quadrature_points": ("GaussHermitePoints", "SparseGridPoints"),
         "gaussian.spherical_radial": (
             "SphericalRule",
             "RadialRule",
