@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from pfbench.claims.schema import ClaimTest
 from pfbench.results.error_measures import Array
@@ -73,6 +74,30 @@ def region_p_value(s: ClaimSample) -> float:
     if np.isfinite(s.low):
         p.append(wilcoxon_signed_rank(s.d - s.low, "greater").p)
     return max(p, default=np.nan)
+
+
+def exclusion_p_value(s: ClaimSample) -> float:
+    """Compute the p-value that the median excludes every sufficient effect.
+
+    It is at most alpha exactly if the order-statistic interval of level 1 - alpha lies outside.
+
+    Args:
+        s: Values and region.
+
+    Returns:
+        Two-sided p-value of the nearer border; 1 without one.
+    """
+    # a sufficient effect lies beyond its border, so the border itself is excluded
+    allows_equality = s.worth > 0
+    inside = []
+    if np.isfinite(s.high):
+        border = s.high - s.worth
+        inside.append(s.d < border if allows_equality else s.d <= border)
+    if np.isfinite(s.low):
+        border = s.low + s.worth
+        inside.append(s.d > border if allows_equality else s.d >= border)
+    tails = (stats.binom.cdf(np.count_nonzero(d), d.size, 0.5) for d in inside)
+    return min((min(1.0, 2 * float(tail)) for tail in tails), default=1.0)
 
 
 def _log_region(test: ClaimTest) -> tuple[float, float, float]:

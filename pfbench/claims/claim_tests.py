@@ -3,8 +3,9 @@
 A test claims that the median over runs of a value lies in a region. The value is the logarithm of a
 ratio to another filter in the same episodes or to a number, a difference, or a share. One-sided
 signed-rank tests (exact binomial for shares) show that the median lies in the region. The test
-fails if the order-statistic interval of the median excludes every effect that is large enough: half
-of the printed effect on the logarithmic scale, or the margin. Otherwise the runs are too few.
+fails if sign tests, which the order-statistic interval inverts, exclude every effect that is large
+enough: half of the printed effect on the logarithmic scale, or the margin. Both p-values are
+corrected by Holm's method over the tests of the paper. Otherwise the runs are too few.
 
 Lost runs rank last. If neither filter has half of its runs, the test is undecided. Times per step
 are one measurement per job: only differences above 10 % count, without an interval [ours].
@@ -22,6 +23,7 @@ from scipy import stats
 from pfbench.claims.claim_samples import (
     EFFECT_FACTOR,
     ClaimSample,
+    exclusion_p_value,
     region_p_value,
     sample_claim_test,
 )
@@ -50,6 +52,8 @@ class ClaimTestResult:
         high: Upper end of that interval.
         p: One-sided p-value of this test alone; NaN if nothing is tested.
         p_holm: p-value corrected over `family` tests of the paper.
+        p_fails: Two-sided p-value that every sufficient effect is excluded; NaN if nothing is tested.
+        p_fails_holm: That p-value, corrected over the tests of the paper.
         family: Number of these tests.
         within: Distance of the median from the border inside the claimed region, in SD over valid
             runs. Negative outside, NaN if lost runs decide the median.
@@ -70,6 +74,8 @@ class ClaimTestResult:
     high: float = np.nan
     p: float = np.nan
     p_holm: float = np.nan
+    p_fails: float = np.nan
+    p_fails_holm: float = np.nan
     family: int = 0
     within: float = np.nan
     outside: float = np.nan
@@ -140,12 +146,8 @@ def _test_median(result: ClaimTestResult, s: ClaimSample, alpha: float) -> Claim
     if result.comparison.statistic == "report":
         return result
     inside, outside = _measure_depth(s)
-    result = replace(result, within=inside, outside=outside, p=region_p_value(s))
-    is_above = low >= s.high - s.worth if s.worth else low > s.high
-    is_below = high <= s.low + s.worth if s.worth else high < s.low
-    return (
-        replace(result, outcome=FAILS) if is_above or is_below else replace(result, reason=NO_POWER)
-    )
+    p = {"p": region_p_value(s), "p_fails": exclusion_p_value(s)}
+    return replace(result, within=inside, outside=outside, reason=NO_POWER, **p)
 
 
 def _measure_depth(s: ClaimSample) -> tuple[float, float]:
@@ -172,8 +174,8 @@ def _test_share(result: ClaimTestResult, hits: Array, alpha: float) -> ClaimTest
         high=float(interval.high),
         p=float(p),
     )
-    is_below = interval.high <= limit
-    return replace(result, outcome=FAILS) if is_below else replace(result, reason=NO_POWER)
+    p_fails = min(1.0, 2 * float(stats.binom.cdf(count, hits.size, limit)))
+    return replace(result, reason=NO_POWER, p_fails=p_fails)
 
 
 def _test_cost(result: ClaimTestResult, seconds: Array) -> ClaimTestResult:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pfbench.claims import figures as claims_figures
+from pfbench.claims.choices import list_choices
 from pfbench.claims.claim_records import read_claims
 from pfbench.claims.claim_tables import (
     Jobs,
@@ -68,8 +69,10 @@ def write_claims(
     )
     studies = {study for claim in claims for study in claim.studies}
     jobs = claim_job_metadata(claims, results, mixed=allow_mixed_versions)
+    has_files = conf is not None and experiments is not None
+    choices = {c.id: list_choices(c, conf, experiments) for c in claims} if has_files else {}
     context: dict[str, Any] = {
-        "papers": rows_by_paper(verdicts, report_anchors(studies, out), jobs),
+        "papers": rows_by_paper(verdicts, report_anchors(studies, out), jobs, choices),
         "made": jobs_table(jobs),
         "commits": list_commits(jobs.values()),
         "verdicts": VERDICTS,
@@ -77,7 +80,8 @@ def write_claims(
         "alpha": alpha,
         "n": len(verdicts),
     }
-    text = json.dumps([_to_json(verdict) for verdict in verdicts], indent=1, allow_nan=False)
+    records = [{**_to_json(v), "choices": choices.get(v.claim.id, [])} for v in verdicts]
+    text = json.dumps(records, indent=1, allow_nan=False)
     with RecordedFolder(Path(out) / STUDY) as folder:
         writers.write_table(folder, STUDY, claims_table(verdicts))
         folder.write("verdicts.json", text + "\n")
@@ -108,6 +112,7 @@ def rows_by_paper(
     verdicts: Sequence[ClaimVerdict],
     reports: Mapping[str, Collection[str]] | None = None,
     jobs: Jobs | None = None,
+    choices: Mapping[str, Sequence[str]] | None = None,
 ) -> list[dict[str, Any]]:
     """Collect the title of each paper and the rows of its claims for the templates.
 
@@ -115,11 +120,21 @@ def rows_by_paper(
         verdicts: Verdicts from `decide_claims`.
         reports: Anchors of each study that has a page; None for no links.
         jobs: Metadata from `claim_job_metadata`; None to omit it.
+        choices: Choices of this project by claim, from `list_choices`; None to omit them.
 
     Returns:
         One entry per paper.
     """
-    rows = [(v.claim.paper, _claim_row(v, reports or {}, jobs or {})) for v in verdicts]
+    rows = [
+        (
+            v.claim.paper,
+            {
+                **_claim_row(v, reports or {}, jobs or {}),
+                "choices": (choices or {}).get(v.claim.id, []),
+            },
+        )
+        for v in verdicts
+    ]
     return [
         {"key": key, "title": title, "rows": [row for paper, row in rows if paper == key]}
         for key, title in PAPERS.items()
@@ -187,12 +202,18 @@ def _test_line(
         "asked": test.statistic.replace("_", " "),
         "said": format_result(result),
         "more": ", ".join(text for text in details if text),
-        "outcome": "measured" if test.statistic == "report" else result.outcome,
+        "outcome": _format_outcome(result),
         "where": test.cell.replace("/", " / "),
         "study": test.study,
         "link": f"{page}#{anchor}" if anchor else page,
         "drawn": bool(anchor),
     }
+
+
+def _format_outcome(result: ClaimTestResult) -> str:
+    """Format the outcome of a test."""
+    outcome = "measured" if result.comparison.statistic == "report" else result.outcome
+    return outcome if result.comparison.decides else f"{outcome}, does not decide"
 
 
 def _format_sides(test: ClaimTest) -> str:

@@ -102,6 +102,7 @@ class ClaimTest:
             one time in seconds.
         high: Upper limit claimed, as `low`.
         margin: Relative margin; in displayed units for "close", of the logarithm for "flat".
+        decides: Whether the verdict depends on the test. If not, it is shown beside the verdict.
     """
 
     statistic: str
@@ -121,6 +122,7 @@ class ClaimTest:
     low: float = -np.inf
     high: float = np.inf
     margin: float = 0.1
+    decides: bool = True
 
     @property
     def measure(self) -> str:

@@ -1,12 +1,12 @@
 """Verdicts on the claims of the papers: a claim holds if all of its tests hold.
 
-`claim_tests` decides single tests. Holm's correction covers all tests of one paper. If a ratio is
-printed, the measured effect must also be within a factor of 2 of it on the logarithmic scale
+`claim_tests` tests single claims. Holm's correction covers all tests of one paper, for "holds" and
+for "fails". Tests that are shown beside a verdict have a family of their own. If a ratio is printed, the measured effect must also be within a factor of 2 of it on the logarithmic scale
 [ours].
 
 For a test with too few runs, the required runs are computed: those that show the measured effect
 with power 0.8. Inside the region, the signed-rank test shows it at the level of the first step of
-Holm's correction. Outside, the interval of the median shows it, which equals the t test of 2/pi as
+Holm's correction. Outside, the sign test shows it at that level, which equals the t test of 2/pi as
 many normal differences. The smaller number counts [ours].
 """
 
@@ -92,23 +92,19 @@ def decide_claims(
 def _correct_by_paper(
     claims: Sequence[Claim], raw: Sequence[Mapping[str, _Results]], alpha: float
 ) -> list[dict[str, _Results]]:
-    """Apply Holm's correction to all tests of each paper."""
-    p_holm: dict[tuple[str, ClaimTest], float] = {}
-    sizes: dict[str, int] = {}
-    for paper in {claim.paper for claim in claims}:
-        of_paper = (r for claim, r in zip(claims, raw, strict=True) if claim.paper == paper)
-        results = (r for forms in of_paper for form in forms.values() for r in form)
-        # A test that several claims, or both forms, share is counted once.
-        p = {r.comparison: r.p for r in results if not np.isnan(r.p)}
-        sizes[paper] = len(p)
-        adjusted = holm(list(p.values()))
-        p_holm |= {(paper, test): float(v) for test, v in zip(p, adjusted, strict=True)}
+    """Apply Holm's correction to all tests of each paper that decide, and to all others."""
+    families: dict[tuple[str, bool], dict[ClaimTest, ClaimTestResult]] = {}
+    for claim, forms in zip(claims, raw, strict=True):
+        for result in (r for results in forms.values() for r in results):
+            if not np.isnan(result.p):
+                # A test that several claims, or both forms, share is counted once.
+                family = families.setdefault((claim.paper, result.comparison.decides), {})
+                family[result.comparison] = result
+    corrected = {key: _correct_family(family, alpha) for key, family in families.items()}
 
     def correct(result: ClaimTestResult, paper: str) -> ClaimTestResult:
-        if np.isnan(result.p):
-            return result
-        p = p_holm[paper, result.comparison]
-        return _decide_corrected(replace(result, p_holm=p, family=sizes[paper]), alpha)
+        family = corrected.get((paper, result.comparison.decides), {})
+        return family.get(result.comparison, result)
 
     return [
         {form: tuple(correct(r, claim.paper) for r in results) for form, results in forms.items()}
@@ -116,22 +112,36 @@ def _correct_by_paper(
     ]
 
 
+def _correct_family(
+    family: Mapping[ClaimTest, ClaimTestResult], alpha: float
+) -> dict[ClaimTest, ClaimTestResult]:
+    """Correct the p-values of holding and of failing, each with Holm's method, and decide."""
+    holding = holm([r.p for r in family.values()])
+    failing = holm([r.p_fails for r in family.values()])
+    return {
+        test: _decide_corrected(
+            replace(r, p_holm=float(p), p_fails_holm=float(q), family=len(family)), alpha
+        )
+        for (test, r), p, q in zip(family.items(), holding, failing, strict=True)
+    }
+
+
 def _decide_corrected(result: ClaimTestResult, alpha: float) -> ClaimTestResult:
-    """Decide a test by its corrected p-value."""
-    if result.p_holm > alpha:
-        needed = _required_runs(result, alpha) if result.reason == NO_POWER else result.needed
-        return replace(result, needed=needed)
-    if result.outcome == FAILS:
-        default = "the direction holds, the effect is below the claimed effect"
-        return replace(result, reason=result.reason or default)
-    return check_effect_size(replace(result, outcome=HOLDS, reason=""))
+    """Decide a test by its corrected p-values."""
+    is_inside, is_excluded = result.p_holm <= alpha, result.p_fails_holm <= alpha
+    if is_excluded:
+        reason = "the direction holds, the effect is below the claimed effect" if is_inside else ""
+        return replace(result, outcome=FAILS, reason=reason)
+    if is_inside:
+        return check_effect_size(replace(result, outcome=HOLDS, reason=""))
+    return replace(result, needed=_required_runs(result, alpha))
 
 
 def _required_runs(result: ClaimTestResult, alpha: float) -> float:
     """Compute the runs that decide a test with power 0.8 if the effect is as measured."""
     test, level = result.comparison, alpha / result.family
     if test.statistic == "share":
-        level = level if result.effect > test.low else alpha / 2
+        level = level if result.effect > test.low else level / 2
         return power.required_runs_proportion(result.effect, test.low, level)
     if np.isnan(result.within):
         return np.nan
@@ -142,7 +152,7 @@ def _required_runs(result: ClaimTestResult, alpha: float) -> float:
     if result.within > 0:  # one-sided: the two-sided test at twice the level
         runs.append(power.required_runs(result.within, min(1.0, 2 * level), target))
     if result.outside > 0:
-        runs.append(power.required_runs(result.outside, alpha, efficiency=_MEDIAN_EFFICIENCY))
+        runs.append(power.required_runs(result.outside, level, efficiency=_MEDIAN_EFFICIENCY))
     return min(runs, default=np.inf)
 
 
@@ -152,7 +162,8 @@ def _decide(claim: Claim, results: Mapping[str, _Results]) -> ClaimVerdict:
         return ClaimVerdict(claim, UNDECIDED, *claim.mark, results)
     if "" in claim.reasons:
         return ClaimVerdict(claim, UNDECIDED, *claim.reasons[""], results)
-    outcomes = {form: _combine(values) for form, values in results.items()}
+    deciding = {form: [r for r in rs if r.comparison.decides] for form, rs in results.items()}
+    outcomes = {form: _combine(values) for form, values in deciding.items()}
     outcomes |= {form: (OPEN, reason) for form, (reason, _) in claim.reasons.items()}
     outcomes |= {form: (outcome, "") for form, (outcome, _) in claim.evidence.items()}
     notes = _notes(claim, results, outcomes)

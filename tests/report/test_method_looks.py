@@ -117,7 +117,7 @@ def test_baselines_exist_and_give_the_planned_pairs() -> None:
     pairs = plan_installed_pairs(METHODS)
     assert ("mcmc_rpf", "sir") in pairs
     assert ("cofm_amssrcpf", "fmcpf") in pairs
-    assert len(pairs) == 15
+    assert len(pairs) == 17
 
 
 def test_a_guide_filter_and_a_variant_do_not_hand_on_their_block() -> None:

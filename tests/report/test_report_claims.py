@@ -468,7 +468,7 @@ def normal(middle: float, scatter: float, runs: int, seed: int = 0) -> dict[str,
 
 
 def test_what_lacks_power_says_the_runs_that_it_takes() -> None:
-    """By hand, from the closed forms of `power`: for the claim at the corrected level, or against it by the interval."""
+    """By hand, from the closed forms of `power`: for the claim at the corrected level, or against it by the sign test."""
     other = replace(LESS, a="n")
     for middle in (-0.2, -0.02, 0.05):
         values = normal(middle, 0.5, 20)
@@ -478,7 +478,9 @@ def test_what_lacks_power_says_the_runs_that_it_takes() -> None:
         for_it = power.required_runs(-middle / 0.5, 2 * 0.05 / 2) if middle < 0 else np.inf
         beyond = middle + np.log(1.1)  # worth the name is a tenth
         against_it = (
-            power.required_runs(beyond / 0.5, 0.05, efficiency=2 / np.pi) if beyond > 0 else np.inf
+            power.required_runs(beyond / 0.5, 0.05 / 2, efficiency=2 / np.pi)
+            if beyond > 0
+            else np.inf
         )
         assert found.needed == pytest.approx(min(for_it, against_it), abs=1)
         assert (
