@@ -26,7 +26,7 @@ from pfbench.claims.claim_tests import (
     check_effect_size,
     run_claim_test,
 )
-from pfbench.claims.schema import NO_POWER, Claim, ClaimTest
+from pfbench.claims.schema import Claim, ClaimTest
 from pfbench.results.statistics import power
 from pfbench.results.statistics.signed_rank import holm
 
