@@ -146,8 +146,8 @@ def _test_median(result: ClaimTestResult, s: ClaimSample, alpha: float) -> Claim
     if result.comparison.statistic == "report":
         return result
     inside, outside = _measure_depth(s)
-    p = {"p": region_p_value(s), "p_fails": exclusion_p_value(s)}
-    return replace(result, within=inside, outside=outside, reason=NO_POWER, **p)
+    result = replace(result, p=region_p_value(s), p_fails=exclusion_p_value(s))
+    return replace(result, within=inside, outside=outside, reason=NO_POWER)
 
 
 def _measure_depth(s: ClaimSample) -> tuple[float, float]:

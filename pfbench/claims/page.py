@@ -69,8 +69,9 @@ def write_claims(
     )
     studies = {study for claim in claims for study in claim.studies}
     jobs = claim_job_metadata(claims, results, mixed=allow_mixed_versions)
-    has_files = conf is not None and experiments is not None
-    choices = {c.id: list_choices(c, conf, experiments) for c in claims} if has_files else {}
+    choices = {}
+    if conf is not None and experiments is not None:
+        choices = {claim.id: list_choices(claim, conf, experiments) for claim in claims}
     context: dict[str, Any] = {
         "papers": rows_by_paper(verdicts, report_anchors(studies, out), jobs, choices),
         "made": jobs_table(jobs),
