@@ -102,7 +102,7 @@ class ClaimTest:
             one time in seconds.
         high: Upper limit claimed, as `low`.
         margin: Relative margin; in displayed units for "close", of the logarithm for "flat".
-        decides: Whether the verdict depends on the test. If not, it is shown beside the verdict.
+        decides: Whether the verdict depends on the test. If not, the page shows it only.
     """
 
     statistic: str

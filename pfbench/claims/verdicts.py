@@ -1,7 +1,7 @@
 """Verdicts on the claims of the papers: a claim holds if all of its tests hold.
 
 `claim_tests` tests single claims. Holm's correction covers all tests of one paper, for "holds" and
-for "fails". Tests that are shown beside a verdict have a family of their own. If a ratio is printed, the measured effect must also be within a factor of 2 of it on the logarithmic scale
+for "fails". Tests that do not decide have a family of their own. If a ratio is printed, the measured effect must also be within a factor of 2 of it on the logarithmic scale
 [ours].
 
 For a test with too few runs, the required runs are computed: those that show the measured effect
