@@ -3,7 +3,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STUDY  ?= quickstart
 
-.PHONY: demo report test test-fast test-slow mutants recompute faults format lint bench clean
+.PHONY: demo studies report test test-fast test-slow mutants recompute faults format lint bench clean
 
 # Python compiles modules at first import. Compiling all installed packages took half of the set-up time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -33,6 +33,9 @@ test-slow: $(VENV)/.installed
 
 mutants: $(VENV)/.installed     ## plant each fault of tests/mutants.toml and check that a test fails
 	$(BIN)/python tests/mutants.py
+
+studies: $(VENV)/.installed     ## run all published studies, cheapest first: about four hours on one idle core; repeat to continue
+	$(BIN)/python docs/run_studies.py
 
 recompute: $(VENV)/.installed      ## compute the decisions of a report a second time, without code of pfbench
 	$(BIN)/python tests/decision_oracle.py results/$(STUDY) reports/$(STUDY)/decisions.json

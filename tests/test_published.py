@@ -13,7 +13,7 @@ import pytest
 from checkout import ROOT
 
 REPORT_FILE = re.compile(
-    r"reports/(README\.md|\w+/(report\.md|verdicts\.json(\.gz)?|headline\.(png|svg)))"
+    r"reports/(README\.md|\w+/(report\.md|verdicts\.json(\.gz)?|runs\.parquet|headline\.(png|svg)))"
 )
 
 
@@ -123,3 +123,26 @@ def test_the_readme_has_no_measured_number_outside_the_blocks() -> None:
     assert re.findall(r"\d+(?:\.\d+)? (?:times|%|s for|ms)\b", prose) == []
     (count,) = set(re.findall(r"(\d+) claims", text))
     assert re.search(rf"^\| all \|.*\| {count} \|$", text, re.MULTILINE)
+
+
+def test_studies_run_cheapest_first_and_within_a_limit() -> None:
+    studies = load("run_studies")
+    costs = {"a": 3600.0, "b": 60.0, "c": 7200.0}
+    assert studies.plan_studies(["c", "a", "unknown", "b"], costs) == ["b", "a", "c", "unknown"]
+    assert studies.plan_studies(["c", "a", "b"], costs, hours=1.5) == ["b", "a"]
+    published = set(load("publish_reports").HEADLINES) - {"claims"}
+    learned = {name for name in published if name.startswith("learn_")}  # scripts of their own
+    assert published - learned <= set(studies.list_studies()) <= set(studies.read_costs())
+
+
+def test_the_cost_of_a_study_is_the_computing_time_of_its_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    studies = load("run_studies")
+    seconds = {"a": {"world": 1.0, "filter": 2.0}, "b": {"filter": 4.0, "per_step": 9.0}}
+    (tmp_path / "s").mkdir()
+    for name in seconds:
+        (tmp_path / "s" / f"{name}.npz").touch()
+    monkeypatch.setattr(studies, "read_metadata", lambda path: {"seconds": seconds[path.stem]})
+    assert studies.measure_cost("s", tmp_path) == 7.0
+    assert studies.measure_cost("none", tmp_path) == 0.0

@@ -1,0 +1,100 @@
+"""Run all published studies, cheapest first: `make studies`.
+
+Each study is a sweep that resumes: finished jobs are skipped, so the command can be stopped and repeated. Progress
+is printed per study. `docs/study_costs.json` has the computing time of each study in seconds on one core: measured
+from its results where it has run, else estimated from the times per step of its published report.
+
+    python docs/run_studies.py                 all studies
+    python docs/run_studies.py --hours=2       only studies that end within 2 hours of computing time
+    python docs/run_studies.py paper_003       these studies
+    python docs/run_studies.py --list          the plan, without a run
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pfbench.results.store import read_metadata
+
+TOP = Path(__file__).parents[1]
+COSTS = TOP / "docs" / "study_costs.json"
+_PARTS = ("world", "pcrb", "scores", "filter")  # of the seconds of a job
+
+
+def list_studies() -> list[str]:
+    """List the published studies that are experiments in YAML."""
+    studies = {path.parent.name for path in (TOP / "reports").glob("*/report.md")}
+    names = {path.stem for path in (TOP / "experiments").glob("*.yaml")}
+    return sorted(names & (studies | set(read_costs())))
+
+
+def read_costs() -> dict[str, float]:
+    """Read the computing time of each study, s."""
+    return dict(json.loads(COSTS.read_text()))
+
+
+def measure_cost(study: str, results: Path) -> float:
+    """Sum the computing time of the jobs of a study, s; 0 without results.
+
+    Args:
+        study: Name of the study.
+        results: Folder of all studies.
+    """
+    metas = (read_metadata(path) for path in sorted((results / study).glob("*.npz")))
+    return float(sum(meta["seconds"].get(part, 0.0) for meta in metas for part in _PARTS))
+
+
+def plan_studies(
+    studies: Sequence[str], costs: Mapping[str, float], hours: float = float("inf")
+) -> list[str]:
+    """Order studies by computing time, and leave out those that exceed a limit together.
+
+    Args:
+        studies: Names.
+        costs: Computing time of each study, s. A study without one comes last.
+        hours: Limit of the sum, h.
+    """
+    plan, total = [], 0.0
+    for study in sorted(studies, key=lambda name: (costs.get(name, float("inf")), name)):
+        total += costs.get(study, 0.0)
+        if total <= 3600 * hours:
+            plan.append(study)
+    return plan
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the planned studies and return 1 if one of them failed."""
+    costs = read_costs()
+    hours = [float(word.partition("=")[2]) for word in words if word.startswith("--hours=")]
+    names = [word for word in words if not word.startswith("--")]
+    plan = plan_studies(names or list_studies(), costs, *hours)
+    rest = sum(costs.get(study, 0.0) for study in plan)
+    print(f"{len(plan)} studies, {rest / 3600:.1f} h of computing time on one core")
+    if "--list" in words:
+        print("\n".join(f"{costs.get(study, float('nan')):8.0f} s  {study}" for study in plan))
+        return 0
+    results = TOP / os.environ.get("PFBENCH_RESULTS", "results")
+    failed = []
+    for number, study in enumerate(plan, start=1):
+        print(f"[{number}/{len(plan)}] {study}, {rest / 3600:.1f} h left", flush=True)
+        start = time.monotonic()
+        command = [sys.executable, "-m", "pfbench", "run", "-m", f"+experiment={study}"]
+        code = subprocess.run(command, cwd=TOP, check=False).returncode
+        rest -= costs.get(study, 0.0)
+        failed += [study] if code else []
+        if code == 0:
+            costs[study] = round(measure_cost(study, results), 1)
+            COSTS.write_text(json.dumps(dict(sorted(costs.items())), indent=1) + "\n")
+        print(f"[{number}/{len(plan)}] {study}: exit code {code}, {time.monotonic() - start:.0f} s")
+    print(f"failed: {', '.join(failed)}" if failed else "all studies finished")
+    return int(bool(failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
