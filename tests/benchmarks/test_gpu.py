@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,7 @@ def test_the_whole_of_it_runs_on_the_cpu(monkeypatch: pytest.MonkeyPatch, tmp_pa
         str(tmp_path),
     ]
     monkeypatch.setattr(sys, "argv", words)
+    monkeypatch.setattr(gpu, "copy_rate", partial(gpu.copy_rate, rounds=1, copies=1))
     with pytest.raises(SystemExit) as end:
         gpu.main()
     assert end.value.code == 0

@@ -303,7 +303,7 @@ print("kibibytes", process_memory.peak_memory() // 1024)  # not getrusage's: tha
     not Path("/proc/self/statm").exists(), reason="memory is read as Linux tells it"
 )
 def test_a_process_never_holds_the_clouds_of_all_steps(tmp_path: Path) -> None:
-    runs, particles, steps = 80, 1000, 600
+    runs, particles, steps = 80, 1000, 400
     words = (
         "run",
         "scenario=linear_walk",
@@ -320,5 +320,5 @@ def test_a_process_never_holds_the_clouds_of_all_steps(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     held = 1024 * int(done.stdout.rpartition("kibibytes")[2])
     clouds = 8 * 2 * runs * particles * steps
-    assert clouds > 0.7e9
-    assert held < 0.8e9  # the libraries alone hold some 0.35e9
+    assert clouds > 0.5e9
+    assert held < 0.73e9  # 0.59e9, with them 0.89e9

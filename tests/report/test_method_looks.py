@@ -118,6 +118,7 @@ def test_baselines_exist_and_give_the_planned_pairs() -> None:
     assert ("mcmc_rpf", "sir") in pairs
     assert ("cofm_amssrcpf", "fmcpf") in pairs
     assert len(pairs) == 17
+    assert plan_installed_pairs(["mcmc_rpf", "sir"]) == [("mcmc_rpf", "sir")]  # rpf did not run
 
 
 def test_a_guide_filter_and_a_variant_do_not_hand_on_their_block() -> None:
