@@ -1,8 +1,9 @@
 """Reduce the generated reports to the files that git stores: `python docs/publish_reports.py`.
 
-Git stores report.md, verdicts.json and one figure of each study. The command copies this figure to
-`headline.svg` (or .png) and removes the references to all other figures from report.md.
-`make report` runs it after the reports. A second run changes nothing.
+Git stores report.md, one figure (`headline.svg` or .png) and the numbers of each report. The command draws
+the figure of a study from the data of its page. For other reports it copies a figure and removes
+the references to all others from report.md. `make report` runs it after the reports. A second run
+changes nothing.
 """
 
 from __future__ import annotations
@@ -11,44 +12,37 @@ import re
 from pathlib import Path
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.journal.headline import HEADLINE, render_headline
+from pfbench.report.stored_page import PAGE_DATA, read_page_data, write_page_data
+from pfbench.report.study_page import write_markdown
 
 REPORTS = Path(__file__).parents[1] / "reports"
 
-# Figure of each study, relative to its folder and without suffix.
+# Figure of each report that is not of a study, relative to its folder and without suffix.
 HEADLINES = {
-    "all_seven": "figures/all_proposed_main_group",
     "claims": "figures/claims_printed_ratios",
     "learn_canyon_noise": "scores",
     "learn_data_efficiency": "data_efficiency",
     "learn_noise_calibration": "calibration_location",
     "learn_quad_noise": "flights",
-    "learned_azimuth": "figures/azimuth_nominal_sins_gps_azimuth_front",
-    "learned_passive": "figures/passive_1_nominal_passive_location_front",
-    "paper_000": "figures/paper_000-3_sar_flight_nominal_sins_sar_position",
-    "paper_000_growth": "figures/growth_nominal_growth_rmse",
-    "paper_000_linear": "figures/linear_walk_nominal_linear_walk_error_state__m",
-    "paper_001": "figures/paper_001-2",
-    "paper_002": "figures/paper_002-12_anshun_fit_paper_burst_sins_gnss_tight_position",
-    "paper_002_bound": "figures/anshun_fit_q_and_r_sins_gnss_tight_rmse",
-    "paper_002_entropy": "figures/anshun_fit_paper_burst_sins_gnss_tight_error_position",
-    "paper_002_fading": "figures/anshun_fit_nominal_sins_gnss_tight_rmse",
-    "paper_002_nonlinear": "figures/anshun_nl_nominal_sins_gnss_tight_nl_rmse",
-    "paper_002_rules": "figures/paper_002-10_anshun_fit_nominal_sins_gnss_tight_position",
-    "paper_003": "figures/paper_003-5_azimuth_fixed_nominal_sins_gps_azimuth_position",
-    "paper_003_biases": "figures/azimuth_fixed_nominal_sins_gps_azimuth_rmse",
-    "paper_003_fast": "figures/paper_003-3_azimuth_fixed_nominal_sins_gps_azimuth_attitude",
-    "paper_003_particles": "figures/azimuth_fixed_nominal_sins_gps_azimuth_rmse",
-    "paper_003_states": "figures/paper_003-3_azimuth_fixed_nominal_sins_gps_azimuth15_attitude",
-    "paper_004": "figures/paper_004-4_gps_ins_nominal_ins_gnss_inflated_position",
-    "paper_004_alone": "figures/paper_004-before_gps_ins_outage_ins_gnss_inflated_position",
-    "paper_004_escape": "figures/gps_ins_nominal_ins_gnss_inflated_rmse",
-    "paper_004_iterations": "figures/gps_ins_nominal_ins_gnss_inflated_iterations",
-    "paper_004_start": "figures/gps_ins_nominal_ins_gnss_inflated_rmse",
-    "recorded_car": "figures/car_drive_nominal_strapdown_total_rmse",
-    "recorded_quad": "figures/quad_flights_nominal_strapdown_total_rmse",
 }
+CAPTION = "Error of each filter relative to the baseline"
 
 _IMAGE = re.compile(r"^!\[([^\]]*)\]\(([^)]+)\)\n+(\*[^*\n].*\*\n+)?", re.MULTILINE)
+
+
+def publish_study(folder: Path) -> None:
+    """Draw the headline figure of a study, and show it in report.md.
+
+    Args:
+        folder: Folder of the report, with the data of its page.
+    """
+    pack = {**read_page_data(folder), "headline": CAPTION}
+    with RecordedFolder(folder, is_complete=False) as target:
+        target.remove("headline.png")
+        target.write(HEADLINE, render_headline(pack))
+        write_page_data(pack, target)
+        write_markdown(pack, target)
 
 
 def publish_report(folder: Path) -> None:
@@ -90,7 +84,7 @@ def reduce_markdown(text: str, folder: Path, stem: str) -> str:
 
     text = _IMAGE.sub(replace, text)
     text = re.sub(
-        r"\[(?:figure of )?([^\]]*)\]\((\.\./\w+)/(?:index|details)\.html[^)]*\)",
+        r"\[(?:figure of )?([^\]]*)\]\((\.\./\w+)/index\.html[^)]*\)",
         r"[\1](\2/report.md)",
         text,
     )
@@ -115,6 +109,8 @@ def main() -> None:
     for page in sorted(REPORTS.glob("*/report.md")):
         if page.parent.name in HEADLINES:
             publish_report(page.parent)
+        elif (page.parent / PAGE_DATA).is_file():
+            publish_study(page.parent)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,8 @@ import pytest
 from checkout import ROOT
 
 REPORT_FILE = re.compile(
-    r"reports/(README\.md|\w+/(report\.md|verdicts\.json(\.gz)?|runs\.parquet|headline\.(png|svg)))"
+    r"reports/(README\.md|\w+/(report\.md|verdicts\.(json(\.gz)?|csv)|runs\.parquet|page\.json\.gz"
+    r"|headline\.(png|svg)))"
 )
 
 
@@ -43,7 +44,7 @@ def test_git_stores_only_the_published_files_of_a_report() -> None:
     stored = [name for name in list_git_files() if name.startswith("reports/")]
     assert [name for name in stored if not REPORT_FILE.fullmatch(name)] == []
     studies = {name.split("/")[1] for name in stored} - {"README.md"}
-    assert studies == set(load("publish_reports").HEADLINES)
+    assert studies > set(load("publish_reports").HEADLINES)
     for study in studies:
         figures = [name for name in stored if name.startswith(f"reports/{study}/headline.")]
         assert len(figures) == 1, study

@@ -56,7 +56,8 @@ def report_study(words: Sequence[str]) -> None:
         raise ValueError(
             "study must be a study, got datasheets. Use: pfbench datasheet scenario=NAME"
         )
-    check_study_exists(study, Path(config.values["results_dir"]))
+    if not _find_page_data(config):
+        check_study_exists(study, Path(config.values["results_dir"]))
     print(f"report: {_write_page(config).resolve()}")
 
 
@@ -99,17 +100,33 @@ def make_report_options(config: JobConfig) -> Any:
 
 
 def _write_page(config: JobConfig) -> Path:
-    """Write the report of one study."""
+    """Write the report of one study, from the stored data of its page if it has no results."""
     from pfbench.report.page import write_report
+    from pfbench.report.stored_page import rebuild_page
 
     values = config.values
+    if data := _find_page_data(config):
+        print(f"{values['study']}: without results, the page is made of {data}")
+        return rebuild_page(data.parent)
     return write_report(
         values["study"], values["results_dir"], values["reports_dir"], make_report_options(config)
     )
 
 
+def _find_page_data(config: JobConfig) -> Path | None:
+    """Return the stored data of the page of a study without results, if there are any."""
+    from pfbench.report.stored_page import PAGE_DATA
+
+    study = config.values["study"]
+    data = Path(config.values["reports_dir"]) / study / PAGE_DATA
+    has_results = any((Path(config.values["results_dir"]) / study).glob("*.npz"))
+    return None if has_results or not data.is_file() else data
+
+
 def _report_all(words: list[str]) -> None:
-    """Write the reports of all studies with results, and of the claims."""
+    """Write the reports of all studies with results or stored data, and of the claims."""
+    from pfbench.report.stored_page import PAGE_DATA, rebuild_page
+
     values = compose(words).values
     results, reports = Path(values["results_dir"]), Path(values["reports_dir"])
     studies = {path.parent.name for path in results.glob("*/*.npz")} - {"datasheets"}
@@ -126,6 +143,9 @@ def _report_all(words: list[str]) -> None:
             failed.append(study)
             print(f"{study}: failed: {format_error(error, words)}", file=sys.stderr)
     for study in sorted(published - studies):
+        if (reports / study / PAGE_DATA).is_file():
+            print(f"{study}: {rebuild_page(reports / study).resolve()}, of the stored data")
+            continue
         print(
             f"{study}: the published report is unchanged, since {results} holds no results. "
             f"Next: pfbench run -m +experiment={study}"

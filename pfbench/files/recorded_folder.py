@@ -104,17 +104,19 @@ class RecordedFolder:
             file.unlink()
 
     def _report_other_files(self) -> None:
-        """Warn about files that are not of the manifest."""
+        """Warn about files of no manifest. Folders with a manifest are those of other commands."""
         if self._renamed:
             log.warning(
                 "warning  %s: renamed before a new file of that name was written: %s",
                 self.path,
                 _list_names(self._renamed),
             )
+        nested = [manifest.parent for manifest in self.path.rglob(f"*/{MANIFEST}")]
         others = sorted(
             name
             for file in self.path.rglob("*")
             if (file.is_symlink() or file.is_file())
+            and not any(file.is_relative_to(folder) for folder in nested)
             and (name := file.relative_to(self.path).as_posix())
             not in (MANIFEST, *self._written, *self._previous)
             and name not in self._renamed

@@ -166,6 +166,9 @@ def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:
     Raises:
         ValueError: If a name in the node is not public or not trusted.
     """
+    if OmegaConf.is_dict(node) and PAPER in node:
+        node = copy.deepcopy(node)  # which keeps the full key for errors
+        node.pop(PAPER)
     is_config = OmegaConf.is_config(node)
     values = OmegaConf.to_container(node, resolve=True) if is_config else node
     bare = remove_all_blocks(values)
@@ -191,7 +194,4 @@ def instantiate_parts(
         The objects.
     """
     tree = OmegaConf.create({name: values[name] for name in names})
-    for node in tree.values():
-        if OmegaConf.is_dict(node):
-            node.pop(PAPER, None)
     return tuple(instantiate(tree[name], trusted) for name in names)

@@ -13,6 +13,7 @@ from pfbench.report.looks import study_looks
 from pfbench.report.options import ReportOptions
 from pfbench.report.plots.paper import paper_figures
 from pfbench.report.plots.plotting import line_styles
+from pfbench.report.stored_page import write_page_data
 from pfbench.report.study_files import write_study_files
 from pfbench.report.study_page import write_page
 from pfbench.results import store
@@ -35,7 +36,7 @@ def write_report(
     """Write the report of a study to `<out>/<study>/`.
 
     The folder contains the page (index.html, report.md) with its numbers (verdicts.csv, runs.parquet,
-    metrics.csv), decisions.json, consistency.json, pfbench.bib, and the figures of the papers. Equal
+    metrics.csv, page.json.gz), decisions.json, consistency.json, pfbench.bib, and the figures of the papers. Equal
     results give equal bytes. Files that an earlier report wrote are removed if this one does not write
     them and they are unchanged (manifest.json). Other files stay.
 
@@ -72,6 +73,7 @@ def write_report(
             "definitions": [(metric.name, metric.caption) for metric in METRICS],
         }
         _state_limits(pack, conditions)
+        write_page_data(pack, folder)
         return write_page(pack, folder)
 
 

@@ -70,6 +70,21 @@ def test_files_of_the_user_stay_and_are_named(
     assert "figures/b.svg, figures/photo.png, notes.txt and 1 more" in caplog.text
 
 
+def test_folders_of_other_commands_are_not_named(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(folder / "paper", {"paper.tex": "paper"})
+    (folder / "paper" / "mine.tex").write_text("mine")
+    (folder / "other").mkdir()
+    (folder / "other" / "mine.txt").write_text("mine")
+    write(folder, {"page.md": "new page"})
+    assert "removed: other/mine.txt" in caplog.text.replace("\n", " ")
+    assert "paper.tex" not in caplog.text
+    caplog.clear()
+    write(folder / "paper", {"paper.tex": "paper"})
+    assert "removed: mine.tex" in caplog.text
+
+
 def test_a_file_in_the_way_is_renamed(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     (folder / "page.md").write_text("page, changed by hand")
     (folder / "new.md").write_text("not of the manifest")

@@ -48,7 +48,14 @@ def report(results, tmp_path_factory):
 def test_every_file_is_there_and_offered_by_the_page(report):
     files = {path.relative_to(report).as_posix() for path in report.rglob("*") if path.is_file()}
     numbers = {"verdicts.csv", "runs.parquet", "metrics.csv", "decisions.json", "consistency.json"}
-    assert files == {"index.html", "report.md", "manifest.json", "pfbench.bib", *numbers}
+    assert files == {
+        "index.html",
+        "report.md",
+        "manifest.json",
+        "page.json.gz",
+        "pfbench.bib",
+        *numbers,
+    }
     html = (report / "index.html").read_text()
     for name in sorted(numbers | {"pfbench.bib"}):
         assert f'<a href="{name}" download>' in html

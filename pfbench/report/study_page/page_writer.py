@@ -48,7 +48,7 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
         "pack": pack,
         "opening": describe_opening(pack),
         "planned": describe_pairs(pack),
-        "level": f"{100 * (1 - pack['alpha']):g}",
+        "level": _format_level(pack),
         "methods": [text for text in pack["methods_paragraph"].split("\n\n") if text.strip()],
         "files": _group_files(pack["downloads"]),
         "sections": [
@@ -70,9 +70,30 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
     script_data = {key: value for key, value in pack.items() if key not in _STATIC}
     data = encode_pack(script_data, PAGE_BYTES - len(html.render(context).encode()))
     folder.write("index.html", html.render({**context, "data": Markup(data)}))
-    markdown = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
-    folder.write("report.md", markdown.render(context))
+    write_markdown(pack, folder)
     return folder.path / "index.html"
+
+
+def write_markdown(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
+    """Write report.md of a study, one screen.
+
+    Args:
+        pack: Data of the page. `headline` names the figure headline.svg of a published study.
+        folder: Target folder.
+    """
+    context = {
+        "pack": {"headline": "", "failures": (), **pack},
+        "opening": describe_opening(pack),
+        "planned": describe_pairs(pack),
+        "level": _format_level(pack),
+    }
+    template = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
+    folder.write("report.md", template.render(context))
+
+
+def _format_level(pack: Mapping[str, Any]) -> str:
+    """Return the level of intervals in percent."""
+    return f"{100 * (1 - pack['alpha']):g}"
 
 
 def _read_script(name: str) -> str:

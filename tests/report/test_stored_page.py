@@ -1,0 +1,62 @@
+"""Published studies: their figure, and their page without results."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shutil
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import synthetic_results as synthetic
+from checkout import ROOT
+from command_line import pfbench
+
+from pfbench.report.page import write_report
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Report of a study of invented results."""
+    home = tmp_path_factory.mktemp("home")
+    synthetic.study(home / "results" / "demo", runs=12, steps=10)
+    return write_report("demo", home / "results", home / "reports").parent
+
+
+def test_a_study_is_published_from_the_data_of_its_page(study: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(study, tmp_path / "demo"))
+    publish_study = runpy.run_path(str(ROOT / "docs" / "publish_reports.py"))["publish_study"]
+    publish_study(folder)
+    first = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    text = (folder / "report.md").read_text()
+    assert "](headline.svg)" in text
+    drawing = (folder / "headline.svg").read_text()
+    rows = pd.read_csv(folder / "verdicts.csv").query(
+        "metric == 'rmse' and world == 'all' and regime == 'all'"
+    )
+    rows = rows[rows["baseline"] == rows["baseline"].iloc[0]]
+    assert len(rows) == 4
+    for ratio in rows["ratio"]:
+        assert f">{ratio:.2f}<" in drawing
+    publish_study(folder)
+    assert first == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_page_is_made_again_without_results(study: Path, tmp_path: Path) -> None:
+    """As from a fresh clone: git stores some files only."""
+    folder = tmp_path / "reports" / "demo"
+    folder.mkdir(parents=True)
+    for name in ("report.md", "runs.parquet", "verdicts.csv", "page.json.gz"):
+        shutil.copy(study / name, folder)
+    text = (folder / "report.md").read_bytes()
+    printed = pfbench("report", "study=demo", home=tmp_path)
+    assert printed.code == 0, printed.err
+    assert "without results" in printed.out
+    assert (folder / "report.md").read_bytes() == text
+    links = re.findall(r'href="([^#"]+)" download', (folder / "index.html").read_text())
+    assert links == ["verdicts.csv", "runs.parquet"]
+    (folder / "page.json.gz").write_bytes((study / "page.json.gz").read_bytes()[:-9])
+    damaged = pfbench("report", "study=demo", home=tmp_path)
+    assert damaged.code == 1
+    assert "page.json.gz must be the data of a page" in damaged.err
