@@ -50,13 +50,13 @@ def test_a_page_is_made_again_without_results(study: Path, tmp_path: Path) -> No
     for name in ("report.md", "runs.parquet", "verdicts.csv", "page.json.gz"):
         shutil.copy(study / name, folder)
     text = (folder / "report.md").read_bytes()
-    printed = pfbench("report", "study=demo", home=tmp_path)
+    printed = pfbench("report", "study=demo", f"reports_dir={tmp_path}/reports", home=tmp_path)
     assert printed.code == 0, printed.err
     assert "without results" in printed.out
     assert (folder / "report.md").read_bytes() == text
     links = re.findall(r'href="([^#"]+)" download', (folder / "index.html").read_text())
     assert links == ["verdicts.csv", "runs.parquet"]
     (folder / "page.json.gz").write_bytes((study / "page.json.gz").read_bytes()[:-9])
-    damaged = pfbench("report", "study=demo", home=tmp_path)
+    damaged = pfbench("report", "study=demo", f"reports_dir={tmp_path}/reports", home=tmp_path)
     assert damaged.code == 1
     assert "page.json.gz must be the data of a page" in damaged.err
