@@ -100,7 +100,7 @@ def make_report_options(config: JobConfig) -> Any:
 
 
 def _write_page(config: JobConfig) -> Path:
-    """Write the report of one study, from the stored data of its page if it has no results."""
+    """Write the report of one study, or make its page of the stored data where the results are missing."""
     from pfbench.report.page import write_report
     from pfbench.report.stored_page import rebuild_page
 
@@ -125,8 +125,6 @@ def _find_page_data(config: JobConfig) -> Path | None:
 
 def _report_all(words: list[str]) -> None:
     """Write the reports of all studies with results or stored data, and of the claims."""
-    from pfbench.report.stored_page import PAGE_DATA, rebuild_page
-
     values = compose(words).values
     results, reports = Path(values["results_dir"]), Path(values["reports_dir"])
     studies = {path.parent.name for path in results.glob("*/*.npz")} - {"datasheets"}
@@ -143,13 +141,7 @@ def _report_all(words: list[str]) -> None:
             failed.append(study)
             print(f"{study}: failed: {format_error(error, words)}", file=sys.stderr)
     for study in sorted(published - studies):
-        if (reports / study / PAGE_DATA).is_file():
-            print(f"{study}: {rebuild_page(reports / study).resolve()}, of the stored data")
-            continue
-        print(
-            f"{study}: the published report is unchanged, since {results} holds no results. "
-            f"Next: pfbench run -m +experiment={study}"
-        )
+        print(_renew_published(study, reports / study, results))
     required = _claimed_studies()
     if "claims" not in page_names:
         required &= published
@@ -162,6 +154,18 @@ def _report_all(words: list[str]) -> None:
             f"all {len(studies)} reports must be written, got {len(failed)} failures: "
             f"{', '.join(failed)}. The messages above give the reasons."
         )
+
+
+def _renew_published(study: str, folder: Path, results: Path) -> str:
+    """Make the page of a published study of its stored data; return a line for the user."""
+    from pfbench.report.stored_page import PAGE_DATA, rebuild_page
+
+    if (folder / PAGE_DATA).is_file():
+        return f"{study}: {rebuild_page(folder).resolve()}, of the stored data"
+    return (
+        f"{study}: the published report is unchanged, since {results} holds no results. "
+        f"Next: pfbench run -m +experiment={study}"
+    )
 
 
 def _claimed_studies() -> set[str]:
