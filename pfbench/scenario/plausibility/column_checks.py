@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pfbench.nav.plausible_limits import COLUMNS, Quantity
-
-if TYPE_CHECKING:
-    from pfbench.scenario.recorded.log_tables import LogTable
+from pfbench.scenario.plausibility.log_table import LogTable
 
 Array = NDArray[np.float64]
 

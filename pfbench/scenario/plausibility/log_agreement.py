@@ -18,7 +18,8 @@ from pfbench.core import quaternion
 from pfbench.nav import attitude
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.nav.preintegration import preintegrate
-from pfbench.scenario.recorded.log_tables import Array, LogTable
+from pfbench.scenario.plausibility.log_table import LogTable
+from pfbench.scenario.recorded.log_tables import Array
 from pfbench.scenario.recorded.navigation_log import GnssLog, ImuLog, ReferenceLog
 from pfbench.scenario.recorded.time_grid import interpolate, split_samples
 

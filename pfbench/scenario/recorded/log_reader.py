@@ -32,6 +32,7 @@ from pfbench.scenario.plausibility.log_agreement import (
     compare_reference,
     compare_times,
 )
+from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.recorded.log_checks import (
     STANDARD_GRAVITY,
     check_force,
@@ -40,7 +41,6 @@ from pfbench.scenario.recorded.log_checks import (
 )
 from pfbench.scenario.recorded.log_tables import (
     Array,
-    LogTable,
     check_increasing,
     check_seconds,
     parse_numbers,

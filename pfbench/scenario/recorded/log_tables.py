@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from pfbench.files.table_file import read_table_file
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_range
+from pfbench.scenario.plausibility.log_table import LogTable
 
 Array = NDArray[np.float64]
 
@@ -46,34 +46,6 @@ def find_dataset(root: str | None, folder: str) -> Path:
 
 # largest satellite number of each system in its interface document; QZSS and SBAS count from 193 and 120, too
 _LARGEST_NUMBERS = {"G": 63, "R": 32, "E": 36, "C": 63, "J": 202, "I": 14, "S": 158}
-
-
-class LogTable(NamedTuple):
-    """Rows of a table file.
-
-    Attributes:
-        rows: Rows.
-        name: Name of the file, for messages.
-        lines: Whether messages count lines (CSV) instead of rows.
-        stated: Metadata of a Parquet file.
-        limits: Limits of the platform.
-        notes: Rows that the reader dropped.
-    """
-
-    rows: pd.DataFrame
-    name: str
-    lines: bool
-    stated: dict[str, str]
-    limits: PlausibleLimits = PlausibleLimits()
-    notes: tuple[str, ...] = ()
-
-    def has(self, columns: Sequence[str]) -> bool:
-        """Return whether the table has all of these columns."""
-        return all(column in self.rows for column in columns)
-
-    def row(self, i: int) -> str:
-        """Describe the position of row i in the file."""
-        return f"line {i + 2}" if self.lines else f"row {i} (from 0)"
 
 
 def read_table(

@@ -13,9 +13,9 @@ import torch
 from pfbench.model.strapdown.tight import TightMemsInputs
 from pfbench.nav import earth
 from pfbench.nav.preintegration import PreintegratedImu
+from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.recorded.log_tables import (
     Array,
-    LogTable,
     parse_numbers,
     parse_satellites,
     read_table,

@@ -16,8 +16,8 @@ from pfbench.nav.motion_spline import MotionSpline, RecordedMotion
 from pfbench.nav.trajectory import TrajectoryData
 from pfbench.scenario.plausibility.column_checks import check_changes
 from pfbench.scenario.plausibility.log_agreement import compare_reference
+from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.recorded.log_tables import (
-    LogTable,
     find_dataset,
     parse_numbers,
     read_table,

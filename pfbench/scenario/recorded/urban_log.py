@@ -21,11 +21,11 @@ from pfbench.nav.gnss.orbits import azimuth_elevation
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_changes
 from pfbench.scenario.plausibility.log_agreement import compare_reference, compare_wheels
+from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.plausibility.satellite_agreement import check_orbits, compare_ranges
 from pfbench.scenario.recorded.assembly import encode_names
 from pfbench.scenario.recorded.log_tables import (
     Array,
-    LogTable,
     parse_numbers,
     parse_satellites,
     read_table,
