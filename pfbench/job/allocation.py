@@ -12,7 +12,7 @@ from pfbench.core.record import Episode
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import memory
 from pfbench.job.budget import BudgetAllocation, CostTrial, allocate_budget
-from pfbench.job.filter_pass import should_compile
+from pfbench.job.filter_pass import choose_engine
 from pfbench.job.plan import JobPlan
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder
 from pfbench.job.system_memory import GIB, memory_limit
@@ -120,9 +120,9 @@ def apply_budget(plan: JobPlan, episodes: EpisodeSource) -> tuple[JobPlan, Budge
         lambda method: plan.choose_run_batch(method, runs),
     )
     sir = ParticleFilter(values["particles"])
-    with compilation.use_compiled(
-        should_compile(values["engine"], sir, model, len(plan.runs) * steps)
-    ):
+    engine = "kernels" if values["engine"] == "auto" else values["engine"]
+    chosen = choose_engine(engine, sir, model, len(plan.runs), steps)
+    with compilation.use_compiled(chosen != "eager"):
         allocation = allocate_budget(values["budget"], plan.method, values["particles"], trial)
     log.info(
         "budget=%s: %d particles cost as much as %d of sir",

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import cache
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -25,11 +26,16 @@ from pfbench.job.system_memory import MemoryTrimmer, peak_above, start_peak_meas
 from pfbench.kernels import compilation
 from pfbench.kernels.cpp_library import is_library_loaded
 from pfbench.model.base import StateSpaceModel
+from pfbench.results import store
 
 log = logging.getLogger("pfbench")
 
-# in normal numbers: compiling costs seconds and saves 15 ms per million [measured]
-_COMPILE_FROM = 5e8
+# normal numbers of a job: on a CUDA device compiling costs seconds and saves 15 ms per million [measured]
+_CUDA_NUMBERS = 5e8
+# a compiled step saves this in place of C++ operators [measured: growth 8e-4 and 4e-8, 15 states 2e-8]
+_SAVED_PER_STEP = 8e-4  # s
+_SAVED_PER_PARTICLE = 2e-8  # s per particle and step
+_COMPILATION = 10.0  # s, of a kind of step that is not cached
 
 
 class TimedFilterPass(NamedTuple):
@@ -95,6 +101,8 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     """
     values, method, clock = plan.values, plan.method, plan.choose_timer()
     device, engine = values["device"], values["engine"]
+    if engine == "auto" and values["budget"] != store.SAME_N:
+        engine = "kernels"  # as the trials that gave the number of particles
     model, steps = plan.make_filter_model(episode), episode.record.y.shape[1]
     truth = model.assemble(episode.truth).to(device, plan.dtype)
     recorder = ScoreRecorder(model, truth, values["score_steps"], clock)
@@ -105,12 +113,12 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
             return recorder(t, info)
 
     compile_start = time.perf_counter()
-    uses_kernels = should_compile(engine, method, model, len(runs) * steps)
+    engine = choose_engine(engine, method, model, len(runs), steps)
     compile_seconds = time.perf_counter() - compile_start
-    step = _compile_step(engine, uses_kernels, method, counter, clock)
+    step = _compile_step(engine, method, counter, clock)
     baseline = start_peak_measurement(device)
     start_time = clock()
-    with compilation.use_compiled(uses_kernels):
+    with compilation.use_compiled(engine != "eager"):
         estimate = _filter_episode(plan, step or method, model, episode, runs, watch, label)
     step_compile_seconds = step.seconds if step else 0.0
     filter_seconds = clock() - start_time - recorder.seconds - step_compile_seconds
@@ -121,7 +129,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
         "per_step": filter_seconds / steps,
     }
     cost = {
-        "engine": "compiled" if step and step.is_active else "kernels" if uses_kernels else "eager",
+        "engine": "kernels" if engine == "compiled" and not (step and step.is_active) else engine,
         "memory": peak_above(baseline, device),
         "likelihoods_per_step": counter.count / (len(runs) * steps),
     }
@@ -159,40 +167,70 @@ def _filter_episode(
     return estimate
 
 
-def should_compile(engine: str, method: Any, model: StateSpaceModel, run_steps: int) -> bool:
-    """Decide whether the C++ operators are used, and load them.
+def choose_engine(
+    engine: str, method: Any, model: StateSpaceModel, runs: int, steps: int
+) -> Literal["eager", "kernels", "compiled"]:
+    """Choose how the steps of a job are executed, and load the C++ operators.
 
-    They are if the engine requires it, or if the job is large enough.
+    `auto` is decided by the size of the job alone, so that a job gives the same numbers on every machine.
+    On the CPU it takes the operators always, and compiles the step where that is predicted to save more
+    time than it takes. On a CUDA device it takes kernels for large jobs.
 
     Args:
-        engine: Engine of the job.
+        engine: Engine of the settings.
         method: Filter.
         model: Model of the filter.
-        run_steps: Number of runs times number of steps.
+        runs: Number of runs.
+        steps: Number of steps.
 
     Returns:
-        Whether they are used. False if they cannot be loaded.
+        The engine: `eager` if the operators cannot be loaded.
     """
-    numbers = 0
+    if engine == "eager":
+        return "eager"
+    if model.anchor.is_cuda:
+        if engine == "auto":
+            return (
+                "kernels"
+                if _count_numbers(method, model) * runs * steps >= _CUDA_NUMBERS
+                else "eager"
+            )
+    elif not is_library_loaded():
+        return "eager"
+    if engine != "auto":
+        return "compiled" if engine == "compiled" else "kernels"
+    saved = 0.0
+    if isinstance(method, ParticleFilter) and method.history is None:
+        saved = steps * (_SAVED_PER_STEP + _SAVED_PER_PARTICLE * runs * method.particles)
+    if saved < 1.5 * _COMPILATION:
+        _say_once("engine=auto: C++ operators")
+        return "kernels"
+    _say_once(f"engine=auto: the step is compiled, which saves about {saved:.0f} s")
+    return "compiled"
+
+
+@cache
+def _say_once(line: str) -> None:
+    """Log a line, once in a process."""
+    log.info(line)
+
+
+def _count_numbers(method: Any, model: StateSpaceModel) -> int:
+    """Return the normal numbers of a step of one run that cost as much as the step."""
     if isinstance(method, ParticleFilter):
-        numbers = run_steps * method.particles * model.noise_dim
-    elif isinstance(method, GaussianFilter):
-        # linear algebra costs as much as eight normal numbers per entry of a covariance
-        numbers = run_steps * 8 * model.chart.dimension**2
-    if engine == "eager" or (engine == "auto" and numbers < _COMPILE_FROM):
-        return False
-    return model.anchor.is_cuda or is_library_loaded()
+        return method.particles * model.noise_dim
+    # linear algebra costs as much as eight normal numbers per entry of a covariance
+    return 8 * model.chart.dimension**2 if isinstance(method, GaussianFilter) else 0
 
 
 def _compile_step(
     engine: str,
-    uses_kernels: bool,
     method: Any,
     counter: LikelihoodCounter,
     clock: Callable[[], float],
 ) -> CompiledParticleFilter | None:
     """Return the filter with its step compiled as a whole, if requested and possible."""
-    if engine != "compiled" or not uses_kernels:
+    if engine != "compiled":
         return None
     if not isinstance(method, ParticleFilter) or method.history is not None:
         reason = f"it is a {type(method).__name__}"

@@ -511,30 +511,34 @@ def test_a_compiled_job_gives_the_numbers_of_an_eager_one(tmp_path: Path, dtype:
         assert np.allclose(compiled[name], eager[name], rtol=tolerance, atol=tolerance), name
 
 
-def test_small_jobs_are_not_compiled_unless_asked() -> None:
-    model, method = linear_walk(1.0, 0.3, 1.0), ParticleFilter(100)
-    assert not filter_pass.should_compile("auto", method, model, 1000)
-    assert not filter_pass.should_compile("eager", method, model, 10**9)
-    assert not filter_pass.should_compile(
-        "auto",
-        gaussian_filter.GaussianFilter(
-            linearisation_rules.SigmaPointLinearisation(CubaturePoints())
-        ),
-        model,
-        10**6,
-    )
-
-
 @compiler
-def test_large_jobs_are_compiled_unasked() -> None:
+def test_auto_takes_the_operators_and_compiles_the_step_where_it_repays(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    model, small, large = linear_walk(1.0, 0.3, 1.0), ParticleFilter(100), ParticleFilter(10**6)
+    gaussian = gaussian_filter.GaussianFilter(
+        linearisation_rules.SigmaPointLinearisation(CubaturePoints())
+    )
+    filter_pass._say_once.cache_clear()
+    choose = filter_pass.choose_engine
+    for _ in range(2):
+        assert choose("auto", small, model, 1, 10) == "kernels"
+        assert choose("auto", large, model, 10, 100) == "compiled"
+    assert [record.getMessage() for record in caplog.records] == [
+        "engine=auto: C++ operators",
+        "engine=auto: the step is compiled, which saves about 20 s",
+    ]
+    assert choose("auto", gaussian, model, 10**4, 10**4) == "kernels"
+    for engine in ("eager", "kernels", "compiled"):
+        assert choose(engine, small, model, 1, 10) == engine
+
+
+def test_auto_runs_in_torch_operations_without_a_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filter_pass, "is_library_loaded", lambda: False)
     model = linear_walk(1.0, 0.3, 1.0)
-    for method in (
-        ParticleFilter(100),
-        gaussian_filter.GaussianFilter(
-            linearisation_rules.SigmaPointLinearisation(CubaturePoints())
-        ),
-    ):
-        assert filter_pass.should_compile("auto", method, model, 10**9)
+    for engine in ("auto", "kernels", "compiled"):
+        assert filter_pass.choose_engine(engine, ParticleFilter(100), model, 10, 10) == "eager"
 
 
 @compiler
