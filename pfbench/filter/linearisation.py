@@ -13,6 +13,7 @@ from torch.distributions import Distribution, Independent, MultivariateNormal, N
 from pfbench.core.density import has_finite_moments
 from pfbench.core.jacobian import jacobian
 from pfbench.core.record import Record
+from pfbench.filter.model_jacobians import find_observation_jacobian, find_propagation_jacobian
 from pfbench.kernels.compilation import is_capturing
 from pfbench.model.base import StateSpaceModel
 
@@ -147,6 +148,9 @@ def transition_jacobian(model: StateSpaceModel, x: Tensor, u: Any) -> Tensor:
     Returns:
         Jacobian, [R, N, d, d].
     """
+    stated = find_propagation_jacobian(model, x, u)
+    if stated is not None:
+        return stated
     chart = model.chart
 
     def propagate_increment(a: Tensor, xi: Tensor) -> Tensor:
@@ -170,7 +174,9 @@ def measurement_jacobian(model: StateSpaceModel, x: Tensor, record: Record) -> T
     def observe_increment(a: Tensor, xi: Tensor) -> Tensor:
         return linearised_mean(model.observation(model.chart.add(a, xi), record.u))
 
-    h = derivative(observe_increment, x, model.chart.dimension, model.residual)
+    h = find_observation_jacobian(model, x, record.u)
+    if h is None:
+        h = derivative(observe_increment, x, model.chart.dimension, model.residual)
     return torch.where(torch.isnan(record.y)[:, None, :, None], 0.0, h)
 
 

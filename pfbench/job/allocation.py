@@ -121,8 +121,8 @@ def apply_budget(plan: JobPlan, episodes: EpisodeSource) -> tuple[JobPlan, Budge
     )
     sir = ParticleFilter(values["particles"])
     engine = "kernels" if values["engine"] == "auto" else values["engine"]
-    chosen = choose_engine(engine, sir, model, len(plan.runs), steps)
-    with compilation.use_compiled(chosen != "eager"):
+    job_engine = choose_engine(engine, sir, model, len(plan.runs), steps)
+    with compilation.use_compiled(job_engine != "eager"):
         allocation = allocate_budget(values["budget"], plan.method, values["particles"], trial)
     log.info(
         "budget=%s: %d particles cost as much as %d of sir",

@@ -172,6 +172,25 @@ class InsGnss(InsErrorModel):
     def propagate(self, x: Tensor, u: LooseStep, w: Tensor) -> Tensor:
         return affine_map(u.phi, x, u.gain, w)
 
+    def propagation_jacobian(self, x: Tensor, u: LooseStep) -> Tensor:
+        """Return the transition matrix, [R or 1, 1, D, D].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        return u.phi.unsqueeze(1)
+
+    def observation_jacobian(self, x: Tensor, u: LooseStep) -> Tensor:
+        """Return the matrix that selects the measured components, [1, 1, k, D].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+        return eye[self.observed_indices][None, None]
+
     @override
     def noise_gain(self, u: LooseStep) -> Tensor:
         return u.gain

@@ -99,6 +99,24 @@ class LinearGaussian(StateSpaceModel):
     def observation(self, x: Tensor, u: Any) -> Distribution:
         return independent_normal(x @ self.h.mT, self.r)
 
+    def propagation_jacobian(self, x: Tensor, u: Any) -> Tensor:
+        """Return F, [1, 1, D, D].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        return self.f[None, None]
+
+    def observation_jacobian(self, x: Tensor, u: Any) -> Tensor:
+        """Return H, [1, 1, k, D].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        return self.h[None, None]
+
     @override
     def transition(self, x: Tensor, u: Any) -> Distribution | None:
         covariance = self.g @ self.g.mT

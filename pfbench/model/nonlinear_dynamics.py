@@ -75,6 +75,28 @@ class Pendulum(StateSpaceModel):
         )
         return self.chart.add(predicted_mean, w @ self.noise_root.mT)
 
+    def propagation_jacobian(self, x: Tensor, u: Any) -> Tensor:
+        """Return the derivative of the Euler step, [R, N, 2, 2].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        f = torch.eye(2, dtype=x.dtype, device=x.device).repeat(*x.shape[:2], 1, 1)
+        f[..., 0, 1] = self.step
+        f[..., 1, 0] = -9.81 * self.step * torch.cos(x[..., 0])
+        return f
+
+    def observation_jacobian(self, x: Tensor, u: Any) -> Tensor:
+        """Return the derivative of sin(angle), [R, N, 1, 2].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        slope = torch.cos(x[..., :1])
+        return torch.cat([slope, torch.zeros_like(slope)], -1).unsqueeze(-2)
+
     @override
     def noise_gain(self, u: Any) -> Tensor:
         return self.noise_root.unsqueeze(0)
@@ -134,6 +156,37 @@ class Lorenz63(StateSpaceModel):
         k3 = self.drift(x + 0.5 * h * k2)
         k4 = self.drift(x + h * k3)
         return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4) + self.q * w
+
+    def drift_jacobian(self, x: Tensor) -> Tensor:
+        """Compute the derivative of `drift`, [..., 3, 3]."""
+        a, b, c = x.unbind(-1)
+        unit, zero = torch.ones_like(a), torch.zeros_like(a)
+        rows = (-10.0 * unit, 10.0 * unit, zero, 28.0 - c, -unit, -a, b, a, -8.0 / 3.0 * unit)
+        return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+    def propagation_jacobian(self, x: Tensor, u: Any) -> Tensor:
+        """Return the derivative of the Runge-Kutta step, [R, N, 3, 3].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        eye, h = torch.eye(3, dtype=x.dtype, device=x.device), self.step
+        total, slope, rate = torch.zeros_like(eye), torch.zeros_like(eye), torch.zeros_like(x)
+        for weight, length in ((1.0, 0.0), (2.0, 0.5), (2.0, 0.5), (1.0, 1.0)):
+            at = x + length * h * rate
+            slope = self.drift_jacobian(at) @ (eye + length * h * slope)
+            rate, total = self.drift(at), total + weight * slope
+        return eye + h / 6.0 * total
+
+    def observation_jacobian(self, x: Tensor, u: Any) -> Tensor:
+        """Return the unit matrix, [1, 1, 3, 3].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        return torch.eye(3, dtype=x.dtype, device=x.device)[None, None]
 
     @override
     def noise_gain(self, u: Any) -> Tensor:

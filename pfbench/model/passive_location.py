@@ -116,6 +116,15 @@ class PassiveLocation(StateSpaceModel):
     def propagate(self, x: Tensor, u: PlatformInputs, w: Tensor) -> Tensor:
         return x @ self.phi.mT + w @ self.gain.mT
 
+    def propagation_jacobian(self, x: Tensor, u: PlatformInputs) -> Tensor:
+        """Return the transition matrix, [1, 1, 4, 4].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        return self.phi[None, None]
+
     @override
     def noise_gain(self, u: PlatformInputs) -> Tensor:
         return self.gain.unsqueeze(0)

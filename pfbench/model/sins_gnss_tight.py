@@ -177,6 +177,15 @@ class SinsGnssTight(InsErrorModel):
         phi[:, 15, 16] = u.duration
         return phi
 
+    def propagation_jacobian(self, x: Tensor, u: TightStep) -> Tensor:
+        """Return the transition matrix, [R or 1, 1, 17, 17].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        return self.transition_matrix(u).unsqueeze(1)
+
     @override
     def noise_gain(self, u: TightStep) -> Tensor:
         gain = u.gain.new_zeros(u.gain.shape[0], 17, self.noise_dim)

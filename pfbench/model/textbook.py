@@ -79,6 +79,25 @@ class UnivariateGrowth(StateSpaceModel):
             + self.q * w
         )
 
+    def propagation_jacobian(self, x: Tensor, u: TimeIndexInputs) -> Tensor:
+        """Return the derivative of the mean, [R, N, 1, 1].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        square = x * x
+        return (0.5 + 25.0 * (1.0 - square) / (1.0 + square) ** 2).unsqueeze(-1)
+
+    def observation_jacobian(self, x: Tensor, u: TimeIndexInputs) -> Tensor:
+        """Return x / 10, [R, N, 1, 1].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        return 0.1 * x.unsqueeze(-1)
+
     @override
     def noise_gain(self, u: TimeIndexInputs) -> Tensor:
         return self.q.reshape(1, 1, 1)
@@ -135,6 +154,15 @@ class StochasticVolatility(StateSpaceModel):
     @override
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
         return self.mu + self.rho * (x - self.mu) + self.sigma * w
+
+    def propagation_jacobian(self, x: Tensor, u: Any) -> Tensor:
+        """Return rho, [1, 1, 1, 1].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        return self.rho.reshape(1, 1, 1, 1)
 
     @override
     def noise_gain(self, u: Any) -> Tensor:

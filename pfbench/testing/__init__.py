@@ -20,6 +20,7 @@ __all__ = [
     "check_evidence",
     "check_filter",
     "check_independence",
+    "check_jacobians",
     "check_move",
     "check_proposal",
     "check_resampling",
@@ -42,6 +43,7 @@ __getattr__, __dir__ = lazy_attributes(
             "check_independence",
             "filter_record",
         ),
+        "jacobians": ("check_jacobians",),
         "moves": (
             "PathPosterior",
             "check_move",

@@ -36,6 +36,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     LinearisationRule,
 )
 from pfbench.filter.linearisation import check_moments, compute_additive_gain
+from pfbench.filter.model_jacobians import find_propagation_jacobian
 from pfbench.model.base import StateSpaceModel, initial_law
 
 Fit = TypeVar("Fit", Innovation, AffineApproximation)
@@ -165,7 +166,7 @@ class GaussianFilter:
             return model.chart.add(prior.unsqueeze(1), xi @ root.mT)
 
         innovation = compute_innovation(
-            self.linearisation, model, state_at, prior, record
+            self.linearisation, model, state_at, prior, record, root
         )._replace(root=root)
         innovation, memory, trace = adapt_innovation(
             self.noise_adaptations, self.gain_adaptations, innovation, belief
@@ -207,7 +208,13 @@ class GaussianFilter:
             x = model.propagate(x, u, noise.mean.expand(*x.shape[:2], -1))
             return x, (noise_root @ noise_root.mT).unsqueeze(1)
 
-        space = DifferenceSpace(chart.subtract, chart.mean)
+        def slope() -> Tensor | None:
+            if gain is None:
+                return None
+            f = find_propagation_jacobian(model, belief.mean.unsqueeze(1), u)
+            return None if f is None else f[:, 0] @ root
+
+        space = DifferenceSpace(chart.subtract, chart.mean, slope)
         return self.linearisation(propagate_points, belief.mean, d + inner, space), ok
 
     def _update(

@@ -18,6 +18,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     around_first,
 )
 from pfbench.filter.linearisation import check_moments
+from pfbench.filter.model_jacobians import find_observation_jacobian
 from pfbench.model.base import StateSpaceModel
 
 _SMALLEST_WEIGHT = 1e-12  # of a reweighted component: R times 1e12
@@ -162,6 +163,7 @@ def compute_innovation(
     state_at: Callable[[Tensor], Tensor],
     template: Tensor,
     record: Record,
+    root: Tensor | None = None,
 ) -> Innovation:
     """Compute the innovation by statistical linearisation.
 
@@ -171,6 +173,7 @@ def compute_innovation(
         state_at: Map of whitened coordinates xi [R, P, d] to states [R, P, D].
         template: Tensor of the runs and dtype, [R, ...].
         record: Measurement and inputs of the step.
+        root: Derivative of the state in xi at 0, [R, d, d]. None if it is not known.
 
     Returns:
         The innovation, without the root of the predicted covariance.
@@ -181,7 +184,14 @@ def compute_innovation(
         check_moments(model, "observation", distribution)
         return distribution.mean, shared_distribution_covariance(distribution)
 
-    space = DifferenceSpace(model.residual, around_first(model.residual))
+    def slope() -> Tensor | None:
+        if root is None:
+            return None
+        x = state_at(root.new_zeros(len(template), 1, root.shape[-1]))
+        h = find_observation_jacobian(model, x, record.u)
+        return None if h is None else h[:, 0] @ root
+
+    space = DifferenceSpace(model.residual, around_first(model.residual), slope)
     y_hat, m, omega, noise = linearisation(observe_points, template, model.chart.dimension, space)
     observed_mask = ~torch.isnan(record.y)
     r = torch.where(observed_mask, model.residual(record.y, y_hat), 0.0)
@@ -220,6 +230,7 @@ def linearise_about_posterior(
         whitened = shift.unsqueeze(1) + xi @ updated.mT
         return model.chart.add(mean.unsqueeze(1), whitened @ root.mT)
 
-    new = compute_innovation(linearisation, model, state_at, mean, record)
+    slope = root @ updated if model.chart.flat else None  # else the chart bends away from the mean
+    new = compute_innovation(linearisation, model, state_at, mean, record, slope)
     m = torch.linalg.solve_triangular(updated, new.m, upper=True, left=False)
     return new._replace(m=m, r=new.r + (m @ shift.unsqueeze(-1)).squeeze(-1), root=root)

@@ -25,15 +25,17 @@ Map: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 class DifferenceSpace(NamedTuple):
-    """Difference and average of the values of a map.
+    """Difference and average of the values of a map, and its slope if the model states it.
 
     Attributes:
         subtract: (y, y0) -> difference.
         mean: (y [R, P, k], w [R, P]) -> weighted average [R, k].
+        slope: Returns the derivative at xi = 0, [R, k, d], or None if it is not stated.
     """
 
     subtract: Callable[[Tensor, Tensor], Tensor]
     mean: Callable[[Tensor, Tensor], Tensor]
+    slope: Callable[[], Tensor | None] = lambda: None
 
 
 def around_first(
@@ -92,9 +94,10 @@ class TaylorLinearisation(LinearisationRule):
     ) -> AffineApproximation:
         y, covariance = f(template.new_zeros(template.shape[0], 1, d))
         noise = covariance[:, 0].expand(template.shape[0], -1, -1)
-        return AffineApproximation(
-            y[:, 0], jacobian(lambda xi: f(xi)[0], y, d, space.subtract), noise, noise
-        )
+        m = space.slope()
+        if m is None:
+            m = jacobian(lambda xi: f(xi)[0], y, d, space.subtract)
+        return AffineApproximation(y[:, 0], m, noise, noise)
 
 
 @dataclass(frozen=True)

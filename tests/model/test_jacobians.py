@@ -1,0 +1,91 @@
+"""Jacobians that models state: finite differences, the extended Kalman filter, and classes that override a map."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from config_cases import composed, world
+from torch import Tensor
+
+from pfbench import job
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
+from pfbench.filter.linearisation import measurement_jacobian, transition_jacobian
+from pfbench.filter.loop import prepare_record, run_filter
+from pfbench.filter.model_jacobians import find_observation_jacobian, find_propagation_jacobian
+from pfbench.model import Lorenz63, UnivariateGrowth
+from pfbench.noise import NominalNoise
+from pfbench.scenario import ModelSimulation
+from pfbench.testing import check_jacobians
+
+BOTH = {"propagation_jacobian", "observation_jacobian"}
+STATED = {
+    "growth": BOTH, "stochastic_volatility": {"propagation_jacobian"}, "pendulum": BOTH, "lorenz63": BOTH,
+    "linear_walk": BOTH, "passive_1": {"propagation_jacobian"}, "flight_300s": BOTH,
+    "anshun_short": {"propagation_jacobian"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_stated_jacobians_are_difference_quotients(name: str) -> None:
+    model: Any = job.instantiate(composed(f"scenario={name}").model)
+    record = prepare_record(model, world(name).record).at_step(1)
+    runs = len(record.y)
+    noise = PhiloxStream(5, torch.arange(runs)).normal("states", 4, model.chart.dimension)
+    x = model.chart.add(model.origin.expand(runs, 4, -1), 0.7 * model.initial(1).stddev * noise)
+    assert check_jacobians(model, x, record.u).keys() == STATED[name]
+    # the derivative by automatic differentiation, which shares nothing with the stated one
+    h = find_observation_jacobian(model, x, record.u)
+    f = find_propagation_jacobian(model, x, record.u)
+    assert f is not None
+    torch.testing.assert_close(transition_jacobian(model, x, record.u), f)
+    if h is not None:
+        missing = torch.isnan(record.y)[:, None, :, None]
+        expected = torch.where(missing, 0.0, h)
+        torch.testing.assert_close(measurement_jacobian(model, x, record), expected)
+
+
+class WrongGrowth(UnivariateGrowth):
+    """A model that states a wrong derivative."""
+
+    def observation_jacobian(self, x: Tensor, u: Any) -> Tensor:
+        return 0.1001 * x.unsqueeze(-1)
+
+
+class SlowLorenz(Lorenz63):
+    """A model whose maps are overridden without their Jacobians: derivatives are automatic."""
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return super().propagate(x, u, w)
+
+    def observation(self, x: Tensor, u: Any) -> Any:
+        return super().observation(x, u)
+
+
+def test_a_wrong_jacobian_and_a_missing_one_are_reported() -> None:
+    x = torch.linspace(-3.0, 3.0, 8, dtype=torch.float64).view(2, 4, 1)
+    model = WrongGrowth(3.0, 1.0, 1.4)
+    record = ModelSimulation(model, steps=2).draw(NominalNoise(), torch.arange(2), seed=1).record
+    u = prepare_record(model, record).at_step(1).u
+    with pytest.raises(AssertionError, match=r"WrongGrowth\.observation_jacobian must be"):
+        check_jacobians(model, x, u)
+    with pytest.raises(AssertionError, match="SlowLorenz must state a Jacobian, got none"):
+        check_jacobians(SlowLorenz(), x.expand(2, 4, 3), None)
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_a_filter_gives_the_same_with_stated_and_automatic_derivatives(iterations: int) -> None:
+    runs = torch.arange(3)
+    method = GaussianFilter(TaylorLinearisation(), iterations=iterations)
+    record = ModelSimulation(Lorenz63(), steps=20).draw(NominalNoise(), runs, seed=2).record
+    stated, automatic = (
+        run_filter(method, model, record, PhiloxStream(2, runs))
+        for model in (Lorenz63(), SlowLorenz())
+    )
+    for name in ("mean", "variance", "log_evidence"):
+        torch.testing.assert_close(
+            getattr(stated, name), getattr(automatic, name), rtol=1e-9, atol=1e-9
+        )
