@@ -32,6 +32,8 @@ def method_of(name: str) -> Any:
 
 DENSE = ("mcmc_bridge", "mcmc_rpf_printed", "mcmc_tail")
 
+BRANCHING = ("gpb1", "imm", "gaussian_sum")
+
 REMEMBERING = ("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf")
 
 
@@ -46,7 +48,8 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
         return "additive noise"
     if name == "rbpf" and not (model.linear or model.linear_given):
         return "no component that is linear given the rest"
-    if record.feedback is not None and (method_past(name) or name == "rbpf"):
+    is_single = not method_past(name) and name != "rbpf" and name not in BRANCHING
+    if record.feedback is not None and not is_single:
         return "scenario with feedback"
     return ""
 

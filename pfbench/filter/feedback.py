@@ -45,6 +45,11 @@ def apply_feedback(
                 "scenario.closed_loop=false."
             )
         return belief._replace(x=correct(belief.x)), info
+    if any(name.startswith("branch_") for name in belief.memory):
+        raise ValueError(
+            "filter must not have several hypotheses in a scenario with feedback, which corrects one "
+            "estimate. Choose another filter, or set scenario.closed_loop=false."
+        )
     chart, centre = model.chart, belief.mean.unsqueeze(1)
 
     def correct_increment(xi: Tensor) -> tuple[Tensor, Tensor]:

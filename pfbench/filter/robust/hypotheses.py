@@ -1,0 +1,204 @@
+"""Hypotheses on the noise, each with a factor on Q and on R, stepped together as further runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from pfbench.core.chart import Chart
+from pfbench.core.record import Record, map_inputs
+from pfbench.filter.belief import GaussianBelief
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.innovation import Innovation, NoiseAdaptation
+from pfbench.filter.gaussian.linearisation_rules import AffineApproximation, LinearisationRule
+from pfbench.filter.robust.scaled_noise import scale_process_noise
+from pfbench.model.base import StateSpaceModel
+
+_ROUNDING = 1e-9  # of the sum of a row
+
+
+@dataclass(frozen=True)
+class NoiseHypotheses:
+    """Hypotheses and the Markov chain of the one that holds.
+
+    Attributes:
+        process_factors: Factor on Q of each hypothesis, [M].
+        measurement_factors: Factor on R of each hypothesis, [M].
+        transition: Probability of hypothesis j after hypothesis i, M rows. With equal rows the
+            hypothesis of a step does not depend on the past, as for single outliers.
+
+    Raises:
+        ValueError: If lengths differ, a factor is not positive, a row is not a distribution, or
+            the chain has several stationary distributions.
+    """
+
+    process_factors: Sequence[float] = (1.0, 1.0)
+    measurement_factors: Sequence[float] = (1.0, 100.0)
+    transition: Sequence[Sequence[float]] = ((0.95, 0.05), (0.95, 0.05))
+
+    def __post_init__(self) -> None:
+        for name in ("process_factors", "measurement_factors"):
+            factors = getattr(self, name)
+            if len(factors) < 2 or not all(0.0 < f < float("inf") for f in factors):
+                raise ValueError(
+                    f"hypotheses.{name} must be at least two positive numbers, got {list(factors)}. "
+                    "Use 1 for the model's noise."
+                )
+        m = len(self.process_factors)
+        if len(self.measurement_factors) != m:
+            raise ValueError(
+                "hypotheses.measurement_factors must be as many as process_factors, got "
+                f"{len(self.measurement_factors)} and {m}. Give both for each hypothesis."
+            )
+        rows = [list(row) for row in self.transition]
+        is_square = len(rows) == m and all(len(row) == m for row in rows)
+        if not is_square or not all(_is_distribution(row) for row in rows):
+            raise ValueError(
+                f"hypotheses.transition must be {m} rows of {m} probabilities with sum 1, got "
+                f"{rows}. Correct the rows."
+            )
+        flow = np.array(rows) - np.eye(m)
+        if np.linalg.matrix_rank(flow, tol=_ROUNDING) < m - 1:
+            raise ValueError(
+                "hypotheses.transition must have one stationary distribution, got "
+                f"{rows}. Let each hypothesis be reached from the others."
+            )
+
+    def start_probabilities(self) -> list[float]:
+        """Return the stationary distribution, [M]."""
+        p = np.array(self.transition, dtype=float)
+        m = len(p)
+        system = np.concatenate([p.T - np.eye(m), np.ones((1, m))])
+        stationary = np.linalg.lstsq(system, np.eye(m + 1)[m], rcond=None)[0].clip(min=0.0)
+        return (stationary / stationary.sum()).tolist()
+
+
+def _is_distribution(row: Sequence[float]) -> bool:
+    """Return whether numbers are probabilities with sum 1."""
+    return all(0.0 <= p <= 1.0 for p in row) and abs(sum(row) - 1.0) <= _ROUNDING
+
+
+class Branches(NamedTuple):
+    """Normal distributions of K branches of each run.
+
+    Attributes:
+        mean: [R, K, D].
+        covariance: [R, K, d, d].
+    """
+
+    mean: Tensor
+    covariance: Tensor
+
+
+class BranchSteps(NamedTuple):
+    """Results of a step of all branches.
+
+    Attributes:
+        branches: Branches after the step.
+        log_likelihood: Log evidence of each branch, [R, K]; -inf without a root.
+        r: Innovations, [R, K, k].
+        covariance: Innovation covariances, [R, K, k, k].
+        observed_mask: Observed components, [R, k].
+    """
+
+    branches: Branches
+    log_likelihood: Tensor
+    r: Tensor
+    covariance: Tensor
+    observed_mask: Tensor
+
+
+@dataclass(frozen=True)
+class _BranchNoise(NoiseAdaptation):
+    """Factors on Q and R of each folded run, from the memory of its belief."""
+
+    has_evidence = True  # the factors do not depend on the measurement
+
+    @override
+    def predict_scale(
+        self, predicted: AffineApproximation, belief: GaussianBelief
+    ) -> AffineApproximation:
+        return scale_process_noise(predicted, belief.memory["process_factor"])
+
+    @override
+    def noise_adapt(
+        self, innovation: Innovation, belief: GaussianBelief
+    ) -> tuple[Innovation, dict[str, Tensor]]:
+        factor = belief.memory["measurement_factor"]
+        return innovation.with_noise(innovation.noise * factor[:, None, None]), {}
+
+
+def advance_branches(
+    linearisation: LinearisationRule,
+    model: StateSpaceModel,
+    branches: Branches,
+    factors: tuple[Tensor, Tensor],
+    record: Record,
+) -> BranchSteps:
+    """Take a step of a Gaussian filter for all branches, folded into the axis of runs.
+
+    Args:
+        linearisation: Linearisation rule of the filter.
+        model: State-space model of the step.
+        branches: Branches before the step, [R, K, ...].
+        factors: Factors on Q and on R of each branch, [K] each.
+        record: Measurement and inputs of the step.
+
+    Returns:
+        The results.
+    """
+    runs, k = branches.mean.shape[:2]
+
+    def repeat(a: Tensor) -> Tensor:
+        return a.repeat_interleave(k, 0) if len(a) == runs else a
+
+    folded = Record(repeat(record.y), map_inputs(repeat, record.u))
+    memory = {
+        name: factor.to(branches.mean).repeat(runs)
+        for name, factor in zip(("process_factor", "measurement_factor"), factors, strict=True)
+    }
+    zero = branches.mean.new_zeros(runs * k, dtype=torch.float64)
+    belief = GaussianBelief(
+        branches.mean.flatten(0, 1), branches.covariance.flatten(0, 1), zero, memory
+    )
+    step = GaussianFilter(linearisation, [_BranchNoise()]).advance(model, belief, folded)
+    innovation = step.innovation
+    s = innovation.m @ innovation.m.mT + innovation.omega
+
+    def unfold(a: Tensor) -> Tensor:
+        return a.unflatten(0, (runs, k))
+
+    after = Branches(unfold(step.mean), unfold(step.root @ step.root.mT))
+    log_like, mask = unfold(step.log_likelihood), unfold(innovation.observed_mask)[:, 0]
+    return BranchSteps(after, log_like, unfold(innovation.r), unfold(s), mask)
+
+
+def mixture_moments(
+    chart: Chart, branches: Branches, weight: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute mean and covariance of a mixture.
+
+    Args:
+        chart: Chart of the state.
+        branches: Components of the mixture, [R, K, ...].
+        weight: Weights, [R, K]. Components of weight 0 may be NaN.
+
+    Returns:
+        Mean [R, D], covariance [R, d, d], and the offsets of the components from the mean [R, K, d].
+    """
+    heaviest = weight.argmax(1)
+    centre = branches.mean[torch.arange(len(weight), device=weight.device), heaviest]
+    used = (weight > 0).unsqueeze(-1)
+    offset = torch.where(used, chart.subtract(branches.mean, centre.unsqueeze(1)), 0.0)
+    shift = (weight.unsqueeze(-1) * offset).sum(1)
+    offset = offset - shift.unsqueeze(1)
+    spread = offset.unsqueeze(-1) * offset.unsqueeze(-2)
+    parts = torch.where(used.unsqueeze(-1), branches.covariance + spread, 0.0)
+    covariance = (weight[..., None, None] * parts).sum(1)
+    return chart.add(centre, shift), covariance, offset
