@@ -54,6 +54,14 @@ def runs_of(data: dict[str, np.ndarray], meta: dict[str, Any]) -> pd.DataFrame:
     energy = data["energy_score"][..., index].astype(float).mean(1)
     overconfident = (nees > stats.chi2.ppf(0.999, len(groups[name]))).astype(float)
     scenario = meta["choices"]["scenario"]
+    others = {}
+    for other, index_of_group in groups.items():
+        for unit in dict.fromkeys(units[k] for k in index_of_group):
+            part = [k for k in index_of_group if units[k] == unit]
+            title = other if len(part) == len(index_of_group) else f"{other} [{unit}]"
+            square = (data["error"][..., part].astype(float) ** 2).sum(-1)
+            if part != places:
+                others[f"{title} error"] = np.sqrt(square.mean(1))
     return pd.DataFrame({
         "filter": meta["label"], "scenario": scenario, "world": paper.get("family") or scenario,
         "regime": meta["choices"]["noise"], "run": np.arange(len(norm)),
@@ -64,6 +72,7 @@ def runs_of(data: dict[str, np.ndarray], meta: dict[str, Any]) -> pd.DataFrame:
         "energy score": energy if is_whole else np.nan,
         "log score per step": data["log_evidence"] / norm.shape[1],
         "overconfident runs": np.where(is_lost, np.nan, overconfident),
+        **others,
     })  # fmt: skip
 
 
@@ -75,7 +84,7 @@ def paired_values(runs: pd.DataFrame, a: str, b: str, metric: str) -> Worlds:
     worlds: dict[str, dict[str, list[np.ndarray]]] = {}
     for (world, scenario, _), rows in runs.groupby(["world", "scenario", "regime"]):
         first, second = (rows[rows["filter"] == name].set_index("run") for name in (a, b))
-        if metric == "keeps track" or first[metric].notna().any():
+        if metric == "keeps track" or first.get(metric, pd.Series(dtype=float)).notna().any():
             d = differences(first, second, metric)
             worlds.setdefault(str(world), {}).setdefault(str(scenario), []).append(d)
     return {
@@ -86,7 +95,7 @@ def paired_values(runs: pd.DataFrame, a: str, b: str, metric: str) -> Worlds:
 
 def differences(first: pd.DataFrame, second: pd.DataFrame, metric: str) -> np.ndarray:
     """Differences of the runs of one condition, negative if the first filter is better."""
-    kind = METRICS[metric]
+    kind = METRICS.get(metric, "ratio")
     keeps_a, keeps_b = first["keeps"].to_numpy(), second["keeps"].to_numpy()
     if kind == "track":
         return np.asarray(keeps_b.astype(float) - keeps_a.astype(float))
@@ -179,8 +188,10 @@ def recompute(runs: pd.DataFrame, records: list[dict[str, Any]]) -> pd.DataFrame
         members = list(family)
         estimates = []
         for r in members:
-            metric = r["metric"] if r["metric"] in METRICS else "error"  # "position error"
-            estimates.append(estimate(paired_values(runs, r["a"], r["b"], metric), METRICS[metric]))
+            is_known = r["metric"] in METRICS or r["metric"] in runs
+            metric = r["metric"] if is_known else "error"  # "main group error"
+            kind = METRICS.get(metric, "ratio")
+            estimates.append(estimate(paired_values(runs, r["a"], r["b"], metric), kind))
         question = members[0]["question"]
         p = np.array([e[f"p_{question}"] for e in estimates])
         tested = np.isfinite(p)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from pfbench.report.writers import write_json
 from pfbench.results.conditions import Condition, natural_sort_key
 from pfbench.results.decisions.decision import Decision
 from pfbench.results.decisions.filter_sets import order_filters
-from pfbench.results.decisions.options import DecisionOptions
+from pfbench.results.decisions.options import DecisionOptions, MetricRule
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs, decide_secondary_metrics
 from pfbench.results.frame import to_long_rows
 from pfbench.results.state_groups import main_component_group
@@ -29,6 +29,7 @@ from pfbench.results.study_decisions.main_metrics import (
     main_rule,
     select_main_metrics,
     tidy_main,
+    tidy_other_groups,
     tidy_secondary,
 )
 
@@ -62,7 +63,8 @@ def write_study_files(
     }
     names = set(mains.values())
     name = names.pop() if len(names) == 1 else MAIN
-    decisions = decide_study(select_main_metrics(table, mains, name), name, options)
+    others = tidy_other_groups(table, mains)
+    decisions = decide_study(select_main_metrics(table, mains, name), name, options, others)
     bands = decide_consistency(table, DecisionOptions(options.alpha, options.equivalence_margin))
     files = {
         "Decisions on all pairs (JSON)": write_json(folder, "decisions", decisions),
@@ -77,13 +79,19 @@ def write_study_files(
     ]  # fmt: skip
 
 
-def decide_study(rows: pd.DataFrame, group: str, options: ReportOptions) -> list[Decision]:
+def decide_study(
+    rows: pd.DataFrame,
+    group: str,
+    options: ReportOptions,
+    others: Mapping[str, pd.DataFrame] | None = None,
+) -> list[Decision]:
     """Decide planned pairs, the metrics of the second family, and the other pairs.
 
     Args:
         rows: Rows of `select_main_metrics`.
         group: Name of the main group in these rows.
         options: Options of the report.
+        others: Tables of `tidy_other_groups`, None for none.
     """
     settings = DecisionOptions(options.alpha, options.equivalence_margin)
     rule, tidy = main_rule(options.metric, group), tidy_main(rows, options.metric, group)
@@ -92,11 +100,11 @@ def decide_study(rows: pd.DataFrame, group: str, options: ReportOptions) -> list
     planned = decide_planned_pairs(tidy, pairs, rule, settings) if pairs else []
     metrics = tidy_secondary(rows, group)
     metrics.pop(options.metric, None)
-    secondary = []
-    if pairs and metrics:
-        rules = [replace(RULES[name], group=group) for name in metrics]
-        tables = {rule.name: values for rule, values in zip(rules, metrics.values(), strict=True)}
-        secondary = decide_secondary_metrics(tables, pairs, rules, settings)
+    rules = [replace(RULES[name], group=group) for name in metrics]
+    rules += [MetricRule(f"{name} error", group=name) for name in others or {}]
+    values = [*metrics.values(), *(others or {}).values()]
+    tables = {rule.name: table for rule, table in zip(rules, values, strict=True)}
+    secondary = decide_secondary_metrics(tables, pairs, rules, settings) if pairs else []
     common, _ = select_common_runs(tidy)
     orders = order_filters(common, rule, settings, planned) if len(common) else ()
     return [

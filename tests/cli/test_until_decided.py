@@ -14,6 +14,7 @@ from pfbench.results import store
 from pfbench.results.decisions.growing_study import decide_at_looks
 from pfbench.results.decisions.tidy_table import tidy_runs
 from pfbench.results.statistics.sequential_looks import LookPlan
+from pfbench.results.until_decided.look_table import LookMetric, read_look_table
 
 STUDY = ("scenario=linear_walk", "scenario.steps=12", "particles=60", "pcrb=false", "score_steps=0")
 SWEEP = ("run", "-m", *STUDY, "filter=ekf,sir,rpf")
@@ -64,6 +65,26 @@ def test_looks_decide_as_one_study_of_all_runs(home: Path, said: Said) -> None:
         assert f"{3 - len(open_pairs)} of 3 pairs decided" in line
         for d in open_pairs:
             assert f"{d.a} / {d.b} (ratio {np.exp(d.low):.3g} to {np.exp(d.high):.3g})" in line
+
+
+def test_the_metric_of_the_report_decides_and_is_fixed_at_the_first_look(
+    home: Path, said: Said
+) -> None:
+    keys = {file.stem for file in results(home)}
+    folder, metric = home / "results", LookMetric("max_error", start_s=3.0)
+    table = read_look_table("growing", folder, keys, lambda labels: PAIRS, metric)
+    expected, path = {}, {file.stem: file for file in results(home)}
+    for key in keys:
+        result = store.read_result(path[key])
+        error = result.data["error"][:, result.data["time"] >= 3.0, 0].astype(float)
+        first = result.meta["first_run"]
+        for run, value in enumerate(np.abs(error).max(1), start=first):
+            expected[result.meta["label"], f"{1:012d} {run:09d}"] = value
+    found = table.runs.set_index(["filter", "run"])["value"]
+    assert found.to_dict() == pytest.approx(expected)
+    refused = pfbench(*GROWING, "report.metric=max_error", home=home)
+    assert refused.code == 1
+    assert "report.metric must be rmse, as at the first look of this study" in refused.err
 
 
 def test_a_finished_study_says_so(home: Path, said: Said) -> None:

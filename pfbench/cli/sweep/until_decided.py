@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.sweep.study_plan import StudyPlan
 from pfbench.config.composition import JobConfig
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 UNTIL_DECIDED = "until-decided"  # value of `runs`
 _HOUR = 3600.0
+# of the report: the decisions of a study follow from them, so they must not change between looks
+_DECIDING_SETTINGS = ("metric", "alpha", "equivalence_margin", "start_time_s")
 
 
 def wants_until_decided(plan: StudyPlan) -> bool:
@@ -40,6 +42,7 @@ class GrowingSweep:
         schedule: Looks.
         max_hours: Computing time of all jobs at most, h; None for no limit.
         repeats_jobs: Whether jobs run again although their results exist.
+        report: Settings of the report, whose metric, level and margin decide.
     """
 
     study: str
@@ -48,6 +51,7 @@ class GrowingSweep:
     schedule: LookSchedule
     max_hours: float | None
     repeats_jobs: bool
+    report: Mapping[str, Any]
 
     @classmethod
     def from_plan(cls, plan: StudyPlan) -> GrowingSweep:
@@ -59,6 +63,7 @@ class GrowingSweep:
         Raises:
             ValueError: If a setting is not valid for a study that adds runs.
         """
+        from pfbench.results.study_decisions.main_metrics import check_main_metric
         from pfbench.results.until_decided.look_schedule import LookSchedule
 
         values = plan.first.values
@@ -75,10 +80,11 @@ class GrowingSweep:
                 "budget must be particles with runs=until-decided, since a budget would set another "
                 f"number of particles at each look, got {values['budget']}. Use budget=particles."
             )
+        check_main_metric(values["report"]["metric"])
         schedule = LookSchedule(settings["mode"], settings["max_runs"])
         return cls(
             str(values["study"]), Path(values["results_dir"]), tuple(plan.compose_jobs()),
-            schedule, hours, values["overwrite"] or values["pcrb"] is True,
+            schedule, hours, values["overwrite"] or values["pcrb"] is True, values["report"],
         )  # fmt: skip
 
     def job_keys(self, number: int) -> set[str]:
@@ -113,10 +119,11 @@ class GrowingSweep:
             number: Number of the look, from 1.
         """
         from pfbench.config.paper_files import plan_installed_pairs
-        from pfbench.results.until_decided.look_table import read_look_table
+        from pfbench.results.until_decided.look_table import LookMetric, read_look_table
 
+        metric = LookMetric(self.report["metric"], self.report["start_time_s"])
         return read_look_table(
-            self.study, self.results, self.job_keys(number), plan_installed_pairs
+            self.study, self.results, self.job_keys(number), plan_installed_pairs, metric
         )
 
     def run(self, run_part: Callable[[Sequence[str]], None]) -> None:
@@ -162,6 +169,7 @@ class GrowingSweep:
         request = {
             "until_decided.mode": self.schedule.mode,
             "until_decided.max_runs": self.schedule.max_runs,
+            **{f"report.{name}": self.report[name] for name in _DECIDING_SETTINGS},
             "jobs": sorted(self.job_keys(1)),
         }
         return LookRecord(self.results / self.study / RECORD, request)
@@ -188,6 +196,8 @@ class GrowingSweep:
 
     def _decide(self, table: LookTable) -> list[PairState]:
         """Decide the planned pairs with the runs so far."""
+        from pfbench.results.decisions.options import DecisionOptions
+        from pfbench.results.study_decisions.main_metrics import RULES
         from pfbench.results.until_decided.pair_states import decide_pairs
 
         if not table.pairs:
@@ -195,7 +205,9 @@ class GrowingSweep:
                 "filter must be at least two filters with runs=until-decided, got one per condition. "
                 "Add a filter (filter=ekf,sir), or set a number of runs."
             )
-        return decide_pairs(table.runs, table.pairs, self.schedule)
+        options = DecisionOptions(self.report["alpha"], self.report["equivalence_margin"])
+        rule = RULES[self.report["metric"]]
+        return decide_pairs(table.runs, table.pairs, self.schedule, options, rule)
 
     def _exceeds_time(self, seconds: float, number: int) -> str:
         """Return why a look must not begin: its expected end exceeds the limit; empty if it may."""

@@ -1,4 +1,4 @@
-"""Metrics of the main group that decide on a pair: the main error of a study, and the second family.
+"""Metrics that decide on a pair: the main error of a study, and the second family.
 
 References:
     T. Gneiting and A. E. Raftery (2007), Strictly proper scoring rules, prediction, and estimation.
@@ -60,6 +60,25 @@ def select_main_metrics(
     component = table["metric"].map(_COMPONENTS).fillna(MAIN_COMPONENT)
     rows = table[is_main & (table["component"] == component)]
     return rows.assign(group=name, component=MAIN_COMPONENT)
+
+
+def tidy_other_groups(
+    table: pd.DataFrame, mains: Mapping[ConditionName, str]
+) -> dict[str, pd.DataFrame]:
+    """Arrange the root mean square errors of all groups but the main one for decisions.
+
+    Args:
+        table: Rows of `load_frame`, of all groups.
+        mains: Main group by scenario, noise and model.
+
+    Returns:
+        Table by name of the group, of the conditions in which it is not the main group.
+    """
+    keys = zip(table["scenario"], table["noise"], table["model"], strict=True)
+    main = pd.Series(list(keys), index=table.index).map(mains)
+    is_other = (table["metric"] == "rmse") & (table["component"] == MAIN_COMPONENT)
+    rows = table[is_other & (table["group"] != main)]
+    return {str(group): tidy_rows(part) for group, part in rows.groupby("group", sort=False)}
 
 
 def main_rule(metric: str, group: str) -> MetricRule:

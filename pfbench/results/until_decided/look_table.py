@@ -1,4 +1,4 @@
-"""Table of the main error of all runs until a look, from the stored results of a study."""
+"""Table of the main metric of all runs until a look, from the stored results of a study."""
 
 from __future__ import annotations
 
@@ -9,9 +9,23 @@ from typing import NamedTuple
 import pandas as pd
 
 from pfbench.results.conditions import Condition, load_conditions
-from pfbench.results.decisions.tidy_table import tidy_runs
 from pfbench.results.frame import to_long_rows
 from pfbench.results.state_groups import main_component_group
+from pfbench.results.study_decisions.main_metrics import select_main_metrics, tidy_main
+
+_MAIN = "main"  # the main groups of the scenarios may have different names
+
+
+class LookMetric(NamedTuple):
+    """Metric that decides at a look.
+
+    Attributes:
+        name: Main metric of the study, one of `MAIN_METRICS`.
+        start_s: Time before which the metric leaves out the steps, s.
+    """
+
+    name: str = "rmse"
+    start_s: float = 0.0
 
 
 class LookTable(NamedTuple):
@@ -35,24 +49,29 @@ def read_look_table(
     results: Path,
     keys: Collection[str],
     list_pairs: Callable[[Collection[str]], list[tuple[str, str]]],
+    metric: LookMetric | None = None,
 ) -> LookTable:
-    """Read the main error of the jobs of a look.
+    """Read the main metric of the jobs of a look.
 
     Args:
         study: Name of the study.
         results: Folder of all studies.
         keys: Keys of all jobs until the look.
         list_pairs: Function that lists the planned pairs of labels.
+        metric: Metric that decides, None for the root mean square error of all steps.
 
     Returns:
         The table and its pairs.
 
     Raises:
         FileNotFoundError: if no result exists.
-        ValueError: if results do not belong together.
+        ValueError: if results do not belong together, or lack the metric.
     """
+    metric = metric or LookMetric()
     conditions = load_conditions(study, results, keys=keys)
-    rows = pd.concat([_main_errors(condition) for condition in conditions], ignore_index=True)
+    rows = pd.concat(
+        [_main_rows(condition, metric.start_s) for condition in conditions], ignore_index=True
+    )
     labels = {job.label for condition in conditions for job in condition.jobs}
     labels_by_condition = [{job.label for job in condition.jobs} for condition in conditions]
     pairs = [
@@ -63,17 +82,12 @@ def read_look_table(
     jobs = [job for condition in conditions for job in condition.jobs]
     seconds = sum(job.meta["seconds"]["world"] + job.meta["seconds"]["filter"] for job in jobs)
     parts = sum(len(job.parts) for job in jobs)
-    return LookTable(tidy_runs(rows), pairs, parts, float(seconds))
+    return LookTable(tidy_main(rows, metric.name, _MAIN), pairs, parts, float(seconds))
 
 
-def _main_errors(condition: Condition) -> pd.DataFrame:
-    """Return the root mean square errors of the main group of a condition, one row per run."""
-    tables = []
-    for job in condition.jobs:
-        result = job.load()
-        rows = to_long_rows(condition, job, result, 0.0, {})
-        group = main_component_group(result.meta["state"])
-        is_main = (rows["metric"] == "rmse") & (rows["group"] == group.group)
-        tables.append(rows[is_main & (rows["component"] == "norm")])
-    # the main groups of the scenarios may have different names
-    return pd.concat(tables, ignore_index=True).assign(group="main")
+def _main_rows(condition: Condition, start_s: float) -> pd.DataFrame:
+    """Return the metrics of the main group of a condition."""
+    tables = [to_long_rows(condition, job, job.load(), start_s, {}) for job in condition.jobs]
+    main = main_component_group(condition.jobs[0].meta["state"]).group
+    mains = {(condition.scenario, condition.noise, condition.model): main}
+    return select_main_metrics(pd.concat(tables, ignore_index=True), mains, _MAIN)

@@ -51,6 +51,7 @@ def decide_pairs(
     pairs: Pairs,
     schedule: LookSchedule,
     options: DecisionOptions | None = None,
+    rule: MetricRule | None = None,
 ) -> list[PairState]:
     """Decide planned pairs with all looks that the runs allow.
 
@@ -59,6 +60,7 @@ def decide_pairs(
         pairs: Labels of the planned pairs.
         schedule: Looks of the study.
         options: Options, None for the defaults.
+        rule: Rule of the main metric, None for the log ratio of errors.
 
     Returns:
         One state per pair.
@@ -66,27 +68,28 @@ def decide_pairs(
     Raises:
         ValueError: if the table or a pair is not valid, or the runs do not reach the first look.
     """
-    options = options or DecisionOptions()
+    options, rule = options or DecisionOptions(), rule or MetricRule()
     if schedule.mode == "e_values":
-        return _decide_at_any_time(table, pairs, schedule, options)
+        return _decide_at_any_time(table, pairs, schedule, options, rule)
     plan = LookPlan(runs=schedule.runs, alpha=options.alpha)
-    decisions = decide_at_looks(table, pairs, plan, options=options)
+    decisions = decide_at_looks(table, pairs, plan, rule, options)
     return [_to_state(error) for error in decisions[1::2]]
 
 
-def average_over_conditions(pair: PairRuns) -> Array:
-    """Average the log ratios of each run over the conditions of a pair.
+def average_over_conditions(pair: PairRuns, rule: MetricRule | None = None) -> Array:
+    """Average the log ratios or differences of each run over the conditions of a pair.
 
     A run of all conditions is one unit, because its conditions share random numbers. Infinite
     values decide by the sum of the weights of their signs.
 
     Args:
         pair: Runs of both filters.
+        rule: Rule of the metric, None for the log ratio of errors.
 
     Returns:
         Averages of the runs that all conditions have, [n], in the order of the runs.
     """
-    d = paired_differences(pair, MetricRule())
+    d = paired_differences(pair, rule or MetricRule())
     used = pair.weights > 0
     d, weights = d[used], pair.weights[used]
     d = d[:, pair.present[used].all(axis=0)]
@@ -104,14 +107,18 @@ def _to_state(error: Decision) -> PairState:
         error.b,
         error.pair_word,
         not is_complete([error]),
-        _format_ratio(error.low, error.high)
+        _format_ends(error.low, error.high, MetricRule())
         if error.scale == "log ratio"
         else f"{error.scale} {format_range(error, error.low, error.high)}",
     )
 
 
 def _decide_at_any_time(
-    table: pd.DataFrame, pairs: Pairs, schedule: LookSchedule, options: DecisionOptions
+    table: pd.DataFrame,
+    pairs: Pairs,
+    schedule: LookSchedule,
+    options: DecisionOptions,
+    rule: MetricRule,
 ) -> list[PairState]:
     """Decide the median of the runs of each pair by e-values, with Bonferroni's correction."""
     study = to_study_runs(table)
@@ -119,11 +126,13 @@ def _decide_at_any_time(
     level = options.alpha / len(pairs)
     states = []
     for a, b in pairs:
-        d = average_over_conditions(select_pair(study, a, b))
+        d = average_over_conditions(select_pair(study, a, b), rule)
         looks = [n for n in schedule.runs if n <= d.size] or [d.size]
         low, high, is_decided = _intersect_looks([d[:n] for n in looks], level)
-        word, _ = pair_word(low, high, is_decided, options.log_margin)
-        states.append(PairState(a, b, word, word == INCONCLUSIVE_PAIR, _format_ratio(low, high)))
+        margin = options.log_margin if rule.margin is None else rule.margin
+        word, _ = pair_word(low, high, is_decided, margin)
+        text = _format_ends(low, high, rule)
+        states.append(PairState(a, b, word, word == INCONCLUSIVE_PAIR, text))
     return states
 
 
@@ -141,6 +150,8 @@ def _intersect_looks(samples: Sequence[Array], level: float) -> tuple[float, flo
     return (max(low, 0.0), max(high, 0.0), True) if sign else (min(low, 0.0), max(high, 0.0), False)
 
 
-def _format_ratio(low: float, high: float) -> str:
-    """Format the ends of a log ratio as a ratio."""
-    return f"ratio {math.exp(low):.3g} to {math.exp(high):.3g}"
+def _format_ends(low: float, high: float, rule: MetricRule) -> str:
+    """Format the ends of an interval: a ratio, or a difference that is negative if a is better."""
+    if rule.scale == "log ratio":
+        return f"ratio {math.exp(low):.3g} to {math.exp(high):.3g}"
+    return f"{rule.scale} {low:.3g} to {high:.3g}"

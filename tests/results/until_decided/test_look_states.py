@@ -11,6 +11,7 @@ from decision_cases import make_study
 
 from pfbench.config.paper_files import plan_installed_pairs
 from pfbench.results.decisions.growing_study import decide_at_looks, is_complete
+from pfbench.results.decisions.options import MetricRule
 from pfbench.results.decisions.study_runs import select_pair, to_study_runs
 from pfbench.results.statistics.sequential_looks import LookPlan
 from pfbench.results.statistics.study_size import detectable_effects
@@ -55,6 +56,19 @@ def test_states_are_the_decisions_at_planned_looks(runs: int) -> None:
     assert states[0].word == "better"
     error = expected[1]
     assert states[0].interval == f"ratio {np.exp(error.low):.3g} to {np.exp(error.high):.3g}"
+
+
+@pytest.mark.parametrize("mode", ["looks", "e_values"])
+def test_a_score_decides_by_its_own_scale_and_direction(mode: Any) -> None:
+    """A log score is better where it is higher, and its interval is a difference."""
+    rule = MetricRule("log score per step", "difference", higher_is_better=True)
+    table = study(80)
+    table = table.assign(value=np.log(table["value"]))  # A has the smallest values
+    schedule = LookSchedule(mode, 80)
+    (by_ratio,) = decide_pairs(study(80), [("A", "B")], schedule)
+    (state,) = decide_pairs(table, [("A", "B")], schedule, rule=rule)
+    assert (by_ratio.word, state.word) == ("better", "worse")
+    assert state.interval.startswith("difference 0.")
 
 
 def test_lines_say_what_is_decided_and_what_is_open() -> None:
