@@ -78,7 +78,9 @@ def tidy_other_groups(
     main = pd.Series(list(keys), index=table.index).map(mains)
     is_other = (table["metric"] == "rmse") & (table["component"] == MAIN_COMPONENT)
     rows = table[is_other & (table["group"] != main)]
-    return {str(group): tidy_rows(part) for group, part in rows.groupby("group", sort=False)}
+    return {
+        str(group): tidy_rows(of_group) for group, of_group in rows.groupby("group", sort=False)
+    }
 
 
 def main_rule(metric: str, group: str) -> MetricRule:
