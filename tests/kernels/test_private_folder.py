@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from pfbench.kernels import private_folder
+from pfbench.kernels import cpp_library, library_build, private_folder
 
 LOAD = """
 from pathlib import Path
@@ -62,8 +63,14 @@ def test_a_library_that_others_can_write_is_not_loaded(tmp_path: Path) -> None:
         )
         return done.stdout
 
+    name = library_build.name_library(cpp_library.choose_variant())
+    cpp_library.load_library()  # compiles it if it does not exist
+    folders = (cpp_library._WITH_PACKAGE, private_folder.code_folder())
+    built = next(folder / name for folder in folders if (folder / name).exists())
+    (tmp_path / "pfbench").mkdir(mode=0o700)
+    library = Path(shutil.copyfile(built, tmp_path / "pfbench" / name))
+    library.chmod(0o600)
     assert load() == "loaded\n"
-    (library,) = (tmp_path / "pfbench").glob("*.so")
     library.chmod(0o666)
     assert load().startswith("refused")
     library.chmod(0o600)
