@@ -10,6 +10,7 @@ from typing import Any
 from pfbench.cli.messages import suggest_similar
 from pfbench.cli.report import check_study_exists
 from pfbench.config.composition import compose
+from pfbench.config.protected_keys import FOLDER_KEYS
 
 HELP = """\
 pfbench replay study=NAME run=NUMBER filter=NAME [scenario=NAME] [noise=NAME] [model=NAME] [key=value ...]
@@ -54,7 +55,9 @@ def replay_run(words: Sequence[str]) -> None:
     choices = {key: values[key] for key in _CHOICES if key in values}
     stored = find_run(study, results, _run_number(values["run"]), values["filter"], choices)
     changes: dict[str, Any] = {
-        key: config.values[key] for key in ("data", *_PLACES) if key in values or key == "data"
+        key: config.values[key]
+        for key in ("data", *FOLDER_KEYS, *_PLACES)
+        if key in values or key not in _PLACES
     }
     result = recomputation.recompute_run(stored, changes)
     comparable = recomputation.select_stored_scores(result, stored.result)

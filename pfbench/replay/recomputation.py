@@ -24,8 +24,8 @@ def replay_config(stored: StoredRun, changes: Mapping[str, Any]) -> JobConfig:
 
     Args:
         stored: Run.
-        changes: Values of top-level keys that replace the stored ones: the folder of the data, threads,
-            device.
+        changes: Values of top-level keys that replace the stored ones: folders, the folder of the data,
+            threads, device.
 
     Returns:
         The configuration.
@@ -55,7 +55,17 @@ def replay_config(stored: StoredRun, changes: Mapping[str, Any]) -> JobConfig:
         values["filter"]["particles"] = meta["particles"]
     if "root" in values["scenario"] and values["scenario"]["root"] is not None:
         values["scenario"]["root"] = values["data"]["root"]
+    _replace_cache_folders(values["scenario"], values["episode_cache_dir"])
     return JobConfig(values, {group: str(meta["choices"][group]) for group in CHOICES})
+
+
+def _replace_cache_folders(node: Any, folder: str | None) -> None:
+    """Set the cache folders of a stored scenario, which may be of another person."""
+    children = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    for child in children:
+        _replace_cache_folders(child, folder)
+    if isinstance(node, dict) and node.get("cache_dir") is not None:
+        node["cache_dir"] = folder
 
 
 def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobResult:
@@ -72,7 +82,7 @@ def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobRes
     choices = {group: config.choices[group] for group in CHOICES}
     title = " / ".join(choices[group] for group in ("scenario", "noise", "filter"))
     meta, outputs = compute_job(config, f"{title}, run {stored.run}")
-    head = {"key": stored.job.path.stem, "study": stored.result.meta["study"]}
+    head = {"key": stored.job.path.stem, "study": stored.job.path.parent.name}
     full = {**head, "choices": choices, "config": config.values, **meta}
     return store.JobResult(full, outputs)
 

@@ -6,6 +6,7 @@ import io
 from importlib.util import find_spec
 from pathlib import Path
 
+from pfbench.files.escapes import escape_csv
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.replay.run_selection import StoredRun
 from pfbench.replay.traces import plot_traces, tabulate_traces
@@ -36,7 +37,7 @@ def write_replay(stored: StoredRun, result: store.JobResult, reports: str | Path
     table = tabulate_traces(result)
     drawing = FigureSpec(_FIGURE, "", lambda: plot_traces(result))
     with RecordedFolder(folder) as target:
-        paths = [target.write("traces.csv", table.to_csv(index=False))]
+        paths = [target.write("traces.csv", table.rename(columns=escape_csv).to_csv(index=False))]
         if find_spec("pyarrow"):
             buffer = io.BytesIO()
             table.to_parquet(buffer, index=False)

@@ -21,6 +21,7 @@ from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
 from pfbench.results.result_format import FORMAT, check_arrays, check_metadata
 
 # values of the key `budget`
+_LARGEST_NOTE = 10_000_000  # bytes
 SAME_N, SAME_TIME, SAME_LIKELIHOODS = BUDGETS = ("particles", "time", "likelihoods")
 
 
@@ -165,10 +166,12 @@ def _note(path: Path) -> Path:
 def _read_note(path: Path) -> dict[str, Any]:
     """Read a failure note. Of a damaged one only the name of the file is used."""
     try:
-        note = json.loads(path.read_bytes())
-        if isinstance(note, dict) and has_valid_digest(note) and path.name.startswith(note["key"]):
-            return note
-    except ValueError:
+        is_note = path.is_file() and path.stat().st_size <= _LARGEST_NOTE
+        note: Any = json.loads(path.read_bytes()) if is_note else None
+        is_complete = isinstance(note, dict) and set(note) >= {"key", "choices", "message"}
+        if is_complete and has_valid_digest(note) and path.name.startswith(str(note["key"])):
+            return dict(note)
+    except (OSError, ValueError, RecursionError):
         pass
     return _unknown_failure(path.name.partition(".")[0], f"{path.name} is damaged")
 
@@ -192,6 +195,10 @@ def _write(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
 def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
     if not path.exists():
         raise FileNotFoundError(f"result {path} does not exist. Run the job.")
+    if not path.is_file():  # reading a pipe or a device would not end
+        raise DamagedResultError(
+            f"{path} is damaged: it must be a file, got another kind. Delete it and run the job again."
+        )
     # opened here, since numpy leaves a damaged file open
     with path.open("rb") as raw:
         try:
@@ -225,7 +232,7 @@ def _meta(path: Path, file: np.lib.npyio.NpzFile) -> dict[str, Any]:
     text = str(_member(path, file, "meta"))
     try:
         meta = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(
             f"{path}: 'meta' must be JSON ({error}). This is not a result of pfbench: move it away."
         ) from error

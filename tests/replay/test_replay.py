@@ -12,6 +12,8 @@ from command_line import Said, pfbench
 
 from pfbench import job
 from pfbench.replay.agreement import compare_runs, describe_agreement
+from pfbench.replay.recomputation import recompute_run, replay_config
+from pfbench.replay.run_selection import StoredRun, find_run
 from pfbench.replay.traces import magnification
 from pfbench.results import store
 
@@ -135,3 +137,23 @@ def test_results_of_other_programs_are_refused(home: Path, tmp_path: Path) -> No
     said = replay(tmp_path, "run=12", f"filter={label}")
     assert said.code == 1
     assert "study must have results of pfbench run" in said.err
+
+
+def test_a_replay_writes_nowhere_else_whatever_a_result_says(home: Path) -> None:
+    """Folders and study come from the command line, not from the file of another person."""
+    choices = {"scenario": "linear_walk", "noise": "nominal"}
+    stored = find_run("walks", home / "results", 12, "ekf", choices)
+    meta = stored.result.meta
+    folders = dict.fromkeys(("results_dir", "reports_dir", "episode_cache_dir"), "outside")
+    changes = {"data": meta["config"]["data"], **dict.fromkeys(folders, "mine")}
+    caches = {"cache_dir": "outside", "nested": [{"cache_dir": "outside"}]}
+
+    def disguise(**more: object) -> StoredRun:
+        config = {**meta["config"], **folders, "scenario": {**meta["config"]["scenario"], **more}}
+        full = {**meta, "study": "../../outside", "config": config}
+        return stored._replace(result=store.JobResult(full, stored.result.data))
+
+    values = replay_config(disguise(**caches), changes).values
+    assert "outside" not in json.dumps(values)
+    assert values["scenario"]["cache_dir"] == values["scenario"]["nested"][0]["cache_dir"] == "mine"
+    assert recompute_run(disguise(), changes).meta["study"] == "walks"
