@@ -128,7 +128,9 @@ __getattr__, __dir__ = lazy_attributes(
         "robust.noise_learning": ("SageHusaAdaptation", "VariationalNoiseAdaptation"),
         "robust.scaled_noise": ("ScaledNoise",),
         "robust.student_update": ("StudentUpdate",),
+        "robust.variational_covariances": ("VariationalCovarianceAdaptation",),
         "robust.weighted_likelihood": ("WeightedLikelihoodUpdate",),
+        "robust.windowed_noise": ("WindowedNoiseAdaptation",),
         "smoothing": ("smooth", "sample_trajectories"),
         "swarm.chaotic_sequences": (
             "SwarmStart",

@@ -10,7 +10,7 @@ from typing import Any
 
 import hydra
 import torch
-from omegaconf import OmegaConf
+from omegaconf import OmegaConf, open_dict
 from torch import Tensor
 
 from pfbench.config.composition import CHOICES, JobConfig
@@ -168,7 +168,8 @@ def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:
     """
     if OmegaConf.is_dict(node) and PAPER in node:
         node = copy.deepcopy(node)  # which keeps the full key for errors
-        node.pop(PAPER)
+        with open_dict(node):  # of a composed configuration, whose keys are fixed
+            node.pop(PAPER)
     is_config = OmegaConf.is_config(node)
     values = OmegaConf.to_container(node, resolve=True) if is_config else node
     bare = remove_all_blocks(values)

@@ -44,7 +44,7 @@ class SageHusaAdaptation(RobustUpdate):
     max_factor: float = 100.0
 
     def __post_init__(self) -> None:
-        _check_forgetting("SageHusaAdaptation", self.forgetting_factor)
+        check_forgetting("SageHusaAdaptation", self.forgetting_factor)
         if not 0.0 < self.max_gain <= 1.0:
             raise ValueError(
                 f"SageHusaAdaptation.max_gain must be in (0, 1], got {self.max_gain}. Use 0.05."
@@ -67,7 +67,7 @@ class SageHusaAdaptation(RobustUpdate):
         newest = (innovation.r.square() - diagonal_axes(innovation.predicted_covariance)) / nominal
         learned = ((1.0 - gain) * factor + gain * newest).clamp(self.min_factor, self.max_factor)
         factor = torch.where(mask & torch.isfinite(learned), learned, factor)
-        return innovation.with_noise(_scaled(innovation.noise, factor)), {
+        return innovation.with_noise(scale_variances(innovation.noise, factor)), {
             "noise_factor": factor,
             "noise_count": count + mask.to(count),
         }
@@ -95,7 +95,7 @@ class VariationalNoiseAdaptation(RobustUpdate):
     iterations: int = 4
 
     def __post_init__(self) -> None:
-        _check_forgetting("VariationalNoiseAdaptation", self.forgetting_factor)
+        check_forgetting("VariationalNoiseAdaptation", self.forgetting_factor)
         if not 0.0 < self.prior_count < math.inf:
             raise ValueError(
                 "VariationalNoiseAdaptation.prior_count must be positive and finite, got "
@@ -118,25 +118,38 @@ class VariationalNoiseAdaptation(RobustUpdate):
         alpha, beta = alpha + 0.5, prior_beta  # per component, in units of the model's variance
         factor = before[1] / before[0]
         for _ in range(self.iterations):
-            adapted = innovation.with_noise(_scaled(innovation.noise, factor))
+            adapted = innovation.with_noise(scale_variances(innovation.noise, factor))
             residual, covariance = updated_residual(adapted)
             square = residual.square() + diagonal_axes(covariance).clamp(min=0.0)
             beta = prior_beta + 0.5 * square / nominal
             factor = torch.where(mask & torch.isfinite(beta), beta / alpha, factor)
-        return innovation.with_noise(_scaled(innovation.noise, factor)), {
+        return innovation.with_noise(scale_variances(innovation.noise, factor)), {
             "noise_alpha": torch.where(mask, alpha, before[0]),
             "noise_beta": torch.where(mask & torch.isfinite(beta), beta, before[1]),
             "noise_factor": factor,
         }
 
 
-def _scaled(noise: Tensor, factor: Tensor) -> Tensor:
-    """Multiply variances by factors [R, k]; correlations do not change."""
+def scale_variances(noise: Tensor, factor: Tensor) -> Tensor:
+    """Multiply variances by factors; correlations do not change.
+
+    Args:
+        noise: Covariance, [R, k, k].
+        factor: Factors, [R, k].
+    """
     root = factor.sqrt()
     return noise * root.unsqueeze(-1) * root.unsqueeze(-2)
 
 
-def _check_forgetting(name: str, value: float) -> None:
-    """Check that a forgetting factor lies in (0, 1)."""
+def check_forgetting(name: str, value: float) -> None:
+    """Check that a forgetting factor lies in (0, 1).
+
+    Args:
+        name: Class for the message.
+        value: Value to check.
+
+    Raises:
+        ValueError: If it does not.
+    """
     if not 0.0 < value < 1.0:
         raise ValueError(f"{name}.forgetting_factor must be in (0, 1), got {value}. Use 0.98.")

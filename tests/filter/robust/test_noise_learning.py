@@ -19,6 +19,8 @@ from pfbench.filter.gaussian.innovation import NoiseAdaptation
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.robust.noise_learning import SageHusaAdaptation, VariationalNoiseAdaptation
+from pfbench.filter.robust.variational_covariances import VariationalCovarianceAdaptation
+from pfbench.filter.robust.windowed_noise import WindowedNoiseAdaptation
 from pfbench.model.linear_gaussian import LinearGaussian
 
 Q, R0 = 0.25, 2.0
@@ -65,8 +67,41 @@ def variational(y: np.ndarray) -> tuple[list[float], list[float]]:
     return [row[0] for row in rows], [row[1] for row in rows]
 
 
+def windowed(y: np.ndarray) -> tuple[list[float], list[float]]:
+    m, p, squares, rows = 0.0, 1.0, [], []
+    for value in y:
+        p += Q
+        if not np.isnan(value):
+            squares = [*squares, (value - m) ** 2][-5:]
+            r = np.clip(np.mean(squares) - p, 0.5 * R0, 100 * R0) if len(squares) == 5 else R0
+            m, p = m + p / (p + r) * (value - m), p * r / (p + r)
+        rows.append((m, p))
+    return [row[0] for row in rows], [row[1] for row in rows]
+
+
+def variational_both(y: np.ndarray) -> tuple[list[float], list[float]]:
+    """In the coordinates of the state, with inverse Wishart means U / u and P."""
+    m, p, u, scale, rows = 0.0, 1.0, 10.0, 10.0 * R0, []
+    for value in y:
+        p += Q
+        if not np.isnan(value):
+            u, scale, r, widened = 0.9 * u, 0.9 * scale, scale / u, p
+            for _ in range(3):
+                gain = widened / (widened + r)
+                after = m + gain * (value - m), (1 - gain) * widened
+                r = (scale + (value - after[0]) ** 2 + after[1]) / (u + 1)
+                widened = (4.0 * p + (after[0] - m) ** 2 + after[1]) / 5.0
+            u, scale = u + 1, r * (u + 1)
+            gain = widened / (widened + r)
+            m, p = m + gain * (value - m), (1 - gain) * widened
+        rows.append((m, p))
+    return [row[0] for row in rows], [row[1] for row in rows]
+
+
 CASES: dict[str, tuple[NoiseAdaptation, Any]] = {
     "sage_husa": (SageHusaAdaptation(0.9, 0.2), sage_husa),
+    "iae": (WindowedNoiseAdaptation(5), windowed),
+    "vb_pr": (VariationalCovarianceAdaptation(0.9, 10.0, 4.0, 3), variational_both),
     "vb_r": (VariationalNoiseAdaptation(0.9, 10.0, 3), variational),
 }
 every_case = pytest.mark.parametrize(("adaptation", "reference"), CASES.values(), ids=CASES.keys())
@@ -98,7 +133,9 @@ def test_the_learned_variance_tends_to_the_true_variance(
     "adaptation",
     [
         SageHusaAdaptation(min_factor=1.0, max_factor=1.0),
+        WindowedNoiseAdaptation(5, 1.0, 1.0),
         VariationalNoiseAdaptation(0.999999, 1e15),
+        VariationalCovarianceAdaptation(0.999999, 1e15, math.inf),
     ],
 )
 def test_the_limit_of_the_parameters_is_the_kalman_filter(adaptation: NoiseAdaptation) -> None:
@@ -107,8 +144,50 @@ def test_the_limit_of_the_parameters_is_the_kalman_filter(adaptation: NoiseAdapt
 
 
 def test_learned_noise_has_no_evidence() -> None:
-    assert not has_evidence(method_of("sage_husa"))
-    assert not has_evidence(method_of("vb_r"))
+    for name in ("sage_husa", "iae", "vb_r", "vb_pr"):
+        assert not has_evidence(method_of(name))
+
+
+def test_the_whole_covariance_is_that_of_numpy() -> None:
+    """Two sensors; where one is missing, its error has the distribution given the other."""
+    f, q, h = (
+        np.array([[1.0, 0.5], [0.0, 0.9]]),
+        np.diag([0.3, 0.2]),
+        np.array([[1.0, 0.2], [0.3, 1.0]]),
+    )
+    y = np.random.default_rng(3).normal(size=(12, 2)) * 3.0
+    y[6, 1] = math.nan
+    model = LinearGaussian(
+        f.tolist(), np.sqrt(q).tolist(), h.tolist(), [1.0, 0.8], [0.0, 0.0], [1.5, 1.0]
+    )
+    method = GaussianFilter(
+        TaylorLinearisation(), [VariationalCovarianceAdaptation(0.9, 10.0, 4.0, 3)]
+    )
+    found = run_filter(
+        method, model, Record(torch.tensor(y)[None]), PhiloxStream(0, torch.arange(1))
+    )
+    m, p, u = np.zeros(2), np.diag([2.25, 1.0]), 10.0
+    r = np.diag([1.0, 0.64])
+    for t, value in enumerate(y):
+        m, p = f @ m, f @ p @ f.T + q
+        mask = ~np.isnan(value)
+        old, wide, weight = r, p, 0.9 * u
+        for k in range(4):
+            hm, rm = h[mask], r[np.ix_(mask, mask)]
+            gain = wide @ hm.T @ np.linalg.inv(hm @ wide @ hm.T + rm)
+            after = m + gain @ (value - h @ m)[mask], wide - gain @ hm @ wide
+            if k == 3:
+                break
+            e = (value - h @ after[0])[mask]
+            fill = old[:, mask] @ np.linalg.inv(old[np.ix_(mask, mask)])
+            rest = old - fill @ old[mask]
+            moment = np.outer(e, e) + hm @ after[1] @ hm.T
+            r = (weight * old + fill @ moment @ fill.T + rest) / (weight + 1)
+            wide = (4.0 * p + np.outer(after[0] - m, after[0] - m) + after[1]) / 5.0
+        u = weight + 1
+        m, p = after
+        np.testing.assert_allclose(found.mean[0, t], m, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found.variance[0, t], np.diag(p), rtol=1e-9)
 
 
 BAD: dict[str, Any] = {
@@ -120,6 +199,19 @@ BAD: dict[str, Any] = {
     ),
     r"SageHusaAdaptation.min_factor must be .*min_factor=2": lambda: SageHusaAdaptation(
         min_factor=2.0
+    ),
+    r"WindowedNoiseAdaptation.window must be .*got 1": lambda: WindowedNoiseAdaptation(1),
+    r"WindowedNoiseAdaptation.min_factor must be .*max_factor=0.9": lambda: WindowedNoiseAdaptation(
+        max_factor=0.9
+    ),
+    r"VariationalCovarianceAdaptation.prior_count must be .*got 0": lambda: (
+        VariationalCovarianceAdaptation(prior_count=0.0)
+    ),
+    r"VariationalCovarianceAdaptation.prediction_count must be .*got 0": lambda: (
+        VariationalCovarianceAdaptation(prediction_count=0.0)
+    ),
+    r"VariationalCovarianceAdaptation.iterations must be .*got 0": lambda: (
+        VariationalCovarianceAdaptation(iterations=0)
     ),
     r"VariationalNoiseAdaptation.prior_count must be .*got inf": lambda: VariationalNoiseAdaptation(
         prior_count=math.inf
