@@ -6,6 +6,7 @@ reports and the benchmark pages. A test fails if a block differs from them.
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import re
@@ -71,8 +72,51 @@ def _digits(value: float) -> str:
     return f"{float(f'{value:.3g}'):.15g}"
 
 
+def board_table(study: str) -> str:
+    """Table of the opening view of a published study, from verdicts.csv. Rows with equal numbers are joined.
+
+    Args:
+        study: Name of the study.
+    """
+    with (TOP / "reports" / study / "verdicts.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    view = ("metric", "world", "regime", "baseline")
+    first = [row for row in rows if all(row[key] == rows[0][key] for key in view)]
+    filters_by_cells: dict[tuple[str, ...], list[str]] = {}
+    for row in first:
+        level, ratio = (
+            f"{_digits(float(row[name]))} [{_digits(float(row[low]))}, {_digits(float(row[high]))}]"
+            if row[name] and row[low] and row[high]
+            else "–"
+            for name, low, high in (
+                ("value", "low", "high"),
+                ("ratio", "ratio_low", "ratio_high"),
+            )
+        )
+        shares = (
+            f"{100 * float(row[name]):.0f} %" if row[name] else "–"
+            for name in ("track", "coverage")
+        )
+        cells = (level, ratio, *shares)
+        filters_by_cells.setdefault(cells, []).append(f"`{row['filter']}`")
+    unit = next((row["unit"] for row in first if row["unit"]), "")
+    head = (
+        "filter",
+        f"error [{unit}]" if unit else "error",
+        f"ratio to `{rows[0]['baseline']}`",
+        "track kept",
+        "true values in 90 % regions",
+    )
+    return format_table(head, ((", ".join(f), *cells) for cells, f in filters_by_cells.items()))
+
+
 def _recorded(study: str, condition: str) -> str:
-    """Table of position and attitude errors of a recorded study, rows with equal errors joined."""
+    """Table of a recorded study: the opening view, or the errors of a report of the first edition.
+
+    The latter has position and attitude errors, rows with equal errors joined.
+    """
+    if (TOP / "reports" / study / "verdicts.csv").is_file():
+        return board_table(study)
     page = f"reports/{study}/report.md"
     overview, attitude, position = (
         {row["filter"]: row for row in read_table(page, *headings)}

@@ -60,3 +60,22 @@ def test_a_page_is_made_again_without_results(study: Path, tmp_path: Path) -> No
     damaged = pfbench("report", "study=demo", f"reports_dir={tmp_path}/reports", home=tmp_path)
     assert damaged.code == 1
     assert "page.json.gz must be the data of a page" in damaged.err
+
+
+def test_a_table_of_the_readme_is_the_opening_view(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers = runpy.run_path(str(ROOT / "docs" / "readme_numbers.py"))
+    monkeypatch.setitem(numbers["board_table"].__globals__, "TOP", tmp_path)
+    (tmp_path / "reports" / "demo").mkdir(parents=True)
+    shutil.copy(study / "verdicts.csv", tmp_path / "reports" / "demo")
+    lines = numbers["board_table"]("demo").split("\n")
+    rows = pd.read_csv(study / "verdicts.csv").iloc[:4]
+    assert lines[0].startswith("| filter | error [m] | ratio to `sir` | track kept |")
+    for line, row in zip(lines[2:], rows.to_dict("records"), strict=True):
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        assert cells[0] == f"`{row['filter']}`"
+        numbers_shown = [float(word.strip("[],")) for word in (cells[1] + " " + cells[2]).split()]
+        names = ("value", "low", "high", "ratio", "ratio_low", "ratio_high")
+        assert numbers_shown == pytest.approx([row[name] for name in names], rel=5e-3)
+        assert cells[3] == f"{100 * row['track']:.0f} %"
