@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
+from checkout import ROOT
 from page_packs import build_pack
 from synthetic_results import study
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report.journal import paper_folder
+from pfbench.report.journal import paper_folder, references
 from pfbench.report.journal.figure_style import FigureSetting
 from pfbench.report.journal.main_table import format_error_value, make_main_tables, make_supplement
 from pfbench.report.journal.methods_text import describe_methods
@@ -222,3 +224,17 @@ def test_methods_list_what_was_not_done(conditions: list[Condition]) -> None:
     assert limits.startswith("Not done: one seed (5)")
     assert "simulated" in limits
     assert "4 runs per condition are fewer than the 10" in limits
+
+
+def test_each_reference_of_a_filter_has_an_entry_and_each_entry_a_filter() -> None:
+    blocks = [
+        yaml.safe_load(path.read_text()).get("paper") or {}
+        for path in (ROOT / "conf" / "filter").glob("*.yaml")
+    ]
+    cited = {block["cite"] for block in blocks if block.get("cite")}
+    bib = (Path(references.__file__).with_name("methods.bib")).read_text()
+    assert set(re.findall(r"^@\w+\{(\w+),", bib, re.MULTILINE)) == cited
+    assert bib.isascii()
+    for entry in re.findall(r"^@.*?^\}", bib, re.MULTILINE | re.DOTALL):
+        assert "title = {" in entry
+        assert "year = {" in entry or "note = {" in entry
