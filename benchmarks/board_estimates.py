@@ -1,4 +1,4 @@
-"""Size and power of two estimates of a board: trimmed log levels and ratios of medians.
+"""Size and power of estimates: trimmed log levels, ratios of medians, and trimmed paired ratios.
 
     python benchmarks/board_estimates.py
 
@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pfbench.report.board.levels import RunArrays, compute_levels
+from pfbench.results.decisions.pair_effects import location_effects
+from pfbench.results.statistics.paired_effects import log_levels, subtract_levels
 
 STUDIES, RESAMPLES = 1000, 499
 EFFECTS = {"size": 0.0, "power at -10 %": np.log(0.9)}
@@ -26,15 +27,15 @@ def draw_studies(rng: np.random.Generator, runs: int, noise: str, effect: float)
     return np.exp(log_error)
 
 
-def decide_by_levels(errors: np.ndarray) -> float:
-    """Return the share of studies whose interval of the difference of levels excludes 0."""
-    decided = 0
-    for study in errors:
-        present = np.ones((2, 1, study.shape[1]), dtype=bool)
-        runs = RunArrays(("a", "b"), np.ones(1), study[:, None], present, present)
-        low, high = compute_levels(runs).difference(0, 1).interval(0.05)
-        decided += not low <= 0 <= high
-    return decided / len(errors)
+def decide_by_pairs(errors: np.ndarray, *, by_levels: bool) -> float:
+    """Return the share of studies that decide the pair, by levels or by paired ratios."""
+    a, b = errors[:, None, None, 0], errors[:, None, None, 1]
+    valid = np.ones(a.shape, dtype=bool)
+    levels = subtract_levels(log_levels(a, valid, valid), log_levels(b, valid, valid))
+    effects = location_effects(
+        np.log(a / b), np.ones((1, 1)), conditions=levels if by_levels else None
+    )
+    return float((effects.same_worlds.p <= 0.05).mean())
 
 
 def decide_by_medians(errors: np.ndarray, rng: np.random.Generator) -> float:
@@ -50,15 +51,18 @@ def decide_by_medians(errors: np.ndarray, rng: np.random.Generator) -> float:
 
 def main() -> None:
     """Print a table."""
-    print("| noise | runs | quantity | trimmed log levels | ratio of medians |")
-    print("| --- | --- | --- | --- | --- |")
+    print("| noise | runs | quantity | trimmed log levels | ratio of medians | paired ratios |")
+    print("| --- | --- | --- | --- | --- | --- |")
     for noise in ("t3", "skewed"):
         for runs in (10, 30, 100):
             for quantity, effect in EFFECTS.items():
                 rng = np.random.default_rng(1)
                 errors = draw_studies(rng, runs, noise, effect)
-                levels, medians = decide_by_levels(errors), decide_by_medians(errors, rng)
-                print(f"| {noise} | {runs} | {quantity} | {levels:.3f} | {medians:.3f} |")
+                levels, paired = (decide_by_pairs(errors, by_levels=by) for by in (True, False))
+                medians = decide_by_medians(errors, rng)
+                print(
+                    f"| {noise} | {runs} | {quantity} | {levels:.3f} | {medians:.3f} | {paired:.3f} |"
+                )
 
 
 if __name__ == "__main__":

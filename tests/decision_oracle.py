@@ -76,19 +76,21 @@ def runs_of(data: dict[str, np.ndarray], meta: dict[str, Any]) -> pd.DataFrame:
     })  # fmt: skip
 
 
-Worlds = dict[str, list[tuple[float, np.ndarray]]]  # weight and differences of each condition
+# of each condition: weight, differences of the runs, and log errors of both filters if it has a ratio
+Levels = tuple[np.ndarray, np.ndarray] | None
+Worlds = dict[str, list[tuple[float, np.ndarray, Levels]]]
 
 
 def paired_values(runs: pd.DataFrame, a: str, b: str, metric: str) -> Worlds:
     """Differences of a pair by world, over the runs in their order; weights of a world have sum 1."""
-    worlds: dict[str, dict[str, list[np.ndarray]]] = {}
+    worlds: dict[str, dict[str, list[tuple[np.ndarray, Levels]]]] = {}
     for (world, scenario, _), rows in runs.groupby(["world", "scenario", "regime"]):
         first, second = (rows[rows["filter"] == name].set_index("run") for name in (a, b))
         if metric == "keeps track" or first.get(metric, pd.Series(dtype=float)).notna().any():
-            d = differences(first, second, metric)
-            worlds.setdefault(str(world), {}).setdefault(str(scenario), []).append(d)
+            values = differences(first, second, metric), log_errors(first, second, metric)
+            worlds.setdefault(str(world), {}).setdefault(str(scenario), []).append(values)
     return {
-        world: [(1 / len(scenarios) / len(rows), d) for rows in scenarios.values() for d in rows]
+        world: [(1 / len(scenarios) / len(rows), *v) for rows in scenarios.values() for v in rows]
         for world, scenarios in worlds.items()
     }
 
@@ -107,6 +109,24 @@ def differences(first: pd.DataFrame, second: pd.DataFrame, metric: str) -> np.nd
     d[keeps_a & ~keeps_b], d[keeps_b & ~keeps_a] = -np.inf, np.inf
     d[~keeps_a & ~keeps_b] = 0.0
     return np.asarray(d)
+
+
+def log_errors(first: pd.DataFrame, second: pd.DataFrame, metric: str) -> Levels:
+    """Log errors of both filters, infinite where the track is lost."""
+    if METRICS[metric] != "ratio":
+        return None
+    a, b = (
+        np.where(rows["keeps"], np.log(rows[metric].to_numpy(float)), np.inf)
+        for rows in (first, second)
+    )
+    return a, b
+
+
+def level_difference(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, int]:
+    """Difference of two trimmed means, with the differences of the contributions of the runs."""
+    (x, parts_x, middle), (y, parts_y, _) = trimmed(a), trimmed(b)
+    with np.errstate(invalid="ignore"):
+        return x - y, parts_x - parts_y, middle
 
 
 def trimmed(d: np.ndarray) -> tuple[float, np.ndarray, int]:
@@ -136,8 +156,11 @@ def exchange_p(contributions: np.ndarray) -> float:
 
 def estimate(worlds: Worlds, kind: str) -> dict[str, Any]:
     """Estimate, standard error, degrees of freedom and p-value for both questions."""
-    location = {"ratio": trimmed, "score": trimmed}.get(kind, plain_mean)
-    parts = {w: [(g, *location(d)) for g, d in conditions] for w, conditions in worlds.items()}
+    location = trimmed if kind == "score" else plain_mean
+    parts = {
+        w: [(g, *(level_difference(*logs) if logs else location(d))) for g, d, logs in conditions]
+        for w, conditions in worlds.items()
+    }
     theta = np.array([sum(g * x for g, x, _, _ in conditions) for conditions in parts.values()])
     psi = np.array([sum(g * row for g, _, row, _ in conditions) for conditions in parts.values()])
     middle = min(c[3] for conditions in parts.values() for c in conditions)
@@ -145,7 +168,7 @@ def estimate(worlds: Worlds, kind: str) -> dict[str, Any]:
     correction = middle / (middle - 1)
     error = np.sqrt(correction * (psi.mean(0) ** 2).sum())
     if kind in ("ratio", "score") and not (np.isfinite(theta).all() and error > 0):
-        won = {w: [(g, np.sign(d)) for g, d in conditions] for w, conditions in worlds.items()}
+        won = {w: [(g, np.sign(d), None) for g, d, _ in c] for w, c in worlds.items()}
         return estimate(won, "won")
     value = theta.mean()
     here = (value, error, middle - 1)
@@ -154,7 +177,7 @@ def estimate(worlds: Worlds, kind: str) -> dict[str, Any]:
     shared = max(0.0, joint / (count * (count - 1))) if count > 1 else np.nan
     between = theta.std(ddof=1) ** 2 / count + shared if count > 1 else np.nan
     if kind in ("track", "share", "won"):
-        x = np.mean([sum(g * d for g, d in c) for c in worlds.values()], axis=0)
+        x = np.mean([sum(g * d for g, d, _ in c) for c in worlds.values()], axis=0)
         n = len(x)  # x: contribution of each run, times the number of runs
         p = exchange_p(x / n)
         shrunk = x.sum() / (n + 2)
@@ -164,7 +187,7 @@ def estimate(worlds: Worlds, kind: str) -> dict[str, Any]:
         between = max(between, error**2)
     new = (value, np.sqrt(between), count - 1)
     p_new = 2 * stats.t.sf(abs(value) / new[1], count - 1) if count > 1 else np.nan
-    is_identical = all((np.abs(d) <= 1e-6).all() for c in worlds.values() for _, d in c)
+    is_identical = all((np.abs(d) <= 1e-6).all() for c in worlds.values() for _, d, _ in c)
     if is_identical:
         p = p_new = np.nan
     return {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from pfbench.results.decisions.options import DecisionOptions
 from pfbench.results.study_decisions.main_metrics import check_main_metric
 
 _FORMATS = ("svg", "png")
@@ -55,3 +56,8 @@ class ReportOptions:
             raise ValueError(
                 f"report.figure_formats must be a subset of {options}, got {list(self.figure_formats)}. Use svg."
             )
+
+    @property
+    def decision_options(self) -> DecisionOptions:
+        """Options of all decisions: planned pairs are decided by the levels of the board."""
+        return DecisionOptions(self.alpha, self.equivalence_margin, estimate="levels")

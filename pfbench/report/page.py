@@ -8,7 +8,7 @@ from typing import Any
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import cost, provenance, writers
-from pfbench.report.board import write_report_data
+from pfbench.report.board import read_study, write_report_data
 from pfbench.report.looks import study_looks
 from pfbench.report.options import ReportOptions
 from pfbench.report.plots.paper import paper_figures
@@ -62,8 +62,9 @@ def write_report(
         study, conditions, style, options.paper_figures, options.start_time_s
     )
     with RecordedFolder(Path(out) / study) as folder:
-        pack = write_report_data(study, conditions, options, folder)
-        pack["downloads"] += write_study_files(conditions, options, folder)
+        data = read_study(conditions, options, has_metrics=True)
+        pack = write_report_data(study, conditions, options, folder, data)
+        pack["downloads"] += write_study_files(data.metrics, conditions, options, folder)
         pack["provenance"] += list_job_settings(conditions, options.planned)
         pack |= {
             "paper_figures": writers.render_figures(

@@ -18,9 +18,8 @@ from pfbench.report.writers import write_json
 from pfbench.results.conditions import Condition, natural_sort_key
 from pfbench.results.decisions.decision import Decision
 from pfbench.results.decisions.filter_sets import order_filters
-from pfbench.results.decisions.options import DecisionOptions, MetricRule
+from pfbench.results.decisions.options import MetricRule
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs, decide_secondary_metrics
-from pfbench.results.frame import to_long_rows
 from pfbench.results.state_groups import main_component_group
 from pfbench.results.study_decisions.common_conditions import select_common_runs
 from pfbench.results.study_decisions.consistency_bands import decide_consistency
@@ -38,11 +37,15 @@ _KEYS = ("scenario", "noise", "model", "label", "group", "component", "metric", 
 
 
 def write_study_files(
-    conditions: Sequence[Condition], options: ReportOptions, folder: RecordedFolder
+    table: pd.DataFrame,
+    conditions: Sequence[Condition],
+    options: ReportOptions,
+    folder: RecordedFolder,
 ) -> list[dict[str, Any]]:
     """Write decisions.json, consistency.json and metrics.csv.
 
     Args:
+        table: Rows of `load_frame`.
         conditions: Conditions of the study.
         options: Options of the report.
         folder: Folder of the report.
@@ -50,13 +53,6 @@ def write_study_files(
     Returns:
         Entries of the downloads of the page.
     """
-    start, converged = options.start_time_s, options.convergence_threshold
-    rows = [
-        to_long_rows(condition, job, job.load(), start, converged)
-        for condition in conditions
-        for job in condition.jobs
-    ]
-    table = pd.concat(rows, ignore_index=True)
     mains = {
         (c.scenario, c.noise, c.model): main_component_group(c.jobs[0].meta["state"]).group
         for c in conditions
@@ -65,7 +61,7 @@ def write_study_files(
     name = names.pop() if len(names) == 1 else MAIN
     others = tidy_other_groups(table, mains)
     decisions = decide_study(select_main_metrics(table, mains, name), name, options, others)
-    bands = decide_consistency(table, DecisionOptions(options.alpha, options.equivalence_margin))
+    bands = decide_consistency(table, options.decision_options)
     files = {
         "Decisions on all pairs (JSON)": write_json(folder, "decisions", decisions),
         "Bands of NEES and NIS (JSON)": write_json(folder, "consistency", bands),
@@ -93,7 +89,7 @@ def decide_study(
         options: Options of the report.
         others: Tables of `tidy_other_groups`, None for none.
     """
-    settings = DecisionOptions(options.alpha, options.equivalence_margin)
+    settings = options.decision_options
     rule, tidy = main_rule(options.metric, group), tidy_main(rows, options.metric, group)
     labels = sorted(tidy["filter"].unique(), key=natural_sort_key)
     pairs = [pair for pair in plan_installed_pairs(labels) if _share_condition(tidy, *pair)]

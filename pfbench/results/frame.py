@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -53,6 +54,16 @@ def load_frame(
     return pd.concat(rows, ignore_index=True)
 
 
+def select_indices(size: int, most: int = 180) -> np.ndarray:
+    """Select at most `most` evenly spaced indices of `size`.
+
+    Args:
+        size: Number of elements.
+        most: Number of indices at most. A column of print is 250 points wide.
+    """
+    return np.unique(np.linspace(0, size - 1, min(size, most)).astype(int))
+
+
 def drop_before(result: store.JobResult, start_time_s: float) -> store.JobResult:
     """Remove the steps before a time.
 
@@ -96,6 +107,24 @@ def select_steps(result: store.JobResult, mask: np.ndarray) -> store.JobResult:
     return store.JobResult(result.meta, {**selected, **shared, **scores})
 
 
+class MetricColumn(NamedTuple):
+    """Values of one metric and component.
+
+    Attributes:
+        metric: Name of the metric.
+        value: Values of the runs, [R].
+        group: Name of the group.
+        component: Name of the component.
+        unit: Unit.
+    """
+
+    metric: str
+    value: np.ndarray
+    group: str
+    component: str
+    unit: str
+
+
 def to_long_rows(
     condition: Condition,
     job: JobFile,
@@ -119,9 +148,14 @@ def to_long_rows(
     scored = drop_before(result, start_time_s)
     keeps = status.keeps_track(scored.data, scored.meta)
     columns = [*_metric_rows(scored), *_convergence(result, converged)]
-    rows = pd.concat(columns, ignore_index=True)
     first, runs = job.meta.get("first_run", 0), lost.size
-    repeats = len(rows) // runs
+    repeats = len(columns)
+    size = repeats * runs
+    names = {
+        name: np.repeat(np.array([getattr(column, name) for column in columns], dtype=object), runs)
+        for name in ("group", "component", "unit", "metric")
+    }
+    value = np.concatenate([column.value for column in columns]).astype(np.float64)
     head = {
         "study": job.meta["study"],
         "key": job.meta["key"],
@@ -131,13 +165,13 @@ def to_long_rows(
         "model": condition.model,
         "filter": job.meta["choices"]["filter"],
         "label": job.label,
-        "particles": pd.array([job.meta.get("particles")] * len(rows), dtype="Int64"),
+        "particles": pd.array([job.meta.get("particles")] * size, dtype="Int64"),
         "seed": job.meta["seed"],
         "run": np.tile(np.arange(first, first + runs), repeats),
         "lost": np.tile(lost, repeats),
         "keeps_track": np.tile(keeps, repeats),
     }
-    return pd.concat([pd.DataFrame(head, index=rows.index), rows], axis=1)
+    return pd.DataFrame({**head, **names, "value": value}, index=range(size))
 
 
 def _select_scores(data: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
@@ -149,8 +183,8 @@ def _select_scores(data: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str
     return {"score_steps": (np.cumsum(mask) - 1)[data["score_steps"][remaining]], **scores}
 
 
-def _metric_rows(result: store.JobResult) -> Iterator[pd.DataFrame]:
-    """Yield one small table of R rows per metric and component."""
+def _metric_rows(result: store.JobResult) -> Iterator[MetricColumn]:
+    """Yield the values of R runs per metric and component."""
     scopes: tuple[metrics.Scope, ...] = ("components", "group", "job")
     for scope in scopes:
         entries = [metric for metric in metrics.METRICS if metric.scope == scope]
@@ -160,22 +194,16 @@ def _metric_rows(result: store.JobResult) -> Iterator[pd.DataFrame]:
                 is_group_unit = metric.unit == metrics.GROUP_UNIT and data.group
                 unit = data.group.unit if is_group_unit and data.group else metric.unit
                 for component, value in metric.compute(data).items():
-                    yield _column(metric.name, value, group, component, unit)
+                    yield MetricColumn(metric.name, value, group, component, unit)
 
 
-def _convergence(result: store.JobResult, converged: Mapping[str, float]) -> Iterator[pd.DataFrame]:
+def _convergence(result: store.JobResult, converged: Mapping[str, float]) -> Iterator[MetricColumn]:
     """Yield the convergence time of each group with a bound, from the start of the record."""
     for group in component_groups(result.meta["state"]):
         if group.group in converged:
             error = result.data["error"][..., group.places].astype(np.float64) * group.scale
             time, lost = result.data["time"], result.data["lost"]
             when = convergence_time(time, error, lost, converged[group.group])
-            yield _column("converged", when, group.group, "norm", "s")
+            yield MetricColumn("converged", when, group.group, "norm", "s")
             share = np.minimum(when, time[-1]) / time[-1]
-            yield _column("time_to_converge", share, group.group, "norm", "")
-
-
-def _column(metric: str, value: np.ndarray, group: str, component: str, unit: str) -> pd.DataFrame:
-    """Return the rows of one metric and component."""
-    names = {"group": group, "component": component, "unit": unit, "metric": metric}
-    return pd.DataFrame({**names, "value": value.astype(np.float64)})
+            yield MetricColumn("time_to_converge", share, group.group, "norm", "")

@@ -82,14 +82,14 @@ def build_pack(
              "words": ""} for i in range(regimes)
         ],
         "cells": [
-            {"key": _cell(c), "world": f"w{c[0]}", "regime": f"r{c[1]}", "model": "model", "runs": runs,
+            {"world": f"w{c[0]}", "regime": f"r{c[1]}", "noise": f"r{c[1]}", "model": "", "runs": runs,
              "particles": 100, "seed": 1} for c in cells
         ],
         "metrics": [
             {"key": key, "name": name, "unit": unit, "direction": "lower", "caption": f"{name} of a run."}
             for key, name, unit in METRICS
         ],
-        "baselines": keys[:2],
+        "baselines": keys[: built.baselines],
         "budgets": [
             {"key": "particles", "name": "Same N", "reason_missing": None},
             {"key": "time", "name": "Same time", "reason_missing": "This study has no runs of that budget."},
@@ -105,10 +105,15 @@ def build_pack(
         },
         "tracks": tracks,
         "sweeps": [built.sweep()] if filters > 2 else [],
-        "replay": "pfbench replay study=invented scenario={world} noise={regime} filter={filter} run={run}",
+        "replay": "pfbench replay study=invented scenario={world} noise={noise} filter={filter} run={run}",
         "downloads": [{"name": "Verdicts (CSV)", "href": "verdicts.csv", "bytes": 1234, "group": "Numbers"}],
         "methods_paragraph": "Filters were compared.\n\nOne seed was used.",
         "bibtex": "@misc{a,\n title = {A},\n}",
+        "filter_notes": [
+            {"filter": key, "particles": "100", "is_exact": i % 2 == 0, "runs": runs, "lost": 0, "diverged": None,
+             "collapsed": i, "severely_overconfident": 0} for i, key in enumerate(keys)
+        ],
+        "choices": [{"text": "the noise is inflated", "filters": "all filters"}],
         "provenance": [["commit", "0" * 7], ["device", "cpu"]],
     }  # fmt: skip
 
@@ -120,6 +125,8 @@ class _Numbers:
         self, keys: list[str], errors: Any, lost: set[int], missing: set[Any], rng: Any
     ) -> None:
         self.keys, self.errors, self.lost, self.missing, self.rng = keys, errors, lost, missing, rng
+        self.are_equal = len(errors) > 1 and np.array_equal(errors[0], errors[1], equal_nan=True)
+        self.baselines = 3 if errors[..., 0].size <= 300 else 2
         self.cost = np.exp(rng.normal(1, 1, len(keys)))
         self.coverage = rng.uniform(0.3, 0.95, len(keys))
 
@@ -127,14 +134,17 @@ class _Numbers:
         scopes = itertools.product(["all", *range(worlds)], ["all", *range(regimes)])
         views: dict[str, Any] = {}
         scopes = list(scopes)
+        by_metric = {"rmse": self.errors}
+        for metric, *_ in METRICS[1:]:
+            factors = np.exp(self.rng.normal(0, 0.1, self.errors.shape))
+            by_metric[metric] = self.errors * (1 if self.are_equal else factors)
         for (metric, *_), (w, r) in itertools.product(METRICS, scopes):
-            for b in range(min(2, len(self.keys))):
-                name = f"{metric}/{_key('w', w)}/{_key('r', r)}/{self.keys[b]}"
-                views[name] = self.view(w, r, b)
+            for b in range(min(self.baselines, len(self.keys))):
+                name = (metric, _key("w", w), _key("r", r), self.keys[b])
+                views[name] = self.view(by_metric[metric], w, r, b)
         return views
 
-    def view(self, w: Any, r: Any, b: int) -> dict[str, Any]:
-        picked = self.errors
+    def view(self, picked: Any, w: Any, r: Any, b: int) -> dict[str, Any]:
         if w != "all":
             picked = picked[:, w : w + 1]
         if r != "all":
@@ -194,7 +204,7 @@ class _Numbers:
                 "a": self.keys[a], "b": self.keys[b], "question": "Error in these worlds", "kind": "paper",
                 "sentence": f"In these worlds Filter {a} against Filter {b}.",
                 "estimate": _short(np.exp(mean)), "low": _short(np.exp(mean - 2 * sd)),
-                "high": _short(np.exp(mean + 2 * sd)), "p": 0.01, "word": "better" if mean < -2 * sd else "open",
+                "high": _short(np.exp(mean + 2 * sd)), "p": 0.01, "reason": "", "word": "better" if mean < -2 * sd else "open",
                 "new_world": None if worlds < 2 else {"estimate": _short(np.exp(mean)),
                     "low": _short(np.exp(mean - 0.5)), "high": _short(np.exp(mean + 0.5)), "word": "open"},
                 "prediction": None if worlds < 3 else [_short(np.exp(mean - 1)), _short(np.exp(mean + 1))],
@@ -215,14 +225,14 @@ class _Numbers:
                 * (1 + 4 * np.exp(-t / 80))
                 * (1 + 0.1 * np.sin(t / 37 + i))
             )
-            filters[key] = {name: [_short(v * factor) for v in shape]
+            filters[key] = {name: [_short(v * factor * np.exp(self.rng.normal(0, 0.06))) for v in shape]
                             for name, factor in (("median", 1.0), ("q10", 0.6), ("q90", 1.7))}  # fmt: skip
         return {"t": t.round(1).tolist(), "unit": "m", "group": "position", "filters": filters}
 
     def calibration(self, worlds: int, regimes: int) -> dict[str, Any]:
         scopes = itertools.product(["all", *range(worlds)], ["all", *range(regimes)])
         return {
-            f"{_key('w', w)}/{_key('r', r)}": {
+            (_key("w", w), _key("r", r)): {
                 key: {"c50": _short(0.55 * c), "c90": _short(c), "nees_ratio": _short(1 / c)}
                 for i, (key, c) in enumerate(zip(self.keys, self.coverage, strict=True))
                 if i not in self.lost
@@ -234,9 +244,11 @@ class _Numbers:
         return {
             "name": "particles", "unit": "", "world": "w0", "regime": "r0", "value_unit": "m",
             "caption": "RMS error against the number of particles.",
-            "filters": {key: [{"x": x, "value": 5 / x**0.3 * (i + 1), "low": 4.5 / x**0.3 * (i + 1),
-                               "high": 5.5 / x**0.3 * (i + 1)} for x in (50, 100, 200, 500, 1000)]
-                        for i, key in enumerate(self.keys[:3])},
+            "ticks": None,
+            "lines": [{"filter": key, "name": f"Line {i}", "points": [
+                {"x": x, "value": 5 / x**0.3 * (i + 1), "low": 4.5 / x**0.3 * (i + 1),
+                 "high": 5.5 / x**0.3 * (i + 1)} for x in (50, 100, 200, 500, 1000)]}
+                for i, key in enumerate(self.keys[:3])],
         }  # fmt: skip
 
     def tracks(self, cell: tuple[int, int], carried: int, plane: bool) -> dict[str, Any]:
@@ -278,8 +290,8 @@ def _key(letter: str, index: Any) -> str:
     return "all" if index == "all" else f"{letter}{index}"
 
 
-def _cell(cell: tuple[int, int]) -> str:
-    return f"w{cell[0]}/r{cell[1]}"
+def _cell(cell: tuple[int, int]) -> tuple[str, str]:
+    return f"w{cell[0]}", f"r{cell[1]}"
 
 
 def _look(i: int, names: dict[int, str]) -> dict[str, Any]:

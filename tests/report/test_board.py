@@ -13,11 +13,26 @@ from scipy import stats
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.board import write_verdict_files
-from pfbench.report.board.levels import RunArrays, arrange_runs, compute_levels
+from pfbench.report.board.levels import (
+    StudyArrays,
+    arrange_runs,
+    average_levels,
+    compute_condition_levels,
+)
+from pfbench.report.board.planned import decide_planned, planned_entries
 from pfbench.report.board.sentence import describe_view
-from pfbench.report.board.view import BoardRow, ViewOptions, build_rows
-from pfbench.report.looks import find_looks
+from pfbench.report.board.view import (
+    BoardRow,
+    Scope,
+    ViewOptions,
+    build_rows,
+    describe_filters,
+)
+from pfbench.report.looks import PartName, find_looks
+from pfbench.report.options import ReportOptions
+from pfbench.report.study_page.opening import describe_pairs
 
+ONE_CONDITION = pd.DataFrame({"family": ["w"], "scenario": ["w"], "regime": ["nominal"]})
 EFFECTS = {"mcmc_rpf": -0.3, "sir": 0.0, "ukf": 0.5}
 
 
@@ -43,7 +58,10 @@ def table(
 
 def board(data: pd.DataFrame, baseline: str = "sir", **options: object) -> dict[str, BoardRow]:
     labels = tuple(sorted(data["filter"].unique()))
-    rows = build_rows(data, "rmse", baseline, labels, ViewOptions(**options))  # type: ignore[arg-type]
+    runs = arrange_runs(data, labels)
+    levels = average_levels(compute_condition_levels(runs, "rmse"), runs.conditions)
+    scope = Scope(labels, levels, describe_filters(runs), "m", len(runs.conditions) == 1)
+    rows = build_rows(scope, baseline, ViewOptions(**options))  # type: ignore[arg-type]
     return {row.filter: row for row in rows}
 
 
@@ -67,8 +85,8 @@ def test_ratios_are_those_of_scipy_and_transitive() -> None:
 
 
 def test_shared_runs_make_the_interval_of_a_difference_short() -> None:
-    runs = arrange_runs(table(worlds=1), "rmse", ("mcmc_rpf", "sir", "ukf"))
-    levels = compute_levels(runs)
+    runs = arrange_runs(table(worlds=1), ("mcmc_rpf", "sir", "ukf"))
+    levels = average_levels(compute_condition_levels(runs, "rmse"), runs.conditions)
     paired = float(levels.difference(0, 1).standard_error)
     alone = math.hypot(*(float(levels.single(k).standard_error) for k in (0, 1)))
     assert paired < 0.5 * alone
@@ -81,7 +99,8 @@ def test_intervals_cover_and_equal_filters_are_rarely_called_worse() -> None:
         rng = np.random.default_rng(k)
         error = np.exp(0.5 * rng.normal(size=(1, 1, 20)) + 0.1 * rng.standard_t(3, (3, 1, 20)))
         ones = np.ones(error.shape, dtype=bool)
-        levels = compute_levels(RunArrays(("a", "b", "c"), np.ones(1), error, ones, ones))
+        runs = StudyArrays(("a", "b", "c"), ONE_CONDITION, {"rmse": error}, ones, ones)
+        levels = average_levels(compute_condition_levels(runs, "rmse"), ONE_CONDITION)
         low, high = levels.difference(0, 1).interval(0.05)
         outside += not low <= 0 <= high
         best = int(np.argmin(levels.level))
@@ -153,7 +172,7 @@ def test_sentences_of_small_studies(runs: int, labels: list[str], is_lost: bool)
 def test_files_hold_what_the_board_shows(tmp_path: Path) -> None:
     data = table()
     rows = [{"filter": k, "ratio": row.ratio} for k, row in board(data).items()]
-    pack = {"views": {"rmse/all/all/sir": {"rows": rows}}}
+    pack = {"views": {("rmse", "all", "all", "sir"): {"rows": rows}}, "bibtex": "@misc{a}"}
     with RecordedFolder(tmp_path / "report") as folder:
         downloads = write_verdict_files(pack, data, folder)
     stored = pd.read_parquet(io.BytesIO((tmp_path / "report" / "runs.parquet").read_bytes()))
@@ -161,4 +180,34 @@ def test_files_hold_what_the_board_shows(tmp_path: Path) -> None:
     for label in EFFECTS:
         expected = math.exp(trimmed_level(stored, label) - trimmed_level(stored, "sir"))
         assert verdicts.loc[label, "ratio"] == pytest.approx(expected)
-    assert [entry["href"] for entry in downloads] == ["verdicts.csv", "runs.parquet"]
+    assert [entry["href"] for entry in downloads] == ["verdicts.csv", "runs.parquet", "pfbench.bib"]
+
+
+def test_planned_pairs_have_the_estimate_of_the_board() -> None:
+    data = table({"mcmc_rpf": -0.3, "sir": 0.0, "rpf": 0.1}).assign(regime="nominal")
+    data["run"] += 100 * (data.groupby(["filter", "scenario", "run"]).cumcount())
+    looks, options = find_looks(sorted(data["filter"].unique())), ReportOptions(alpha=0.1)
+    worlds = {k: PartName(k, f"World {k}", "", "m", None, k) for k in ("w0", "w1")}
+    entries = planned_entries(decide_planned(data, looks, options), data, looks, worlds, options)
+    assert {entry["a"] for entry in entries} == {"mcmc_rpf"}
+    for entry in entries:
+        rows = board(data, entry["b"], alpha=0.1)
+        assert entry["estimate"] == pytest.approx(rows["mcmc_rpf"].ratio, rel=1e-3)
+        assert entry["low"] < rows["mcmc_rpf"].ratio_low  # a family of four tests
+        assert "90 % simultaneous interval" in entry["sentence"]
+        assert "[[MCMC-RPF]]" in entry["sentence"]
+        for cell in entry["cells"]:
+            single = board(data[data["scenario"] == cell["world"]], entry["b"], alpha=0.1)
+            assert cell["estimate"] == pytest.approx(single["mcmc_rpf"].ratio, rel=1e-3)
+            assert cell["low"] == pytest.approx(single["mcmc_rpf"].ratio_low, rel=1e-3)
+            assert cell["name"] == f"World {cell['world']}"
+
+
+def test_too_few_runs_say_why_a_planned_pair_has_no_interval() -> None:
+    data = table(runs=4, worlds=1)
+    looks, options = find_looks(sorted(data["filter"].unique())), ReportOptions()
+    planned = decide_planned(data, looks, options)
+    (entry, *_) = planned_entries(planned, data, looks, {}, options)
+    assert (entry["low"], entry["high"]) == (None, None)
+    pack = {"planned": [entry], "filters": [{"key": k, "name": k} for k in looks]}
+    assert describe_pairs(pack)[0]["interval"] == "4 runs per condition, 10 are required"

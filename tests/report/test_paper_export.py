@@ -130,7 +130,7 @@ def test_a_table_that_does_not_fit_is_refused_with_advice(
 
 def test_bold_is_the_smallest_printed_number_and_worse_has_a_dagger() -> None:
     pack = build_pack(3, 1, 1, runs=3, instants=4, carried=0)
-    rows = pack["views"]["rmse/w0/r0/f0"]["rows"]
+    rows = pack["views"]["rmse", "w0", "r0", "f0"]["rows"]
     values = [(1.2344, "best"), (1.2341, "open"), (9.0, "worse")]
     for row, (value, verdict) in zip(rows, values, strict=True):
         row |= {"value": value, "low": value / 2, "high": 2 * value, "verdict": verdict}

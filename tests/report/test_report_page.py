@@ -13,7 +13,7 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.report import page, table_formats
-from pfbench.report.board.curves import list_curves
+from pfbench.report.board.curves import make_curves
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 
@@ -203,7 +203,8 @@ def test_curves_have_the_rare_steps_with_truth(tmp_path):
     rare[[101, 355, 612, 990]] = True  # none of which a stride meets
     error[:, ~rare, 6:] = np.nan
     store.write_result(path, meta, {**arrays, "error": error})
-    (curve,) = list_curves(load_conditions("demo", tmp_path)).values()
+    (condition,) = load_conditions("demo", tmp_path)
+    curve = make_curves({job.label: job.load() for job in condition.jobs})
     assert curve["t"] == arrays["time"][rare].tolist()
     norm = np.linalg.norm(error[:, rare, 6:].astype(float), axis=-1)
     np.testing.assert_allclose(curve["filters"]["ekf"]["median"], np.median(norm, 0), rtol=1e-3)

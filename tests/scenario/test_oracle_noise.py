@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from copy import deepcopy
 from functools import cache
@@ -625,6 +626,9 @@ def test_the_switch_reaches_the_result(tmp_path: Path) -> None:
     assert report.code == 0, report.err
     page = (tmp_path / "reports" / "adhoc" / "report.md").read_text()
     assert "EKF [oracle_noise=True]" in page
+    assert re.search(
+        r"receives the true noise.*\(EKF \[oracle_noise=True\]\)", page.replace("\\", "")
+    )
 
 
 @pytest.mark.parametrize(

@@ -4,57 +4,76 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from pfbench.report.plots.plotting import select_indices
-from pfbench.results.conditions import Condition
+from pfbench.results.error_measures import Array
+from pfbench.results.frame import select_indices
 from pfbench.results.state_groups import main_component_group
+from pfbench.results.store import JobResult
 
-INSTANTS = 60
+INSTANTS, FEW_INSTANTS = 60, 24
+_MANY = 300  # filters times conditions, from which curves have few instants
 ALL = "all"
+CellKey = tuple[str, str]
 
 
-def list_curves(conditions: Sequence[Condition]) -> dict[str, Any]:
-    """List quantiles over runs of the error of the main group at up to 60 instants, by cell.
+def make_curves(results: Mapping[str, JobResult], conditions: int = 1) -> dict[str, Any]:
+    """Compute quantiles over runs of the error of the main group at up to 60 instants, or 24 of a large study.
 
     Args:
-        conditions: Conditions of the study.
+        results: Results of the filters of a condition by label.
+        conditions: Number of conditions of the study.
     """
-    curves: dict[str, Any] = {}
-    for condition in conditions:
-        key = f"{condition.scenario}/{condition.noise}"
-        if key in curves:  # another model of the scenario
-            key += f" + {condition.model}"
-        norms, time, group = {}, np.zeros(0), None
-        for job in condition.jobs:
-            result = job.load()
-            group = main_component_group(result.meta["state"])
-            time = result.data["time"]
-            error = result.data["error"][..., group.places].astype(np.float64)
-            norms[job.label] = np.sqrt((error**2).sum(axis=-1)) * group.scale
-            norms[job.label][np.asarray(result.data["lost"], dtype=bool)] = np.nan
-        # steps without truth are dropped before thinning, which could miss rare steps with truth
-        steps = np.flatnonzero(np.any([np.isfinite(n).any(axis=0) for n in norms.values()], axis=0))
-        steps = steps if steps.size else np.arange(time.size)
-        steps = steps[select_indices(steps.size, INSTANTS)]
-        filters = {}
-        for label, norm in norms.items():
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # instants without a run
-                low, median, high = np.nanquantile(norm[:, steps], [0.1, 0.5, 0.9], axis=0)
-            filters[label] = {
-                "median": _numbers(median), "q10": _numbers(low), "q90": _numbers(high),
-            }  # fmt: skip
-        unit, name = (group.unit, group.group) if group else ("", "")
-        curves[key] = {"t": _numbers(time[steps]), "filters": filters, "unit": unit, "group": name}
-    return curves
+    first = next(iter(results.values()))
+    group = main_component_group(first.meta["state"])
+    most = INSTANTS if len(results) * conditions <= _MANY else FEW_INSTANTS
+    norms = compute_error_norms(results)
+    steps = select_truth_steps(norms.values(), most)
+    filters = {}
+    for label, norm in norms.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # instants without a run
+            low, median, high = np.nanquantile(norm[:, steps], [0.1, 0.5, 0.9], axis=0)
+        filters[label] = {
+            "median": _numbers(median), "q10": _numbers(low), "q90": _numbers(high),
+        }  # fmt: skip
+    time = _numbers(first.data["time"][steps])
+    return {"t": time, "filters": filters, "unit": group.unit, "group": group.group}
 
 
-def list_calibration(table: pd.DataFrame) -> dict[str, Any]:
+def compute_error_norms(results: Mapping[str, JobResult]) -> dict[str, Array]:
+    """Compute the norm of the error of the main group in displayed units, [R, T] by label; NaN in lost runs.
+
+    Args:
+        results: Results of the filters of a condition by label.
+    """
+    norms = {}
+    for label, result in results.items():
+        group = main_component_group(result.meta["state"])
+        error = result.data["error"][..., group.places].astype(np.float64)
+        norm = np.sqrt((error**2).sum(axis=-1)) * group.scale
+        norm[np.asarray(result.data["lost"], dtype=bool)] = np.nan
+        norms[label] = norm
+    return norms
+
+
+def select_truth_steps(norms: Iterable[Array], most: int) -> np.ndarray:
+    """Select evenly spaced steps among those with truth.
+
+    Args:
+        norms: Errors of the filters, [R, T].
+        most: Number of steps at most.
+    """
+    has_truth = np.any([np.isfinite(norm).any(axis=0) for norm in norms], axis=0)
+    steps = np.flatnonzero(has_truth) if has_truth.any() else np.arange(has_truth.size)
+    return np.asarray(steps[select_indices(steps.size, most)])
+
+
+def list_calibration(table: pd.DataFrame) -> dict[CellKey, Any]:
     """List coverage and NEES ratio of each filter, by cell and by scope.
 
     Args:
@@ -63,13 +82,13 @@ def list_calibration(table: pd.DataFrame) -> dict[str, Any]:
     columns = {"coverage_50": "c50", "coverage_90": "c90", "nees_ratio": "nees_ratio"}
     cells = table.groupby(["scenario", "regime", "filter"], sort=False)[list(columns)].mean()
     cells = cells.rename(columns=columns)
-    scopes = {f"{ALL}/{ALL}": cells.groupby("filter").mean()}
+    scopes = {(ALL, ALL): cells.groupby("filter").mean()}
     for world, rows in cells.groupby("scenario"):
-        scopes[f"{world}/{ALL}"] = rows.groupby("filter").mean()
+        scopes[str(world), ALL] = rows.groupby("filter").mean()
     for noise, rows in cells.groupby("regime"):
-        scopes[f"{ALL}/{noise}"] = rows.groupby("filter").mean()
+        scopes[ALL, str(noise)] = rows.groupby("filter").mean()
     for (scenario, regime), rows in cells.groupby(["scenario", "regime"]):
-        scopes[f"{scenario}/{regime}"] = rows.droplevel([0, 1])
+        scopes[str(scenario), str(regime)] = rows.droplevel([0, 1])
     return {
         key: {
             str(label): {name: _number(value) for name, value in row.items()}
@@ -79,16 +98,16 @@ def list_calibration(table: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def list_runs(table: pd.DataFrame) -> dict[str, Any]:
+def list_runs(table: pd.DataFrame) -> dict[CellKey, Any]:
     """List the RMS error of each run, None for a lost one, by cell.
 
     Args:
         table: Table of `build_run_table`.
     """
-    runs = {}
+    runs: dict[CellKey, Any] = {}
     for (world, regime), rows in table.groupby(["scenario", "regime"], sort=False):
         values = rows.pivot_table("rmse", "run", "filter", dropna=False)
-        runs[f"{world}/{regime}"] = {
+        runs[str(world), str(regime)] = {
             "unit": rows["unit"].iloc[0], "name": "RMS error",
             "numbers": [int(number) for number in values.index],
             "values": {str(label): _numbers(values[label].to_numpy()) for label in values},

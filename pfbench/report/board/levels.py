@@ -9,32 +9,50 @@ interval of a difference uses that filters share their runs.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from pfbench.results.error_measures import Array, Flags
-from pfbench.results.statistics.paired_effects import trimmed_effects
+from pfbench.results.statistics.paired_effects import ConditionEffects, log_levels
 from pfbench.results.statistics.world_effects import EffectEstimate
 
+_CONDITION = ["family", "scenario", "regime"]
 
-class RunArrays(NamedTuple):
-    """Values of one view.
+
+class StudyArrays(NamedTuple):
+    """Values of all filters F, conditions C and runs N of a study; NaN without a value.
 
     Attributes:
         filters: Labels, [F].
-        weights: Weights of the conditions with sum 1, [C].
-        value: Errors, [F, C, N]; NaN without a value.
+        conditions: Family, scenario and regime of each condition, C rows.
+        values: Values by column of the table, [F, C, N].
         keeps: Runs that keep track, [F, C, N].
         present: Runs that exist, [F, C, N].
     """
 
     filters: tuple[str, ...]
-    weights: Array
-    value: Array
+    conditions: pd.DataFrame
+    values: Mapping[str, Array]
     keeps: Flags
     present: Flags
+
+    def select(self, mask: Flags) -> StudyArrays:
+        """Select conditions.
+
+        Args:
+            mask: Selected conditions, [C].
+        """
+        values = {name: value[:, mask] for name, value in self.values.items()}
+        return StudyArrays(
+            self.filters,
+            self.conditions[mask],
+            values,
+            self.keeps[:, mask],
+            self.present[:, mask],
+        )
 
 
 class FilterLevels(NamedTuple):
@@ -77,46 +95,58 @@ class FilterLevels(NamedTuple):
         return EffectEstimate(np.asarray(value), np.asarray(error), np.asarray(middle - 1.0))
 
 
-def arrange_runs(table: pd.DataFrame, metric: str, filters: tuple[str, ...]) -> RunArrays:
-    """Arrange the runs of a view as arrays.
+def arrange_runs(table: pd.DataFrame, filters: tuple[str, ...]) -> StudyArrays:
+    """Arrange the runs of a study as arrays.
 
     Args:
-        table: Rows of `build_run_table` of the view.
-        metric: Column of the error.
+        table: Table of `build_run_table`.
         filters: Labels of all filters of the study.
     """
-    names = ["family", "scenario", "regime"]
-    conditions = table[names].drop_duplicates().sort_values(names).reset_index(drop=True)
-    families = conditions["family"].nunique()
-    scenarios = conditions.groupby("family")["scenario"].transform("nunique")
-    regimes = conditions.groupby(["family", "scenario"])["regime"].transform("size")
-    weights = (1 / (families * scenarios * regimes)).to_numpy(dtype=np.float64)
-    index = pd.MultiIndex.from_frame(conditions)
-    c = index.get_indexer(pd.MultiIndex.from_frame(table[names]))
+    conditions = table[_CONDITION].drop_duplicates().sort_values(_CONDITION).reset_index(drop=True)
+    c = pd.MultiIndex.from_frame(conditions).get_indexer(
+        pd.MultiIndex.from_frame(table[_CONDITION])
+    )
     run_names = table[["seed", "run"]].drop_duplicates().sort_values(["seed", "run"])
     runs = pd.MultiIndex.from_frame(run_names)
     n = runs.get_indexer(pd.MultiIndex.from_frame(table[["seed", "run"]]))
     f = pd.Index(filters).get_indexer(pd.Index(table["filter"]))
     shape = (len(filters), len(conditions), len(runs))
-    value, keeps, present = np.full(shape, np.nan), np.zeros(shape, bool), np.zeros(shape, bool)
-    value[f, c, n] = table[metric].to_numpy(dtype=np.float64)
-    keeps[f, c, n] = table["keeps_track"].to_numpy(dtype=bool)
-    present[f, c, n] = True
-    return RunArrays(filters, weights, value, keeps, present)
+
+    def arrange(name: str) -> Array:
+        values = np.full(shape, np.nan)
+        values[f, c, n] = table[name].to_numpy(dtype=np.float64)
+        return values
+
+    numbers = table.select_dtypes(["number", "bool"]).columns
+    values = {str(name): arrange(str(name)) for name in numbers}
+    keeps = values["keeps_track"]
+    return StudyArrays(filters, conditions, values, keeps == 1, ~np.isnan(keeps))
 
 
-def compute_levels(runs: RunArrays) -> FilterLevels:
-    """Compute the levels of all filters of a view.
+def compute_condition_levels(runs: StudyArrays, metric: str) -> ConditionEffects:
+    """Compute the level of each filter in each condition.
 
     Args:
-        runs: Values of the view.
+        runs: Runs of the study.
+        metric: Column of the error.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_error = np.where(runs.keeps, np.log(runs.value), np.inf)
-    log_error = np.where(runs.present & ~(runs.keeps & np.isnan(runs.value)), log_error, np.nan)
-    effects = trimmed_effects(log_error)
-    count = effects.runs.min(axis=1)
+    value = runs.values[metric]
+    return log_levels(value, runs.keeps, runs.present & ~(runs.keeps & np.isnan(value)))
+
+
+def average_levels(levels: ConditionEffects, conditions: pd.DataFrame) -> FilterLevels:
+    """Average the levels of conditions: worlds, their scenarios, and regimes have equal weight.
+
+    Args:
+        levels: Levels of the conditions, [F, C].
+        conditions: Family, scenario and regime of the conditions, C rows.
+    """
+    scenarios = conditions.groupby("family")["scenario"].transform("nunique")
+    regimes = conditions.groupby(["family", "scenario"])["regime"].transform("size")
+    families = conditions["family"].nunique()
+    weights = (1 / (families * scenarios * regimes)).to_numpy(dtype=np.float64)
+    count = levels.runs.min(axis=1)
     with np.errstate(invalid="ignore"):
-        level = np.where(count > 0, (runs.weights * effects.location).sum(axis=1), np.nan)
-    parts = np.einsum("c,fcn->fn", runs.weights, effects.parts)
-    return FilterLevels(level, parts, effects.middle.min(axis=1), count)
+        level = np.where(count > 0, (weights * levels.location).sum(axis=1), np.nan)
+    parts = np.einsum("c,fcn->fn", weights, levels.parts)
+    return FilterLevels(level, parts, levels.middle.min(axis=1), count)

@@ -8,66 +8,30 @@ from typing import Any
 
 import pandas as pd
 
-from pfbench.report.board.run_table import METRIC_NAMES, SHOWN_METRICS
+from pfbench.report.board.run_table import METRIC_NAMES
 from pfbench.report.looks import MethodLook, PartName
 from pfbench.results.conditions import Condition
-from pfbench.results.decisions.comparisons import TRACK
-from pfbench.results.decisions.decision import Decision
-from pfbench.results.decisions.sentences import describe_pair
-
-OPPOSITE = {"better": "worse", "worse": "better"}
 
 
-def list_metrics(table: pd.DataFrame) -> list[str]:
-    """List the metrics that have values, and the main one though all runs are lost."""
-    return [name for name in SHOWN_METRICS if name == "rmse" or table[name].notna().any()]
-
-
-def planned_words(planned: Sequence[Decision]) -> dict[tuple[str, str], str]:
-    """Return the words of planned pairs for the verdict on the first filter against the second."""
-    words = {}
-    for d in planned:
-        if d.question == "a" and d.metric != TRACK:
-            words[d.a, d.b] = d.word
-            words[d.b, d.a] = OPPOSITE.get(d.word, d.word)
-    return {pair: {"better": "best"}.get(word, word) for pair, word in words.items()}
-
-
-def planned_entries(
-    planned: Sequence[Decision], looks: Mapping[str, MethodLook]
-) -> list[dict[str, Any]]:
-    """Return the entries of planned pairs, in ratios.
+def list_metrics(table: pd.DataFrame, main: str = "rmse") -> list[str]:
+    """List the metrics of a board: that which decides first, then all that have values.
 
     Args:
-        planned: Decisions on the planned pairs.
-        looks: Looks by label of the filter.
+        table: Table of `build_run_table`.
+        main: Metric that decides the study.
     """
-    errors = {(d.question, d.a, d.b): d for d in planned if d.metric != TRACK}
-    entries = []
-    for (question, a, b), d in errors.items():
-        if question != "a":
-            continue
-        new = errors["b", a, b]
-        track = next(t for t in planned if (t.a, t.b, t.question, t.metric) == (a, b, "a", TRACK))
-        ratios = {k: _ratio(d, getattr(d, k)) for k in ("estimate", "low", "high")}
-        entry = {
-            "a": a, "b": b, "question": "Error in these worlds", "kind": "paper" if b in looks[a].baselines else "",
-            "sentence": describe_pair(track, d), **ratios, "p": d.p_corrected, "word": d.pair_word,
-            "cells": [],
-            "new_world": None if new.worlds < 2 else {
-                **{k: _ratio(new, getattr(new, k)) for k in ("estimate", "low", "high")}, "word": new.word,
-            },
-            "prediction": None if new.worlds < 3 else [_ratio(new, new.new_low), _ratio(new, new.new_high)],
-        }  # fmt: skip
-        entries.append(round_values(entry))
-    return entries
+    names = [name for name in METRIC_NAMES if name in table]
+    names.sort(key=lambda name: name != main)
+    return [name for name in names if name in (main, "rmse") or table[name].notna().any()]
 
 
-def _ratio(decision: Decision, value: float) -> float:
-    """Return a log ratio as a ratio, NaN for an effect of another scale."""
-    if decision.scale != "log ratio":
-        return math.nan
-    return math.exp(value) if value < 700 else math.inf
+def format_interval_level(alpha: float) -> str:
+    """Format the level of an interval in percent.
+
+    Args:
+        alpha: Probability outside the interval.
+    """
+    return f"{100 * (1 - alpha):g} %"
 
 
 def round_values(values: Any) -> Any:
@@ -117,23 +81,34 @@ def regime_entries(table: pd.DataFrame, regimes: Mapping[str, PartName]) -> list
 
 
 def cell_entries(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """List the entries of the cells."""
+    """List the entries of the cells.
+
+    Args:
+        table: Table of `build_run_table`.
+    """
+    is_ambiguous = table.groupby("scenario")["model"].nunique().max() > 1
     cells = []
     for (world, regime), rows in table.groupby(["scenario", "regime"], sort=False):
         particles = rows["particles"].max()
         cells.append({
-            "key": f"{world}/{regime}", "world": world, "regime": regime, "model": rows["model"].iloc[0],
+            "world": world, "regime": regime, "noise": str(regime).partition(" + ")[0],
+            "model": rows["model"].iloc[0] if is_ambiguous else "",
             "runs": int(rows.groupby("filter").size().max()), "seed": int(rows["seed"].iloc[0]),
             "particles": None if math.isnan(particles) else int(particles),
         })  # fmt: skip
     return cells
 
 
-def metric_entries(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """List the entries of the metrics."""
+def metric_entries(table: pd.DataFrame, main: str) -> list[dict[str, Any]]:
+    """List the entries of the metrics.
+
+    Args:
+        table: Table of `build_run_table`.
+        main: Metric that decides the study.
+    """
     units, groups = table["unit"].unique(), table["group"].unique()
     unit, group = units[0] if len(units) == 1 else "", groups[0] if len(groups) == 1 else "main"
     return [
         {"key": key, "name": METRIC_NAMES[key], "unit": unit, "direction": "lower",
-         "caption": f"{METRIC_NAMES[key]} of the group {group}."} for key in list_metrics(table)
+         "caption": f"{METRIC_NAMES[key]} of the group {group}."} for key in list_metrics(table, main)
     ]  # fmt: skip

@@ -18,6 +18,7 @@ def describe_view(
     baseline: str,
     scope: str,
     metric: str,
+    level: str = "95 %",
 ) -> str:
     """Describe a view: failures, the best filter, the best proposed method, ties.
 
@@ -27,6 +28,7 @@ def describe_view(
         baseline: Label of the baseline.
         scope: Worlds and regimes in words, such as "in these 3 worlds".
         metric: Name of the metric in a sentence.
+        level: Level of the interval of a ratio, as text.
 
     Returns:
         Sentences. Names of filters are enclosed in double square brackets.
@@ -44,7 +46,7 @@ def describe_view(
             None,
             [
                 failures,
-                _describe_best(ranked, rows, looks, baseline, f"{metric} {scope}"),
+                _describe_best(ranked, rows, looks, baseline, (f"{metric} {scope}", level)),
                 _describe_proposed(ranked, looks),
                 _describe_ties(ranked),
             ],
@@ -78,6 +80,7 @@ def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]
     """Count the filters that lose the track in many runs, or were not run."""
     off = [r for r in rows if r.verdict != MISSING and 1 - r.track > _LOST_SHARE]
     missing = sum(row.verdict == MISSING for row in rows)
+    lost = sum(row.verdict == LOST for row in rows)
     text = ""
     if off:
         worst = min(off, key=lambda row: row.track)
@@ -89,6 +92,12 @@ def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]
                 f"{len(off)} of {len(rows)} filters lose the track in over a fifth of runs "
                 f"({_name(worst, looks)}: {share})."
             )
+    if lost > len(off):
+        verb = "loses" if lost == 1 else "lose"
+        text += (
+            f" {lost} of {count_words(len(rows), 'filter')} {verb} the track in over a fifth of the runs "
+            "of a condition, and no error is compared."
+        )
     if missing:
         verb = "was" if missing == 1 else "were"
         text += f" {count_words(missing, 'filter')} {verb} not run in all conditions."
@@ -100,9 +109,10 @@ def _describe_best(
     rows: Sequence[BoardRow],
     looks: Mapping[str, MethodLook],
     baseline: str,
-    where: str,
+    texts: tuple[str, str],
 ) -> str:
-    """State the filter of the smallest error against the baseline."""
+    """State the filter of the smallest error against the baseline, with metric and level as text."""
+    where, level = texts
     best = ranked[0]
     base = next(row for row in rows if row.filter == baseline)
     twins = [row for row in ranked if row.words == IDENTICAL]
@@ -119,7 +129,7 @@ def _describe_best(
     if not math.isfinite(best.ratio_low) or not math.isfinite(best.ratio_high):
         return f"{head}, {size}, without an interval from so few runs."
     ends = [100 * (1 - end) for end in (best.ratio_high, best.ratio_low)]
-    interval = f"95 % interval {ends[0]:.3g} to {ends[1]:.3g} %"
+    interval = f"{level} interval {ends[0]:.3g} to {ends[1]:.3g} %"
     cost = f"at {best.ms / base.ms:.2g} times its cost" if base.ms > 0 else ""
     if best.ratio_high >= 1 > best.ratio_low or best.ratio == 1:
         return (

@@ -1,21 +1,50 @@
-"""Files next to the page: verdicts.csv with all that the board shows, and runs.parquet."""
+"""Files next to the page: verdicts.csv with all that the board shows, runs.parquet and pfbench.bib."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.board.pack import build_pack
+from pfbench.report.board.study_data import StudyData, read_study
+from pfbench.report.board.study_views import ViewKey
+from pfbench.report.options import ReportOptions
 from pfbench.report.table_formats import format_csv
+from pfbench.results.conditions import Condition
+
+
+def write_report_data(
+    study: str,
+    conditions: Sequence[Condition],
+    options: ReportOptions,
+    folder: RecordedFolder,
+    data: StudyData | None = None,
+) -> dict[str, Any]:
+    """Build the data of a report and write its files.
+
+    Args:
+        study: Name of the study.
+        conditions: Conditions of the study.
+        options: Options of the report.
+        folder: Target folder.
+        data: Data of the results, None to read them.
+
+    Returns:
+        Data for `study_page.write_page` and `journal.write_paper`.
+    """
+    data = data or read_study(conditions, options)
+    pack = build_pack(study, conditions, options, data)
+    return pack | {"downloads": write_verdict_files(pack, data.table, folder)}
 
 
 def write_verdict_files(
     pack: Mapping[str, Any], table: pd.DataFrame, folder: RecordedFolder
 ) -> list[dict[str, Any]]:
-    """Write verdicts.csv and runs.parquet.
+    """Write verdicts.csv, runs.parquet and pfbench.bib.
 
     Args:
         pack: Data of the page, of `build_pack`.
@@ -26,19 +55,19 @@ def write_verdict_files(
         Entries of the downloads of the page.
     """
     rows = [
-        {**dict(zip(("metric", "world", "regime", "baseline"), key.split("/"), strict=True)), **row}
+        {**dict(zip(ViewKey._fields, key, strict=True)), **row}
         for key, view in pack["views"].items()
         for row in view["rows"]
     ]
-    verdicts = format_csv(pd.DataFrame(rows))
     buffer = io.BytesIO()
     table.to_parquet(buffer, index=False, compression="zstd")
-    contents: list[tuple[str, str, str | bytes]] = [
-        ("Verdicts of all views (CSV)", "verdicts.csv", verdicts),
-        ("Values of all runs (Parquet)", "runs.parquet", buffer.getvalue()),
+    contents: list[tuple[str, str, str, str | bytes]] = [
+        ("Numbers", "Verdicts of all views (CSV)", "verdicts.csv", format_csv(pd.DataFrame(rows))),
+        ("Numbers", "Values of all runs (Parquet)", "runs.parquet", buffer.getvalue()),
+        ("LaTeX", "References (BibTeX)", "pfbench.bib", pack["bibtex"]),
     ]
     downloads = []
-    for title, name, content in contents:
+    for group, title, name, content in contents:
         size = folder.write(name, content).stat().st_size
-        downloads.append({"name": title, "href": name, "bytes": size, "group": "Numbers"})
+        downloads.append({"name": title, "href": name, "bytes": size, "group": group})
     return downloads

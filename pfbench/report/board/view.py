@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from scipy.special import stdtrit
 
-from pfbench.report.board.levels import FilterLevels, RunArrays, arrange_runs, compute_levels
+from pfbench.report.board.levels import FilterLevels, StudyArrays
+from pfbench.results.error_measures import Array
 from pfbench.results.statistics.paired_effects import MIN_RUNS
 
 BEST, EQUAL, OPEN, WORSE, LOST, MISSING = "best", "equal", "open", "worse", "lost", "missing"
@@ -24,7 +25,7 @@ class ViewOptions:
     """Options of all views.
 
     Attributes:
-        alpha: Error of all comparisons of a view together.
+        alpha: Error of all comparisons of a view together, and of each interval.
         margin: Relative difference of errors within which filters are equal.
         planned: Words of planned pairs by (filter, other filter), which decide over those of all pairs.
     """
@@ -43,7 +44,7 @@ class BoardRow:
         rank: Rank by level, None without a level.
         tied: Whether the filter is not shown to be worse than the best.
         value: Error, the exponential of the level; for a single condition only.
-        low: Lower end of its 95 % interval over runs.
+        low: Lower end of its interval over runs, of level 1 - alpha.
         high: Upper end.
         unit: Unit of the error.
         ratio: Error divided by that of the baseline.
@@ -79,29 +80,37 @@ class BoardRow:
     ms: float
 
 
-def build_rows(
-    table: pd.DataFrame,
-    metric: str,
-    baseline: str,
-    filters: tuple[str, ...],
-    options: ViewOptions,
-) -> list[BoardRow]:
+class Scope(NamedTuple):
+    """Filters in the conditions of a view, before a baseline is chosen.
+
+    Attributes:
+        filters: Labels of all filters of the study, [F].
+        levels: Levels of the error.
+        descriptions: Track, lost runs, calibration and cost of each filter.
+        unit: Unit of the error, empty for several conditions.
+        is_single: Whether there is one condition.
+    """
+
+    filters: tuple[str, ...]
+    levels: FilterLevels
+    descriptions: Mapping[str, Mapping[str, Any]]
+    unit: str
+    is_single: bool
+
+
+def build_rows(scope: Scope, baseline: str, options: ViewOptions) -> list[BoardRow]:
     """Build the rows of a view, ordered by level.
 
     Args:
-        table: Rows of `build_run_table` in the scope of the view.
-        metric: Column of the error.
+        scope: Filters in the conditions of the view.
         baseline: Label of the baseline.
-        filters: Labels of all filters of the study.
         options: Options.
     """
-    runs = arrange_runs(table, metric, filters)
-    levels = compute_levels(runs)
+    filters, levels = scope.filters, scope.levels
     level = levels.level
     order = sorted(range(len(filters)), key=lambda i: (np.isnan(level[i]), level[i], filters[i]))
     best = order[0] if np.isfinite(level[order[0]]) else None
-    descriptions = _describe_filters(table, runs)
-    unit = str(table["unit"].iloc[0]) if len(runs.weights) == 1 else ""
+    base = filters.index(baseline)
     rows = []
     for i in order:
         verdict, words = _decide(levels, i, best, filters, options)
@@ -110,12 +119,12 @@ def build_rows(
                 filters[i],
                 int((level < level[i] - _SAME).sum()) + 1 if np.isfinite(level[i]) else None,
                 verdict in (EQUAL, OPEN),
-                *_level_interval(levels, i, len(runs.weights) == 1, options.alpha),
-                unit,
-                *_ratio(levels, i, filters.index(baseline), options.alpha),
+                *_level_interval(levels, i, scope.is_single, options.alpha),
+                scope.unit,
+                *_ratio(levels, i, base, options.alpha),
                 verdict,
                 words,
-                **descriptions[filters[i]],
+                **scope.descriptions[filters[i]],
             )
         )
     return rows
@@ -182,36 +191,40 @@ def _ratio(levels: FilterLevels, i: int, base: int, alpha: float) -> tuple[float
         return float(np.exp(estimate.value)), low, high
 
 
-def _describe_filters(table: pd.DataFrame, runs: RunArrays) -> dict[str, dict[str, Any]]:
-    """Return track, lost runs, calibration and cost of each filter."""
-    by_condition = table.groupby(["filter", "family", "scenario", "regime"], sort=False)
-    columns = ["keeps_track", "coverage_90", "nees_ratio"]
-    mean = by_condition[columns].mean().groupby("filter").mean()
-    by_run = table.groupby(["filter", "seed", "run"], sort=False)["coverage_90"].mean()
-    spread = by_run.groupby("filter").agg(["mean", "std", "count"])
-    lost = table.groupby("filter")["lost"].sum()
-    cost = np.exp(np.log(table.groupby(["filter", "scenario", "regime"])["ms"].first()).groupby("filter").mean())  # fmt: skip
+def describe_filters(runs: StudyArrays, alpha: float = 0.05) -> dict[str, dict[str, Any]]:
+    """Describe track, lost runs, calibration and cost of each filter.
+
+    Args:
+        runs: Runs of the conditions of a view.
+        alpha: Probability outside the interval of the coverage.
+    """
+    lost = np.nansum(runs.values["lost"], axis=(1, 2))
+    names = ("keeps_track", "coverage_90", "nees_ratio", "ms")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # filters without runs
+        by_condition = {name: np.nanmean(runs.values[name], axis=2) for name in names}
+        track, coverage, nees = (np.nanmean(by_condition[name], axis=1) for name in names[:3])
+        cost = np.exp(np.nanmean(np.log(by_condition["ms"]), axis=1))
+        by_run = np.nanmean(runs.values["coverage_90"], axis=1)
     return {
         label: {
-            "track": float(mean["keeps_track"].get(label, np.nan)),
-            "lost": int(lost.get(label, 0)),
-            "coverage": float(mean["coverage_90"].get(label, np.nan)),
-            "nees": float(mean["nees_ratio"].get(label, np.nan)),
-            "calibration": _calibration(pd.Series(spread.loc[label]))
-            if label in spread.index
-            else "",
-            "ms": float(cost.get(label, np.nan)),
+            "track": float(track[i]),
+            "lost": int(lost[i]),
+            "coverage": float(coverage[i]),
+            "nees": float(nees[i]),
+            "calibration": _calibration(by_run[i][~np.isnan(by_run[i])], alpha),
+            "ms": float(cost[i]),
         }
-        for label in runs.filters
+        for i, label in enumerate(runs.filters)
     }
 
 
-def _calibration(coverage: pd.Series[Any]) -> str:
-    """Return a word on the coverage of 90 % intervals over runs, from its 95 % interval."""
-    count = float(coverage["count"])
+def _calibration(coverage: Array, alpha: float) -> str:
+    """Return a word on the coverage [N] of 90 % regions from the interval of its mean."""
+    count = coverage.size
     if count < MIN_RUNS:
         return ""
-    half = -float(stdtrit(count - 1, 0.025)) * float(coverage["std"]) / math.sqrt(count)
-    if coverage["mean"] + half < 0.9:
+    half = -float(stdtrit(count - 1, alpha / 2)) * float(coverage.std(ddof=1)) / math.sqrt(count)
+    if coverage.mean() + half < 0.9:
         return "overconfident"
-    return "cautious" if coverage["mean"] - half > 0.9 else "consistent"
+    return "cautious" if coverage.mean() - half > 0.9 else "consistent"

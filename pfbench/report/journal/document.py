@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pfbench.files.escapes import escape_latex
 from pfbench.report.journal.page_format import PageFormat
 from pfbench.report.journal.references import SELF, cite, list_cited_keys
-from pfbench.report.journal.study_pack import ALL, Pack
+from pfbench.report.journal.study_pack import Pack
 
 _PACKAGES = (
     r"\usepackage[T1]{fontenc}",
@@ -92,7 +92,7 @@ def format_document(
         if is_elsevier
         else [*heading, "\\maketitle"]
     )
-    sentence = pack["views"].get(_first_view(pack), {}).get("sentence", "")
+    sentence = next((view["sentence"] for view in pack["views"].values()), "")
     plain = str(sentence).replace("[[", "").replace("]]", "")
     cited = list_cited_keys(pack)
     methods = f"The methods are those of{cite(cited)}." if cited else ""
@@ -104,12 +104,6 @@ def format_document(
         *floats, *(rf"\input{{{name}.tex}}" for name in tables),
         rf"\bibliographystyle{{{page.bibliography}}}", r"\bibliography{pfbench}", r"\end{document}", "",
     ])  # fmt: skip
-
-
-def _first_view(pack: Pack) -> str:
-    """Return the key of the opening view."""
-    baseline = next(iter(map(str, pack["baselines"])), "")
-    return f"{pack['metrics'][0]['key']}/{ALL}/{ALL}/{baseline}"
 
 
 def _format_figure(name: str, pack: Pack, is_wide: bool) -> str:

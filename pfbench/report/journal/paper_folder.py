@@ -53,10 +53,10 @@ def select_figures(pack: Pack) -> dict[str, Plot]:
     regime = str(pack["regimes"][0]["key"]) if pack["regimes"] else ""
     plots: dict[str, tuple[Plot, bool]] = {
         "leaderboard": (plot_leaderboard, has_ratio),
-        "over_time": (plot_over_time, any(key.endswith(f"/{regime}") for key in pack["curves"])),
+        "over_time": (plot_over_time, any(key[1] == regime for key in pack["curves"])),
         "planned": (plot_planned, any(is_number(pair["estimate"]) for pair in pack["planned"])),
         "cost": (plot_error_against_cost, has_cost),
-        "calibration": (plot_calibration, bool(pack["calibration"].get(f"{ALL}/{ALL}"))),
+        "calibration": (plot_calibration, bool(pack["calibration"].get((ALL, ALL)))),
     }
     return {name: plot for name, (plot, is_present) in plots.items() if is_present}
 

@@ -42,7 +42,7 @@ def find_rows(
     """
     metric = metric or str(pack["metrics"][0]["key"])
     baseline = baseline or next(iter(map(str, pack["baselines"])), "")
-    view = pack["views"].get(f"{metric}/{world}/{regime}/{baseline}", {"rows": ()})
+    view = pack["views"].get((metric, world, regime, baseline), {"rows": ()})
     return {str(row["filter"]): row for row in view["rows"]}
 
 

@@ -56,7 +56,7 @@ def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
     """
     regime, looks = str(pack["regimes"][0]["key"]), filters_by_key(pack)
     worlds = [str(world["key"]) for world in pack["worlds"]]
-    worlds = [world for world in worlds if f"{world}/{regime}" in pack["curves"]][:_PANELS]
+    worlds = [world for world in worlds if (world, regime) in pack["curves"]][:_PANELS]
     is_wide = setting.page.has_columns and len(worlds) > 1
     across = max(1, min(len(worlds), 3 if is_wide or setting.page.column > 320 else 1))
     down = -(-len(worlds) // across)
@@ -65,7 +65,7 @@ def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
     axes = figure.subplots(down, across, squeeze=False).ravel()
     curve_keys: dict[str, None] = {}
     for axis, world in zip(axes, worlds, strict=False):
-        curves = pack["curves"][f"{world}/{regime}"]
+        curves = pack["curves"][world, regime]
         curve_keys |= dict.fromkeys(_plot_curves(axis, curves, keys, looks, setting))
         axis.set_title(setting.escape(name_of(pack, "worlds", world)))
         axis.set_xlabel("time [s]")
@@ -85,7 +85,7 @@ def plot_calibration(pack: Pack, setting: FigureSetting) -> Figure:
         pack: Data of the report.
         setting: Setting of the figures.
     """
-    looks, values = filters_by_key(pack), pack["calibration"].get(f"{ALL}/{ALL}", {})
+    looks, values = filters_by_key(pack), pack["calibration"].get((ALL, ALL), {})
     keys = [key for key in find_rows(pack) if key in values] or [
         key for key in looks if key in values
     ]
@@ -142,7 +142,7 @@ def _plot_curves(
 
 def _quantity(pack: Pack, worlds: list[str], regime: str) -> str:
     """Return the label of the y axis: quantity and unit, without a unit that differs by world."""
-    curves = [pack["curves"][f"{world}/{regime}"] for world in worlds]
+    curves = [pack["curves"][world, regime] for world in worlds]
     groups, units = ({str(curve.get(name, "")) for curve in curves} for name in ("group", "unit"))
     group = f"{groups.pop()} error" if len(groups) == 1 else "error"
     unit = units.pop() if len(units) == 1 else ""

@@ -177,16 +177,6 @@ def format_slug(text: str) -> str:
     return "".join(c if c.isalnum() else "_" for c in text).strip("_")
 
 
-def select_indices(size: int, most: int = INSTANTS) -> np.ndarray:
-    """Select at most `most` evenly spaced indices of `size`.
-
-    Args:
-        size: Number of elements.
-        most: Number of indices at most.
-    """
-    return np.unique(np.linspace(0, size - 1, min(size, most)).astype(int))
-
-
 def compute_run_quantiles(values: np.ndarray, q: Sequence[float]) -> np.ndarray:
     """Compute quantiles over runs.
 

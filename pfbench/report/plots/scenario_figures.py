@@ -14,10 +14,10 @@ from pfbench.report.plots.plotting import (
     add_legend,
     format_axis_label,
     line_styles,
-    select_indices,
     stacked_axes,
 )
 from pfbench.results import consistency, store
+from pfbench.results.frame import select_indices
 
 _BOUND: Any = {"color": "black", "ls": (0, (4, 1.5)), "lw": 0.9}
 _AXES = ("right", "forward", "up")

@@ -34,7 +34,7 @@ function heads() {
 }
 
 function drawSwitches() {
-  const known = (axis, value) => viewKeys.some((key) => key.split("/")[axes.indexOf(axis)] === value);
+  const known = (axis, value) => viewKeys.some((key) => key[axes.indexOf(axis)] === value);
   const option =
     (axis) =>
     ([value, text]) =>
@@ -176,7 +176,7 @@ function drawBoard() {
         `<th scope="row"${look.proposed ? ' class="proposed"' : ""}><button type="button" class="name" data-row="${esc(row.filter)}" aria-expanded="${open}" title="${esc(look.long || look.name)}">${icon(look)}${esc(look.name)}</button></th>` +
         `<td class="desk">${several ? strip(row.filter) : esc(valueText(row))}</td>` +
         `<td class="number"><b>${short(row.ratio)}</b> <span class="interval faint">${interval(row.ratio_low, row.ratio_high)}</span></td>` +
-        `<td class="desk bar">${drawBar(row)}</td><td class="${row.verdict}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
+        `<td class="desk scale">${drawBar(row)}</td><td class="${row.verdict}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
         `<td class="number">${percent(row.track)}</td><td class="desk">${percent(row.coverage)} <span class="${row.calibration === "consistent" ? "faint" : "open"}">${esc(row.calibration || "")}</span></td>` +
         `<td class="number desk">${short(row.ms)}</td></tr>${open ? details(row, columns.length) : ""}`
       );

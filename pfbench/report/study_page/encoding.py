@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Levels = NDArray[np.int64]
+_MANY_RUNS = 30_000  # of all filters and conditions, from which a run has one byte
 
 
 def encode_pack(pack: Mapping[str, Any], limit: int) -> str:
@@ -33,15 +34,19 @@ def encode_pack(pack: Mapping[str, Any], limit: int) -> str:
     """
     base = {
         **pack,
+        "opening": list(next(iter(pack["views"]))),
         "views": _encode_views(pack["views"]),
-        "curves": {key: _encode_curves(cell) for key, cell in pack["curves"].items()},
-        "runs": {key: _encode_runs(cell) for key, cell in pack["runs"].items()},
+        "curves": _nest({key: _encode_curves(cell) for key, cell in pack["curves"].items()}),
+        "calibration": _nest(pack["calibration"]),
+        "runs": _nest(
+            {key: _encode_runs(cell, len(pack["runs"])) for key, cell in pack["runs"].items()}
+        ),
     }
     counts = [len(cell["numbers"]) for cell in pack["tracks"].values()]
     carried = max(counts, default=0)
     while True:
         tracks = {k: _encode_tracks(cell, carried) for k, cell in pack["tracks"].items()}
-        text = _compress({**base, "tracks": tracks if carried else {}})
+        text = _compress({**base, "tracks": _nest(tracks) if carried else {}})
         if len(text) <= limit or carried == 0:
             return text
         carried = carried - 1 if carried <= 4 else int(carried * max(0.5, limit / len(text)))
@@ -53,31 +58,46 @@ def _compress(pack: Mapping[str, Any]) -> str:
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode("ascii")
 
 
-def _encode_views(views: Mapping[str, Any]) -> dict[str, Any]:
-    """Encode views as columns, once for all baselines of a scope where they agree."""
-    scopes: dict[str, dict[str, Any]] = {}
+def _nest(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
+    """Nest values by the parts of their keys."""
+    nested: dict[str, Any] = {}
+    for key, value in values.items():
+        level = nested
+        for name in key[:-1]:
+            level = level.setdefault(name, {})
+        level[key[-1]] = value
+    return nested
+
+
+def _encode_views(views: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
+    """Encode views as columns, which compress better side by side than view by view.
+
+    Returns:
+        Keys of the scopes, baselines, texts by scope and baseline, and columns by scope: `shared` if
+        they are the same for all baselines, else `separate`.
+    """
+    scopes: dict[tuple[str, ...], dict[str, Any]] = {}
     for key, view in views.items():
-        scope, _, baseline = key.rpartition("/")
-        rows = view["rows"]
-        columns = {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
-        texts = {name: value for name, value in view.items() if name != "rows"}
-        scopes.setdefault(scope, {})[baseline] = {**texts, "columns": columns}
-    for scope, parts in scopes.items():
-        first, *others = parts.values()
-        shared = {
-            name: column
-            for name, column in first["columns"].items()
-            if all(view["columns"].get(name) == column for view in others)
-        }
-        separate = {
-            baseline: {
-                **view,
-                "columns": {k: v for k, v in view["columns"].items() if k not in shared},
-            }
-            for baseline, view in parts.items()
-        }
-        scopes[scope] = {"shared": shared, "baselines": separate}
-    return scopes
+        scopes.setdefault(tuple(key[:-1]), {})[key[-1]] = view
+    baselines = list(next(iter(scopes.values())))
+    tables = [[view["rows"] for view in scope.values()] for scope in scopes.values()]
+    columns: dict[str, dict[str, Any]] = {"shared": {}, "separate": {}}
+    for name in tables[0][0][0] if tables[0][0] else ():
+        values = [[[row[name] for row in rows] for rows in scope] for scope in tables]
+        is_shared = all(column == scope[0] for scope in values for column in scope)
+        kind = "shared" if is_shared else "separate"
+        columns[kind][name] = [scope[0] for scope in values] if is_shared else values
+    texts = [[_drop_rows(view) for view in scope.values()] for scope in scopes.values()]
+    return {
+        "keys": [list(key) for key in scopes],
+        "baselines": baselines,
+        "texts": texts,
+        **columns,
+    }
+
+
+def _drop_rows(view: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in view.items() if name != "rows"}
 
 
 def _encode_curves(cell: Mapping[str, Any]) -> dict[str, Any]:
@@ -90,9 +110,11 @@ def _encode_curves(cell: Mapping[str, Any]) -> dict[str, Any]:
     return {**cell, "filters": filters}
 
 
-def _encode_runs(cell: Mapping[str, Any]) -> dict[str, Any]:
+def _encode_runs(cell: Mapping[str, Any], cells: int) -> dict[str, Any]:
     """Encode the numbers of all runs in one condition."""
-    values = {key: encode_levels(runs, bits=12) for key, runs in cell["values"].items()}
+    count = len(cell["numbers"]) * len(cell["values"])
+    bits = 12 if count * cells <= _MANY_RUNS else 8
+    values = {key: encode_levels(runs, bits=bits) for key, runs in cell["values"].items()}
     return {**cell, "values": values}
 
 
@@ -107,7 +129,7 @@ def _encode_tracks(cell: Mapping[str, Any], carried: int) -> dict[str, Any]:
     encoded = {**cell, "numbers": numbers}
     if "truth" in cell:
         encoded["truth"] = {
-            k: np.round(track, 1).tolist()
+            k: [[x, y] if np.isfinite(x + y) else None for x, y in np.round(track, 1).tolist()]
             for k, track in cell["truth"].items()
             if k in (*keys, "all")
         }

@@ -4,7 +4,7 @@ const find = (selector, part = document) => part.querySelector(selector);
 const findAll = (selector, part = document) => [...part.querySelectorAll(selector)];
 const escapes = { "&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;", "'": "&#39;" };
 const esc = (text) => String(text).replace(/[&<>"']/g, (sign) => escapes[sign]);
-const strong = (text) => esc(text).replace(/\[\[(.*?)\]\]/g, "<b>$1</b>");
+const strong = (text) => esc(text).replace(/\[\[(.*?)\]\](?!\])/g, "<b>$1</b>");
 const plain = (text) => String(text).replace(/\[\[|\]\]/g, "");
 
 // Numbers with significant digits, as opening.py writes them.

@@ -24,10 +24,10 @@ function drawView(changed = true) {
   drawCost(find("#cost .figure"));
   for (const select of findAll("select.cell")) {
     select.innerHTML = data.cells
-      .filter((cell) => data.curves[keyOf(cell)] || data.runs[keyOf(cell)])
+      .filter(hasRuns)
       .map(
         (cell) =>
-          `<option value="${esc(keyOf(cell))}"${keyOf(cell) === state.cell ? " selected" : ""}>${esc(cellName(cell))}</option>`,
+          `<option value="${data.cells.indexOf(cell)}"${cell === state.cell ? " selected" : ""}>${esc(cellName(cell))}</option>`,
       )
       .join("");
   }
@@ -105,8 +105,8 @@ function listen() {
       choose(axis, event.target.value);
       drawView();
     } else if (event.target.matches("select.cell")) {
-      selectCell(event.target.value);
-      for (const select of findAll("select.cell")) select.value = state.cell;
+      selectCell(data.cells[event.target.value]);
+      for (const select of findAll("select.cell")) select.value = event.target.value;
       redraw(drawTime, drawRuns);
     }
   });

@@ -60,7 +60,7 @@ def format_sentence(text: str) -> Markup:
     Args:
         text: Sentence of the board.
     """
-    return Markup(re.sub(r"\[\[(.*?)\]\]", r"<b>\1</b>", str(escape(text))))
+    return Markup(re.sub(r"\[\[(.*?)\]\](?!\])", r"<b>\1</b>", str(escape(text))))
 
 
 def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         pack: Data of the page.
     """
     key, view = next(iter(pack["views"].items()))
-    metric, world, regime, baseline = key.split("/")
+    metric, world, regime, baseline = key
     names = {f["key"]: f for f in pack["filters"]}
     parts = (
         _name(pack["metrics"], metric),
@@ -133,7 +133,7 @@ def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
             "pair": f"{names[pair['a']]} against {names[pair['b']]}",
             "question": pair["question"],
             "ratio": format_short(pair["estimate"]),
-            "interval": format_interval(pair["low"], pair["high"]),
+            "interval": format_interval(pair["low"], pair["high"]) or pair["reason"],
             "word": pair["word"],
             "sentence": pair["sentence"].replace("[[", "").replace("]]", ""),
         }

@@ -18,7 +18,14 @@ from pfbench.report.writers import template_environment
 PAGE_BYTES = 1_500_000
 _HERE = Path(__file__).parent
 _SCRIPTS = ("kit", "state", "board", "cost", "pairs", "worlds", "time", "runs", "main")
-_STATIC = ("paper_figures", "failures", "definitions")  # not read by the script
+_OPTIONAL = ("paper_figures", "failures", "definitions", "filter_notes", "choices")
+_STATIC = (
+    *_OPTIONAL,
+    "methods_paragraph",
+    "bibtex",
+    "provenance",
+    "downloads",
+)  # not read by the script
 _COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
 _SECTIONS = (
     ("planned", "planned", "Planned comparisons"), ("cells", "worlds", "Worlds"), ("curves", "time", "Over time"),
@@ -43,13 +50,16 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
     views = {
         key: {**view, "front": find_front(view["rows"])} for key, view in pack["views"].items()
     }
-    pack = {**dict.fromkeys(_STATIC, ()), **pack, "views": views}
+    pack = {**dict.fromkeys(_OPTIONAL, ()), **pack, "views": views}
+    names = {look["key"]: look["name"] for look in pack["filters"]}
     context = {
         "pack": pack,
         "opening": describe_opening(pack),
         "planned": describe_pairs(pack),
         "level": _format_level(pack),
         "methods": [text for text in pack["methods_paragraph"].split("\n\n") if text.strip()],
+        "notes": [{**note, "name": names[note["filter"]]} for note in pack["filter_notes"]],
+        "choices": pack["choices"],
         "files": _group_files(pack["downloads"]),
         "sections": [
             (anchor, title)
@@ -97,8 +107,10 @@ def _format_level(pack: Mapping[str, Any]) -> str:
 
 
 def _read_script(name: str) -> str:
-    """Return one file of the script."""
-    return (_HERE / f"{name}.js").read_text(encoding="utf-8")
+    """Return one file of the script without indents and lines of comments."""
+    lines = (_HERE / f"{name}.js").read_text(encoding="utf-8").splitlines()
+    stripped = [line.strip() for line in lines]
+    return "\n".join(line for line in stripped if line and not line.startswith("//"))
 
 
 def _format_colours(filters: Sequence[Mapping[str, Any]]) -> str:

@@ -98,19 +98,19 @@ function drawSweep(panel, sweep) {
   const width = widthOf(panel);
   const height = 260;
   const [left, right, top, bottom] = [48, 110, 24, 38];
-  const points = Object.values(sweep.filters)
-    .flat()
-    .filter((point) => point.value > 0);
+  const points = sweep.lines.flatMap((line) => line.points).filter((point) => point.value > 0);
   if (!points.length) return;
   const xs = points.map((point) => point.x);
-  const logX = Math.min(...xs) > 0 && Math.max(...xs) / Math.min(...xs) >= 20;
+  const logX = !sweep.ticks && Math.min(...xs) > 0 && Math.max(...xs) / Math.min(...xs) >= 20;
   const [xLow, xHigh] = [Math.min(...xs), Math.max(...xs)];
   const ys = points.flatMap((point) => [point.value, point.low, point.high]).filter((v) => v > 0);
   const [yLow, yHigh] = [Math.min(...ys) / 1.1, Math.max(...ys) * 1.1];
   const x = (logX ? logarithmic : linear)(xLow, xHigh === xLow ? xLow + 1 : xHigh, left + 6, width - right);
   const y = logarithmic(yLow, yHigh, height - bottom, top);
   const ticks = [...new Set(xs)].length <= 7 ? [...new Set(xs)] : (logX ? logTicks : linearTicks)(xLow, xHigh, 6);
-  let content = xAxis(ticks, x, top, height - bottom) + yAxis(logTicks(yLow, yHigh, 6), y, left, width - right);
+  const format = sweep.ticks ? (v) => cut(sweep.ticks[v] ?? "", 14) : tidy;
+  let content =
+    xAxis(sweep.ticks ? sweep.ticks.map((_, k) => k) : ticks, x, top, height - bottom, format) + yAxis(logTicks(yLow, yHigh, 6), y, left, width - right);
   content += label(
     0,
     12,
@@ -123,9 +123,9 @@ function drawSweep(panel, sweep) {
     `${sweep.name}${sweep.unit ? ` [${sweep.unit}]` : ""}${logX ? " (log)" : ""}`,
     ' class="axis" text-anchor="middle"',
   );
-  const lines = Object.entries(sweep.filters)
-    .map(([key, values]) => [looks[key], values.filter((point) => point.value > 0)])
-    .filter(([look, values]) => look && values.length);
+  const lines = sweep.lines
+    .map((item) => [{ ...looks[item.filter], name: item.name }, item.points.filter((point) => point.value > 0)])
+    .filter(([, values]) => values.length);
   const heights = spread(
     lines.map(([, values]) => y(values[values.length - 1].value)),
     13,
@@ -138,7 +138,7 @@ function drawSweep(panel, sweep) {
     for (const point of values) {
       if (point.low > 0)
         content += `<line class="c${look.index}" x1="${px(x(point.x))}" x2="${px(x(point.x))}" y1="${px(y(point.low))}" y2="${px(y(point.high))}" stroke="var(--c)" stroke-opacity=".5"/>`;
-      content += `<g${spoken(`${look.name}, ${sweep.name} ${tidy(point.x)}: ${short(point.value)} ${sweep.value_unit || ""} ${interval(point.low, point.high)}`)}>${mark(look, x(point.x), y(point.value), 4)}</g>`;
+      content += `<g${spoken(`${look.name}, ${sweep.name} ${format(point.x)}: ${short(point.value)} ${sweep.value_unit || ""} ${interval(point.low, point.high)}`)}>${mark(look, x(point.x), y(point.value), 4)}</g>`;
     }
     content += label(
       width - right + 8,

@@ -1,9 +1,9 @@
 // Single runs: a dot for each run; the chosen one with its track, its errors and its traces.
 let dots = null; // geometry of the dots that are drawn: condition, filters, scale
 
-const currentCell = () => data.cells.find((cell) => keyOf(cell) === state.cell);
-const runValues = (key) => decode(data.runs[state.cell].values[key]);
-const runFilters = () => order().filter((look) => data.runs[state.cell] && data.runs[state.cell].values[look.key]);
+const runsOf = () => partOf(data.runs, state.cell);
+const runValues = (key) => decode(runsOf().values[key]);
+const runFilters = () => order().filter((look) => runsOf()?.values[look.key]);
 const byError = (key) =>
   runValues(key)
     .map((v, k) => [v === null ? Infinity : v, k])
@@ -11,7 +11,7 @@ const byError = (key) =>
     .map(([, k]) => k);
 
 function drawRuns(part) {
-  const cell = data.runs[state.cell];
+  const cell = runsOf();
   const filters = runFilters();
   if (!cell || !filters.length) {
     part.innerHTML = '<p class="note">This condition has no runs.</p>';
@@ -60,7 +60,7 @@ function drawRuns(part) {
     width,
     bottom + 36,
     `${content}<g id="chosen"></g>`,
-    `All runs of ${filters.length} filters in ${cellName(currentCell())}.`,
+    `All runs of ${filters.length} filters in ${cellName(state.cell)}.`,
     "group",
   );
   dots = { filters, place, level };
@@ -68,14 +68,14 @@ function drawRuns(part) {
     const best = byError(filters[0].key);
     state.filter = filters[0].key;
     state.run = best[Math.floor(best.length / 2)];
-    const carried = (data.tracks[state.cell] || { numbers: [] }).numbers.map((number) => cell.numbers.indexOf(number));
+    const carried = (partOf(data.tracks, state.cell) || { numbers: [] }).numbers.map((number) => cell.numbers.indexOf(number));
     if (carried.length && !carried.includes(state.run)) state.run = carried[0];
   }
   drawRun(false);
 }
 
 function drawRun(focus) {
-  const cell = data.runs[state.cell];
+  const cell = runsOf();
   const look = looks[state.filter];
   const value = runValues(state.filter)[state.run];
   const number = cell.numbers[state.run];
@@ -90,20 +90,27 @@ function drawRun(focus) {
     `<path d="${path}" fill="none" stroke="var(--ink)" stroke-opacity=".4" pointer-events="none"/>` +
     `<circle class="c${look.index}" id="dot" cx="${px(dots.place(value))}" cy="${px(dots.level(row))}" r="6" fill="var(--c)" stroke="var(--ink)" stroke-width="1.5" tabindex="0" role="button" aria-label="${esc(words)}"${tip(words)}/>`;
   if (focus) find("#dot").focus();
-  const place = currentCell();
+  const place = state.cell;
   const rank =
     1 + dots.filters.filter((item) => error(item.key) !== null && (value === null || error(item.key) < value)).length;
-  const fill = { world: place.world, regime: place.regime, filter: look.key, run: number, model: place.model };
+  const fill = { world: place.world, noise: place.noise, filter: look.key, run: number, model: place.model };
   const command = data.replay
-    ? data.replay.replace(/\{(\w+)\}/g, (all, name) => (name in fill ? fill[name] : all))
+    ? quoted(data.replay.replace(/\{(\w+)\}/g, (all, name) => (name in fill ? fill[name] : all)))
     : "";
   find("#runwords").innerHTML =
     `Run ${esc(number)} of ${esc(cellName(place))}: ${icon(look)}<b>${esc(look.name)}</b> ${esc(text)}, rank ${rank} of ${dots.filters.length} in this run.${command ? ` Repeat it: <code>${esc(command)}</code>` : ""}`;
   drawTrack(look, number, cell);
 }
 
+// Words of a command with signs of the shell in single quotes.
+const quoted = (command) =>
+  command
+    .split(" ")
+    .map((word) => (/[^\w.,=/+-]/.test(word) ? `'${word}'` : word))
+    .join(" ");
+
 function drawTrack(look, number, cell) {
-  const part = data.tracks[state.cell];
+  const part = partOf(data.tracks, state.cell);
   const carried = part && part.numbers.includes(number) && part.error[look.key] && part.error[look.key][number];
   const few =
     part && part.numbers.length < cell.numbers.length
@@ -120,24 +127,24 @@ function drawTrack(look, number, cell) {
   const truth = part.truth && (part.truth[number] || part.truth.all);
   if (truth && part.plane[look.key]) drawPlane(find("#plane"), look, truth, decode(part.plane[look.key][number]));
   const times = [];
-  const add = (filters, head, unit, isLog) => {
+  const add = (filters, head, unit, isLog, t = part.t) => {
     const lines = order()
       .filter((item) => (item === look || state.on.has(item.key)) && filters[item.key] && filters[item.key][number])
       .map((item) => ({ look: item, values: decode(filters[item.key][number]), bold: item === look }));
     if (lines.length)
-      times.push({ t: part.t, lines, head, unit, isLog, height: 210, caption: `${head} of run ${number} over time` });
+      times.push({ t, lines, head, unit, isLog, height: 210, caption: `${head} of run ${number} over time` });
   };
   add(part.error, "error of the run", part.unit, true);
-  for (const trace of part.traces) add(trace.filters, trace.name, trace.unit, trace.log !== false);
+  for (const trace of part.traces) add(trace.filters, trace.name, trace.unit, trace.log !== false, trace.t);
   find("#runtimes").innerHTML = times.map(() => '<div class="figure"></div>').join("");
   findAll("#runtimes .figure").forEach((figure, k) => curveFigure(figure, times[k]));
 }
 
-function drawPlane(part, look, truth, flat) {
-  const errors = truth.map((_, k) => [flat[2 * k], flat[2 * k + 1]]);
-  const usable = errors
-    .map((error, k) => [error, truth[k]])
-    .filter(([error]) => error[0] !== null && error[1] !== null);
+function drawPlane(part, look, points, flat) {
+  const truth = points.filter((point) => point !== null);
+  const usable = points
+    .map((point, k) => [[flat[2 * k], flat[2 * k + 1]], point])
+    .filter(([error, point]) => point !== null && error[0] !== null && error[1] !== null);
   if (!usable.length) return;
   const extent = (points, axis) => Math.max(...points.map((p) => p[axis])) - Math.min(...points.map((p) => p[axis]));
   const span = Math.max(extent(truth, 0), extent(truth, 1));
@@ -149,10 +156,10 @@ function drawPlane(part, look, truth, flat) {
   const width = widthOf(part);
   const height = Math.min(380, 0.75 * width);
   const [left, right, top, bottom] = [52, 12, 10, 36];
-  const points = [...truth, ...track];
-  const mid = (axis) => (Math.max(...points.map((p) => p[axis])) + Math.min(...points.map((p) => p[axis]))) / 2;
+  const both = [...truth, ...track];
+  const mid = (axis) => (Math.max(...both.map((p) => p[axis])) + Math.min(...both.map((p) => p[axis]))) / 2;
   const scale =
-    Math.max(extent(points, 0) / (width - left - right), extent(points, 1) / (height - top - bottom)) * 1.1 || 1;
+    Math.max(extent(both, 0) / (width - left - right), extent(both, 1) / (height - top - bottom)) * 1.1 || 1;
   const [cx, cy] = [mid(0), mid(1)];
   const x = (v) => (left + width - right) / 2 + (v - cx) / scale;
   const y = (v) => (top + height - bottom) / 2 - (v - cy) / scale;

@@ -8,7 +8,7 @@ const state = {
   down: false,
   open: null,
   on: new Set(),
-  cell: "",
+  cell: null, // of data.cells
   run: null,
   filter: null,
 };
@@ -24,9 +24,8 @@ async function unpack() {
   data = await new Response(stream).json();
   data.filters.forEach((look, index) => (look.index = index));
   looks = Object.fromEntries(data.filters.map((look) => [look.key, look]));
-  viewKeys = Object.entries(data.views).flatMap(([scope, part]) =>
-    Object.keys(part.baselines).map((baseline) => `${scope}/${baseline}`),
-  );
+  const { keys, baselines } = data.views;
+  viewKeys = keys.flatMap((scope) => baselines.map((baseline) => [...scope, baseline]));
 }
 
 // Numbers from levels of equal ratio (encoding.py). Level 0 is a missing value.
@@ -54,18 +53,20 @@ function decode(code) {
 }
 
 // The view: the choice of the switches, kept in the address after #.
-const viewKey = (choice = state) => axes.map((axis) => choice[axis]).join("/");
-const view = () => viewOf(viewKey());
-const single = (cell) => viewOf([state.metric, cell.world, cell.regime, state.baseline].join("/"));
+const view = () => viewOf(axes.map((axis) => state[axis]));
+const single = (cell) => viewOf([state.metric, cell.world, cell.regime, state.baseline]);
 
 // A view from its columns: those that all baselines of the scope share, and its own.
-function viewOf(key) {
+function viewOf(wish) {
+  const key = viewKeys.findIndex((parts) => parts.every((part, k) => part === wish[k]));
   if (views.has(key)) return views.get(key);
-  const cut = key.lastIndexOf("/");
-  const scope = data.views[key.slice(0, cut)];
-  const own = scope && scope.baselines[key.slice(cut + 1)];
-  if (!own) return undefined;
-  const columns = { ...scope.shared, ...own.columns };
+  if (key < 0) return undefined;
+  const { baselines, texts, shared, separate } = data.views;
+  const [scope, base] = [Math.floor(key / baselines.length), key % baselines.length];
+  const own = texts[scope][base];
+  const columns = {};
+  for (const [name, values] of Object.entries(shared)) columns[name] = values[scope];
+  for (const [name, values] of Object.entries(separate)) columns[name] = values[scope][base];
   const names = Object.keys(columns);
   const rows = (columns.filter || []).map((_, k) => Object.fromEntries(names.map((name) => [name, columns[name][k]])));
   const built = { ...own, rows, byFilter: Object.fromEntries(rows.map((row) => [row.filter, row])) };
@@ -78,7 +79,9 @@ const cellName = (cell) =>
   data.regimes.length > 1
     ? `${named(data.worlds, cell.world)}, ${named(data.regimes, cell.regime)}`
     : named(data.worlds, cell.world);
-const keyOf = (cell) => `${cell.world}/${cell.regime}`;
+// The part of a cell in data by world and regime, or undefined.
+const partOf = (parts, cell) => cell && parts[cell.world]?.[cell.regime];
+const hasRuns = (cell) => partOf(data.curves, cell) || partOf(data.runs, cell);
 const cellsInView = () =>
   data.cells.filter((cell) => ["world", "regime"].every((axis) => state[axis] === "all" || cell[axis] === state[axis]));
 const order = () => view().rows.map((row) => looks[row.filter]);
@@ -86,28 +89,27 @@ const order = () => view().rows.map((row) => looks[row.filter]);
 // Choose a value of a switch. If the study has no such view, the nearest that exists is shown.
 function choose(axis, value) {
   const wish = { ...state, [axis]: value };
-  if (!viewKeys.includes(viewKey(wish))) {
+  const score = (parts) => axes.reduce((sum, name, k) => sum + (parts[k] === wish[name] ? 1 : 0), 0);
+  if (!viewKeys.some((parts) => score(parts) === axes.length)) {
     const place = axes.indexOf(axis);
-    const score = (parts) => axes.reduce((sum, name, k) => sum + (parts[k] === wish[name] ? 1 : 0), 0);
-    const near = viewKeys.map((key) => key.split("/")).filter((parts) => parts[place] === value);
+    const near = viewKeys.filter((parts) => parts[place] === value);
     if (!near.length) return false;
     const best = near.reduce((a, b) => (score(b) > score(a) ? b : a));
     axes.forEach((name, k) => (wish[name] = best[k]));
   }
   Object.assign(state, Object.fromEntries(axes.map((name) => [name, wish[name]])));
-  const cells = cellsInView().filter((cell) => data.curves[keyOf(cell)] || data.runs[keyOf(cell)]);
-  if (cells.length && !cells.some((cell) => keyOf(cell) === state.cell)) selectCell(keyOf(cells[0]));
+  const cells = cellsInView().filter(hasRuns);
+  if (cells.length && !cells.includes(state.cell)) selectCell(cells[0]);
   return true;
 }
-function selectCell(key) {
-  state.cell = key;
+function selectCell(cell) {
+  state.cell = cell;
   state.run = null;
   state.filter = null;
 }
 function openView() {
-  const first = viewKeys[0].split("/");
-  axes.forEach((axis, k) => (state[axis] = first[k]));
-  state.cell = Object.keys(data.curves)[0] || Object.keys(data.runs)[0] || "";
+  axes.forEach((axis, k) => (state[axis] = data.opening[k]));
+  state.cell = data.cells.find(hasRuns) || null;
   followAddress();
   const rows = view().rows;
   const chosen = rows.filter((row, k) => looks[row.filter].proposed || row.filter === state.baseline || k === 0);

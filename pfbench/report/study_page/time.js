@@ -82,7 +82,7 @@ function curveFigure(part, { t, lines, band = null, head, unit, height = 360, ca
 }
 
 function drawTime(part) {
-  const cell = data.curves[state.cell];
+  const cell = partOf(data.curves, state.cell);
   drawChips();
   if (!cell) return void (part.innerHTML = '<p class="note">This condition has no curves.</p>');
   const chosen = order().filter((look) => state.on.has(look.key) && cell.filters[look.key]);

@@ -67,7 +67,7 @@ function drawWorld(panel, world) {
 }
 
 function drawCalibration(part) {
-  const shares = data.calibration[`${state.world}/${state.regime}`] || {};
+  const shares = data.calibration[state.world]?.[state.regime] || {};
   const filters = order().filter((look) => shares[look.key]);
   const width = widthOf(part);
   const narrow = width < 640;

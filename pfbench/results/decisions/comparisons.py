@@ -17,8 +17,11 @@ from pfbench.results.decisions.study_runs import PairRuns
 from pfbench.results.error_measures import Array
 from pfbench.results.statistics.paired_effects import (
     TRIM_SHARE,
+    ConditionEffects,
+    log_levels,
     order_failed_runs,
     paired_log_ratio,
+    subtract_levels,
     trimmed_effects,
 )
 
@@ -89,8 +92,10 @@ def compare_metric(pair: PairRuns, rule: MetricRule, options: DecisionOptions) -
         effects = share_effects(d, pair.weights, shared, _key(pair, rule.name))
         return PairComparison(pair, rule.name, rule.group, "share", margin, effects, np.nan)
     trim = 0.0 if rule.scale == "mean difference" else TRIM_SHARE
-    effects = location_effects(d, pair.weights, trim, shared)
     is_ratio = rule.scale == "log ratio"
+    by_levels = is_ratio and options.estimate == "levels"
+    levels = _subtract_pair_levels(pair, rule) if by_levels else None
+    effects = location_effects(d, pair.weights, trim, shared, levels)
     scale: Scale = "log ratio" if is_ratio else "difference"
     scale = "runs won" if effects.by_runs_won else scale
     both_kept = np.where(pair.keeps_a & pair.keeps_b, d, np.nan)
@@ -112,6 +117,17 @@ def compare_track(pair: PairRuns, group: str, options: DecisionOptions) -> PairC
     d = np.where(pair.present, pair.keeps_b.astype(float) - pair.keeps_a, np.nan)
     effects = share_effects(d, pair.weights, options.shared_runs, _key(pair, TRACK))
     return PairComparison(pair, TRACK, group, "share", options.track_margin, effects, np.nan)
+
+
+def _subtract_pair_levels(pair: PairRuns, rule: MetricRule) -> ConditionEffects:
+    """Subtract the levels of the second filter from those of the first, by condition."""
+    first, second = (pair.value_a, pair.value_b)
+    if rule.higher_is_better:
+        first, second = 1 / first, 1 / second
+    return subtract_levels(
+        log_levels(first, pair.keeps_a, pair.present),
+        log_levels(second, pair.keeps_b, pair.present),
+    )
 
 
 def _mean_location(d: Array, weights: Array, trim: float) -> float:

@@ -14,6 +14,7 @@ from pfbench.results.statistics.label_flips import flip_p_value, run_contributio
 from pfbench.results.statistics.paired_effects import (
     MIN_RUNS,
     TRIM_SHARE,
+    ConditionEffects,
     is_identical,
     trimmed_effects,
 )
@@ -62,9 +63,13 @@ class PairEffects(NamedTuple):
 
 
 def location_effects(
-    d: Array, weights: Array, trim: float = TRIM_SHARE, shared_runs: bool = True
+    d: Array,
+    weights: Array,
+    trim: float = TRIM_SHARE,
+    shared_runs: bool = True,
+    conditions: ConditionEffects | None = None,
 ) -> PairEffects:
-    """Estimate the effect as the mean over worlds of trimmed means.
+    """Estimate the effect as the mean over worlds of locations.
 
     If lost runs decide a location, or ties hide all spread, the effect is the difference of the
     shares of runs won.
@@ -75,11 +80,12 @@ def location_effects(
         weights: Weights of the conditions, [W, C]; 0 for an absent one.
         trim: Share removed at each end; 0 for the mean.
         shared_runs: Whether a run has the same random numbers in all worlds.
+        conditions: Locations of the conditions, None for trimmed means of the differences.
 
     Returns:
         Effects.
     """
-    conditions = trimmed_effects(d, trim)
+    conditions = trimmed_effects(d, trim) if conditions is None else conditions
     worlds = combine_conditions(conditions, weights)
     same_worlds = _as_question(estimate_in_these_worlds(worlds, shared_runs))
     new = _as_question(estimate_in_new_world(worlds, shared_runs))

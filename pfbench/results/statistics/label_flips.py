@@ -19,7 +19,7 @@ from fractions import Fraction
 from functools import lru_cache
 
 import numpy as np
-from scipy import stats
+from scipy.special import gammaln
 
 from pfbench.results.error_measures import Array
 
@@ -96,6 +96,9 @@ def _positive_sum_distribution(sizes: tuple[int, ...], counts: tuple[int, ...]) 
     total = np.ones(1)
     for size, count in zip(sizes, counts, strict=True):
         spaced = np.zeros(size * count + 1)
-        spaced[::size] = stats.binom.pmf(np.arange(count + 1), count, 0.5)
+        k = np.arange(count + 1)
+        spaced[::size] = np.exp(
+            gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1) - count * math.log(2)
+        )
         total = np.convolve(total, spaced)
     return total

@@ -114,6 +114,39 @@ def trimmed_effects(d: Array, trim: float = TRIM_SHARE) -> ConditionEffects:
     return ConditionEffects(location, np.where(finite, parts, 0.0), middle, runs)
 
 
+def log_levels(value: Array, keeps_track: Flags, present: Flags) -> ConditionEffects:
+    """Compute the level of one filter in each condition: the trimmed mean of the log error.
+
+    The difference of two levels is transitive, unlike a location of paired differences.
+
+    Args:
+        value: Errors, [..., N].
+        keeps_track: Runs that keep track, [..., N]. The others lie at the upper end.
+        present: Runs that exist, [..., N].
+
+    Returns:
+        Levels and contributions of the runs.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_error = np.where(keeps_track, np.log(value), np.inf)
+    return trimmed_effects(np.where(present, log_error, np.nan))
+
+
+def subtract_levels(a: ConditionEffects, b: ConditionEffects) -> ConditionEffects:
+    """Subtract the levels of two filters; contributions are subtracted run by run.
+
+    Args:
+        a: Levels of the first filter.
+        b: Levels of the second filter in the same runs.
+    """
+    with np.errstate(invalid="ignore"):  # lost runs decide both
+        location = a.location - b.location
+    parts = np.where(np.isfinite(location)[..., None], a.parts - b.parts, 0.0)
+    return ConditionEffects(
+        location, parts, np.minimum(a.middle, b.middle), np.minimum(a.runs, b.runs)
+    )
+
+
 def is_identical(d: Array, axes: int | tuple[int, ...] = -1) -> Flags:
     """Return whether all differences agree with 0 to the stored precision.
 

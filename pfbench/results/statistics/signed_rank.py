@@ -8,7 +8,7 @@ from itertools import product
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy import stats
+import scipy  # scipy.stats is imported at its first use, which takes longer than a small report
 from scipy.special import ndtr
 
 from pfbench.results.error_measures import Array
@@ -73,7 +73,7 @@ def wilcoxon_signed_rank_rows(
     """
     n = d.shape[1]
     size = np.abs(d)
-    ranks = np.asarray(stats.rankdata(size, axis=1), dtype=np.float64)
+    ranks = np.asarray(scipy.stats.rankdata(size, axis=1), dtype=np.float64)
     ordered = np.sort(size, axis=1)
     has_ties = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1) | (d == 0).any(axis=1)
     half_zero = np.where(d == 0, ranks, 0.0).sum(axis=1) / 2
@@ -119,7 +119,7 @@ def _rank_sum_cdf(n: int) -> Array:
 def _normal_score(ranks: Array, size: Array, above: Array) -> Array:
     """Standardise positive rank sums [K], with the variance corrected for ties."""
     n = ranks.shape[1]
-    last, first = (stats.rankdata(size, method=m, axis=1) for m in ("max", "min"))
+    last, first = (scipy.stats.rankdata(size, method=m, axis=1) for m in ("max", "min"))
     count = (last - first + 1).astype(np.float64)
     ties = (count**2 - 1).sum(axis=1)  # over values, equals the sum of t^3 - t over ties
     deviation = np.sqrt((n * (n + 1) * (2 * n + 1) - ties / 2) / 24)

@@ -14,10 +14,10 @@ from pfbench.report.plots.plotting import (
     add_legend,
     compute_run_quantiles,
     format_axis_label,
-    select_indices,
     stacked_axes,
 )
 from pfbench.results import store
+from pfbench.results.frame import select_indices
 from pfbench.results.state_groups import ComponentGroup
 
 SYMLOG = " Outside the grey lines, if any, the scale is logarithmic."

@@ -1,0 +1,159 @@
+"""Planned pairs of a study, decided by the levels of the board."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pfbench.report.board.levels import (
+    StudyArrays,
+    arrange_runs,
+    average_levels,
+    compute_condition_levels,
+)
+from pfbench.report.board.pack_entries import round_values
+from pfbench.report.looks import MethodLook, PartName, plan_look_pairs
+from pfbench.report.options import ReportOptions
+from pfbench.results.decisions.comparisons import TRACK
+from pfbench.results.decisions.decision import Decision
+from pfbench.results.decisions.family_records import LOST_TRACK
+from pfbench.results.decisions.planned_pairs import decide_planned_pairs
+from pfbench.results.decisions.sentences import describe_pair
+from pfbench.results.statistics.paired_effects import ConditionEffects
+from pfbench.results.study_decisions.main_metrics import main_rule
+
+OPPOSITE = {"better": "worse", "worse": "better"}
+
+
+def decide_planned(
+    table: pd.DataFrame, looks: Mapping[str, MethodLook], options: ReportOptions
+) -> list[Decision]:
+    """Decide the planned pairs that share runs.
+
+    Args:
+        table: Table of `build_run_table`.
+        looks: Looks by label.
+        options: Options of the report.
+    """
+    keys = ["family", "scenario", "regime", "seed", "run"]
+    by_filter = {label: pd.MultiIndex.from_frame(rows[keys]) for label, rows in table.groupby("filter")}  # fmt: skip
+    pairs = [
+        pair
+        for pair in plan_look_pairs(looks)
+        if len(by_filter[pair[0]].intersection(by_filter[pair[1]]))
+    ]
+    if not pairs:
+        return []
+    groups = table["group"].unique()
+    rule = main_rule(options.metric, groups[0] if len(groups) == 1 else "main")
+    runs = table["seed"].map("{:012d}".format) + " " + table["run"].map("{:09d}".format)
+    tidy = table.assign(run=runs, value=table[options.metric].fillna(math.inf))
+    tidy = tidy[~(table[options.metric].isna() & table["keeps_track"])]
+    return decide_planned_pairs(tidy, pairs, rule, options.decision_options)
+
+
+def planned_words(planned: Sequence[Decision]) -> dict[tuple[str, str], str]:
+    """Return the words of planned pairs for the verdict on the first filter against the second.
+
+    Args:
+        planned: Decisions on the planned pairs.
+    """
+    words = {}
+    for d in planned:
+        if d.question == "a" and d.metric != TRACK:
+            words[d.a, d.b] = d.word
+            words[d.b, d.a] = OPPOSITE.get(d.word, d.word)
+    return {pair: {"better": "best"}.get(word, word) for pair, word in words.items()}
+
+
+def planned_entries(
+    planned: Sequence[Decision],
+    table: pd.DataFrame,
+    looks: Mapping[str, MethodLook],
+    worlds: Mapping[str, PartName],
+    options: ReportOptions,
+) -> list[dict[str, Any]]:
+    """List the entries of planned pairs, in ratios.
+
+    Args:
+        planned: Decisions on the planned pairs.
+        table: Table of `build_run_table`.
+        looks: Looks by label of the filter.
+        worlds: Names of the scenarios by key.
+        options: Options of the report.
+    """
+    if not planned:
+        return []
+    errors = {(d.question, d.a, d.b): d for d in planned if d.metric != TRACK}
+    tracks = {(d.question, d.a, d.b): d for d in planned if d.metric == TRACK}
+    runs = arrange_runs(table, tuple(looks))
+    levels = compute_condition_levels(runs, options.metric)
+    entries = []
+    for (question, a, b), d in errors.items():
+        if question != "a":
+            continue
+        new = errors["b", a, b]
+        ratios = {k: _ratio(d, getattr(d, k)) for k in ("estimate", "low", "high")}
+        records = [
+            replace(record, a=f"[[{looks[a].name}]]", b=f"[[{looks[b].name}]]")
+            for record in (tracks["a", a, b], d)
+        ]
+        entry = {
+            "a": a, "b": b, "question": "Error in these worlds", "kind": "paper" if b in looks[a].baselines else "",
+            "sentence": describe_pair(*records), **ratios, "p": d.p_corrected, "word": d.pair_word,
+            "reason": _describe_gap(d), "cells": _list_cells(runs, levels, (a, b), worlds, options.alpha) if d.scale == "log ratio" else [],
+            "new_world": None if new.worlds < 2 else {
+                **{k: _ratio(new, getattr(new, k)) for k in ("estimate", "low", "high")}, "word": new.word,
+            },
+            "prediction": None if new.worlds < 3 else [_ratio(new, new.new_low), _ratio(new, new.new_high)],
+        }  # fmt: skip
+        entries.append(round_values(entry))
+    return entries
+
+
+def _describe_gap(decision: Decision) -> str:
+    """Return the reason of a missing ratio or interval, empty if the pair has both."""
+    if decision.reason:
+        return decision.reason
+    if decision.scale == "log ratio":
+        return ""
+    return LOST_TRACK if decision.scale == "runs won" else "a difference, which is no ratio"
+
+
+def _list_cells(
+    runs: StudyArrays,
+    levels: ConditionEffects,
+    pair: tuple[str, str],
+    worlds: Mapping[str, PartName],
+    alpha: float,
+) -> list[dict[str, Any]]:
+    """List the ratio of a pair in each scenario with its own interval; none for one scenario."""
+    i, j = (runs.filters.index(label) for label in pair)
+    scenarios = runs.conditions["scenario"]
+    if scenarios.nunique() < 2:
+        return []
+    cells = []
+    for scenario in scenarios.unique():
+        mask = (scenarios == scenario).to_numpy()
+        selected = ConditionEffects(*(array[:, mask] for array in levels))
+        estimate = average_levels(selected, runs.conditions[mask]).difference(i, j)
+        if np.isfinite(estimate.value):
+            ends = (estimate.value, *estimate.interval(alpha))
+            ratios = (float(np.exp(np.minimum(end, 700.0))) for end in ends)
+            cells.append({
+                "world": scenario, "regime": "all", "name": worlds[scenario].name,
+                **dict(zip(("estimate", "low", "high"), ratios, strict=True)),
+            })  # fmt: skip
+    return cells
+
+
+def _ratio(decision: Decision, value: float) -> float:
+    """Return a log ratio as a ratio, NaN for an effect of another scale or an end that does not exist."""
+    if decision.scale != "log ratio" or not math.isfinite(value):
+        return math.nan
+    return math.exp(min(value, 700.0))

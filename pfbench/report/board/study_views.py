@@ -1,0 +1,179 @@
+"""All views of a study: metric, world, regime and baseline, each with its sentence and its rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pfbench.report.board.levels import (
+    StudyArrays,
+    arrange_runs,
+    average_levels,
+    compute_condition_levels,
+)
+from pfbench.report.board.pack_entries import format_interval_level, list_metrics, round_values
+from pfbench.report.board.run_table import METRIC_NAMES
+from pfbench.report.board.sentence import count_words, describe_view
+from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_filters
+from pfbench.report.looks import MethodLook, PartName
+from pfbench.report.options import ReportOptions
+from pfbench.results.error_measures import Flags
+from pfbench.results.statistics.paired_effects import ConditionEffects
+
+ALL = "all"
+
+
+class ViewKey(NamedTuple):
+    """Key of a view.
+
+    Attributes:
+        metric: Column of the error.
+        world: Key of the scenario, or "all".
+        regime: Key of the regime, or "all".
+        baseline: Label of the baseline.
+    """
+
+    metric: str
+    world: str
+    regime: str
+    baseline: str
+
+
+class StudyNames(NamedTuple):
+    """Names of the parts of a study.
+
+    Attributes:
+        looks: Looks by label.
+        worlds: Names of the scenarios by key.
+        regimes: Names of the noise regimes by key.
+        baselines: Labels of the baselines.
+    """
+
+    looks: Mapping[str, MethodLook]
+    worlds: Mapping[str, PartName]
+    regimes: Mapping[str, PartName]
+    baselines: Sequence[str]
+
+
+def build_views(
+    table: pd.DataFrame,
+    names: StudyNames,
+    options: ReportOptions,
+    words: Mapping[tuple[str, str], str],
+) -> dict[ViewKey, dict[str, Any]]:
+    """Build all views that have runs. The first one opens the page.
+
+    Args:
+        table: Table of `build_run_table`.
+        names: Names of the parts.
+        options: Options of the report.
+        words: Words of planned pairs, which decide in the view of all conditions.
+    """
+    runs = arrange_runs(table, tuple(names.looks))
+    groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
+    views: dict[ViewKey, dict[str, Any]] = {}
+    baselines: list[str] = []
+    for metric in list_metrics(table, options.metric):
+        levels = compute_condition_levels(runs, metric)
+        for world, regime, mask in _list_scopes(runs.conditions):
+            selected = runs.select(mask)
+            of_scope = groups.loc[list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))]  # fmt: skip
+            scope = _assess_scope(selected, levels, mask, of_scope, options)
+            is_opening = (metric, world, regime) == (options.metric, ALL, ALL)
+            view_options = ViewOptions(
+                options.alpha, options.equivalence_margin, words if is_opening else None
+            )
+            where = _describe_scope(selected.conditions, names)
+            name = METRIC_NAMES[metric]
+            if of_scope["group"].nunique() == 1:
+                name = f"{of_scope['group'].iloc[0]} {name}"
+            small_print = _small_print(selected, options)
+            if not views:  # the page opens with a baseline that has an error
+                baselines = _order_baselines(scope, names.baselines)
+            for baseline in baselines:
+                rows = build_rows(scope, baseline, view_options)
+                views[ViewKey(metric, world, regime, baseline)] = {
+                    "sentence": describe_view(
+                        rows,
+                        names.looks,
+                        baseline,
+                        where,
+                        name,
+                        format_interval_level(options.alpha),
+                    ),
+                    "small_print": small_print,
+                    "rows": [round_values(asdict(row)) for row in rows],
+                }
+    return views
+
+
+def _order_baselines(scope: Scope, baselines: Sequence[str]) -> list[str]:
+    """Order baselines with an error first. If none has one, the filter of the smallest error leads."""
+    level = dict(zip(scope.filters, scope.levels.level, strict=True))
+    ordered = sorted(baselines, key=lambda label: not np.isfinite(level[label]))
+    best = min(level, key=lambda label: (not np.isfinite(level[label]), level[label]))
+    is_needed = np.isfinite(level[best]) and not np.isfinite(level[ordered[0]])
+    return [best, *ordered] if is_needed else ordered
+
+
+def _list_scopes(conditions: pd.DataFrame) -> Iterator[tuple[str, str, Flags]]:
+    """Yield world, regime and mask of the conditions of each scope that has conditions."""
+    for world in (ALL, *conditions["scenario"].unique()):
+        for regime in (ALL, *conditions["regime"].unique()):
+            mask = ((world == ALL) | (conditions["scenario"] == world)) & (
+                (regime == ALL) | (conditions["regime"] == regime)
+            )
+            if mask.any():
+                yield world, regime, mask.to_numpy()
+
+
+def _assess_scope(
+    runs: StudyArrays,
+    levels: ConditionEffects,
+    mask: Flags,
+    groups: pd.DataFrame,
+    options: ReportOptions,
+) -> Scope:
+    """Average the levels of the conditions of a scope, and describe the filters there."""
+    selected = ConditionEffects(*(array[:, mask] for array in levels))
+    is_single = len(runs.conditions) == 1
+    return Scope(
+        runs.filters,
+        average_levels(selected, runs.conditions),
+        describe_filters(runs, options.alpha),
+        str(groups["unit"].iloc[0]) if is_single else "",
+        is_single,
+    )
+
+
+def _describe_scope(conditions: pd.DataFrame, names: StudyNames) -> str:
+    """Describe worlds and regimes in words."""
+    where = f"in {count_words(conditions['family'].nunique(), 'world')}"
+    scenarios, regimes = conditions["scenario"].unique(), conditions["regime"].unique()
+    if len(scenarios) == 1:
+        where = f"in {names.worlds[scenarios[0]].name}"
+    if len(regimes) == 1 and regimes[0] in names.regimes:
+        where += f" with {names.regimes[regimes[0]].words}"
+    return where
+
+
+def _small_print(runs: StudyArrays, options: ReportOptions) -> str:
+    """Describe the sample of a view and its intervals."""
+    filters = int(runs.present.any(axis=(1, 2)).sum())
+    seeds = np.unique(runs.values["seed"][runs.present])
+    level = format_interval_level(options.alpha)
+    return (
+        f"{count_words(filters, 'filter')}, "
+        f"{count_words(runs.conditions['family'].nunique(), 'world')}, "
+        f"{count_words(runs.conditions['regime'].nunique(), 'noise regime')}, "
+        f"{count_words(int(runs.present.sum(axis=2).max()), 'paired run')} per condition, "
+        f"{count_words(len(seeds), 'seed')}. "
+        "Errors are trimmed means over runs on the logarithmic scale, averaged over conditions. "
+        f"Intervals of the ratio: {level} each. "
+        f"Verdicts against the best hold for all pairs together at {level}. "
+        "They concern these worlds."
+    )

@@ -1,0 +1,107 @@
+"""Single runs, sweeps and notes of the page, from invented results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic_results as synthetic
+
+from pfbench.report.board import build_pack
+from pfbench.report.board.sweeps import read_settings
+from pfbench.report.board.tracks import select_telling_runs
+from pfbench.report.options import ReportOptions
+from pfbench.results.conditions import load_conditions
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    synthetic.study(folder / "demo", runs=12, steps=50)
+    return folder
+
+
+def test_telling_runs_come_in_turn() -> None:
+    level = np.array([3.0, 1.0, 2.0, 8.0, 2.5, 2.2, 2.4])
+    errors = np.exp([level, level])
+    errors[1, 5] *= 4  # the largest disagreement
+    errors[0, 0] = np.nan  # the filter is lost
+    runs = select_telling_runs(errors, 4)
+    assert runs[1:] == [0, 1, 5]
+    assert runs[0] in (2, 4, 6)
+    assert sorted(select_telling_runs(errors, 50)) == list(range(7))
+    assert select_telling_runs(np.full((2, 3), np.nan), 2) == [0, 1]
+
+
+def test_tracks_are_those_of_the_results(results: Path) -> None:
+    (first, *_) = conditions = load_conditions("demo", results)
+    pack = build_pack("demo", conditions, ReportOptions())
+    entry = pack["tracks"][first.scenario, first.noise]
+    assert len(entry["t"]) == 40
+    assert entry["note"] == "40 of 50 instants."
+    assert sorted(entry["numbers"]) == list(range(12))
+    for job in first.jobs:
+        data, names = job.load().data, job.meta["state"]["names"]
+        steps = [int(np.argmin(np.abs(data["time"] - t))) for t in entry["t"]]
+        places = [names.index(f"position_{axis}") for axis in "ENU"]
+        for run in (0, 5, 11):
+            if data["lost"][run]:
+                assert np.isnan(entry["error"][job.label][str(run)]).all()
+                continue
+            error = data["error"][run][steps][:, places].astype(float)
+            norm = np.linalg.norm(error, axis=-1)
+            np.testing.assert_allclose(entry["error"][job.label][str(run)], norm, rtol=1e-6)
+            if "plane" in entry:
+                np.testing.assert_allclose(entry["plane"][job.label][str(run)], error[:, :2])
+
+
+def test_settings_of_a_label() -> None:
+    items = read_settings("sir[particles=100,noise.sd=[1.0, 2.0]]")
+    assert [(item.line, item.name, item.value) for item in items] == [
+        ("sir[noise.sd=[1.0, 2.0]]", "particles", "100"),
+        ("sir[particles=100]", "noise.sd", "[1.0, 2.0]"),
+    ]
+    assert read_settings("ekf") == []
+
+
+def test_a_study_of_a_setting_has_a_sweep(tmp_path: Path) -> None:
+    for particles in (50, 100, 200):
+        method = synthetic.Method("sir", 1 + 50 / particles, 0.9, particles)
+        synthetic.write(tmp_path / "dose", method, runs=12, steps=9)
+    synthetic.write(tmp_path / "dose", synthetic.METHODS[0], runs=12, steps=9)
+    pack = build_pack("dose", load_conditions("dose", tmp_path), ReportOptions())
+    (sweep,) = pack["sweeps"]
+    lines = {line["name"]: line["points"] for line in sweep["lines"]}
+    assert [point["x"] for point in lines["SIR"]] == [50, 100, 200]
+    assert [point["x"] for point in lines["EKF"]] == [50, 200]
+    rows = next(view for key, view in pack["views"].items() if key[:3] == ("rmse", sweep["world"], sweep["regime"]))["rows"]  # fmt: skip
+    values = {row["filter"]: row["value"] for row in rows}
+    assert [point["value"] for point in lines["SIR"]] == [values[f"sir[particles={n}]"] for n in (50, 100, 200)]  # fmt: skip
+
+
+def test_notes_state_exactness_failures_and_choices(results: Path) -> None:
+    conditions = load_conditions("demo", results)
+    pack = build_pack("demo", conditions, ReportOptions())
+    notes = {note["filter"]: note for note in pack["filter_notes"]}
+    for label, note in notes.items():
+        jobs = [job for c in conditions for job in c.jobs if job.label == label]
+        assert note["runs"] == sum(job.meta["runs"] for job in jobs)
+        assert note["lost"] == sum(int(job.load().data["lost"].sum()) for job in jobs)
+        assert note["particles"] in ("200", "")
+        assert note["is_exact"] == all(bool(job.meta.get("is_exact")) for job in jobs)
+    (choice,) = pack["choices"]
+    assert choice["text"].startswith("initial heading error")
+    assert choice["filters"] == "all filters"
+
+
+@pytest.mark.parametrize("alpha", [0.05, 0.2])
+def test_the_level_of_a_report_is_that_of_its_option(results: Path, alpha: float) -> None:
+    pack = build_pack("demo", load_conditions("demo", results), ReportOptions(alpha=alpha))
+    level = f"{100 * (1 - alpha):g} %"
+    for view in pack["views"].values():
+        assert f"ratio: {level} each" in view["small_print"]
+        assert f"together at {level}" in view["small_print"]
+        if "interval" in view["sentence"]:
+            assert f"{level} interval" in view["sentence"]
+    assert level in pack["methods_paragraph"]
