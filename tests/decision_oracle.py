@@ -113,7 +113,7 @@ def differences(first: pd.DataFrame, second: pd.DataFrame, metric: str) -> np.nd
 
 def log_errors(first: pd.DataFrame, second: pd.DataFrame, metric: str) -> Levels:
     """Log errors of both filters, infinite where the track is lost."""
-    if METRICS[metric] != "ratio":
+    if METRICS.get(metric, "ratio") != "ratio":
         return None
     a, b = (
         np.where(rows["keeps"], np.log(rows[metric].to_numpy(float)), np.inf)
