@@ -13,6 +13,7 @@ from pfbench.report.study_page import write_page
 
 PAGE_DATA = "page.json.gz"
 _OMITTED: dict[str, Any] = {"paper_figures": [], "tracks": {}}  # too large; they need the results
+_KEYED = ("views", "curves", "calibration", "runs")  # parts with a tuple as key
 
 
 def write_page_data(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
@@ -22,7 +23,11 @@ def write_page_data(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
         pack: Data of the page.
         folder: Folder of the report.
     """
-    text = json.dumps({**pack, **_OMITTED}, separators=(",", ":"), allow_nan=False)
+    keyed = {
+        name: {"keys": [list(key) for key in pack[name]], "values": list(pack[name].values())}
+        for name in _KEYED
+    }
+    text = json.dumps({**pack, **_OMITTED, **keyed}, separators=(",", ":"), allow_nan=False)
     folder.write(PAGE_DATA, gzip.compress(text.encode(), mtime=0))
 
 
@@ -38,7 +43,10 @@ def read_page_data(folder: Path) -> dict[str, Any]:
     path = folder / PAGE_DATA
     try:
         pack: dict[str, Any] = json.loads(gzip.decompress(path.read_bytes()))
-    except (OSError, EOFError, ValueError) as error:
+        for name in _KEYED:
+            keys = [tuple(key) for key in pack[name]["keys"]]
+            pack[name] = dict(zip(keys, pack[name]["values"], strict=True))
+    except (OSError, EOFError, ValueError, TypeError, KeyError) as error:
         raise ValueError(
             f"{path} must be the data of a page, got {error}. Run the study and write its report again."
         ) from error

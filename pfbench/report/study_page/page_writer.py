@@ -93,6 +93,7 @@ def write_markdown(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
     """
     context = {
         "pack": {"headline": "", "failures": (), **pack},
+        "choices": pack.get("choices", ()),
         "opening": describe_opening(pack),
         "planned": describe_pairs(pack),
         "level": _format_level(pack),
