@@ -95,7 +95,7 @@ def modelling_choices(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
 
 
 def format_bibtex(conditions: Sequence[Condition]) -> str:
-    """Format a BibTeX entry with the versions and the year of the results."""
+    """Format a BibTeX entry, of a type that all styles know, with the versions and the year of the results."""
     metadata = [job.meta for cell in conditions for job in cell.jobs]
     version = ", ".join(
         distinct_values(str(_value_at(meta, "versions.pfbench")) for meta in metadata)
@@ -110,7 +110,7 @@ def format_bibtex(conditions: Sequence[Condition]) -> str:
     years = [str(meta["created"])[:4] for meta in metadata if meta.get("created")]
     note = f"  note    = {{Commit {commit}}},\n" if commit else ""
     return (
-        "@software{pfbench,\n"
+        "@misc{pfbench,\n"
         "  author  = {{The pfbench authors}},\n"
         "  title   = {{pfbench}: probabilistic programming and benchmarking of particle filters in integrated navigation},\n"
         f"  version = {{{version}}},\n{note}"

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from checkout import ROOT
+from matplotlib.figure import Figure
 from page_packs import build_pack
 from synthetic_results import study
 
@@ -19,8 +20,13 @@ from pfbench.report.journal import paper_folder, references
 from pfbench.report.journal.figure_style import FigureSetting
 from pfbench.report.journal.main_table import format_error_value, make_main_tables, make_supplement
 from pfbench.report.journal.methods_text import describe_methods
-from pfbench.report.journal.page_format import JOURNALS, find_page_format
-from pfbench.report.journal.paper_folder import draw_paper_figure, render_pdf, select_figures
+from pfbench.report.journal.page_format import JOURNALS, SUPERSCRIPTS, find_page_format
+from pfbench.report.journal.paper_folder import (
+    draw_paper_figure,
+    render_pdf,
+    render_pgf,
+    select_figures,
+)
 from pfbench.report.journal.table_layout import (
     Column,
     LatexTable,
@@ -238,3 +244,31 @@ def test_each_reference_of_a_filter_has_an_entry_and_each_entry_a_filter() -> No
     for entry in re.findall(r"^@.*?^\}", bib, re.MULTILINE | re.DOTALL):
         assert "title = {" in entry
         assert "year = {" in entry or "note = {" in entry
+
+
+@pytest.mark.parametrize("journal", JOURNALS)
+@pytest.mark.filterwarnings("error")
+def test_powers_of_ten_have_all_glyphs(journal: str) -> None:
+    def plot(_: Any, setting: FigureSetting) -> Figure:
+        figure = setting.make_figure(1.0)
+        figure.text(0.1, 0.5, f"10{''.join(map(chr, SUPERSCRIPTS))}")
+        return figure
+
+    page = JOURNALS[journal]
+    figure = draw_paper_figure(plot, {}, FigureSetting(page))
+    assert render_pdf(figure, page).startswith(b"%PDF")
+    if shutil.which("pdflatex"):
+        text = render_pgf(plot, {}, page)
+        assert r"10\textsuperscript{-}\textsuperscript{0}" in text
+        assert not set(map(chr, SUPERSCRIPTS)) & set(text)
+
+
+@needs_tex
+def test_the_width_of_a_percent_sign_is_that_of_tex(tmp_path: Path) -> None:
+    lines = [r"\documentclass[journal]{IEEEtran}", r"\usepackage[T1]{fontenc}", r"\begin{document}",
+             r"\fontsize{8}{9.6}\selectfont\setbox0\hbox{\%}\typeout{WIDTH \the\wd0}", r"\end{document}"]  # fmt: skip
+    (tmp_path / "a.tex").write_text("\n".join(lines))
+    words = ["pdflatex", "-interaction=nonstopmode", "a"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    (width,) = re.findall(r"^WIDTH ([\d.]+)pt", done.stdout, re.MULTILINE)
+    assert text_width("%", 8.0) == pytest.approx(float(width), abs=0.01)

@@ -75,7 +75,7 @@ def test_the_page_says_what_ran_what_failed_and_what_was_lost(report):
     for said in ("1 job failed", "00000000deadbeef", "covariance lost its positive eigenvalues"):
         assert said in html, said
         assert said in text, said
-    for said in ("0123abc", "@software{pfbench,", "year    = {2026}", "N = 200 in each particle filter",
+    for said in ("0123abc", "@misc{pfbench,", "year    = {2026}", "N = 200 in each particle filter",
                  "<code>pcrb</code>"):  # fmt: skip
         assert said in html, said
     lost = pd.read_csv(report / "verdicts.csv").query("world == 'all' and metric == 'rmse'")

@@ -6,6 +6,11 @@ import re
 from typing import Any, NamedTuple
 
 POINTS_PER_INCH = 72.27  # TeX points
+# signs of powers of ten at axes, which LaTeX does not know
+SUPERSCRIPTS = {
+    ord(sign): rf"\textsuperscript{{{digit}}}"
+    for sign, digit in zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True)
+}
 _POINTS_PER_MM = POINTS_PER_INCH / 25.4
 _NARROWEST, _WIDEST = 60 * _POINTS_PER_MM, 400 * _POINTS_PER_MM
 
@@ -44,7 +49,7 @@ class PageFormat(NamedTuple):
         """Return the settings of matplotlib."""
         family = "STIXGeneral" if self.serif else "DejaVu Sans"
         return {
-            "font.family": [family],
+            "font.family": [family, "DejaVu Sans"],  # STIX lacks some superscripts
             "mathtext.fontset": "stix" if self.serif else "dejavusans",
             "font.size": self.size,
             "axes.labelsize": self.size,
@@ -73,6 +78,10 @@ class PageFormat(NamedTuple):
             "text.parse_math": False,  # a name may contain $ as a plain character
             "pgf.texsystem": "pdflatex",
             "pgf.rcfonts": False,  # the fonts of the document
+            "pgf.preamble": "\n".join(
+                rf"\DeclareUnicodeCharacter{{{sign:04X}}}{{{code}}}"
+                for sign, code in SUPERSCRIPTS.items()
+            ),
             "figure.constrained_layout.h_pad": 0.02,
             "figure.constrained_layout.w_pad": 0.02,
         }

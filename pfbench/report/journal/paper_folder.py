@@ -13,7 +13,7 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.journal.document import format_document, format_methods
 from pfbench.report.journal.figure_style import FigureSetting
 from pfbench.report.journal.main_table import make_main_tables, make_supplement
-from pfbench.report.journal.page_format import POINTS_PER_INCH, PageFormat
+from pfbench.report.journal.page_format import POINTS_PER_INCH, SUPERSCRIPTS, PageFormat
 from pfbench.report.journal.pair_table import make_cost_table, make_planned_table
 from pfbench.report.journal.ratio_figures import (
     plot_error_against_cost,
@@ -144,7 +144,7 @@ def render_pgf(plot: Plot, pack: Pack, page: PageFormat) -> str:
     setting, buffer = FigureSetting(page, escape_latex), io.StringIO()
     with setting.applied():
         plot(pack, setting).savefig(buffer, format="pgf")
-    return buffer.getvalue()
+    return buffer.getvalue().translate(SUPERSCRIPTS)
 
 
 def _format_tables(pack: Pack, conditions: Sequence[Condition], page: PageFormat) -> dict[str, str]:

@@ -102,7 +102,7 @@ def plot_planned(pack: Pack, setting: FigureSetting) -> Figure:
                 x = float(np.clip(cell["estimate"], *limits))
                 axis.plot([x], [y], ".", ms=2.5, color=_GREY, zorder=2)
         _draw_diamond(axis, y, pair, colour, limits)
-    axis.set_xlabel("error of the first method / error of the second")
+    axis.set_xlabel("ratio of errors, first / second")
     return figure
 
 

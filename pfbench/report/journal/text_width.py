@@ -10,6 +10,7 @@ import matplotlib
 from matplotlib.ft2font import FT2Font, LoadFlags
 
 _FONTS = {False: "STIXGeneral.ttf", True: "STIXGeneralBol.ttf"}
+_OTHER_WIDTHS = {"%": 0.833}  # in which Times differs
 _UNITS = 1000  # size at which the glyphs are measured, in points
 
 
@@ -24,6 +25,8 @@ def _font(is_bold: bool) -> FT2Font:
 @cache
 def _letter_width(letter: str, is_bold: bool) -> float:
     """Return the advance of a letter, or of what `escape_latex` writes for it, in units of the size."""
+    if letter in _OTHER_WIDTHS:
+        return _OTHER_WIDTHS[letter]
     font = _font(is_bold)
     base = unicodedata.normalize("NFD", letter)[0]
     if not font.get_char_index(ord(base)):

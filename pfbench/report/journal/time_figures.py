@@ -102,7 +102,7 @@ def plot_calibration(pack: Pack, setting: FigureSetting) -> Figure:
     coverage_axis.set_xlim(-2, 102)
     coverage_axis.set_xticks([0, 25, 50, 75, 90])
     coverage_axis.set_xlabel("coverage [%]".replace("%", setting.escape("%")))
-    use_log_if_wide(nees_axis, nees_axis.xaxis, [np.array([1.0, *ratios])])
+    use_log_if_wide(nees_axis, nees_axis.xaxis, [np.array([1.0, *ratios])], narrow=True)
     nees_axis.axvline(1.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
     nees_axis.set_xlabel("NEES / expectation")
     return figure

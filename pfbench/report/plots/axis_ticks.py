@@ -14,19 +14,22 @@ from typing_extensions import override
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def use_log_if_wide(axis: Axes, side: Axis, values: Sequence[np.ndarray]) -> None:
+def use_log_if_wide(
+    axis: Axes, side: Axis, values: Sequence[np.ndarray], narrow: bool = False
+) -> None:
     """Use a logarithmic scale if the values span more than a factor of 10.
 
     Args:
         axis: Panel.
         side: Its x or y axis.
         values: Plotted values, in arrays of any shape.
+        narrow: Whether space is short, so that fewer ticks are labelled.
     """
     positive = _finite(values)
     positive = positive[positive > 0]
     if positive.size and np.quantile(positive, 0.995) > 10 * np.quantile(positive, 0.005):
         (axis.set_xscale if side is axis.xaxis else axis.set_yscale)("log")
-        set_plain_ticks(side, positive)
+        set_plain_ticks(side, positive, narrow)
 
 
 def set_plain_ticks(side: Axis, values: Sequence[float] | np.ndarray, narrow: bool = False) -> None:
@@ -46,7 +49,7 @@ def set_plain_ticks(side: Axis, values: Sequence[float] | np.ndarray, narrow: bo
         narrow = narrow or (side is side.axes.xaxis and positive.max() >= 1e4)
         factors = (1.0, 3.0) if narrow else (1.0, 2.0, 5.0)
         subs = factors if span < 100 else (1.0,)
-        side.set_major_locator(ticker.LogLocator(subs=subs, numticks=8))
+        side.set_major_locator(ticker.LogLocator(subs=subs, numticks=4 if narrow else 8))
     side.set_major_formatter(_PlainFormatter())
     if span < 100:  # major ticks are dense enough, and minor ticks cost time
         side.set_minor_locator(ticker.NullLocator())
