@@ -130,7 +130,7 @@ def test_lost_runs_and_missing_conditions() -> None:
     data.loc[off, "keeps_track"] = False
     rows = board(data)
     assert rows["mcmc_rpf"].verdict == "lost"
-    assert rows["mcmc_rpf"].words == "decided by lost track"
+    assert rows["mcmc_rpf"].words == "lost track"
     assert rows["mcmc_rpf"].track == pytest.approx(0.6)
     assert rows["sir"].verdict == "best"
     few = table()

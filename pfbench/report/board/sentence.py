@@ -156,5 +156,7 @@ def _describe_ties(ranked: Sequence[BoardRow]) -> str:
         return ""
     if len(ranked) == 2:
         return "The other filter is not shown to be worse."
+    if tied == len(ranked) - 1:
+        return "No other filter is shown to be worse."
     verb = "is" if tied == 1 else "are"
     return f"{tied} of {len(ranked) - 1} others {verb} not shown to be worse."

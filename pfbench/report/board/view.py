@@ -137,7 +137,7 @@ def _decide(
     if np.isnan(levels.level[i]):
         return MISSING, "not run in all conditions"
     if best is None or not np.isfinite(levels.level[i]):
-        return LOST, "decided by lost track"
+        return LOST, "lost track"
     if i == best:
         return BEST, "smallest"
     estimate = levels.difference(i, best)

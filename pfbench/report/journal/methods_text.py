@@ -112,7 +112,7 @@ def _describe_decisions(alpha: float, margin: float, pairs: int) -> list[str]:
     """Describe metric, intervals, tests and lost runs."""
     level = f"{100 * (1 - alpha):g} %"
     tests = (
-        f"The {_count(pairs, 'planned pair')} are decided from the 20 % trimmed mean of the log ratio of paired runs, "
+        f"The {_count(pairs, 'planned pair')} are decided from the differences of these trimmed means, paired by run, "
         "with runs as units and Holm's correction over all pairs, separately for track and error; "
         if pairs
         else "No pair was planned; "

@@ -12,7 +12,7 @@ function heads() {
     {
       key: "value",
       text: several ? "Where" : "Error",
-      small: several ? "darker: further from the best" : "with interval",
+      small: several ? "darker: worse" : "with interval",
       value: (row) => row.value,
     },
     {

@@ -33,7 +33,9 @@ function drawForest(part) {
     }
     const [a, b] = [looks[pair.a], looks[pair.b]];
     const names = `${a.name} against ${b.name}`;
-    const words = `${change(pair.estimate)} [${change(pair.low)}, ${change(pair.high)}]`;
+    const known = pair.low !== null && pair.high !== null;
+    const range = known ? `[${change(pair.low)}, ${change(pair.high)}]` : `(${pair.reason})`;
+    const words = `${change(pair.estimate)} ${range}`;
     const small = pair.cells.filter((cell) => cell.estimate > 0);
     const rise = narrow ? 16 : 0;
     const step = Math.min(5, 40 / Math.max(1, small.length));
@@ -54,11 +56,11 @@ function drawForest(part) {
         label(
           width - right + 12,
           middle + 4,
-          `${words} ${pair.word}`,
+          `${known ? words : change(pair.estimate)} ${pair.word}`,
           ` style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`,
         );
     content += `<g${spoken(`${group}. ${names}: ${words}, ${pair.word}. ${plain(pair.sentence)}`)}><rect x="${left}" y="${px(y + rise)}" width="${px(width - left - right)}" height="${px(height - rise - 4)}" fill="transparent"/>`;
-    if (pair.prediction)
+    if (pair.prediction?.every((end) => end > 0))
       content += line(
         inside(pair.prediction[0]),
         middle,
@@ -66,9 +68,9 @@ function drawForest(part) {
         middle,
         ' stroke="var(--faint)" stroke-width="1"',
       );
-    if (pair.new_world) content += bar(inside(pair.new_world.low), inside(pair.new_world.high), middle, 3, a, 0.45);
+    if (pair.new_world?.low > 0 && pair.new_world.high > 0) content += bar(inside(pair.new_world.low), inside(pair.new_world.high), middle, 3, a, 0.45);
     content +=
-      bar(inside(pair.low), inside(pair.high), middle, 6, a, 0.85) + mark(a, inside(pair.estimate), middle, 6) + "</g>";
+      (known ? bar(inside(pair.low), inside(pair.high), middle, 6, a, 0.85) : "") + mark(a, inside(pair.estimate), middle, 6) + "</g>";
     small.forEach((cell, k) => {
       const level = middle + 10 + step * (k + 0.5);
       const text = `${cell.name || cellName(cell)}: ${change(cell.estimate)} [${change(cell.low)}, ${change(cell.high)}]`;

@@ -130,7 +130,8 @@ function drawTrack(look, number, cell) {
   const add = (filters, head, unit, isLog, t = part.t) => {
     const lines = order()
       .filter((item) => (item === look || state.on.has(item.key)) && filters[item.key] && filters[item.key][number])
-      .map((item) => ({ look: item, values: decode(filters[item.key][number]), bold: item === look }));
+      .map((item) => ({ look: item, values: decode(filters[item.key][number]), bold: item === look }))
+      .filter((item) => item.values.some((v) => v > 0 || (!isLog && v !== null)));
     if (lines.length)
       times.push({ t, lines, head, unit, isLog, height: 210, caption: `${head} of run ${number} over time` });
   };
