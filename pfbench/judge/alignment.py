@@ -21,14 +21,16 @@ class CommonEpochs(NamedTuple):
     """Rows of each trajectory at the common epochs.
 
     Attributes:
-        time: Epochs of the trajectory with the fewest rows, [T], s.
-        rows: Rows of each valid trajectory, [T] each; None for a lost one.
+        time: Epochs of the trajectory with the longest steps, [T], s.
+        rows: Rows of each valid trajectory, [T] each; None for a lost one. At a hole, the nearest row.
+        holes: Epochs that a valid trajectory leaves out although another one has them, [T] each.
         coverage: Share of the time that each trajectory covers.
         unused: Rows of each trajectory within the scored time that are not common.
     """
 
     time: Array
     rows: tuple[np.ndarray | None, ...]
+    holes: tuple[np.ndarray | None, ...]
     coverage: tuple[float, ...]
     unused: tuple[int, ...]
 
@@ -36,10 +38,11 @@ class CommonEpochs(NamedTuple):
 def find_common_epochs(
     tables: Sequence[TrajectoryTable], reference: ReferenceTrack, options: JudgeOptions
 ) -> CommonEpochs:
-    """Find the epochs at which all valid trajectories have a row.
+    """Find the epochs at which all valid trajectories have a row or a hole.
 
     The trajectories are never interpolated. A trajectory that covers less than `coverage` of the
-    time that any of them covers is lost, and does not limit the epochs of the others.
+    time that any of them covers is lost, and does not limit the epochs of the others. A hole is longer
+    than 1.5 steps. It keeps its epochs, so that a program gains nothing by leaving out bad ones.
 
     Args:
         tables: Trajectories of all programs and runs of a sequence.
@@ -56,12 +59,12 @@ def find_common_epochs(
     coverage = _shares_covered([t.time[m] for t, m in zip(tables, masks, strict=True)])
     valid = [k for k, share in enumerate(coverage) if share >= options.coverage]
     times = {k: tables[k].time[masks[k]] for k in valid}
-    base = min(valid, key=lambda k: len(times[k]), default=None)
-    grid = times[base] if base is not None else np.zeros(0)
+    grid = _slowest(list(times.values()))
     nearest = {k: _nearest(times[k], grid) for k in valid}
+    has_row = {k: np.abs(times[k][nearest[k]] - grid) <= options.tolerance for k in valid}
     common = np.ones(len(grid), dtype=bool)
     for k in valid:
-        common &= np.abs(times[k][nearest[k]] - grid) <= options.tolerance
+        common &= has_row[k] | _is_in_hole(times[k], grid)
     common &= _thinned(grid, common, options.every)
     if common.sum() < LEAST_EPOCHS:
         raise ValueError(
@@ -74,10 +77,28 @@ def find_common_epochs(
         np.flatnonzero(masks[k])[nearest[k][common]] if k in times else None
         for k in range(len(tables))
     )
-    unused = tuple(
-        int(m.sum()) - (0 if r is None else len(r)) for m, r in zip(masks, rows, strict=True)
-    )
-    return CommonEpochs(grid[common], rows, coverage, unused)
+    holes = tuple(~has_row[k][common] if k in times else None for k in range(len(tables)))
+    used = [0 if h is None else int((~h).sum()) for h in holes]
+    unused = tuple(int(m.sum()) - n for m, n in zip(masks, used, strict=True))
+    return CommonEpochs(grid[common], rows, holes, coverage, unused)
+
+
+def _slowest(times: Sequence[Array]) -> Array:
+    """Return the epochs of the longest steps; of several such trajectories, of the longest one."""
+    steps = [float(np.median(np.diff(time))) if len(time) > 1 else 0.0 for time in times]
+    longest = max(steps, default=0.0)
+    candidates = [t for t, step in zip(times, steps, strict=True) if step >= 0.9 * longest]
+    return max(candidates, key=len, default=np.zeros(0))
+
+
+def _is_in_hole(time: Array, grid: Array) -> np.ndarray:
+    """Return the epochs of a grid that lie in a hole of a trajectory, before it or after it."""
+    if len(time) < 2:
+        return np.zeros(len(grid), dtype=bool)
+    limit = 1.5 * float(np.median(np.diff(time)))
+    padded = np.concatenate(([-np.inf], time, [np.inf]))
+    right = np.searchsorted(time, grid)
+    return np.asarray(padded[right + 1] - padded[right] > limit)
 
 
 def _scored(time: Array, reference: ReferenceTrack, options: JudgeOptions) -> np.ndarray:

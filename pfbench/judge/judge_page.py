@@ -140,6 +140,13 @@ def _describe_notes(judgement: Judgement, options: JudgeOptions) -> Iterator[str
             if sequence.epochs.rows[k] is None:
                 share = 100 * sequence.epochs.coverage[k]
                 yield f"Lost: {label} covers {share:.3g} % of the time, {100 * options.coverage:g} % are required."
+            holes = sequence.epochs.holes[k]
+            if holes is not None and holes.any():
+                yield (
+                    f"Holes: {label} lacks {int(holes.sum())} of {len(holes)} epochs that another program "
+                    "has. The error there is the largest one of any program. Set start or end to leave out "
+                    "a time for all programs."
+                )
             if math.isfinite(run.clock_offset) and abs(run.clock_offset) > _CLOCK_SHOWN:
                 yield (
                     f"Clock: {label} agrees best with the reference at an offset of "

@@ -17,6 +17,7 @@ from pfbench.judge.alignment import (
     find_common_epochs,
     position_errors,
 )
+from pfbench.judge.epoch_holes import fill_holes
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.readers.trajectory_files import TrajectoryFile, read_trajectories
 from pfbench.judge.readers.trajectory_table import (
@@ -155,7 +156,15 @@ def score_sequence(
         ]
         results[program] = _to_result(program, epochs.time, columns, parts, options)
         names[program] = tuple(runs[k].run for k in rows)
+    fill_holes(results, {p: _holes_of(epochs, runs, p) for p in results})
     return SequenceResults(name, reference, tuple(runs), epochs, results, names)
+
+
+def _holes_of(epochs: CommonEpochs, runs: Sequence[JudgedRun], program: str) -> np.ndarray:
+    """Return the holes of the runs of a program, [R, T]; False for a lost run."""
+    nothing = np.zeros(len(epochs.time), dtype=bool)
+    masks = [h for h, run in zip(epochs.holes, runs, strict=True) if run.program == program]
+    return np.stack([nothing if mask is None else mask for mask in masks])
 
 
 class _RunScores(NamedTuple):

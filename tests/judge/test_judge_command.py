@@ -61,6 +61,32 @@ def test_only_common_epochs_are_scored_and_an_early_stop_is_lost(tmp_path: Path)
     } == {"not tested"}
 
 
+def test_a_program_gains_nothing_by_leaving_out_its_bad_epochs(tmp_path: Path) -> None:
+    """Equal programs; one leaves out its worst 8 % of epochs. On common epochs alone it would be better."""
+    truth = cases.drive()
+    reference = cases.write(truth, tmp_path / "truth.csv")
+    full = cases.estimate(truth, 1.0, 1)
+    places = ["pn", "pe", "pd"]
+    norm = np.linalg.norm(full[places].to_numpy() - truth[places].to_numpy(), axis=1)
+    is_kept = norm < np.quantile(norm, 0.92)
+    is_kept[[0, -1]] = True
+    other = cases.write(cases.estimate(truth, 1.0, 2), tmp_path / "other.csv")
+    holes = cases.write(full[is_kept], tmp_path / "holes.csv")
+    files = {"holes": str(holes), "other": str(other)}
+    judged = judge_programs(str(reference), files)
+    (sequence,) = judged.sequences
+    assert np.array_equal(sequence.epochs.time, truth.t)  # no epoch of the other program is lost
+    np.testing.assert_array_equal(sequence.epochs.holes[0], ~is_kept)
+    assert not sequence.epochs.holes[1].any()
+    errors = {name: r.data["error"][0][:, :3] for name, r in sequence.results.items()}
+    norms = {name: np.linalg.norm(error, axis=1) for name, error in errors.items()}
+    largest = max(norms["other"].max(), norm[is_kept].max())
+    np.testing.assert_allclose(norms["holes"][~is_kept], largest)
+    np.testing.assert_allclose(norms["holes"][is_kept], norm[is_kept], rtol=1e-6)
+    assert np.mean(norms["holes"] ** 2) > np.mean(norm**2)
+    assert judged.along_runs[0].decision.word != "better"
+
+
 def test_removed_motion_is_stated(tmp_path: Path) -> None:
     truth = cases.drive()
     reference = cases.write(truth, tmp_path / "truth.csv")
