@@ -38,19 +38,19 @@ def fill_holes(results: Mapping[str, JobResult], holes: Mapping[str, np.ndarray]
 
 def _norm(result: JobResult, group: str) -> Array:
     """Return the norm of the error of a group, [R, T]."""
-    places = list(result.meta["state"]["groups"][group])
-    return np.asarray(np.linalg.norm(result.data["error"][..., places], axis=-1))
+    indices = list(result.meta["state"]["groups"][group])
+    return np.asarray(np.linalg.norm(result.data["error"][..., indices], axis=-1))
 
 
 def _fill_group(result: JobResult, holes: np.ndarray, group: str, norm: float) -> None:
     """Set the error of a group in holes to a norm, with equal components."""
     runs, times = np.nonzero(holes)
     names = list(result.meta["state"]["groups"])
-    places = result.meta["state"]["groups"][group]
-    component = norm / math.sqrt(len(places))
+    indices = result.meta["state"]["groups"][group]
+    component = norm / math.sqrt(len(indices))
     result.data["nees"][runs, times, names.index(group)] = np.nan
-    for place in places:
-        result.data["error"][runs, times, place] = component
+    for index in indices:
+        result.data["error"][runs, times, index] = component
         if "crps" in result.data:
-            result.data["crps"][runs, times, place] = component
-            result.data["pit"][runs, times, place] = np.nan
+            result.data["crps"][runs, times, index] = component
+            result.data["pit"][runs, times, index] = np.nan
