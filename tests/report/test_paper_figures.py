@@ -18,7 +18,7 @@ from pfbench import job
 from pfbench.report import page
 from pfbench.report.plots.axis_ticks import format_ticks
 from pfbench.report.plots.figure_files import render_palette_png
-from pfbench.report.plots.paper import experiment_plots, paper_figures, time_plots
+from pfbench.report.plots.paper import experiment_plots, flight_figures, paper_figures, time_plots
 from pfbench.report.plots.paper.paper_catalogue import FIGURES
 from pfbench.report.plots.plotting import line_styles
 from pfbench.results import store
@@ -263,10 +263,25 @@ def test_largest_errors_stand_beside_the_printed_ones(results: Path) -> None:
     )
 
 
+def test_the_flight_is_the_true_track_and_its_velocity(results: Path) -> None:
+    caption, flight = drawn(results, "000-1")["000-1_flight"]
+    velocity = flight_figures.plot_flight_velocity(loaded(results, "sir"))
+    arrays = loaded(results, "sir").data
+    plan, height = flight.axes
+    track = arrays["track"][0].astype(float)
+    np.testing.assert_allclose(plan.lines[0].get_xdata(), track[:, 0] / 1e3)
+    np.testing.assert_allclose(plan.lines[0].get_ydata(), track[:, 1] / 1e3)
+    np.testing.assert_allclose(height.lines[0].get_ydata(), track[:, 2])
+    assert "true track of the first run" in caption
+    steps = (track[2:] - track[:-2]) / 2  # a second each
+    for axis, values in zip(velocity.axes, steps.T, strict=True):
+        np.testing.assert_allclose(axis.lines[0].get_ydata()[1:-1], values, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("wanted", "message"),
     [
-        ("999-1", "got 999-1. Choose from 000-2"),
+        ("999-1", "got 999-1. Choose from 000-1"),
         ("001-3", None),
         ("003-5", "got 003-5 .* requires results of ukf"),
     ],

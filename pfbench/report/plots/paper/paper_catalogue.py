@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 
+from pfbench.report.plots.paper.flight_figures import (
+    make_flight_figures,
+    make_flight_velocity_figures,
+)
 from pfbench.report.plots.paper.paper_specs import (
     PaperFigure,
     make_error_figures,
@@ -51,6 +55,7 @@ _FLOWN = partial(make_trace_figures, "iterations", "iterations until the swarm s
 
 
 FIGURES: Mapping[str, PaperFigure] = {
+    "000-1": PaperFigure(f"{_YAN}, figure 1", _MODIFIED, make_flight_figures),
     "000-2": PaperFigure(f"{_YAN}, figure 2", _MODIFIED, make_error_figures, groups=("attitude",)),
     "000-3": PaperFigure(f"{_YAN}, figure 3", _MODIFIED, make_error_figures, groups=("position",)),
     "001-2": PaperFigure(f"{_PU}, figure 2", _PASSIVE, make_relative_error_figures),
@@ -70,6 +75,8 @@ FIGURES: Mapping[str, PaperFigure] = {
     "002-neff": PaperFigure(
         f"{_COFM}, section on simulation 2", _CUBATURE, _NEFF, "paper_bursts", printed={"": (110.0, 180.0)}
     ),
+    "003-1": PaperFigure(f"{_DMC}, figure 1", _CORRECTED, make_flight_figures),
+    "003-2": PaperFigure(f"{_DMC}, figure 2", _CORRECTED, make_flight_velocity_figures),
     "003-3": PaperFigure(f"{_DMC}, figure 3", _CORRECTED, make_error_figures, groups=("attitude",)),
     "003-4": PaperFigure(f"{_DMC}, figure 4", _CORRECTED, make_error_figures, groups=("velocity",)),
     "003-5": PaperFigure(f"{_DMC}, figure 5", _CORRECTED, make_error_figures, groups=("position",)),
