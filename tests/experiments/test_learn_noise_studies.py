@@ -244,7 +244,7 @@ def test_the_canyon_is_learned_and_scored_on_a_few_seconds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        learn_canyon_noise, "STRETCHES", {"first": (0.0, 30.0), "second": (30.0, 60.0)}
+        learn_canyon_noise, "STRETCHES", {"first": (0.0, 15.0), "second": (15.0, 30.0)}
     )
     monkeypatch.setattr(learn_canyon_noise, "PARTICLES", 50)
     monkeypatch.setattr(
