@@ -1,8 +1,8 @@
-"""Compilation of inner loops into one pass over the particles.
+"""Choice between torch operations and operators for the inner loops over particles.
 
 A compilable function takes tensors, the first argument among them, and integers. It returns
-tensors. In eager mode each of its operations is a pass over all particles. Compilation takes some
-seconds, so it is used on request:
+tensors. Each of its torch operations is a pass over all particles. The C++ operators make one pass. They
+are the default on the CPU. On other devices they are compiled on request, which takes some seconds:
 
     with compilation.use_compiled():
         run_filter(...)
@@ -29,13 +29,14 @@ from pfbench.kernels.private_folder import use_private_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_fused: ContextVar[bool] = ContextVar("fused", default=False)
+# None: operators on the CPU, where they cost nothing, and torch operations on other devices
+_fused: ContextVar[bool | None] = ContextVar("fused", default=None)
 _graph: ContextVar[bool] = ContextVar("graph", default=False)
 
 
 @contextmanager
 def use_compiled(enabled: bool = True) -> Iterator[None]:
-    """Run compilable functions compiled in this context, or eagerly if `enabled` is False."""
+    """Run compilable functions by operators in this context, or in torch operations if `enabled` is False."""
     token = _fused.set(enabled)
     try:
         yield
@@ -59,13 +60,16 @@ def is_capturing() -> bool:
 
 
 def _plain(args: tuple[Any, ...]) -> bool:
-    """Return whether no argument requires a gradient."""
-    tensors = [a for a in args if isinstance(a, torch.Tensor)]
-    return not any(
-        (a.requires_grad and torch.is_grad_enabled())
-        or forward_ad.unpack_dual(a).tangent is not None
-        for a in tensors
-    )
+    """Return whether no argument requires a gradient or is a batch of `torch.vmap`."""
+    has_gradients, has_tangents = torch.is_grad_enabled(), forward_ad._current_level >= 0
+    for a in args:
+        if isinstance(a, torch.Tensor) and (
+            (has_gradients and a.requires_grad)
+            or (has_tangents and forward_ad.unpack_dual(a).tangent is not None)
+            or torch._C._functorch.is_functorch_wrapped_tensor(a)
+        ):
+            return False
+    return True
 
 
 def _on_cuda(args: tuple[Any, ...]) -> bool:
@@ -119,7 +123,8 @@ def compilable(
     @wraps(function)
     def call(*args: Any) -> Any:
         if not _graph.get():
-            return (run_compiled if _fused.get() else check_and_run)(*args)
+            enabled = not _on_cuda(args) if _fused.get() is None else _fused.get()
+            return (run_compiled if enabled else check_and_run)(*args)
         if _on_cuda(args):
             return (_find_cuda_kernel(operator, args) or function)(*args)
         _check(operator, args)

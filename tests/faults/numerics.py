@@ -13,7 +13,6 @@ import json
 import logging
 import math
 import tempfile
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +117,7 @@ def try_case(name: str, case: Extreme, engine: str) -> list[Any]:
         if not isinstance(method, ParticleFilter) or method.history is not None:
             raise ValueError(f"{name} must be a particle filter without moves. Choose another one.")
         method = CompiledParticleFilter(method)
-    context = nullcontext() if engine == "eager" else compilation.use_compiled()
+    context = compilation.use_compiled(engine != "eager")
     try:
         with torch.no_grad(), context:
             model = case.build()
