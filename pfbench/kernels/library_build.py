@@ -26,6 +26,7 @@ FLAGS = {
     # each operation rounds once, as in torch: all engines draw the same bits and choose the same ancestors
     "random_normal": (*_COMMON, *_MATHS, "-ffp-contract=off"),
     "resampling": (*_COMMON, *_MATHS, "-ffp-contract=off"),
+    "weights": (*_COMMON, *_MATHS),
     "compiled_step": _COMMON,
     "operators": _COMMON,
     "particles": (*_COMMON, *_MATHS, *_SUMS),

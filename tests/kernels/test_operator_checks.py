@@ -94,6 +94,7 @@ def eager_function(name: str) -> Callable[..., Any]:
         "propagate_affine": affine_map._affine,
         "count_unique": particle_moments.count_distinct_ancestors,
         "sum_and_squares": weight_update._totals,
+        "normalise_weights": weight_update.normalise_updated_weights,
         "weighted_moments": particle_moments._flat_moments,
         "cholesky_factor": covariance.factor,
         "kalman_update": kalman_update._updated,
@@ -103,6 +104,64 @@ def eager_function(name: str) -> Callable[..., Any]:
         "marginal_scores": scoring._marginal_scores,
         "energy_score": scoring._energy_score,
     }[name]
+
+
+def valid_numbers(name: str, rng: random.Random) -> list[Any]:
+    """A call whose results are defined: covariances are positive, and weights are not negative."""
+    sizes = {axis: rng.randint(2, 9) for axis in "BDRNMWEKPGS"}
+    call = random_calls.make_call(name, rng, sizes)
+    arguments = random_calls.OPERATORS[name]
+    for place, argument in enumerate(arguments):
+        value = call[place]
+        if argument.kind in ("real", "number") and argument.limit is None:
+            call[place] = value = value.nan_to_num(0.5, 0.5, 0.5).clamp(0.0, 1.0)
+            if argument.name in ("covariance", "omega"):
+                eye = torch.eye(value.shape[-1], dtype=value.dtype)
+                call[place] = value @ value.mT + 0.5 * eye
+            if argument.name in ("w", "a") and value.dim() == 2:
+                call[place] = torch.softmax(value, 1)
+    return call
+
+
+@compiler
+@pytest.mark.parametrize("name", random_calls.ON_CPU)
+def test_an_operator_computes_what_its_torch_function_does(name: str) -> None:
+    """Random sizes, layouts and both precisions."""
+    rng = random.Random(name)
+    torch.manual_seed(11)
+    for _ in range(12):
+        call = valid_numbers(name, rng)
+        expected, result = eager_function(name)(*call), getattr(cpp, name)(*call)
+        is_single = any(isinstance(a, torch.Tensor) and a.dtype == torch.float32 for a in call)
+        tolerance = 2e-4 if is_single else 1e-9
+        torch.testing.assert_close(
+            result, expected, rtol=tolerance, atol=tolerance, check_dtype=False
+        )
+
+
+@compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_normalised_weights_at_their_limits(dtype: torch.dtype) -> None:
+    """Weights beyond the smallest number, and runs without a resolved weight, get what torch gives."""
+    rows = torch.randn(6, 300, dtype=dtype, generator=torch.Generator().manual_seed(3))
+    rows = rows * torch.tensor([1.0, 10.0, 100.0, 1e3, 3e4, 1e6], dtype=dtype)[:, None] - 50.0
+    rows[2, 5:200] = -torch.inf
+    rows = torch.cat([rows, rows[:5]])
+    rows[6, 7] = torch.nan
+    rows[7] = -torch.inf
+    rows[8, 0] = torch.inf
+    rows[9] -= 2.0 / torch.finfo(dtype).eps
+    rows[10] = -3.0
+    expected, result = weight_update._separate_normalise(rows), cpp.normalise_weights(rows)
+    tolerance = 2e-6 if dtype == torch.float32 else 1e-13
+    for a, b in zip(result, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
+    # every weight to its last places, down to the smallest normal number
+    x = -torch.linspace(0.0, 80.0 if dtype == torch.float32 else 700.0, 4001, dtype=dtype)
+    w = cpp.normalise_weights(x[None])[2][0].double()
+    reference = torch.exp(x.double())
+    ratio = w / (reference / reference.sum())
+    assert float((ratio / ratio[0] - 1.0).abs().max()) < 8.0 * torch.finfo(dtype).eps
 
 
 def refusal(call: Callable[..., Any], arguments: list[Any]) -> str:

@@ -92,6 +92,8 @@ def draw_noise(model: StateSpaceModel, n: int, draws: RandomStream) -> Tensor:
     Raises:
         ValueError: If the distribution cannot be drawn, see `draw_values`.
     """
+    if type(model).noise is StateSpaceModel.noise:  # standard normal: not built at each step
+        return draws.normal("noise", n, model.noise_dim)
     distribution = model.noise
     if isinstance(getattr(distribution, "base_dist", distribution), StandardNormal):
         return draws.normal("noise", n, model.noise_dim)

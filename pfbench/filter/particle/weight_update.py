@@ -125,7 +125,7 @@ def deactivate_invalid_particles(
     return x, log_w
 
 
-def normalise_updated_weights(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _separate_normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Normalise the log weights of a step.
 
     A run without a finite weight gets equal weights, as one whose log weights are not resolved.
@@ -163,3 +163,9 @@ def has_long_rows(a: Tensor, *_: Tensor) -> bool:
 
 
 _totals = compilable(_separate_totals, operator=cpp.sum_and_squares, keep_in_graph=has_long_rows)
+normalise_updated_weights = compilable(
+    _separate_normalise,
+    operator=cpp.normalise_weights,
+    keep_in_graph=False,
+    use_torch_compiler=False,
+)

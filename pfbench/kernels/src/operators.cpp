@@ -88,6 +88,12 @@ std::tuple<Tensor, Tensor> sum_and_squares(const Tensor& terms) {
     return operators::sum_and_squares(terms);
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor> normalise_weights(const Tensor& log_w) {
+    ArgumentCheck check("normalise_weights");
+    check.real("log_w", log_w, "RN", "N");
+    return operators::normalise_weights(log_w);
+}
+
 std::tuple<Tensor, Tensor> weighted_moments(const Tensor& x, const Tensor& w) {
     ArgumentCheck check("weighted_moments");
     check.real("x", x, "RND");
@@ -158,6 +164,7 @@ const pfbench::Registration registration(
     pfbench::entry<&propagate_affine>("propagate_affine"),
     pfbench::entry<&count_unique>("count_unique"),
     pfbench::entry<&sum_and_squares>("sum_and_squares"),
+    pfbench::entry<&normalise_weights>("normalise_weights"),
     pfbench::entry<&weighted_moments>("weighted_moments"),
     pfbench::entry<&cholesky_factor>("cholesky_factor"),
     pfbench::entry<&kalman_update>("kalman_update"),
@@ -202,6 +209,10 @@ DIRECT_CALL aoti_torch_cpu_count_unique(AtenTensorHandle ancestors, AtenTensorHa
 
 DIRECT_CALL aoti_torch_cpu_sum_and_squares(AtenTensorHandle terms, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {
     return call_directly<&sum_and_squares>({result_0, result_1}, terms);
+}
+
+DIRECT_CALL aoti_torch_cpu_normalise_weights(AtenTensorHandle log_w, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3) {
+    return call_directly<&normalise_weights>({result_0, result_1, result_2, result_3}, log_w);
 }
 
 DIRECT_CALL aoti_torch_cpu_weighted_moments(AtenTensorHandle x, AtenTensorHandle w, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {

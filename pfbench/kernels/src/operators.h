@@ -13,6 +13,7 @@ Tensor log_normal(const Tensor& y, const Tensor& mean, const Tensor& scale, cons
 Tensor propagate_affine(const Tensor& phi, const Tensor& x, const Tensor& gain, const Tensor& w);
 Tensor count_unique(const Tensor& ancestors, const Tensor& log_w);
 std::tuple<Tensor, Tensor> sum_and_squares(const Tensor& terms);
+std::tuple<Tensor, Tensor, Tensor, Tensor> normalise_weights(const Tensor& log_w);
 std::tuple<Tensor, Tensor> weighted_moments(const Tensor& x, const Tensor& w);
 std::tuple<Tensor, Tensor> cholesky_factor(const Tensor& covariance);
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> kalman_update(const Tensor& m, const Tensor& r, const Tensor& omega);

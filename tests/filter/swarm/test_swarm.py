@@ -381,7 +381,8 @@ def test_a_perturbation_is_kept_only_where_it_improves() -> None:
     moved = flock.q - frame.q
     went = moved.abs().amax(-1) > 0
     assert 0.2 < went.double().mean() < 0.8
-    assert torch.equal(went, flock.fitness > model.log_likelihood(seen.y, x, ()))
+    before = model.log_likelihood(seen.y, x, ())  # to rounding, which follows the layout in memory
+    assert torch.equal(went, flock.fitness > before + 1e-9)
     sd = frame.covariance.diagonal(dim1=1, dim2=2).sqrt().unsqueeze(1)
     dx = 6 * 0.05 * sd * (2 * (4 * chaos * (1 - chaos)) - 1)
     inside = (frame.q + dx).abs().amax(-1) < (3 * sd).amin()
