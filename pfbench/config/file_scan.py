@@ -15,6 +15,14 @@ from typing import Any
 from pfbench.config.trust import UntrustedConfigError
 
 _PACKAGE = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
+_INNERMOST = re.compile(r"\$\{([^{}]*)\}")
+_OPENING = re.compile(r"\$\{\s*([^\s{}:]*)\s*:")
+_RESOLVERS = (
+    "oc.select",
+    "oc.dict.keys",
+    "oc.dict.values",
+)  # others read the environment or compute
+_MOST_NODES = 100_000  # of a file, with its aliases expanded
 _SEARCH_PATH = re.compile(r"[+~]*hydra\.searchpath=\[?(.*?)\]?$")
 
 
@@ -25,7 +33,8 @@ def check_files(words: Sequence[str]) -> None:
         words: Overrides. Files of installed packages (`pkg://`) are not checked.
 
     Raises:
-        UntrustedConfigError: If a file sets a node of Hydra, or a default has an interpolation.
+        UntrustedConfigError: If a file sets a node of Hydra, a default has an interpolation, a value
+            reads the environment, or aliases make the file huge.
     """
     for word in words:
         match = _SEARCH_PATH.match(word)
@@ -48,6 +57,7 @@ def _check_file(path: Path) -> None:
         raise UntrustedConfigError(
             f"{path}: the package of a file must not be in hydra, got {package[1]}. Remove the line."
         )
+    _check_values(path, text)
     try:
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
     except (yaml.YAMLError, OSError, ValueError):  # Hydra reports it if the file is chosen
@@ -62,6 +72,57 @@ def _check_file(path: Path) -> None:
                 f"got {text_of_default!r}. Choose the file on the command line."
             )
     _check_hydra_node(path, content.get("hydra"))
+
+
+def _check_values(path: Path, text: str) -> None:
+    """Check the texts of a file and its size, before it is loaded."""
+    import yaml
+
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        nodes = list(_walk_nodes(root, {}, [0]))
+    except (yaml.YAMLError, RecursionError):  # Hydra reports it if the file is chosen
+        return
+    except OverflowError as error:
+        raise UntrustedConfigError(
+            f"{path} must have at most {_MOST_NODES} values, got more by aliases. Write them out."
+        ) from error
+    for value in nodes:
+        if resolver := _find_resolver(value):
+            raise UntrustedConfigError(
+                f"{path}: interpolations must name keys, got the resolver {resolver} in {value!r:.80}. "
+                "Give the value on the command line."
+            )
+
+
+def _walk_nodes(node: Any, sizes: dict[int, int], total: list[int]) -> Iterator[str]:
+    """Yield the texts of a node once; raise OverflowError if its aliases expand to too many nodes."""
+    before = total[0]
+    if id(node) in sizes:
+        total[0] += sizes[id(node)]
+    else:
+        sizes[id(node)] = _MOST_NODES  # of an alias to a node that contains it
+        total[0] += 1
+        children = getattr(node, "value", None)
+        if isinstance(children, str):
+            yield children
+        for child in children if isinstance(children, list) else ():
+            for entry in child if isinstance(child, tuple) else (child,):
+                yield from _walk_nodes(entry, sizes, total)
+        sizes[id(node)] = total[0] - before
+    if total[0] > _MOST_NODES:
+        raise OverflowError
+
+
+def _find_resolver(text: str) -> str:
+    """Return a resolver of a text that a file may not use, or an empty text."""
+    while match := _INNERMOST.search(text):
+        name, colon, _ = match[1].partition(":")
+        if colon and name.strip() not in _RESOLVERS:
+            return name.strip()
+        text = f"{text[: match.start()]}?{text[match.end() :]}"
+    nested = _OPENING.search(text)  # with braces in its arguments
+    return nested[1] if nested else ""
 
 
 def _check_hydra_node(path: Path, node: Any) -> None:

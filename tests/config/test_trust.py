@@ -10,6 +10,7 @@ from hostile_cases import COMMANDS, FILES, GROUPS, NODES, text_of, try_file
 
 from pfbench import job
 from pfbench.config import trust
+from pfbench.config.file_scan import check_files
 from pfbench.config.sweep_check import check_words
 from pfbench.config.trust import UntrustedConfigError
 
@@ -18,7 +19,7 @@ def refuse_to_compose(folder: Path, group: str, text: str) -> None:
     (folder / "conf" / group).mkdir(parents=True)
     (folder / "conf" / group / "hostile.yaml").write_text(text)
     words = [f"hydra.searchpath=[file://{folder / 'conf'}]", "scenario=linear_walk"]
-    with pytest.raises(Exception, match=rf"({group}\.|hydra)(.|\n)*must"):
+    with pytest.raises(Exception, match=rf"({group}[./]|hydra)(.|\n)*must"):
         job.compose([*words, f"{group}=hostile"])
 
 
@@ -34,7 +35,8 @@ def test_hostile_nodes_are_refused_before_anything_is_built(tmp_path: Path) -> N
         said = try_file(folder, group, text_of(node), command)
         assert said.code == 1, (name, said)
         assert "must" in said.err, (name, said.err)
-        assert f"{group}." in said.err or "hydra" in said.err, (name, said.err)
+        places = (f"{group}.", f"{group}/", "hydra")
+        assert any(place in said.err for place in places), (name, said.err)
         assert not (folder / "results").exists(), name
     assert os.environ.get("PFBENCH_TRUST", "") == ""
 
@@ -50,6 +52,31 @@ def test_files_cannot_set_folders_or_the_settings_of_hydra(tmp_path: Path) -> No
         said = try_file(*words)
         assert said.code == 1, (name, said)
         assert "must" in said.err, (name, said.err)
+
+
+BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]\n" for i in range(40))
+VALUES = {
+    "environment": "name: ${oc.env:HOME}",
+    "environment with braces": "name: '${oc.env:HOME,\"{}\"}'",
+    "environment by another name": "a: oc.env\nname: ${${noise.a}:HOME}",
+    "environment within a text": "name: 'a ${oc.decode:\"${oc.env:HOME}\"} b'",
+    "folder": "name: ${hydra:runtime.cwd}",
+    "key": "${oc.env:HOME}: 1",
+    "bomb": BOMB,
+    "alias to itself": "a: &a [*a, *a]",
+}
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_a_value_reads_no_environment_and_stays_small(tmp_path: Path, name: str) -> None:
+    """A result of a stranger's scene may be published: it must hold nothing of this machine."""
+    (tmp_path / "noise").mkdir()
+    file = tmp_path / "noise" / "hostile.yaml"
+    file.write_text(f"{VALUES[name]}\n")
+    with pytest.raises(UntrustedConfigError, match=r"hostile\.yaml.* must"):
+        check_files([f"hydra.searchpath=[file://{tmp_path}]"])
+    file.write_text("a: &a [1, 2]\nb: [*a, *a]\nc: ${noise.a}\nd: ${oc.select:noise.e,1}\n")
+    check_files([f"hydra.searchpath=[file://{tmp_path}]"])
 
 
 def test_a_file_cannot_set_the_folder_of_results(tmp_path: Path) -> None:
