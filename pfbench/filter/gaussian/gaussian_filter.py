@@ -34,7 +34,9 @@ from pfbench.filter.gaussian.linearisation_rules import (
     AffineApproximation,
     DifferenceSpace,
     LinearisationRule,
+    SigmaPointLinearisation,
 )
+from pfbench.filter.gaussian.point_reach import warn_of_point_reach
 from pfbench.filter.linearisation import check_moments, compute_additive_gain
 from pfbench.filter.model_jacobians import find_propagation_jacobian
 from pfbench.model.base import StateSpaceModel, initial_law
@@ -117,9 +119,11 @@ class GaussianFilter:
         for name, distribution in (("initial", initial), ("noise", model.noise)):
             check_moments(model, name, distribution)
         origin = model.origin.expand(runs, -1) if start is None else start
-        mean = model.chart.add(origin, initial.mean)
+        mean, covariance = model.chart.add(origin, initial.mean), distribution_covariance(initial)
+        if isinstance(self.linearisation, SigmaPointLinearisation):
+            warn_of_point_reach(self.linearisation.points, model.chart, covariance)
         log_z = torch.zeros(runs, dtype=torch.float64, device=mean.device)
-        return GaussianBelief(mean, distribution_covariance(initial), log_z)
+        return GaussianBelief(mean, covariance, log_z)
 
     def step(
         self, model: StateSpaceModel, belief: GaussianBelief, record: Record, draws: RandomStream
