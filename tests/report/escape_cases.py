@@ -65,7 +65,9 @@ def find_faults(name: str, text: str) -> list[str]:
 def faults_of_folder(folder: Path) -> dict[str, list[str]]:
     """Return the faults of all files of a report by name."""
     files = [
-        file for file in sorted(folder.rglob("*")) if file.is_file() and file.suffix != ".parquet"
+        file
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and file.suffix not in (".parquet", ".gz")
     ]
     found = {file.name: find_faults(file.name, file.read_text()) for file in files}
     return {name: faults for name, faults in found.items() if faults}

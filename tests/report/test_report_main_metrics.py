@@ -81,8 +81,9 @@ def test_the_main_metric_is_in_the_first_family_and_the_others_in_the_second(
     metric: str, results: Path, tmp_path: Path
 ) -> None:
     options = ReportOptions(metric=metric, convergence_threshold={"position": 4.0})
+    table = load_frame("demo", results, convergence_threshold=options.convergence_threshold)
     with RecordedFolder(tmp_path) as folder:
-        downloads = write_study_files(load_conditions("demo", results), options, folder)
+        downloads = write_study_files(table, load_conditions("demo", results), options, folder)
     assert [d["href"] for d in downloads] == ["decisions.json", "consistency.json", "metrics.csv"]
     assert all((tmp_path / d["href"]).stat().st_size == d["bytes"] for d in downloads)
     records = json.loads((tmp_path / "decisions.json").read_text())
