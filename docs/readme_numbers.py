@@ -14,6 +14,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from pfbench.claims.claim_records import read_claims
+
 TOP = Path(__file__).parents[1]
 README = TOP / "README.md"
 _ARCMIN_PER_DEG = 60.0
@@ -159,7 +161,8 @@ def recorded_car() -> str:
 
 
 def claims() -> str:
-    """Verdicts by paper, counted in verdicts.json."""
+    """Verdicts by paper, counted in verdicts.json. Circular and vacuous claims are undecided."""
+    marked = {claim.id for claim in read_claims() if claim.mark[0]}
     titles = [row["paper"] for row in read_table("reports/claims/report.md")][:-1]
     records = json.loads((TOP / "reports/claims/verdicts.json").read_text())
     papers = sorted({record["paper"] for record in records})
@@ -172,7 +175,7 @@ def claims() -> str:
     )
     counts = {
         paper: Counter(
-            "undecided" if r["verdict"] in _UNDECIDED else r["verdict"]
+            "undecided" if r["verdict"] in _UNDECIDED or r["id"] in marked else r["verdict"]
             for r in records
             if r["paper"] == paper
         )
