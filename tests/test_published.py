@@ -12,6 +12,10 @@ from types import ModuleType
 import pytest
 from checkout import ROOT
 
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.stored_page import read_page_data
+from pfbench.report.study_page import write_markdown
+
 REPORT_FILE = re.compile(
     r"reports/(README\.md|\w+/(report\.md|verdicts\.(json(\.gz)?|csv)|runs\.parquet|page\.json\.gz"
     r"|headline\.(png|svg)))"
@@ -63,6 +67,16 @@ def test_published_reports_are_reduced() -> None:
         folder = publish.REPORTS / study
         text = (folder / "report.md").read_text()
         assert publish.reduce_markdown(text, folder, stem) == text, study
+
+
+def test_the_stored_data_of_a_page_give_its_published_text(tmp_path: Path) -> None:
+    folders = [data.parent for data in (ROOT / "reports").glob("*/page.json.gz")]
+    assert folders
+    for folder in folders:
+        with RecordedFolder(tmp_path / folder.name) as target:
+            write_markdown(read_page_data(folder), target)
+        text = (tmp_path / folder.name / "report.md").read_text()
+        assert text == (folder / "report.md").read_text(), folder.name
 
 
 def test_a_report_keeps_its_headline_figure_only(tmp_path: Path) -> None:
