@@ -68,6 +68,11 @@ def _format_value_error(text: str) -> str:
         )
     if match := re.search(r"Missing mandatory value: (\S+)", text):
         return f"{match[1]} must be set. Set {match[1]}=..."
+    if "LexerNoViableAlt" in text or text.startswith(("mismatched input", "extraneous input")):
+        return "each word must be key=value. Quote a value with spaces or signs."
+    if match := re.search(r"tried to allocate (\d+) bytes", text):
+        size = int(match[1]) / 2**30
+        return f"memory must hold an array of {size:.3g} GiB. Reduce runs, particles or steps."
     if match := re.search(r"Error parsing override '([^']*)'", text):
         return f"'{match[1]}' must be key=value. Quote it if the shell reads brackets or spaces."
     return ""

@@ -90,6 +90,19 @@ def test_a_module_that_is_not_installed_is_named() -> None:
     assert "PYTHONPATH" in message
 
 
+@pytest.mark.parametrize(
+    ("text", "advice"),
+    [
+        ("LexerNoViableAltException: study=é\n  ^\nSee https://hydra.cc", "must be key=value. Quote"),
+        ("mismatched input '(' expecting <EOF>", "must be key=value. Quote"),
+        ("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8589934592 bytes.",
+         "an array of 8 GiB. Reduce runs"),
+    ],
+)  # fmt: skip
+def test_messages_of_other_libraries_are_translated(text: str, advice: str) -> None:
+    assert advice in messages.format_error(RuntimeError(text))
+
+
 def test_a_closed_pipe_gives_no_traceback() -> None:
     code = "import sys; sys.argv = ['pfbench', '--help']; from pfbench import cli; cli.main()"
     run = subprocess.Popen(
