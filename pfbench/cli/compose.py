@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pfbench.config.composition import JobConfig, compose
 from pfbench.config.folders import experiments_dir
+from pfbench.config.named_sets import expand_filter_sets
 from pfbench.config.sweep_check import expand_sweep
 
 
@@ -54,7 +55,7 @@ def read_sweep(experiment: str) -> list[str]:
     if not path.exists():
         return []
     params = OmegaConf.select(OmegaConf.load(path), "hydra.sweeper.params") or {}
-    return [f"{name}={value}" for name, value in params.items()]
+    return expand_filter_sets([f"{name}={value}" for name, value in params.items()])
 
 
 def read_description(path: Path) -> str:

@@ -14,6 +14,7 @@ from pfbench.cli.sweep.sweep_progress import SWEEP_JOBS, SweepProgress
 from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
 from pfbench.config.composition import JobConfig, register_experiments
 from pfbench.config.folders import conf_dir
+from pfbench.config.named_sets import expand_filter_sets
 from pfbench.config.sweep_check import check_words
 from pfbench.config.trust import ENVIRONMENT
 
@@ -55,7 +56,7 @@ def run_jobs(words: Sequence[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
-    overrides = [word for word in words if word not in flags]
+    overrides = expand_filter_sets([word for word in words if word not in flags])
     overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
     first = check_words([*flags, *overrides])
     decorate = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
+from pfbench.config.named_sets import expand_filter_names
 from pfbench.config.paper_block import check_paper_blocks, remove_nested_blocks
 from pfbench.config.protected_keys import check_protected_keys
 from pfbench.config.trust import check_configuration, check_study, split_trust
@@ -164,7 +165,6 @@ def register_experiments() -> None:
     not change since the last call are skipped.
     """
     from hydra.core.config_store import ConfigStore
-    from omegaconf import OmegaConf
 
     store = ConfigStore.instance()
     stored_names = store.repo.get("experiment", {})
@@ -174,11 +174,22 @@ def register_experiments() -> None:
             store.store(
                 group="experiment",
                 name=path.stem,
-                node=OmegaConf.load(path),
+                node=_load_experiment(path),
                 package="_global_",
                 provider="pfbench.experiments",
             )
             _registered[path.stem] = version
+
+
+def _load_experiment(path: Path) -> Any:
+    """Load an experiment, with the filters of named sets in its sweep."""
+    from omegaconf import OmegaConf
+
+    node = OmegaConf.load(path)
+    params = OmegaConf.select(node, "hydra.sweeper.params")
+    if params is not None and "filter" in params:
+        params["filter"] = expand_filter_names(str(params["filter"]))
+    return node
 
 
 @contextmanager

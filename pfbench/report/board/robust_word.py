@@ -1,0 +1,88 @@
+"""The word "robust": what a filter must show against a tuned control before a sentence may say it.
+
+On a model whose process noise is too large, a constant factor on R improves a filter in every
+regime. A robust filter must therefore be better than the EKF with tuned factors in outliers, and
+not worse than 1.05 times its error in nominal noise. Both must be shown, so the p-value of a filter
+is the larger of two one-sided ones, and Holm's correction is over the filters [ours].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import stdtr
+
+from pfbench.results.statistics.signed_rank import holm
+from pfbench.results.statistics.world_effects import EffectEstimate
+
+CONTROL = "ekf_scaled_tuned"  # EKF with tuned constant factors on R and Q
+OUTLIER_REGIME, NOMINAL_REGIME = "outliers", "nominal"
+NOMINAL_LIMIT = 1.05  # largest ratio of errors to the control in nominal noise
+
+
+class RobustnessEvidence(NamedTuple):
+    """Log error of a filter minus that of the control, in two regimes.
+
+    Attributes:
+        outliers: Difference in outliers.
+        nominal: Difference in nominal noise.
+    """
+
+    outliers: EffectEstimate
+    nominal: EffectEstimate
+
+
+def find_robust_filters(
+    evidence: Mapping[str, RobustnessEvidence], alpha: float = 0.05
+) -> tuple[str, ...]:
+    """Return the filters that a sentence may call robust.
+
+    Args:
+        evidence: Differences to the control by label, for all filters of the study but the control.
+        alpha: Probability that any filter is called robust wrongly.
+
+    Returns:
+        Labels in the given order.
+    """
+    p = [
+        max(_p_below(pair.outliers, 0.0), _p_below(pair.nominal, math.log(NOMINAL_LIMIT)))
+        for pair in evidence.values()
+    ]
+    adjusted = holm(p) if p else np.zeros(0)
+    return tuple(name for name, value in zip(evidence, adjusted, strict=True) if value <= alpha)
+
+
+def describe_robust_filters(names: Mapping[str, str], robust: tuple[str, ...]) -> str:
+    """Describe which filters are robust.
+
+    Args:
+        names: Name by label of the filters that were compared with the control.
+        robust: Labels of the robust filters.
+
+    Returns:
+        A sentence, empty without a comparison.
+    """
+    if not names:
+        return ""
+    rule = (
+        "better than the EKF with tuned noise covariances in outliers, and at most "
+        f"{NOMINAL_LIMIT} times its error in nominal noise"
+    )
+    if not robust:
+        return f"No filter is shown to be robust: {rule}."
+    listed = [f"[[{names[label]}]]" for label in robust]
+    text = " and ".join(filter(None, [", ".join(listed[:-1]), listed[-1]]))
+    return f"Robust: {text} ({rule})."
+
+
+def _p_below(effect: EffectEstimate, limit: float) -> float:
+    """Compute the one-sided p-value of an effect that is not below a limit; 1 without an estimate."""
+    value, error, df = (float(a) for a in effect)
+    if not (math.isfinite(value) and math.isfinite(error) and df > 0):
+        return 1.0
+    if error == 0.0:  # identical in all runs
+        return 0.0 if value < limit else 1.0
+    return float(stdtr(df, (value - limit) / error))
