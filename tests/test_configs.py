@@ -29,6 +29,7 @@ from recorded_data import DATA
 
 from pfbench import job
 from pfbench.cli.compose import read_description
+from pfbench.config.named_sets import expand_filter_names
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -239,7 +240,8 @@ def test_the_choices_of_every_experiment_compose(experiment: str) -> None:
     content = raw(job.experiments_dir() / f"{experiment}.yaml")
     assert content["study"] == experiment  # `pfbench report` finds what +experiment=NAME made
     swept = {
-        key: str(values).split(",") for key, values in content["hydra"]["sweeper"]["params"].items()
+        key: expand_filter_names(str(values)).split(",")
+        for key, values in content["hydra"]["sweeper"]["params"].items()
     }
     assert math.prod(map(len, swept.values())) > 1
     for key in swept.keys() & GROUPS.keys():
