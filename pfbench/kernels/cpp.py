@@ -102,8 +102,8 @@ def _call_in_batches(operator: Operator, overload: Callable[..., Any], *args: An
         flat.append(value.expand(*batch, *rest).reshape(batch.numel(), *rest))
     results = overload(*flat)
     if isinstance(results, Tensor):
-        return results.view(*batch, *results.shape[1:])
-    return tuple(a.view(*batch, *a.shape[1:]) for a in results)
+        return results.view((*batch, *results.shape[1:]))
+    return tuple(a.view((*batch, *a.shape[1:])) for a in results)
 
 
 for _operator in read_operators().values():

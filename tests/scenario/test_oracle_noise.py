@@ -357,9 +357,9 @@ def test_told_nothing_changes_nothing(model: StateSpaceModel, regime: NoiseRegim
         job.instantiate(composed("filter=apf", "particles=40")["filter"]),
     ):
         a, b = estimate(method, knows, episode.record), estimate(method, model, episode.record)
-        assert torch.equal(a.mean, b.mean)
-        assert torch.equal(a.variance, b.variance)
-        assert torch.equal(a.log_evidence, b.log_evidence)
+        for name in ("mean", "variance", "log_evidence"):
+            # to rounding: the inner model states its Jacobians, the other is differentiated
+            torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=1e-9, atol=1e-9)
 
 
 def test_told_is_the_model_inside_in_all_else() -> None:
