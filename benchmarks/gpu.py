@@ -240,7 +240,7 @@ def moved(model: StateSpaceModel, record: Record, particles: int) -> Moved:
             Pass("eager", model, begun, particles, len(few.y))(0)
         counts.append(traffic.bytes)
     draws = PhiloxStream(0, torch.arange(len(few.y), device=few.y.device), few.y.dtype)
-    with Traffic() as traffic:
+    with compilation.use_compiled(False), Traffic() as traffic:
         draws.normal("counted", particles, model.noise_dim)
     each = len(few.y) * particles
     return Moved((counts[1] - counts[0]) / each, traffic.bytes / each)
