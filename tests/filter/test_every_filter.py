@@ -47,7 +47,7 @@ PARTICLES = [
     name for name in NAMES if "pfbench.filter.ParticleFilter" in TEXTS[name] or name in BASED
 ]
 EXACT = (
-    *("sir", "apf", "sqmc", "rbpf"), *("ckf_pf", "ekf_pf", "ukf_pf"), *("mcmc_tail", "mcmc_bridge", "mcmc_rpf_printed"),
+    *("sir", "sir_printed", "apf", "sqmc", "rbpf"), *("ckf_pf", "ekf_pf", "ukf_pf"), *("mcmc_tail", "mcmc_bridge", "mcmc_rpf_printed"),
     *("dmc_density", "dmc_noise", "dmc_optimal"),
 )  # fmt: skip
 
