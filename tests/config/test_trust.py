@@ -10,7 +10,9 @@ from hostile_cases import COMMANDS, FILES, GROUPS, NODES, text_of, try_file
 
 from pfbench import job
 from pfbench.config import trust
+from pfbench.config.composition import compose_tree
 from pfbench.config.file_scan import check_files
+from pfbench.config.protected_keys import check_protected_keys
 from pfbench.config.sweep_check import check_words
 from pfbench.config.trust import UntrustedConfigError
 
@@ -89,6 +91,14 @@ def test_a_file_cannot_set_the_folder_of_results(tmp_path: Path) -> None:
         with pytest.raises(UntrustedConfigError, match=f"{key} must be set on the command line"):
             job.compose(words)
         assert job.compose([*words, f"{key}=here"]).values[key] == "here"
+
+
+def test_settings_of_hydra_are_compared_even_if_no_file_shows_them() -> None:
+    tree = compose_tree(["scenario=linear_walk"])
+    check_protected_keys(tree, [], compose_tree)
+    tree.hydra.run.dir = "elsewhere"
+    with pytest.raises(UntrustedConfigError, match=r"hydra\.run must be set on the command line"):
+        check_protected_keys(tree, [], compose_tree)
 
 
 def test_every_alternative_of_a_sweep_is_checked(tmp_path: Path) -> None:
