@@ -25,6 +25,7 @@ from pfbench.claims.claim_tables import (
 from pfbench.claims.claim_tests import OPEN, ClaimTestResult
 from pfbench.claims.measurements import claim_job_metadata, load_claim_measurements
 from pfbench.claims.schema import PAPERS, Claim, ClaimTest
+from pfbench.claims.stored_verdicts import check_stored_verdicts
 from pfbench.claims.verdicts import VERDICTS, ClaimVerdict, decide_claims
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import table_formats, writers
@@ -59,7 +60,7 @@ def write_claims(
         Path of index.html.
 
     Raises:
-        ValueError: if a record is wrong, or results do not belong together.
+        ValueError: if a record is wrong, results do not belong together, or those of stored verdicts are missing.
     """
     claims = read_claims(conf, experiments)
     verdicts = decide_claims(
@@ -82,6 +83,7 @@ def write_claims(
         "n": len(verdicts),
     }
     records = [{**_to_json(v), "choices": choices.get(v.claim.id, [])} for v in verdicts]
+    check_stored_verdicts(Path(out) / STUDY / "verdicts.json", records)
     text = json.dumps(records, indent=1, allow_nan=False)
     with RecordedFolder(Path(out) / STUDY) as folder:
         writers.write_table(folder, STUDY, claims_table(verdicts))

@@ -21,7 +21,7 @@ Write the report of a study: figures, tables and statistical tests, as index.htm
 `all` writes the reports of all studies with results, and the page of the claims.
 
   pfbench report study=quickstart
-  pfbench report study=mine report=paper report.figure_formats=[pdf,png]
+  pfbench report study=mine report.figure_formats=[pdf,png]
   pfbench list report        report configurations
 
 See also: pfbench claims, pfbench datasheet scenario=NAME"""

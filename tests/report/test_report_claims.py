@@ -832,6 +832,20 @@ def page_of(folder: Path, out: Path, *tests: ClaimTest) -> tuple[str, str]:
     return (path.parent / "report.md").read_text(), path.read_text()
 
 
+def test_a_page_without_results_replaces_no_verdict(study: Path, tmp_path: Path) -> None:
+    """The same page may be written again, and a page without verdicts by one with them."""
+    test = ClaimTest("less", "s", CELL, "rmse", "cofm_amssrcpf", "ekf", group="position")
+    out = tmp_path / "out"
+    for folder in (tmp_path / "none", study, study):
+        page_of(folder, out, test)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(
+        ValueError, match=r"verdicts\.json, got none for 1 of 1 claims.*reports_dir="
+    ):
+        page_of(tmp_path / "none", out, test)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
 def test_the_page_says_what_each_claims_study_ran_with(study: Path, tmp_path: Path) -> None:
     test = ClaimTest("less", "s", CELL, "rmse", "cofm_amssrcpf", "sir", group="position")
     write(
