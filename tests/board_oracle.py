@@ -123,7 +123,7 @@ def verdict_of(name: str, best: str | None, levels: dict[str, Level], words: dic
     if np.isnan(level.value):
         return "missing"
     if best is None or not np.isfinite(level.value):
-        return "lost"
+        return "not_kept"
     if name == best:
         return "best"
     pairs = len(levels) * (len(levels) - 1) / 2

@@ -139,7 +139,7 @@ def keeps_track(data: Mapping[str, Array], meta: Mapping[str, Any]) -> Flags:
 
     Args:
         data: Arrays of a result.
-        meta: Metadata of the result. Without a threshold, only lost runs lose the track.
+        meta: Metadata of the result. Without a threshold, only lost runs do not keep track.
 
     Returns:
         Mask, [R].

@@ -170,7 +170,7 @@ class _Numbers:
     ) -> dict[str, Any]:
         gap = means[i] - best
         if np.isnan(gap):
-            word = "lost" if i in self.lost else "missing"
+            word = "not_kept" if i in self.lost else "missing"
         else:
             word = "best" if k == 0 else "open" if gap < 4 * sd else "worse"
         spread = np.exp(np.array([0, -2, 2]) * sd)
@@ -183,12 +183,12 @@ class _Numbers:
             "ratio": _short(ratio[0]), "ratio_low": _short(ratio[1]), "ratio_high": _short(ratio[2]),
             "verdict": word,
             "words": {"best": "best", "open": f"{100 * (gap - 2 * sd):+.0f} to {100 * (gap + 2 * sd):+.0f} %",
-                      "worse": f"{100 * np.expm1(gap):+.0f} %", "lost": "all runs lost"}.get(word, "not run"),
+                      "worse": f"{100 * np.expm1(gap):+.0f} %", "not_kept": "track not kept"}.get(word, "not run"),
             "track": _short(0.0 if i in self.lost else 1 - 0.03 * i), "lost": 20 if i in self.lost else 0,
-            "coverage": None if word in ("lost", "missing") else _short(self.coverage[i]),
+            "coverage": None if word in ("not_kept", "missing") else _short(self.coverage[i]),
             "nees": _short(1 / self.coverage[i]),
-            "calibration": None if word in ("lost", "missing") else
-            "overconfident" if self.coverage[i] < 0.85 else "consistent",
+            "calibration": None if word in ("not_kept", "missing") else
+            "too low" if self.coverage[i] < 0.85 else "consistent",
             "ms": _short(self.cost[i]),
         }  # fmt: skip
 

@@ -129,8 +129,8 @@ def test_lost_runs_and_missing_conditions() -> None:
     off = (data["filter"] == "mcmc_rpf") & (data["run"] < 12)
     data.loc[off, "keeps_track"] = False
     rows = board(data)
-    assert rows["mcmc_rpf"].verdict == "lost"
-    assert rows["mcmc_rpf"].words == "lost track"
+    assert rows["mcmc_rpf"].verdict == "not_kept"
+    assert rows["mcmc_rpf"].words == "track not kept"
     assert rows["mcmc_rpf"].track == pytest.approx(0.6)
     assert rows["sir"].verdict == "best"
     few = table()

@@ -1,7 +1,7 @@
 """Levels of filters: the location of the log error of each filter, from which a board is made.
 
 The level of a filter in a condition is the 20 % trimmed mean over runs of the logarithm of its error.
-A run that loses the track lies at the upper end. Levels are averaged over conditions. A
+A run that does not keep track lies at the upper end. Levels are averaged over conditions. A
 difference of levels is transitive, unlike a median of paired ratios: A against B and B against C give A
 against C. The influence values of the runs are subtracted before they are squared, so that the
 interval of a difference uses that filters share their runs.

@@ -21,7 +21,7 @@ from pfbench.report.looks import MethodLook, PartName, plan_look_pairs
 from pfbench.report.options import ReportOptions
 from pfbench.results.decisions.comparisons import TRACK
 from pfbench.results.decisions.decision import Decision
-from pfbench.results.decisions.family_records import LOST_TRACK
+from pfbench.results.decisions.family_records import TRACK_NOT_KEPT
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs
 from pfbench.results.decisions.sentences import describe_pair
 from pfbench.results.statistics.paired_effects import ConditionEffects
@@ -122,7 +122,7 @@ def _describe_gap(decision: Decision) -> str:
         return decision.reason
     if decision.scale == "log ratio":
         return ""
-    return LOST_TRACK if decision.scale == "runs won" else "a difference, which is no ratio"
+    return TRACK_NOT_KEPT if decision.scale == "runs won" else "a difference, which is no ratio"
 
 
 def _list_cells(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from pfbench.report.board.view import EQUAL, IDENTICAL, LOST, MISSING, OPEN, BoardRow, percent
+from pfbench.report.board.view import EQUAL, IDENTICAL, MISSING, NOT_KEPT, OPEN, BoardRow, percent
 from pfbench.report.looks import MethodLook
 
 _MOST_NAMES = 3  # in a sentence
@@ -77,25 +77,25 @@ def _join(names: Sequence[str]) -> str:
 
 
 def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]) -> str:
-    """Count the filters that lose the track in many runs, or were not run."""
+    """Count the filters that do not keep track in many runs, or were not run."""
     off = [r for r in rows if r.verdict != MISSING and 1 - r.track > _LOST_SHARE]
     missing = sum(row.verdict == MISSING for row in rows)
-    lost = sum(row.verdict == LOST for row in rows)
+    without = sum(row.verdict == NOT_KEPT for row in rows)
     text = ""
     if off:
         worst = min(off, key=lambda row: row.track)
         share = f"{100 * (1 - worst.track):.0f} %"
         if len(off) == 1:
-            text = f"{_name(worst, looks)} loses the track in {share} of runs."
+            text = f"{_name(worst, looks)} does not keep track in {share} of runs."
         else:
             text = (
-                f"{len(off)} of {len(rows)} filters lose the track in over a fifth of runs "
+                f"{len(off)} of {len(rows)} filters do not keep track in over a fifth of runs "
                 f"({_name(worst, looks)}: {share})."
             )
-    if lost > len(off):
-        verb = "loses" if lost == 1 else "lose"
+    if without > len(off):
+        verb = "does" if without == 1 else "do"
         text += (
-            f" {lost} of {count_words(len(rows), 'filter')} {verb} the track in over a fifth of the runs "
+            f" {without} of {count_words(len(rows), 'filter')} {verb} not keep track in over a fifth of the runs "
             "of a condition, and no error is compared."
         )
     if missing:
@@ -123,7 +123,7 @@ def _describe_best(
     if baseline in (best.filter, *(row.filter for row in twins)):
         return f"{head}. It is the baseline."
     if math.isnan(best.ratio):
-        state = "lost track" if base.verdict == LOST else "missing runs"
+        state = "tracks not kept" if base.verdict == NOT_KEPT else "missing runs"
         return f"{head}. The baseline {_name(base, looks)} has no error because of {state}."
     size = f"{percent(math.log(best.ratio))} % below {_name(base, looks)}"
     if not math.isfinite(best.ratio_low) or not math.isfinite(best.ratio_high):

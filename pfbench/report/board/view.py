@@ -15,7 +15,8 @@ from pfbench.report.board.levels import FilterLevels, StudyArrays
 from pfbench.results.error_measures import Array
 from pfbench.results.statistics.paired_effects import MIN_RUNS
 
-BEST, EQUAL, OPEN, WORSE, LOST, MISSING = "best", "equal", "open", "worse", "lost", "missing"
+BEST, EQUAL, OPEN, WORSE, MISSING = "best", "equal", "open", "worse", "missing"
+NOT_KEPT = "not_kept"  # too few runs keep track for an error
 IDENTICAL = "identical"
 _SAME = 1e-6  # difference of levels of identical filters
 
@@ -50,13 +51,13 @@ class BoardRow:
         ratio: Error divided by that of the baseline.
         ratio_low: Lower end of its interval.
         ratio_high: Upper end.
-        verdict: best, equal, open, worse, lost or missing.
+        verdict: best, equal, open, worse, not_kept or missing.
         words: Verdict as a short text.
         track: Share of runs that keep track.
         lost: Number of lost runs.
         coverage: Coverage of 90 % intervals.
         nees: Mean NEES divided by its degrees of freedom.
-        calibration: overconfident, consistent or cautious.
+        calibration: Coverage against its level: too low, consistent or too high.
         ms: Time per step, ms.
     """
 
@@ -137,7 +138,7 @@ def _decide(
     if np.isnan(levels.level[i]):
         return MISSING, "not run in all conditions"
     if best is None or not np.isfinite(levels.level[i]):
-        return LOST, "lost track"
+        return NOT_KEPT, "track not kept"
     if i == best:
         return BEST, "smallest"
     estimate = levels.difference(i, best)
@@ -226,5 +227,5 @@ def _calibration(coverage: Array, alpha: float) -> str:
         return ""
     half = -float(stdtrit(count - 1, alpha / 2)) * float(coverage.std(ddof=1)) / math.sqrt(count)
     if coverage.mean() + half < 0.9:
-        return "overconfident"
-    return "cautious" if coverage.mean() - half > 0.9 else "consistent"
+        return "too low"
+    return "too high" if coverage.mean() - half > 0.9 else "consistent"

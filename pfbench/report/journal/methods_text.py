@@ -65,7 +65,7 @@ def list_limits(conditions: Sequence[Condition]) -> list[str]:
             "The filters were not given equal time: particle filters have equal numbers of particles."
         )
     if all(divergence_threshold(job) is None for job in jobs):
-        limits.append("No limit of a lost track is stated, so only numerical failures count.")
+        limits.append("No divergence threshold is stated, so only numerical failures count.")
     labels = [{job.label for job in condition.jobs} for condition in conditions]
     if any(names != set.union(*labels) for names in labels):
         limits.append("Not every filter was run in every condition.")

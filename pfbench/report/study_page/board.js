@@ -1,5 +1,5 @@
 // Sentence, switches and leaderboard.
-const signs = { best: "★", equal: "≈", better: "▲", open: "?", worse: "▼", lost: "✕", missing: "–" };
+const signs = { best: "★", equal: "≈", better: "▲", open: "?", worse: "▼", not_kept: "✕", missing: "–" };
 const few = new Set(["rank", "filter", "ratio", "verdict", "track"]); // columns of a telephone
 const numeric = new Set(["rank", "ratio", "track", "ms"]);
 
@@ -24,7 +24,7 @@ function heads() {
     { key: "bar", text: "Ratio", small: "log scale" },
     { key: "verdict", text: "Against the best", small: "jointly", value: (row) => row.rank },
     { key: "track", text: "Track kept", value: (row) => row.track },
-    { key: "calibration", text: "Calibration", small: "90 % regions", value: (row) => row.coverage },
+    { key: "calibration", text: "Coverage", small: "90 % regions", value: (row) => row.coverage },
     { key: "ms", text: "ms/step", value: (row) => row.ms },
   ];
   return all.map((head) => ({
@@ -114,7 +114,7 @@ function details(row, span) {
     ["Family", look.family],
     [metricOf().name, valueText(row)],
     [`Ratio to ${looks[state.baseline].name}`, `${short(row.ratio, 4)} ${interval(row.ratio_low, row.ratio_high)}`],
-    ["Against the best", `${row.verdict}: ${row.words}`],
+    ["Against the best", `${row.verdict.replace("_", " ")}: ${row.words}`],
     ["Track kept", percent(row.track)],
     ["Lost runs", row.lost === null ? "–" : row.lost],
     ["Coverage of 90 % regions", percent(row.coverage)],
@@ -177,7 +177,7 @@ function drawBoard() {
         `<td class="desk">${several ? strip(row.filter) : esc(valueText(row))}</td>` +
         `<td class="number"><b>${short(row.ratio)}</b> <span class="interval faint">${interval(row.ratio_low, row.ratio_high)}</span></td>` +
         `<td class="desk scale">${drawBar(row)}</td><td class="${row.verdict}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
-        `<td class="number">${percent(row.track)}</td><td class="desk">${percent(row.coverage)} <span class="${row.calibration === "consistent" ? "faint" : "open"}">${esc(row.calibration || "")}</span></td>` +
+        `<td class="number">${percent(row.track)}</td><td class="desk">${percent(row.coverage)}${row.calibration ? ", " : ""}<span class="${row.calibration === "consistent" ? "faint" : "open"}">${esc(row.calibration || "")}</span></td>` +
         `<td class="number desk">${short(row.ms)}</td></tr>${open ? details(row, columns.length) : ""}`
       );
     })

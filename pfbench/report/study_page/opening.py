@@ -10,7 +10,7 @@ from typing import Any
 from markupsafe import Markup, escape
 
 SIGNS = {
-    "best": "★", "equal": "≈", "better": "▲", "open": "?", "worse": "▼", "lost": "✕", "missing": "–",
+    "best": "★", "equal": "≈", "better": "▲", "open": "?", "worse": "▼", "not_kept": "✕", "missing": "–",
 }  # fmt: skip
 _DASH = "–"
 
@@ -93,7 +93,7 @@ def _heads(baseline: str) -> list[dict[str, str]]:
     heads = [
         ("#", "number", "", "ascending"), ("Filter", "", "", ""), ("Error", "desk", "with interval", ""),
         (f"÷ {baseline}", "number", "with interval", ""), ("Against the best", "", "jointly", ""),
-        ("Track kept", "number", "", ""), ("Calibration", "desk", "90 % regions", ""),
+        ("Track kept", "number", "", ""), ("Coverage", "desk", "90 % regions", ""),
         ("ms/step", "number desk", "", ""),
     ]  # fmt: skip
     return [dict(zip(("text", "style", "small", "sort"), head, strict=True)) for head in heads]
@@ -116,7 +116,7 @@ def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
         "verdict": row["verdict"],
         "words": f"{SIGNS[row['verdict']]} {row['words']}",
         "track": format_share(row["track"]),
-        "calibration": f"{format_share(row['coverage'])} {calibration}".strip(),
+        "calibration": ", ".join(filter(None, (format_share(row["coverage"]), calibration))),
         "ms": format_short(row["ms"]),
     }
 

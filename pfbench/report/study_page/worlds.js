@@ -90,8 +90,8 @@ function drawCalibration(part) {
   filters.forEach((look, k) => {
     const y = top + rowHeight * (k + 0.5);
     const { c50, c90, nees_ratio: nees } = shares[look.key];
-    const word = rows[look.key].calibration || "";
-    const words = `${look.name}: the 50 % regions contain ${percent(c50)}, the 90 % regions ${percent(c90)}; NEES per degree of freedom ${short(nees)}; ${word}`;
+    const word = rows[look.key].calibration ? `coverage ${rows[look.key].calibration}` : "";
+    const words = `${look.name}: the 50 % regions contain ${percent(c50)}, the 90 % regions ${percent(c90)}; NEES per degree of freedom ${short(nees)}${word && `; ${word}`}`;
     content += label(
       left - 8,
       y + 4,

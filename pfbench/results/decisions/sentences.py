@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from pfbench.results.decisions.comparisons import TRACK
 from pfbench.results.decisions.decision import Decision
-from pfbench.results.decisions.family_records import LOST_TRACK, ONE_WORLD
+from pfbench.results.decisions.family_records import ONE_WORLD, TRACK_NOT_KEPT
 from pfbench.results.decisions.filter_sets import FilterRanking
 from pfbench.results.decisions.sentence_formats import (
     format_count,
@@ -113,11 +113,11 @@ def _describe_here(error: Decision) -> str:
     sample = f"{format_level(error)} simultaneous interval; {format_count(error.runs, 'paired run')} per condition"
     if error.word == IDENTICAL:
         return f"{head}{error.a} and {error.b} give identical results."
-    if error.reason == LOST_TRACK:
+    if error.reason == TRACK_NOT_KEPT:
         won = format_effect(error, -error.estimate, -error.high, -error.low)
         verb = "is decided" if error.word in (BETTER, WORSE) else "is not decided"
         return (
-            f"{head}the comparison of {error.a} and {error.b} {verb} by lost track: share of runs "
+            f"{head}the comparison of {error.a} and {error.b} {verb} by track not kept: share of runs "
             f"won, {won}; {sample}."
         )
     effect = format_effect(error, error.estimate, error.low, error.high)
@@ -147,7 +147,7 @@ def _describe_track(track: Decision) -> str:
 
 
 def _describe_trade_off(error: Decision) -> str:
-    lost_a, lost_b = (format_percent(1 - share) for share in (error.share_a, error.share_b))
+    off_a, off_b = (format_percent(1 - share) for share in (error.share_a, error.share_b))
     size = format_digits(100 * abs(math.expm1(error.both_keep)))
     direction = "smaller" if error.both_keep < 0 else "larger"
     both = (
@@ -156,9 +156,9 @@ def _describe_trade_off(error: Decision) -> str:
         else f"different by {error.both_keep:.3g}"
     )
     return (
-        f"Trade-off in {format_worlds(error)}: {error.a} loses track in {lost_a} %, {error.b} in {lost_b} % of "
+        f"Trade-off in {format_worlds(error)}: {error.a} does not keep track in {off_a} %, {error.b} in {off_b} % of "
         f"runs. If both keep it, the {error.metric} of {error.a} is {both}. The choice depends on the "
-        "cost of a lost track."
+        "cost of a track that is not kept."
     )
 
 
@@ -184,7 +184,7 @@ def _describe_new_world(error: Decision) -> str:
         effect = format_effect(error, -error.estimate, -error.high, -error.low)
         state = f"{error.word} than" if error.word in (BETTER, WORSE) else "not decided against"
         return (
-            f"In a new world of this kind, {error.a} is {state} {error.b} by lost track: share of runs won, "
+            f"In a new world of this kind, {error.a} is {state} {error.b} by track not kept: share of runs won, "
             f"{effect}, {format_count(error.worlds, 'world')}."
         )
     if error.word in (BETTER, WORSE):

@@ -51,8 +51,8 @@ class StudySetting:
             with that of worlds.
         world_correlation: Share of the run variance that all worlds have in common.
         noise: Distribution of the runs.
-        lost_a: Share of runs in which the first filter loses track.
-        lost_b: Share of runs in which the second filter loses track.
+        lost_a: Share of runs in which the first filter does not keep track.
+        lost_b: Share of runs in which the second filter does not keep track.
     """
 
     worlds: int = 3
