@@ -28,7 +28,7 @@ EXACT = (
 )
 
 FLOAT32 = Contestant("pfbench float32, compiled", "own", ("house.py", "float32", "compiled"))
-LOOPS = Contestant("pfbench float32, C++ loops", "own", ("house.py", "float32", "kernels"))
+LOOPS = Contestant("pfbench float32, kernels", "own", ("house.py", "float32", "kernels"))
 EAGER = Contestant("pfbench float32, eager", "own", ("house.py", "float32", "eager"))
 FLOAT64 = Contestant("pfbench float64, compiled", "own", ("house.py", "float64", "compiled"))
 LIMIT = Contestant("fused C", "own", ("fused.py",))
@@ -47,9 +47,9 @@ BATCH = (
     Contestant("naive torch float32", "own", ("naive.py", "float32")),
 )  # fmt: skip
 GAUSSIAN = (
-    Contestant("pfbench float32, C++ loops", "own", ("house.py", "float32", "kernels", "ckf")),
+    Contestant("pfbench float32, kernels", "own", ("house.py", "float32", "kernels", "ckf")),
     Contestant("pfbench float32, eager", "own", ("house.py", "float32", "eager", "ckf")),
-    Contestant("pfbench float64, C++ loops", "own", ("house.py", "float64", "kernels", "ckf")),
+    Contestant("pfbench float64, kernels", "own", ("house.py", "float64", "kernels", "ckf")),
     Contestant("dynamax", "jax", ("peer_dynamax.py",)),
     Contestant("FilterPy", "jax", ("peer_filterpy.py", "ckf")),
     Contestant("Stone Soup", "jax", ("peer_stonesoup.py", "ckf")),

@@ -191,7 +191,7 @@ class Pass:
     def ran(self) -> str:
         """The engine, once it has run."""
         fell_back = isinstance(self.method, CompiledParticleFilter) and not self.method.is_active
-        return "loops (the step did not compile)" if fell_back else self.engine
+        return "kernels (the step did not compile)" if fell_back else self.engine
 
 
 def measure(engine: str, work: workload.Workload, device: torch.device, rounds: int) -> Measured:
@@ -296,10 +296,12 @@ def goals(found: Sequence[Measured], rate: float) -> list[str]:
         return []
     best = max(at_size, key=lambda one: one.rate)
     seconds, share = statistics.median(best.seconds), NEEDED * best.rate / rate
-    must, aim = (f"{wanted:g}, {'met' if seconds <= wanted else 'missed'}" for wanted in SECONDS)
+    required, desired = (
+        f"{wanted:g}, {'met' if seconds <= wanted else 'missed'}" for wanted in SECONDS
+    )
     return [
-        f"| {best.size}, {best.engine} | reached | must | aim |", "|---|---|---|---|",
-        f"| seconds | {seconds:.3g} | {must} | {aim} |",
+        f"| {best.size}, {best.engine} | reached | required | desired |", "|---|---|---|---|",
+        f"| seconds | {seconds:.3g} | {required} | {desired} |",
         f"| bytes needed, share of the copy rate | {share:.2g} | {SHARE:g}, {'met' if share >= SHARE else 'missed'} | - |",
         *([f"| bytes moved, likewise | {best.moved.whole * best.rate / rate:.2g} | - | - |"] if best.moved else []), "",
     ]  # fmt: skip

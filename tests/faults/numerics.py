@@ -33,10 +33,10 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.kernels import compilation
 from pfbench.model.linear_gaussian import LinearGaussian
 
-ENGINES = ("eager", "loops", "compiled")
+ENGINES = ("eager", "kernels", "compiled")
 COMPILED = ("sir", "rpf", "apf", "ckf_pf")  # compiling one case takes seconds
 MEMORY_GIB = 16.0  # of addresses; compilers are processes of their own
-TIMEOUT = {"eager": 600.0, "loops": 600.0, "compiled": 3600.0}  # s for all cases of a filter
+TIMEOUT = {"eager": 600.0, "kernels": 600.0, "compiled": 3600.0}  # s for all cases of a filter
 SLACK = 1e-6  # of the bound on the evidence, relative
 STANDARD_ERRORS = 4.0
 
