@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import fields, is_dataclass
+
+_BEHAVIOUR = ("__call__", "__getattr__", "__getattribute__")  # other dunder names are data
+_OF_THE_TYPE_SYSTEM = ("_abc_impl", "_is_protocol", "_is_runtime_protocol")
 
 
-def is_every_part_exact(**parts: object) -> bool:
+def is_every_part_exact(method: object = None, /, **parts: object) -> bool:
     """Return whether all parts of a filter state that they are asymptotically exact.
 
     A part that states nothing counts as not exact, with a warning: a report must not call a filter
-    exact because a stage written by a user is silent.
+    exact because a stage written by a user is silent. A class that overrides behaviour of the class
+    that states it is silent, too, unless it states `is_exact` in its own body.
 
     Args:
+        method: Filter of these parts. Its class may be silent, too.
         **parts: Stages by their configuration key, each with `is_exact: bool`.
 
     Returns:
@@ -20,22 +26,50 @@ def is_every_part_exact(**parts: object) -> bool:
     statements = [
         _is_stated_exact(key, stage) for key, stage in parts.items()
     ]  # each silent part warns
+    if method is not None and _overrides_silently(method):
+        _warn_silence("filter", method)
+        return False
     return all(statements)
 
 
 def _is_stated_exact(key: str, stage: object) -> bool:
     """Return `stage.is_exact`, or False with a warning."""
     value = getattr(stage, "is_exact", None)
-    if isinstance(value, bool):
+    if value is False or (value is True and not _overrides_silently(stage)):
         return value
+    _warn_silence(key, stage)
+    return False
+
+
+def _overrides_silently(stage: object) -> bool:
+    """Return whether a class overrides behaviour of the class whose `is_exact` it inherits."""
+    classes = type(stage).__mro__
+    home = next((i for i, cls in enumerate(classes) if "is_exact" in vars(cls)), 0)
+    if "is_exact" in getattr(stage, "__dict__", {}):
+        return False
+    defaults = {field.name for field in fields(stage)} if is_dataclass(stage) else set()
+    inherited = {name for cls in classes[home:-1] for name in vars(cls)} - defaults
+    return any(
+        name in inherited and _is_behaviour(name) for cls in classes[:home] for name in vars(cls)
+    )
+
+
+def _is_behaviour(name: str) -> bool:
+    """Return whether a name of a class can change what it computes."""
+    if name.startswith("__"):
+        return name in _BEHAVIOUR
+    return name not in _OF_THE_TYPE_SYSTEM
+
+
+def _warn_silence(key: str, stage: object) -> None:
+    """Warn of a stage that does not state whether it is exact."""
     name = getattr(stage, "__name__", type(stage).__name__)
     warnings.warn(
         f"filter: {key} must state whether it is asymptotically exact, got {name} without "
         "`is_exact`. The filter counts as not exact. Add `is_exact = True` to it (or "
         "`is_exact = False`) and test it with pfbench.testing.",
-        stacklevel=4,
+        stacklevel=5,
     )
-    return False
 
 
 def has_evidence(method: object) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 import torch
 from move_cases import Always
 from torch import Tensor
+from typing_extensions import override
 
 import pfbench.testing
 from pfbench.core.random_stream import RandomStream
@@ -97,6 +99,7 @@ class Scaled(BayesWeightUpdate):
     """Weights times a factor: the estimate stays right, the evidence does not."""
 
     factor: float = 1.05
+    is_exact = True  # a false statement
 
     def __call__(
         self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
@@ -107,6 +110,8 @@ class Scaled(BayesWeightUpdate):
 @dataclasses.dataclass(frozen=True)
 class Mixing(BootstrapProposal):
     """Noise that depends on the other runs of the batch."""
+
+    is_exact = True  # a false statement
 
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
@@ -241,6 +246,67 @@ def test_a_stage_decides_by_what_it_states(stage: str, exact: bool) -> None:
     part = Silent()
     part.is_exact = exact  # type: ignore[attr-defined]
     assert SILENT[stage](part).is_exact is exact
+
+
+class FirstHalf(Systematic):
+    """Inherits the statement of a scheme that it breaks."""
+
+    @override
+    def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
+        return HalfToFirst()(a, n, draws)
+
+
+class Blind(BootstrapProposal):
+    """Inherits the statement of a proposal."""
+
+    __call__ = Silent.__call__
+
+
+class Lazy(EssResampler):
+    """Inherits the statement of a resampler."""
+
+    __call__ = Silent.__call__
+
+
+class Skipping(ParticleFilter):
+    """Inherits the statement of a filter."""
+
+    step = Silent.__call__
+
+
+SILENT_CLASSES: dict[str, Callable[[], ParticleFilter]] = {
+    "FirstHalf": lambda: ParticleFilter(10, EssResampler(FirstHalf())),
+    "Blind": lambda: ParticleFilter(10, proposal=Blind()),
+    "Lazy": lambda: ParticleFilter(10, Lazy(Systematic())),
+    "Skipping": lambda: Skipping(10),
+}
+
+
+@pytest.mark.parametrize("name", SILENT_CLASSES)
+def test_a_class_that_overrides_an_exact_one_must_state_it_again(name: str) -> None:
+    with pytest.warns(UserWarning, match=f"got {name} without `is_exact`"):
+        method = SILENT_CLASSES[name]()
+    with pytest.warns(UserWarning, match="counts as not exact"):
+        assert method.is_exact is False
+
+
+def test_a_class_that_overrides_no_behaviour_inherits_the_statement() -> None:
+    class Eager(EssResampler):
+        """Another default."""
+
+        ess_threshold = 0.9
+
+    class Stated(FirstHalf):
+        """A statement of its own."""
+
+        is_exact = True
+
+    class Named(Stated):
+        """Nothing new."""
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert ParticleFilter(10, Eager(Named())).is_exact
 
 
 def test_a_kernel_decides_unless_it_makes_no_step() -> None:

@@ -134,7 +134,7 @@ class RaoBlackwellisedFilter:
 
         This is not claimed for components that are selected by name.
         """
-        return is_every_part_exact(resampler=self.resampler) and self.sampled_states is None
+        return is_every_part_exact(self, resampler=self.resampler) and self.sampled_states is None
 
     def init(
         self,

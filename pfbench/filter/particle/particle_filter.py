@@ -115,7 +115,7 @@ class ParticleFilter(Filter):
             "points",
         )
         moves = {f"moves[{i}]": move for i, move in enumerate(self.moves)}
-        return is_every_part_exact(**{name: getattr(self, name) for name in stages}, **moves)
+        return is_every_part_exact(self, **{name: getattr(self, name) for name in stages}, **moves)
 
     @property
     def history(self) -> PathHistory | None:

@@ -82,6 +82,7 @@ class Steady(RandomWalk):
     """Steps of a fixed covariance, `size` in each component: what a cloud decides cannot bias it."""
 
     size: float = 0.5
+    is_exact = True
 
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, x: Tensor, draws: Any
@@ -476,6 +477,8 @@ def rate_of(chains: int) -> Tensor:
 @dataclasses.dataclass(frozen=True)
 class PriorSized(RandomWalk):
     """Steps of a size in proportion to the prior's."""
+
+    is_exact = True
 
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, x: Tensor, draws: Any
