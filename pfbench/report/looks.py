@@ -44,6 +44,7 @@ class MethodLook:
         marker: Marker of matplotlib.
         cite: Key of the reference, empty without one.
         baselines: Labels of the methods with which its paper compares it.
+        tuning: Data on which its parameters were chosen, empty if they were not tuned.
     """
 
     key: str
@@ -56,6 +57,7 @@ class MethodLook:
     marker: str = MARKERS[0]
     cite: str = ""
     baselines: tuple[str, ...] = ()
+    tuning: str = ""
 
 
 @dataclass(frozen=True)
@@ -150,6 +152,19 @@ def plan_look_pairs(looks: Mapping[str, MethodLook]) -> list[tuple[str, str]]:
     return list_planned_pairs(looks, {key: look.baselines for key, look in looks.items()})
 
 
+def describe_tuning(looks: Mapping[str, MethodLook]) -> str:
+    """Say how many filters have tuned parameters, and on which data; empty if none has.
+
+    Args:
+        looks: Looks of all filters of a study.
+    """
+    counts = Counter(look.tuning for look in looks.values() if look.tuning)
+    return " ".join(
+        f"Parameters of {number} of {len(looks)} filters were tuned on {tuning}."
+        for tuning, number in sorted(counts.items())
+    )
+
+
 def _parse_look(label: str, block: Mapping[str, Any]) -> MethodLook:
     """Build the look of a label from its node."""
     family = str(block.get("family", ""))
@@ -165,6 +180,7 @@ def _parse_look(label: str, block: Mapping[str, Any]) -> MethodLook:
         marker=str(block.get("marker", "")),
         cite=str(block.get("cite", "")),
         baselines=tuple(map(str, block.get("baselines", ()))),
+        tuning=str(block.get("tuning", "")),
     )
 
 

@@ -66,7 +66,7 @@ def test_every_method_states_its_own_name_and_look() -> None:
     keys = {
         "name", "long_name", "family", "proposed", "colour", "marker", "cite", "baselines"
     }  # fmt: skip
-    assert [m for m in METHODS if set(read_paper_block("filter", m)) != keys] == []
+    assert [m for m in METHODS if set(read_paper_block("filter", m)) - {"tuning"} != keys] == []
     for method in METHODS:
         check_paper_blocks({"filter": {"paper": read_paper_block("filter", method)}})
     assert len({look.name for look in LOOKS.values()}) == len(METHODS)

@@ -44,6 +44,7 @@ def write_filter_file(
     name = {key: f"{block.get(key, result.method)}, tuned" for key in ("name", "long_name")}
     lines += ["paper:", *(f"  {key}: {json.dumps(value)}" for key, value in name.items())]
     lines += ["  family: kalman", "  proposed: false", '  cite: ""', "  baselines: []"]
+    lines.append(f"  tuning: {json.dumps(_describe_world(world))}")
     path = folder / "filter" / f"{result.method}_{suffix}.yaml"
     return _write(path, "\n".join(lines) + "\n")
 
@@ -65,6 +66,14 @@ def write_record(
     content = {"world": dict(world), "filters": [result.to_record() for result in results]}
     text = json.dumps(content, indent=1) + "\n"
     return _write(folder / "tuning" / f"{suffix}.json", text)
+
+
+def _describe_world(world: Mapping[str, Any]) -> str:
+    """Describe the data of the search for reports."""
+    return (
+        f"{world['scenario']} (model {world['model']}, seed {world['seed']}, {world['runs']} runs; "
+        f"noise: {', '.join(world['regimes'])})"
+    )
 
 
 def _write(path: Path, text: str) -> Path:

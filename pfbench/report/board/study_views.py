@@ -19,7 +19,7 @@ from pfbench.report.board.pack_entries import format_interval_level, list_metric
 from pfbench.report.board.run_table import METRIC_NAMES
 from pfbench.report.board.sentence import count_words, describe_view
 from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_filters
-from pfbench.report.looks import MethodLook, PartName
+from pfbench.report.looks import MethodLook, PartName, describe_tuning
 from pfbench.report.options import ReportOptions
 from pfbench.results.error_measures import Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects
@@ -91,7 +91,7 @@ def build_views(
             name = METRIC_NAMES[metric]
             if of_scope["group"].nunique() == 1:
                 name = f"{of_scope['group'].iloc[0]} {name}"
-            small_print = _small_print(selected, options)
+            small_print = _small_print(selected, options, describe_tuning(names.looks))
             if not views:  # the page opens with a baseline that has an error
                 baselines = _order_baselines(scope, names.baselines)
             for baseline in baselines:
@@ -161,8 +161,8 @@ def _describe_scope(conditions: pd.DataFrame, names: StudyNames) -> str:
     return where
 
 
-def _small_print(runs: StudyArrays, options: ReportOptions) -> str:
-    """Describe the sample of a view and its intervals."""
+def _small_print(runs: StudyArrays, options: ReportOptions, tuning: str) -> str:
+    """Describe the sample of a view, its intervals, and what was tuned."""
     filters = int(runs.present.any(axis=(1, 2)).sum())
     seeds = np.unique(runs.values["seed"][runs.present])
     level = format_interval_level(options.alpha)
@@ -175,5 +175,5 @@ def _small_print(runs: StudyArrays, options: ReportOptions) -> str:
         "Errors are trimmed means over runs on the logarithmic scale, averaged over conditions. "
         f"Intervals of the ratio: {level} each. "
         f"Verdicts against the best hold for all pairs together at {level}. "
-        "They concern these worlds."
-    )
+        f"They concern these worlds. {tuning}"
+    ).rstrip()

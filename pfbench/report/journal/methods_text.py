@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pfbench.report.looks import describe_tuning, study_looks
 from pfbench.report.provenance import distinct_values
 from pfbench.results import store
 from pfbench.results.conditions import Condition, natural_sort_key
@@ -69,8 +70,10 @@ def list_limits(conditions: Sequence[Condition]) -> list[str]:
     labels = [{job.label for job in condition.jobs} for condition in conditions]
     if any(names != set.union(*labels) for names in labels):
         limits.append("Not every filter was run in every condition.")
+    tuning = describe_tuning(study_looks(conditions))
+    others = "the other filters" if tuning else "the filters"
     limits.append(
-        "Parameters of the filters were not tuned for this comparison unless the paper says so."
+        f"{tuning} Parameters of {others} were not tuned for this comparison unless the paper says so.".lstrip()
     )
     limits.append("Times were measured once on a machine that may have been shared.")
     return limits

@@ -18,6 +18,7 @@ from pfbench.config.paper_files import list_named_parts
 from pfbench.job.tuning import knobs
 from pfbench.job.tuning.candidate_search import SEED_SHIFT, Candidate, choose_candidate
 from pfbench.job.tuning.knobs import KNOBS, Knob, apply_candidate, list_candidates
+from pfbench.report.looks import describe_tuning, find_looks
 from pfbench.results import store
 
 
@@ -87,6 +88,17 @@ def test_tuned_filters_were_not_tuned_on_scored_seeds() -> None:
         assert {k: stated[k] for k in choice.values} == choice.values
 
 
+def test_reports_say_on_which_data_filters_were_tuned() -> None:
+    world = json.loads((job.conf_dir() / "tuning" / "tuned.json").read_text())["world"]
+    looks = find_looks(["ekf", "gate_tuned", "huber_tuned"])
+    said = describe_tuning(looks)
+    assert said.startswith("Parameters of 2 of 3 filters were tuned on flight_500s (")
+    for value in (world["model"], f"seed {world['seed']}", f"{world['runs']} runs"):
+        assert str(value) in said
+    assert ", ".join(world["regimes"]) in said
+    assert describe_tuning(find_looks(["ekf", "gate"])) == ""
+
+
 def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -101,6 +113,8 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     written = yaml.safe_load((tmp_path / "lab/filter/ekf_scaled_walk.yaml").read_text())
     assert written["noise_adaptations"][0]["r_factor"] == 4.0
     assert written["paper"]["name"] == "Scaled EKF, tuned"
+    world = "linear_walk (model linear_walk, seed 1001, 20 runs; noise: outliers)"
+    assert written["paper"]["tuning"] == world
     record = json.loads((tmp_path / "lab/tuning/walk.json").read_text())
     (found,) = record["filters"]
     assert record["world"] == {
