@@ -2,17 +2,26 @@
 
     python benchmarks/board_estimates.py
 
+It writes board_estimates.json and a table of docs/statistics.md, in less than a minute.
+
 Studies are drawn per filter: two filters share the difficulty of each run (SD 0.4) and have noise of
 their own (SD 0.28, Student's t with 3 degrees of freedom, or a skewed distribution). One condition.
 """
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 
 from pfbench.results.decisions.pair_effects import location_effects
 from pfbench.results.statistics.paired_effects import log_levels, subtract_levels
 
+STORE = Path(__file__).with_name("board_estimates.json")
+PAGE = Path(__file__).parents[1] / "docs" / "statistics.md"
+START, END = "<!-- numbers:board_estimates -->", "<!-- numbers:end -->"
 STUDIES, RESAMPLES = 1000, 499
 EFFECTS = {"size": 0.0, "power at -10 %": np.log(0.9)}
 
@@ -49,10 +58,9 @@ def decide_by_medians(errors: np.ndarray, rng: np.random.Generator) -> float:
     return decided / len(errors)
 
 
-def main() -> None:
-    """Print a table."""
-    print("| noise | runs | quantity | trimmed log levels | ratio of medians | paired ratios |")
-    print("| --- | --- | --- | --- | --- | --- |")
+def measure_rates() -> list[dict[str, Any]]:
+    """Return one row per noise, number of runs and effect."""
+    rows = []
     for noise in ("t3", "skewed"):
         for runs in (10, 30, 100):
             for quantity, effect in EFFECTS.items():
@@ -60,9 +68,29 @@ def main() -> None:
                 errors = draw_studies(rng, runs, noise, effect)
                 levels, paired = (decide_by_pairs(errors, by_levels=by) for by in (True, False))
                 medians = decide_by_medians(errors, rng)
-                print(
-                    f"| {noise} | {runs} | {quantity} | {levels:.3f} | {medians:.3f} | {paired:.3f} |"
-                )
+                rows.append(
+                    {"noise": noise, "runs": runs, "quantity": quantity, "trimmed log levels": levels,
+                     "ratio of medians": medians, "paired ratios": paired}
+                )  # fmt: skip
+    return rows
+
+
+def page(text: str, rows: list[dict[str, Any]]) -> str:
+    """Return the page with the table of the rows."""
+    lines = [list(rows[0]), ["---"] * len(rows[0])]
+    lines += [
+        [f"{v:.3f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows
+    ]
+    table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    before, rest = text.split(START)
+    return f"{before}{START}\n{table}\n{END}{rest.split(END, 1)[1]}"
+
+
+def main() -> None:
+    """Write the rows and the table."""
+    rows = measure_rates()
+    STORE.write_text(json.dumps(rows, indent=1) + "\n")
+    PAGE.write_text(page(PAGE.read_text(), rows))
 
 
 if __name__ == "__main__":
