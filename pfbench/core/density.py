@@ -44,11 +44,7 @@ def log_density(distribution: Distribution, y: Tensor, observed_mask: Tensor, na
         ValueError: If a component is missing that cannot be integrated out.
     """
     kind = type(distribution).__name__
-    if len(distribution.event_shape) != 1:
-        raise TypeError(
-            f"{name} must return a distribution with one event dimension, got {kind} with event "
-            f"shape {tuple(distribution.event_shape)}. Return Independent or MultivariateNormal."
-        )
+    check_event_dimension(distribution, name, y.shape[-1])
     if isinstance(distribution, Independent) and not distribution.base_dist.event_shape:
         base = distribution.base_dist
         value = base.log_prob(_filled(base, y, observed_mask))
@@ -69,6 +65,27 @@ def log_density(distribution: Distribution, y: Tensor, observed_mask: Tensor, na
         )
     value = distribution.log_prob(_filled(distribution, y, observed_mask))
     return torch.where(observed, value, 0.0)
+
+
+def check_event_dimension(distribution: Distribution, name: str, width: int | None = None) -> None:
+    """Check that the components of a vector are the event of its distribution.
+
+    Args:
+        distribution: Distribution of a vector.
+        name: Name of the method that returned the distribution, for messages.
+        width: Number of components; None if it is not known.
+
+    Raises:
+        TypeError: If the distribution has not one event dimension.
+    """
+    if len(distribution.event_shape) != 1:
+        size = "" if width is None else f" of {width} components"
+        raise TypeError(
+            f"{name} must be a distribution with one event dimension{size}, got "
+            f"{type(distribution).__name__} with batch shape {list(distribution.batch_shape)} and event "
+            f"shape {list(distribution.event_shape)}. Keep a last axis of components and append "
+            ".to_event(1), or use MultivariateNormal."
+        )
 
 
 def has_finite_moments(distribution: Any) -> bool:

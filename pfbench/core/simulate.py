@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from pfbench.core.chart import Chart
+from pfbench.core.density import check_event_dimension
 from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record, iterate_steps
@@ -134,7 +135,11 @@ def draw_initial_state(
 
     Returns:
         States, [R, n, D].
+
+    Raises:
+        TypeError: If the distribution has not one event dimension.
     """
+    check_event_dimension(distribution, f"{type(model).__name__}.initial", model.origin.shape[-1])
     origin = model.origin.expand(1, -1) if start is None else start
     shift = draw_values(distribution, stream, purpose, n)
     return model.chart.add(origin.unsqueeze(1), shift)
@@ -160,12 +165,19 @@ def simulate_steps(
 
     Yields:
         The steps in order.
+
+    Raises:
+        TypeError: If the distribution of noise or measurement has not one event dimension.
     """
+    name = type(model).__name__
+    check_event_dimension(model.noise, f"{name}.noise")
     for t, step_model, step in iterate_steps(model, record):
         factor = None if scale is None else scale[t]
         w = draw_noise_values(model.noise, stream.at_step(t + 1), purpose, 1, factor)
         x = step_model.propagate(x, step.u, w)
-        yield SimulatedStep(t, step, x, w, model.observation(x, step.u))
+        distribution = model.observation(x, step.u)
+        check_event_dimension(distribution, f"{name}.observation")
+        yield SimulatedStep(t, step, x, w, distribution)
 
 
 def draw_measurements(

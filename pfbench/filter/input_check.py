@@ -6,7 +6,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.distributions import Independent
+from torch.distributions.constraints import Constraint, is_dependent
 
+from pfbench.core.density import check_event_dimension
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
@@ -72,7 +75,8 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
     Raises:
         ValueError: If states have another shape, if none is finite, or if the model
             observes another number of components than `record.y` has. If the number type does not
-            resolve the measurements.
+            resolve the measurements. If a measurement is outside the support of its distribution.
+        TypeError: If a distribution has not one event dimension.
     """
     first, step_model = record.at_step(0), model.at_step(0)
     runs, width = first.y.shape
@@ -83,6 +87,7 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
         stream = PhiloxStream(0, torch.arange(runs, device=model.anchor.device), model.anchor.dtype)
         x = draw_initial_state(model, distribution, stream, "input check", _STATES, record.start)
         x = x.to(model.anchor)
+        check_event_dimension(step_model.noise, f"{name}.noise", step_model.noise_dim)
         w = torch.nan_to_num(step_model.noise.mean).expand(runs, _STATES, step_model.noise_dim)
         next_x = step_model.propagate(x, first.u, w)
         if next_x.shape != x.shape or not bool(next_x.isfinite().all(-1).any()):
@@ -93,6 +98,7 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
             )
         _check_independence(step_model, x, first.u, w, next_x)
         observed = _observe(step_model, next_x, first.u)
+        check_event_dimension(observed, f"{name}.observation", width)
     shape = (*observed.batch_shape, *observed.event_shape)
     is_blank = bool(torch.isnan(record.y).all())  # a record without measurements may have any width
     if not shape or (shape[-1] != width and not is_blank):
@@ -107,6 +113,33 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
             "expand what all particles share."
         )
     check_measurement_resolution(observed, record.y, name)
+    _check_support(model, record, observed, next_x)
+
+
+def _check_support(model: StateSpaceModel, record: Record, first: Any, x: Tensor) -> None:
+    """Check the measurements of all steps against a support that is the same for all states."""
+    support = _fixed_support(first)
+    if support is None or model.has_residual:
+        return
+    is_wrong = ~(support.check(record.y) | torch.isnan(record.y))
+    for run, t, k in torch.nonzero(is_wrong)[:1].tolist():
+        later = _observe(model.at_step(t), x, record.at_step(t).u)
+        if _fixed_support(later) is support:  # the distribution may change with the step
+            law = type(later.base_dist if isinstance(later, Independent) else later).__name__
+            raise ValueError(
+                f"record.y must be in the support of {law} ({support}), got "
+                f"{float(record.y[run, t, k]):g} at step {t} of run {run}. Mark a missing component as "
+                f"NaN, or let {type(model).__name__}.observation return a distribution with this support."
+            )
+
+
+def _fixed_support(distribution: Any) -> Constraint | None:
+    """Return the support of a component if no parameter changes it, else None."""
+    base = distribution.base_dist if isinstance(distribution, Independent) else distribution
+    support: Any = getattr(type(base), "support", None)
+    if not isinstance(support, Constraint) or is_dependent(support) or support.event_dim:
+        return None
+    return support
 
 
 def _check_independence(

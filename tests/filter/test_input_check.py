@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
 import torch
+from pyro.distributions import LogNormal, Normal, Poisson
 from torch import Tensor
 from typing_extensions import override
 
@@ -21,6 +23,9 @@ from pfbench.filter.particle.weight_update import BayesWeightUpdate, FlooredWeig
 from pfbench.kernels import compilation
 from pfbench.model.base import ModelWrapper
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.noise import NominalNoise
+from pfbench.ppl import simulate
+from pfbench.scenario import ModelSimulation
 
 MODEL = linear_walk(1.0, 0.3, 1.0)
 RUNS, STEPS = 3, 4
@@ -47,6 +52,28 @@ class Wide(LinearGaussian):
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
         moved = super().propagate(x, u, w)
         return torch.cat([moved, moved], -1)
+
+
+class Law(LinearGaussian):
+    """A model whose measurement and noise have distributions of the test."""
+
+    law: Any = None
+    noise_law: Any = None
+
+    @property
+    @override
+    def noise(self) -> Any:
+        return self.noise_law or super().noise
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Any:
+        return self.law(x[..., :1]) if self.law else super().observation(x, u)
+
+
+def law_model(law: Any = None, noise_law: Any = None) -> Law:
+    model = Law(torch.eye(2), torch.eye(2), [[1.0, 0.0]], [1.0], [0.0, 0.0], [1.0, 1.0])
+    model.law, model.noise_law = law, noise_law
+    return model
 
 
 class Mixing(LinearGaussian):
@@ -249,3 +276,43 @@ def test_what_fits_is_computed() -> None:
     for record in (Record(Y), Record(Y.float()), Record(Y, inputs), Record(Y * torch.nan)):
         result = run_filter(ParticleFilter(20), MODEL, record, DRAWS)
         assert not result.lost.any()
+
+
+LAWS = {
+    "Law.observation": law_model(lambda x: Normal(x, 1.0)),
+    "Law.noise": law_model(noise_law=Normal(torch.zeros(2, dtype=torch.float64), 1.0)),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_without_an_event_is_refused_at_each_door(name: str) -> None:
+    model, steps = LAWS[name], STEPS
+    doors: dict[str, Callable[[], Any]] = {
+        "filter": lambda: run_filter(ParticleFilter(8), model, Record(Y), DRAWS),
+        "scenario": lambda: ModelSimulation(model, steps).draw(NominalNoise(), DRAWS.runs, 1),
+        "program": lambda: simulate(model, Record(Y), 1),
+    }
+    for door in doors.values():
+        with pytest.raises(TypeError, match=rf"{name} must .* got Normal .*\[\]\. .*to_event\(1\)"):
+            door()
+
+
+@pytest.mark.parametrize(
+    ("law", "wrong"), [("Poisson", -1.0), ("Poisson", 1.5), ("LogNormal", -2.0)]
+)
+@pytest.mark.parametrize("validate", [False, True])
+def test_a_measurement_outside_the_support_is_refused(
+    law: str, wrong: float, validate: bool
+) -> None:
+    """A missing component is not checked, whether or not torch validates."""
+    kinds: dict[str, Callable[[Tensor], Any]] = {
+        "Poisson": lambda x: Poisson(x.exp(), validate_args=validate).to_event(1),
+        "LogNormal": lambda x: LogNormal(x, 1.0, validate_args=validate).to_event(1),
+    }
+    model, y = law_model(kinds[law]), Y + 1.0
+    y[2, 1] = torch.nan
+    run_filter(ParticleFilter(8), model, Record(y), DRAWS)
+    y[1, 3] = wrong
+    message = rf"support of {law} \(.*Than.*\), got {wrong:g} at step 3 of run 1\. Mark "
+    with pytest.raises(ValueError, match=message):
+        run_filter(ParticleFilter(8), model, Record(y), DRAWS)

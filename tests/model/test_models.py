@@ -417,7 +417,7 @@ def test_other_observation_laws() -> None:
     expected = stats.laplace.logpdf(1.0, x[..., 0]) + stats.laplace.logpdf(2.0, x[..., 2])
     assert np.allclose(model.log_likelihood(y, x, ()).numpy(), expected)
     model.observation = lambda x, u: Laplace(x, torch.ones_like(x))  # type: ignore[method-assign]
-    with pytest.raises(TypeError, match="Independent or MultivariateNormal"):
+    with pytest.raises(TypeError, match=r"of 3 components, got Laplace .*to_event\(1\)"):
         model.log_likelihood(y, x, ())
 
 
