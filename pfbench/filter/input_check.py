@@ -101,10 +101,9 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
         check_event_dimension(observed, f"{name}.observation", width)
     shape = (*observed.batch_shape, *observed.event_shape)
     is_blank = bool(torch.isnan(record.y).all())  # a record without measurements may have any width
-    if not shape or (shape[-1] != width and not is_blank):
+    if shape[-1] != width and not is_blank:
         raise ValueError(
-            f"record.y must have as many components as {name} observes, {shape[-1] if shape else 0}, "
-            f"got {width}."
+            f"record.y must have as many components as {name} observes, {shape[-1]}, got {width}."
         )
     if tuple(observed.batch_shape) != (runs, _STATES):
         raise ValueError(
