@@ -130,6 +130,20 @@ def test_floors() -> None:
     assert first == []  # the lazy door
 
 
+def test_the_page_for_contributors_states_floors_and_limits() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    lines = re.findall(r"^  \d+\. (`.+`)$", text, re.MULTILINE)
+    stated = [tuple(re.findall(r"`(\w+)`", line)) for line in lines]
+    assert stated == [tuple(sorted(floor)) for floor in FLOORS[-2::-1]]
+    lint = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["ruff"]["lint"]
+    limits = (
+        f"at most {LONGEST_FILE} lines ({LONGEST_FILE + 100} if its docstring says why it is long), "
+        f"a function at most {LONGEST_FUNCTION} statements and complexity "
+        f"{lint['mccabe']['max-complexity']}, a folder at most {MODULES_IN_A_FOLDER} modules"
+    )
+    assert limits in " ".join(text.split())
+
+
 BROKEN = {
     "pfbench.core.record": "from pfbench.nav.earth import radii",
     "pfbench.nav.earth": "import pfbench.model.base",
