@@ -124,9 +124,9 @@ def _check_support(model: StateSpaceModel, record: Record, first: Any, x: Tensor
     for run, t, k in torch.nonzero(is_wrong)[:1].tolist():
         later = _observe(model.at_step(t), x, record.at_step(t).u)
         if _fixed_support(later) is support:  # the distribution may change with the step
-            law = type(later.base_dist if isinstance(later, Independent) else later).__name__
+            kind = type(later.base_dist if isinstance(later, Independent) else later).__name__
             raise ValueError(
-                f"record.y must be in the support of {law} ({support}), got "
+                f"record.y must be in the support of {kind} ({support}), got "
                 f"{float(record.y[run, t, k]):g} at step {t} of run {run}. Mark a missing component as "
                 f"NaN, or let {type(model).__name__}.observation return a distribution with this support."
             )
