@@ -12,11 +12,11 @@ import numpy as np
 import yaml
 
 from pfbench.claims.schema import (
+    CLAIM_METRICS,
     FORMS,
     GROUPED,
     GROUPS,
     MARKS,
-    METRICS,
     PAPERS,
     REASONS,
     STATISTICS,
@@ -152,7 +152,7 @@ def _yaml_names(folder: Path) -> list[str]:
 def _check_test(claim: str, test: ClaimTest, options: Mapping[str, Sequence[str]]) -> None:
     """Raise ValueError if a test names something unknown, or lacks a field."""
     _check_option(claim, "is", test.statistic, STATISTICS)
-    _check_option(claim, "metric", test.metric, METRICS)
+    _check_option(claim, "metric", test.metric, CLAIM_METRICS)
     if test.metric in GROUPED:
         _check_option(claim, "group", test.group, GROUPS)
     for need in STATISTICS[test.statistic].split():

@@ -59,7 +59,7 @@ _ERROR_METRICS = ("mean_abs", "settled", "growth", "sd")
 _RUN_METRICS = ("effective", "severely_overconfident")
 _BY_SCOPE = {metric.name: metric.scope for metric in metrics.METRICS}
 SCALED = (*(m for m, s in _BY_SCOPE.items() if s == "components"), *_ERROR_METRICS)
-METRICS = tuple(dict.fromkeys((*_BY_SCOPE, *_ERROR_METRICS, *_RUN_METRICS)))
+CLAIM_METRICS = tuple(dict.fromkeys((*_BY_SCOPE, *_ERROR_METRICS, *_RUN_METRICS)))
 GROUPED = (*SCALED, *(m for m, s in _BY_SCOPE.items() if s == "group"))  # metrics of a group
 
 
@@ -87,7 +87,7 @@ class ClaimTest:
         statistic: One of `STATISTICS`, see `claim_tests`.
         study: Experiment whose results are used.
         cell: Condition, as scenario/noise/model.
-        metric: One of `METRICS`.
+        metric: One of `CLAIM_METRICS`.
         a: Label of a filter.
         b: Label of the filter that a is compared with, or empty.
         b_cell: Condition of b, if it differs. Runs of the same number are paired.

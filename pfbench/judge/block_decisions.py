@@ -15,6 +15,7 @@ from pfbench.judge.sequence_results import SequenceResults
 from pfbench.results.decisions.decision import Decision
 from pfbench.results.decisions.family_tests import FamilyTests, decide_family, stack_questions
 from pfbench.results.decisions.pair_effects import QuestionEffect
+from pfbench.results.decisions.planned_pairs import Pairs
 from pfbench.results.decisions.sentence_formats import (
     format_count,
     format_digits,
@@ -37,7 +38,6 @@ from pfbench.results.statistics.world_effects import EffectEstimate
 FAMILY_BLOCKS = "planned pairs, blocks of time"
 METRIC = "position RMSE"
 _POWER = 0.8
-Pairs = Sequence[tuple[str, str]]
 
 
 class BlockDecision(NamedTuple):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from pfbench.judge.block_decisions import METRIC, BlockDecision, Pairs, decide_along_runs
+from pfbench.judge.block_decisions import METRIC, BlockDecision, decide_along_runs
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.readers.trajectory_files import TrajectoryFile, list_trajectory_files
 from pfbench.judge.reference_track import read_reference
@@ -16,7 +16,7 @@ from pfbench.judge.sequence_results import JudgedRun, SequenceResults, read_runs
 from pfbench.results.decisions.decision import Decision
 from pfbench.results.decisions.filter_sets import FilterRanking, order_filters
 from pfbench.results.decisions.options import DecisionOptions, MetricRule
-from pfbench.results.decisions.planned_pairs import decide_planned_pairs
+from pfbench.results.decisions.planned_pairs import Pairs, decide_planned_pairs
 from pfbench.results.metrics import compute_metric, data_by_scope
 from pfbench.results.statistics.paired_effects import MIN_RUNS
 from pfbench.results.status import keeps_track

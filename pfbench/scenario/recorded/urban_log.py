@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pfbench.model.pseudorange_errors import UrbanInputs
 from pfbench.nav import earth
-from pfbench.nav.gnss.orbits import azimuth_elevation
+from pfbench.nav.gnss.orbits import LIGHT, azimuth_elevation
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_changes
 from pfbench.scenario.plausibility.log_agreement import compare_reference, compare_wheels
@@ -33,7 +33,6 @@ from pfbench.scenario.recorded.log_tables import (
 )
 from pfbench.scenario.recorded.navigation_log import ReferenceLog
 
-LIGHT = 299792458.0  # m/s
 MOVING = 1.0  # m/s; smallest speed at which the velocity determines the heading
 _SAME_TIME = 1e-3  # s
 
