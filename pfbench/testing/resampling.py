@@ -29,16 +29,17 @@ def check_resampling(
 ) -> LawCheck:
     """Check that a resampler or a scheme is unbiased and copies whole particles.
 
-    The weights are uneven, some are 0. The total weight of the copies of each particle must average
-    to its weight, by Hotelling's test over runs. States, stored past, memory and ancestors of a
-    slot must belong to one particle. A resampler is tested with the weights as resampling
-    probabilities, and with others, for which its weights must correct.
+    The weights are uneven with some of 0, equal, nearly equal, and almost 1 for one particle. The
+    total weight of the copies of each particle must average to its weight, by Hotelling's test over
+    runs. States, stored past, memory and ancestors of a slot must belong to one particle. A
+    resampler is tested with the weights as resampling probabilities, and with others, for which its
+    weights must correct. The copies of two steps must not be correlated.
 
     Args:
         stage: Resampler, or scheme to be used in every run.
         particles: Number of particles before resampling.
         slots: Number of particles after resampling. The same by default.
-        runs: Number of independent repetitions.
+        runs: Number of independent repetitions. Fewer than 20 000 count as 20 000.
         seed: Seed of the random stream.
 
     Returns:
@@ -49,20 +50,22 @@ def check_resampling(
     """
     count = particles if slots is None else slots
     resampler: Any = EssResampler(stage, 1.0) if _is_scheme(stage) else stage  # type: ignore[arg-type]
-    a = _uneven_weights(particles, np.random.default_rng(0))
-    log_w = torch.log(torch.tensor(a))
-    tilt = torch.linspace(-1.0, 1.0, particles, dtype=torch.float64)
-    probabilities = {
-        "the weights": log_w,
-        "other probabilities": torch.log_softmax(0.5 * log_w + tilt, -1),
-    }
     p_values, deviations = {}, {}
-    for name, log_a in probabilities.items():
-        shares = _shares(resampler, log_w.expand(runs, -1), log_a, count, seed)
+    for name, (a, log_a) in _weight_cases(particles).items():
+        cases = max(runs, 20_000)  # a copy of a light particle is rare
+        log_w = torch.log(torch.tensor(a))
+        log_probabilities = log_w if log_a is None else log_a
+        shares = _shares(resampler, log_w.expand(cases, -1), log_probabilities, count, seed)
         assert not shares[:, a == 0.0].any(), (
             f"{_STATEMENT}: with {name}, a particle of weight 0 was copied"
         )
         p_values[name], deviations[name] = _hotelling(count * (shares - a))
+        if name == "the weights":
+            few = max(runs // 4, 4 * particles)
+            later = _shares(
+                resampler, log_w.expand(few, -1), log_probabilities, count, seed, step=4
+            )
+            p_values["two steps"] = _correlation(shares[:few], later)
     return check_p_values(
         _STATEMENT, p_values, 1e-4, largest_deviation_in_copies=max(deviations.values())
     )
@@ -82,7 +85,36 @@ def _uneven_weights(n: int, rng: np.random.Generator) -> np.ndarray:
     return a
 
 
-def _shares(resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int) -> np.ndarray:
+def _weight_cases(n: int) -> dict[str, tuple[np.ndarray, Tensor | None]]:
+    """Return weights [N] by name, with other resampling probabilities if any."""
+    rng = np.random.default_rng(0)
+    uneven = _uneven_weights(n, rng)
+    near = 1.0 + 0.1 * rng.uniform(-1.0, 1.0, n)
+    heavy = np.full(n, 0.02 / (n - 1))
+    heavy[n // 2] = 0.98
+    tilt = torch.linspace(-1.0, 1.0, n, dtype=torch.float64)
+    tilted = torch.log_softmax(0.5 * torch.log(torch.tensor(uneven)) + tilt, -1)
+    return {
+        "the weights": (uneven, None),
+        "other probabilities": (uneven, tilted),
+        "equal weights": (np.full(n, 1.0 / n), None),
+        "nearly equal weights": (near / near.sum(), None),
+        "one weight of almost 1": (heavy, None),
+    }
+
+
+def _correlation(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the p-value of uncorrelated sums of two steps, weighted by fixed random numbers."""
+    projection = np.random.default_rng(2).normal(size=first.shape[1])
+    sums = first @ projection, second @ projection
+    if min(float(np.std(sum_)) for sum_ in sums) < 1e-9:
+        return 1.0  # all copies are certain
+    return float(stats.pearsonr(*sums).pvalue)
+
+
+def _shares(
+    resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int, step: int = 3
+) -> np.ndarray:
     """Resample numbered particles, and return the weight of their copies [runs, N]."""
     runs, n = log_w.shape
     number = torch.arange(n, dtype=torch.float64).expand(runs, -1)
@@ -104,7 +136,7 @@ def _shares(resampler: Any, log_w: Tensor, log_a: Tensor, count: int, seed: int)
     )
     same = torch.equal(log_a, log_w[0])  # by identity: nothing to correct
     slots = torch.full((runs, 1), float(count), dtype=torch.float64)
-    draws = PhiloxStream(seed, torch.arange(runs)).at_step(3)
+    draws = PhiloxStream(seed, torch.arange(runs)).at_step(step)
     after, _ = resampler(
         local_level(1.0, 1.0, 0.0, 1.0),
         belief,

@@ -109,6 +109,15 @@ MISTAKES = {
         normalised(torch.floor(a * n)), n, d
     ),
     "weights above 0 taken as equal": lambda a, n, d: Killing()(normalised((a > 0).double()), n, d),
+    "no resampling of nearly equal weights": lambda a, n, d: torch.where(
+        a.amax(1, keepdim=True) < 1.2 * a.mean(1, keepdim=True),
+        torch.arange(a.shape[1]),
+        Systematic()(a, n, d),
+    ),
+    "the most probable takes all": lambda a, n, d: torch.where(
+        a.amax(1, keepdim=True) > 0.9, a.argmax(1, keepdim=True), Systematic()(a, n, d)
+    ),
+    "the same random numbers in each step": lambda a, n, d: Systematic()(a, n, d.at_step(0)),
     "tempered": lambda a, n, d: Multinomial()(normalised(a**0.95), n, d),
 }
 
