@@ -61,7 +61,7 @@ def check_resampling(
         )
         p_values[name], deviations[name] = _hotelling(count * (shares - a))
         if name == "the weights":
-            few = max(runs // 4, 4 * particles)
+            few = min(cases, max(runs // 4, 4 * particles))
             later = _shares(
                 resampler, log_w.expand(few, -1), log_probabilities, count, seed, step=4
             )
