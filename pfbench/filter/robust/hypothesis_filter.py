@@ -74,12 +74,12 @@ class HypothesisFilter(ABC):
         )
         log_w, log_next = self._start(log_law)
         k = len(log_w)
-        memory = {
-            OFFSET: belief.covariance.new_zeros(runs, k, belief.covariance.shape[-1]),
-            "branch_covariance": belief.covariance.unsqueeze(1).repeat(1, k, 1, 1),
-            "branch_log_weight": log_w.repeat(runs, 1),
-            "branch_log_next": log_next.repeat(runs, 1, 1),
-        }
+        memory = branch_memory(
+            belief.covariance.new_zeros(runs, k, belief.covariance.shape[-1]),
+            belief.covariance.unsqueeze(1).repeat(1, k, 1, 1),
+            log_w.repeat(runs, 1),
+            log_next.repeat(runs, 1, 1),
+        )
         return belief._replace(memory=memory)
 
     def step(

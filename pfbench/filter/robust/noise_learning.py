@@ -49,11 +49,7 @@ class SageHusaAdaptation(RobustUpdate):
             raise ValueError(
                 f"SageHusaAdaptation.max_gain must be in (0, 1], got {self.max_gain}. Use 0.05."
             )
-        if not 0.0 < self.min_factor <= 1.0 <= self.max_factor:
-            raise ValueError(
-                "SageHusaAdaptation.min_factor must be in (0, 1] and max_factor at least 1, got "
-                f"min_factor={self.min_factor}, max_factor={self.max_factor}. Use 0.5 and 100."
-            )
+        check_factor_bounds("SageHusaAdaptation", self.min_factor, self.max_factor)
 
     @override
     def noise_adapt(
@@ -139,6 +135,24 @@ def scale_variances(noise: Tensor, factor: Tensor) -> Tensor:
     """
     root = factor.sqrt()
     return noise * root.unsqueeze(-1) * root.unsqueeze(-2)
+
+
+def check_factor_bounds(name: str, lowest: float, largest: float) -> None:
+    """Check the bounds of a factor on the model's variance.
+
+    Args:
+        name: Class for the message.
+        lowest: Smallest factor.
+        largest: Largest factor.
+
+    Raises:
+        ValueError: If 1 does not lie between them, or the smallest is not positive.
+    """
+    if not 0.0 < lowest <= 1.0 <= largest:
+        raise ValueError(
+            f"{name}.min_factor must be in (0, 1] and max_factor at least 1, got "
+            f"min_factor={lowest}, max_factor={largest}. Use 0.5 and 100."
+        )
 
 
 def check_forgetting(name: str, value: float) -> None:

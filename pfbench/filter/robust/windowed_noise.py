@@ -11,7 +11,7 @@ from typing_extensions import override
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.principal_axes import diagonal_axes
-from pfbench.filter.robust.noise_learning import scale_variances
+from pfbench.filter.robust.noise_learning import check_factor_bounds, scale_variances
 from pfbench.filter.robust.robust_update import RobustUpdate
 
 _WINDOW = "innovation_window"
@@ -44,11 +44,7 @@ class WindowedNoiseAdaptation(RobustUpdate):
                 "WindowedNoiseAdaptation.window must be a whole number of at least 2, got "
                 f"{self.window}. Use 20."
             )
-        if not 0.0 < self.min_factor <= 1.0 <= self.max_factor:
-            raise ValueError(
-                "WindowedNoiseAdaptation.min_factor must be in (0, 1] and max_factor at least 1, got "
-                f"min_factor={self.min_factor}, max_factor={self.max_factor}. Use 0.5 and 100."
-            )
+        check_factor_bounds("WindowedNoiseAdaptation", self.min_factor, self.max_factor)
 
     @override
     def noise_adapt(

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from pfbench.report.board.curves import ALL
 from pfbench.report.board.levels import (
     StudyArrays,
     arrange_runs,
@@ -23,8 +24,6 @@ from pfbench.report.looks import MethodLook, PartName, describe_tuning
 from pfbench.report.options import ReportOptions
 from pfbench.results.error_measures import Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects
-
-ALL = "all"
 
 
 class ViewKey(NamedTuple):

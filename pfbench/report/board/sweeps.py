@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from pfbench.report.board.curves import ALL
 from pfbench.report.board.study_views import ViewKey
 from pfbench.report.looks import MethodLook
 
@@ -54,7 +55,7 @@ def list_sweeps(
         for (world, regime), view in cells.items():
             rows = {row["filter"]: row for row in view["rows"] if row["value"] is not None}
             lines = _list_lines(members, rows, x, looks)
-            if "all" not in (world, regime) and lines:
+            if ALL not in (world, regime) and lines:
                 sweeps.append({
                     "name": name, "world": world, "regime": regime, "unit": "",
                     "ticks": None if is_number else values, "value_unit": _find_unit(rows),
