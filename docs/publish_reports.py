@@ -32,15 +32,21 @@ _IMAGE = re.compile(r"^!\[([^\]]*)\]\(([^)]+)\)\n+(\*[^*\n].*\*\n+)?", re.MULTIL
 
 
 def publish_study(folder: Path) -> None:
-    """Draw the headline figure of a study, and show it in report.md.
+    """Draw the headline figure of a study, and show it in report.md; no figure if no filter has an error.
 
     Args:
         folder: Folder of the report, with the data of its page.
     """
-    pack = {**read_page_data(folder), "headline": CAPTION}
+    pack = read_page_data(folder)
+    opening = next(iter(pack["views"].values()))
+    has_error = any(row["ratio"] is not None for row in opening["rows"])
+    pack["headline"] = CAPTION if has_error else ""
     with RecordedFolder(folder, is_complete=False) as target:
         target.remove("headline.png")
-        target.write(HEADLINE, render_headline(pack))
+        if has_error:
+            target.write(HEADLINE, render_headline(pack))
+        else:
+            target.remove(HEADLINE)
         write_page_data(pack, target)
         write_markdown(pack, target)
 

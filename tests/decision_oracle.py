@@ -232,7 +232,9 @@ def recompute(runs: pd.DataFrame, records: list[dict[str, Any]]) -> pd.DataFrame
             word = word_of(low, high, is_decided, e["value"], 0.0 if e["won"] else r["margin"])
             if np.isnan(p_single):
                 low, high, word = -np.inf, np.inf, "not tested"
-            if e["identical"]:
+            if e["identical"] and (
+                r["scale"] != "log ratio" or max(r["share_a"], r["share_b"]) > 0.0
+            ):
                 low, high, word = 0.0, 0.0, "identical"
             rows.append({
                 "family": r["family"], "question": question, "a": r["a"], "b": r["b"],

@@ -20,6 +20,7 @@ from pfbench.results.statistics.world_spread import fit_world_posterior
 
 ONE_WORLD = "one world"
 TRACK_NOT_KEPT = "decided by track not kept"
+NO_ERROR = "no run of either filter keeps track"
 _FEW_WORLDS = range(2, 6)  # worlds with which the posterior is shown
 _LARGE_EFFECT = 2.0  # SD between worlds, for the statement on the worlds required
 
@@ -121,7 +122,7 @@ def describe(
 def _word(comparison: PairComparison, tests: FamilyTests, k: int) -> tuple[str, str]:
     """Return the word and the statement on the margin."""
     if comparison.effects.identical:
-        return IDENTICAL, NO_SIZE
+        return (NOT_TESTED if _has_no_error(comparison) else IDENTICAL), NO_SIZE
     if not np.isfinite(tests.p_corrected[k]):
         return NOT_TESTED, NO_SIZE
     ends = float(tests.low[k]), float(tests.high[k]), bool(tests.is_decided[k])
@@ -142,9 +143,18 @@ def _intervals(
     return float(tests.low[k]), float(tests.high[k]), float(plain[0]), float(plain[1])
 
 
+def _has_no_error(comparison: PairComparison) -> bool:
+    """Return whether neither filter keeps track in any run, so that all their runs are equally bad."""
+    is_error = comparison.scale == "log ratio"
+    is_equal = bool(np.all(comparison.effects.identical))
+    return is_error and is_equal and max(comparison.pair.shares) == 0.0
+
+
 def _reason(comparison: PairComparison, question: Question) -> str:
     """State why a decision is missing or has another scale."""
     effects = comparison.effects
+    if _has_no_error(comparison):
+        return NO_ERROR
     if effects.identical:
         return "all runs agree"
     if question == "a" and effects.too_few:

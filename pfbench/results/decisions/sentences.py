@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from pfbench.results.decisions.comparisons import TRACK
 from pfbench.results.decisions.decision import Decision
-from pfbench.results.decisions.family_records import ONE_WORLD, TRACK_NOT_KEPT
+from pfbench.results.decisions.family_records import NO_ERROR, ONE_WORLD, TRACK_NOT_KEPT
 from pfbench.results.decisions.filter_sets import FilterRanking
 from pfbench.results.decisions.sentence_formats import (
     format_count,
@@ -165,6 +165,8 @@ def _describe_trade_off(error: Decision) -> str:
 def _describe_too_few(error: Decision) -> str:
     if not error.reason:
         return f"{error.a} and {error.b} are not tested."
+    if error.reason == NO_ERROR:
+        return f"{error.a} and {error.b} are not compared: {error.reason}."
     least = 2.0 ** (1 - error.runs)
     ask = f"{error.a} and {error.b} are not tested: {error.reason}. The estimates are shown only."
     if error.runs and error.runs < min_pairs(0.05):

@@ -25,6 +25,7 @@ from pfbench.results.decisions.planned_pairs import (
     decide_secondary_metrics,
     decision_frame,
 )
+from pfbench.results.decisions.sentences import describe_pair
 from pfbench.results.decisions.simulated_studies import StudySetting, assess_pairs
 from pfbench.results.decisions.study_runs import select_pair, to_study_runs
 from pfbench.results.decisions.tidy_table import tidy_runs
@@ -180,6 +181,15 @@ def test_lost_track_decides():
     assert error.share_b == pytest.approx(0.4, abs=0.1)
     both = make_study({"A": 0.0, "B": 0.0}, lost={"A": 0.7, "B": 0.7}, runs=40)
     assert select(decide_planned_pairs(both, PAIR), "a")[0].word == "inconclusive"
+
+
+def test_filters_that_never_keep_track_are_not_called_identical():
+    table = make_study({"A": 0.0, "B": 0.3}, lost={"A": 1.0, "B": 1.0}, runs=40)
+    decisions = decide_planned_pairs(table, PAIR)
+    (error,), (track,) = select(decisions, "a"), select(decisions, "a", "keeps track")
+    assert (error.word, error.reason) == ("not tested", "no run of either filter keeps track")
+    assert track.word == "identical"
+    assert "A and B are not compared: no run of either" in describe_pair(track, error)
 
 
 def test_trade_off():
