@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -102,7 +103,9 @@ def find_looks(
         block = read_paper_block("filter", method) or _own_block(label, blocks or {})
         name = str(block.get("name", method))
         look = _parse_look(label, block)
-        looks[label] = replace(look, name=f"{name} [{setting}") if setting else look
+        looks[label] = (
+            replace(look, name=f"{name} [{_format_settings(setting)}]") if setting else look
+        )
     return _separate_markers(looks)
 
 
@@ -182,6 +185,18 @@ def _parse_look(label: str, block: Mapping[str, Any]) -> MethodLook:
         baselines=tuple(map(str, block.get("baselines", ()))),
         tuning=str(block.get("tuning", "")),
     )
+
+
+def _format_settings(text: str) -> str:
+    """Write the settings of a label such as "a.max_ratio=1000.0,b=2]" in words: "max ratio = 1000, b = 2"."""
+    parts = []
+    for item in text.removesuffix("]").split(","):
+        key, equals, value = item.partition("=")
+        with suppress(ValueError):  # a text is not a number
+            value = f"{float(value):g}"
+        name = key.rpartition(".")[2].replace("_", " ")
+        parts.append(f"{name} = {value}" if equals else item)
+    return ", ".join(parts)
 
 
 def _stored_block(meta: Mapping[str, Any], group: str) -> Mapping[str, Any]:

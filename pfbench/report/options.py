@@ -27,6 +27,7 @@ class ReportOptions:
         planned: Number of jobs of the experiment, if known.
         metric: Metric of the main group that decides, one of `main_metrics.MAIN_METRICS`. The others are
             in the second family.
+        title: Title of the page; empty for the name of the study.
 
     Raises:
         ValueError: If a value is out of range.
@@ -41,6 +42,7 @@ class ReportOptions:
     paper_figures: tuple[str, ...] | None = None
     planned: int | None = None
     metric: str = "rmse"
+    title: str = ""
 
     def __post_init__(self) -> None:
         check_main_metric(self.metric)

@@ -169,6 +169,36 @@ def test_sentences_of_small_studies(runs: int, labels: list[str], is_lost: bool)
         assert text.startswith("[[MCMC-RPF]] has the smallest position error in Flight: 2")
 
 
+def sentence(data: pd.DataFrame, baseline: str) -> str:
+    rows = list(board(data, baseline).values())
+    return describe_view(rows, find_looks(data["filter"].unique()), baseline, "in Flight", "error")
+
+
+def test_sentence_where_the_baseline_is_the_best_states_the_distance_of_the_next() -> None:
+    data = table()
+    assert data["filter"].nunique() == 3
+    size = 100 * (math.exp(trimmed_level(data, "sir") - trimmed_level(data, "mcmc_rpf")) - 1)
+    text = sentence(data, "mcmc_rpf")
+    assert (
+        f"[[MCMC-RPF]] has the smallest error in Flight. The next, [[SIR]], is {size:.0f} % above it (95"
+        in text
+    )
+
+
+def test_results_that_differ_by_rounding_are_identical_in_words() -> None:
+    data = table({"sir": 0.0})
+    noise = 1e-9 * np.random.default_rng(3).normal(size=len(data))
+    twin = data.assign(filter="ukf", rmse=data["rmse"] * (1 + noise))
+    assert sorted(row.words for row in board(pd.concat([data, twin])).values()) == [
+        "identical",
+        "smallest",
+    ]
+    text = sentence(pd.concat([data, twin]), "sir")
+    assert text.endswith("have the smallest error in Flight (identical results).")
+    apart = data.assign(filter="ukf", rmse=data["rmse"] * (1 + 1e6 * noise))
+    assert "identical" not in sentence(pd.concat([data, apart]), "sir")
+
+
 def test_files_hold_what_the_board_shows(tmp_path: Path) -> None:
     data = table()
     rows = [{"filter": k, "ratio": row.ratio} for k, row in board(data).items()]

@@ -150,7 +150,7 @@ def test_settings_of_one_method_share_its_colour_and_differ_in_marker() -> None:
     first, second = find_looks(labels).values()
     assert first.colour == second.colour == LOOKS["sir"].colour
     assert first.marker != second.marker
-    assert first.name == "SIR [particles=100]"
+    assert first.name == "SIR [particles = 100]"
 
 
 def test_one_method_has_one_look_in_every_figure() -> None:

@@ -63,7 +63,7 @@ def build_pack(
     model = " model={model}" if any(cell["model"] for cell in cells) else ""
     pack = {
         "study": study,
-        "title": study,
+        "title": options.title or study,
         "generated": describe_versions(conditions),
         "alpha": options.alpha,
         "filters": [filter_entry(looks[row["filter"]]) for row in first],

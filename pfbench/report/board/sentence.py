@@ -121,7 +121,7 @@ def _describe_best(
     if twins:
         head += " (identical results)"
     if baseline in (best.filter, *(row.filter for row in twins)):
-        return f"{head}. It is the baseline."
+        return f"{head}. {_describe_next(ranked, looks, level)}".rstrip()
     if math.isnan(best.ratio):
         state = "tracks not kept" if base.verdict == NOT_KEPT else "missing runs"
         return f"{head}. The baseline {_name(base, looks)} has no error because of {state}."
@@ -130,13 +130,34 @@ def _describe_best(
         return f"{head}, {size}, without an interval from so few runs."
     ends = [100 * (1 - end) for end in (best.ratio_high, best.ratio_low)]
     interval = f"{level} interval {ends[0]:.3g} to {ends[1]:.3g} %"
-    cost = f"at {best.ms / base.ms:.2g} times its cost" if base.ms > 0 else ""
+    cost = _describe_cost(best.ms, base.ms)
     if best.ratio_high >= 1 > best.ratio_low or best.ratio == 1:
         return (
             f"No difference to {_name(base, looks)} is decided: the interval of the best filter contains 0. "
-            f"{head}, {size} ({interval}), {cost}."
+            f"{head}, {size} ({interval}){cost}."
         )
-    return f"{head}: {size} ({interval}), {cost}."
+    return f"{head}: {size} ({interval}){cost}."
+
+
+def _describe_next(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook], level: str) -> str:
+    """State the distance of the second filter where the best one is the baseline."""
+    others = [row for row in ranked[1:] if row.words != IDENTICAL]
+    if not others:
+        return "No other filter has an error to compare." if len(ranked) == 1 else ""
+    row = others[0]
+    size = f"The next, {_name(row, looks)}, is {percent(math.log(row.ratio))} % above it"
+    ends = [100 * (end - 1) for end in (row.ratio_low, row.ratio_high)]
+    if not all(map(math.isfinite, ends)):
+        return f"{size}, without an interval from so few runs."
+    return f"{size} ({level} interval {ends[0]:.3g} to {ends[1]:.3g} %)."
+
+
+def _describe_cost(ms: float, other_ms: float) -> str:
+    """Compare the time per step with that of the baseline."""
+    if not other_ms > 0:
+        return ""
+    factor = f"{ms / other_ms:.2g}"
+    return ", at the same cost" if factor == "1" else f", at {factor} times its cost"
 
 
 def _describe_proposed(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook]) -> str:
@@ -151,12 +172,13 @@ def _describe_proposed(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLoo
 
 def _describe_ties(ranked: Sequence[BoardRow]) -> str:
     """Count the filters that are not decided against the best."""
-    tied = sum(row.verdict in (OPEN, EQUAL) for row in ranked)
+    others = [row for row in ranked[1:] if row.words != IDENTICAL]
+    tied = sum(row.verdict in (OPEN, EQUAL) for row in others)
     if not tied:
         return ""
-    if len(ranked) == 2:
+    if len(others) == 1:
         return "The other filter is not shown to be worse."
-    if tied == len(ranked) - 1:
+    if tied == len(others):
         return "No other filter is shown to be worse."
     verb = "is" if tied == 1 else "are"
-    return f"{tied} of {len(ranked) - 1} others {verb} not shown to be worse."
+    return f"{tied} of {len(others)} others {verb} not shown to be worse."

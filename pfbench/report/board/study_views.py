@@ -151,13 +151,20 @@ def _assess_scope(
 
 def _describe_scope(conditions: pd.DataFrame, names: StudyNames) -> str:
     """Describe worlds and regimes in words."""
-    where = f"in {count_words(conditions['family'].nunique(), 'world')}"
+    where = f"in {_count_worlds(conditions)}"
     scenarios, regimes = conditions["scenario"].unique(), conditions["regime"].unique()
     if len(scenarios) == 1:
         where = f"in {names.worlds[scenarios[0]].name}"
     if len(regimes) == 1 and regimes[0] in names.regimes:
         where += f" with {names.regimes[regimes[0]].words}"
     return where
+
+
+def _count_worlds(conditions: pd.DataFrame) -> str:
+    """Count the scenarios, and the worlds where several scenarios share a trajectory."""
+    scenarios, worlds = conditions["scenario"].nunique(), conditions["family"].nunique()
+    text = count_words(scenarios, "scenario")
+    return text if scenarios == worlds else f"{text} of {count_words(worlds, 'world')}"
 
 
 def _small_print(runs: StudyArrays, options: ReportOptions, tuning: str) -> str:
@@ -167,7 +174,7 @@ def _small_print(runs: StudyArrays, options: ReportOptions, tuning: str) -> str:
     level = format_interval_level(options.alpha)
     return (
         f"{count_words(filters, 'filter')}, "
-        f"{count_words(runs.conditions['family'].nunique(), 'world')}, "
+        f"{_count_worlds(runs.conditions)}, "
         f"{count_words(runs.conditions['regime'].nunique(), 'noise regime')}, "
         f"{count_words(int(runs.present.sum(axis=2).max()), 'paired run')} per condition, "
         f"{count_words(len(seeds), 'seed')}. "

@@ -18,7 +18,7 @@ from pfbench.results.statistics.paired_effects import MIN_RUNS
 BEST, EQUAL, OPEN, WORSE, MISSING = "best", "equal", "open", "worse", "missing"
 NOT_KEPT = "not_kept"  # too few runs keep track for an error
 IDENTICAL = "identical"
-_SAME = 1e-6  # difference of levels of identical filters
+_SAME = 1e-6  # difference of levels of identical filters, and its standard error
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _decide(
     if i == best:
         return BEST, "smallest"
     estimate = levels.difference(i, best)
-    if abs(float(estimate.value)) <= _SAME and not estimate.standard_error:
+    if max(abs(float(estimate.value)), float(estimate.standard_error)) <= _SAME:
         return EQUAL, IDENTICAL
     runs = int(min(levels.runs[i], levels.runs[best]))
     if runs < MIN_RUNS:

@@ -40,7 +40,7 @@ function drawSwitches() {
     ([value, text]) =>
       `<option value="${esc(value)}"${state[axis] === value ? " selected" : ""}${known(axis, value) ? "" : " disabled"}>${esc(text)}</option>`;
   const items = (list, all) => [
-    ...(known(all, "all") && list.length > 1 ? [["all", all === "world" ? `All ${list.length} worlds` : "All"]] : []),
+    ...(known(all, "all") && list.length > 1 ? [["all", all === "world" ? `All ${list.length} scenarios` : "All"]] : []),
     ...list.map((item) => [item.key, item.name]),
   ];
   find("#metric").innerHTML = items(data.metrics).map(option("metric")).join("");
@@ -155,7 +155,7 @@ function drawBoard() {
         ? items[0].name
         : `all ${items.length} ${noun}s`;
   find("#caption").textContent =
-    `${metricOf().name}; ${scope("world", data.worlds, "world")}; ${scope("regime", data.regimes, "noise regime")}; ratio to ${looks[state.baseline].name}.`;
+    `${metricOf().name}; ${scope("world", data.worlds, "scenario")}; ${scope("regime", data.regimes, "noise regime")}; ratio to ${looks[state.baseline].name}.`;
   const columns = heads();
   find("#heads").innerHTML = columns
     .map((head) => {

@@ -74,7 +74,7 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
     names = {f["key"]: f for f in pack["filters"]}
     parts = (
         _name(pack["metrics"], metric),
-        _scope(pack["worlds"], world, "world"),
+        _scope(pack["worlds"], world, "scenario"),
         _scope(pack["regimes"], regime, "noise regime"),
         f"ratio to {names[baseline]['name']}",
     )

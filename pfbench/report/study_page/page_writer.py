@@ -28,7 +28,7 @@ _STATIC = (
 )  # not read by the script
 _COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
 _SECTIONS = (
-    ("planned", "planned", "Planned comparisons"), ("cells", "worlds", "Worlds"), ("curves", "time", "Over time"),
+    ("planned", "planned", "Planned comparisons"), ("cells", "worlds", "Scenarios"), ("curves", "time", "Over time"),
     ("calibration", "calibration", "Calibration"), ("runs", "runs", "Single runs"), ("sweeps", "sweeps", "Dose and response"),
     ("paper_figures", "figures", "Figures of the paper"), ("cells", "table", "Table"), ("methods_paragraph", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
 )  # fmt: skip
