@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pfbench.files.atomic_write import write_atomically
+from pfbench.files import write_atomically
 from pfbench.results.decisions import words
 from pfbench.results.decisions.family_tests import decide_family, stack_questions
 from pfbench.results.decisions.options import DecisionOptions

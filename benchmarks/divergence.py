@@ -23,16 +23,13 @@ from torch import Tensor
 
 from pfbench import job
 from pfbench.config.folders import conf_dir
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
-from pfbench.filter import Filter, GaussianFilter, ParticleFilter, TaylorLinearisation
-from pfbench.filter.loop import run_filter
+from pfbench.core import Episode, PhiloxStream
+from pfbench.filter import Filter, GaussianFilter, ParticleFilter, TaylorLinearisation, run_filter
+from pfbench.job import build_plan
 from pfbench.job.metadata import describe_state
-from pfbench.job.plan import build_plan
 from pfbench.job.raw_estimate import compute_dead_reckoning, compute_raw_estimate
-from pfbench.model.base import StateSpaceModel
-from pfbench.results.state_groups import main_component_group
-from pfbench.results.status import is_diverged
+from pfbench.model import StateSpaceModel
+from pfbench.results import is_diverged, main_component_group
 
 HERE = Path(__file__).parent
 STORE = HERE / "divergence.json"

@@ -30,16 +30,12 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record, map_inputs
-from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.core import PhiloxStream, Record, map_inputs
+from pfbench.filter import EssResampler, FilterResult, ParticleFilter, Systematic, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.run_batches import choose_run_batch
 from pfbench.kernels import compilation, process_memory
-from pfbench.model.base import StateSpaceModel
+from pfbench.model import StateSpaceModel
 
 HERE = Path(__file__).parent
 ENGINES = ("compiled", "kernels", "eager")

@@ -20,20 +20,15 @@ from worker import Filter, serve
 from workload import ins_model
 
 from pfbench import job
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.affine_map import affine_map
 from pfbench.core.normal import independent_normal, normal_batch
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.loop import run_filter
+from pfbench.filter import EssResampler, ParticleFilter, Systematic, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.run_batches import choose_run_batch
 from pfbench.kernels import compilation, process_memory
-from pfbench.model.base import StateSpaceModel
+from pfbench.model import StateSpaceModel, StochasticVolatility, UnivariateGrowth
 from pfbench.model.ins_gnss import LooseStep
-from pfbench.model.textbook import StochasticVolatility, UnivariateGrowth
 
 
 class Radar(StateSpaceModel):

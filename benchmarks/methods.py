@@ -23,13 +23,10 @@ from matplotlib.figure import Figure
 from race import cpu_name
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record, map_inputs
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.core import PhiloxStream, Record, map_inputs
+from pfbench.filter import GaussianFilter, ParticleFilter, run_filter
 from pfbench.kernels import compilation, process_memory
-from pfbench.noise.white import NominalNoise
+from pfbench.noise import NominalNoise
 
 HERE = Path(__file__).parent
 FIRST = "sir"

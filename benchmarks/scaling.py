@@ -25,16 +25,14 @@ import torch
 from matplotlib.figure import Figure
 from race import cpu_name
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
-from pfbench.filter.loop import Watch, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.core import Episode, PhiloxStream
+from pfbench.filter import ParticleFilter, Watch, run_filter
 from pfbench.filter.run_batches import choose_run_batch
-from pfbench.job.scoring import ScoreRecorder
+from pfbench.job import ScoreRecorder
 from pfbench.kernels import compilation, process_memory
-from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.model import LinearGaussian
+from pfbench.noise import NominalNoise
+from pfbench.scenario import ModelSimulation
 
 HERE = Path(__file__).parent
 USUAL = {"N": 1000, "D": 6, "R": 10, "T": 20}

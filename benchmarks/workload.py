@@ -15,9 +15,10 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
+from pfbench.core import PhiloxStream
 from pfbench.job import conf_dir
-from pfbench.model.ins_gnss import InsGnss, LooseStep
+from pfbench.model import InsGnss
+from pfbench.model.ins_gnss import LooseStep
 from pfbench.nav.strapdown import InsIntervals
 
 Array = np.ndarray

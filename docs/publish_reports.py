@@ -11,10 +11,15 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report.journal.headline import HEADLINE, render_headline
-from pfbench.report.stored_page import PAGE_DATA, read_page_data, write_page_data
-from pfbench.report.study_page import write_markdown
+from pfbench.files import RecordedFolder
+from pfbench.report import (
+    HEADLINE,
+    PAGE_DATA,
+    read_page_data,
+    render_headline,
+    write_markdown,
+    write_page_data,
+)
 
 REPORTS = Path(__file__).parents[1] / "reports"
 

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from pfbench.claims.claim_records import read_claims
+from pfbench.claims import read_claims
 
 TOP = Path(__file__).parents[1]
 README = TOP / "README.md"

@@ -20,7 +20,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pfbench.results.store import read_metadata
+from pfbench.results import read_metadata
 
 TOP = Path(__file__).parents[1]
 COSTS = TOP / "docs" / "study_costs.json"

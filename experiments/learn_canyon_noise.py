@@ -34,51 +34,41 @@ from torch import Tensor, nn
 from torch.distributions.transforms import SigmoidTransform
 from tqdm import tqdm
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.files.markdown import (
-    markdown_bullets,
-    markdown_head,
-    markdown_paragraph,
-    markdown_row,
-)
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job import instantiate
-from pfbench.job.resumable import ResumableResults
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.pseudorange_errors import (
-    CN0_REFERENCE,
+from pfbench.core import PhiloxStream, Record
+from pfbench.files import markdown_bullets, markdown_head, markdown_paragraph, markdown_row
+from pfbench.filter import ParticleFilter, run_filter
+from pfbench.job import ResumableResults, instantiate
+from pfbench.model import (
     LosNlosRangeError,
     NormalExponentialMixture,
     PseudorangeError,
+    StateSpaceModel,
+    UrbanGnss,
     UrbanInputs,
+    range_change,
 )
-from pfbench.model.pseudorange_errors import NormalRangeError as NormalRanges
-from pfbench.model.urban_gnss import UrbanGnss, range_change
-from pfbench.noise.white import NominalNoise
-from pfbench.ppl.parameter_posterior import WELL_MIXED, ParameterPosterior, plot_posterior
-from pfbench.ppl.parameterised_model import ParameterisedModel
-from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
-from pfbench.ppl.posterior_estimate import repeat_runs
-from pfbench.report.plots.figure_files import render_palette_png
-from pfbench.report.plots.plotting import (
-    COLUMN,
-    RC,
-    add_legend,
-    compute_jitter,
-    line_styles,
+from pfbench.model import NormalRangeError as NormalRanges
+from pfbench.noise import NominalNoise
+from pfbench.ppl import (
+    WELL_MIXED,
+    ParameterisedModel,
+    ParameterPosterior,
+    PmmhSettings,
+    plot_posterior,
+    pmmh,
+    repeat_runs,
 )
-from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
-from pfbench.scenario.recorded.log_tables import find_dataset
-from pfbench.scenario.recorded.urban_drive import UrbanDrive
-from pfbench.scenario.recorded.urban_error_fit import (
+from pfbench.report import COLUMN, RC, add_legend, compute_jitter, line_styles, render_palette_png
+from pfbench.results import holm, wilcoxon_signed_rank
+from pfbench.scenario import (
+    UrbanDrive,
     estimate_mixture,
     estimate_normal,
+    find_dataset,
     range_residuals,
+    read_drive,
 )
-from pfbench.scenario.recorded.urban_log import read_drive
-from pfbench.scenario.recorded.urban_log import select_stretch as cut
+from pfbench.scenario import select_stretch as cut
 
 STRETCHES = {"first": (0.0, 100.0), "second": (100.0, 283.0)}  # s
 PRIOR = {
@@ -117,7 +107,7 @@ class Learned(nn.Module):
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float64))
 
     def forward(self, mean: Tensor, u: UrbanInputs) -> Independent:
-        odds = self.odds + self.slope * (u.cn0 - CN0_REFERENCE)
+        odds = self.odds + self.slope * (u.cn0 - LosNlosRangeError.cn0_reference)
         return Independent(NormalExponentialMixture(mean, odds.unsqueeze(1), self.sd, self.tail), 1)
 
 

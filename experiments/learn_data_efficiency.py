@@ -33,34 +33,32 @@ from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
 from scipy.stats import t as student
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import PhiloxStream
+from pfbench.filter import (
+    BootstrapProposal,
     CubaturePoints,
+    DiagonalNormalHead,
+    EssResampler,
+    EvidenceLowerBound,
+    GaussianFilter,
+    GuidedNoiseProposal,
+    InferenceCompilation,
+    LearnedProposal,
+    Objective,
+    ParticleFilter,
+    Proposal,
     SigmaPointLinearisation,
+    Systematic,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.learned.networks import DiagonalNormalHead
-from pfbench.filter.learned.objectives import EvidenceLowerBound, InferenceCompilation, Objective
-from pfbench.filter.learned.proposal import LearnedProposal
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.job import instantiate
-from pfbench.learn.training_config import Training
-from pfbench.learn.training_data import draw_training_data
-from pfbench.learn.training_job import train
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.textbook import StochasticVolatility
-from pfbench.noise.white import NominalNoise
-from pfbench.report.plots.figure_files import render_palette_png
-from pfbench.report.plots.plotting import COLUMN, RC, add_legend, line_styles
-from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
-from pfbench.scenario.base import Scenario
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.learn import Training, draw_training_data, train
+from pfbench.model import StateSpaceModel, StochasticVolatility
+from pfbench.noise import NominalNoise
+from pfbench.report import COLUMN, RC, add_legend, line_styles, render_palette_png
+from pfbench.results import holm, wilcoxon_signed_rank
+from pfbench.scenario import ModelSimulation, Scenario
 
 MEASURES = {
     "ess": "ESS / N",

@@ -21,21 +21,30 @@ from typing import Any
 import torch
 from pyro.distributions import LogNormal
 
-from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import local_level
-from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
-from pfbench.ppl.marginal_likelihood import FilterLikelihood, GaussianHmmLikelihood
-from pfbench.ppl.nuts_svi import normal_guide, svi
-from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.parameterised_model import ParameterisedModel
-from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
-from pfbench.ppl.pyro_program import program
-from pfbench.ppl.sbc import SbcRanks, sbc_histograms, simulation_based_calibration
-from pfbench.report.plots.figure_files import render_palette_png
+from pfbench.core import Record
+from pfbench.filter import GaussianFilter, ParticleFilter, TaylorLinearisation
+from pfbench.model import (
+    PassiveLocation,
+    PlatformInputs,
+    StateSpaceModel,
+    compute_level_attitude,
+    local_level,
+)
+from pfbench.ppl import (
+    FilterLikelihood,
+    GaussianHmmLikelihood,
+    ParameterisedModel,
+    ParameterPosterior,
+    PmmhSettings,
+    SbcRanks,
+    normal_guide,
+    pmmh,
+    program,
+    sbc_histograms,
+    simulation_based_calibration,
+    svi,
+)
+from pfbench.report import render_palette_png
 
 WRONG = 1.5
 BINS = 10

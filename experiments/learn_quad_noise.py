@@ -30,32 +30,29 @@ from pyro.distributions import LogNormal, Normal
 from scipy.stats import bootstrap
 from tqdm import tqdm
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.files.markdown import (
-    markdown_bullets,
-    markdown_head,
-    markdown_paragraph,
-    markdown_row,
-)
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import PhiloxStream
+from pfbench.files import markdown_bullets, markdown_head, markdown_paragraph, markdown_row
+from pfbench.filter import (
     CubaturePoints,
+    GaussianFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.loop import run_filter
-from pfbench.job import instantiate
-from pfbench.job.resumable import ResumableResults
-from pfbench.model.strapdown.total import StrapdownTotal
-from pfbench.model.strapdown.tuning import StrapdownTuning
-from pfbench.noise.white import NominalNoise
-from pfbench.ppl.parameter_posterior import WELL_MIXED, ParameterPosterior, plot_posterior
-from pfbench.ppl.parameterised_model import ParameterisedModel
-from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
-from pfbench.report.plots.figure_files import render_palette_png
-from pfbench.report.plots.plotting import COLUMN, RC, add_legend, line_styles
-from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank
-from pfbench.scenario.recorded.drive import RecordedFlights
+from pfbench.job import ResumableResults, instantiate
+from pfbench.model import StrapdownTotal, StrapdownTuning
+from pfbench.noise import NominalNoise
+from pfbench.ppl import (
+    WELL_MIXED,
+    ParameterisedModel,
+    ParameterPosterior,
+    PmmhSettings,
+    plot_posterior,
+    pmmh,
+)
+from pfbench.report import COLUMN, RC, add_legend, line_styles, render_palette_png
+from pfbench.results import holm, wilcoxon_signed_rank
+from pfbench.scenario import RecordedFlights
 
 LEARNED_ON, TRIED_ON = (1, 2, 3, 4, 5), tuple(range(6, 21))
 # of the maker's chip in this class (MTi-1): 0.007 deg/s/sqrt(Hz), 120 ug/sqrt(Hz); of bias walks it says nothing

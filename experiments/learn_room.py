@@ -27,21 +27,22 @@ import torch
 from hydra import compose, initialize_config_module
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record, map_inputs
-from pfbench.filter.belief import ParticleBelief, normalise_log_weights
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import PhiloxStream, Record, map_inputs
+from pfbench.filter import (
+    BootstrapProposal,
     CubaturePoints,
+    GaussianFilter,
+    GuidedNoiseProposal,
+    ParticleBelief,
+    ParticleFilter,
+    Proposal,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    normalise_log_weights,
 )
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
 from pfbench.job import instantiate
-from pfbench.model.base import StateSpaceModel, StaticModel
-from pfbench.scenario.oracle_noise import RecordingRegime
+from pfbench.model import StateSpaceModel, StaticModel
+from pfbench.scenario import RecordingRegime
 
 SCENES = (
     "growth", "stochastic_volatility", "pendulum", "lorenz63", "linear_walk",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -13,6 +15,37 @@ try:
     __version__ = version("pfbench")
 except PackageNotFoundError:  # a checkout on the path that is not installed
     __version__ = "0.0.0"
+
+__all__ = [
+    "__version__",
+    "claims",
+    "core",
+    "files",
+    "filter",
+    "job",
+    "judge",
+    "learn",
+    "load",
+    "model",
+    "nav",
+    "noise",
+    "ppl",
+    "report",
+    "results",
+    "scenario",
+    "testing",
+]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Import a folder on first use, so that `import pfbench` stays fast."""
+    if name not in __all__:
+        raise AttributeError(f"pfbench does not define {name!r}. Choose a name of pfbench.__all__.")
+    return import_module(f"pfbench.{name}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
 
 
 def load(

@@ -1,4 +1,4 @@
-"""The structure of the package: floors, sizes, single definitions, doors and packaging, from the syntax trees."""
+"""The structure of the package: floors, sizes, single definitions and packaging, from the syntax trees."""
 
 from __future__ import annotations
 
@@ -224,13 +224,6 @@ def test_files_and_functions_are_short() -> None:
         if isinstance(node, ast.FunctionDef) and (n := statements(node)) > LONGEST_FUNCTION
     }
     assert functions == {}
-
-
-def test_the_doors_list_what_they_export() -> None:
-    for folder in ("nav", "model", "noise", "scenario", "filter", "job", "learn", "ppl", "testing"):
-        door = importlib.import_module(f"pfbench.{folder}")
-        assert sorted(door.__all__) == dir(door)
-        assert all(hasattr(door, name) for name in door.__all__)
 
 
 def test_the_command_line_imports_lazily() -> None:

@@ -18,6 +18,7 @@ __all__ = [
     "ResumableResults",
     "ScoreRecorder",
     "apply_global_settings",
+    "available_memory",
     "build_datasheet",
     "build_plan",
     "compose",
@@ -37,6 +38,7 @@ __all__ = [
 __getattr__, __dir__ = lazy_attributes(
     __name__,
     {
+        "system_memory": ("available_memory",),
         ".config.composition": (
             "JobConfig",
             "compose",

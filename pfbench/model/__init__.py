@@ -43,6 +43,7 @@ __all__ = [
     "linear_walk",
     "local_level",
     "normal_batch",
+    "range_change",
 ]
 
 __getattr__, __dir__ = lazy_attributes(
@@ -107,6 +108,7 @@ __getattr__, __dir__ = lazy_attributes(
             "Benes",
         ),
         "urban_gnss": (
+            "range_change",
             "UrbanTuning",
             "UrbanGnss",
         ),

@@ -17,7 +17,6 @@ from pfbench.core.normal import independent_normal
 from pfbench.core.parameter_checks import check_positive
 
 _LOG_ROOT_2PI = 0.5 * math.log(2.0 * math.pi)
-CN0_REFERENCE = 40.0  # dB-Hz; carrier-to-noise density at which `share` is defined
 
 
 class UrbanInputs(NamedTuple):
@@ -102,6 +101,7 @@ class LosNlosRangeError(PseudorangeError):
             finite.
     """
 
+    cn0_reference: ClassVar[float] = 40.0  # dB-Hz; where `share` is defined
     share: float
     sd: float
     tail: float
@@ -123,7 +123,7 @@ class LosNlosRangeError(PseudorangeError):
 
     @override
     def __call__(self, mean: Tensor, u: UrbanInputs) -> Distribution:
-        odds = math.log(self.share / (1.0 - self.share)) + self.slope * (u.cn0 - CN0_REFERENCE)
+        odds = math.log(self.share / (1.0 - self.share)) + self.slope * (u.cn0 - self.cn0_reference)
         distribution = NormalExponentialMixture(
             mean, odds.unsqueeze(1), mean.new_tensor(self.sd), mean.new_tensor(self.tail)
         )

@@ -4,6 +4,7 @@ from pfbench.core.lazy_import import lazy_attributes
 
 __all__ = [
     "BiasStep",
+    "ErrorDistribution",
     "ErrorReplay",
     "GaussMarkovNoise",
     "GlintNoise",
@@ -15,11 +16,16 @@ __all__ = [
     "OutlierNoise",
     "StudentTNoise",
     "VarianceSurge",
+    "make_normal",
 ]
 
 __getattr__, __dir__ = lazy_attributes(
     __name__,
     {
+        "distributions": (
+            "ErrorDistribution",
+            "make_normal",
+        ),
         "base": ("NoiseRegime",),
         "correlated": (
             "GaussMarkovNoise",

@@ -3,6 +3,7 @@
 from pfbench.core.lazy_import import lazy_attributes
 
 __all__ = [
+    "WELL_MIXED",
     "FilterLikelihood",
     "GaussianHmmLikelihood",
     "MarginalLikelihood",
@@ -42,6 +43,7 @@ __getattr__, __dir__ = lazy_attributes(
             "svi",
         ),
         "parameter_posterior": (
+            "WELL_MIXED",
             "ParameterPosterior",
             "plot_posterior",
         ),

@@ -16,7 +16,6 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from pfbench.model.pseudorange_errors import (
-    CN0_REFERENCE,
     LosNlosRangeError,
     NormalExponentialMixture,
     NormalRangeError,
@@ -176,7 +175,8 @@ def estimate_mixture(
     """
 
     def log_density(e: Tensor, p: Tensor) -> Tensor:
-        odds, sd, tail = p[0] + p[3] * (data.cn0 - CN0_REFERENCE), torch.exp(p[1]), torch.exp(p[2])
+        odds = p[0] + p[3] * (data.cn0 - LosNlosRangeError.cn0_reference)
+        sd, tail = torch.exp(p[1]), torch.exp(p[2])
         return NormalExponentialMixture(torch.zeros_like(e), odds, sd, tail).log_prob(e)
 
     p, clock = fit_clock(data, log_density, np.array([0.0, np.log(5.0), np.log(40.0), 0.0]), knot)
