@@ -26,7 +26,8 @@ from matplotlib.figure import Figure
 from race import cpu_name
 
 from pfbench.core import Episode, PhiloxStream
-from pfbench.filter import ParticleFilter, Watch, run_filter
+from pfbench.filter import ParticleFilter, run_filter
+from pfbench.filter.loop import Watch
 from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job import ScoreRecorder
 from pfbench.kernels import compilation, process_memory

@@ -57,7 +57,7 @@ __getattr__, __dir__ = lazy_attributes(
             "ExpectedSquaredJump",
         ),
         "learned.proposal": ("LearnedProposal",),
-        "loop": ("FilterResult", "Watch", "MultiStepFilter", "run_filter"),
+        "loop": ("FilterResult", "MultiStepFilter", "run_filter"),
         "marginal.rao_blackwellised": ("RaoBlackwellisedFilter",),
         "moves.flow_kernels": (
             "RandomWalk",
