@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from pfbench.cli.messages import suggest_similar
 from pfbench.config.composition import JobConfig, compose
 from pfbench.config.folders import experiments_dir
 from pfbench.config.named_sets import expand_filter_sets
@@ -32,6 +33,40 @@ def compose_study(words: Sequence[str]) -> JobConfig:
 def given_keys(words: Sequence[str]) -> set[str]:
     """Return the keys of overrides."""
     return {word.lstrip("+~").partition("=")[0] for word in words}
+
+
+def split_words(
+    words: Sequence[str], keys: Sequence[str], required: Sequence[str], usage: str
+) -> dict[str, str]:
+    """Split words into values by key and check the keys.
+
+    Args:
+        words: Words `key=value`.
+        keys: Keys that the command has.
+        required: Keys that must be set.
+        usage: Command with its required words, such as `pfbench cost study=NAME`.
+
+    Returns:
+        Values by key.
+
+    Raises:
+        ValueError: If a word is not `key=value`, a key is unknown or repeated, or one is missing.
+    """
+    values: dict[str, str] = {}
+    advice = f"See {' '.join(usage.split()[:2])} --help."
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not value or key in values:
+            raise ValueError(f"words must be key=value, each key once, got {word}. {advice}")
+        if key not in keys:
+            raise ValueError(
+                f"key must be one of {', '.join(keys)}, got {key}.{suggest_similar(key, keys)} {advice}"
+            )
+        values[key] = value
+    for key in required:
+        if key not in values:
+            raise ValueError(f"{key} must be set. Use: {usage}")
+    return values
 
 
 def count_planned_jobs(study: str) -> int | None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pfbench.cli.messages import suggest_similar
+from pfbench.cli.compose import split_words
 from pfbench.cli.report import check_study_exists
 from pfbench.config.composition import compose
 from pfbench.config.protected_keys import FOLDER_KEYS
@@ -42,7 +42,9 @@ def replay_run(words: Sequence[str]) -> None:
     Raises:
         ValueError: If a word is not valid, or no job or several jobs match.
     """
-    values = split_replay_words(words)
+    keys = (*_REQUIRED, *_CHOICES, *_FOLDERS, *_PLACES)
+    usage = "study=NAME run=NUMBER filter=NAME"
+    values = split_words(words, keys, _REQUIRED, f"pfbench replay {usage}")
     config = compose(
         [f"{key}={values[key]}" for key in ("study", *_FOLDERS, *_PLACES) if key in values]
     )
@@ -70,40 +72,6 @@ def replay_run(words: Sequence[str]) -> None:
         print(f"  {name:28} {_format(new):>12} {unit:8} stored {_format(old)}")
     for path in replay_files.write_replay(stored, result, config.values["reports_dir"]):
         print(f"{path.suffix[1:]}: {path.resolve()}")
-
-
-def split_replay_words(words: Sequence[str]) -> dict[str, str]:
-    """Split words into values by key and check the keys.
-
-    Args:
-        words: Words `key=value`.
-
-    Returns:
-        Values by key.
-
-    Raises:
-        ValueError: If a word is not `key=value`, a key is unknown or repeated, or one is missing.
-    """
-    keys = (*_REQUIRED, *_CHOICES, *_FOLDERS, *_PLACES)
-    values: dict[str, str] = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if not equals or not value or key in values:
-            raise ValueError(
-                f"words must be key=value, each key once, got {word}. See pfbench replay --help."
-            )
-        if key not in keys:
-            raise ValueError(
-                f"key must be one of {', '.join(keys)}, got {key}.{suggest_similar(key, keys)} "
-                "See pfbench replay --help."
-            )
-        values[key] = value
-    for key in _REQUIRED:
-        if key not in values:
-            raise ValueError(
-                f"{key} must be set. Use: pfbench replay study=NAME run=NUMBER filter=NAME"
-            )
-    return values
 
 
 def _run_number(text: str) -> int:

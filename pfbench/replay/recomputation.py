@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,9 @@ _ENGINES = ("kernels", "compiled")  # engines that a job may have used; the othe
 def replay_config(stored: StoredRun, changes: Mapping[str, Any]) -> JobConfig:
     """Return the configuration that computes one run of a stored job.
 
-    All settings that affect the numbers are those of the job. A number of particles that a budget chose is
-    set as such, so that nothing is measured again.
-
     Args:
         stored: Run.
-        changes: Values of top-level keys that replace the stored ones: folders, the folder of the data,
-            threads, device.
+        changes: See `stored_config`.
 
     Returns:
         The configuration.
@@ -34,18 +31,37 @@ def replay_config(stored: StoredRun, changes: Mapping[str, Any]) -> JobConfig:
         ValueError: If the result was not computed by a job, or names what is not trusted.
     """
     meta = stored.result.meta
+    one_run = {"first_run": stored.run, "runs": 1, "score_steps": int(meta["steps"])}
+    return stored_config(meta, stored.job.path, {**one_run, **changes})
+
+
+def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any]) -> JobConfig:
+    """Return the configuration of a stored job.
+
+    All settings that affect the numbers are those of the job. A number of particles that a budget chose is
+    set as such, so that nothing is measured again.
+
+    Args:
+        meta: Metadata of the job.
+        path: File of the job, for errors.
+        changes: Values of top-level keys that replace the stored ones: folders, the folder of the data,
+            threads, device.
+
+    Returns:
+        The configuration.
+
+    Raises:
+        ValueError: If the result was not computed by a job.
+    """
     parts = ("scenario", "noise", "filter", "model")
     values = copy.deepcopy(meta["config"])
     if not all(isinstance(values.get(name), Mapping) for name in parts):
         raise ValueError(
             f"study must have results of pfbench run, got results without {', '.join(parts)} in "
-            f"{stored.job.path}. Choose another study."
+            f"{path}. Choose another study."
         )
     values |= {
-        "first_run": stored.run,
-        "runs": 1,
         "pcrb": False,
-        "score_steps": int(meta["steps"]),
         "engine": meta["engine"] if meta.get("engine") in _ENGINES else "eager",
         "memory_limit_gib": None,
         "budget": store.SAME_N,

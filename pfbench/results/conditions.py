@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from pfbench.files.atomic_write import set_aside
 from pfbench.results import store
 from pfbench.results.joined_runs import find_consecutive_parts, join_metadata, read_joined
+from pfbench.results.step_times import STEP_TIME, add_step_times
 
 log = logging.getLogger("pfbench")
 
@@ -36,8 +37,10 @@ class JobFile(NamedTuple):
     parts: tuple[Path, ...] = ()
 
     def load(self) -> store.JobResult:
-        """Read the arrays and metadata of all runs."""
-        return read_joined(self.parts or (self.path,))
+        """Read the arrays of all runs, and the metadata with the times that were measured in turn."""
+        result = read_joined(self.parts or (self.path,))
+        times = {k: v for k, v in self.meta.items() if k == STEP_TIME}
+        return store.JobResult({**result.meta, **times}, result.data)
 
 
 class Condition(NamedTuple):
@@ -93,6 +96,7 @@ def load_conditions(
     groups = {group[0][0]: group for group in find_consecutive_parts(items)}
     items = [(path, join_metadata([meta for _, meta in group])) for path, group in groups.items()]
     items.sort(key=lambda item: (_condition_key(item[1]), *_job_order(item[1])))
+    items = add_step_times(items, Path(results) / study)
     conditions = []
     for key, group in groupby(items, key=lambda item: _condition_key(item[1])):
         members = list(group)

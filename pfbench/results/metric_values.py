@@ -21,6 +21,7 @@ from pfbench.results.error_measures import (
 )
 from pfbench.results.state_groups import ComponentGroup
 from pfbench.results.status import is_overconfident
+from pfbench.results.step_times import STEP_TIME
 
 _PARTICLE_COUNTS = ("ess", "ancestors", "unique")  # divided by the number of particles
 
@@ -241,5 +242,8 @@ def _log_score(result: store.JobResult, lost: Flags) -> Array:
 
 
 def compute_seconds_per_step(data: MetricInput) -> ByComponent:
-    """Return the time per step of the job, equal for all runs."""
-    return {"": np.full(data.lost.size, data.result.meta["seconds"]["per_step"])}
+    """Return the time per step of the job, equal for all runs; median and quartiles of its rounds if any."""
+    meta = data.result.meta
+    rounds = meta.get(STEP_TIME, {"median": meta["seconds"]["per_step"]})
+    names = {"": "median", "quartile_25": "low", "quartile_75": "high"}
+    return {k: np.full(data.lost.size, rounds[n]) for k, n in names.items() if n in rounds}

@@ -215,7 +215,8 @@ METRICS: tuple[Metric, ...] = (
     ),
     Metric("log_score", compute_log_score, "job", "", "higher", "Log evidence per step."),
     Metric(
-        "seconds_per_step", compute_seconds_per_step, "job", "s", "lower", "Time per step of all runs.",
+        "seconds_per_step", compute_seconds_per_step, "job", "s", "lower",
+        "Time per step of all runs: one timing of the job, or median and quartiles of `pfbench cost`.",
     ),
 )  # fmt: skip
 

@@ -1,0 +1,105 @@
+"""Command `pfbench cost`: time per step of the filters of a study, measured in turn."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pfbench.cli.compose import split_words
+from pfbench.cli.report import check_study_exists
+from pfbench.config.composition import compose
+from pfbench.config.protected_keys import FOLDER_KEYS
+
+HELP = """\
+pfbench cost study=NAME [rounds=7] [overwrite=true] [key=value ...]
+
+Measure the time per step of the filters of a study with results. All filters of a condition are built
+once and take turns over the first steps, after one run each that is not counted. The report then
+states medians with quartiles, and the ratio to the baseline with its interval. Without this command it has
+one timing per job. Finished conditions are skipped: repeat an interrupted command to resume.
+
+  pfbench cost study=quickstart
+  pfbench cost study=mine rounds=15
+
+  rounds=7                   at least 5
+  seconds=0.05               mean time of a filter in a round; at least 20 steps are taken
+  overwrite=true             measure finished conditions again
+  device=cpu threads=1       where to measure; by default as stored
+  results_dir=FOLDER         the file is RESULTS/STUDY/step_times.json
+
+See also: pfbench report study=NAME"""
+
+_PLACES = ("device", "threads")
+_KEYS = ("study", "rounds", "seconds", "overwrite", "results_dir", "episode_cache_dir", *_PLACES)
+
+
+def measure_cost(words: Sequence[str]) -> None:
+    """Measure the time per step of all filters of a study.
+
+    Args:
+        words: Words `key=value`.
+
+    Raises:
+        ValueError: If a word is not valid, or the study has no results.
+    """
+    values = split_words(words, _KEYS, ("study",), "pfbench cost study=NAME")
+    rounds, seconds = _read_numbers(values)
+    composed = [f"{key}={values[key]}" for key in _KEYS if key in values and key not in ("rounds", "seconds")]  # fmt: skip
+    config = compose(composed).values
+    study, results = config["study"], Path(config["results_dir"])
+    check_study_exists(study, results)
+    from pfbench.replay.step_timing import time_condition
+    from pfbench.results.conditions import load_conditions
+    from pfbench.results.step_times import (
+        measurement_key,
+        read_commit,
+        read_step_times,
+        write_step_times,
+    )
+
+    changes: dict[str, Any] = {
+        key: config[key]
+        for key in ("data", *FOLDER_KEYS, *_PLACES)
+        if key in values or key not in _PLACES
+    }
+    conditions = load_conditions(study, results, allow_mixed_versions=True)
+    keys = [
+        measurement_key([(job.path.stem, read_commit(job.meta)) for job in condition.jobs])
+        for condition in conditions
+    ]
+    measured = {} if config["overwrite"] else read_step_times(results / study)
+    measured = {key: entry for key, entry in measured.items() if key in keys}
+    start_time = time.perf_counter()
+    for number, (key, condition) in enumerate(zip(keys, conditions, strict=True), start=1):
+        state = "skipped "
+        if key not in measured:
+            measured[key] = time_condition(condition, changes, rounds, seconds)
+            write_step_times(results / study, measured)
+            state = "measured"
+        entry = measured[key]
+        size = f"{len(condition.jobs)} filters, {entry['steps']} steps, {rounds} rounds"
+        print(f"[{number}/{len(conditions)}] {state}  {condition.name}   {size}", flush=True)
+    elapsed = time.perf_counter() - start_time
+    print(f"cost: {len(conditions)} conditions in {elapsed:.0f} s.  Next: pfbench report study={study}")  # fmt: skip
+
+
+def _read_numbers(values: dict[str, str]) -> tuple[int, float]:
+    """Read the number of rounds and the time of a filter in a round, s."""
+    from pfbench.results.step_times import FEWEST_ROUNDS
+
+    text = values.get("rounds", "7")
+    if not text.isdecimal() or not FEWEST_ROUNDS <= int(text) <= 1000:
+        raise ValueError(
+            f"rounds must be a whole number from {FEWEST_ROUNDS} to 1000, got {text}. Set rounds=7."
+        )
+    try:
+        seconds = float(values.get("seconds", "0.05"))
+    except ValueError:
+        seconds = 0.0
+    if not 0.001 <= seconds <= 3600:
+        raise ValueError(
+            f"seconds must be a time from 0.001 to 3600 s, got {values['seconds']}. Set seconds=0.05."
+        )
+    return int(text), seconds

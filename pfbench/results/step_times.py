@@ -1,0 +1,182 @@
+"""Time per step of the filters of a study, measured in turn: one file in the folder of its results.
+
+The time of a job depends on what ran beside it. Here all filters of a condition are timed in turn, in
+several rounds, so that a ratio of two filters is paired by round.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pfbench.files.atomic_write import write_atomically
+from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+from pfbench.results.error_measures import Array
+from pfbench.results.statistics.world_effects import EffectEstimate
+
+STEP_TIMES = "step_times.json"
+STEP_TIME = "step_time"  # of the metadata of a job
+FEWEST_ROUNDS = 5
+_FORMAT = 1
+_LARGEST = 50_000_000  # bytes
+Conditions = dict[str, dict[str, Any]]
+
+
+class StepTimes(NamedTuple):
+    """Time per step of one filter in one condition.
+
+    Attributes:
+        seconds: Time per step of all runs by round, [K] (s).
+        group: Key of the measurement of the condition. Filters of one group took turns.
+    """
+
+    seconds: Array
+    group: str
+
+    def to_metadata(self) -> dict[str, Any]:
+        """Return the values for the metadata of a job: median and quartiles (s), rounds, group."""
+        low, median, high = np.quantile(self.seconds, (0.25, 0.5, 0.75))
+        return {
+            "median": float(median),
+            "low": float(low),
+            "high": float(high),
+            "rounds": [float(value) for value in self.seconds],
+            "group": self.group,
+        }
+
+
+def write_step_times(folder: Path, conditions: Mapping[str, Mapping[str, Any]]) -> Path:
+    """Write the measurements of a study.
+
+    Args:
+        folder: Folder of the results of the study.
+        conditions: Measurements by key of the condition, see `measurement_key`.
+
+    Returns:
+        Path of the file.
+    """
+    # as it is read back: versions are texts of a class of their own
+    content = json.loads(json.dumps({"format": _FORMAT, "conditions": dict(conditions)}))
+    content[DIGEST] = hash_content(content)
+    text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n"
+    write_atomically(folder / STEP_TIMES, lambda file: file.write(text.encode()))
+    return folder / STEP_TIMES
+
+
+def read_step_times(folder: Path) -> Conditions:
+    """Read the measurements of a study by key of the condition; empty without a file.
+
+    Args:
+        folder: Folder of the results of the study.
+
+    Raises:
+        ValueError: If the file is damaged.
+    """
+    path = folder / STEP_TIMES
+    if not path.exists():
+        return {}
+    try:
+        if not path.is_file() or path.stat().st_size > _LARGEST:
+            raise ValueError("another kind of file, or a very large one")
+        content = json.loads(path.read_bytes())
+        if not isinstance(content, dict) or not has_valid_digest(content):
+            raise ValueError("another digest")
+        if content["format"] != _FORMAT:
+            raise ValueError(f"format {content['format']}")
+        conditions: Conditions = content["conditions"]
+        for condition in conditions.values():
+            _check_condition(condition)
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(
+            f"{path} must be the times of a study with a valid digest, got {error}. Delete it and run: "
+            f"pfbench cost study={folder.name}"
+        ) from error
+    return conditions
+
+
+def measurement_key(jobs: Sequence[tuple[str, str]]) -> str:
+    """Return the key of the measurement of a condition: it changes with its jobs and their version.
+
+    Args:
+        jobs: Key and commit of each job.
+    """
+    return hash_content(sorted(jobs))[:16]
+
+
+def read_commit(meta: Mapping[str, Any]) -> str:
+    """Return the commit of a job, empty if it is not known.
+
+    Args:
+        meta: Metadata of the job.
+    """
+    return str(meta.get("versions", {}).get("commit", ""))
+
+
+def select_job_times(conditions: Conditions) -> dict[tuple[str, str], StepTimes]:
+    """Return the times of each job by its key and its commit.
+
+    Args:
+        conditions: Measurements of `read_step_times`.
+    """
+    return {
+        (key, job["commit"]): StepTimes(np.array(job[entry["clock"]]), group)
+        for group, entry in conditions.items()
+        for key, job in entry["jobs"].items()
+    }
+
+
+def add_step_times(
+    items: Sequence[tuple[Path, dict[str, Any]]], folder: Path
+) -> list[tuple[Path, dict[str, Any]]]:
+    """Add the times of `pfbench cost` to the metadata of the jobs that were measured.
+
+    Args:
+        items: Files and metadata of jobs.
+        folder: Folder of the results of the study.
+
+    Raises:
+        ValueError: If the file of the times is damaged.
+    """
+    times = select_job_times(read_step_times(folder))
+    measured_times = [times.get((str(meta["key"]), read_commit(meta))) for _, meta in items]
+    return [
+        (path, meta if job_times is None else {**meta, STEP_TIME: job_times.to_metadata()})
+        for (path, meta), job_times in zip(items, measured_times, strict=True)
+    ]
+
+
+def estimate_cost_ratio(pairs: Sequence[tuple[Array, Array]]) -> EffectEstimate:
+    """Estimate the mean log ratio of the times of two filters over conditions, paired by round.
+
+    Args:
+        pairs: Times of both filters in each condition, [K] each.
+
+    Returns:
+        Estimate with the degrees of freedom of Welch and Satterthwaite.
+    """
+    ratios = [np.log(first / second) for first, second in pairs]
+    value = float(np.mean([ratio.mean() for ratio in ratios]))
+    variance = np.array([ratio.var(ddof=1) / ratio.size for ratio in ratios])
+    rounds = np.array([ratio.size for ratio in ratios])
+    total = float(variance.sum())
+    # equal ratios in all rounds: of a filter with itself
+    df = total**2 / (variance**2 / (rounds - 1)).sum() if total else float(rounds.min() - 1)
+    error = math.sqrt(total) / len(ratios)
+    return EffectEstimate(np.asarray(value), np.asarray(error), np.asarray(df))
+
+
+def _check_condition(condition: Mapping[str, Any]) -> None:
+    """Raise ValueError if a measurement lacks positive times of enough rounds."""
+    if condition["clock"] not in ("cpu", "wall"):
+        raise ValueError(f"clock {condition['clock']}")
+    rounds = {len(job[clock]) for job in condition["jobs"].values() for clock in ("cpu", "wall")}
+    if len(rounds) != 1 or min(rounds) < FEWEST_ROUNDS:
+        raise ValueError(f"{sorted(rounds)} rounds")
+    times = [t for job in condition["jobs"].values() for t in job[condition["clock"]]]
+    if not all(type(t) is float and math.isfinite(t) and t > 0 for t in times):
+        raise ValueError("times that are not positive numbers")
