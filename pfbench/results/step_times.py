@@ -38,6 +38,16 @@ class StepTimes(NamedTuple):
     seconds: Array
     group: str
 
+    @classmethod
+    def from_metadata(cls, meta: Mapping[str, Any]) -> StepTimes | None:
+        """Return the times in the metadata of a job, None if it was not measured in rounds.
+
+        Args:
+            meta: Metadata of the job.
+        """
+        times = meta.get(STEP_TIME)
+        return None if times is None else cls(np.array(times["rounds"]), times["group"])
+
     def to_metadata(self) -> dict[str, Any]:
         """Return the values for the metadata of a job: median and quartiles (s), rounds, group."""
         low, median, high = np.quantile(self.seconds, (0.25, 0.5, 0.75))
@@ -168,6 +178,38 @@ def estimate_cost_ratio(pairs: Sequence[tuple[Array, Array]]) -> EffectEstimate:
     df = total**2 / (variance**2 / (rounds - 1)).sum() if total else float(rounds.min() - 1)
     error = math.sqrt(total) / len(ratios)
     return EffectEstimate(np.asarray(value), np.asarray(error), np.asarray(df))
+
+
+def describe_costs(
+    times: Sequence[Mapping[str, StepTimes]], label: str, baseline: str, alpha: float
+) -> dict[str, float]:
+    """Describe the cost of a filter in some conditions: times in ms, and their ratio to a baseline.
+
+    Args:
+        times: Times by label in each condition.
+        label: Label of the filter.
+        baseline: Label of the baseline.
+        alpha: Probability outside the interval of the ratio.
+
+    Returns:
+        Median and quartiles of the rounds (`ms`, `ms_low`, `ms_high`), averaged over conditions on the logarithmic scale,
+        and the ratio (`cost`, `cost_low`, `cost_high`). Empty if a condition has no times of the
+        filter, without a ratio if it has none of the baseline from the same rounds.
+    """
+    if not times or not all(label in by_label for by_label in times):
+        return {}
+    quartiles = [np.quantile(by_label[label].seconds, (0.25, 0.5, 0.75)) for by_label in times]
+    low, middle, high = 1e3 * np.exp(np.mean(np.log(quartiles), axis=0))
+    costs = {"ms": float(middle), "ms_low": float(low), "ms_high": float(high)}
+    pairs = [(by_label[label], by_label.get(baseline)) for by_label in times]
+    same = [(a.seconds, b.seconds) for a, b in pairs if b is not None and a.group == b.group]
+    if len(same) < len(times):
+        return costs
+    estimate = estimate_cost_ratio(same)
+    with np.errstate(over="ignore"):
+        ends = [float(np.exp(end)) for end in estimate.interval(alpha)]
+    names = ("cost", "cost_low", "cost_high")
+    return costs | dict(zip(names, (float(np.exp(estimate.value)), *ends), strict=True))
 
 
 def _check_condition(condition: Mapping[str, Any]) -> None:

@@ -56,7 +56,7 @@ def build_pack(
     planned = decide_planned(table, looks, options)
     most = _MOST_BASELINES if len(looks) * len(conditions) <= _MANY else _FEW_BASELINES
     names = StudyNames(looks, worlds, regimes, _select_baselines(looks)[:most])
-    views = build_views(table, names, options, planned_words(planned))
+    views = build_views(table, names, options, planned_words(planned), data.times)
     entries = planned_entries(planned, table, looks, worlds, options)
     first = next(iter(views.values()))["rows"]
     cells = cell_entries(table)

@@ -13,6 +13,7 @@ from pfbench.results.conditions import Condition
 from pfbench.results.frame import drop_before
 from pfbench.results.metric_values import MetricInput
 from pfbench.results.state_groups import ComponentGroup, main_component_group
+from pfbench.results.step_times import STEP_TIME
 
 # metrics of the main group that a board can show, each with the component of its value
 SHOWN_METRICS: Mapping[str, str] = {"rmse": "norm", "max_error": "norm", "crps": "mean"}
@@ -111,7 +112,7 @@ def job_rows(
         "unit": group.unit,
         "group": group.group,
         **dict(_metric_columns(result, group, lost, components)),
-        "ms": 1e3 * float(meta["seconds"]["per_step"]),
+        "ms": 1e3 * float(meta.get(STEP_TIME, {}).get("median", meta["seconds"]["per_step"])),
     }
     return pd.DataFrame(columns)
 

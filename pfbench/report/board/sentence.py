@@ -130,7 +130,7 @@ def _describe_best(
         return f"{head}, {size}, without an interval from so few runs."
     ends = [100 * (1 - end) for end in (best.ratio_high, best.ratio_low)]
     interval = f"{level} interval {ends[0]:.3g} to {ends[1]:.3g} %"
-    cost = _describe_cost(best.ms, base.ms)
+    cost = _describe_cost(best, base)
     if best.ratio_high >= 1 > best.ratio_low or best.ratio == 1:
         return (
             f"No difference to {_name(base, looks)} is decided: the interval of the best filter contains 0. "
@@ -152,11 +152,14 @@ def _describe_next(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook], 
     return f"{size} ({level} interval {ends[0]:.3g} to {ends[1]:.3g} %)."
 
 
-def _describe_cost(ms: float, other_ms: float) -> str:
-    """Compare the time per step with that of the baseline."""
-    if not other_ms > 0:
+def _describe_cost(row: BoardRow, base: BoardRow) -> str:
+    """Compare the time per step with that of the baseline, with its interval if it was measured in rounds."""
+    if not math.isnan(row.cost):
+        ends = f"interval {row.cost_low:.2f} to {row.cost_high:.2f}"
+        return f", at {row.cost:.2f} times its cost ({ends})"
+    if not base.ms > 0:
         return ""
-    factor = f"{ms / other_ms:.2g}"
+    factor = f"{row.ms / base.ms:.2g}"
     return ", at the same cost" if factor == "1" else f", at {factor} times its cost"
 
 

@@ -14,6 +14,7 @@ from pfbench.report.board.tracks import count_carried_runs, make_tracks
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import Condition
 from pfbench.results.frame import drop_before, to_long_rows
+from pfbench.results.step_times import StepTimes
 
 
 class StudyData(NamedTuple):
@@ -25,6 +26,7 @@ class StudyData(NamedTuple):
         curves: Quantiles of the error over time by condition.
         tracks: Single runs by condition.
         notes: Notes on the filters.
+        times: Times in rounds by label, of each condition; without filters that were not measured.
     """
 
     table: pd.DataFrame
@@ -32,6 +34,7 @@ class StudyData(NamedTuple):
     curves: dict[CellKey, dict[str, Any]]
     tracks: dict[CellKey, dict[str, Any]]
     notes: MethodNotes
+    times: dict[CellKey, dict[str, StepTimes]]
 
 
 def read_study(
@@ -48,7 +51,7 @@ def read_study(
         ValueError: If a job lacks values of the metric that decides.
     """
     rows, metrics, notes = [], [], MethodNotes()
-    data = StudyData(pd.DataFrame(), pd.DataFrame(), {}, {}, notes)
+    data = StudyData(pd.DataFrame(), pd.DataFrame(), {}, {}, notes, {})
     start, converged = options.start_time_s, options.convergence_threshold
     most = count_carried_runs(max(len(c.jobs) for c in conditions), len(conditions))
     for condition, regime in zip(conditions, name_regimes(conditions), strict=True):
@@ -63,6 +66,8 @@ def read_study(
             if has_metrics:
                 metrics.append(to_long_rows(condition, job, results[job.label], start, converged))
         key = condition.scenario, regime
+        times = {job.label: StepTimes.from_metadata(job.meta) for job in condition.jobs}
+        data.times[key] = {label: rounds for label, rounds in times.items() if rounds}
         data.curves[key] = make_curves(results, len(conditions))
         errors = pd.concat(parts).pivot_table("rmse", "filter", "run", dropna=False)
         if errors.shape == (len(results), len(parts[0])):  # all filters have the same runs

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pfbench.report.board.curves import ALL
+from pfbench.report.board.curves import ALL, CellKey
 from pfbench.report.board.levels import (
     StudyArrays,
     arrange_runs,
@@ -24,6 +24,7 @@ from pfbench.report.looks import MethodLook, PartName, describe_tuning
 from pfbench.report.options import ReportOptions
 from pfbench.results.error_measures import Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects
+from pfbench.results.step_times import StepTimes
 
 
 class ViewKey(NamedTuple):
@@ -63,6 +64,7 @@ def build_views(
     names: StudyNames,
     options: ReportOptions,
     words: Mapping[tuple[str, str], str],
+    times: Mapping[CellKey, Mapping[str, StepTimes]] | None = None,
 ) -> dict[ViewKey, dict[str, Any]]:
     """Build all views that have runs. The first one opens the page.
 
@@ -71,6 +73,7 @@ def build_views(
         names: Names of the parts.
         options: Options of the report.
         words: Words of planned pairs, which decide in the view of all conditions.
+        times: Times in rounds by label, of each scenario and regime; None without any.
     """
     runs = arrange_runs(table, tuple(names.looks))
     groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
@@ -82,6 +85,7 @@ def build_views(
             selected = runs.select(mask)
             of_scope = groups.loc[list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))]  # fmt: skip
             scope = _assess_scope(selected, levels, mask, of_scope, options)
+            scope = scope._replace(times=[(times or {}).get(key, {}) for key in of_scope.index])
             is_opening = (metric, world, regime) == (options.metric, ALL, ALL)
             view_options = ViewOptions(
                 options.alpha, options.equivalence_margin, words if is_opening else None
@@ -91,6 +95,7 @@ def build_views(
             if of_scope["group"].nunique() == 1:
                 name = f"{of_scope['group'].iloc[0]} {name}"
             small_print = _small_print(selected, options, describe_tuning(names.looks))
+            small_print = f"{small_print} {_describe_timing(scope, options)}"
             if not views:  # the page opens with a baseline that has an error
                 baselines = _order_baselines(scope, names.baselines)
             for baseline in baselines:
@@ -165,6 +170,20 @@ def _count_worlds(conditions: pd.DataFrame) -> str:
     scenarios, worlds = conditions["scenario"].nunique(), conditions["family"].nunique()
     text = count_words(scenarios, "scenario")
     return text if scenarios == worlds else f"{text} of {count_words(worlds, 'world')}"
+
+
+def _describe_timing(scope: Scope, options: ReportOptions) -> str:
+    """Describe how the times per step of a view were measured."""
+    measured = [scope.filters and set(scope.filters) <= set(times) for times in scope.times]
+    if not all(measured):
+        return "ms/step: one timing per job, which depends on what ran beside it."
+    rounds = sorted({t.seconds.size for times in scope.times for t in times.values()})
+    number = str(rounds[0]) if len(rounds) == 1 else f"{rounds[0]} to {rounds[-1]}"
+    level = format_interval_level(options.alpha)
+    return (
+        f"ms/step: median and quartiles of {number} rounds in which the filters took turns; "
+        f"ratio of the times paired by round, {level} interval."
+    )
 
 
 def _small_print(runs: StudyArrays, options: ReportOptions, tuning: str) -> str:

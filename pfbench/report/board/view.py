@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ from scipy.special import stdtrit
 from pfbench.report.board.levels import FilterLevels, StudyArrays
 from pfbench.results.error_measures import Array
 from pfbench.results.statistics.paired_effects import MIN_RUNS
+from pfbench.results.step_times import StepTimes, describe_costs
 
 BEST, EQUAL, OPEN, WORSE, MISSING = "best", "equal", "open", "worse", "missing"
 NOT_KEPT = "not_kept"  # too few runs keep track for an error
@@ -58,7 +59,12 @@ class BoardRow:
         coverage: Coverage of 90 % intervals.
         nees: Mean NEES divided by its degrees of freedom.
         calibration: Coverage against its level: too low, consistent or too high.
-        ms: Time per step, ms.
+        ms: Time per step, ms: the median of rounds, or one timing per job.
+        ms_low: Lower quartile of the rounds.
+        ms_high: Upper quartile.
+        cost: Time per step divided by that of the baseline, paired by round.
+        cost_low: Lower end of its interval.
+        cost_high: Upper end.
     """
 
     filter: str
@@ -79,6 +85,11 @@ class BoardRow:
     nees: float
     calibration: str
     ms: float
+    ms_low: float = math.nan
+    ms_high: float = math.nan
+    cost: float = math.nan
+    cost_low: float = math.nan
+    cost_high: float = math.nan
 
 
 class Scope(NamedTuple):
@@ -90,6 +101,7 @@ class Scope(NamedTuple):
         descriptions: Track, lost runs, calibration and cost of each filter.
         unit: Unit of the error, empty for several conditions.
         is_single: Whether there is one condition.
+        times: Times of the filters in rounds, by label in each condition.
     """
 
     filters: tuple[str, ...]
@@ -97,6 +109,7 @@ class Scope(NamedTuple):
     descriptions: Mapping[str, Mapping[str, Any]]
     unit: str
     is_single: bool
+    times: Sequence[Mapping[str, StepTimes]] = ()
 
 
 def build_rows(scope: Scope, baseline: str, options: ViewOptions) -> list[BoardRow]:
@@ -125,7 +138,10 @@ def build_rows(scope: Scope, baseline: str, options: ViewOptions) -> list[BoardR
                 *_ratio(levels, i, base, options.alpha),
                 verdict,
                 words,
-                **scope.descriptions[filters[i]],
+                **{
+                    **scope.descriptions[filters[i]],
+                    **describe_costs(scope.times, filters[i], baseline, options.alpha),
+                },
             )
         )
     return rows

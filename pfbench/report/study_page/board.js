@@ -106,6 +106,11 @@ function ratioBars(rows) {
   };
 }
 
+// Quartiles of the rounds, where the filters were timed in turn.
+function quartiles(row) {
+  return row.ms_low > 0 ? interval(row.ms_low, row.ms_high) : "";
+}
+
 function details(row, span) {
   const look = looks[row.filter];
   const items = [
@@ -119,7 +124,15 @@ function details(row, span) {
     ["Lost runs", row.lost === null ? "–" : row.lost],
     ["Coverage of 90 % regions", percent(row.coverage)],
     ["NEES per degree of freedom", short(row.nees)],
-    ["ms per step", short(row.ms)],
+    ["ms per step", `${short(row.ms)} ${quartiles(row)}`],
+    ...(row.cost > 0
+      ? [
+          [
+            `ms per step ÷ ${looks[state.baseline].name}`,
+            `${short(row.cost)} ${interval(row.cost_low, row.cost_high)}`,
+          ],
+        ]
+      : []),
   ];
   if (cellsInView().length > 1) {
     for (const cell of cellsInView()) {
@@ -178,7 +191,7 @@ function drawBoard() {
         `<td class="number"><b>${short(row.ratio)}</b> <span class="interval faint">${interval(row.ratio_low, row.ratio_high)}</span></td>` +
         `<td class="desk scale">${drawBar(row)}</td><td class="${row.verdict}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
         `<td class="number">${percent(row.track)}</td><td class="desk">${percent(row.coverage)}${row.calibration ? ", " : ""}<span class="${row.calibration === "consistent" ? "faint" : "open"}">${esc(row.calibration || "")}</span></td>` +
-        `<td class="number desk">${short(row.ms)}</td></tr>${open ? details(row, columns.length) : ""}`
+        `<td class="number desk"${row.cost > 0 ? ` title="ratio ${short(row.cost)} ${interval(row.cost_low, row.cost_high)}"` : ""}>${short(row.ms)}${row.ms_low > 0 ? ` <span class="interval faint">${quartiles(row)}</span>` : ""}</td></tr>${open ? details(row, columns.length) : ""}`
       );
     })
     .join("");

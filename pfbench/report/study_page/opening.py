@@ -85,6 +85,7 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         "caption": f"{'; '.join(parts)}.",
         "heads": _heads(names[baseline]["name"]),
         "rows": [_row(row, names[row["filter"]]) for row in view["rows"]],
+        "has_costs": any(row.get("cost") is not None for row in view["rows"]),
     }
 
 
@@ -117,7 +118,9 @@ def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
         "words": f"{SIGNS[row['verdict']]} {row['words']}",
         "track": format_share(row["track"]),
         "calibration": ", ".join(filter(None, (format_share(row["coverage"]), calibration))),
-        "ms": format_short(row["ms"]),
+        "ms": f"{format_short(row['ms'])} {format_interval(row.get('ms_low'), row.get('ms_high'))}".rstrip(),
+        "cost": format_short(row.get("cost")),
+        "cost_interval": format_interval(row.get("cost_low"), row.get("cost_high")),
     }
 
 
