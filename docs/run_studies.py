@@ -89,6 +89,8 @@ def main(words: Sequence[str]) -> int:
         rest -= costs.get(study, 0.0)
         failed += [study] if code else []
         if code == 0:
+            words = [sys.executable, "-m", "pfbench", "cost", f"study={study}"]
+            code = subprocess.run(words, cwd=TOP, check=False).returncode
             costs[study] = round(measure_cost(study, results), 1)
             COSTS.write_text(json.dumps(dict(sorted(costs.items())), indent=1) + "\n")
         print(f"[{number}/{len(plan)}] {study}: exit code {code}, {time.monotonic() - start:.0f} s")

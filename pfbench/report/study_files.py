@@ -21,6 +21,7 @@ from pfbench.results.decisions.filter_sets import order_filters
 from pfbench.results.decisions.options import MetricRule
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs, decide_secondary_metrics
 from pfbench.results.state_groups import main_component_group
+from pfbench.results.step_times import STEP_TIMES
 from pfbench.results.study_decisions.common_conditions import select_common_runs
 from pfbench.results.study_decisions.consistency_bands import decide_consistency
 from pfbench.results.study_decisions.main_metrics import (
@@ -42,7 +43,7 @@ def write_study_files(
     options: ReportOptions,
     folder: RecordedFolder,
 ) -> list[dict[str, Any]]:
-    """Write decisions.json, consistency.json and metrics.csv.
+    """Write decisions.json, consistency.json, metrics.csv, and the times of `pfbench cost` if there are any.
 
     Args:
         table: Rows of `load_frame`.
@@ -69,6 +70,9 @@ def write_study_files(
             "metrics.csv", format_csv(summarise_metrics(table))
         ).name,
     }
+    times = conditions[0].jobs[0].path.parent / STEP_TIMES
+    if times.is_file():
+        files["Times per step by round (JSON)"] = folder.write(STEP_TIMES, times.read_bytes()).name
     return [
         {"name": title, "href": file, "bytes": (folder.path / file).stat().st_size, "group": "Numbers"}
         for title, file in files.items()

@@ -28,6 +28,7 @@ from pfbench.report.journal.table_layout import (
 from pfbench.report.journal.text_width import text_width
 
 _LEAST_P = 0.001
+_ROUNDS = "Times: medians of rounds in which the filters took turns; ratio to the baseline by round with its interval."
 
 
 def make_planned_table(pack: Pack) -> LatexTable | None:
@@ -71,15 +72,19 @@ def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
         particles: Number of particles by filter, as text; several numbers as a range.
     """
     rows = find_rows(pack)
+    has_rounds = any(is_number(row.get("cost")) for row in rows.values())
     columns = [
-        Column("l"), Column("r"),
-        number_column(_whole_digits(rows, "ms"), 2), number_column(3, 0), number_column(_whole_digits(rows, "lost"), 0),
-        number_column(3, 0),
+        Column("l"), Column("r"), number_column(_whole_digits(rows, "ms"), 2), *([Column("l")] * has_rounds),
+        number_column(3, 0), number_column(_whole_digits(rows, "lost"), 0), number_column(3, 0),
     ]  # fmt: skip
-    head = ["Method", "N", "ms/step", "track (%)", "lost", "coverage (%)"]
+    ratio = ["ratio"] if has_rounds else []
+    head = ["Method", "N", "ms/step", *ratio, "track (%)", "lost", "coverage (%)"]
     groups = [
         [
-            [text_cell(name_with_star(pack, key)), *_cost_cells(rows[key], particles.get(key, ""))]
+            [
+                text_cell(name_with_star(pack, key)),
+                *_cost_cells(rows[key], particles.get(key, ""), has_rounds),
+            ]
             for key in family
             if key in rows
         ]
@@ -88,12 +93,13 @@ def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
     runs = sum(int(cell["runs"]) for cell in pack["cells"])
     caption = (
         r"Cost and reliability over all conditions: particles \textit{N}, time per step of a batch of runs, share of runs "
-        rf"that keep track, lost runs of {runs}, coverage of 90\,\% regions. \textsuperscript{{*}}: proposed methods."
+        rf"that keep track, lost runs of {runs}, coverage of 90\,\% regions. \textsuperscript{{*}}: proposed methods. "
+        + (_ROUNDS if has_rounds else "Times: one timing per job.")
     )
     return LatexTable("cost", caption, columns, [[_head_cell(text) for text in head]], groups)
 
 
-def _cost_cells(row: Row, particles: str) -> list[LatexCell]:
+def _cost_cells(row: Row, particles: str, has_rounds: bool) -> list[LatexCell]:
     """Return the cells of a filter."""
     track, coverage = (
         f"{100 * row[name]:.0f}" if is_number(row[name]) else "--" for name in ("track", "coverage")
@@ -101,6 +107,9 @@ def _cost_cells(row: Row, particles: str) -> list[LatexCell]:
     cost = f"{row['ms']:.2f}" if is_number(row["ms"]) else "--"
     values = (cost, track, str(int(row["lost"] or 0)), coverage)
     cells = [LatexCell("{--}" if text == "--" else text, text_width(text, SIZE)) for text in values]
+    if has_rounds:
+        ends = f" [{_ratio(row['cost_low'])}, {_ratio(row['cost_high'])}]"
+        cells.insert(1, text_cell(_ratio(row["cost"]) + ends if is_number(row["cost"]) else "--"))
     return [text_cell(particles or "--"), *cells]
 
 
