@@ -50,6 +50,21 @@ def measure_cost(words: Sequence[str]) -> None:
     config = compose(composed).values
     study, results = config["study"], Path(config["results_dir"])
     check_study_exists(study, results)
+    changes: dict[str, Any] = {
+        key: config[key]
+        for key in ("data", *FOLDER_KEYS, *_PLACES)
+        if key in values or key not in _PLACES
+    }
+    start_time = time.perf_counter()
+    count = _time_study(results / study, changes, (rounds, seconds), config["overwrite"])
+    elapsed = time.perf_counter() - start_time
+    print(f"cost: {count} conditions in {elapsed:.0f} s.  Next: pfbench report study={study}")
+
+
+def _time_study(
+    folder: Path, changes: dict[str, Any], numbers: tuple[int, float], overwrite: bool
+) -> int:
+    """Time the conditions of a study that are not yet in its file, and return their number."""
     from pfbench.replay.step_timing import time_condition
     from pfbench.results.conditions import load_conditions
     from pfbench.results.step_times import (
@@ -59,30 +74,24 @@ def measure_cost(words: Sequence[str]) -> None:
         write_step_times,
     )
 
-    changes: dict[str, Any] = {
-        key: config[key]
-        for key in ("data", *FOLDER_KEYS, *_PLACES)
-        if key in values or key not in _PLACES
-    }
-    conditions = load_conditions(study, results, allow_mixed_versions=True)
+    rounds, seconds = numbers
+    conditions = load_conditions(folder.name, folder.parent, allow_mixed_versions=True)
     keys = [
         measurement_key([(job.path.stem, read_commit(job.meta)) for job in condition.jobs])
         for condition in conditions
     ]
-    measured = {} if config["overwrite"] else read_step_times(results / study)
+    measured = {} if overwrite else read_step_times(folder)
     measured = {key: entry for key, entry in measured.items() if key in keys}
-    start_time = time.perf_counter()
     for number, (key, condition) in enumerate(zip(keys, conditions, strict=True), start=1):
-        state = "skipped "
+        state = "skipped " if key in measured else "measured"
         if key not in measured:
             measured[key] = time_condition(condition, changes, rounds, seconds)
-            write_step_times(results / study, measured)
-            state = "measured"
-        entry = measured[key]
-        size = f"{len(condition.jobs)} filters, {entry['steps']} steps, {rounds} rounds"
+            write_step_times(folder, measured)
+        jobs, steps = measured[key]["jobs"], measured[key]["steps"]
+        used = len(next(iter(jobs.values()))["cpu"])
+        size = f"{len(jobs)} filters, {steps} steps, {used} rounds"
         print(f"[{number}/{len(conditions)}] {state}  {condition.name}   {size}", flush=True)
-    elapsed = time.perf_counter() - start_time
-    print(f"cost: {len(conditions)} conditions in {elapsed:.0f} s.  Next: pfbench report study={study}")  # fmt: skip
+    return len(conditions)
 
 
 def _read_numbers(values: dict[str, str]) -> tuple[int, float]:
