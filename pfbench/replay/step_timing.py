@@ -122,8 +122,8 @@ def time_condition(
 def _count_steps(jobs: Sequence[JobFile], seconds: float) -> int:
     """Return the number of steps that all filters together take in the time of a round."""
     per_step = sum(float(job.meta["seconds"]["per_step"]) for job in jobs) / len(jobs)
-    wanted = math.ceil(seconds / per_step) if per_step > 0 else _FEWEST_STEPS
-    return min(int(jobs[0].meta["steps"]), max(_FEWEST_STEPS, wanted))
+    target_steps = math.ceil(seconds / per_step) if per_step > 0 else _FEWEST_STEPS
+    return min(int(jobs[0].meta["steps"]), max(_FEWEST_STEPS, target_steps))
 
 
 def _build_tasks(
