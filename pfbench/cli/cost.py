@@ -42,7 +42,7 @@ def measure_cost(words: Sequence[str]) -> None:
         words: Words `key=value`.
 
     Raises:
-        ValueError: If a word is not valid, or the study has no results.
+        ValueError: If a word is not valid, or results of the study are missing.
     """
     values = split_words(words, _KEYS, ("study",), "pfbench cost study=NAME")
     rounds, seconds = _read_numbers(values)

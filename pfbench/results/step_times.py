@@ -1,6 +1,6 @@
 """Time per step of the filters of a study, measured in turn: one file in the folder of its results.
 
-The time of a job depends on what ran beside it. Here all filters of a condition are timed in turn, in
+Other programs change the time of a job. Here all filters of a condition are timed in turn, in
 several rounds, so that a ratio of two filters is paired by round.
 """
 
@@ -70,7 +70,7 @@ def write_step_times(folder: Path, conditions: Mapping[str, Mapping[str, Any]]) 
     Returns:
         Path of the file.
     """
-    # as it is read back: versions are texts of a class of their own
+    # in the types of JSON: the version of torch has a class of its own
     content = json.loads(json.dumps({"format": _FORMAT, "conditions": dict(conditions)}))
     content[DIGEST] = hash_content(content)
     text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n"
@@ -193,8 +193,8 @@ def describe_costs(
 
     Returns:
         Median and quartiles of the rounds (`ms`, `ms_low`, `ms_high`), averaged over conditions on the logarithmic scale,
-        and the ratio (`cost`, `cost_low`, `cost_high`). Empty if a condition has no times of the
-        filter, without a ratio if it has none of the baseline from the same rounds.
+        and the ratio (`cost`, `cost_low`, `cost_high`). Empty if times of the filter are
+        missing in a condition, without a ratio if those of the baseline are missing or of other rounds.
     """
     if not times or not all(label in by_label for by_label in times):
         return {}

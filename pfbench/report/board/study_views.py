@@ -176,7 +176,7 @@ def _describe_timing(scope: Scope, options: ReportOptions) -> str:
     """Describe how the times per step of a view were measured."""
     measured = [scope.filters and set(scope.filters) <= set(times) for times in scope.times]
     if not all(measured):
-        return "ms/step: one timing per job, which depends on what ran beside it."
+        return "ms/step: one timing per job, which other programs can change."
     rounds = sorted({t.seconds.size for times in scope.times for t in times.values()})
     number = str(rounds[0]) if len(rounds) == 1 else f"{rounds[0]} to {rounds[-1]}"
     level = format_interval_level(options.alpha)
