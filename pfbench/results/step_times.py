@@ -91,21 +91,19 @@ def read_step_times(folder: Path) -> Conditions:
     if not path.exists():
         return {}
     try:
-        if not path.is_file() or path.stat().st_size > _LARGEST:
-            raise ValueError("another kind of file, or a very large one")
-        content = json.loads(path.read_bytes())
-        if not isinstance(content, dict) or not has_valid_digest(content):
-            raise ValueError("another digest")
-        if content["format"] != _FORMAT:
-            raise ValueError(f"format {content['format']}")
-        conditions: Conditions = content["conditions"]
-        for condition in conditions.values():
-            _check_condition(condition)
-    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        is_note = path.is_file() and path.stat().st_size <= _LARGEST
+        content: Any = json.loads(path.read_bytes()) if is_note else None
+        fault = "" if isinstance(content, dict) else "no dictionary"
+        fault = fault or ("" if has_valid_digest(content) else "another digest")
+        fault = fault or _find_fault(content)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        fault = f"{type(error).__name__}: {error}"
+    if fault:
         raise ValueError(
-            f"{path} must be the times of a study with a valid digest, got {error}. Delete it and run: "
+            f"{path} must be the times of a study with a valid digest, got {fault}. Delete it and run: "
             f"pfbench cost study={folder.name}"
-        ) from error
+        )
+    conditions: Conditions = content["conditions"]
     return conditions
 
 
@@ -212,13 +210,19 @@ def describe_costs(
     return costs | dict(zip(names, (float(np.exp(estimate.value)), *ends), strict=True))
 
 
-def _check_condition(condition: Mapping[str, Any]) -> None:
-    """Raise ValueError if a measurement lacks positive times of enough rounds."""
-    if condition["clock"] not in ("cpu", "wall"):
-        raise ValueError(f"clock {condition['clock']}")
-    rounds = {len(job[clock]) for job in condition["jobs"].values() for clock in ("cpu", "wall")}
-    if len(rounds) != 1 or min(rounds) < FEWEST_ROUNDS:
-        raise ValueError(f"{sorted(rounds)} rounds")
-    times = [t for job in condition["jobs"].values() for t in job[condition["clock"]]]
-    if not all(type(t) is float and math.isfinite(t) and t > 0 for t in times):
-        raise ValueError("times that are not positive numbers")
+def _find_fault(content: Mapping[str, Any]) -> str:
+    """Describe the first fault of the content of a file: format, clock, rounds or times; empty without one."""
+    if content["format"] != _FORMAT:
+        return f"format {content['format']}"
+    for condition in content["conditions"].values():
+        clock = condition["clock"]
+        if clock not in ("cpu", "wall"):
+            return f"clock {clock}"
+        jobs = condition["jobs"].values()
+        rounds = {len(job[name]) for job in jobs for name in ("cpu", "wall")}
+        if len(rounds) != 1 or min(rounds) < FEWEST_ROUNDS:
+            return f"{sorted(rounds)} rounds"
+        times = [t for job in jobs for t in job[clock]]
+        if not all(type(t) is float and math.isfinite(t) and t > 0 for t in times):
+            return "times that are not positive numbers"
+    return ""
