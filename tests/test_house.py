@@ -190,15 +190,36 @@ def test_nothing_loose_at_the_top_and_folders_are_small() -> None:
     ] == []
 
 
+# what every command defines, and the logger of a module
+OF_EACH_MODULE = {"main", "HELP", "log"}
+
+
+def defined_names(tree: ast.Module) -> Iterator[str]:
+    """Yield the public names that a module defines: classes, functions, constants and types."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            names = [node.name]
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            parts = [part for target in targets for part in ast.walk(target)]
+            names = [part.id for part in parts if isinstance(part, ast.Name)]
+        else:
+            names = []
+        yield from (name for name in names if not name.startswith("_"))
+
+
 def test_a_public_name_is_defined_once() -> None:
-    homes = defaultdict(list)
+    homes = defaultdict(set)
     for file in FILES:
-        for node in tree_of(file).body:
-            if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
-                homes[node.name].append(module_name(file))
+        for name in defined_names(tree_of(file)):
+            homes[name].add(module_name(file))
     assert {
-        name: modules for name, modules in homes.items() if len(modules) > 1 and name != "main"
+        name: modules
+        for name, modules in homes.items()
+        if len(modules) > 1 and name not in OF_EACH_MODULE
     } == {}
+    source = "A, B = 1, 2\nC: int = 3\ndef f(): ...\nclass D: ...\n_E = 4"
+    assert list(defined_names(ast.parse(source))) == ["A", "B", "C", "f", "D"]
 
 
 def statements(function: ast.FunctionDef) -> int:

@@ -12,10 +12,10 @@ import numpy as np
 import yaml
 
 from pfbench.claims.schema import (
+    CLAIM_GROUPS,
     CLAIM_METRICS,
     FORMS,
     GROUPED,
-    GROUPS,
     MARKS,
     PAPERS,
     REASONS,
@@ -154,7 +154,7 @@ def _check_test(claim: str, test: ClaimTest, options: Mapping[str, Sequence[str]
     _check_option(claim, "is", test.statistic, STATISTICS)
     _check_option(claim, "metric", test.metric, CLAIM_METRICS)
     if test.metric in GROUPED:
-        _check_option(claim, "group", test.group, GROUPS)
+        _check_option(claim, "group", test.group, CLAIM_GROUPS)
     for need in STATISTICS[test.statistic].split():
         value = getattr(test, need)
         if not value or (not isinstance(value, str) and not np.isfinite(value)):

@@ -28,10 +28,11 @@ from pfbench.claims.claim_samples import (
     sample_claim_test,
 )
 from pfbench.claims.schema import LOST, NO_POWER, NOT_RUN, ClaimTest
+from pfbench.results.decisions.words import FAILS, HOLDS
 from pfbench.results.error_measures import Array
 from pfbench.results.statistics.intervals import order_statistic_interval
 
-HOLDS, FAILS, OPEN = "holds", "fails", "open"
+NOT_DECIDED = "open"
 _TIMING_FACTOR = 1.1  # between two timings
 
 
@@ -98,14 +99,14 @@ def run_claim_test(
     tables = [series.get((*side, test.measure)) for side in test.sides]
     rows = [table.set_index(["seed", "run"]).sort_index() for table in tables if table is not None]
     if len(rows) < len(tables):
-        return ClaimTestResult(test, OPEN, NOT_RUN)
+        return ClaimTestResult(test, NOT_DECIDED, NOT_RUN)
     columns = [table.value for table in rows]
     values = pd.concat(columns, axis=1, join="inner").dropna().to_numpy(dtype=np.float64)
     runs = min(len(table) for table in rows)
     lost_a, lost_b, *_ = [int(table.lost.sum()) for table in rows] + [0]
     has_unit = (len(rows) == 1 or test.statistic == "close") and runs
     unit = str(rows[0].unit.iloc[0]) if has_unit else ""
-    result = ClaimTestResult(test, OPEN, "", len(values), lost_a, lost_b, unit)
+    result = ClaimTestResult(test, NOT_DECIDED, "", len(values), lost_a, lost_b, unit)
     # An infinite value is an answer if the test asks whether it stays below a limit.
     counts_lost = test.metric in ("settled", "severely_overconfident")
     counts_lost |= test.statistic == "below"

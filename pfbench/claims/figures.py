@@ -10,13 +10,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pfbench.claims.claim_tests import FAILS, HOLDS, ClaimTestResult
+from pfbench.claims.claim_tests import ClaimTestResult
 from pfbench.claims.schema import Claim, ClaimTest
 from pfbench.claims.verdicts import ClaimVerdict
 from pfbench.report.plots.axis_ticks import set_plain_ticks
 from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.paper.paper_catalogue import FIGURES
 from pfbench.report.plots.plotting import COLUMN, SMALL, format_slug
+from pfbench.results.decisions.words import FAILS, HOLDS
 
 _COLOURS = {HOLDS: "#0072B2", FAILS: "#D55E00"}  # open results are grey
 

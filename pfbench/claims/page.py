@@ -22,7 +22,7 @@ from pfbench.claims.claim_tables import (
     jobs_table,
     list_commits,
 )
-from pfbench.claims.claim_tests import OPEN, ClaimTestResult
+from pfbench.claims.claim_tests import NOT_DECIDED, ClaimTestResult
 from pfbench.claims.measurements import claim_job_metadata, load_claim_measurements
 from pfbench.claims.schema import PAPERS, Claim, ClaimTest
 from pfbench.claims.stored_verdicts import check_stored_verdicts
@@ -30,7 +30,7 @@ from pfbench.claims.verdicts import VERDICTS, ClaimVerdict, decide_claims
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import table_formats, writers
 
-STUDY = "claims"  # folder of the page among the reports
+CLAIMS_STUDY = "claims"  # folder of the page among the reports
 
 
 def write_claims(
@@ -83,15 +83,15 @@ def write_claims(
         "n": len(verdicts),
     }
     records = [{**_to_json(v), "choices": choices.get(v.claim.id, [])} for v in verdicts]
-    check_stored_verdicts(Path(out) / STUDY / "verdicts.json", records)
+    check_stored_verdicts(Path(out) / CLAIMS_STUDY / "verdicts.json", records)
     text = json.dumps(records, indent=1, allow_nan=False)
-    with RecordedFolder(Path(out) / STUDY) as folder:
-        writers.write_table(folder, STUDY, claims_table(verdicts))
+    with RecordedFolder(Path(out) / CLAIMS_STUDY) as folder:
+        writers.write_table(folder, CLAIMS_STUDY, claims_table(verdicts))
         folder.write("verdicts.json", text + "\n")
         if len(context["made"]):
             writers.write_table(folder, "studies", context["made"])
         drawings = claims_figures.claim_figures(verdicts)
-        context["drawings"] = writers.render_figures(drawings, STUDY, folder, formats)
+        context["drawings"] = writers.render_figures(drawings, CLAIMS_STUDY, folder, formats)
         return writers.render_template("page", folder, context, Path(__file__).parent)
 
 
@@ -158,7 +158,7 @@ def format_result(result: ClaimTestResult) -> str:
 
 def format_required_runs(result: ClaimTestResult) -> str:
     """Format the runs required by a test with too few runs; empty for others."""
-    if result.outcome != OPEN or np.isnan(result.needed):
+    if result.outcome != NOT_DECIDED or np.isnan(result.needed):
         return ""
     if np.isinf(result.needed):
         return "no number of runs decides an effect of this size"

@@ -63,7 +63,7 @@ CLAIM_METRICS = tuple(dict.fromkeys((*_BY_SCOPE, *_ERROR_METRICS, *_RUN_METRICS)
 GROUPED = (*SCALED, *(m for m, s in _BY_SCOPE.items() if s == "group"))  # metrics of a group
 
 
-GROUPS = (
+CLAIM_GROUPS = (
     "attitude",
     "velocity",
     "position",

@@ -19,14 +19,13 @@ import numpy as np
 import pandas as pd
 
 from pfbench.claims.claim_tests import (
-    FAILS,
-    HOLDS,
-    OPEN,
+    NOT_DECIDED,
     ClaimTestResult,
     check_effect_size,
     run_claim_test,
 )
 from pfbench.claims.schema import Claim, ClaimTest
+from pfbench.results.decisions.words import FAILS, HOLDS
 from pfbench.results.statistics import power
 from pfbench.results.statistics.signed_rank import holm
 
@@ -164,12 +163,12 @@ def _decide(claim: Claim, results: Mapping[str, _Results]) -> ClaimVerdict:
         return ClaimVerdict(claim, UNDECIDED, *claim.reasons[""], results)
     deciding = {form: [r for r in rs if r.comparison.decides] for form, rs in results.items()}
     outcomes = {form: _combine(values) for form, values in deciding.items()}
-    outcomes |= {form: (OPEN, reason) for form, (reason, _) in claim.reasons.items()}
+    outcomes |= {form: (NOT_DECIDED, reason) for form, (reason, _) in claim.reasons.items()}
     outcomes |= {form: (outcome, "") for form, (outcome, _) in claim.evidence.items()}
     notes = _notes(claim, results, outcomes)
     tested = {form: outcome for form, outcome in outcomes.items() if form not in claim.reasons}
     holding = [form for form, (state, _) in tested.items() if state == HOLDS]
-    reasons = [reason for state, reason in tested.values() if state == OPEN]
+    reasons = [reason for state, reason in tested.values() if state == NOT_DECIDED]
     if reasons:
         note = "; ".join([*notes, *(f"as {form} it holds" for form in holding)])
         return ClaimVerdict(claim, UNDECIDED, reasons[0], note, results)
@@ -222,5 +221,5 @@ def _combine(results: Sequence[ClaimTestResult]) -> tuple[str, str]:
     reasons = [r.reason for r in results if r.outcome == FAILS]
     if reasons:
         return FAILS, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
-    reasons = [r.reason for r in results if r.outcome == OPEN]
-    return (OPEN, reasons[0]) if reasons else (HOLDS, "")
+    reasons = [r.reason for r in results if r.outcome == NOT_DECIDED]
+    return (NOT_DECIDED, reasons[0]) if reasons else (HOLDS, "")

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
+Array = NDArray[np.float64]  # of columns
 _CONTROL = frozenset(map(chr, range(32))) - {"\t"}
 
 

@@ -9,7 +9,11 @@ import numpy as np
 
 from pfbench.judge.judge_options import JudgeOptions
 from pfbench.judge.readers.local_frame import wrap_to_half_turn
-from pfbench.judge.readers.trajectory_table import ATTITUDE, VELOCITY, TrajectoryTable
+from pfbench.judge.readers.trajectory_table import (
+    ATTITUDE_COLUMNS,
+    VELOCITY_COLUMNS,
+    TrajectoryTable,
+)
 from pfbench.judge.reference_track import ReferenceTrack
 from pfbench.results.error_measures import Array
 
@@ -176,7 +180,7 @@ def column_errors(
     """
     truth = reference.interpolate_columns(names, table.time[rows])
     difference = table.select(names)[rows] - truth
-    return np.asarray(wrap_to_half_turn(difference) if names[0] in ATTITUDE else difference)
+    return np.asarray(wrap_to_half_turn(difference) if names[0] in ATTITUDE_COLUMNS else difference)
 
 
 def common_columns(
@@ -193,6 +197,6 @@ def common_columns(
     """
     everywhere = [set(table.values) for table in (*tables, reference.table)]
     shared = set.intersection(*everywhere)
-    groups = {"velocity": VELOCITY, "attitude": ATTITUDE}
+    groups = {"velocity": VELOCITY_COLUMNS, "attitude": ATTITUDE_COLUMNS}
     names = {group: tuple(n for n in columns if n in shared) for group, columns in groups.items()}
     return {group: columns for group, columns in names.items() if columns}

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from pfbench.judge.readers.trajectory_table import (
-    ATTITUDE,
+    ATTITUDE_COLUMNS,
     GEODETIC,
     LOCAL,
-    VELOCITY,
+    VELOCITY_COLUMNS,
     TrajectoryTable,
 )
 from pfbench.judge.reference_track import ReferenceTrack
@@ -156,8 +156,8 @@ def _common_columns(
     units = {
         **dict.fromkeys((*LOCAL, "h_m"), "m"),
         **dict.fromkeys(GEODETIC[:2], "deg"),
-        **dict.fromkeys(VELOCITY, "m/s"),
-        **dict.fromkeys(ATTITUDE, "rad"),
+        **dict.fromkeys(VELOCITY_COLUMNS, "m/s"),
+        **dict.fromkeys(ATTITUDE_COLUMNS, "rad"),
     }
     for column, unit in units.items():
         if column not in table.values:

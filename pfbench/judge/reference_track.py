@@ -11,10 +11,10 @@ from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.readers.local_frame import to_north_east_down, wrap_to_half_turn
 from pfbench.judge.readers.trajectory_files import read_trajectories
 from pfbench.judge.readers.trajectory_table import (
-    ATTITUDE,
+    ATTITUDE_COLUMNS,
     GEODETIC,
     LOCAL,
-    VELOCITY,
+    VELOCITY_COLUMNS,
     TrajectoryTable,
 )
 from pfbench.results.error_measures import Array
@@ -78,9 +78,9 @@ class ReferenceTrack:
         """
         clock, position = self.table.time, self.position
         linear = np.stack([np.interp(time, clock, p) for p in position.T], axis=-1)
-        if any(name not in self.table.values for name in VELOCITY):
+        if any(name not in self.table.values for name in VELOCITY_COLUMNS):
             return linear
-        velocity = self.table.select(VELOCITY)
+        velocity = self.table.select(VELOCITY_COLUMNS)
         k = np.clip(np.searchsorted(clock, time, side="right") - 1, 0, len(clock) - 2)
         step = (clock[k + 1] - clock[k])[:, None]
         s = (time - clock[k])[:, None] / step
@@ -97,10 +97,11 @@ class ReferenceTrack:
         """
         columns = [self.table.values[name] for name in names]
         columns = [
-            np.unwrap(c) if n in ATTITUDE else c for n, c in zip(names, columns, strict=True)
+            np.unwrap(c) if n in ATTITUDE_COLUMNS else c
+            for n, c in zip(names, columns, strict=True)
         ]
         values = np.stack([np.interp(time, self.table.time, c) for c in columns], axis=-1)
-        return np.asarray(wrap_to_half_turn(values) if names[0] in ATTITUDE else values)
+        return np.asarray(wrap_to_half_turn(values) if names[0] in ATTITUDE_COLUMNS else values)
 
     def is_bridged(self, time: Array) -> np.ndarray:
         """Return the times [K] that lie within the reference and in none of its long gaps."""

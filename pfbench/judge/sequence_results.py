@@ -22,10 +22,10 @@ from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.readers.trajectory_files import TrajectoryFile, read_trajectories
 from pfbench.judge.readers.trajectory_table import (
     ATTITUDE_SD,
-    COVARIANCE,
+    COVARIANCE_COLUMNS,
     LOCAL,
     POSITION_SD,
-    VELOCITY,
+    VELOCITY_COLUMNS,
     VELOCITY_SD,
     TrajectoryTable,
     covariance_matrices,
@@ -46,7 +46,9 @@ _UNITS = {"position": ("m", 1.0), "velocity": ("m/s", 1.0), "attitude": ("deg", 
 
 _NAMES = {
     **dict(zip(LOCAL, ("north", "east", "down"), strict=True)),
-    **dict(zip(VELOCITY, ("velocity north", "velocity east", "velocity down"), strict=True)),
+    **dict(
+        zip(VELOCITY_COLUMNS, ("velocity north", "velocity east", "velocity down"), strict=True)
+    ),
 }
 
 
@@ -195,8 +197,8 @@ def _score_run(
         if table.has(sd_names):
             sd = factor * table.select(sd_names)[rows]
         normalised = ((error / sd) ** 2).sum(axis=-1)
-        if group == "position" and table.has(COVARIANCE):
-            matrices = covariance_matrices(table.select(COVARIANCE)[rows])
+        if group == "position" and table.has(COVARIANCE_COLUMNS):
+            matrices = covariance_matrices(table.select(COVARIANCE_COLUMNS)[rows])
             sd = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1))
             solved = np.linalg.solve(matrices, error[..., None])[..., 0]
             normalised = (error * solved).sum(axis=-1)

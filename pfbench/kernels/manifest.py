@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-FOLDER = Path(__file__).parent
+KERNELS_FOLDER = Path(__file__).parent
 _ARGUMENT = re.compile(r"(\w+): (\w+)(?: \[(.*)\])?(?: (below|to) (?:(\d+) )?([A-Z]|1))?")
 _RESULT = re.compile(r"(real|float32|float64|int64|bool) \[(.*)\]")
 _TERM = re.compile(r"(?:(\d+) )?(\w+)")
@@ -115,7 +115,7 @@ def read_operators() -> dict[str, Operator]:
     Raises:
         ValueError: If an argument or a result is not written as the head of the file says.
     """
-    content = tomllib.loads((FOLDER / "operators.toml").read_text())
+    content = tomllib.loads((KERNELS_FOLDER / "operators.toml").read_text())
     return {
         name: Operator(
             name,

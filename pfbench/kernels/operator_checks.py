@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pfbench.kernels.manifest import Argument, read_operators
 
-F = TypeVar("F", bound=Callable[..., Any])
+_F = TypeVar("_F", bound=Callable[..., Any])
 LARGEST_SIZE = (1 << 30) - 1  # of an axis: counters of particles have 32 bits
 LARGEST_INTEGER = (1 << 32) - 1
 _KINDS = {
@@ -25,7 +25,7 @@ _KINDS = {
 }
 
 
-def check_first(kernel: F) -> F:
+def check_first(kernel: _F) -> _F:
     """Check the arguments before a kernel runs.
 
     Args:
@@ -41,7 +41,7 @@ def check_first(kernel: F) -> F:
         check_arguments(name, args)
         return kernel(*args)
 
-    return cast(F, call)
+    return cast(_F, call)
 
 
 def check_arguments(name: str, arguments: Sequence[Any], with_values: bool = True) -> None:

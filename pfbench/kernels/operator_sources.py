@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from pfbench.kernels.manifest import FOLDER, Argument, Operator, read_operators
+from pfbench.kernels.manifest import KERNELS_FOLDER, Argument, Operator, read_operators
 
 _HEAD = "// Written by `python -m pfbench.kernels.operator_sources` from operators.toml."
 _DECLARATIONS = """\
@@ -88,4 +88,4 @@ def _direct_call(operator: Operator) -> str:
 
 if __name__ == "__main__":
     for name, text in make_sources().items():
-        (FOLDER / "src" / name).write_text(text)
+        (KERNELS_FOLDER / "src" / name).write_text(text)

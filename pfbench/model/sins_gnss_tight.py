@@ -15,8 +15,8 @@ from pfbench.core.normal import independent_normal
 from pfbench.core.record import Record, map_inputs
 from pfbench.model.ins_errors import InsErrorModel, additive_transition
 from pfbench.model.tight_coupling import (
-    GROUPS,
     NAMES,
+    TIGHT_GROUPS,
     UNITS,
     check_ranging_inputs,
     compute_initial_sd,
@@ -82,7 +82,7 @@ class SinsGnssTight(InsErrorModel):
     """
 
     r: Tensor
-    names, units, groups = NAMES, UNITS, GROUPS
+    names, units, groups = NAMES, UNITS, TIGHT_GROUPS
 
     def __init__(
         self,

@@ -16,8 +16,8 @@ from pfbench.core.normal import independent_normal
 from pfbench.core.record import Record
 from pfbench.model.ins_errors import InsErrorModel
 from pfbench.model.tight_coupling import (
-    GROUPS,
     NAMES,
+    TIGHT_GROUPS,
     UNITS,
     check_ranging_inputs,
     compute_initial_sd,
@@ -93,7 +93,7 @@ class SinsGnssTightNl(InsErrorModel):
     """
 
     r: Tensor
-    names, units, groups = NAMES, UNITS, GROUPS
+    names, units, groups = NAMES, UNITS, TIGHT_GROUPS
     noise_dim = 11
     choices = ("an interval's specific force enters as one impulse, not in steps of 0.1 s",)
 

@@ -16,7 +16,7 @@ from pfbench.nav.imu_errors import ImuErrors
 _INS = name_ins_components(NAVIGATION + BIASES)
 NAMES = (*_INS.names, "clock_bias", "clock_drift")
 UNITS = (*_INS.units, "m", "m/s")
-GROUPS = {**_INS.groups, "clock": (15, 16)}
+TIGHT_GROUPS = {**_INS.groups, "clock": (15, 16)}
 
 
 def predict_measurement(

@@ -24,7 +24,6 @@ from typing_extensions import override
 from pfbench.nav import earth
 from pfbench.nav.trajectory import NODES, WEIGHTS, TrajectoryData, TrajectorySource, ideal_sensors
 
-Array = NDArray[np.float64]
 _POSITION, _ATTITUDE = 5, 3  # degrees of the splines
 _PASSES = 4  # Gauss-Newton steps for attitude, each squares the angular error
 
@@ -177,7 +176,7 @@ def _dcm(attitude: Any, t: Tensor) -> Tensor:
     return torch.from_numpy(attitude(t.numpy().ravel()).as_matrix()).reshape(*t.shape, 3, 3)
 
 
-def _knots(time: Array, spacing: float) -> Array:
+def _knots(time: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
     """Place knots at the first time, then every `spacing` seconds, and at the last."""
     intervals = max(1, int((time[-1] - time[0]) / spacing))
     # The last interval is up to twice as long. Evenly stretched knots would lie inside samples,
@@ -186,11 +185,11 @@ def _knots(time: Array, spacing: float) -> Array:
 
 
 def _fit_spline(
-    time: Array,
-    knots: Array,
+    time: NDArray[np.float64],
+    knots: NDArray[np.float64],
     degree: int,
-    values: Array,
-    rates: Array | None = None,
+    values: NDArray[np.float64],
+    rates: NDArray[np.float64] | None = None,
     weight: float = 0.0,
 ) -> Any:
     """Fit the spline that minimises sum |values - s|^2 + weight sum |rates - s'|^2."""

@@ -84,7 +84,7 @@ QUANTITIES = {
     "second of day": Quantity("s", 0.0, 1e6, source="a day, or several"),
 }  # fmt: skip
 
-COLUMNS = {
+LIMIT_COLUMNS = {
     "t": "time",
     **dict.fromkeys(("fx", "fy", "fz"), "specific force"),
     **dict.fromkeys(("wx", "wy", "wz"), "angular rate"),

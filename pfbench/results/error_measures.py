@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pfbench.files.table_file import Array as Array
+
 Flags = NDArray[np.bool_]
 
 

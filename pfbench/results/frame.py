@@ -185,7 +185,7 @@ def _select_scores(data: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str
 
 def _metric_rows(result: store.JobResult) -> Iterator[MetricColumn]:
     """Yield the values of R runs per metric and component."""
-    scopes: tuple[metrics.Scope, ...] = ("components", "group", "job")
+    scopes: tuple[metrics.MetricScope, ...] = ("components", "group", "job")
     for scope in scopes:
         entries = [metric for metric in metrics.METRICS if metric.scope == scope]
         for data in metrics.data_by_scope(result, scope):

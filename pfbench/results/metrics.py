@@ -40,7 +40,7 @@ from pfbench.results.state_groups import ComponentGroup, component_groups
 
 COVERAGE_LEVELS = (50, 90, 99)  # percent
 GROUP_UNIT = "unit of the group"
-Scope = Literal["components", "group", "job"]
+MetricScope = Literal["components", "group", "job"]
 Direction = Literal["lower", "higher", "target"]
 
 
@@ -64,7 +64,7 @@ class Metric:
 
     name: str
     compute: Callable[[MetricInput], ByComponent]
-    scope: Scope
+    scope: MetricScope
     unit: str
     direction: Direction
     caption: str
@@ -221,7 +221,7 @@ METRICS: tuple[Metric, ...] = (
 )  # fmt: skip
 
 
-def data_by_scope(result: store.JobResult, scope: Scope) -> list[MetricInput]:
+def data_by_scope(result: store.JobResult, scope: MetricScope) -> list[MetricInput]:
     """List the inputs of a scope: one per group, or one for the job.
 
     Args:

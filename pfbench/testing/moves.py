@@ -12,16 +12,15 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.files.table_file import Array
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.moves.metropolis import McmcKernel, MetropolisHastings, Move
 from pfbench.filter.moves.path_history import PathHistory
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.testing.results import LawCheck, check_p_values
 
-Array = np.ndarray
-
 STEPS = 10  # so 11 states of 2 components
-SIZE = 2 * (STEPS + 1)
+PATH_SIZE = 2 * (STEPS + 1)
 
 
 class PathPosterior(NamedTuple):
@@ -30,9 +29,9 @@ class PathPosterior(NamedTuple):
     Attributes:
         model: Walk with constant velocity.
         y: Measurements, [k, 1].
-        paths: Draws, [M, SIZE].
-        mean: Mean of the paths, [SIZE].
-        root: Factor of the covariance of the paths, [SIZE, SIZE].
+        paths: Draws, [M, PATH_SIZE].
+        mean: Mean of the paths, [PATH_SIZE].
+        root: Factor of the covariance of the paths, [PATH_SIZE, PATH_SIZE].
     """
 
     model: LinearGaussian
@@ -64,18 +63,18 @@ class PathPosterior(NamedTuple):
         return belief
 
     def paths_after(self, belief: ParticleBelief) -> Array:
-        """Return the paths of moved particles, [M, SIZE]; states that are not stored stay."""
+        """Return the paths of moved particles, [M, PATH_SIZE]; states that are not stored stay."""
         stored = belief.window.get("states", belief.x.unsqueeze(2))
         count = 2 * stored.shape[2]
         paths = self.paths.copy()
-        paths[:, SIZE - count :] = stored.reshape(len(paths), count).numpy()
+        paths[:, PATH_SIZE - count :] = stored.reshape(len(paths), count).numpy()
         return paths
 
     def moments_p_value(self, paths: Array, components: slice = slice(None)) -> float:
         """Return the p-value of all moments of the whitened components.
 
         Args:
-            paths: Paths, [M, SIZE].
+            paths: Paths, [M, PATH_SIZE].
             components: Components of the path. All by default.
 
         Returns:
@@ -131,20 +130,24 @@ def simulate_path_posterior(noise_sd: float, paths: int) -> PathPosterior:
     """
     model, rng = linear_walk(1.0, noise_sd, 1.0), np.random.default_rng(0)
     f, g, h, l0 = (getattr(model, k).numpy() for k in ("f", "g", "h", "l0"))
-    a = np.zeros((SIZE, SIZE))  # path = a z, z standard normal: x_0, then the noises
+    a = np.zeros((PATH_SIZE, PATH_SIZE))  # path = a z, z standard normal: x_0, then the noises
     a[:2, :2] = l0
-    for j in range(2, SIZE, 2):
+    for j in range(2, PATH_SIZE, 2):
         a[j : j + 2] = f @ a[j - 2 : j]
         a[j : j + 2, j : j + 2] = g
     look = np.kron(np.eye(STEPS + 1)[1:], h) @ a
-    y = look @ rng.normal(size=SIZE) + rng.normal(size=STEPS)
-    precision = np.eye(SIZE) + look.T @ look
+    y = look @ rng.normal(size=PATH_SIZE) + rng.normal(size=STEPS)
+    precision = np.eye(PATH_SIZE) + look.T @ look
     mean, root = (
         a @ np.linalg.solve(precision, look.T @ y),
         a @ np.linalg.inv(np.linalg.cholesky(precision)).T,
     )
     return PathPosterior(
-        model, torch.tensor(y)[:, None], mean + rng.normal(size=(paths, SIZE)) @ root.T, mean, root
+        model,
+        torch.tensor(y)[:, None],
+        mean + rng.normal(size=(paths, PATH_SIZE)) @ root.T,
+        mean,
+        root,
     )
 
 
@@ -196,7 +199,9 @@ def check_move(
     details = {"accepted": float(rate), "moved": share}
     if "states" not in after.window:
         newest = {
-            "moments of the newest state": case.moments_p_value(result, slice(SIZE - 2, SIZE))
+            "moments of the newest state": case.moments_p_value(
+                result, slice(PATH_SIZE - 2, PATH_SIZE)
+            )
         }
         return check_p_values(statement, newest, limit, **details)
     p_values = {

@@ -13,10 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pfbench.files.table_file import Array
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-
-Array = np.ndarray
 
 
 class KalmanResult(NamedTuple):

@@ -6,9 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import numpy as np
-
-Array = np.ndarray
+from pfbench.files.table_file import Array
 
 
 class LawCheck(NamedTuple):

@@ -33,7 +33,7 @@ ONE = torch.ones(3, 1)
 
 def test_the_cpp_sources_are_those_of_the_manifest() -> None:
     for name, text in operator_sources.make_sources().items():
-        assert (manifest.FOLDER / "src" / name).read_text() == text, name
+        assert (manifest.KERNELS_FOLDER / "src" / name).read_text() == text, name
     for name in manifest.read_operators():
         assert getattr(cpp, name).__name__ == name
 

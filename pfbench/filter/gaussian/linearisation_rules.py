@@ -20,7 +20,7 @@ from pfbench.core.jacobian import jacobian
 from pfbench.kernels import cpp
 from pfbench.kernels.compilation import compilable
 
-Map: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
+ConditionalMoments: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
 """xi [R, P, d] -> mean [R, P, k] and covariance [R or 1, P or 1, k, k] given each point."""
 
 
@@ -69,12 +69,12 @@ class LinearisationRule(Protocol):
     """A rule that approximates a map of whitened coordinates by an affine one."""
 
     def __call__(
-        self, f: Map, template: Tensor, d: int, space: DifferenceSpace
+        self, f: ConditionalMoments, template: Tensor, d: int, space: DifferenceSpace
     ) -> AffineApproximation:
         """Linearise a map.
 
         Args:
-            f: Map.
+            f: Mean and covariance of the value given each point.
             template: Tensor with the dtype and the R runs of the result, [R, ...].
             d: Number of whitened coordinates.
             space: Difference and average of the values.
@@ -90,7 +90,7 @@ class TaylorLinearisation(LinearisationRule):
 
     @override
     def __call__(
-        self, f: Map, template: Tensor, d: int, space: DifferenceSpace
+        self, f: ConditionalMoments, template: Tensor, d: int, space: DifferenceSpace
     ) -> AffineApproximation:
         y, covariance = f(template.new_zeros(template.shape[0], 1, d))
         noise = covariance[:, 0].expand(template.shape[0], -1, -1)
@@ -113,7 +113,7 @@ class SigmaPointLinearisation(LinearisationRule):
 
     @override
     def __call__(
-        self, f: Map, template: Tensor, d: int, space: DifferenceSpace
+        self, f: ConditionalMoments, template: Tensor, d: int, space: DifferenceSpace
     ) -> AffineApproximation:
         xi, w_mean, w_cov = (a.to(template) for a in self.points(d))
         values, covariance = f(xi.expand(template.shape[0], -1, -1))

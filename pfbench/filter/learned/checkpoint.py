@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from pfbench.files.atomic_write import write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
 
-FORMAT = "pfbench checkpoint 2"
+CHECKPOINT_FORMAT = "pfbench checkpoint 2"
 UNTRAINED = "untrained"
 
 Weights = dict[str, Tensor]
@@ -39,7 +39,7 @@ def write_checkpoint(path: str | Path, content: Mapping[str, Any]) -> None:
         path: File to write.
         content: Tensors, numbers, texts, lists and dicts.
     """
-    full = {"format": FORMAT, **content}
+    full = {"format": CHECKPOINT_FORMAT, **content}
     full[DIGEST] = hash_content(full)
     write_atomically(Path(path), lambda file: torch.save(full, file))
 
@@ -62,10 +62,10 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
             f"checkpoint must be a file of weights, got {path}, which is damaged or another file "
             f"({type(error).__name__}). Use a checkpoint that `pfbench train` wrote."
         ) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    if not isinstance(content, dict) or content.get("format") != CHECKPOINT_FORMAT:
         stored = content.get("format") if isinstance(content, dict) else type(content).__name__
         raise ValueError(
-            f"checkpoint must have the format {FORMAT!r}, got {stored!r} in {path}. Train again."
+            f"checkpoint must have the format {CHECKPOINT_FORMAT!r}, got {stored!r} in {path}. Train again."
         )
     if not has_valid_digest(content):
         raise ValueError(

@@ -12,7 +12,7 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.learned.network_builder import CheckpointSpec, build_networks
 from pfbench.filter.learned.networks import log_standard_normal
-from pfbench.filter.learned.proposal import Make
+from pfbench.filter.learned.proposal import NetworkFactory
 from pfbench.filter.learned.reparameterised_sampling import sample_from
 from pfbench.filter.linearisation import unwrap_independent
 from pfbench.filter.moves.flow_kernels import propagate_path
@@ -55,7 +55,7 @@ class LearnedRandomWalk(nn.Module):
 
     def __init__(
         self,
-        network: Make,
+        network: NetworkFactory,
         lag: int = 1,
         scale: float = 2.38,
         checkpoint: str | None = "untrained",

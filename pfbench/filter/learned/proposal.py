@@ -38,7 +38,7 @@ from pfbench.model.base import StateSpaceModel, StaticModel
 
 PAST = "learned.past"  # hidden state of a recurrent network in the belief's memory, [R, 1, H]
 
-Make = Callable[[int, int], nn.Module]
+NetworkFactory = Callable[[int, int], nn.Module]
 """(number of features, dimension of the noise) -> network."""
 
 
@@ -85,7 +85,7 @@ class LearnedProposal(nn.Module):
 
     def __init__(
         self,
-        network: Make,
+        network: NetworkFactory,
         features: Sequence[Feature] | None = None,
         guide_filter: GuidedNoiseProposal | None = None,
         defensive_fraction: float = 0.05,

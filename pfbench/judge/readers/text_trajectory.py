@@ -9,19 +9,19 @@ import numpy as np
 from pfbench.judge.judge_options import SourceOptions
 from pfbench.judge.readers.local_frame import euler_angles, rotation_from_quaternion
 from pfbench.judge.readers.trajectory_table import (
-    ATTITUDE,
+    ATTITUDE_COLUMNS,
     ATTITUDE_SD,
     GEODETIC,
     LOCAL,
     POSITION_SD,
-    VELOCITY,
+    VELOCITY_COLUMNS,
     VELOCITY_SD,
     TrajectoryTable,
 )
 from pfbench.results.error_measures import Array
 
 _TUM_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
-_KF_GINS_COLUMNS = ("week", "t", *GEODETIC, *VELOCITY, "roll", "pitch", "yaw")
+_KF_GINS_COLUMNS = ("week", "t", *GEODETIC, *VELOCITY_COLUMNS, "roll", "pitch", "yaw")
 _KF_GINS_SD = 22  # columns of the file of standard deviations: time, 9 of navigation, 12 of sensors
 _TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # from East, North, Up
 _TO_FRD = np.diag([1.0, -1.0, -1.0])  # a body with forward, left, up
@@ -61,7 +61,7 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     position, rotation = numbers[:, 1:4], rotation_from_quaternion(numbers[:, 4:])
     if options.frame == "enu":
         position, rotation = position @ _TO_NED.T, _TO_NED @ rotation @ _TO_FRD
-    values = _by_name(LOCAL, position) | _by_name(ATTITUDE, euler_angles(rotation))
+    values = _by_name(LOCAL, position) | _by_name(ATTITUDE_COLUMNS, euler_angles(rotation))
     return [TrajectoryTable(file.name, numbers[:, 0], values, lines)]
 
 
@@ -86,8 +86,8 @@ def read_kf_gins_trajectory(
     numbers, lines = _read_numbers(file, _KF_GINS_COLUMNS)
     values = (
         _by_name(GEODETIC, numbers[:, 2:5])
-        | _by_name(VELOCITY, numbers[:, 5:8])
-        | _by_name(ATTITUDE, np.radians(numbers[:, 8:11]))
+        | _by_name(VELOCITY_COLUMNS, numbers[:, 5:8])
+        | _by_name(ATTITUDE_COLUMNS, np.radians(numbers[:, 8:11]))
     )
     time = numbers[:, 1]
     if sd is not None:

@@ -7,29 +7,36 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pfbench.nav.plausible_limits import COLUMNS, QUANTITIES
+from pfbench.nav.plausible_limits import LIMIT_COLUMNS, QUANTITIES
 from pfbench.results.error_measures import Array
 
 LOCAL = ("pn", "pe", "pd")
 GEODETIC = ("lat_deg", "lon_deg", "h_m")
-VELOCITY = ("vn", "ve", "vd")
-ATTITUDE = ("roll", "pitch", "yaw")
+VELOCITY_COLUMNS = ("vn", "ve", "vd")
+ATTITUDE_COLUMNS = ("roll", "pitch", "yaw")
 POSITION_SD = ("sd_pn", "sd_pe", "sd_pd")
 VELOCITY_SD = ("sd_vn", "sd_ve", "sd_vd")
 ATTITUDE_SD = ("sd_roll", "sd_pitch", "sd_yaw")
-COVARIANCE = ("cov_nn", "cov_ne", "cov_nd", "cov_ee", "cov_ed", "cov_dd")  # of the position, m^2
-GROUPS = (
+COVARIANCE_COLUMNS = (
+    "cov_nn",
+    "cov_ne",
+    "cov_nd",
+    "cov_ee",
+    "cov_ed",
+    "cov_dd",
+)  # of the position, m^2
+COLUMN_GROUPS = (
     LOCAL,
     GEODETIC,
-    VELOCITY,
-    ATTITUDE,
+    VELOCITY_COLUMNS,
+    ATTITUDE_COLUMNS,
     POSITION_SD,
     VELOCITY_SD,
     ATTITUDE_SD,
-    COVARIANCE,
+    COVARIANCE_COLUMNS,
 )
 SD_GROUPS = (POSITION_SD, VELOCITY_SD, ATTITUDE_SD)
-ALL_COLUMNS = ("t", *(name for group in GROUPS for name in group))
+ALL_COLUMNS = ("t", *(name for group in COLUMN_GROUPS for name in group))
 _SD_COLUMNS = {name for group in SD_GROUPS for name in group}
 
 
@@ -40,7 +47,7 @@ class TrajectoryTable:
     Attributes:
         file: Name of the file, for messages.
         time: Time, [T], s, increasing.
-        values: Columns by name, [T] each: groups of `GROUPS` in m, deg (latitude, longitude), m/s
+        values: Columns by name, [T] each: groups of `COLUMN_GROUPS` in m, deg (latitude, longitude), m/s
             and rad.
         lines: Line of each row in the file, [T].
         notes: Notes of the reader.
@@ -86,7 +93,7 @@ def check_trajectory(table: TrajectoryTable) -> TrajectoryTable:
         raise ValueError(
             f"{table.file} must have at least 2 rows, got {len(table.time)}. Write the file again."
         )
-    for group in GROUPS:
+    for group in COLUMN_GROUPS:
         present = [name for name in group if name in table.values]
         if present and len(present) < len(group) and present != ["vn", "ve"]:
             missing = ", ".join(name for name in group if name not in table.values)
@@ -146,15 +153,15 @@ def _check_range(table: TrajectoryTable, name: str, value: Array) -> None:
 def _ranges(name: str) -> Iterator[tuple[float, float, str, str]]:
     if name in _SD_COLUMNS or name in ("cov_nn", "cov_ee", "cov_dd"):
         yield np.nextafter(0.0, 1.0), 1e12, "", "Remove the uncertainty columns or repair them."
-    elif name in COLUMNS:
-        quantity = QUANTITIES[COLUMNS[name]]
+    elif name in LIMIT_COLUMNS:
+        quantity = QUANTITIES[LIMIT_COLUMNS[name]]
         yield quantity.least, quantity.largest, quantity.unit, quantity.hint
 
 
 def _check_covariance(table: TrajectoryTable) -> None:
-    if not table.has(COVARIANCE):
+    if not table.has(COVARIANCE_COLUMNS):
         return
-    least = np.linalg.eigvalsh(covariance_matrices(table.select(COVARIANCE)))[:, 0]
+    least = np.linalg.eigvalsh(covariance_matrices(table.select(COVARIANCE_COLUMNS)))[:, 0]
     if (least <= 0).any():
         row = int((least <= 0).argmax())
         raise ValueError(
@@ -164,6 +171,6 @@ def _check_covariance(table: TrajectoryTable) -> None:
 
 
 def covariance_matrices(entries: Array) -> Array:
-    """Return matrices [T, 3, 3] from the columns `COVARIANCE`, [T, 6]."""
+    """Return matrices [T, 3, 3] from the columns `COVARIANCE_COLUMNS`, [T, 6]."""
     upper = entries[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
     return upper.reshape(-1, 3, 3)

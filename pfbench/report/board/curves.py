@@ -15,7 +15,7 @@ from pfbench.results.frame import select_indices
 from pfbench.results.state_groups import main_component_group
 from pfbench.results.store import JobResult
 
-INSTANTS, FEW_INSTANTS = 60, 24
+CURVE_INSTANTS, FEW_CURVE_INSTANTS = 60, 24
 _MANY = 300  # filters times conditions, from which curves have few instants
 ALL = "all"
 CellKey = tuple[str, str]
@@ -30,7 +30,7 @@ def make_curves(results: Mapping[str, JobResult], conditions: int = 1) -> dict[s
     """
     first = next(iter(results.values()))
     group = main_component_group(first.meta["state"])
-    most = INSTANTS if len(results) * conditions <= _MANY else FEW_INSTANTS
+    most = CURVE_INSTANTS if len(results) * conditions <= _MANY else FEW_CURVE_INSTANTS
     norms = compute_error_norms(results)
     steps = select_truth_steps(norms.values(), most)
     filters = {}

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from pfbench.report.board.view import EQUAL, IDENTICAL, MISSING, NOT_KEPT, OPEN, BoardRow, percent
+from pfbench.report.board.view import EQUAL, MISSING, NOT_KEPT, OPEN, BoardRow, percent
 from pfbench.report.looks import MethodLook
+from pfbench.results.decisions.words import IDENTICAL
 
 _MOST_NAMES = 3  # in a sentence
 _LOST_SHARE = 0.2  # share of runs off track from which a filter is counted

@@ -14,7 +14,7 @@ from pfbench.results.error_measures import Array
 from pfbench.results.state_groups import main_component_group
 from pfbench.results.store import JobResult
 
-INSTANTS = 40
+TRACK_INSTANTS = 40
 _TRACKS = 3000  # of all filters, conditions and runs of a page [ours]
 _MIN_RUNS = 10  # of each condition that a page carries, if its size allows it
 _PLANES = (("position_E", "position_N"), ("x", "y"))  # components east and north
@@ -76,7 +76,7 @@ def make_tracks(
     group = main_component_group(first.meta["state"])
     runs = select_telling_runs(errors, most)
     norms = compute_error_norms(results)
-    steps = select_truth_steps(norms.values(), INSTANTS)
+    steps = select_truth_steps(norms.values(), TRACK_INSTANTS)
     names = [str(numbers[k]) for k in runs]
 
     def by_run(values: Array) -> dict[str, Array]:

@@ -12,13 +12,13 @@ import numpy as np
 from scipy.special import stdtrit
 
 from pfbench.report.board.levels import FilterLevels, StudyArrays
+from pfbench.results.decisions.words import IDENTICAL, WORSE
 from pfbench.results.error_measures import Array
 from pfbench.results.statistics.paired_effects import MIN_RUNS
 from pfbench.results.step_times import StepTimes, describe_costs
 
-BEST, EQUAL, OPEN, WORSE, MISSING = "best", "equal", "open", "worse", "missing"
+BEST, EQUAL, OPEN, MISSING = "best", "equal", "open", "missing"
 NOT_KEPT = "not_kept"  # too few runs keep track for an error
-IDENTICAL = "identical"
 _SAME = 1e-6  # difference of levels of identical filters, and its standard error
 
 

@@ -20,8 +20,8 @@ from pfbench.report.journal.study_pack import (
 )
 from pfbench.report.journal.table_captions import describe_columns
 from pfbench.report.journal.table_layout import (
+    INTERVAL_SIZE,
     SIZE,
-    SMALL,
     Column,
     LatexCell,
     LatexTable,
@@ -202,16 +202,18 @@ def _error_cells(columns: Sequence[ErrorColumn], key: str, has_intervals: bool) 
         )
         if has_intervals:
             small = (
-                rf"{{\fontsize{{{SMALL:g}}}{{{SIZE:g}}}\selectfont {interval}}}" if interval else ""
+                rf"{{\fontsize{{{INTERVAL_SIZE:g}}}{{{SIZE:g}}}\selectfont {interval}}}"
+                if interval
+                else ""
             )
-            cells.append(LatexCell(small, text_width(interval, SMALL)))
+            cells.append(LatexCell(small, text_width(interval, INTERVAL_SIZE)))
     return cells
 
 
 def _error_width(text: str, is_best: bool) -> float:
     """Return the width of a number and the dagger after it."""
     printed = text.replace("e", "×10") if "e" in text and text != "lost" else text
-    return text_width(printed, SIZE, is_bold=is_best) + text_width("†", SMALL)
+    return text_width(printed, SIZE, is_bold=is_best) + text_width("†", INTERVAL_SIZE)
 
 
 def _is_printed_number(text: str) -> bool:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-ALL = "all"
-FAMILIES = ("kalman", "gaussian", "particle", "guided", "swarm", "learned")
+from pfbench.report.board.curves import ALL as ALL
+
+FAMILY_ORDER = ("kalman", "gaussian", "particle", "guided", "swarm", "learned")
 
 Pack = Mapping[str, Any]
 Row = Mapping[str, Any]
@@ -20,7 +21,7 @@ def filters_by_key(pack: Pack) -> dict[str, Mapping[str, Any]]:
 def filters_by_family(pack: Pack) -> list[list[str]]:
     """Return the keys of the filters of each family, families in a fixed order."""
     looks = filters_by_key(pack)
-    families = dict.fromkeys([*FAMILIES, *(str(look["family"]) for look in looks.values())])
+    families = dict.fromkeys([*FAMILY_ORDER, *(str(look["family"]) for look in looks.values())])
     groups = [[key for key, look in looks.items() if look["family"] == name] for name in families]
     return [group for group in groups if group]
 

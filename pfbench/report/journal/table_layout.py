@@ -8,7 +8,7 @@ from typing import NamedTuple
 from pfbench.files.escapes import escape_latex
 from pfbench.report.journal.text_width import text_width
 
-SIZE, SMALL = 8.0, 6.0  # of entries and of intervals, points
+SIZE, INTERVAL_SIZE = 8.0, 6.0  # of entries and of intervals, points
 THIN_SPACE = SIZE / 6
 _SEPARATIONS = (6.0, 5.0, 4.0, 3.0, 2.4)  # candidates of \tabcolsep, points
 _SLACK = 1.5  # points of rounding

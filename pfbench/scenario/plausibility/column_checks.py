@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pfbench.nav.plausible_limits import COLUMNS, Quantity
+from pfbench.files.table_file import Array
+from pfbench.nav.plausible_limits import LIMIT_COLUMNS, Quantity
 from pfbench.scenario.plausibility.log_table import LogTable
-
-Array = NDArray[np.float64]
 
 
 def check_range(table: LogTable, column: str, values: Array) -> None:
@@ -24,7 +22,7 @@ def check_range(table: LogTable, column: str, values: Array) -> None:
     Raises:
         ValueError: If a value is out of range. The message names file, column and row.
     """
-    quantity = table.limits.select(COLUMNS[column])
+    quantity = table.limits.select(LIMIT_COLUMNS[column])
     outside = np.flatnonzero((values < quantity.least) | (values > quantity.largest))
     if outside.size:
         i = int(outside[0])
@@ -56,7 +54,7 @@ def check_changes(table: LogTable, columns: Sequence[str], time: Array, values: 
             plus `allowance` in `plausible_limits`.
     """
     for column, series in zip(columns, values.T, strict=True):
-        quantity = table.limits.select(COLUMNS[column])
+        quantity = table.limits.select(LIMIT_COLUMNS[column])
         step = np.diff(series)
         largest = quantity.rate * np.diff(time) + quantity.allowance
         outside = np.flatnonzero(np.abs(step) > largest)

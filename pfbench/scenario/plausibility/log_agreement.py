@@ -25,7 +25,7 @@ from pfbench.scenario.recorded.time_grid import interpolate, split_samples
 
 _WINDOW = 1.0  # s; IMU and reference are compared over windows of about this length
 _STRAIGHT = 1.5  # s; longest interval over which the velocity is taken as linear
-MOVING = 1.0  # m/s; smallest RMS velocity at which position and velocity have a common scale
+MIN_RMS_SPEED = 1.0  # m/s; smallest RMS velocity at which position and velocity have a common scale
 
 
 class Agreement(NamedTuple):
@@ -74,7 +74,7 @@ def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ..
     straight = dt <= _STRAIGHT
     for axis, name in enumerate(("East", "North", "Up")):
         x, y = expected[straight, axis], displacement[straight, axis]
-        if not len(x) or np.sqrt(np.mean((x / dt[straight]) ** 2)) < MOVING:
+        if not len(x) or np.sqrt(np.mean((x / dt[straight]) ** 2)) < MIN_RMS_SPEED:
             continue
         slope = float((x * y).sum() / (x * x).sum())
         if not 0.7 < slope < 1.4:
@@ -212,7 +212,7 @@ def compare_wheels(
     rows, dt = np.arange(len(speed)), np.diff(reference.time)
     # the track changes with the heading while the car moves
     turn = np.angle(np.exp(1j * np.diff(np.arctan2(east, north)))) / dt
-    steady = np.minimum(true_speed[1:], true_speed[:-1]) > 2.0 * MOVING
+    steady = np.minimum(true_speed[1:], true_speed[:-1]) > 2.0 * MIN_RMS_SPEED
     off = np.where(steady, np.abs(turn - 0.5 * (yaw_rate[1:] + yaw_rate[:-1])), 0.0)
     return (
         *_judge(WHEELS, np.abs(np.abs(speed) - true_speed), table, rows),

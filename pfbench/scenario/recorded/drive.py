@@ -24,7 +24,7 @@ from pfbench.scenario.recorded.fix_holdout import FixHoldout
 from pfbench.scenario.recorded.log_reader import read_log
 from pfbench.scenario.recorded.log_tables import find_dataset
 from pfbench.scenario.recorded.navigation_log import LogFiles
-from pfbench.scenario.recorded.time_grid import SAME_TIME, ResampledLog, resample_log
+from pfbench.scenario.recorded.time_grid import TIME_TOLERANCE, ResampledLog, resample_log
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,9 @@ class RecordedFlights(Scenario):
         longest = max(legs, key=lambda leg: len(leg.time))
         for i, leg in zip(used, legs, strict=True):
             n = len(leg.time)
-            same = np.allclose(leg.since_start, longest.since_start[:n], rtol=0.0, atol=SAME_TIME)
+            same = np.allclose(
+                leg.since_start, longest.since_start[:n], rtol=0.0, atol=TIME_TOLERANCE
+            )
             if not same or not np.array_equal(leg.fix_steps, longest.fix_steps[:n]):
                 raise ValueError(
                     "scenario.flights must have equal fix times, "

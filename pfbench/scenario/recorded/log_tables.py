@@ -10,14 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from pfbench.files.table_file import Array as Array
 from pfbench.files.table_file import read_table_file
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_range
 from pfbench.scenario.plausibility.log_table import LogTable
-
-Array = NDArray[np.float64]
 
 
 def find_dataset(root: str | None, folder: str) -> Path:

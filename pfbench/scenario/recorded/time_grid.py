@@ -17,7 +17,7 @@ from pfbench.core import quaternion
 from pfbench.scenario.recorded.log_tables import Array
 from pfbench.scenario.recorded.navigation_log import ImuLog, NavigationLog, ReferenceLog
 
-SAME_TIME = 1e-3  # s
+TIME_TOLERANCE = 1e-3  # s
 
 
 class ResampledLog(NamedTuple):
@@ -190,7 +190,7 @@ def interpolate(motion: ReferenceLog, time: Array) -> Array:
         more.
     """
     longest = 1.9 * float(np.median(np.diff(motion.time)))
-    after = np.clip(np.searchsorted(motion.time, time - SAME_TIME), 1, len(motion.time) - 1)
+    after = np.clip(np.searchsorted(motion.time, time - TIME_TOLERANCE), 1, len(motion.time) - 1)
     before = after - 1
     gap = motion.time[after] - motion.time[before]
     fraction = ((time - motion.time[before]) / gap)[:, None]
@@ -204,9 +204,11 @@ def interpolate(motion: ReferenceLog, time: Array) -> Array:
     rotated = quaternion.quaternion_multiply(
         q[before], quaternion.quaternion_from_rotation_vector(rotation)
     ).numpy()
-    on_sample = np.minimum(fraction, 1.0 - fraction)[:, 0] * gap <= SAME_TIME
+    on_sample = np.minimum(fraction, 1.0 - fraction)[:, 0] * gap <= TIME_TOLERANCE
     valid_mask = (gap <= longest) | on_sample
-    valid_mask &= (time >= motion.time[0] - SAME_TIME) & (time <= motion.time[-1] + SAME_TIME)
+    valid_mask &= (time >= motion.time[0] - TIME_TOLERANCE) & (
+        time <= motion.time[-1] + TIME_TOLERANCE
+    )
     return np.where(valid_mask[:, None], np.hstack([rotated, linear]), np.nan)
 
 

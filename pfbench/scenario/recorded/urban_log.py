@@ -33,7 +33,7 @@ from pfbench.scenario.recorded.log_tables import (
 )
 from pfbench.scenario.recorded.navigation_log import ReferenceLog
 
-MOVING = 1.0  # m/s; smallest speed at which the velocity determines the heading
+MIN_HEADING_SPEED = 1.0  # m/s; smallest speed at which the velocity determines the heading
 _SAME_TIME = 1e-3  # s
 
 
@@ -208,12 +208,14 @@ def select_epochs(time: Array, interval: float) -> NDArray[np.bool_]:
 def interpolate_reference(drive: UrbanLog) -> dict[str, Tensor]:
     """Return the reference of each component group of the model, [T, k].
 
-    The heading is NaN at speeds below `MOVING`.
+    The heading is NaN at speeds below `MIN_HEADING_SPEED`.
     """
     position = torch.from_numpy(drive.position)
     enu = earth.local_enu(position, position[0])
     east, north = torch.from_numpy(drive.velocity).unbind(-1)
-    heading = torch.where(torch.hypot(east, north) > MOVING, torch.atan2(east, north), torch.nan)
+    heading = torch.where(
+        torch.hypot(east, north) > MIN_HEADING_SPEED, torch.atan2(east, north), torch.nan
+    )
     return {"position": enu[:, :2], "height": enu[:, 2:], "heading": heading[:, None]}
 
 

@@ -620,7 +620,7 @@ def test_what_is_no_file_of_weights_is_never_run(tmp_path: Any) -> None:
         def __reduce__(self) -> Any:
             return print, ("run!",)
 
-    torch.save({"format": checkpoint.FORMAT, "networks": Evil()}, tmp_path / "evil.pt")
+    torch.save({"format": checkpoint.CHECKPOINT_FORMAT, "networks": Evil()}, tmp_path / "evil.pt")
     (tmp_path / "text.pt").write_text("weights?")
     torch.save({"networks": {}}, tmp_path / "old.pt")
     for name, said in (

@@ -14,7 +14,7 @@ from checkout import ROOT
 from mutations import CLOSE, ERROR, EVERY_ROW, NOTED, READERS, run_mutations
 from synthetic_log import tables, write
 
-from pfbench.nav.plausible_limits import COLUMNS, QUANTITIES, PlausibleLimits
+from pfbench.nav.plausible_limits import LIMIT_COLUMNS, QUANTITIES, PlausibleLimits
 from pfbench.scenario.plausibility.log_agreement import AGREEMENTS
 from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.recorded.log_reader import read_log
@@ -30,7 +30,7 @@ def limits_table() -> str:
         "| --- | --- | --- | --- | --- |",
     ]
     for name, q in QUANTITIES.items():
-        columns = ", ".join(f"`{c}`" for c, quantity in COLUMNS.items() if quantity == name)
+        columns = ", ".join(f"`{c}`" for c, quantity in LIMIT_COLUMNS.items() if quantity == name)
         change = f"{q.allowance:g} + {q.rate:g}/s" if math.isfinite(q.rate) else "-"
         rows.append(
             f"| {name} [{q.unit}] | {columns} | {q.least:g} to {q.largest:g} | {change} | {q.source} |"
@@ -203,4 +203,4 @@ def test_more_random_damage_never_gives_wrong_numbers_silently(reader: str) -> N
 
 
 def test_the_table_of_columns_names_quantities() -> None:
-    assert set(COLUMNS.values()) == set(QUANTITIES)
+    assert set(LIMIT_COLUMNS.values()) == set(QUANTITIES)
