@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from pfbench.report.journal.study_pack import ALL as ALL
 from pfbench.results.error_measures import Array
 from pfbench.results.frame import select_indices
 from pfbench.results.state_groups import main_component_group
@@ -17,7 +18,6 @@ from pfbench.results.store import JobResult
 
 CURVE_INSTANTS, FEW_CURVE_INSTANTS = 60, 24
 _MANY = 300  # filters times conditions, from which curves have few instants
-ALL = "all"
 CellKey = tuple[str, str]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pfbench.report.board.curves import ALL as ALL
+ALL = "all"
 
 FAMILY_ORDER = ("kalman", "gaussian", "particle", "guided", "swarm", "learned")
 
