@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
+import pytest
+from page_packs import build_pack
 from scipy import stats
 
 from pfbench.config.named_sets import FILTER_SETS
+from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.board.robust_word import (
     CONTROL,
     RobustnessEvidence,
     describe_robust_filters,
+    describe_robustness,
     find_robust_filters,
 )
+from pfbench.report.looks import find_looks
+from pfbench.report.options import ReportOptions
+from pfbench.report.study_page import write_page
 from pfbench.results.statistics.world_effects import EffectEstimate
 
 
@@ -79,3 +88,59 @@ def test_sentences_name_the_rule() -> None:
     )
     assert describe_robust_filters(names, ()).startswith("No filter is shown to be robust")
     assert describe_robust_filters({}, ()) == ""
+
+
+def study(effects: dict[str, tuple[float, float]], runs: int = 20, worlds: int = 2) -> pd.DataFrame:
+    """Runs whose log errors differ by (outliers, nominal) from the difficulty that they share."""
+    rng = np.random.default_rng(3)
+    rows = []
+    for w in range(worlds):
+        for k, noise in enumerate(("outliers", "nominal")):
+            hard = rng.normal(0, 0.5, runs)
+            rows += [pd.DataFrame({
+                "filter": label, "scenario": f"w{w}", "family": f"w{w}", "regime": noise, "seed": 1,
+                "run": np.arange(runs), "keeps_track": True,
+                "rmse": np.exp(hard + effect[k] + 0.02 * rng.normal(size=runs)),
+            }) for label, effect in effects.items()]  # fmt: skip
+    return pd.concat(rows, ignore_index=True)
+
+
+def describe(data: pd.DataFrame, alpha: float = 0.05) -> str:
+    looks = find_looks(sorted(data["filter"].unique()))
+    return describe_robustness(data, looks, ReportOptions(alpha=alpha))
+
+
+EFFECTS = {CONTROL: (0.0, 0.0), "gate": (-0.4, 0.0), "wolf": (-0.4, 0.2), "ekf": (0.1, 0.0)}
+
+
+def test_a_study_names_its_robust_filters() -> None:
+    text = describe(study(EFFECTS))
+    assert text.startswith(f"Robust: [[{find_looks(['gate'])['gate'].name}]] (better than")
+    assert "The control was tuned in another world, flight_500s" in text
+    assert describe(study(EFFECTS), alpha=1e-30).startswith("No filter is shown to be robust")
+    home = study(EFFECTS, worlds=1).assign(scenario="flight_500s")
+    assert "another world" not in describe(home)
+
+
+def test_a_study_says_what_it_lacks_for_the_word() -> None:
+    data = study(EFFECTS)
+    control = find_looks([CONTROL])[CONTROL].name
+    without = data[data["filter"] != CONTROL]
+    assert describe(without).endswith(f"the study lacks the control {control}.")
+    regime = data["regime"] == "outliers"
+    assert "lacks nominal noise in the worlds with outliers" in describe(data[regime])
+    assert describe(data[~regime]) == ""
+    assert "fewer than 10 runs" in describe(study(EFFECTS, runs=4))
+    few = data[(data["filter"] != "gate") | (data["run"] < 5)]
+    assert describe(few).startswith("No filter is shown to be robust")
+
+
+@pytest.mark.parametrize("text", ["", "Robust: [[A & B]] (better)."])
+def test_page_and_markdown_say_it(text: str, tmp_path: Path) -> None:
+    pack = build_pack(3, 1, 1) | {"robustness": text}
+    with RecordedFolder(tmp_path / "report") as folder:
+        write_page(pack, folder)
+    html = (tmp_path / "report" / "index.html").read_text()
+    assert ("Robust: <b>A &amp; B</b> (better)." in html) == bool(text)
+    markdown = (tmp_path / "report" / "report.md").read_text()
+    assert ("Robust: A & B (better)." in markdown) == bool(text)

@@ -16,6 +16,7 @@ from pfbench.report.board.pack_entries import (
     regime_entries,
 )
 from pfbench.report.board.planned import decide_planned, planned_entries, planned_words
+from pfbench.report.board.robust_word import describe_robustness
 from pfbench.report.board.study_data import StudyData, read_study
 from pfbench.report.board.study_views import StudyNames, build_views
 from pfbench.report.board.sweeps import list_sweeps
@@ -75,6 +76,7 @@ def build_pack(
         "budgets": [{"key": "particles", "name": "Same N", "reason_missing": None}],
         "views": views,
         "planned": entries,
+        "robustness": describe_robustness(table, looks, options),
         "curves": data.curves,
         "calibration": list_calibration(table),
         "runs": list_runs(table),

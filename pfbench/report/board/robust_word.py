@@ -13,8 +13,20 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from scipy.special import stdtr
 
+from pfbench.report.board.levels import (
+    FilterLevels,
+    StudyArrays,
+    arrange_runs,
+    average_levels,
+    compute_condition_levels,
+)
+from pfbench.report.looks import MethodLook, find_looks
+from pfbench.report.options import ReportOptions
+from pfbench.results.error_measures import Flags
+from pfbench.results.statistics.paired_effects import MIN_RUNS, ConditionEffects
 from pfbench.results.statistics.signed_rank import holm
 from pfbench.results.statistics.world_effects import EffectEstimate
 
@@ -33,6 +45,57 @@ class RobustnessEvidence(NamedTuple):
 
     outliers: EffectEstimate
     nominal: EffectEstimate
+
+
+def describe_robustness(
+    table: pd.DataFrame, looks: Mapping[str, MethodLook], options: ReportOptions
+) -> str:
+    """Describe which filters of a study are robust, or what the study lacks for the word.
+
+    The scenarios that have both regimes are compared, with equal weight, by the levels of the board.
+
+    Args:
+        table: Table of `build_run_table`.
+        looks: Looks by label.
+        options: Options of the report.
+
+    Returns:
+        Sentences, empty for a study without outliers.
+    """
+    runs = arrange_runs(table, tuple(looks))
+    noise = runs.conditions["regime"].str.partition(" + ")[0]
+    scenario = runs.conditions["scenario"]
+    masks = [(noise == name).to_numpy() for name in (OUTLIER_REGIME, NOMINAL_REGIME)]
+    common = set(scenario[masks[0]]) & set(scenario[masks[1]])
+    if not masks[0].any():
+        return ""
+    lacking = [] if CONTROL in looks else [f"the control {find_looks([CONTROL])[CONTROL].name}"]
+    lacking += [] if common else ["nominal noise in the worlds with outliers"]
+    if lacking:
+        return f"No filter can be called robust: the study lacks {' and '.join(lacking)}."
+    levels = compute_condition_levels(runs, options.metric)
+    selected = [mask & scenario.isin(common).to_numpy() for mask in masks]
+    outliers, nominal = (_average(runs, levels, mask) for mask in selected)
+    present = np.minimum(outliers.runs, nominal.runs)
+    control = runs.filters.index(CONTROL)
+    if present[control] < MIN_RUNS:
+        return f"No filter can be called robust: the control {looks[CONTROL].name} has fewer than {MIN_RUNS} runs in a condition."  # fmt: skip
+    evidence = {
+        label: RobustnessEvidence(outliers.difference(i, control), nominal.difference(i, control))
+        for i, label in enumerate(runs.filters)
+        if i != control and present[i] >= MIN_RUNS
+    }
+    names = {label: looks[label].name for label in evidence}
+    text = describe_robust_filters(names, find_robust_filters(evidence, options.alpha))
+    tuning = looks[CONTROL].tuning
+    is_foreign = tuning and not any(tuning.startswith(f"{key} ") for key in common)
+    return f"{text} The control was tuned in another world, {tuning}." if is_foreign else text
+
+
+def _average(runs: StudyArrays, levels: ConditionEffects, mask: Flags) -> FilterLevels:
+    """Average the levels of the selected conditions."""
+    selected = ConditionEffects(*(array[:, mask] for array in levels))
+    return average_levels(selected, runs.conditions[mask])
 
 
 def find_robust_filters(

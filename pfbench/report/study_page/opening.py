@@ -72,6 +72,7 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
     key, view = next(iter(pack["views"].items()))
     metric, world, regime, baseline = key
     names = {f["key"]: f for f in pack["filters"]}
+    robustness = pack.get("robustness") or ""
     parts = (
         _name(pack["metrics"], metric),
         _scope(pack["worlds"], world, "scenario"),
@@ -80,13 +81,20 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
     )
     return {
         "sentence": format_sentence(view["sentence"]),
-        "text": view["sentence"].replace("[[", "").replace("]]", ""),
+        "text": _remove_marks(view["sentence"]),
         "small_print": view["small_print"],
+        "robustness": format_sentence(robustness),
+        "robustness_text": _remove_marks(robustness),
         "caption": f"{'; '.join(parts)}.",
         "heads": _heads(names[baseline]["name"]),
         "rows": [_row(row, names[row["filter"]]) for row in view["rows"]],
         "has_costs": any(row.get("cost") is not None for row in view["rows"]),
     }
+
+
+def _remove_marks(text: str) -> str:
+    """Return a sentence without the brackets of names."""
+    return text.replace("[[", "").replace("]]", "")
 
 
 def _heads(baseline: str) -> list[dict[str, str]]:
@@ -138,7 +146,7 @@ def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
             "ratio": format_short(pair["estimate"]),
             "interval": format_interval(pair["low"], pair["high"]) or pair["reason"],
             "word": pair["word"],
-            "sentence": pair["sentence"].replace("[[", "").replace("]]", ""),
+            "sentence": _remove_marks(pair["sentence"]),
         }
         for pair in pack["planned"]
     ]

@@ -18,7 +18,7 @@ from pfbench.report.writers import template_environment
 PAGE_BYTES = 1_500_000
 _HERE = Path(__file__).parent
 _SCRIPTS = ("kit", "state", "board", "cost", "pairs", "worlds", "time", "runs", "main")
-_OPTIONAL = ("paper_figures", "failures", "definitions", "filter_notes", "choices")
+_OPTIONAL = ("paper_figures", "failures", "definitions", "filter_notes", "choices", "robustness")
 _STATIC = (
     *_OPTIONAL,
     "methods_paragraph",
