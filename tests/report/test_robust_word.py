@@ -131,7 +131,9 @@ def test_a_study_says_what_it_lacks_for_the_word() -> None:
     assert "lacks nominal noise in the worlds with outliers" in describe(data[regime])
     assert describe(data[~regime]) == ""
     assert "fewer than 10 runs" in describe(study(EFFECTS, runs=4))
-    few = data[(data["filter"] != "gate") | (data["run"] < 5)]
+    data = study(EFFECTS | {"gate": (-2.0, -2.0)})
+    assert describe(data).startswith("Robust")
+    few = data[(data["filter"] != "gate") | (data["run"] < 8)]
     assert describe(few).startswith("No filter is shown to be robust")
 
 
