@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -13,9 +14,10 @@ from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.readers.trajectory_files import TrajectoryFile, list_trajectory_files
 from pfbench.judge.reference_track import read_reference
 from pfbench.judge.sequence_results import JudgedRun, SequenceResults, read_runs, score_sequence
+from pfbench.report.options import ReportOptions
 from pfbench.results.decisions.decision import Decision
 from pfbench.results.decisions.filter_sets import FilterRanking, order_filters
-from pfbench.results.decisions.options import DecisionOptions, MetricRule
+from pfbench.results.decisions.options import MetricRule
 from pfbench.results.decisions.planned_pairs import Pairs, decide_planned_pairs
 from pfbench.results.metrics import compute_metric, data_by_scope
 from pfbench.results.statistics.paired_effects import MIN_RUNS
@@ -125,7 +127,8 @@ def _decide(
     """Make the decisions that the numbers of sequences and runs allow."""
     table = tabulate_runs(sequences)
     rule = MetricRule(METRIC)
-    study = DecisionOptions(alpha=options.alpha, margin=options.margin, shared_runs=False)
+    report = ReportOptions(alpha=options.alpha, equivalence_margin=options.margin)
+    study = replace(report.decision_options, shared_runs=False)
     decisions: list[Decision] = []
     rankings: tuple[FilterRanking, ...] = ()
     runs = table.groupby(["filter", "family"]).size().min()

@@ -10,6 +10,7 @@ import pytest
 from command_line import Said, pfbench
 
 import pfbench as package
+from pfbench.report.options import ReportOptions
 from pfbench.results import store
 from pfbench.results.decisions.growing_study import decide_at_looks
 from pfbench.results.decisions.tidy_table import tidy_runs
@@ -58,9 +59,10 @@ def test_looks_decide_as_one_study_of_all_runs(home: Path, said: Said) -> None:
     assert left[columns[:-1]].equals(right[columns[:-1]])
     np.testing.assert_allclose(left["value"], right["value"], rtol=1e-9)
     table = tidy_runs(fixed, group="state [m]")
+    options = ReportOptions().decision_options
     for line, runs in ((first, 20), (second, 40)):
         early = table[table.run.isin(sorted(table.run.unique())[:runs])]
-        decisions = decide_at_looks(early, PAIRS, LookPlan(runs=(20, 40)))[1::2]
+        decisions = decide_at_looks(early, PAIRS, LookPlan(runs=(20, 40)), None, options)[1::2]
         open_pairs = [d for d in decisions if d.pair_word == "inconclusive"]
         assert f"{3 - len(open_pairs)} of 3 pairs decided" in line
         for d in open_pairs:

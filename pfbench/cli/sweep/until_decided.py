@@ -196,7 +196,7 @@ class GrowingSweep:
 
     def _decide(self, table: LookTable) -> list[PairState]:
         """Decide the planned pairs with the runs so far."""
-        from pfbench.results.decisions.options import DecisionOptions
+        from pfbench.report.options import ReportOptions
         from pfbench.results.study_decisions.main_metrics import RULES
         from pfbench.results.until_decided.pair_states import decide_pairs
 
@@ -205,8 +205,9 @@ class GrowingSweep:
                 "filter must be at least two filters with runs=until-decided, got one per condition. "
                 "Add a filter (filter=ekf,sir), or set a number of runs."
             )
-        options = DecisionOptions(self.report["alpha"], self.report["equivalence_margin"])
-        rule = RULES[self.report["metric"]]
+        names = ("alpha", "equivalence_margin", "metric")
+        report = ReportOptions(**{name: self.report[name] for name in names})
+        rule, options = RULES[report.metric], report.decision_options
         return decide_pairs(table.runs, table.pairs, self.schedule, options, rule)
 
     def _exceeds_time(self, seconds: float, number: int) -> str:
