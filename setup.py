@@ -25,7 +25,12 @@ specification.loader.exec_module(library_build)
 
 
 class BuildOperators(build_ext):
-    """Build of one library for each variant of vector instructions."""
+    """Build of one library for each variant of vector instructions, all at once."""
+
+    def initialize_options(self) -> None:
+        """Use one process for each variant, as far as there are processors."""
+        super().initialize_options()
+        self.parallel = True
 
     def get_ext_filename(self, name: str) -> str:
         """Return the path of a library: its name contains a hash of the sources."""
