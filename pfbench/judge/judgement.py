@@ -21,6 +21,7 @@ from pfbench.results.decisions.options import MetricRule
 from pfbench.results.decisions.planned_pairs import Pairs, decide_planned_pairs
 from pfbench.results.metrics import compute_metric, data_by_scope
 from pfbench.results.statistics.paired_effects import MIN_RUNS
+from pfbench.results.statistics.run_dependence import find_copied_runs
 from pfbench.results.status import keeps_track
 
 
@@ -126,6 +127,7 @@ def _decide(
 ) -> Judgement:
     """Make the decisions that the numbers of sequences and runs allow."""
     table = tabulate_runs(sequences)
+    _check_copies(table)
     rule = MetricRule(METRIC)
     report = ReportOptions(alpha=options.alpha, equivalence_margin=options.margin)
     study = replace(report.decision_options, shared_runs=False)
@@ -138,6 +140,17 @@ def _decide(
             rankings = order_filters(table, rule, study)
     along = decide_along_runs(sequences, pairs, options)
     return Judgement(sequences, tuple(pairs), tuple(decisions), tuple(along), rankings)
+
+
+def _check_copies(table: pd.DataFrame) -> None:
+    """Raise ValueError if two runs of a program have equal errors."""
+    copies = find_copied_runs(table, "value", ["run"])
+    if copies:
+        copy, original = next(iter(copies.items()))
+        raise ValueError(
+            f"runs must be independent, got {len(copies)} with the errors of another run (run {copy} is "
+            f"equal to run {original}). Remove the files of the copies."
+        )
 
 
 def _check_sequences(

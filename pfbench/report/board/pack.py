@@ -58,6 +58,8 @@ def build_pack(
     most = _MOST_BASELINES if len(looks) * len(conditions) <= _MANY else _FEW_BASELINES
     names = StudyNames(looks, worlds, regimes, _select_baselines(looks)[:most])
     views = build_views(table, names, options, planned_words(planned), data.times)
+    for view in views.values():
+        view["sentence"] = f"{data.warning} {view['sentence']}".lstrip()
     entries = planned_entries(planned, table, looks, worlds, options)
     first = next(iter(views.values()))["rows"]
     cells = cell_entries(table)

@@ -14,7 +14,15 @@ from pfbench.report.board.tracks import count_carried_runs, make_tracks
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import Condition
 from pfbench.results.frame import drop_before, to_long_rows
+from pfbench.results.statistics.run_dependence import (
+    describe_copies,
+    describe_dependence,
+    drop_runs,
+    find_copied_runs,
+)
 from pfbench.results.step_times import StepTimes
+
+_RUN = ["seed", "run"]
 
 
 class StudyData(NamedTuple):
@@ -27,6 +35,7 @@ class StudyData(NamedTuple):
         tracks: Single runs by condition.
         notes: Notes on the filters.
         times: Times in rounds by label, of each condition; without filters that were not measured.
+        warning: Sentence on runs that are not independent; empty if none is shown.
     """
 
     table: pd.DataFrame
@@ -35,6 +44,7 @@ class StudyData(NamedTuple):
     tracks: dict[CellKey, dict[str, Any]]
     notes: MethodNotes
     times: dict[CellKey, dict[str, StepTimes]]
+    warning: str = ""
 
 
 def read_study(
@@ -76,6 +86,12 @@ def read_study(
                 results, values, [int(run) for run in errors.columns.to_numpy()], most
             )
     table = join_rows(rows, options.metric)
+    copies = find_copied_runs(table, "rmse", _RUN)
+    table = drop_runs(table, copies, _RUN)
+    long_rows = pd.concat(metrics, ignore_index=True) if metrics else data.metrics
+    sentences = (describe_copies(copies), describe_dependence(table, "rmse", _RUN))
     return data._replace(
-        table=table, metrics=pd.concat(metrics, ignore_index=True) if metrics else data.metrics
+        table=table,
+        metrics=drop_runs(long_rows, copies, _RUN),
+        warning=" ".join(filter(None, sentences)),
     )

@@ -1,0 +1,122 @@
+"""Runs that are not independent: copies of a run, and errors that correlate from run to run.
+
+References:
+    R. Bartels (1982), The rank version of von Neumann's ratio test for randomness.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from scipy.special import ndtr
+from scipy.stats import rankdata
+
+from pfbench.results.error_measures import Array
+
+ALARM_LEVEL = 0.001  # of the test of all filters together: a study has many readers [ours]
+_FEWEST = 10  # runs of a test
+
+
+def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[object, object]:
+    """Find runs whose errors are equal, digit by digit, to those of an earlier run.
+
+    A filter whose error is the same in all runs of a condition has no random data there and is left out.
+
+    Args:
+        table: One row per filter, scenario, regime and run.
+        value: Column of the error, a number with many digits.
+        run: Columns that name a run.
+
+    Returns:
+        The earlier run by each copy. A run is a copy if the errors of one filter agree in all conditions.
+    """
+    wide = table.pivot_table(value, ["filter", "scenario", "regime"], run, dropna=False)
+    copies: dict[object, object] = {}
+    for _, rows in wide.groupby(level="filter", sort=False):
+        values = rows.to_numpy()
+        finite = np.where(np.isfinite(values), values, np.nan)
+        varying = np.nan_to_num(np.nanmax(finite, 1) > np.nanmin(finite, 1)).astype(bool)
+        first: dict[bytes, object] = {}
+        for k, name in enumerate(rows.columns):
+            column = np.ascontiguousarray(values[varying, k])
+            if column.size and np.isfinite(column).all():
+                original = first.setdefault(column.tobytes(), name)
+                if original != name:
+                    copies.setdefault(name, original)
+    return copies
+
+
+def drop_runs(table: pd.DataFrame, runs: dict[object, object], run: list[str]) -> pd.DataFrame:
+    """Remove the rows of some runs.
+
+    Args:
+        table: Table with the columns of a run.
+        runs: Runs, as the keys of `find_copied_runs`.
+        run: Columns that name a run.
+    """
+    if not runs:
+        return table
+    index = pd.MultiIndex.from_frame(table[run]) if len(run) > 1 else pd.Index(table[run[0]])
+    return table[~index.isin(list(runs))]
+
+
+def describe_copies(copies: dict[object, object]) -> str:
+    """Describe copies in one sentence, empty without any.
+
+    Args:
+        copies: Result of `find_copied_runs`.
+    """
+    if not copies:
+        return ""
+    copy, original = next(iter(copies.items()))
+    names = [" ".join(map(str, n)) if isinstance(n, tuple) else str(n) for n in (copy, original)]
+    count = f"{len(copies)} runs have" if len(copies) > 1 else "1 run has"
+    return (
+        f"{count} the errors of another run (run {names[0]} is equal to run {names[1]}) and "
+        f"{'are' if len(copies) > 1 else 'is'} left out: copies are not independent."
+    )
+
+
+def lag_p_values(values: Array) -> Array:
+    """Test for errors that are alike in neighbouring runs, one-sided, by ranks.
+
+    Args:
+        values: Series in the order of the runs, [..., n].
+
+    Returns:
+        p-values, [...]; 1 for fewer than 10 runs.
+    """
+    n = values.shape[-1]
+    if n < _FEWEST:
+        return np.ones(values.shape[:-1])
+    ranks = rankdata(values, axis=-1)
+    centred = ranks - ranks.mean(axis=-1, keepdims=True)
+    total = (centred**2).sum(axis=-1)
+    with np.errstate(invalid="ignore"):
+        ratio = (np.diff(ranks, axis=-1) ** 2).sum(axis=-1) / total
+    variance = 4 * (n - 2) * (5 * n**2 - 2 * n - 9) / (5 * n * (n + 1) * (n - 1) ** 2)
+    return np.asarray(np.where(total > 0, ndtr((ratio - 2) / np.sqrt(variance)), 1.0))
+
+
+def describe_dependence(table: pd.DataFrame, value: str, run: list[str]) -> str:
+    """Describe errors that correlate from run to run, empty if none is shown.
+
+    Args:
+        table: One row per filter, scenario, regime and run.
+        value: Column of the error.
+        run: Columns that name a run, in the order of the runs.
+    """
+    logs = table.assign(log=np.log(table[value].where(table[value] > 0)))
+    wide = logs.pivot_table("log", "filter", run, dropna=False)
+    p = {
+        str(label): float(lag_p_values(series[np.isfinite(series)]))
+        for label, series in zip(wide.index, wide.to_numpy(), strict=True)
+    }
+    alarms = [label for label, chance in p.items() if chance * len(p) < ALARM_LEVEL]
+    if not alarms:
+        return ""
+    least = min(p[label] for label in alarms) * len(p)
+    return (
+        f"Errors of neighbouring runs are alike for {len(alarms)} of {len(p)} filters (p = {least:.1g}): the runs "
+        "are not independent, and all intervals are too short."
+    )
