@@ -85,13 +85,19 @@ def read_study(
             data.tracks[key] = make_tracks(
                 results, values, [int(run) for run in errors.columns.to_numpy()], most
             )
-    table = join_rows(rows, options.metric)
-    copies = find_copied_runs(table, "rmse", _RUN)
-    table = drop_runs(table, copies, _RUN)
     long_rows = pd.concat(metrics, ignore_index=True) if metrics else data.metrics
+    return _leave_out_copies(
+        data._replace(table=join_rows(rows, options.metric), metrics=long_rows)
+    )
+
+
+def _leave_out_copies(data: StudyData) -> StudyData:
+    """Leave out copies of runs, and state runs that are not independent."""
+    copies = find_copied_runs(data.table, "rmse", _RUN)
+    table = drop_runs(data.table, copies, _RUN)
     sentences = (describe_copies(copies), describe_dependence(table, "rmse", _RUN))
     return data._replace(
         table=table,
-        metrics=drop_runs(long_rows, copies, _RUN),
+        metrics=drop_runs(data.metrics, copies, _RUN),
         warning=" ".join(filter(None, sentences)),
     )

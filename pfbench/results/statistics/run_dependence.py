@@ -20,7 +20,7 @@ _FEWEST = 10  # runs of a test
 def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[object, object]:
     """Find runs whose errors are equal, digit by digit, to those of an earlier run.
 
-    A filter whose error is the same in all runs of a condition has no random data there and is left out.
+    A condition in which all runs of a filter have one error is left out: its data are not random.
 
     Args:
         table: One row per filter, scenario, regime and run.
@@ -34,8 +34,11 @@ def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[ob
     copies: dict[object, object] = {}
     for _, rows in wide.groupby(level="filter", sort=False):
         values = rows.to_numpy()
-        finite = np.where(np.isfinite(values), values, np.nan)
-        varying = np.nan_to_num(np.nanmax(finite, 1) > np.nanmin(finite, 1)).astype(bool)
+        largest, least = (
+            extreme(np.where(np.isfinite(values), values, fill), 1)
+            for extreme, fill in ((np.max, -np.inf), (np.min, np.inf))
+        )
+        varying = largest > least
         first: dict[bytes, object] = {}
         for k, name in enumerate(rows.columns):
             column = np.ascontiguousarray(values[varying, k])
