@@ -6,6 +6,8 @@ References:
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from scipy.special import ndtr
@@ -17,7 +19,7 @@ ALARM_LEVEL = 0.001  # of the test of all filters together: a study has many rea
 _FEWEST = 10  # runs of a test
 
 
-def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[object, object]:
+def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[Any, Any]:
     """Find runs whose errors are equal, digit by digit, to those of an earlier run.
 
     A condition in which all runs of a filter have one error is left out: its data are not random.
@@ -31,7 +33,7 @@ def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[ob
         The earlier run by each copy. A run is a copy if the errors of one filter agree in all conditions.
     """
     wide = table.pivot_table(value, ["filter", "scenario", "regime"], run, dropna=False)
-    copies: dict[object, object] = {}
+    copies: dict[Any, Any] = {}
     for _, rows in wide.groupby(level="filter", sort=False):
         values = rows.to_numpy()
         largest, least = (
@@ -39,7 +41,7 @@ def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[ob
             for extreme, fill in ((np.max, -np.inf), (np.min, np.inf))
         )
         varying = largest > least
-        first: dict[bytes, object] = {}
+        first: dict[bytes, Any] = {}
         for k, name in enumerate(rows.columns):
             column = np.ascontiguousarray(values[varying, k])
             if column.size and np.isfinite(column).all():
@@ -49,7 +51,7 @@ def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[ob
     return copies
 
 
-def drop_runs(table: pd.DataFrame, runs: dict[object, object], run: list[str]) -> pd.DataFrame:
+def drop_runs(table: pd.DataFrame, runs: dict[Any, Any], run: list[str]) -> pd.DataFrame:
     """Remove the rows of some runs.
 
     Args:
@@ -63,7 +65,7 @@ def drop_runs(table: pd.DataFrame, runs: dict[object, object], run: list[str]) -
     return table[~index.isin(list(runs))]
 
 
-def describe_copies(copies: dict[object, object]) -> str:
+def describe_copies(copies: dict[Any, Any]) -> str:
     """Describe copies in one sentence, empty without any.
 
     Args:
