@@ -38,7 +38,7 @@ CONTESTANTS = (
     EAGER,
     PARTICLES,
     JAX,
-    Contestant("JAX, run by run", "jax", ("peer_jax.py", "loop")),
+    Contestant("JAX, run by run", "jax", ("peer_jax.py", "loop", "count", "float32")),
 )
 
 

@@ -2,7 +2,9 @@
 
 W1 to W3 are single runs, W4 a batch. Of W3 the package has no model; `Radar` is one as a user would write it.
 
-    python house.py float32|float64 eager|kernels|compiled [sir|ckf] WORKLOAD
+    python house.py float32|float64 auto|eager|kernels|compiled [sir|ckf] WORKLOAD
+
+`auto` is the engine that a job of this size takes by default.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.filter import EssResampler, ParticleFilter, Systematic, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.run_batches import choose_run_batch
+from pfbench.job.filter_pass import choose_engine
 from pfbench.kernels import compilation, process_memory
 from pfbench.model import StateSpaceModel, StochasticVolatility, UnivariateGrowth
 from pfbench.model.ins_gnss import LooseStep
@@ -107,6 +110,8 @@ def ckf(work: Any, dtype: torch.dtype, engine: str = "eager") -> Filter:
 def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) -> Filter:
     """A filter in the project's time loop, in blocks of runs as a job makes them."""
     model, record = model_and_record(work, dtype)
+    if engine == "auto":
+        engine = choose_engine(engine, method, model, *work.y.shape[:2])
     method = (
         CompiledParticleFilter(method)
         if engine == "compiled" and isinstance(method, ParticleFilter)

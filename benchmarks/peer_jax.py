@@ -1,8 +1,9 @@
-"""What one writes in plain JAX: one jitted scan over the steps, in single precision. Runs in an environment of its own.
+"""What one writes in plain JAX: one jitted scan over the steps. Runs in an environment of its own.
 
-    python peer_jax.py vmap|loop WORKLOAD
+    python peer_jax.py vmap|loop search|count float32|float64 WORKLOAD
 
-`vmap` takes all runs at once, `loop` one after the other.
+`vmap` takes all runs at once, `loop` one after the other. `search` finds ancestors by binary search, `count` by a sum over
+the numbers of descendants, without a search.
 """
 
 from __future__ import annotations
@@ -22,8 +23,24 @@ from problems import Problem
 from worker import Filter, serve
 
 
+def by_search(place: Any, w: Any, n: int) -> Any:
+    """Ancestors of systematic resampling by binary search."""
+    positions = (jnp.arange(n) + place) / n
+    return jnp.clip(jnp.searchsorted(jnp.cumsum(w), positions), 0, n - 1)
+
+
+def by_count(place: Any, w: Any, n: int) -> Any:
+    """The same by counting: each weight's last descendant, then a sum."""
+    cdf = jnp.cumsum(w)
+    last = jnp.clip(jnp.ceil(cdf / cdf[-1] * n - place), 0, n).astype(jnp.int32)
+    count = jnp.zeros(n + 1, jnp.int32).at[last].add(1)
+    return jnp.minimum(jnp.cumsum(count)[:-1], n - 1)
+
+
 def sir(work: Any) -> Filter:
-    n, problem = int(work.particles), Problem(work, jnp, lambda a: jnp.asarray(a, jnp.float32))
+    dtype = getattr(jnp, sys.argv[3])
+    n, problem = int(work.particles), Problem(work, jnp, lambda a: jnp.asarray(a, dtype))
+    resample = {"search": by_search, "count": by_count}[sys.argv[2]]
     y = problem.y
     runs, steps, _ = y.shape
 
@@ -31,9 +48,8 @@ def sir(work: Any) -> Filter:
         x, w, total = carry
         t, seen, key = given
         chance, place = jax.random.split(key)
-        positions = (jnp.arange(n) + jax.random.uniform(place)) / n
-        ancestors = jnp.clip(jnp.searchsorted(jnp.cumsum(w), positions), 0, n - 1)
-        x = problem.move(t, x[ancestors], jax.random.normal(chance, (n, problem.w)))
+        ancestors = resample(jax.random.uniform(place, dtype=dtype), w, n)
+        x = problem.move(t, x[ancestors], jax.random.normal(chance, (n, problem.w), dtype))
         log_w = problem.log_like(seen, x)
         rise = jax.nn.logsumexp(log_w)
         w = jnp.exp(log_w - rise)
@@ -43,8 +59,8 @@ def sir(work: Any) -> Filter:
 
     def one(key: Any, seen: Any) -> Any:
         first, rest = jax.random.split(key)
-        x = problem.initial(jax.random.normal(first, (n, problem.d)))
-        start = (x, jnp.full(n, 1.0 / n), jnp.zeros(()))
+        x = problem.initial(jax.random.normal(first, (n, problem.d), dtype))
+        start = (x, jnp.full(n, 1.0 / n, dtype), jnp.zeros((), dtype))
         (_, _, total), told = jax.lax.scan(
             step, start, (jnp.arange(steps), seen, jax.random.split(rest, steps))
         )
@@ -67,4 +83,5 @@ def contestant(work: Any) -> tuple[Filter, dict[str, str]]:
 
 
 if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", sys.argv[3] == "float64")
     serve(contestant)

@@ -117,6 +117,51 @@ def race(
     ]
 
 
+def store_results(path: Path, workload: str, results: Mapping[str, Result | None]) -> None:
+    """Put the results of a workload in a file of JSON, beside those of other workloads.
+
+    Args:
+        path: the file, made where there is none.
+        workload: name of the workload; earlier results of it are replaced.
+        results: of each contestant by label; None where it did not run.
+    """
+    everything = json.loads(path.read_text()) if path.exists() else {}
+    everything[workload] = {
+        label: result
+        and {
+            "cpu": _rounded(result.cpu),
+            "wall": _rounded(result.wall),
+            "qualities": {name: _rounded(rows) for name, rows in result.qualities.items()},
+            "versions": result.versions,
+            "start": round(result.start),
+        }
+        for label, result in results.items()
+    }
+    lines = [f"{json.dumps(name)}: {json.dumps(told)}" for name, told in everything.items()]
+    path.write_text("{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def load_results(path: Path, workload: str) -> dict[str, Result | None]:
+    """Return the stored results of a workload by label; empty where none are stored."""
+    told = json.loads(path.read_text()).get(workload, {}) if path.exists() else {}
+    return {
+        label: one
+        and Result(
+            np.array(one["cpu"]),
+            np.array(one["wall"]),
+            {name: np.array(rows) for name, rows in one["qualities"].items()},
+            one["versions"],
+            one["start"],
+        )
+        for label, one in told.items()
+    }
+
+
+def _rounded(values: np.ndarray) -> Any:
+    """Six significant digits: lists of numbers, NaN as JSON's NaN."""
+    return np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[float])(values).tolist()
+
+
 def _answer(process: subprocess.Popen[str]) -> dict[str, Any] | None:
     line = process.stdout.readline() if process.stdout else ""
     return json.loads(line) if line else None
