@@ -202,6 +202,16 @@ class SinsGpsAzimuth(InsErrorModel):
     def observation(self, x: Tensor, u: AzimuthStep) -> Distribution:
         return independent_normal(x.mT.index_select(1, self.observed_indices).mT, self.r)
 
+    def observation_jacobian(self, x: Tensor, u: AzimuthStep) -> Tensor:
+        """Return the matrix that selects the measured components, [1, 1, k, D].
+
+        Args:
+            x: States, [R, N, D].
+            u: Inputs of the step.
+        """
+        eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+        return eye[self.observed_indices][None, None]
+
 
 def _bias_sizes(imu: ImuErrors) -> Tensor:
     """Return standard deviations of all gyro and accelerometer biases [6]."""

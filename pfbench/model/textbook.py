@@ -233,6 +233,17 @@ class Benes(StateSpaceModel):
         is_upward = torch.special.ndtr(w[..., 1:]) < torch.sigmoid(2.0 * x)
         return x + torch.where(is_upward, self.d, -self.d) + torch.sqrt(self.d) * w[..., :1]
 
+    def propagation_jacobian(self, x: Tensor, u: Any) -> Tensor:
+        """Return 1, the derivative of step (but at its jump, 0) and measurement, [1, 1, 1, 1].
+
+        Args:
+            x: States, [R, N, 1].
+            u: Not used.
+        """
+        return x.new_ones(1, 1, 1, 1)
+
+    observation_jacobian = propagation_jacobian
+
     @override
     def observation(self, x: Tensor, u: Any) -> Distribution:
         return independent_normal(x, self.r)

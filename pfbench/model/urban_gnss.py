@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from torch.nn.functional import normalize
 from typing_extensions import override
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
@@ -207,6 +208,19 @@ class UrbanGnss(StateSpaceModel):
     def observation(self, x: Tensor, u: UrbanInputs) -> Distribution:
         offset = x[..., 4:5] + x[..., 6:7] * u.glonass.unsqueeze(1)
         return self.range_error(range_change(x[..., :3], u.line, u.reach) + offset, u)
+
+    def observation_jacobian(self, x: Tensor, u: UrbanInputs) -> Tensor:
+        """Return unit vectors from the satellites and the derivatives of the clock, [R, N, S, 9].
+
+        Args:
+            x: States, [R, N, 9].
+            u: Inputs of the step.
+        """
+        sight = x[..., None, :3] - (u.reach.unsqueeze(-1) * u.line).unsqueeze(1)
+        rows = x.new_zeros(*sight.shape[:-1], x.shape[-1])
+        rows[..., :3], rows[..., 4] = normalize(sight, dim=-1), 1.0
+        rows[..., 6] = u.glonass.unsqueeze(1)
+        return rows
 
 
 def range_change(position: Tensor, line: Tensor, reach: Tensor) -> Tensor:

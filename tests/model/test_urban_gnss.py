@@ -23,6 +23,7 @@ from pfbench.model.pseudorange_errors import (
     UrbanInputs,
 )
 from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning, range_change
+from pfbench.testing import check_jacobians
 
 BELIEVED = UrbanTuning(
     distance_density=0.2,
@@ -356,3 +357,9 @@ def test_the_initial_law_has_the_spreads_in_their_places() -> None:
     expected = [15.0, 16.0, 10.0, math.radians(10.0), 14.0, 0.5, 5.0, 0.01, 0.002]
     assert torch.allclose(sd, sd.new_tensor(expected), rtol=1e-12, atol=0)
     assert len(model().names) == len(model().units) == model().chart.dimension == 9
+
+
+@pytest.mark.parametrize("law", [MIXED, NormalRangeError()])
+def test_the_jacobian_of_ranges_is_the_difference_quotient(law: PseudorangeError) -> None:
+    x = STATE.expand(2, 3, 9) * torch.tensor([1.0, 30.0, -300.0], dtype=torch.float64).view(3, 1)
+    assert check_jacobians(model(law), x, sky(), step=1e-2).keys() == {"observation_jacobian"}
