@@ -28,6 +28,8 @@ class ReportOptions:
         metric: Metric of the main group that decides, one of `main_metrics.MAIN_METRICS`. The others are
             in the second family.
         title: Title of the page; empty for the name of the study.
+        baseline: Label of the filter that measures the others in the opening view; empty for the first of
+            `baselines.REFERENCES` that has an error. Planned pairs do not depend on it.
 
     Raises:
         ValueError: If a value is out of range.
@@ -43,6 +45,7 @@ class ReportOptions:
     planned: int | None = None
     metric: str = "rmse"
     title: str = ""
+    baseline: str = ""
 
     def __post_init__(self) -> None:
         check_main_metric(self.metric)

@@ -9,8 +9,10 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.report.board import build_pack
+from pfbench.report.board.pack import select_baselines
 from pfbench.report.board.sweeps import read_settings
 from pfbench.report.board.tracks import select_telling_runs
+from pfbench.report.looks import find_looks
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import load_conditions
 
@@ -105,3 +107,20 @@ def test_the_level_of_a_report_is_that_of_its_option(results: Path, alpha: float
         if "interval" in view["sentence"]:
             assert f"{level} interval" in view["sentence"]
     assert level in pack["methods_paragraph"]
+
+
+def test_one_baseline_measures_all_filters(results: Path) -> None:
+    conditions = load_conditions("demo", results)
+    labels = ["sir", "ekf", "ckf", "ekf_scaled_tuned"]
+    assert select_baselines(find_looks(labels))[:2] == ["ekf_scaled_tuned", "ekf"]
+    assert select_baselines(find_looks(["sir", "ckf", "ekf"]))[0] == "ekf"
+    assert select_baselines(find_looks(["sir", "ckf"]))[0] == "sir"
+    for baseline in ("", "ukf"):
+        pack = build_pack("demo", conditions, ReportOptions(baseline=baseline))
+        view = next(iter(pack["views"]))
+        assert view.baseline == (baseline or "ekf")
+    with pytest.raises(ValueError, match=r"report\.baseline must be a filter of the study, got apf"):
+        build_pack("demo", conditions, ReportOptions(baseline="apf"))
+    missing = {entry["key"]: entry["reason_missing"] for entry in pack["budgets"]}
+    assert missing["particles"] is None
+    assert missing["time"] == "The study has no jobs with budget=time."

@@ -71,7 +71,7 @@ def test_a_table_of_the_readme_is_the_opening_view(
     shutil.copy(study / "verdicts.csv", tmp_path / "reports" / "demo")
     lines = numbers["board_table"]("demo").split("\n")
     rows = pd.read_csv(study / "verdicts.csv").iloc[:4]
-    assert lines[0].startswith("| filter | error [m] | ratio to `sir` | track kept |")
+    assert lines[0].startswith("| filter | error [m] | ratio to `ekf` | track kept |")
     for line, row in zip(lines[2:], rows.to_dict("records"), strict=True):
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         assert cells[0] == f"`{row['filter']}`"

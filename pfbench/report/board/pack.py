@@ -9,6 +9,7 @@ from typing import Any
 from pfbench.report import provenance
 from pfbench.report.board.curves import list_calibration, list_runs
 from pfbench.report.board.pack_entries import (
+    budget_entries,
     cell_entries,
     describe_versions,
     filter_entry,
@@ -24,9 +25,10 @@ from pfbench.report.journal.methods_text import describe_methods
 from pfbench.report.journal.references import format_bibliography
 from pfbench.report.looks import MethodLook, study_looks, study_part_names
 from pfbench.report.options import ReportOptions
+from pfbench.results.comparison.baselines import REFERENCES
 from pfbench.results.conditions import Condition
 
-_BASELINES = ("sir", "ekf", "ukf", "ckf")  # offered first if they are in the study
+_BASELINES = (*REFERENCES, "ukf", "ckf")  # offered first if they are in the study
 _MOST_BASELINES, _FEW_BASELINES = 3, 2
 _MANY = 300  # filters times conditions, from which a page offers few baselines
 
@@ -56,7 +58,7 @@ def build_pack(
     regimes = study_part_names(conditions, "noise")
     planned = decide_planned(table, looks, options)
     most = _MOST_BASELINES if len(looks) * len(conditions) <= _MANY else _FEW_BASELINES
-    names = StudyNames(looks, worlds, regimes, _select_baselines(looks)[:most])
+    names = StudyNames(looks, worlds, regimes, select_baselines(looks, options.baseline)[:most])
     views = build_views(table, names, options, planned_words(planned), data.times)
     for view in views.values():
         view["sentence"] = f"{data.warning} {view['sentence']}".lstrip()
@@ -75,7 +77,7 @@ def build_pack(
         "cells": cells,
         "metrics": metric_entries(table, options.metric),
         "baselines": list(dict.fromkeys(key.baseline for key in views)),
-        "budgets": [{"key": "particles", "name": "Same N", "reason_missing": None}],
+        "budgets": budget_entries(conditions),
         "views": views,
         "planned": entries,
         "robustness": describe_robustness(table, looks, options),
@@ -101,8 +103,21 @@ def _describe_methods(conditions: Sequence[Condition], options: ReportOptions, p
     return "\n\n".join(paragraphs)
 
 
-def _select_baselines(looks: Mapping[str, MethodLook]) -> list[str]:
-    """Select the baselines that a reader may choose."""
+def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> list[str]:
+    """Select the baselines that a reader may choose, the one of the opening view first.
+
+    Args:
+        looks: Looks by label.
+        baseline: Label of the first baseline, empty for the default.
+
+    Raises:
+        ValueError: If it is no filter of the study.
+    """
+    if baseline and baseline not in looks:
+        raise ValueError(
+            f"report.baseline must be a filter of the study, got {baseline}. "
+            f"Choose from {', '.join(looks)}."
+        )
     stated = [label for look in looks.values() for label in look.baselines]
-    available = [label for label in (*_BASELINES, *stated) if label in looks]
+    available = [label for label in (baseline, *_BASELINES, *stated) if label in looks]
     return list(dict.fromkeys(available)) or list(looks)[:1]

@@ -11,6 +11,9 @@ import pandas as pd
 from pfbench.report.board.run_table import METRIC_NAMES
 from pfbench.report.looks import MethodLook, PartName
 from pfbench.results.conditions import Condition
+from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
+
+_BUDGET_NAMES = {"particles": "Equal N", "time": "Equal time", "likelihoods": "Equal likelihoods"}
 
 
 def list_metrics(table: pd.DataFrame, main: str = "rmse") -> list[str]:
@@ -97,6 +100,21 @@ def cell_entries(table: pd.DataFrame) -> list[dict[str, Any]]:
             "particles": None if math.isnan(particles) else int(particles),
         })  # fmt: skip
     return cells
+
+
+def budget_entries(conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+    """List the entries of the budgets, each with the reason why the study lacks it.
+
+    Args:
+        conditions: Conditions of the study.
+    """
+    jobs = [job.meta for condition in conditions for job in condition.jobs]
+    kinds = {str(meta["config"].get("budget", SAME_N)) for meta in jobs}
+    return [
+        {"key": key, "name": name,
+         "reason_missing": None if key in kinds else f"The study has no jobs with budget={key}."}
+        for key, name in _BUDGET_NAMES.items() if key in kinds or key != SAME_LIKELIHOODS
+    ]  # fmt: skip
 
 
 def metric_entries(table: pd.DataFrame, main: str) -> list[dict[str, Any]]:

@@ -25,12 +25,13 @@ from pfbench.report.board.levels import (
 )
 from pfbench.report.looks import MethodLook, find_looks
 from pfbench.report.options import ReportOptions
+from pfbench.results.comparison.baselines import REFERENCES
 from pfbench.results.error_measures import Flags
 from pfbench.results.statistics.paired_effects import MIN_RUNS, ConditionEffects
 from pfbench.results.statistics.signed_rank import holm
 from pfbench.results.statistics.world_effects import EffectEstimate
 
-CONTROL = "ekf_scaled_tuned"  # EKF with tuned constant factors on R and Q
+CONTROL = REFERENCES[0]  # EKF with tuned constant factors on R and Q
 OUTLIER_REGIME, NOMINAL_REGIME = "outliers", "nominal"
 NOMINAL_LIMIT = 1.05  # largest ratio of errors to the control in nominal noise
 

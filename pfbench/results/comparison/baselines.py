@@ -8,7 +8,8 @@ from itertools import combinations
 from pfbench.results.conditions import natural_sort_key
 
 _FEW = 5  # filters up to which all pairs are planned if no proposed method is compared
-_REFERENCES = ("ekf", "sir")  # of larger studies without a proposed method
+# filters that measure the others, the first that a study has: the tuned control, EKF, SIR
+REFERENCES = ("ekf_scaled_tuned", "ekf", "sir")
 
 
 def list_planned_pairs(
@@ -22,7 +23,7 @@ def list_planned_pairs(
 
     Returns:
         Proposed methods with each baseline of their paper. Without such a pair: all pairs of at most
-        five filters, or each filter with the EKF, else with SIR.
+        five filters, or each filter with the first of `REFERENCES` that the study has.
     """
     labels = sorted(set(labels), key=natural_sort_key)
     pairs = [
@@ -35,5 +36,5 @@ def list_planned_pairs(
         return pairs
     if len(labels) <= _FEW:
         return list(combinations(labels, 2))
-    reference = next((label for label in _REFERENCES if label in labels), None)
+    reference = next((label for label in REFERENCES if label in labels), None)
     return [(label, reference) for label in labels if reference and label != reference]
