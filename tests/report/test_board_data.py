@@ -119,7 +119,9 @@ def test_one_baseline_measures_all_filters(results: Path) -> None:
         pack = build_pack("demo", conditions, ReportOptions(baseline=baseline))
         view = next(iter(pack["views"]))
         assert view.baseline == (baseline or "ekf")
-    with pytest.raises(ValueError, match=r"report\.baseline must be a filter of the study, got apf"):
+    with pytest.raises(
+        ValueError, match=r"report\.baseline must be a filter of the study, got apf"
+    ):
         build_pack("demo", conditions, ReportOptions(baseline="apf"))
     missing = {entry["key"]: entry["reason_missing"] for entry in pack["budgets"]}
     assert missing["particles"] is None

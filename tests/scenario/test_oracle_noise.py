@@ -625,7 +625,7 @@ def test_the_switch_reaches_the_result(tmp_path: Path) -> None:
     )
     assert report.code == 0, report.err
     page = (tmp_path / "reports" / "adhoc" / "report.md").read_text()
-    assert "EKF [oracle_noise=True]" in page
+    assert "EKF [oracle noise = True]" in page
     assert re.search(
         r"receives the true noise.*\(EKF \[oracle_noise=True\]\)", page.replace("\\", "")
     )
