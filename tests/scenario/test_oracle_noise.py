@@ -627,7 +627,7 @@ def test_the_switch_reaches_the_result(tmp_path: Path) -> None:
     page = (tmp_path / "reports" / "adhoc" / "report.md").read_text()
     assert "EKF [oracle noise = True]" in page
     assert re.search(
-        r"receives the true noise.*\(EKF \[oracle_noise=True\]\)", page.replace("\\", "")
+        r"receives the true noise.*\(EKF \[oracle noise = True\]\)", page.replace("\\", "")
     )
 
 

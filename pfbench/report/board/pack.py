@@ -111,7 +111,7 @@ def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> lis
         baseline: Label of the first baseline, empty for the default.
 
     Raises:
-        ValueError: If it is no filter of the study.
+        ValueError: If the study lacks it.
     """
     if baseline and baseline not in looks:
         raise ValueError(
