@@ -11,13 +11,14 @@ import pandas as pd
 from pfbench.nav import earth
 from pfbench.nav.gnss.ephemeris import GM_GPS
 
-# one eccentric and one nearly circular satellite, every parameter at work
+# one eccentric and one nearly circular satellite, every parameter at work. deltan, Omegadot, cu and cr are fitted to
+# the gravity of an oblate Earth, as those of broadcast orbits are
 EPHEMERIDES = pd.DataFrame(
     {
         "sys": ["G", "E"], "prn": [7, 14], "week": [1900, 1900], "toe": [129600.0, 129600.0], "toc": [129584.0, 129600.0],
         "sqrtA": [5153.7, 5289.3], "e": [0.0123, 0.163], "i0": [0.96, 0.86], "Omega0": [-2.4, 0.8], "omega": [0.47, 2.95],
-        "M0": [2.37, 0.12], "deltan": [4.4e-9, 3.9e-9], "Omegadot": [-7.8e-9, -6.1e-9], "idot": [6.2e-10, -4.0e-10],
-        "cuc": [9.1e-6, 2.0e-6], "cus": [1.1e-5, -3.0e-6], "crc": [173.8, 293.9], "crs": [20.1, 33.7],
+        "M0": [2.37, 0.12], "deltan": [4.247e-9, 6.75e-9], "Omegadot": [-7.632e-9, -9.249e-9], "idot": [6.2e-10, -4.0e-10],
+        "cuc": [8.4e-7, 2.031e-6], "cus": [5.467e-6, 5.832e-7], "crc": [285.74, 321.88], "crs": [25.69, 32.732],
         "cic": [-1.8e-7, 2.0e-6], "cis": [-8.0e-8, 2.1e-6], "af0": [2.3e-5, 4.8e-4], "af1": [1.3e-12, 2.0e-12],
         "af2": [1e-18, 0.0], "tgd": [5.1e-9, -3.0e-9], "ttx": [126000.0, 126000.0],
     }

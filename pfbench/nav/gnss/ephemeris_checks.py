@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from pfbench.nav.gnss.broadcast_elements import broadcast_elements
+from pfbench.nav.gnss.orbit_dynamics import describe_unexplained
 from pfbench.nav.gnss.rinex import CLOCK, ORBIT, WEEK
 
 _TURN = 2 * math.pi
@@ -135,7 +136,7 @@ def check_ephemerides(table: pd.DataFrame, name: str) -> EphemerisSelection:
         alone += [] if compared else [satellite]
     if alone:
         notes.append(f"{name}: ephemerides without a neighbour to compare with: {', '.join(alone)}")
-    return EphemerisSelection(mask, tuple(notes))
+    return EphemerisSelection(mask, (*notes, *describe_unexplained(table[mask], name)))
 
 
 def _reason(row: Mapping[Any, Any]) -> str:
