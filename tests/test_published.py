@@ -163,3 +163,23 @@ def test_the_cost_of_a_study_is_the_computing_time_of_its_jobs(
     monkeypatch.setattr(studies, "read_metadata", lambda path: {"seconds": seconds[path.stem]})
     assert studies.measure_cost("s", tmp_path) == 7.0
     assert studies.measure_cost("none", tmp_path) == 0.0
+
+
+def test_old_and_new_decisions_are_compared_in_the_direction_of_the_early_page():
+    """The pairs are stored in either direction; other metrics and families do not count."""
+    script = load("compare_decisions")
+    head = "| method | baseline | cells | p | across cells |\n|---|---|--:|--:|---|\n"
+    rows = "| a | b | 24 | 0.1 | a |\n| a | c | 24 | 0.1 | c |\n| a | d | 24 | 0.1 | no difference shown |\n\n| x |"
+    early = script.read_early_words(head + rows)
+    assert early == {("a", "b"): "better", ("a", "c"): "worse", ("a", "d"): "inconclusive"}
+    first = {"family": "planned pairs, track and error", "metric": "position error"}
+    decisions = [
+        {"a": "b", "b": "a", "question": "a", "pair_word": "worse", **first},
+        {"a": "a", "b": "c", "question": "a", "pair_word": "better", **first},
+        {"a": "a", "b": "c", "question": "a", "pair_word": "worse", **first, "metric": "CRPS", "family": "second"},
+        {"a": "a", "b": "b", "question": "b", "pair_word": "inconclusive", **first},
+    ]  # fmt: skip
+    text = script.compare(early, decisions)
+    assert "| `a` | `b` | better | better | inconclusive |  |" in text
+    assert "| `a` | `c` | worse | better | missing | yes |" in text
+    assert "1 of 3 decisions changed, 1 are missing." in text
