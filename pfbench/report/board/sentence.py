@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from pfbench.report.board.view import EQUAL, MISSING, NOT_KEPT, OPEN, BoardRow, percent
 from pfbench.report.looks import MethodLook
-from pfbench.results.decisions.words import IDENTICAL
+from pfbench.results.decisions.words import IDENTICAL, WORSE
 
 _MOST_NAMES = 3  # in a sentence
 _LOST_SHARE = 0.2  # share of runs off track from which a filter is counted
@@ -141,12 +141,13 @@ def _describe_best(
 
 
 def _describe_next(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook], level: str) -> str:
-    """State the distance of the second filter where the best one is the baseline."""
+    """State the distance of the first filter that is worse, or of the second, where the best is the baseline."""
     others = [row for row in ranked[1:] if row.words != IDENTICAL]
     if not others:
         return "No other filter has an error to compare." if len(ranked) == 1 else ""
-    row = others[0]
-    size = f"The next, {_name(row, looks)}, is {percent(math.log(row.ratio))} % above it"
+    row = next((row for row in others if row.verdict == WORSE), others[0])
+    subject = "The next" if row is others[0] else "The first that is worse"
+    size = f"{subject}, {_name(row, looks)}, is {percent(math.log(row.ratio))} % above it"
     ends = [100 * (end - 1) for end in (row.ratio_low, row.ratio_high)]
     if not all(map(math.isfinite, ends)):
         return f"{size}, without an interval from so few runs."
