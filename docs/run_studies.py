@@ -25,6 +25,7 @@ from pfbench.results import read_metadata
 TOP = Path(__file__).parents[1]
 COSTS = TOP / "docs" / "study_costs.json"
 _PARTS = ("world", "pcrb", "scores", "filter")  # of the seconds of a job
+LEARNED = "neural_ckf"  # the filter whose network a study named learned_* trains first
 
 
 def list_studies() -> list[str]:
@@ -68,6 +69,26 @@ def plan_studies(
     return plan
 
 
+def run_study(study: str, results: Path) -> int:
+    """Train the network of a study that needs one, run the sweep, and return the exit code.
+
+    Args:
+        study: Name of the study.
+        results: Folder of all studies.
+    """
+    options = [f"+experiment={study}"]
+    commands = [["run", "-m", *options]]
+    if study.startswith("learned_") and not (results / study / "network.pt").exists():
+        commands.insert(0, ["train", *options, f"filter={LEARNED}", "checkpoint=null"])
+    for words in commands:
+        code = subprocess.run(
+            [sys.executable, "-m", "pfbench", *words], cwd=TOP, check=False
+        ).returncode
+        if code:
+            return code
+    return 0
+
+
 def main(words: Sequence[str]) -> int:
     """Run the planned studies and return 1 if one of them failed."""
     costs = read_costs()
@@ -84,8 +105,7 @@ def main(words: Sequence[str]) -> int:
     for number, study in enumerate(plan, start=1):
         print(f"[{number}/{len(plan)}] {study}, {rest / 3600:.1f} h left", flush=True)
         start = time.monotonic()
-        command = [sys.executable, "-m", "pfbench", "run", "-m", f"+experiment={study}"]
-        code = subprocess.run(command, cwd=TOP, check=False).returncode
+        code = run_study(study, results)
         rest -= costs.get(study, 0.0)
         failed += [study] if code else []
         if code == 0:
