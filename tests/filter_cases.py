@@ -44,6 +44,8 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
         return "density of x_t given x_t-1"
     if name.startswith("gauss_hermite") and _needs_many_points(name, model, first.u):
         return "at most 20000 points"
+    if name == "invariant_ekf" and not hasattr(model, "group_chart"):
+        return "filter.chart must be an invariant chart of the model"
     if name == "dmc_density" and model.noise_gain(first.u) is None:
         return "additive noise"
     if name == "rbpf" and not (model.linear or model.linear_given):
