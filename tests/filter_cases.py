@@ -20,6 +20,10 @@ TEXTS = {file.stem: file.read_text() for file in sorted((CONF / "filter").glob("
 
 NAMES = [name for name in TEXTS if not name.startswith("neural_")]  # these need a trained network
 
+ON_ANY_MODEL = [
+    name for name in NAMES if name != "invariant_ekf"
+]  # it needs a model with an attitude
+
 
 @cache
 def method_of(name: str) -> Any:
