@@ -166,12 +166,13 @@ def measure(method: Filter, angle: float, runs: int, seconds: float = 60.0) -> d
     heading = model.error(result.mean, truth)[..., 2].abs().rad2deg()
     wrong = ~(heading < SETTLED)
     after = torch.where(wrong, torch.arange(1, wrong.shape[1] + 1), 0).amax(1) * INTERVAL
+    settle_s = float(np.median(torch.where(after < seconds, after, torch.inf)))
     position = (result.mean - truth)[..., 7:10].square().sum(-1).mean(1).sqrt()
     values, half = torch.stack(nees, 1), len(nees) // 2
     early = values[:, round(10 / INTERVAL) : round(30 / INTERVAL)]
     return {
         "settled": int((after < seconds).sum()),
-        "settle_s": float(np.median(torch.where(after < seconds, after, torch.inf))),
+        "settle_s": settle_s if math.isfinite(settle_s) else None,
         "lost": int(result.lost.sum()),
         "nees_10_30": float(early.nanmean()),
         "nees_half": float(values[:, half:].nanmean()),
@@ -198,20 +199,26 @@ def page(stored: dict[str, Any]) -> str:
         "",
         f"{stored['runs']} runs of 60 s. A run settles when its heading stays within 5 degrees; the time is the",
         "median. NEES is in the chart of the filter, divided by its 15 components; 1 is consistent. The position",
-        "error is the median RMSE of the runs. CPU times are relative to the EKF of the same angle.",
+        "error is the median RMSE of the runs. CPU times are relative to the EKF of the same angle. The covariance of",
+        "collapsed particles is singular to rounding and has no NEES.",
         "",
         "| heading error [deg] | filter | settled | time [s] | NEES, 10 to 30 s | NEES, second half | position [m] | CPU time |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in stored["rows"]:
         ekf = next(r for r in stored["rows"] if r["angle"] == row["angle"] and r["filter"] == "EKF")
-        settle = "never" if math.isinf(row["settle_s"]) else f"{row['settle_s']:.1f}"
+        settle = "never" if row["settle_s"] is None else f"{row['settle_s']:.1f}"
         lines.append(
             f"| {row['angle']} | {row['filter']} | {row['settled']} | {settle} | "
-            f"{row['nees_10_30']:.3g} | {row['nees_half']:.3g} | {row['position']:.2f} | "
+            f"{_nees(row['nees_10_30'])} | {_nees(row['nees_half'])} | {row['position']:.2f} | "
             f"{row['cpu_s'] / ekf['cpu_s']:.2g} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def _nees(value: float) -> str:
+    """Format a NEES; a dash for a covariance that is singular to rounding."""
+    return f"{value:.3g}" if 0.0 <= value < 1e6 else "–"
 
 
 def main() -> None:
