@@ -1,8 +1,7 @@
 """Chart blocks of the groups SO(3), SE(3) and SE_2(3): a quaternion followed by 0, 1 or 2 vectors.
 
-An element X = (C, a_1, ..., a_k) is the matrix [C a_1 ... a_k; 0 I], with the product
-(C C', a_i + C a_i') and the exponential exp(phi, d_i) = (Exp phi, J(phi) d_i)
-[Barrau and Bonnabel 2017].
+An element X = (C, a_1, ..., a_k) is the matrix [C a_1 ... a_k; 0 I]. The product of two elements is
+(C C', a_i + C a_i'). The exponential of (phi, d_i) is (Exp phi, J(phi) d_i) [Barrau and Bonnabel 2017].
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ class InvariantFilter:
     """A filter whose differences of states are those of a Lie group.
 
     With TaylorLinearisation this is the invariant EKF [Barrau and Bonnabel 2017], with sigma points the
-    UKF on manifolds [Brossard, Barrau and Bonnabel 2017]. Sensor biases are Euclidean components beside
+    UKF on manifolds [Brossard, Barrau and Bonnabel 2017]. Sensor biases are Euclidean components outside
     the group, the `imperfect` form. The initial distribution is that of the model. Mean and covariance
     of the report are in the chart of the model, in the same axes as those of other filters.
 
@@ -39,7 +39,7 @@ class InvariantFilter:
             not change. Use `left` for position fixes, `right` for measurements in body axes.
 
     Raises:
-        ValueError: If the chart or the filter is none of these. On use, if the model has no such chart.
+        ValueError: If the chart or the filter is none of these. On use, if the model does not define the chart.
     """
 
     filter: GaussianFilter | ParticleFilter
@@ -87,7 +87,7 @@ class InvariantFilter:
             The belief.
 
         Raises:
-            ValueError: If the model has no invariant chart.
+            ValueError: If the model does not define an invariant chart.
         """
         chart = find_group_chart(model, self.chart)
         belief = self.filter.init(model, runs, draws, start, spread)

@@ -25,7 +25,7 @@ class ChartModel(ModelWrapper):
         side: `left` or `right`.
 
     Raises:
-        ValueError: If the model has no invariant chart.
+        ValueError: If the model does not define an invariant chart.
     """
 
     def __init__(self, model: StateSpaceModel, side: str) -> None:

@@ -93,8 +93,8 @@ class StrapdownTotal(StateSpaceModel):
     def group_chart(self, side: str) -> Chart:
         """Return an invariant chart: attitude, velocity and position are an element of SE_2(3).
 
-        The noise gain holds in the left chart as well, to first order in the attitude noise of a step,
-        because the density of the accelerometer is the same in all axes.
+        The noise gain holds in the left chart as well, to first order in the attitude noise of a step.
+        The reason is that the density of the accelerometer is the same in all axes.
 
         Args:
             side: `left` or `right`, see LieGroupBlock.
