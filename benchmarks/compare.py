@@ -339,9 +339,11 @@ def main() -> None:
         for result in found[case].values():
             versions |= {name: value for name, value in result.versions.items() if name != "numpy"}
             rounds.add(len(result.cpu))
+    late = [case.name for case in CASES if case not in found]
+    missing = [f"Not timed in this edition: {'; '.join(late)}."] if late else []
     page = [
         "# pfbench and its peers", "",
-        *summary(found), "",
+        *summary(found), "", *missing, "",
         f"One thread each, one process at a time, {' or '.join(map(str, sorted(rounds)))} interleaved rounds after a warm-up; "
         "CPU time of the process; systematic resampling at every step. Every contestant delivers mean, variance and effective "
         "sample size at every step and, where it has one, the log evidence (of W4 and W5: minus the exact one). Ratios are taken "

@@ -260,7 +260,7 @@ def speed() -> str:
         (
             (
                 workload,
-                row.get("pfbench", row.get("pfbench's best", "")).replace("C++ loops", "kernels"),
+                row.get("pfbench", row.get("pfbench's best", "")),
                 other,
                 row["times as fast (quartiles)"],
             )

@@ -20,6 +20,10 @@ TEXTS = {file.stem: file.read_text() for file in sorted((CONF / "filter").glob("
 
 NAMES = [name for name in TEXTS if not name.startswith("neural_")]  # these need a trained network
 
+ON_ANY_MODEL = [
+    name for name in NAMES if name != "invariant_ekf"
+]  # it needs a model with an attitude
+
 
 @cache
 def method_of(name: str) -> Any:
@@ -44,6 +48,8 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
         return "density of x_t given x_t-1"
     if name.startswith("gauss_hermite") and _needs_many_points(name, model, first.u):
         return "at most 20000 points"
+    if name == "invariant_ekf" and not hasattr(model, "group_chart"):
+        return "filter.chart must be an invariant chart of the model"
     if name == "dmc_density" and model.noise_gain(first.u) is None:
         return "additive noise"
     if name == "rbpf" and not (model.linear or model.linear_given):

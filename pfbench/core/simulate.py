@@ -181,7 +181,10 @@ def simulate_steps(
 
 
 def draw_measurements(
-    distributions: Sequence[Distribution], stream: RandomStream, purpose: str
+    distributions: Sequence[Distribution],
+    stream: RandomStream,
+    purpose: str,
+    errors: Tensor | None = None,
 ) -> Tensor:
     """Draw the measurements of all steps.
 
@@ -192,6 +195,8 @@ def draw_measurements(
         distributions: Distribution of each step, batch [R, 1], event [Dy].
         stream: Random stream.
         purpose: Name of the draws.
+        errors: Errors of independent normal measurements in standard deviations, [R, T, Dy], or
+            None to draw them as standard normal numbers.
 
     Returns:
         Measurements, [R, T, Dy].
@@ -201,7 +206,7 @@ def draw_measurements(
             torch.stack([getattr(d, name)[:, 0] for d in distributions], 1)
             for name in ("mean", "stddev")
         )
-        return mean + sd * stream.normal(purpose, *mean.shape[1:])
+        return mean + sd * (stream.normal(purpose, *mean.shape[1:]) if errors is None else errors)
     rows = [draw_values(d, stream.at_step(t + 1), purpose, 1) for t, d in enumerate(distributions)]
     return torch.cat(rows, 1)
 

@@ -58,6 +58,7 @@ __getattr__, __dir__ = lazy_attributes(
         ),
         "learned.proposal": ("LearnedProposal",),
         "loop": ("FilterResult", "MultiStepFilter", "run_filter"),
+        "manifold.chart_filter": ("InvariantFilter",),
         "marginal.rao_blackwellised": ("RaoBlackwellisedFilter",),
         "moves.flow_kernels": (
             "RandomWalk",

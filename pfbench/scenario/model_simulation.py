@@ -86,9 +86,7 @@ def _measurements(
     channels = MeasurementChannels.of_one_kind(unit)
     errors = noise.draw_errors(stream, channels, time)
     if all(is_independent_normal(distribution) for distribution in distributions):
-        mean = torch.stack([distribution.mean[:, 0] for distribution in distributions], 1)
-        sd = torch.stack([distribution.stddev[:, 0] for distribution in distributions], 1)
-        return mean + sd * errors
+        return draw_measurements(distributions, stream, "world.receiver", errors)
     missing_mask = torch.isnan(errors)
     nominal = NominalNoise().draw_errors(stream, channels, time)
     if not torch.equal(torch.where(missing_mask, nominal, errors), nominal):

@@ -16,6 +16,7 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.manifold.group_block import LieGroupBlock
 from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive
 from pfbench.core.record import Record
@@ -88,6 +89,14 @@ class StrapdownAided(StateSpaceModel):
     @override
     def chart(self) -> Chart:
         return _CHART
+
+    def group_chart(self, side: str) -> Chart:
+        """Return an invariant chart, that of StrapdownTotal with further Euclidean components.
+
+        Args:
+            side: `left` or `right`, see LieGroupBlock.
+        """
+        return Chart((LieGroupBlock(side=side), EuclideanBlock(6 + _BIASES)))
 
     @property
     @override

@@ -15,6 +15,7 @@ from typing_extensions import override
 
 from pfbench.core import quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.manifold.group_block import LieGroupBlock
 from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive
 from pfbench.core.record import Record
@@ -88,6 +89,17 @@ class StrapdownTotal(StateSpaceModel):
     @override
     def chart(self) -> Chart:
         return _CHART
+
+    def group_chart(self, side: str) -> Chart:
+        """Return an invariant chart: attitude, velocity and position are an element of SE_2(3).
+
+        The noise gain holds in the left chart as well, to first order in the attitude noise of a step.
+        The reason is that the density of the accelerometer is the same in all axes.
+
+        Args:
+            side: `left` or `right`, see LieGroupBlock.
+        """
+        return Chart((LieGroupBlock(side=side), EuclideanBlock(6)))
 
     @property
     @override

@@ -1,0 +1,243 @@
+"""Filters that start with a wrong heading: how many settle, when, and whether they state their error.
+
+A vehicle weaves at 10 m/s from rest, with position fixes of 1 m each second. The truth of each run is drawn from
+the model of the filter, so the filters have no model error. The heading of the start is wrong by plus or minus
+the angle, with the angle as its standard deviation. Results are kept in heading_errors.json.
+
+Run: python benchmarks/heading_errors.py [--runs 24]; --page writes the page from the stored results alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter import (
+    Filter,
+    GaussianFilter,
+    InvariantFilter,
+    ParticleFilter,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+    UnscentedPoints,
+    run_filter,
+)
+from pfbench.model import StrapdownTotal, StrapdownTuning
+from pfbench.nav.preintegration import PreintegratedImu, preintegrate
+
+HERE = Path(__file__).parent
+STORE = HERE / "heading_errors.json"
+ANGLES = (10, 45, 90, 150)  # deg
+INTERVAL, SAMPLES = 0.5, 10  # s; IMU samples of an interval
+SETTLED = 5.0  # deg
+PARTICLES = 500
+
+
+def tuning(heading_sd: float) -> StrapdownTuning:
+    """Return the tuning of filter and truth; heading in degrees."""
+    return StrapdownTuning(
+        gyro_density=1e-3,
+        accelerometer_density=0.02,
+        gyro_bias_walk=1e-6,
+        accelerometer_bias_walk=1e-5,
+        position_sd=[1.0, 1.0, 1.0],
+        velocity_sd=None,
+        attitude_sd_deg=[1.0, 1.0, heading_sd],
+        initial_velocity_sd=[0.1, 0.1, 0.1],
+        initial_position_sd=[1.0, 1.0, 1.0],
+        gyro_bias_sd_deg_s=0.1,
+        accelerometer_bias_sd=0.05,
+        gyro_bias_deg_s=[0.0, 0.0, 0.0],
+        accelerometer_bias=[0.0, 0.0, 0.0],
+    )
+
+
+def weave(seconds: float) -> PreintegratedImu:
+    """Return increments of a weaving path: 5 m/s^2 for 2 s, then turns of 0.3 rad/s that alternate."""
+    spans = torch.full(
+        (round(seconds / INTERVAL), SAMPLES), INTERVAL / SAMPLES, dtype=torch.float64
+    )
+    t = spans.flatten().cumsum(0).reshape(spans.shape) - 0.5 * spans
+    turn = 0.3 * torch.sign(torch.sin(2 * math.pi * t / 20.0)) * (t > 2.0)
+    speed = 5.0 * t.clamp(max=2.0)
+    zero = torch.zeros_like(t)
+    # body axes right, forward, up: a turn to the left accelerates to the left
+    force = torch.stack([-turn * speed, 5.0 * (t < 2.0), zero + 9.8], -1)
+    rate, bias = torch.stack([zero, zero, turn], -1), torch.zeros(len(t), 6).double()
+    parts = preintegrate(force, rate, spans, bias)
+    gravity, duration = torch.full_like(t[:, 0], 9.8), spans.sum(-1)
+    return PreintegratedImu(*(a.unsqueeze(0) for a in (*parts, bias, gravity, duration)))
+
+
+def draw(
+    angle: float, runs: int, seconds: float, seed: int
+) -> tuple[StrapdownTotal, Record, Tensor]:
+    """Draw truth and fixes from the model.
+
+    Args:
+        angle: Heading error and its standard deviation, deg.
+        runs: Number of runs, with errors of alternating signs.
+        seconds: Duration.
+        seed: Seed.
+
+    Returns:
+        Model, record, and true states [R, T, D].
+    """
+    model, u = StrapdownTotal(tuning(angle)), weave(seconds)
+    steps = u.duration.shape[1]
+    u = PreintegratedImu(*(a.expand(runs, *a.shape[1:]) for a in u))
+    stream = PhiloxStream(seed, torch.arange(runs))
+    d = stream.normal("start", 1, 15).squeeze(1) * model.p0
+    d[:, 2] = math.radians(angle) * (1 - 2 * (torch.arange(runs) % 2))
+    x = model.chart.add(model.origin.expand(runs, -1), d).unsqueeze(1)
+    truth, y = [], torch.full((runs, steps, 3), torch.nan).double()
+    noise, errors = stream.normal("noise", steps, 12), stream.normal("fix", steps, 3)
+    for t in range(steps):
+        inputs = PreintegratedImu(*(a[:, t] for a in u))
+        x = model.propagate(x, inputs, noise[:, t : t + 1])
+        truth.append(x)
+        if t % 2:  # a fix each second
+            y[:, t] = x[:, 0, 7:10] + errors[:, t]
+    return model, Record(y, u), torch.cat(truth, 1)
+
+
+def filters() -> dict[str, Filter]:
+    """Return the filters of the table by name."""
+    ekf = GaussianFilter(TaylorLinearisation())
+    points = {
+        alpha: GaussianFilter(SigmaPointLinearisation(UnscentedPoints(alpha=alpha)))
+        for alpha in (1.0, 0.3)
+    }
+    return {
+        "EKF": ekf,
+        "invariant EKF, left": InvariantFilter(ekf, "left"),
+        "invariant EKF, right": InvariantFilter(ekf, "right"),
+        "UKF, alpha 1": points[1.0],
+        "UKF, alpha 0.3": points[0.3],
+        "invariant UKF, left, alpha 0.3": InvariantFilter(points[0.3], "left"),
+        f"SIR, {PARTICLES} particles": ParticleFilter(PARTICLES),
+    }
+
+
+def measure(method: Filter, angle: float, runs: int, seconds: float = 60.0) -> dict[str, Any]:
+    """Run a filter and compare it with the truth.
+
+    NEES is the squared error in the filter's own chart, over the 15 components of the state.
+
+    Args:
+        method: Filter.
+        angle: Heading error, deg.
+        runs: Number of runs.
+        seconds: Duration.
+
+    Returns:
+        Share of runs that settle, seconds until they do, NEES over its dimension, position error.
+    """
+    model, record, truth = draw(angle, runs, seconds, seed=1)
+    chart = model.chart
+    if isinstance(method, InvariantFilter):
+        chart = model.group_chart(method.chart)
+    nees: list[Tensor] = []
+
+    def watch(t: int, info: Any) -> dict[str, Tensor]:
+        error = model.chart.subtract(truth[:, t], info.mean)
+        slope = None
+        if chart is not model.chart:
+            slope, error = change(model, chart, info.mean), chart.subtract(truth[:, t], info.mean)
+        covariance = info.covariance()
+        covariance = covariance if slope is None else slope @ covariance @ slope.mT
+        white = torch.linalg.solve(covariance, error.unsqueeze(-1)).squeeze(-1)
+        nees.append((error * white).sum(-1) / error.shape[-1])
+        return {}
+
+    started = time.process_time()
+    with torch.no_grad():
+        result = run_filter(method, model, record, PhiloxStream(2, torch.arange(runs)), watch)
+    heading = model.error(result.mean, truth)[..., 2].abs().rad2deg()
+    wrong = ~(heading < SETTLED)
+    after = torch.where(wrong, torch.arange(1, wrong.shape[1] + 1), 0).amax(1) * INTERVAL
+    settle_s = float(np.median(torch.where(after < seconds, after, torch.inf)))
+    position = (result.mean - truth)[..., 7:10].square().sum(-1).mean(1).sqrt()
+    values, half = torch.stack(nees, 1), len(nees) // 2
+    early = values[:, round(10 / INTERVAL) : round(30 / INTERVAL)]
+    return {
+        "settled": int((after < seconds).sum()),
+        "settle_s": settle_s if math.isfinite(settle_s) else None,
+        "lost": int(result.lost.sum()),
+        "nees_10_30": float(early.nanmean()),
+        "nees_half": float(values[:, half:].nanmean()),
+        "position": float(position.nanmedian()),
+        "cpu_s": time.process_time() - started,
+    }
+
+
+def change(model: StrapdownTotal, chart: Any, mean: Tensor) -> Tensor:
+    """Return the derivative from the model's chart to another, by central differences, [R, d, d]."""
+    steps = 1e-6 * torch.eye(15, dtype=mean.dtype).unsqueeze(1)
+    sides = [chart.subtract(model.chart.add(mean, s * steps), mean) for s in (1.0, -1.0)]
+    return ((sides[0] - sides[1]) / 2e-6).permute(1, 2, 0)
+
+
+def page(stored: dict[str, Any]) -> str:
+    """Return the page of the stored results."""
+    assert __doc__ is not None
+    lines = [
+        "# Wrong headings",
+        "",
+        " ".join(__doc__.split("\n\n")[1].split()[:-5]),
+        "Written by `benchmarks/heading_errors.py`.",
+        "",
+        f"{stored['runs']} runs of 60 s. A run settles when its heading stays within 5 degrees; the time is the",
+        "median. NEES is in the chart of the filter, divided by its 15 components; 1 is consistent. The position",
+        "error is the median RMSE of the runs. CPU times are relative to the EKF of the same angle. The covariance of",
+        "collapsed particles is singular to rounding and has no NEES.",
+        "",
+        "| heading error [deg] | filter | settled | time [s] | NEES, 10 to 30 s | NEES, second half | position [m] | CPU time |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in stored["rows"]:
+        ekf = next(r for r in stored["rows"] if r["angle"] == row["angle"] and r["filter"] == "EKF")
+        settle = "never" if row["settle_s"] is None else f"{row['settle_s']:.1f}"
+        lines.append(
+            f"| {row['angle']} | {row['filter']} | {row['settled']} | {settle} | "
+            f"{_nees(row['nees_10_30'])} | {_nees(row['nees_half'])} | {row['position']:.2f} | "
+            f"{row['cpu_s'] / ekf['cpu_s']:.2g} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _nees(value: float) -> str:
+    """Format a NEES; a dash for a covariance that is singular to rounding."""
+    return f"{value:.3g}" if 0.0 <= value < 1e6 else "–"
+
+
+def main() -> None:
+    """Measure all filters and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=24)
+    parser.add_argument("--page", action="store_true")
+    options = parser.parse_args()
+    if not options.page:
+        rows = []
+        for angle in ANGLES:
+            for name, method in filters().items():
+                rows.append(
+                    {"angle": angle, "filter": name, **measure(method, angle, options.runs)}
+                )
+                print(rows[-1], flush=True)
+        STORE.write_text(json.dumps({"runs": options.runs, "rows": rows}, indent=1) + "\n")
+    (HERE / "heading_errors.md").write_text(page(json.loads(STORE.read_text())))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Chart blocks of matrix Lie groups."""

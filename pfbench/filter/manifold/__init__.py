@@ -1,0 +1,1 @@
+"""Filters in an invariant chart of the state."""
