@@ -31,6 +31,7 @@ HEADLINES = {
     "learn_noise_calibration": "calibration_location",
     "learn_quad_noise": "flights",
 }
+SUFFIXES = (".svg", ".png")  # of a headline figure, not of the copies that a folder keeps
 CAPTION = "Error of each filter relative to the baseline"
 
 _IMAGE = re.compile(r"^!\[([^\]]*)\]\(([^)]+)\)\n+(\*[^*\n].*\*\n+)?", re.MULTILINE)
@@ -63,11 +64,10 @@ def publish_report(folder: Path) -> None:
         folder: Folder of the report. Its name is the study.
     """
     stem = HEADLINES[folder.name]
-    suffixes = (".svg", ".png")
-    suffix = next((s for s in suffixes if (folder / f"{stem}{s}").exists()), None)
+    suffix = next((s for s in SUFFIXES if (folder / f"{stem}{s}").exists()), None)
     with RecordedFolder(folder, is_complete=False) as target:
         if suffix is not None:
-            for other in suffixes:
+            for other in SUFFIXES:
                 target.remove(f"headline{other}")
             target.write(f"headline{suffix}", (folder / f"{stem}{suffix}").read_bytes())
         page = (folder / "report.md").read_text(encoding="utf-8")
@@ -85,7 +85,8 @@ def reduce_markdown(text: str, folder: Path, stem: str) -> str:
     Returns:
         The reduced content.
     """
-    headline = next(folder.glob("headline.*"), None)
+    names = (f"headline{suffix}" for suffix in SUFFIXES)
+    headline = next((folder / name for name in names if (folder / name).exists()), None)
 
     def replace(match: re.Match[str]) -> str:
         alt, target, caption = match[1], match[2], match[3] or ""
