@@ -20,8 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     Filter,
     GaussianFilter,

@@ -15,9 +15,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pfbench.files.markdown import markdown_head, markdown_row
-from pfbench.results.decisions.comparisons import TRACK
-from pfbench.results.decisions.planned_pairs import FAMILY_1
+from pfbench.files import markdown_head, markdown_row
+
+_FIRST_FAMILY, _TRACK = "planned pairs, track and error", "keeps track"  # words of decisions.json
 
 TOP = Path(__file__).parents[1]
 FIRST = "f32489b"  # the oldest commit that has reports/all_seven/report.md
@@ -55,7 +55,7 @@ def select_words(decisions: Sequence[Mapping[str, Any]], a: str, b: str) -> dict
     """
     words = {}
     for d in decisions:
-        is_first = d["family"] == FAMILY_1 and d["metric"] != TRACK
+        is_first = d["family"] == _FIRST_FAMILY and d["metric"] != _TRACK
         if is_first and {d["a"], d["b"]} == {a, b}:
             word = str(d["pair_word"])
             words[str(d["question"])] = word if d["a"] == a else OPPOSITE.get(word, word)

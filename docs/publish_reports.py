@@ -9,7 +9,9 @@ changes nothing.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from pfbench.files import RecordedFolder
 from pfbench.report import (
@@ -47,6 +49,7 @@ def publish_study(folder: Path) -> None:
     opening = next(iter(pack["views"].values()))
     has_error = any(row["ratio"] is not None for row in opening["rows"])
     pack["headline"] = CAPTION if has_error else ""
+    pack["headline_note"] = describe_absent(pack) if has_error else ""
     with RecordedFolder(folder, is_complete=False) as target:
         target.remove("headline.png")
         if has_error:
@@ -55,6 +58,20 @@ def publish_study(folder: Path) -> None:
             target.remove(HEADLINE)
         write_page_data(pack, target)
         write_markdown(pack, target)
+
+
+def describe_absent(pack: Mapping[str, Any]) -> str:
+    """Name the filters that the headline figure does not show, by reason; empty if it shows all.
+
+    Args:
+        pack: Data of the page.
+    """
+    names = {look["key"]: look["name"] for look in pack["filters"]}
+    absent: dict[str, list[str]] = {}
+    for row in next(iter(pack["views"].values()))["rows"]:
+        if row["ratio"] is None:
+            absent.setdefault(row["words"], []).append(names[row["filter"]])
+    return " ".join(f"Not shown, {words}: {', '.join(rows)}." for words, rows in absent.items())
 
 
 def publish_report(folder: Path) -> None:

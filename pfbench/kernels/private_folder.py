@@ -6,6 +6,8 @@ import os
 import stat
 from pathlib import Path
 
+_PACKAGE = Path(__file__).resolve().parents[1]
+
 
 def code_folder() -> Path:
     """Return the folder of compiled code, `pfbench` in the user's cache folder.
@@ -49,3 +51,28 @@ def check_private(path: Path) -> None:
             f"{path} must be a folder or file of this user that others cannot write. Compiled code "
             "is not loaded from it. Remove it, or set XDG_CACHE_HOME to a private folder."
         )
+
+
+def find_compiled_code(library: Path) -> Path:
+    """Return the file of a library, in the package, in `code_folder` or in a private folder of the user.
+
+    Others cannot reach the files in `code_folder`, whatever the mode of these is.
+
+    Args:
+        library: Path of the library.
+
+    Returns:
+        Absolute path without links.
+
+    Raises:
+        PermissionError: If others can write the library or its folder.
+        FileNotFoundError: If it does not exist.
+    """
+    file = library.resolve(strict=True)
+    if _PACKAGE in file.parents:
+        return file
+    home = code_folder().resolve()
+    is_kept = home in file.parents and not home.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH)
+    for path in () if is_kept else (file.parent, file):
+        check_private(path)
+    return file

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import inspect
 import logging
-import os
 import subprocess
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -171,7 +170,7 @@ def _register_entry(
     library: str, constants: list[Tensor], example: list[Tensor], outputs: int
 ) -> NativeEntry:
     """Return the entry of a library, after registering what it takes."""
-    path = torch.tensor(list(os.fsencode(library)), dtype=torch.uint8)
+    path = step_table.encode_path(library)
     return NativeEntry(step_table.register_step(path, outputs, [*constants, *example]), constants)
 
 

@@ -6,10 +6,14 @@ the step was compiled for.
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
 from pfbench.kernels.cpp_library import load_library
+from pfbench.kernels.private_folder import find_compiled_code
 
 _operators = torch.library.Library("pfbench", "FRAGMENT")
 
@@ -52,9 +56,35 @@ def register_step(library: Tensor, outputs: int, arguments: list[Tensor]) -> int
 
     Returns:
         Number of the step.
+
+    Raises:
+        PermissionError: If others can write the library, see `find_compiled_code`.
+        RuntimeError: If the library is not a step of torch's compiler.
     """
     load_library()
+    name = os.fsdecode(bytes(library.tolist())) if _is_path(library) else ""
+    if name:  # the operator refuses all else
+        try:
+            library = encode_path(find_compiled_code(Path(name)))
+        except FileNotFoundError as error:
+            raise RuntimeError(
+                f"register_step: library must be a step of torch's compiler, got {name}."
+            ) from error
     return int(torch.ops.pfbench.register_step.default(library, outputs, arguments))
+
+
+def encode_path(path: str | Path) -> Tensor:
+    """Return a path as bytes, uint8 [n], as an operator takes it.
+
+    Args:
+        path: Path of a file.
+    """
+    return torch.tensor(list(os.fsencode(path)), dtype=torch.uint8)
+
+
+def _is_path(a: Tensor) -> bool:
+    """Return whether a tensor can be a path as bytes."""
+    return a.dtype == torch.uint8 and a.dim() == 1 and 0 not in a
 
 
 for _kernel in (run_steps, register_step):

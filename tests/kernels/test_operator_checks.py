@@ -21,7 +21,15 @@ from pfbench.filter import belief
 from pfbench.filter.gaussian import kalman_update, linearisation_rules
 from pfbench.filter.particle import particle_moments, resampling_schemes, weight_update
 from pfbench.job import scoring
-from pfbench.kernels import compilation, cpp, manifest, operator_sources, step_table
+from pfbench.kernels import (
+    compilation,
+    cpp,
+    cpp_library,
+    manifest,
+    operator_sources,
+    private_folder,
+    step_table,
+)
 from pfbench.kernels.operator_checks import check_arguments
 from pfbench.kernels.step_compiler import compile_function
 
@@ -201,12 +209,52 @@ def test_a_step_is_called_by_its_number_only() -> None:
     for number in (-1, 0, 4096, 2**62, id(X)):
         with pytest.raises(RuntimeError, match="must be the number of a registered step"):
             step_table.run_steps(number, [], [], [torch.rand(2, 1)], [])
-    names = [b"", b"no such file", str(Path(torch.__file__).parent / "lib/libc10.so").encode()]
+    loaded = str(Path(torch.__file__).parent / "lib/libc10.so").encode()  # may be another user's
+    names = [b"", b"no such file", b"libc10.so", loaded]
     for name in names:
-        with pytest.raises(RuntimeError, match="library must be a step of torch's compiler"):
+        with pytest.raises(
+            RuntimeError if name != loaded else (RuntimeError, PermissionError),
+            match=r"library must be a step of torch's compiler|Compiled code is not loaded",
+        ):
             step_table.register_step(torch.tensor(list(name), dtype=torch.uint8), 1, [])
     with pytest.raises(RuntimeError, match="must be a path as bytes"):
         step_table.register_step(torch.zeros(4), 1, [])
+
+
+@compiler
+def test_a_step_is_loaded_only_from_where_others_cannot_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Refused before it is loaded, which alone would run its code; a link counts as what it leads to."""
+    cpp_library.load_library()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    folder = tmp_path / "steps"
+    library, link = folder / "step.so", tmp_path / "link.so"
+    folder.mkdir(mode=0o700)
+    library.write_bytes(b"")
+    link.symlink_to(library)
+
+    def register(path: Path) -> None:
+        step_table.register_step(step_table.encode_path(path), 1, [])
+
+    for folder_mode, library_mode in ((0o777, 0o600), (0o700, 0o666), (0o720, 0o600)):
+        folder.chmod(folder_mode)
+        library.chmod(library_mode)
+        for path in (library, link):
+            with pytest.raises(PermissionError, match="Compiled code is not loaded from it"):
+                register(path)
+    folder.chmod(0o700)
+    library.chmod(0o600)
+    kept = private_folder.code_folder() / "torch" / "step.so"
+    kept.parent.mkdir()
+    kept.write_bytes(b"")
+    kept.chmod(0o664)  # of a user whose files a group may write, in a folder that it cannot enter
+    for path in (library, link, kept, Path(step_table.__file__)):
+        with pytest.raises(RuntimeError, match="library must be a step of torch's compiler"):
+            register(path)
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+    with pytest.raises(PermissionError, match="of this user"):
+        register(library)
 
 
 @compiler

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +152,28 @@ def test_the_planned_word_decides() -> None:
     assert board(data, planned={("sir", "mcmc_rpf"): "best"})["sir"].verdict == "open"
 
 
+def test_a_pair_that_track_decides_has_the_difference_of_shares() -> None:
+    """The interval is that of Agresti and Min for paired shares: half a run is added to each cell."""
+    data = table({"mcmc_rpf": -0.3, "sir": 0.0}, worlds=1, runs=60)
+    off = data["filter"].eq("sir") & (data["run"] < 36) | (data["run"] == 50)
+    data.loc[off, "keeps_track"] = False
+    looks = find_looks(["mcmc_rpf", "sir"])
+    worlds = {"w0": PartName("w0", "World", "", "m", None, "w0")}
+    options = ReportOptions()
+    (entry,) = planned_entries(decide_planned(data, looks, options), data, looks, worlds, options)
+    only, other, total = 36.5, 0.5, 62.0
+    error = math.sqrt(only + other - (only - other) ** 2 / total) / total
+    level = 1 - 0.05 / 2  # two tests of a pair, track and error
+    low, high = 100 * np.array(stats.t.interval(level, 59, (only - other) / total, error))
+    for text in (entry["reason"], entry["sentence"]):
+        shown = re.search(
+            r"98\.3 and 38\.3 % of runs, difference 60 percentage points \((\S+) to (\S+)\)", text
+        )
+        assert shown is not None, text
+        assert [float(end) for end in shown.groups()] == pytest.approx([low, high], rel=3e-3)
+    assert entry["reason"].startswith("decided by track not kept: ")
+
+
 @pytest.mark.parametrize("runs", [1, 4, 30])
 @pytest.mark.parametrize("labels", [["sir"], ["sir", "mcmc_rpf"], list(EFFECTS)])
 @pytest.mark.parametrize("is_lost", [False, True])
@@ -183,6 +206,16 @@ def test_sentence_where_the_baseline_is_the_best_states_the_distance_of_the_next
         f"[[MCMC-RPF]] has the smallest error in Flight. The next, [[SIR]], is {size:.0f} % above it (95"
         in text
     )
+
+
+def test_intervals_of_a_sentence_have_two_significant_digits() -> None:
+    data = table()
+    for baseline, form in (("sir", lambda r: 1 - r), ("mcmc_rpf", lambda r: r - 1)):
+        row = board(data, baseline)["mcmc_rpf" if baseline == "sir" else "sir"]
+        shown = re.search(r"interval (\S+) to (\S+) %", sentence(data, baseline))
+        assert shown is not None
+        ends = sorted(100 * form(r) for r in (row.ratio_low, row.ratio_high))
+        assert [float(text) for text in shown.groups()] == [float(f"{end:.1e}") for end in ends]
 
 
 def test_results_that_differ_by_rounding_are_identical_in_words() -> None:

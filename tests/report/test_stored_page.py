@@ -13,6 +13,8 @@ import synthetic_results as synthetic
 from checkout import ROOT
 from command_line import pfbench
 
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report import read_page_data, write_page_data
 from pfbench.report.page import write_report
 
 
@@ -41,6 +43,29 @@ def test_a_study_is_published_from_the_data_of_its_page(study: Path, tmp_path: P
         assert f">{ratio:.2f}<" in drawing
     publish_study(folder)
     assert first == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_published_figure_names_the_filters_that_it_does_not_show(
+    study: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(study, tmp_path / "demo"))
+    publish_study = runpy.run_path(str(ROOT / "docs" / "publish_reports.py"))["publish_study"]
+    publish_study(folder)
+    assert "Not shown" not in (folder / "report.md").read_text()
+    pack = read_page_data(folder)
+    rows = next(iter(pack["views"].values()))["rows"]
+    for row, words in zip(rows[-2:], ("track not kept", "not run in all conditions"), strict=True):
+        row.update(ratio=None, ratio_low=None, ratio_high=None, words=words)
+    with RecordedFolder(folder, is_complete=False) as target:
+        write_page_data(pack, target)
+    publish_study(folder)
+    names = {look["key"]: look["name"] for look in pack["filters"]}
+    first, second = (names[row["filter"]] for row in rows[-2:])
+    note = f"Not shown, track not kept: {first}. Not shown, not run in all conditions: {second}."
+    assert f"](headline.svg)\n\n{note}\n\n" in (folder / "report.md").read_text()
+    drawing = (folder / "headline.svg").read_text()
+    assert f">{first}<" not in drawing
+    assert f">{second}<" not in drawing
 
 
 def test_a_page_is_made_again_without_results(study: Path, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from pfbench.results.decisions.comparisons import TRACK
 from pfbench.results.decisions.decision import Decision
 from pfbench.results.decisions.family_records import TRACK_NOT_KEPT
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs
-from pfbench.results.decisions.sentences import describe_pair
+from pfbench.results.decisions.sentences import describe_pair, describe_shares
 from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.study_decisions.main_metrics import main_rule
 
@@ -106,7 +106,7 @@ def planned_entries(
         entry = {
             "a": a, "b": b, "question": "Error in these worlds", "kind": "paper" if b in looks[a].baselines else "",
             "sentence": describe_pair(*records), **ratios, "p": d.p_corrected, "word": d.pair_word,
-            "reason": _describe_gap(d), "cells": _list_cells(runs, levels, (a, b), worlds, options.alpha) if d.scale == "log ratio" else [],
+            "reason": _describe_gap(d, tracks["a", a, b]), "cells": _list_cells(runs, levels, (a, b), worlds, options.alpha) if d.scale == "log ratio" else [],
             "new_world": None if new.worlds < 2 else {
                 **{k: _ratio(new, getattr(new, k)) for k in ("estimate", "low", "high")}, "word": new.word,
             },
@@ -116,13 +116,18 @@ def planned_entries(
     return entries
 
 
-def _describe_gap(decision: Decision) -> str:
-    """Return the reason of a missing ratio or interval, empty if the pair has both."""
+def _describe_gap(decision: Decision, track: Decision) -> str:
+    """Return the reason of a missing ratio or interval, empty if the pair has both.
+
+    Where track decides, the reason has the shares of runs that keep track, and their difference.
+    """
+    if decision.reason == TRACK_NOT_KEPT:
+        return f"{TRACK_NOT_KEPT}: {describe_shares(track)}"
     if decision.reason:
         return decision.reason
     if decision.scale == "log ratio":
         return ""
-    return TRACK_NOT_KEPT if decision.scale == "runs won" else "a difference, which is no ratio"
+    return "a difference, which is no ratio"
 
 
 def _list_cells(

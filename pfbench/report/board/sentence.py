@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from pfbench.report.board.view import EQUAL, MISSING, NOT_KEPT, OPEN, BoardRow, percent
 from pfbench.report.looks import MethodLook
+from pfbench.results.decisions.sentence_formats import format_digits
 from pfbench.results.decisions.words import IDENTICAL, WORSE
 
 _MOST_NAMES = 3  # in a sentence
@@ -67,6 +68,11 @@ def count_words(number: int, noun: str) -> str:
 
 def _name(row: BoardRow, looks: Mapping[str, MethodLook]) -> str:
     return f"[[{looks[row.filter].name}]]"
+
+
+def _format_ends(low: float, high: float) -> str:
+    """Format the ends of an interval with two significant digits."""
+    return f"{format_digits(low, 2)} to {format_digits(high, 2)}"
 
 
 def _join(names: Sequence[str]) -> str:
@@ -130,7 +136,7 @@ def _describe_best(
     if not math.isfinite(best.ratio_low) or not math.isfinite(best.ratio_high):
         return f"{head}, {size}, without an interval from so few runs."
     ends = [100 * (1 - end) for end in (best.ratio_high, best.ratio_low)]
-    interval = f"{level} interval {ends[0]:.3g} to {ends[1]:.3g} %"
+    interval = f"{level} interval {_format_ends(*ends)} %"
     cost = _describe_cost(best, base)
     if best.ratio_high >= 1 > best.ratio_low or best.ratio == 1:
         return (
@@ -151,7 +157,7 @@ def _describe_next(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook], 
     ends = [100 * (end - 1) for end in (row.ratio_low, row.ratio_high)]
     if not all(map(math.isfinite, ends)):
         return f"{size}, without an interval from so few runs."
-    return f"{size} ({level} interval {ends[0]:.3g} to {ends[1]:.3g} %)."
+    return f"{size} ({level} interval {_format_ends(*ends)} %)."
 
 
 def _describe_cost(row: BoardRow, base: BoardRow) -> str:

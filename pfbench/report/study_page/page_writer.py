@@ -88,11 +88,12 @@ def write_markdown(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
     """Write report.md of a study, one screen.
 
     Args:
-        pack: Data of the page. `headline` names the figure headline.svg of a published study.
+        pack: Data of the page. `headline` names the figure headline.svg of a published study, and
+            `headline_note` the filters that it does not show.
         folder: Target folder.
     """
     context = {
-        "pack": {"headline": "", "failures": (), **pack},
+        "pack": {"headline": "", "headline_note": "", "failures": (), **pack},
         "choices": pack.get("choices", ()),
         "opening": describe_opening(pack),
         "planned": describe_pairs(pack),

@@ -25,7 +25,7 @@ def format_effect(decision: Decision, value: float, low: float, high: float) -> 
     if decision.scale == "difference":
         return f"difference {value:.3g} ({low:.3g} to {high:.3g})"
     ends = [100 * v for v in (low, high)]
-    return f"difference {format_digits(100 * value)} points ({format_digits(ends[0])} to {format_digits(ends[1])})"
+    return f"difference {format_digits(100 * value)} percentage points ({format_digits(ends[0])} to {format_digits(ends[1])})"
 
 
 def _format_change(value: float, low: float, high: float) -> str:
@@ -107,12 +107,19 @@ def format_percent(share: float) -> str:
     return f"{100 * share:.3g}"
 
 
-def format_digits(value: float) -> str:
-    """Format a number with three significant digits, without an exponent below 1e6."""
+def format_digits(value: float, digits: int = 3) -> str:
+    """Format a number with significant digits, without an exponent below 1e6.
+
+    Args:
+        value: Number.
+        digits: Number of significant digits.
+    """
     if not math.isfinite(value):
         return (
             "no number of" if math.isnan(value) else ("any amount" if value > 0 else "-any amount")
         )
     if abs(value) >= 1e6:
-        return f"{value:.2e}"
-    return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")
+        return f"{value:.{digits - 1}e}"
+    return np.format_float_positional(
+        value, precision=digits, unique=False, fractional=False, trim="-"
+    )

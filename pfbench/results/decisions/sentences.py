@@ -134,9 +134,21 @@ def _describe_here(error: Decision) -> str:
     )
 
 
-def _describe_track(track: Decision) -> str:
-    """Describe the shares of runs that keep track."""
+def describe_shares(track: Decision) -> str:
+    """Describe the shares of runs in which two filters keep track, and their difference.
+
+    Args:
+        track: Record of the share of runs that keep track.
+    """
     shares = f"{format_percent(track.share_a)} and {format_percent(track.share_b)} % of runs"
+    if track.word == IDENTICAL or not (math.isfinite(track.low) and math.isfinite(track.high)):
+        return shares
+    return f"{shares}, {format_effect(track, -track.estimate, -track.high, -track.low)}"
+
+
+def _describe_track(track: Decision) -> str:
+    """Describe which filter keeps track more often."""
+    shares = describe_shares(track)
     if track.word == BETTER:
         return f"{track.a} keeps track more often: {shares}."
     if track.word == WORSE:
