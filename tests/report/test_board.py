@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from pfbench.report.board.levels import (
     StudyArrays,
     arrange_runs,
     average_levels,
+    compare_track_shares,
     compute_condition_levels,
 )
 from pfbench.report.board.planned import decide_planned, planned_entries
@@ -206,6 +208,44 @@ def test_sentence_where_the_baseline_is_the_best_states_the_distance_of_the_next
         f"[[MCMC-RPF]] has the smallest error in Flight. The next, [[SIR]], is {size:.0f} % above it (95"
         in text
     )
+
+
+@pytest.mark.parametrize(
+    ("lost", "baseline", "words", "pair"),
+    [
+        ({"sir": 36}, "sir", "because of tracks not kept. Track", (0, 36)),
+        ({"sir": 36, "ukf": 48}, "mcmc_rpf", "No other filter has an error to compare. Track", (0, 36)),
+        ({"sir": 36, "ukf": 48, "mcmc_rpf": 24}, "ukf", "to compare in Flight. Track", (24, 48)),
+        ({"sir": 36}, "ukf", "", None),
+    ],
+)  # fmt: skip
+def test_a_sentence_without_a_ratio_has_the_difference_of_shares(
+    lost: dict[str, int], baseline: str, words: str, pair: tuple[int, int] | None
+) -> None:
+    """As the interval of Agresti and Min; lost runs of one filter are lost by those that lose more."""
+    data = table(runs=60)
+    for label, count in lost.items():
+        data.loc[data["filter"].eq(label) & (data["run"] < count), "keeps_track"] = False
+    labels = tuple(sorted(data["filter"].unique()))
+    interval = partial(compare_track_shares, arrange_runs(data, labels))
+    rows = list(board(data, baseline).values())
+    arguments = (rows, find_looks(labels), baseline, "in Flight", "error", "95 %")
+    text = describe_view(*arguments, interval)
+    assert ("percentage points" in text) == (pair is not None)
+    if pair is None:
+        return
+    only, other, total = pair[1] - pair[0] + 0.5, 0.5, 62.0
+    error = math.sqrt(only + other - (only - other) ** 2 / total) / total
+    ends = 100 * np.array(stats.t.interval(0.95, 59, (only - other) / total, error))
+    kept = [100 * (1 - count / 60) for count in pair]
+    shown = re.search(
+        r"by \S+ in (\S+) % and by \S+ in (\S+) % of runs, difference (\S+) percentage points "
+        r"\(95 % interval (\S+) to (\S+)\)", text,
+    )  # fmt: skip
+    assert words in text
+    assert shown is not None
+    expected = [*kept, kept[0] - kept[1], *(float(f"{end:.1e}") for end in ends)]
+    assert [float(number) for number in shown.groups()] == pytest.approx(expected)
 
 
 def test_intervals_of_a_sentence_have_two_significant_digits() -> None:

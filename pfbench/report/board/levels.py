@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from pfbench.results.decisions.pair_effects import estimate_share_difference
 from pfbench.results.error_measures import Array, Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects, log_levels
 from pfbench.results.statistics.world_effects import EffectEstimate
@@ -132,6 +133,29 @@ def compute_condition_levels(runs: StudyArrays, metric: str) -> ConditionEffects
     """
     value = runs.values[metric]
     return log_levels(value, runs.keeps, runs.present & ~(runs.keeps & np.isnan(value)))
+
+
+def compare_track_shares(
+    runs: StudyArrays, first: str, second: str, alpha: float = 0.05
+) -> tuple[float, float]:
+    """Compute the interval of the difference of the shares of runs that keep track.
+
+    Args:
+        runs: Runs of the conditions of a view, which have equal weight.
+        first: Label of the filter from whose share the other one is subtracted.
+        second: Label of the other filter.
+        alpha: Probability outside the interval.
+
+    Returns:
+        Ends of the interval.
+    """
+    i, j = (runs.filters.index(label) for label in (first, second))
+    d = np.where(
+        runs.present[i] & runs.present[j], runs.keeps[i].astype(float) - runs.keeps[j], np.nan
+    )
+    weights = np.full((1, len(d)), 1 / len(d))
+    low, high = estimate_share_difference(d[None], weights).interval(alpha)
+    return max(float(low), -1.0), min(float(high), 1.0)
 
 
 def average_levels(levels: ConditionEffects, conditions: pd.DataFrame) -> FilterLevels:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from pfbench.report.board.view import EQUAL, MISSING, NOT_KEPT, OPEN, BoardRow, percent
 from pfbench.report.looks import MethodLook
 from pfbench.results.decisions.sentence_formats import format_digits
 from pfbench.results.decisions.words import IDENTICAL, WORSE
+
+TrackInterval = Callable[[str, str], tuple[float, float]]  # of two labels
 
 _MOST_NAMES = 3  # in a sentence
 _LOST_SHARE = 0.2  # share of runs off track from which a filter is counted
@@ -21,6 +23,7 @@ def describe_view(
     scope: str,
     metric: str,
     level: str = "95 %",
+    track_interval: TrackInterval | None = None,
 ) -> str:
     """Describe a view: failures, the best filter, the best proposed method, ties.
 
@@ -30,15 +33,18 @@ def describe_view(
         baseline: Label of the baseline.
         scope: Worlds and regimes in words, such as "in these 3 worlds".
         metric: Name of the metric in a sentence.
-        level: Level of the interval of a ratio, as text.
+        level: Level of an interval, as text.
+        track_interval: Interval of the difference of the shares of runs in which two filters keep track;
+            None for sentences without it.
 
     Returns:
         Sentences. Names of filters are enclosed in double square brackets.
     """
     ranked = [row for row in rows if row.rank is not None]
     failures = _describe_failures(rows, looks)
+    tracks = _describe_tracks(rows, looks, baseline, level, track_interval)
     if not ranked:
-        return f"{failures} No filter has an error to compare {scope}.".strip()
+        return f"{failures} No filter has an error to compare {scope}. {tracks}".strip()
     if len(rows) == 1:
         row = rows[0]
         value = "" if math.isnan(row.value) else f" of {row.value:.3g} {row.unit}".rstrip()
@@ -49,6 +55,7 @@ def describe_view(
             [
                 failures,
                 _describe_best(ranked, rows, looks, baseline, (f"{metric} {scope}", level)),
+                tracks,
                 _describe_proposed(ranked, looks),
                 _describe_ties(ranked),
             ],
@@ -144,6 +151,34 @@ def _describe_best(
             f"{head}, {size} ({interval}){cost}."
         )
     return f"{head}: {size} ({interval}){cost}."
+
+
+def _describe_tracks(
+    rows: Sequence[BoardRow],
+    looks: Mapping[str, MethodLook],
+    baseline: str,
+    level: str,
+    track_interval: TrackInterval | None,
+) -> str:
+    """State the difference of shares of runs that keep track where no errors are compared; else empty."""
+    ranked = [row for row in rows if row.rank is not None]
+    off = sorted((row for row in rows if row.verdict == NOT_KEPT), key=lambda row: -row.track)
+    if not off or (len(ranked) > 1 and all(row.filter != baseline for row in off)):
+        return ""
+    first = ranked[0] if ranked else off[0]
+    others = off if ranked else [row for row in off if row.track < first.track]
+    if not others:
+        return ""
+    second = next((row for row in others if row.filter == baseline), others[0])
+    size = format_digits(100 * (first.track - second.track), 2)
+    text = (
+        f"Track is kept by {_name(first, looks)} in {100 * first.track:.0f} % and by {_name(second, looks)} in "
+        f"{100 * second.track:.0f} % of runs, difference {size} percentage points"
+    )
+    if track_interval is None:
+        return f"{text}."
+    ends = (100 * end for end in track_interval(first.filter, second.filter))
+    return f"{text} ({level} interval {_format_ends(*ends)})."
 
 
 def _describe_next(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook], level: str) -> str:

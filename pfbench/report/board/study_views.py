@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from pfbench.report.board.levels import (
     StudyArrays,
     arrange_runs,
     average_levels,
+    compare_track_shares,
     compute_condition_levels,
 )
 from pfbench.report.board.pack_entries import format_interval_level, list_metrics, round_values
@@ -108,6 +110,7 @@ def build_views(
                         where,
                         name,
                         format_interval_level(options.alpha),
+                        partial(compare_track_shares, selected, alpha=options.alpha),
                     ),
                     "small_print": small_print,
                     "rows": [round_values(asdict(row)) for row in rows],

@@ -130,6 +130,18 @@ def share_effects(d: Array, weights: Array, shared_runs: bool = True, key: str =
     return _mark(PairEffects(same_worlds, _as_question(new), worlds, *_no_flags(value)), d, weights)
 
 
+def estimate_share_difference(d: Array, weights: Array, shared_runs: bool = True) -> EffectEstimate:
+    """Estimate the difference of shares in these worlds, as `share_effects` does, without a test.
+
+    Args:
+        d: Differences -1, 0 or 1, [..., W, C, N], NaN for an absent run.
+        weights: Weights of the conditions, [W, C].
+        shared_runs: Whether a run has the same random numbers in all worlds.
+    """
+    contributions = run_contributions(d, weights, shared_runs)
+    return _shrunk_share(contributions, _run_count(d, weights, shared_runs))
+
+
 def run_sd(effects: PairEffects) -> Array:
     """Compute the SD over runs of the mean over worlds: standard error times root of the runs."""
     runs = np.count_nonzero(effects.worlds.parts.any(axis=-2), axis=-1)
