@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
+from pfbench.config.group_checks import check_groups, resolve_values
 from pfbench.config.named_sets import expand_filter_names
 from pfbench.config.paper_block import check_paper_blocks, remove_nested_blocks
 from pfbench.config.protected_keys import check_protected_keys
@@ -36,7 +37,8 @@ class JobConfig:
         trusted: Packages that `_target_` may name besides pfbench.
 
     Raises:
-        ValueError: If a group is missing, or a value names what is not trusted.
+        ValueError: If a group is missing or names no class, one of its numbers is not finite, or a
+            value names what is not trusted.
     """
 
     values: dict[str, Any]
@@ -51,6 +53,7 @@ class JobConfig:
                 f"choices must name {', '.join(CHOICES)}, got {sorted(self.choices)}. Add "
                 f"{', '.join(missing)}, or build the configuration with job.compose([...])."
             )
+        check_groups(self.values, CHOICES)
         check_configuration(self.values, self.trusted)
         check_paper_blocks(self.values)
         if "study" in self.values:
@@ -129,8 +132,8 @@ def resolve_config(
         The resolved configuration.
 
     Raises:
-        ValueError: If the choices do not name scenario, noise, filter and model, or a value names
-            what is not trusted.
+        ValueError: If the choices do not name scenario, noise, filter and model, a group is not
+            valid, a value refers to itself, or one names what is not trusted.
     """
     from omegaconf import OmegaConf
 
@@ -140,11 +143,10 @@ def resolve_config(
     is_shared = "particles" in tree["filter"] and OmegaConf.is_interpolation(
         tree["filter"], "particles"
     )
-    values = OmegaConf.to_container(tree, resolve=True)
-    assert isinstance(values, dict)
+    values = resolve_values(tree)
     names = {str(group): str(name) for group, name in (choices or {}).items()}
     _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
-    values = remove_nested_blocks({str(key): value for key, value in values.items()})
+    values = remove_nested_blocks(values)
     return JobConfig(values, names, is_shared, packages)
 
 

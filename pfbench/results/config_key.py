@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pfbench.kernels.generator_version import GENERATOR_VERSION
@@ -52,6 +53,8 @@ def compute_config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) 
     if config.get("dtype") == "float32":
         ignore = tuple(path for path in ignore if path != "engine")
     relevant = _without(config, {tuple(path.split(".")) for path in ignore})
+    for key, value in list_not_finite(relevant, ""):
+        raise ValueError(f"{key} must be finite, got {value}. Set {key} to a number.")
     relevant = {"config": relevant, "generator": GENERATOR_VERSION}
     try:
         text = json.dumps(relevant, sort_keys=True, separators=(",", ":"), allow_nan=False)
@@ -60,6 +63,21 @@ def compute_config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) 
             f"configuration must be numbers, texts, lists and dicts, got {error}."
         ) from error
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def list_not_finite(node: Any, key: str) -> Iterator[tuple[str, float]]:
+    """Yield the keys and values of all numbers that are infinite or NaN.
+
+    Args:
+        node: Resolved configuration or a part of it.
+        key: Its key.
+    """
+    if isinstance(node, Mapping | list):
+        pairs = node.items() if isinstance(node, Mapping) else enumerate(node)
+        for name, value in pairs:
+            yield from list_not_finite(value, f"{key}.{name}" if key else f"{name}")
+    elif isinstance(node, float) and not math.isfinite(node):
+        yield key, node
 
 
 def _without(config: Any, paths: set[tuple[str, ...]]) -> Any:
