@@ -41,13 +41,14 @@ def log_density(distribution: Distribution, y: Tensor, observed_mask: Tensor, na
 
     Raises:
         TypeError: If the distribution has not one event dimension.
-        ValueError: If a component is missing that cannot be integrated out.
+        ValueError: If a component is missing that cannot be integrated out, or one is outside a
+            support that depends on the state.
     """
     kind = type(distribution).__name__
     check_event_dimension(distribution, name, y.shape[-1])
     if isinstance(distribution, Independent) and not distribution.base_dist.event_shape:
         base = distribution.base_dist
-        value = base.log_prob(_filled(base, y, observed_mask))
+        value = _log_prob(base, _filled(base, y, observed_mask), name)
         return torch.where(observed_mask, value, 0.0).sum(-1)
     if isinstance(distribution, MultivariateNormal | LowRankMultivariateNormal):
         r = torch.where(observed_mask, y - distribution.loc, 0.0)
@@ -63,8 +64,26 @@ def log_density(distribution: Distribution, y: Tensor, observed_mask: Tensor, na
             f"{name} must return Independent, MultivariateNormal or a mixture of them for a "
             f"measurement with missing components, got {kind}. Provide complete measurements."
         )
-    value = distribution.log_prob(_filled(distribution, y, observed_mask))
+    value = _log_prob(distribution, _filled(distribution, y, observed_mask), name)
     return torch.where(observed, value, 0.0)
+
+
+def _log_prob(distribution: Any, y: Tensor, name: str) -> Tensor:
+    """Return `log_prob`; a value that torch refuses is named with a remedy."""
+    try:
+        value: Tensor = distribution.log_prob(y)
+    except ValueError as error:
+        kind = type(distribution).__name__
+        if "within the support" not in str(error) or distribution.event_shape:
+            raise
+        is_inside = distribution.support.check(y)
+        wrong = y.expand(is_inside.shape)[~is_inside]
+        raise ValueError(
+            f"{name} must return a distribution whose support contains the measurement at every state, "
+            f"got {kind} for {float(wrong[0]):g}. Mark the component as NaN, or create {kind} with "
+            "validate_args=False if its log_prob is -inf outside the support."
+        ) from error
+    return value
 
 
 def check_event_dimension(distribution: Distribution, name: str, width: int | None = None) -> None:

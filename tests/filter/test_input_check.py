@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from pyro.distributions import LogNormal, Normal, Poisson
+from pyro.distributions import Binomial, LogNormal, Normal, Poisson, Uniform
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.density import log_density
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -316,3 +317,28 @@ def test_a_measurement_outside_the_support_is_refused(
     message = rf"support of {law} \(.*Than.*\), got {wrong:g} at step 3 of run 1\. Mark "
     with pytest.raises(ValueError, match=message):
         run_filter(ParticleFilter(8), model, Record(y), DRAWS)
+
+
+@pytest.mark.parametrize("law", ["Uniform", "Binomial"])
+def test_a_support_that_depends_on_the_state_is_named_with_a_remedy(law: str) -> None:
+    def make(x: Tensor, validate: bool) -> Any:
+        if law == "Uniform":
+            return Uniform(x - 1.0, x + 1.0, validate_args=validate).to_event(1)
+        count = torch.full_like(x, 3.0)
+        return Binomial(count, logits=x, validate_args=validate).to_event(1)
+
+    y = torch.zeros_like(Y)
+    y[1, 3] = 50.0
+    message = (
+        rf"^\w+\.observation must return .* contains the measurement .*, got {law} for 50\. Mark "
+        rf".* create {law} with validate_args=False"
+    )
+    with pytest.raises(ValueError, match=message):
+        log_density(
+            make(Y[:, :1] * 0.0, True), y[:, 3:4], torch.ones(len(Y), 1, 1).bool(), "A.observation"
+        )
+    free = log_density(
+        make(Y[:, :1] * 0.0, False), y[:, 3:4], torch.ones(len(Y), 1, 1).bool(), "A.observation"
+    )
+    assert free.flatten()[1] == -torch.inf
+    assert torch.isfinite(free.flatten()[[0, *range(2, len(Y))]]).all()
