@@ -20,9 +20,9 @@ TEXTS = {file.stem: file.read_text() for file in sorted((CONF / "filter").glob("
 
 NAMES = [name for name in TEXTS if not name.startswith("neural_")]  # these need a trained network
 
-ON_ANY_MODEL = [
-    name for name in NAMES if name != "invariant_ekf"
-]  # it needs a model with an attitude
+NEEDS_ATTITUDE = "invariant_ekf"  # refuses a model without one
+
+ON_ANY_MODEL = [name for name in NAMES if name != NEEDS_ATTITUDE]
 
 
 @cache

@@ -21,7 +21,7 @@ from config_cases import (
     composed,
     world,
 )
-from filter_cases import method_of
+from filter_cases import NEEDS_ATTITUDE, method_of
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf, open_dict
@@ -164,7 +164,7 @@ def test_every_scenario_runs_with_the_default_filter(scenario: str) -> None:
     assert not torch.equal(first, second)  # runs have their own errors and particles
 
 
-@pytest.mark.parametrize("method", GROUPS["filter"])
+@pytest.mark.parametrize("method", [m for m in GROUPS["filter"] if m != NEEDS_ATTITUDE])
 def test_every_filter_runs(method: str) -> None:
     """Gaussian filters that leave noise and gain alone are the Kalman filter on a linear model, whatever their rule.
 

@@ -144,7 +144,7 @@ def _describe_notes(judgement: Judgement, options: JudgeOptions) -> Iterator[str
             if holes is not None and holes.any():
                 yield (
                     f"Holes: {label} lacks {int(holes.sum())} of {len(holes)} epochs that another program "
-                    "has. The error there is the largest one of any program. Set start or end to leave out "
+                    "has. The error there is the largest one of any program. Set `from` or `to` to leave out "
                     "a time for all programs."
                 )
             if math.isfinite(run.clock_offset) and abs(run.clock_offset) > _CLOCK_SHOWN:

@@ -145,9 +145,11 @@ def _describe_best(
     ends = [100 * (1 - end) for end in (best.ratio_high, best.ratio_low)]
     interval = f"{level} interval {_format_ends(*ends)} %"
     cost = _describe_cost(best, base)
-    if best.ratio_high >= 1 > best.ratio_low or best.ratio == 1:
+    if base.verdict == EQUAL:
+        return f"{head}, {size} ({interval}){cost}: equal to it {base.words}."
+    if base.verdict == OPEN:
         return (
-            f"No difference to {_name(base, looks)} is decided: the interval of the best filter contains 0. "
+            f"No difference to {_name(base, looks)} is decided jointly ({base.words}). "
             f"{head}, {size} ({interval}){cost}."
         )
     return f"{head}: {size} ({interval}){cost}."
@@ -217,14 +219,11 @@ def _describe_proposed(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLoo
 
 
 def _describe_ties(ranked: Sequence[BoardRow]) -> str:
-    """Count the filters that are not decided against the best."""
+    """Count the filters that are equal to the best, and those that are not decided against it."""
     others = [row for row in ranked[1:] if row.words != IDENTICAL]
-    tied = sum(row.verdict in (OPEN, EQUAL) for row in others)
-    if not tied:
-        return ""
-    if len(others) == 1:
-        return "The other filter is not shown to be worse."
-    if tied == len(others):
-        return "No other filter is shown to be worse."
-    verb = "is" if tied == 1 else "are"
-    return f"{tied} of {len(others)} others {verb} not shown to be worse."
+    counts = [
+        (sum(row.verdict == EQUAL for row in others), "equal to it within the margin"),
+        (sum(row.verdict == OPEN for row in others), "not decided against it"),
+    ]
+    parts = [f"{n} {'is' if n == 1 else 'are'} {state}" for n, state in counts if n]
+    return f"Of {count_words(len(others), 'other filter')}, {' and '.join(parts)}." if parts else ""

@@ -121,5 +121,5 @@ def format_digits(value: float, digits: int = 3) -> str:
     if abs(value) >= 1e6:
         return f"{value:.{digits - 1}e}"
     return np.format_float_positional(
-        value, precision=digits, unique=False, fractional=False, trim="-"
+        value + 0.0, precision=digits, unique=False, fractional=False, trim="-"
     )

@@ -111,8 +111,9 @@ def describe_dependence(table: pd.DataFrame, value: str, run: list[str]) -> str:
         value: Column of the error.
         run: Columns that name a run, in the order of the runs.
     """
-    logs = table.assign(log=np.log(table[value].where(table[value] > 0)))
-    wide = logs.pivot_table("log", "filter", run, dropna=False)
+    # Ranks within a condition, since a run that some conditions lack has another mean error than the others.
+    ranks = table.groupby(["filter", "scenario", "regime"], sort=False)[value].rank(pct=True)
+    wide = table.assign(rank=ranks - 0.5).pivot_table("rank", "filter", run, dropna=False)
     p = {
         str(label): float(lag_p_values(series[np.isfinite(series)]))
         for label, series in zip(wide.index, wide.to_numpy(), strict=True)

@@ -68,3 +68,13 @@ def test_groups_of_runs_with_a_common_error_give_an_alarm() -> None:
     text = describe_dependence(table.assign(value=table.value * common), "value", RUN)
     assert "the runs are not independent" in text
     assert "2 of 2 filters" in text
+
+
+def test_conditions_of_different_numbers_of_runs_give_no_alarm() -> None:
+    study = make_study({"a": 0.0, "b": 0.1}, runs=100)
+    first, *_ = study["scenario"].unique()
+    easy = study["scenario"] == first
+    table = study.assign(value=study.value.where(~easy, study.value * 1e-3))
+    table = table[~easy | (table.run < 50)]  # the later runs lack the easy scenario
+    assert table["scenario"].nunique() > 1
+    assert describe_dependence(table, "value", RUN) == ""
