@@ -7,8 +7,8 @@ reports and the benchmark pages. A test fails if a block differs from them.
 from __future__ import annotations
 
 import csv
+import gzip
 import json
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -18,7 +18,7 @@ from pfbench.claims import read_claims
 
 TOP = Path(__file__).parents[1]
 README = TOP / "README.md"
-_ARCMIN_PER_DEG = 60.0
+
 _BLOCK = re.compile(r"<!-- numbers:(\w+) -->\n.*?<!-- numbers:end -->", re.DOTALL)
 _UNDECIDED = ("undecided", "cannot be decided")
 
@@ -112,52 +112,14 @@ def board_table(study: str) -> str:
     return format_table(head, ((", ".join(f), *cells) for cells, f in filters_by_cells.items()))
 
 
-def _recorded(study: str, condition: str) -> str:
-    """Table of a recorded study: the opening view, or the errors of a report by earlier rules.
-
-    The latter has position and attitude errors, rows with equal errors joined.
-    """
-    if (TOP / "reports" / study / "verdicts.csv").is_file():
-        return board_table(study)
-    page = f"reports/{study}/report.md"
-    overview, attitude, position = (
-        {row["filter"]: row for row in read_table(page, *headings)}
-        for headings in ((condition,), (condition, "attitude"), (condition, "position"))
-    )
-    filters_by_cells: dict[tuple[str, ...], list[str]] = {}
-    for name in sorted(position, key=lambda key: float(position[key]["RMSE norm in m"])):
-        row = position[name]
-        horizontal = math.hypot(*(float(row[f"RMSE {axis} in m"]) for axis in "EN"))
-        angles = (
-            _digits(float(attitude[name][f"RMSE {axis} in arcmin"]) / _ARCMIN_PER_DEG)
-            for axis in ("roll", "pitch", "yaw")
-        )
-        job = overview[name]
-        cells = (
-            _digits(float(row["RMSE norm in m"])),
-            _digits(horizontal),
-            ", ".join(angles),
-            f"{job['diverged']} of {job['runs']}",
-        )
-        filters_by_cells.setdefault(cells, []).append(f"`{name}`")
-    head = (
-        "filter",
-        "3-D position RMSE [m]",
-        "horizontal RMSE [m]",
-        "roll, pitch, yaw RMSE [deg]",
-        "severely overconfident runs",
-    )
-    return format_table(head, ((", ".join(f), *cells) for cells, f in filters_by_cells.items()))
-
-
 def recorded_quad() -> str:
     """Errors on the quadrotor flights."""
-    return _recorded("recorded_quad", "quad_flights / nominal / strapdown_total")
+    return board_table("recorded_quad")
 
 
 def recorded_car() -> str:
     """Errors on the car drive."""
-    return _recorded("recorded_car", "car_drive / nominal / strapdown_total")
+    return board_table("recorded_car")
 
 
 def claims() -> str:
@@ -191,55 +153,17 @@ def claims() -> str:
 
 
 def all_seven() -> str:
-    """Ranks, severely overconfident runs and the comparison of proposed methods with their baselines."""
-    page = "reports/all_seven/report.md"
-    text = (TOP / page).read_text().split("\n# ")[0]
-    ranks = {
-        row["filter"]: float(row["rank, main group"]) for row in read_table(page, "Mean ranks")
-    }
-    best, worst = sorted(ranks, key=ranks.__getitem__)[:3], max(ranks, key=ranks.__getitem__)
-    jobs = [
-        (name, int(diverged), int(runs))
-        for name, runs, diverged in re.findall(
-            r"^\| ([\w.]+) \| (?:yes|no) \| (?:yes|no) \| [^|]+ \| (\d+) \| \d+ \| \d+ \| (\d+) \|",
-            text,
-            re.MULTILINE,
-        )
-    ]
-    runs, diverged = sum(n for *_, n in jobs), sum(n for _, n, _ in jobs)
-    sir = [(n, of) for name, n, of in jobs if name == "sir"]
-    sir_share = sum(n for n, _ in sir) / sum(of for _, of in sir)
-    conditions = len(sir)
-    table = format_table(
-        ("method", "baseline", "median RMSE change", "adjusted p", "lower error"),
-        (
-            (
-                f"`{row['method']}`",
-                f"`{row['baseline']}`",
-                f"{float(row['RMSE to baseline in %']):+.3g} %",
-                row["p Holm (15)"],
-                "inconclusive"
-                if "no difference" in row["across cells"]
-                else f"`{row['across cells']}`",
-            )
-            for row in read_table(page, "Proposed methods beside their baselines")
-        ),
-    )
-    return "\n".join(
-        (
-            "Computed by earlier rules, which took the regimes of a scenario for independent. "
-            "The study will be decided again by the rules of [statistics](docs/statistics.md).",
-            "",
-            f"- Best mean ranks over {conditions} conditions, of {len(ranks)} filters: "
-            + ", ".join(f"`{name}` {ranks[name]:.1f}" for name in best)
-            + f". Last: `{worst}` {ranks[worst]:.1f}.",
-            f"- Severely overconfident: {diverged / runs:.0%} of {runs} runs. For `sir`: {sir_share:.0%}.".replace(
-                "%", " %"
-            ),
-            "",
-            table,
-        )
-    )
+    """Scenarios, first sentences and planned comparisons of the study of all methods."""
+    folder = TOP / "reports" / "all_seven"
+    pack = json.loads(gzip.decompress((folder / "page.json.gz").read_bytes()))
+    experiment = (TOP / "experiments" / "all_seven.yaml").read_text()
+    planned = re.search(r"^      scenario: (.+)$", experiment, re.MULTILINE)
+    names = ", ".join(world["name"] for world in pack["worlds"])
+    count = f"{len(pack['worlds'])} of {len(planned[1].split(','))}" if planned else ""
+    text = (folder / "report.md").read_text()
+    _, first, second, *_ = text.split("\n\n")
+    table = text.partition("Planned comparisons:\n\n")[2].partition("\n\n")[0]
+    return f"The report has {count} scenarios: {names}.\n\n{first}\n\n{second}\n\n{table}"
 
 
 def speed() -> str:
