@@ -173,7 +173,7 @@ def test_a_pair_that_track_decides_has_the_difference_of_shares() -> None:
         )
         assert shown is not None, text
         assert [float(end) for end in shown.groups()] == pytest.approx([low, high], rel=3e-3)
-    assert entry["reason"].startswith("decided by track not kept: ")
+    assert entry["reason"].startswith("share of runs won in place of the error: difference ")
 
 
 @pytest.mark.parametrize("runs", [1, 4, 30])
@@ -256,6 +256,20 @@ def test_intervals_of_a_sentence_have_two_significant_digits() -> None:
         assert shown is not None
         ends = sorted(100 * form(r) for r in (row.ratio_low, row.ratio_high))
         assert [float(text) for text in shown.groups()] == [float(f"{end:.1e}") for end in ends]
+
+
+def test_sentence_on_the_baseline_follows_the_joint_verdict() -> None:
+    data = table({"mcmc_rpf": -0.02, "sir": 0.0}, worlds=1, runs=100)
+    assert board(data)["sir"].verdict == "equal"
+    assert "below [[SIR]]" in (text := sentence(data, "sir"))
+    assert "equal to it within 5.0 %" in text
+    wide = table({"mcmc_rpf": -0.02, "sir": 0.0, "ukf": 0.01}, worlds=1, runs=12)
+    best = next(row.filter for row in board(wide).values() if row.verdict == "best")
+    other = next(row.filter for row in board(wide).values() if row.verdict == "open")
+    text = sentence(wide, other)
+    assert best != other
+    assert text.startswith("No difference to")
+    assert "2 are not decided against the best" in text
 
 
 def test_results_that_differ_by_rounding_are_identical_in_words() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pfbench.report.journal.study_pack import ALL as ALL
+from pfbench.report.journal.study_pack import ALL
 from pfbench.results.error_measures import Array
 from pfbench.results.frame import select_indices
 from pfbench.results.state_groups import main_component_group

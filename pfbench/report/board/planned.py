@@ -21,9 +21,9 @@ from pfbench.report.looks import MethodLook, PartName, plan_look_pairs
 from pfbench.report.options import ReportOptions
 from pfbench.results.decisions.comparisons import TRACK
 from pfbench.results.decisions.decision import Decision
-from pfbench.results.decisions.family_records import TRACK_NOT_KEPT
+from pfbench.results.decisions.family_records import RUNS_WON
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs
-from pfbench.results.decisions.sentences import describe_pair, describe_shares
+from pfbench.results.decisions.sentences import describe_pair, describe_runs_won, describe_shares
 from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.study_decisions.main_metrics import main_rule
 
@@ -119,10 +119,10 @@ def planned_entries(
 def _describe_gap(decision: Decision, track: Decision) -> str:
     """Return the reason of a missing ratio or interval, empty if the pair has both.
 
-    Where track decides, the reason has the shares of runs that keep track, and their difference.
+    Where tracks are not kept, the reason has the shares of runs won and those of runs that keep track.
     """
-    if decision.reason == TRACK_NOT_KEPT:
-        return f"{TRACK_NOT_KEPT}: {describe_shares(track)}"
+    if decision.reason == RUNS_WON:
+        return f"{RUNS_WON}: {describe_runs_won(decision)}; track kept in {describe_shares(track)}"
     if decision.reason:
         return decision.reason
     if decision.scale == "log ratio":

@@ -139,7 +139,7 @@ def _describe_best(
     if math.isnan(best.ratio):
         state = "tracks not kept" if base.verdict == NOT_KEPT else "missing runs"
         return f"{head}. The baseline {_name(base, looks)} has no error because of {state}."
-    size = f"{percent(math.log(best.ratio))} % below {_name(base, looks)}"
+    size = f"{_format_size(best.ratio)} below {_name(base, looks)}"
     if not math.isfinite(best.ratio_low) or not math.isfinite(best.ratio_high):
         return f"{head}, {size}, without an interval from so few runs."
     ends = [100 * (1 - end) for end in (best.ratio_high, best.ratio_low)]
@@ -190,7 +190,7 @@ def _describe_next(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook], 
         return "No other filter has an error to compare." if len(ranked) == 1 else ""
     row = next((row for row in others if row.verdict == WORSE), others[0])
     subject = "The next" if row is others[0] else "The first that is worse"
-    size = f"{subject}, {_name(row, looks)}, is {percent(math.log(row.ratio))} % above it"
+    size = f"{subject}, {_name(row, looks)}, is {_format_size(row.ratio)} above it"
     ends = [100 * (end - 1) for end in (row.ratio_low, row.ratio_high)]
     if not all(map(math.isfinite, ends)):
         return f"{size}, without an interval from so few runs."
@@ -205,7 +205,12 @@ def _describe_cost(row: BoardRow, base: BoardRow) -> str:
     if not base.ms > 0:
         return ""
     factor = f"{row.ms / base.ms:.2g}"
-    return ", at the same cost" if factor == "1" else f", at {factor} times its cost"
+    return ", at about the same cost" if factor == "1" else f", at about {factor} times its cost"
+
+
+def _format_size(ratio: float) -> str:
+    """Format the difference from 1 in percent."""
+    return "less than 0.01 %" if abs(ratio - 1) < 1e-4 else f"{percent(math.log(ratio))} %"
 
 
 def _describe_proposed(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook]) -> str:
@@ -222,8 +227,8 @@ def _describe_ties(ranked: Sequence[BoardRow]) -> str:
     """Count the filters that are equal to the best, and those that are not decided against it."""
     others = [row for row in ranked[1:] if row.words != IDENTICAL]
     counts = [
-        (sum(row.verdict == EQUAL for row in others), "equal to it within the margin"),
-        (sum(row.verdict == OPEN for row in others), "not decided against it"),
+        (sum(row.verdict == EQUAL for row in others), "equal to the best within the margin"),
+        (sum(row.verdict == OPEN for row in others), "not decided against the best"),
     ]
     parts = [f"{n} {'is' if n == 1 else 'are'} {state}" for n, state in counts if n]
     return f"Of {count_words(len(others), 'other filter')}, {' and '.join(parts)}." if parts else ""

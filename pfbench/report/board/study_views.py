@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pfbench.report.board.curves import ALL, CellKey
+from pfbench.report.board.curves import CellKey
 from pfbench.report.board.levels import (
     StudyArrays,
     arrange_runs,
@@ -22,6 +22,7 @@ from pfbench.report.board.pack_entries import format_interval_level, list_metric
 from pfbench.report.board.run_table import METRIC_NAMES
 from pfbench.report.board.sentence import count_words, describe_view
 from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_filters
+from pfbench.report.journal.study_pack import ALL
 from pfbench.report.looks import MethodLook, PartName, describe_tuning
 from pfbench.report.options import ReportOptions
 from pfbench.results.error_measures import Flags

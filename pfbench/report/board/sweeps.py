@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pfbench.report.board.curves import ALL
 from pfbench.report.board.study_views import ViewKey
+from pfbench.report.journal.study_pack import ALL
 from pfbench.report.looks import MethodLook
 
 _MIN_VALUES = 2  # of a setting

@@ -19,7 +19,7 @@ from pfbench.results.statistics.world_effects import prediction_interval
 from pfbench.results.statistics.world_spread import fit_world_posterior
 
 ONE_WORLD = "one world"
-TRACK_NOT_KEPT = "decided by track not kept"
+RUNS_WON = "share of runs won in place of the error"
 NO_ERROR = "no run of either filter keeps track"
 _FEW_WORLDS = range(2, 6)  # worlds with which the posterior is shown
 _LARGE_EFFECT = 2.0  # SD between worlds, for the statement on the worlds required
@@ -162,7 +162,7 @@ def _reason(comparison: PairComparison, question: Question) -> str:
     if question == "b" and len(comparison.pair.worlds) < 2:
         return ONE_WORLD
     if comparison.scale == "runs won":
-        return TRACK_NOT_KEPT
+        return RUNS_WON
     if question == "a" and effects.same_worlds.estimate.standard_error == 0:
         return "no variation over runs"
     return ""

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from pfbench.results.decisions.comparisons import TRACK
 from pfbench.results.decisions.decision import Decision
-from pfbench.results.decisions.family_records import NO_ERROR, ONE_WORLD, TRACK_NOT_KEPT
+from pfbench.results.decisions.family_records import NO_ERROR, ONE_WORLD, RUNS_WON
 from pfbench.results.decisions.filter_sets import FilterRanking
 from pfbench.results.decisions.sentence_formats import (
     format_count,
@@ -113,12 +113,11 @@ def _describe_here(error: Decision) -> str:
     sample = f"{format_level(error)} simultaneous interval; {format_count(error.runs, 'paired run')} per condition"
     if error.word == IDENTICAL:
         return f"{head}{error.a} and {error.b} give identical results."
-    if error.reason == TRACK_NOT_KEPT:
-        won = format_effect(error, -error.estimate, -error.high, -error.low)
-        verb = "is decided" if error.word in (BETTER, WORSE) else "is not decided"
+    if error.reason == RUNS_WON:
+        state = "decided" if error.word in (BETTER, WORSE) else "not decided"
         return (
-            f"{head}the comparison of {error.a} and {error.b} {verb} by track not kept: share of runs "
-            f"won, {won}; {sample}."
+            f"{head}{error.a} and {error.b} are compared by the share of runs won, since tracks are not kept: {state}, "
+            f"{describe_runs_won(error)}; {sample}."
         )
     effect = format_effect(error, error.estimate, error.low, error.high)
     if error.word in (BETTER, WORSE):
@@ -132,6 +131,15 @@ def _describe_here(error: Decision) -> str:
         f"{head}{error.a} and {error.b} are not decided: {effect}, {sample}. About "
         f"{format_digits(error.runs_needed)} runs per condition would decide a difference of {format_margin(error)}."
     )
+
+
+def describe_runs_won(error: Decision) -> str:
+    """Describe the difference of the shares of runs that the first and the second filter win.
+
+    Args:
+        error: Record of the error, on the scale of runs won.
+    """
+    return format_effect(error, -error.estimate, -error.high, -error.low)
 
 
 def describe_shares(track: Decision) -> str:
@@ -195,10 +203,10 @@ def _describe_new_world(error: Decision) -> str:
         return f"In a new world of this kind, {error.a} and {error.b} are not compared: {reason}."
     effect = format_effect(error, error.estimate, error.low, error.high)
     if error.scale == "runs won":
-        effect = format_effect(error, -error.estimate, -error.high, -error.low)
+        effect = describe_runs_won(error)
         state = f"{error.word} than" if error.word in (BETTER, WORSE) else "not decided against"
         return (
-            f"In a new world of this kind, {error.a} is {state} {error.b} by track not kept: share of runs won, "
+            f"In a new world of this kind, {error.a} is {state} {error.b} by the share of runs won, since tracks are not kept: "
             f"{effect}, {format_count(error.worlds, 'world')}."
         )
     if error.word in (BETTER, WORSE):

@@ -79,7 +79,7 @@ STUDIES = [
     ({"A": 0.0, "B": 0.0}, {"runs": 20, "world_sd": 0.0}, "are not decided"),
     ({"A": 0.0, "B": 0.0}, {"runs": 600, "world_sd": 0.0}, "equivalent to within 5 %"),
     ({"A": 0.0, "B": -0.3}, {"lost": {"B": 0.15}, "runs": 60}, "Trade-off"),
-    ({"A": 0.0, "B": 0.0}, {"lost": {"B": 0.6}}, "by track not kept"),
+    ({"A": 0.0, "B": 0.0}, {"lost": {"B": 0.6}}, "by the share of runs won"),
     ({"A": 0.0, "B": 0.0}, {"runs": 5}, "not tested: 5 runs per condition"),
     ({"A": -0.4, "B": 0.0}, {"worlds": 1}, "In this world"),
     ({"A": -0.4, "B": 0.0}, {"worlds": 8}, "smaller in 8 of 8 worlds"),

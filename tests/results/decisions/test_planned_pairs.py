@@ -173,7 +173,7 @@ def test_lost_track_decides():
     table = make_study({"A": 0.0, "B": 0.0}, lost={"B": 0.6}, runs=40)
     error = select(decide_planned_pairs(table, PAIR), "a")[0]
     assert (error.reason, error.scale, error.word) == (
-        "decided by track not kept",
+        "share of runs won in place of the error",
         "runs won",
         "better",
     )
