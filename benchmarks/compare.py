@@ -276,7 +276,7 @@ def draw(found: Mapping[Case, Mapping[Contestant, Result]], path: Path) -> None:
         axis.set_yticks(range(len(results)), [who.label for who in results], fontsize=7)
         axis.set_title(f"{case.name}: {case.said}", fontsize=8, loc="left")
         axis.margins(x=0.15)
-        axis.tick_params(axis="x", labelsize=7)
+        axis.tick_params(axis="x", which="both", labelsize=7)
         axis.spines[["top", "right"]].set_visible(False)
     axes[-1].set_xlabel("CPU time in ms, one thread (median, quartiles)", fontsize=8)
     figure.savefig(path, dpi=150, metadata={"Software": None})

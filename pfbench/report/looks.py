@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 from pfbench.config.paper_block import MARKERS
 from pfbench.config.paper_files import list_named_parts, read_paper_block
+from pfbench.report.setting_names import name_settings
 from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.conditions import Condition
 
@@ -98,14 +98,14 @@ def find_looks(
         Looks by label, in the order of the labels.
     """
     looks = {}
+    settings = name_settings(labels)
     for label in dict.fromkeys(labels):
-        method, _, setting = label.partition("[")
+        method = label.partition("[")[0]
         block = read_paper_block("filter", method) or _own_block(label, blocks or {})
         name = str(block.get("name", method))
         look = _parse_look(label, block)
-        looks[label] = (
-            replace(look, name=f"{name} [{_format_settings(setting)}]") if setting else look
-        )
+        text = settings.get(label)
+        looks[label] = replace(look, name=f"{name} [{text}]") if text else look
     return _separate_markers(looks)
 
 
@@ -185,18 +185,6 @@ def _parse_look(label: str, block: Mapping[str, Any]) -> MethodLook:
         baselines=tuple(map(str, block.get("baselines", ()))),
         tuning=str(block.get("tuning", "")),
     )
-
-
-def _format_settings(text: str) -> str:
-    """Write the settings of a label such as "a.max_ratio=1000.0,b=2]" in words: "max ratio = 1000, b = 2"."""
-    parts = []
-    for item in text.removesuffix("]").split(","):
-        key, equals, value = item.partition("=")
-        with suppress(ValueError):  # a text is not a number
-            value = f"{float(value):g}"
-        name = key.rpartition(".")[2].replace("_", " ")
-        parts.append(f"{name} = {value}" if equals else item)
-    return ", ".join(parts)
 
 
 def _stored_block(meta: Mapping[str, Any], group: str) -> Mapping[str, Any]:

@@ -14,6 +14,7 @@ from pfbench.config.paper_block import FAMILIES, check_paper_blocks, remove_nest
 from pfbench.config.paper_files import list_named_parts, plan_installed_pairs, read_paper_block
 from pfbench.report.looks import MethodLook, find_looks
 from pfbench.report.plots.plotting import line_styles
+from pfbench.report.setting_names import describe_settings
 
 METHODS = list_named_parts("filter")
 LOOKS = find_looks(METHODS)
@@ -150,7 +151,16 @@ def test_settings_of_one_method_share_its_colour_and_differ_in_marker() -> None:
     first, second = find_looks(labels).values()
     assert first.colour == second.colour == LOOKS["sir"].colour
     assert first.marker != second.marker
-    assert first.name == "SIR [particles = 100]"
+    assert (first.name, second.name) == ("SIR [100]", "SIR [400]")
+    assert describe_settings(labels) == "In brackets: particles."
+    mixed = [*labels, "gpf[a.max_ratio=1000.0]"]
+    assert find_looks(mixed)[labels[0]].name == "SIR [particles = 100]"
+    assert find_looks(mixed)[mixed[2]].name == "GPF [max ratio = 1000]"
+    assert describe_settings(mixed) == ""
+    assert (
+        find_looks(["sir", "sir[oracle_noise=True]"])["sir[oracle_noise=True]"].name
+        == "SIR [oracle noise = True]"
+    )
 
 
 def test_one_method_has_one_look_in_every_figure() -> None:

@@ -25,6 +25,7 @@ from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_f
 from pfbench.report.journal.study_pack import ALL
 from pfbench.report.looks import MethodLook, PartName, describe_tuning
 from pfbench.report.options import ReportOptions
+from pfbench.report.setting_names import describe_settings
 from pfbench.results.error_measures import Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.step_times import StepTimes
@@ -97,7 +98,7 @@ def build_views(
             name = METRIC_NAMES[metric]
             if of_scope["group"].nunique() == 1:
                 name = f"{of_scope['group'].iloc[0]} {name}"
-            small_print = _small_print(selected, options, describe_tuning(names.looks))
+            small_print = _small_print(selected, options, names.looks)
             small_print = f"{small_print} {_describe_timing(scope, options)}"
             if not views:  # the page opens with a baseline that has an error
                 baselines = _order_baselines(scope, names.baselines)
@@ -190,11 +191,12 @@ def _describe_timing(scope: Scope, options: ReportOptions) -> str:
     )
 
 
-def _small_print(runs: StudyArrays, options: ReportOptions, tuning: str) -> str:
-    """Describe the sample of a view, its intervals, and what was tuned."""
+def _small_print(runs: StudyArrays, options: ReportOptions, looks: Mapping[str, MethodLook]) -> str:
+    """Describe the sample of a view, its intervals, settings in names, and what was tuned."""
     filters = int(runs.present.any(axis=(1, 2)).sum())
     seeds = np.unique(runs.values["seed"][runs.present])
     level = format_interval_level(options.alpha)
+    notes = " ".join(filter(None, (describe_settings(list(looks)), describe_tuning(looks))))
     return (
         f"{count_words(filters, 'filter')}, "
         f"{_count_worlds(runs.conditions)}, "
@@ -204,5 +206,5 @@ def _small_print(runs: StudyArrays, options: ReportOptions, tuning: str) -> str:
         "Errors are trimmed means over runs on the logarithmic scale, averaged over conditions. "
         f"Intervals of the ratio: {level} each. "
         f"Verdicts against the best hold for all pairs together at {level}. "
-        f"They concern these worlds. {tuning}"
+        f"They concern these worlds. {notes}"
     ).rstrip()
