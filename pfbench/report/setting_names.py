@@ -13,8 +13,8 @@ def name_settings(labels: Sequence[str]) -> dict[str, str]:
         labels: Labels such as "sir" or "sir[particles=100]".
 
     Returns:
-        Text by label, for labels with settings: the values alone if all labels have one common setting
-        with a number or a text, else such as "max ratio = 1000, stages = 2".
+        Text by label, for labels with settings. It has the values alone if all labels have one common
+        setting with several numbers or texts. Else it is like "max ratio = 1000, stages = 2".
     """
     settings = {label: _split(label) for label in labels if "[" in label}
     if _find_common_name(settings.values()):
