@@ -47,9 +47,15 @@ def read_table(page: str, *headings: str) -> list[Row]:
     lines = re.search(r"^\|.*\n\|[-:| ]+\n(?:\|.*\n)+", text, re.MULTILINE)
     if lines is None:
         raise ValueError(f"{page} must contain a table after {headings}")
+    return _parse_rows(lines[0])
+
+
+def _parse_rows(text: str) -> list[Row]:
+    """Rows of a Markdown table by column name."""
     head, _, *rows = [
         [cell.strip() for cell in line.strip().strip("|").split("|")]
-        for line in lines[0].split("\n")[:-1]
+        for line in text.split("\n")
+        if line.startswith("|")
     ]
     return [dict(zip(head, row, strict=True)) for row in rows]
 
@@ -64,8 +70,7 @@ def format_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     Returns:
         The table, without a final line break.
     """
-    names = list(head)
-    lines = [names, ["---"] * len(names), *(list(row) for row in rows)]
+    lines = [names := list(head), ["---"] * len(names), *(list(row) for row in rows)]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
@@ -157,20 +162,30 @@ def all_seven() -> str:
     folder = TOP / "reports" / "all_seven"
     pack = json.loads(gzip.decompress((folder / "page.json.gz").read_bytes()))
     experiment = (TOP / "experiments" / "all_seven.yaml").read_text()
-    planned = re.search(r"^      scenario: (.+)$", experiment, re.MULTILINE)
+    scenarios = re.search(r"^      scenario: (.+)$", experiment, re.MULTILINE)
     names = ", ".join(world["name"] for world in pack["worlds"])
-    count = f"{len(pack['worlds'])} of {len(planned[1].split(','))}" if planned else ""
+    count = f"{len(pack['worlds'])} of {len(scenarios[1].split(','))}" if scenarios else ""
     text = (folder / "report.md").read_text()
     _, first, second, *_ = text.split("\n\n")
-    table = text.partition("Planned comparisons:\n\n")[2].partition("\n\n")[0]
-    return f"The report has {count} scenarios: {names}.\n\n{first}\n\n{second}\n\n{table}"
+    planned = re.search(r"^Planned comparisons.*\n\n(?:\|.*\n)+", text, re.MULTILINE)
+    pairs = _planned_table(planned[0]) if planned else ""
+    return f"The report has {count} scenarios: {names}.\n\n{first}\n\n{second}\n\n{pairs}"
+
+
+def _planned_table(text: str) -> str:
+    """Table of planned comparisons without columns of a single value, which stand above it."""
+    rows = _parse_rows(text)
+    alike = [name for name in rows[0] if len({row[name] for row in rows}) == 1 < len(rows)]
+    kept = [name for name in rows[0] if name not in alike]
+    note = "; ".join(f"{name}: {rows[0][name]}" for name in alike if rows[0][name] != "–")
+    table = format_table(kept, ([row[name] for name in kept] for row in rows))
+    return f"Planned comparisons{f' ({note})' if note else ''}:\n\n{table}"
 
 
 def speed() -> str:
     """Speed relative to other libraries, on one core."""
     page = "benchmarks/compare.md"
     models = dict(re.findall(r"^## (W.*)\n\n(.*)\.$", (TOP / page).read_text(), re.MULTILINE))
-    # pages of earlier measurements have the earlier name of the engine
     entries = [
         (f"{row['workload']}: {models[row['workload']]}", row["fastest peer"], row)
         for row in read_table(page)
@@ -195,30 +210,18 @@ def speed() -> str:
 
 def gpu() -> str:
     """Time of a large job on a GPU."""
-    page = "benchmarks/gpu.md"
+    text = (TOP / "benchmarks/gpu.md").read_text()
     row = next(
         row
-        for row in _engine_rows(page)
+        for row in _parse_rows(text[text.index("| R x N x T") :].split("\n\n")[0])
         if row["engine"] == "compiled" and row["R x N x T"].startswith("1000 x 10000")
     )
-    device = (TOP / page).read_text().rstrip().rsplit("\n", 1)[-1].split(";")[0]
+    device = text.rstrip().rsplit("\n", 1)[-1].split(";")[0]
     runs, particles, steps = row["R x N x T"].split(" x ")
     return (
         f"{device}: {row['s, median (range)'].split()[0]} s for {runs} runs of {particles} particles "
         f"and {steps} steps, single precision, `engine=compiled`."
     )
-
-
-def _engine_rows(page: str) -> list[Row]:
-    """Rows of the second table of a benchmark page, by engine."""
-    text = (TOP / page).read_text()
-    lines = [
-        line for line in text[text.index("| R x N x T") :].split("\n\n")[0].split("\n") if line
-    ]
-    head, _, *rows = [
-        [cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines
-    ]
-    return [dict(zip(head, row, strict=True)) for row in rows]
 
 
 BLOCKS: dict[str, Callable[[], str]] = {

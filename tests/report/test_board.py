@@ -133,9 +133,15 @@ def test_lost_runs_and_missing_conditions() -> None:
     data.loc[off, "keeps_track"] = False
     rows = board(data)
     assert rows["mcmc_rpf"].verdict == "not_kept"
-    assert rows["mcmc_rpf"].words == "track not kept"
+    assert rows["mcmc_rpf"].words == "track not kept in 4 of 4 conditions"
     assert rows["mcmc_rpf"].track == pytest.approx(0.6)
     assert rows["sir"].verdict == "best"
+    off = data["filter"].eq("sir") & data["scenario"].eq("w0") & (data["run"] < 28)
+    data.loc[off, "keeps_track"] = False
+    rows = board(data)
+    assert rows["sir"].words == "track not kept in 2 of 4 conditions"
+    # fewer conditions first, although fewer runs of the other filter keep track there
+    assert list(rows) == ["ukf", "sir", "mcmc_rpf"]
     few = table()
     few.loc[(few["filter"] == "mcmc_rpf") & (few["run"] < 5), "keeps_track"] = False
     assert board(few)["mcmc_rpf"].verdict == "best"  # fewer than the trimmed fifth

@@ -65,12 +65,14 @@ class FilterLevels(NamedTuple):
         parts: Contribution of each run, [F, N].
         middle: Runs that the location of a condition uses at least, [F].
         runs: Runs of the condition that has the fewest, [F].
+        off: Conditions in which lost runs reach the trimmed middle, [F, C].
     """
 
     level: Array
     parts: Array
     middle: Array
     runs: Array
+    off: Flags
 
     def difference(self, i: int, j: int) -> EffectEstimate:
         """Estimate the difference of the levels of two filters.
@@ -173,4 +175,5 @@ def average_levels(levels: ConditionEffects, conditions: pd.DataFrame) -> Filter
     with np.errstate(invalid="ignore"):
         level = np.where(count > 0, (weights * levels.location).sum(axis=1), np.nan)
     parts = np.einsum("c,fcn->fn", weights, levels.parts)
-    return FilterLevels(level, parts, levels.middle.min(axis=1), count)
+    off = np.isposinf(levels.location)
+    return FilterLevels(level, parts, levels.middle.min(axis=1), count, off)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 
-from pfbench.report.board.view import EQUAL, MISSING, NOT_KEPT, OPEN, BoardRow, percent
+from pfbench.report.board.view import EQUAL, MISSING, NOT_KEPT, OPEN, BoardRow
 from pfbench.report.looks import MethodLook
-from pfbench.results.decisions.sentence_formats import format_digits
+from pfbench.results.decisions.sentence_formats import format_digits, percent
 from pfbench.results.decisions.words import IDENTICAL, WORSE
 
 TrackInterval = Callable[[str, str], tuple[float, float]]  # of two labels
@@ -110,7 +110,7 @@ def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]
         verb = "does" if without == 1 else "do"
         text += (
             f" {without} of {count_words(len(rows), 'filter')} {verb} not keep track in over a fifth of the runs "
-            "of a condition, and no error is compared."
+            "of a condition, and no error of theirs is compared."
         )
     if missing:
         verb = "was" if missing == 1 else "were"

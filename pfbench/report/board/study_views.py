@@ -99,7 +99,16 @@ def build_views(
             if of_scope["group"].nunique() == 1:
                 name = f"{of_scope['group'].iloc[0]} {name}"
             small_print = _small_print(selected, options, names.looks)
-            small_print = f"{small_print} {_describe_timing(scope, options)}"
+            small_print = " ".join(
+                filter(
+                    None,
+                    (
+                        small_print,
+                        _describe_hard_condition(scope, selected.conditions, names),
+                        _describe_timing(scope, options),
+                    ),
+                )
+            )
             if not views:  # the page opens with a baseline that has an error
                 baselines = _order_baselines(scope, names.baselines)
             for baseline in baselines:
@@ -175,6 +184,18 @@ def _count_worlds(conditions: pd.DataFrame) -> str:
     scenarios, worlds = conditions["scenario"].nunique(), conditions["family"].nunique()
     text = count_words(scenarios, "scenario")
     return text if scenarios == worlds else f"{text} of {count_words(worlds, 'world')}"
+
+
+def _describe_hard_condition(scope: Scope, conditions: pd.DataFrame, names: StudyNames) -> str:
+    """Name the condition in which most filters do not keep track, where there are several conditions."""
+    counts = scope.levels.off.sum(axis=0)
+    if len(counts) == 1 or not counts.any():
+        return ""
+    hardest = conditions.iloc[[int(counts.argmax())]]
+    return (
+        f"Over a fifth of runs do not keep track in {counts.max()} of {count_words(len(scope.filters), 'filter')} "
+        f"{_describe_scope(hardest, names)}, the most of a condition."
+    )
 
 
 def _describe_timing(scope: Scope, options: ReportOptions) -> str:

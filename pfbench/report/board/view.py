@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from pfbench.report.board.levels import FilterLevels, StudyArrays
+from pfbench.results.decisions.sentence_formats import percent
 from pfbench.results.decisions.words import IDENTICAL, WORSE
 from pfbench.results.error_measures import Array
 from pfbench.results.statistics.paired_effects import MIN_RUNS
@@ -113,7 +114,7 @@ class Scope(NamedTuple):
 
 
 def build_rows(scope: Scope, baseline: str, options: ViewOptions) -> list[BoardRow]:
-    """Build the rows of a view, ordered by level.
+    """Build the rows of a view, ordered by level. Filters without a level follow in the order of their tracks.
 
     Args:
         scope: Filters in the conditions of the view.
@@ -122,7 +123,8 @@ def build_rows(scope: Scope, baseline: str, options: ViewOptions) -> list[BoardR
     """
     filters, levels = scope.filters, scope.levels
     level = levels.level
-    order = sorted(range(len(filters)), key=lambda i: (np.isnan(level[i]), level[i], filters[i]))
+    track = np.array([scope.descriptions[label]["track"] for label in filters])
+    order = np.lexsort((np.array(filters), -track, levels.off.sum(axis=1), level)).tolist()
     best = order[0] if np.isfinite(level[order[0]]) else None
     base = filters.index(baseline)
     rows = []
@@ -154,7 +156,10 @@ def _decide(
     if np.isnan(levels.level[i]):
         return MISSING, "not run in all conditions"
     if best is None or not np.isfinite(levels.level[i]):
-        return NOT_KEPT, "track not kept"
+        off = levels.off[i]
+        return NOT_KEPT, "track not kept" + f" in {off.sum()} of {off.size} conditions" * (
+            off.size > 1
+        )
     if i == best:
         return BEST, "smallest"
     estimate = levels.difference(i, best)
@@ -171,17 +176,6 @@ def _decide(
     if high < math.log1p(options.margin) or planned == "equivalent":
         return EQUAL, f"within {percent(math.log1p(options.margin))} %"
     return OPEN, f"{_signed(low)} to {_signed(high)} %"
-
-
-def percent(log_ratio: float) -> str:
-    """Format a log ratio as a change in percent with two digits, without its sign.
-
-    Args:
-        log_ratio: Log ratio.
-    """
-    value = abs(100 * math.expm1(min(log_ratio, 20.0)))
-    digits = 0 if value >= 10 else 1 if value >= 1 else 2
-    return f"{value:.{digits}f}" if value < 1e4 else f"{value:.1e}"
 
 
 def _signed(log_ratio: float) -> str:

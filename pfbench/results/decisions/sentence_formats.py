@@ -123,3 +123,14 @@ def format_digits(value: float, digits: int = 3) -> str:
     return np.format_float_positional(
         value + 0.0, precision=digits, unique=False, fractional=False, trim="-"
     )
+
+
+def percent(log_ratio: float) -> str:
+    """Format a log ratio as a change in percent with two digits, without its sign.
+
+    Args:
+        log_ratio: Log ratio.
+    """
+    value = abs(100 * math.expm1(min(log_ratio, 20.0)))
+    digits = 0 if value >= 10 else 1 if value >= 1 else 2
+    return f"{value:.{digits}f}" if value < 1e4 else f"{value:.1e}"
