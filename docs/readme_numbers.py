@@ -1,7 +1,8 @@
-"""Write the numbers of README.md: `python docs/readme_numbers.py`.
+"""Write the numbers of README.md and of the pages of methods: `python docs/readme_numbers.py`.
 
 Each block between `<!-- numbers:NAME -->` and `<!-- numbers:end -->` is generated from the published
-reports and the benchmark pages. A test fails if a block differs from them.
+reports and the benchmark pages. A block without a function of its own is the table of the study of its
+name. A test fails if a block differs from them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 from pfbench.claims import read_claims
 
 TOP = Path(__file__).parents[1]
-README = TOP / "README.md"
+PAGES = (TOP / "README.md", *sorted((TOP / "docs" / "methods").glob("*.md")))
 
 _BLOCK = re.compile(r"<!-- numbers:(\w+) -->\n.*?<!-- numbers:end -->", re.DOTALL)
 _UNDECIDED = ("undecided", "cannot be decided")
@@ -114,17 +115,9 @@ def board_table(study: str) -> str:
         "track kept",
         "true values in 90 % regions",
     )
-    return format_table(head, ((", ".join(f), *cells) for cells, f in filters_by_cells.items()))
-
-
-def recorded_quad() -> str:
-    """Errors on the quadrotor flights."""
-    return board_table("recorded_quad")
-
-
-def recorded_car() -> str:
-    """Errors on the car drive."""
-    return board_table("recorded_car")
+    body = [(", ".join(labels), *cells) for cells, labels in filters_by_cells.items()]
+    kept = [i for i in range(len(head)) if any(row[i] != "–" for row in body)]
+    return format_table((head[i] for i in kept), ([row[i] for i in kept] for row in body))
 
 
 def claims() -> str:
@@ -225,7 +218,7 @@ def gpu() -> str:
 
 
 BLOCKS: dict[str, Callable[[], str]] = {
-    block.__name__: block for block in (recorded_quad, recorded_car, claims, all_seven, speed, gpu)
+    block.__name__: block for block in (claims, all_seven, speed, gpu)
 }
 
 
@@ -233,17 +226,20 @@ def fill_blocks(text: str) -> str:
     """Replace the content of all number blocks.
 
     Args:
-        text: Content of README.md.
+        text: Content of a page.
 
     Returns:
         The content with current numbers.
     """
 
     def replace(match: re.Match[str]) -> str:
-        return f"<!-- numbers:{match[1]} -->\n{BLOCKS[match[1]]()}\n<!-- numbers:end -->"
+        name = match[1]
+        table = BLOCKS[name]() if name in BLOCKS else board_table(name)
+        return f"<!-- numbers:{name} -->\n{table}\n<!-- numbers:end -->"
 
     return _BLOCK.sub(replace, text)
 
 
 if __name__ == "__main__":
-    README.write_text(fill_blocks(README.read_text()))
+    for path in PAGES:
+        path.write_text(fill_blocks(path.read_text()))

@@ -117,16 +117,21 @@ def test_publishing_removes_only_headlines_that_it_made(tmp_path: Path) -> None:
     assert (folder / "headline.svg").read_text() == "<svg/>"
 
 
-def test_the_numbers_of_the_readme_are_those_of_the_published_files() -> None:
+def test_the_numbers_of_pages_are_those_of_the_published_files() -> None:
     numbers = load("readme_numbers")
-    text = numbers.README.read_text()
-    assert set(re.findall(r"<!-- numbers:(\w+) -->", text)) - {"end"} == set(numbers.BLOCKS)
-    assert numbers.fill_blocks(text) == text, "run: python docs/readme_numbers.py"
+    blocks = set()
+    for page in numbers.PAGES:
+        text = page.read_text()
+        blocks |= set(re.findall(r"<!-- numbers:(\w+) -->", text)) - {"end"}
+        assert numbers.fill_blocks(text) == text, "run: python docs/readme_numbers.py"
+    assert set(numbers.BLOCKS) < blocks
+    methods = [page for page in numbers.PAGES if page.name != "README.md"]
+    assert sum("<!-- numbers:paper_" in page.read_text() for page in methods) == 8
 
 
 def test_a_changed_number_of_the_readme_is_found() -> None:
     numbers = load("readme_numbers")
-    text = numbers.README.read_text()
+    text = numbers.PAGES[0].read_text()
     ratio = numbers.read_table("benchmarks/campaigns.md")[0]["times as fast (quartiles)"]
     assert ratio in text
     assert numbers.fill_blocks(text.replace(ratio, "9.9")) == text
