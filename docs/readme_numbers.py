@@ -12,8 +12,9 @@ import gzip
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pfbench.claims import read_claims
 
@@ -161,18 +162,29 @@ def all_seven() -> str:
     text = (folder / "report.md").read_text()
     _, first, second, *_ = text.split("\n\n")
     planned = re.search(r"^Planned comparisons.*\n\n(?:\|.*\n)+", text, re.MULTILINE)
-    pairs = _planned_table(planned[0]) if planned else ""
+    pairs = _planned_table(planned[0], pack["planned"]) if planned else ""
     return f"The report has {count} scenarios: {names}.\n\n{first}\n\n{second}\n\n{pairs}"
 
 
-def _planned_table(text: str) -> str:
-    """Table of planned comparisons without columns of a single value, which stand above it."""
-    rows = _parse_rows(text)
+def _planned_table(text: str, pairs: Sequence[Mapping[str, Any]]) -> str:
+    """Table of planned comparisons without columns of a single value, which stand above it.
+
+    Comparisons with tuned baselines are counted below it.
+    """
+    entries = zip(_parse_rows(text), pairs, strict=True)
+    rows = [row for row, pair in entries if pair["kind"] != "tuned"]
     alike = [name for name in rows[0] if len({row[name] for row in rows}) == 1 < len(rows)]
     kept = [name for name in rows[0] if name not in alike]
     note = "; ".join(f"{name}: {rows[0][name]}" for name in alike if rows[0][name] != "–")
     table = format_table(kept, ([row[name] for name in kept] for row in rows))
-    return f"Planned comparisons{f' ({note})' if note else ''}:\n\n{table}"
+    tuned = Counter(pair["word"] for pair in pairs if pair["kind"] == "tuned")
+    counts = ", ".join(f"{word}: {number}" for word, number in tuned.most_common())
+    end = (
+        f"\n\nPlanned comparisons of a proposed method with a tuned baseline: {counts}."
+        if counts
+        else ""
+    )
+    return f"Planned comparisons{f' ({note})' if note else ''}:\n\n{table}{end}"
 
 
 def speed() -> str:

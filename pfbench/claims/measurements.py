@@ -111,7 +111,9 @@ def _find_jobs(
     for study in sorted({side[0] for side in sides}):
         if not any((Path(results) / study).glob("*.npz")):
             continue
-        for condition in load_conditions(study, results, allow_mixed_versions=mixed):
+        for condition in load_conditions(
+            study, results, allow_mixed_versions=mixed, same_data=False
+        ):
             name = f"{condition.scenario}/{condition.noise}/{condition.model}"
             labels = [label for *where, label in sides if where == [study, name]]
             for job in condition.jobs:

@@ -13,6 +13,7 @@ import yaml
 from pfbench.config.folders import conf_dir
 from pfbench.config.paper_block import PAPER
 from pfbench.results.comparison.baselines import list_planned_pairs
+from pfbench.results.job_labels import parse_label
 
 _NAME = re.compile(r"\w+")
 _NODE = re.compile(rf"^{PAPER}:.*\n(?:[ \t]+.*\n?|[ \t]*\n)*", re.MULTILINE)
@@ -47,5 +48,9 @@ def plan_installed_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
     Args:
         labels: Labels of filters.
     """
-    blocks = {label: read_paper_block("filter", label) for label in labels}
-    return list_planned_pairs(labels, {k: b.get("baselines", ()) for k, b in blocks.items()})
+    methods = {parse_label(label)[0] for label in labels}
+    blocks = {method: read_paper_block("filter", method) for method in methods}
+    tuned = sorted(method for method, block in blocks.items() if block.get("tuning"))
+    return list_planned_pairs(
+        labels, {method: block.get("baselines", ()) for method, block in blocks.items()}, tuned
+    )

@@ -10,6 +10,7 @@ import numpy as np
 
 from pfbench.results import store
 from pfbench.results.conditions import Condition, JobFile, load_conditions, natural_sort_key
+from pfbench.results.job_labels import parse_label
 from pfbench.results.joined_runs import select_run
 
 _GROUPS = ("scenario", "noise", "model")
@@ -50,11 +51,12 @@ def find_run(
         FileNotFoundError: If results of the study are missing.
         ValueError: If no job or several jobs match, or the job does not have the run.
     """
-    keys = _matching_keys(Path(results) / study, choices)
+    plain = {group: parse_label(value)[0] for group, value in choices.items()}
+    keys = _matching_keys(Path(results) / study, plain)
     conditions = load_conditions(study, results, allow_mixed_versions=True, keys=keys)
     matches = [
         (condition, job)
-        for condition in conditions
+        for condition in _select_data(conditions, choices)
         for job in condition.jobs
         if label in (job.label, job.meta["choices"]["filter"])
     ]
@@ -73,6 +75,24 @@ def find_run(
             f"Set run={numbers.min()}."
         )
     return StoredRun(condition, job, run, select_run(result, int(np.argmax(numbers == run))))
+
+
+def _select_data(
+    conditions: Sequence[Condition], choices: Mapping[str, str]
+) -> Sequence[Condition]:
+    """Select the conditions of settings of scenario and noise such as "flight[gps_sd=2.0]".
+
+    Raises:
+        ValueError: If no condition has the settings.
+    """
+    for group, value in choices.items():
+        names = {str(getattr(condition, group)) for condition in conditions}
+        if "[" in value and value not in names:
+            raise ValueError(
+                f"{group} must be one of the study, got {value}. Choose from {_list_names(names)}."
+            )
+        conditions = [c for c in conditions if "[" not in value or getattr(c, group) == value]
+    return conditions
 
 
 def _matching_keys(folder: Path, choices: Mapping[str, str]) -> list[str] | None:

@@ -17,6 +17,7 @@ from pfbench.config.paper_files import list_named_parts, read_paper_block
 from pfbench.report.setting_names import name_settings
 from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.conditions import Condition
+from pfbench.results.job_labels import parse_label
 
 # Colours on white and on dark ground of methods that state none, by family.
 _GREY = ("#5f6b76", "#a9b4be")
@@ -100,12 +101,12 @@ def find_looks(
     looks = {}
     settings = name_settings(labels)
     for label in dict.fromkeys(labels):
-        method = label.partition("[")[0]
+        method = parse_label(label)[0]
         block = read_paper_block("filter", method) or _own_block(label, blocks or {})
         name = str(block.get("name", method))
         look = _parse_look(label, block)
         text = settings.get(label)
-        looks[label] = replace(look, name=f"{name} [{text}]") if text else look
+        looks[label] = replace(look, name=_add_text(name, text)) if text else look
     return _separate_markers(looks)
 
 
@@ -130,20 +131,27 @@ def study_part_names(conditions: Sequence[Condition], group: str) -> dict[str, P
         Names by key, in the order of the conditions.
     """
     names = {}
-    for condition in conditions:
-        key = condition.scenario if group == "scenario" else condition.noise
-        block = read_paper_block(group, key) or _stored_block(condition.jobs[0].meta, group)
+    keys = [c.scenario if group == "scenario" else c.noise for c in conditions]
+    settings = name_settings(keys)
+    for key, condition in zip(keys, conditions, strict=True):
+        plain, _ = parse_label(key)
+        block = read_paper_block(group, plain) or _stored_block(condition.jobs[0].meta, group)
         stored = _stored_block(condition.jobs[0].meta, group)  # limits that the jobs had
         limit = stored.get("divergence_threshold")
         names[key] = PartName(
             key,
-            str(block.get("name", key)),
-            str(block.get("words", key)),
+            _add_text(str(block.get("name", plain)), settings.get(key)),
+            _add_text(str(block.get("words", plain)), settings.get(key)),
             str(block.get("unit", "")),
             None if limit is None else float(limit),
-            str(stored.get("family") or key),
+            str(stored.get("family") or plain),
         )
     return names
+
+
+def _add_text(name: str, text: str | None) -> str:
+    """Return a name with its settings in brackets."""
+    return f"{name} [{text}]" if text else name
 
 
 def plan_look_pairs(looks: Mapping[str, MethodLook]) -> list[tuple[str, str]]:
@@ -152,7 +160,9 @@ def plan_look_pairs(looks: Mapping[str, MethodLook]) -> list[tuple[str, str]]:
     Args:
         looks: Looks by label.
     """
-    return list_planned_pairs(looks, {key: look.baselines for key, look in looks.items()})
+    methods = {parse_label(key)[0]: look for key, look in looks.items()}
+    tuned = sorted(key for key, look in methods.items() if look.tuning and not look.proposed)
+    return list_planned_pairs(looks, {key: look.baselines for key, look in methods.items()}, tuned)
 
 
 def describe_tuning(looks: Mapping[str, MethodLook]) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 
+from pfbench.results.job_labels import parse_label
+
 
 def name_settings(labels: Sequence[str]) -> dict[str, str]:
     """Write the settings of labels in words.
@@ -35,11 +37,25 @@ def describe_settings(labels: Sequence[str]) -> str:
     return f"In brackets: {name}." if name else ""
 
 
+def describe_data_settings(names: Iterable[str]) -> str:
+    """Say in which settings of their data scenarios or noise regimes differ; else empty.
+
+    Args:
+        names: Keys of scenarios and noise regimes.
+    """
+    settings = dict.fromkeys(key for name in names for key, _ in _split(name))
+    if not settings:
+        return ""
+    return (
+        f"Conditions in brackets differ in {', '.join(settings)}. Their data differ: "
+        "filters are compared within each of them."
+    )
+
+
 def _split(label: str) -> list[tuple[str, str]]:
     """Return the names and values of the settings of a label."""
     pairs = []
-    for item in label.partition("[")[2].removesuffix("]").split(","):
-        key, _, value = item.partition("=")
+    for key, value in parse_label(label)[1].items():
         with suppress(ValueError):  # a text is not a number
             value = f"{float(value):g}"
         pairs.append((key.rpartition(".")[2].replace("_", " "), value))

@@ -11,13 +11,19 @@ from typing import Any, NamedTuple
 
 from pfbench.files.atomic_write import set_aside
 from pfbench.results import store
+from pfbench.results.job_labels import (
+    flatten_settings,
+    list_data_settings,
+    list_differing,
+    make_distinct_label,
+    name_data,
+)
 from pfbench.results.joined_runs import find_consecutive_parts, join_metadata, read_joined
 from pfbench.results.step_times import STEP_TIME, add_step_times
 
 log = logging.getLogger("pfbench")
 
 _SHARED_SETTINGS = ("scenario", "noise", "dtype")  # settings that decide the data of a filter
-_LOCATION_SETTINGS = ("scenario.cache_dir", "scenario.root")  # settings that do not
 _Described = tuple[Path, dict[str, Any]]
 
 
@@ -70,6 +76,7 @@ def load_conditions(
     *,
     allow_mixed_versions: bool = False,
     keys: Collection[str] | None = None,
+    same_data: bool = True,
 ) -> list[Condition]:
     """List the conditions of a study; arguments and errors as `load_frame`.
 
@@ -81,6 +88,8 @@ def load_conditions(
         allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a
             condition.
         keys: Keys of the jobs that are read, None for all.
+        same_data: Whether jobs with other settings of scenario or noise are conditions of their own,
+            such as "flight[gps_sd=2.0]". Otherwise these settings are part of the labels.
 
     Returns:
         Conditions sorted by scenario, noise and model.
@@ -100,16 +109,29 @@ def load_conditions(
     conditions = []
     for key, group in groupby(items, key=lambda item: _condition_key(item[1])):
         members = list(group)
-        jobs = _label_jobs(members)
+        separate = list_data_settings([meta for _, meta in members]) if same_data else []
         if not allow_mixed_versions:
             where = f"the condition {' / '.join(key)}"
             _check_equal(members, ("seed", "first_run", "runs", "steps"), where)
-            settings = [f"config.{name}" for name in unlabelled_settings(jobs)]
-            _check_equal(members, settings, where)
-        parts = [tuple(path for path, _ in groups[job.path]) for job in jobs]
-        joined_jobs = [job._replace(parts=p) for job, p in zip(jobs, parts, strict=True)]
-        conditions.append(Condition(*key, tuple(joined_jobs)))
+            settings = set(unlabelled_settings(_label_jobs(members))) - set(separate)
+            _check_equal(members, [f"config.{name}" for name in sorted(settings)], where)
+        for names, own in _separate_data(members, separate):
+            jobs = _label_jobs(own)
+            parts = [tuple(path for path, _ in groups[job.path]) for job in jobs]
+            joined = [job._replace(parts=p) for job, p in zip(jobs, parts, strict=True)]
+            conditions.append(Condition(*names, key[2], tuple(joined)))
     return conditions
+
+
+def _separate_data(
+    items: Sequence[_Described], settings: Sequence[str]
+) -> list[tuple[tuple[str, str], list[_Described]]]:
+    """Group jobs by the settings of their data, with the names of scenario and noise."""
+    parts: dict[tuple[str, str], list[_Described]] = {}
+    for item in items:
+        parts.setdefault(name_data(item[1], settings), []).append(item)
+    order = sorted(parts, key=lambda names: [natural_sort_key(name) for name in names])
+    return [(names, parts[names]) for names in order]
 
 
 def _read_undamaged(path: Path) -> tuple[Path, dict[str, Any]] | None:
@@ -124,8 +146,8 @@ def _read_undamaged(path: Path) -> tuple[Path, dict[str, Any]] | None:
 def differing_settings(jobs: Sequence[JobFile]) -> list[str]:
     """List settings of scenario, noise and number type in which jobs of a condition differ."""
     configs = [job.meta["config"] for job in jobs]
-    flat = [_flatten({name: c.get(name) for name in _SHARED_SETTINGS}) for c in configs]
-    return _differing(flat)
+    flat = [flatten_settings({name: c.get(name) for name in _SHARED_SETTINGS}) for c in configs]
+    return list_differing(flat)
 
 
 def unlabelled_settings(jobs: Sequence[JobFile]) -> list[str]:
@@ -157,51 +179,8 @@ def _label_jobs(items: Sequence[_Described]) -> tuple[JobFile, ...]:
     jobs = []
     for (path, meta), name in zip(items, names, strict=True):
         twins = [twin for (_, twin), label in zip(items, names, strict=True) if label == name]
-        jobs.append(JobFile(path, _distinct_label(meta, twins), meta))
+        jobs.append(JobFile(path, make_distinct_label(meta, twins), meta))
     return tuple(sorted(jobs, key=lambda job: natural_sort_key(job.label)))
-
-
-def _distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> str:
-    """Extend a label by the settings in which jobs of that label differ.
-
-    Settings of the filter alone are used if they suffice.
-    """
-    if len(twins) == 1:
-        return str(meta["label"])
-    flat = [_flatten(twin["config"]) for twin in twins]
-    names = _differing(flat)
-    of_filter = [name for name in names if name.startswith("filter.")]
-    if len({tuple(repr(config.get(name)) for name in of_filter) for config in flat}) == len(flat):
-        names = of_filter
-    config = _flatten(meta["config"])
-    settings = [_setting(name.removeprefix("filter."), config.get(name, "-")) for name in names]
-    return f"{meta['label']}[{','.join(settings) or meta['key']}]"
-
-
-def _setting(name: str, value: Any) -> str:
-    """Format a setting of a label; a class is written without its module."""
-    if name.endswith("._target_"):
-        return f"{name.removesuffix('._target_')}={str(value).rpartition('.')[2]}"
-    return f"{name}={value}"
-
-
-def _differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """List the settings in which flat configurations differ, without locations."""
-    names = sorted(set().union(*configs) - set(_LOCATION_SETTINGS))
-    return [name for name in names if len({repr(config.get(name)) for config in configs}) > 1]
-
-
-def _flatten(config: Any, path: str = "") -> dict[str, Any]:
-    """Flatten a configuration to dotted names; stages of a filter are numbered."""
-    if isinstance(config, list) and any(isinstance(stage, Mapping) for stage in config):
-        config = dict(enumerate(config))
-    if not isinstance(config, Mapping):
-        return {path: config}
-    return {
-        key: value
-        for name, below in config.items()
-        for key, value in _flatten(below, f"{path}.{name}" if path else name).items()
-    }
 
 
 def _check_distinct(items: Sequence[_Described]) -> None:
@@ -223,7 +202,7 @@ def _check_equal(items: Sequence[_Described], names: Sequence[str], where: str) 
     for name in names:
         by_value: dict[str, list[str]] = {}
         for path, meta in items:
-            by_value.setdefault(str(_flatten(meta).get(name)), []).append(path.name)
+            by_value.setdefault(str(flatten_settings(meta).get(name)), []).append(path.name)
         if len(by_value) > 1:
             listed = "; ".join(
                 f"{value}: {_list_files(files)}" for value, files in sorted(by_value.items())

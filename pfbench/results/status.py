@@ -119,12 +119,12 @@ def scenario_family(meta: Mapping[str, Any], scenario: str) -> str:
 
     Args:
         meta: Metadata of a job.
-        scenario: Name of the scenario, used if it states no family.
+        scenario: Name of the scenario, used without its settings if it states no family.
 
     Returns:
         The name.
     """
-    return str(_paper_block(meta).get("family") or scenario)
+    return str(_paper_block(meta).get("family") or scenario.partition("[")[0])
 
 
 def _paper_block(meta: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import synthetic_results as synthetic
 
+from pfbench.replay.run_selection import find_run
+from pfbench.report.looks import study_part_names
 from pfbench.results import conditions, frame, state_groups, store
 
 SMALL = {"runs": 6, "steps": 20}
@@ -180,23 +182,52 @@ def test_filters_of_one_cell_met_the_same_worlds(tmp_path, first, second, named)
     assert len(conditions.load_conditions("demo", tmp_path, allow_mixed_versions=True)) == 1
 
 
-def test_worlds_may_differ_where_every_label_tells_in_what(tmp_path):
-    for k, sd in enumerate((1.0, 10.0)):
+def write_two_worlds(folder):
+    for k, sd in enumerate((10.0, 2.0)):
         for name in ("ekf", "ukf"):
             path = synthetic.write(
-                tmp_path / "demo", synthetic.Method(name, 1.0, 1.0, 100 + k), **SMALL
+                folder / "demo", synthetic.Method(name, 1.0, 1.0, 100 + k), **SMALL
             )
             meta, arrays = store.read_result(path)
             settings = {
                 "filter": {"name": name},
-                "scenario": {"gps_sd": sd, "cache_dir": f"place{k}"},
+                "scenario": {"gps_sd": sd, "cache_dir": f"place{k}", "paper": {"unit": "m"}},
+                "noise": {"scale": sd / 2},
             }
             store.write_result(path, {**meta, "config": settings}, arrays)
-    (cell,) = conditions.load_conditions("demo", tmp_path)
-    assert [job.label for job in cell.jobs] == [
-        "ekf[scenario.gps_sd=1.0]", "ekf[scenario.gps_sd=10.0]", "ukf[scenario.gps_sd=1.0]", "ukf[scenario.gps_sd=10.0]",
+
+
+def test_jobs_with_other_data_are_other_conditions(tmp_path):
+    write_two_worlds(tmp_path)
+    first, second = conditions.load_conditions("demo", tmp_path)
+    assert [(c.scenario, c.noise) for c in (first, second)] == [
+        ("flight[gps_sd=2.0]", "surge[scale=1.0]"), ("flight[gps_sd=10.0]", "surge[scale=5.0]"),
     ]  # fmt: skip
-    assert conditions.differing_settings(cell.jobs) == ["scenario.gps_sd"]
+    for condition in (first, second):
+        assert [job.label for job in condition.jobs] == ["ekf", "ukf"]
+        assert conditions.differing_settings(condition.jobs) == []
+    table = frame.load_frame("demo", tmp_path)
+    assert set(table.family) == {"flight"}
+    assert set(table.scenario) == {"flight[gps_sd=2.0]", "flight[gps_sd=10.0]"}
+    names = study_part_names([first, second], "scenario")
+    assert [name.name for name in names.values()] == ["flight [2]", "flight [10]"]
+    assert {name.family for name in names.values()} == {"flight"}
+    (cell,) = conditions.load_conditions("demo", tmp_path, same_data=False)
+    settings = [f"noise.scale={sd / 2},scenario.gps_sd={sd}" for sd in (2.0, 10.0)]
+    assert [job.label for job in cell.jobs] == [f"{name}[{text}]" for name in ("ekf", "ukf") for text in settings]  # fmt: skip
+    assert conditions.differing_settings(cell.jobs) == ["noise.scale", "scenario.gps_sd"]
+
+
+def test_a_run_is_found_by_the_settings_of_its_data(tmp_path):
+    write_two_worlds(tmp_path)
+    found = find_run("demo", tmp_path, 0, "ekf", {"scenario": "flight[gps_sd=2.0]"})
+    assert found.result.meta["config"]["scenario"]["gps_sd"] == 2.0
+    with pytest.raises(
+        ValueError, match=r"scenario must be one of the study, got flight\[gps_sd=3\]"
+    ):
+        find_run("demo", tmp_path, 0, "ekf", {"scenario": "flight[gps_sd=3]"})
+    with pytest.raises(ValueError, match=r"Add scenario=.*flight\[gps_sd=10.0\]"):
+        find_run("demo", tmp_path, 0, "ekf", {})
 
 
 def test_shares_are_of_the_particles_in_use(tmp_path):

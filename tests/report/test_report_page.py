@@ -210,7 +210,7 @@ def test_curves_have_the_rare_steps_with_truth(tmp_path):
     np.testing.assert_allclose(curve["filters"]["ekf"]["median"], np.median(norm, 0), rtol=1e-3)
 
 
-def test_cells_whose_worlds_differ_by_name_say_so(tmp_path):
+def test_conditions_whose_data_differ_say_so(tmp_path):
     for k, sd in enumerate((1.0, 10.0)):
         path = synthetic.write(
             tmp_path / "demo", synthetic.Method("ekf", 1.0, 1.0, 100 + k), runs=6, steps=20
@@ -224,7 +224,7 @@ def test_cells_whose_worlds_differ_by_name_say_so(tmp_path):
     page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     text = (tmp_path / "reports" / "demo" / "report.md").read_text()
     assert (
-        "Jobs of flight / surge / ins_gnss differ in scenario.gps_sd: their runs share random numbers, but not the data."
+        "Conditions in brackets differ in gps sd. Their data differ: filters are compared within each of them."
         in text
     )
 

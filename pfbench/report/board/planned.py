@@ -24,6 +24,7 @@ from pfbench.results.decisions.decision import Decision
 from pfbench.results.decisions.family_records import RUNS_WON
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs
 from pfbench.results.decisions.sentences import describe_pair, describe_runs_won, describe_shares
+from pfbench.results.job_labels import parse_label
 from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.study_decisions.main_metrics import main_rule
 
@@ -104,7 +105,7 @@ def planned_entries(
             for record in (tracks["a", a, b], d)
         ]
         entry = {
-            "a": a, "b": b, "question": "Error in these worlds", "kind": "paper" if b in looks[a].baselines else "",
+            "a": a, "b": b, "question": "Error in these worlds", "kind": _find_kind(looks[a], looks[b]),
             "sentence": describe_pair(*records), **ratios, "p": d.p_corrected, "word": d.pair_word,
             "reason": _describe_gap(d, tracks["a", a, b]), "cells": _list_cells(runs, levels, (a, b), worlds, options.alpha) if d.scale == "log ratio" else [],
             "new_world": None if new.worlds < 2 else {
@@ -114,6 +115,13 @@ def planned_entries(
         }  # fmt: skip
         entries.append(round_values(entry))
     return entries
+
+
+def _find_kind(method: MethodLook, other: MethodLook) -> str:
+    """Return whether the other filter is a baseline of the paper or a tuned one; empty for neither."""
+    if parse_label(other.key)[0] in method.baselines:
+        return "paper"
+    return "tuned" if method.baselines and other.tuning else ""
 
 
 def _describe_gap(decision: Decision, track: Decision) -> str:

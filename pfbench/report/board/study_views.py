@@ -25,7 +25,7 @@ from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_f
 from pfbench.report.journal.study_pack import ALL
 from pfbench.report.looks import MethodLook, PartName, describe_tuning
 from pfbench.report.options import ReportOptions
-from pfbench.report.setting_names import describe_settings
+from pfbench.report.setting_names import describe_data_settings, describe_settings
 from pfbench.results.error_measures import Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.step_times import StepTimes
@@ -98,7 +98,7 @@ def build_views(
             name = METRIC_NAMES[metric]
             if of_scope["group"].nunique() == 1:
                 name = f"{of_scope['group'].iloc[0]} {name}"
-            small_print = _small_print(selected, options, names.looks)
+            small_print = _small_print(selected, options, names)
             small_print = " ".join(
                 filter(
                     None,
@@ -212,12 +212,14 @@ def _describe_timing(scope: Scope, options: ReportOptions) -> str:
     )
 
 
-def _small_print(runs: StudyArrays, options: ReportOptions, looks: Mapping[str, MethodLook]) -> str:
+def _small_print(runs: StudyArrays, options: ReportOptions, names: StudyNames) -> str:
     """Describe the sample of a view, its intervals, settings in names, and what was tuned."""
     filters = int(runs.present.any(axis=(1, 2)).sum())
     seeds = np.unique(runs.values["seed"][runs.present])
     level = format_interval_level(options.alpha)
-    notes = " ".join(filter(None, (describe_settings(list(looks)), describe_tuning(looks))))
+    settings = describe_data_settings([*names.worlds, *names.regimes])
+    texts = (settings, describe_settings(list(names.looks)), describe_tuning(names.looks))
+    notes = " ".join(filter(None, texts))
     return (
         f"{count_words(filters, 'filter')}, "
         f"{_count_worlds(runs.conditions)}, "

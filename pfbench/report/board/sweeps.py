@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from pfbench.report.board.study_views import ViewKey
 from pfbench.report.journal.study_pack import ALL
 from pfbench.report.looks import MethodLook
+from pfbench.results.job_labels import parse_label
 
 _MIN_VALUES = 2  # of a setting
 
@@ -70,12 +70,10 @@ def read_settings(label: str) -> list[LabelSetting]:
     Args:
         label: Label of a filter.
     """
-    method, _, text = label.partition("[")
-    parts = re.split(r",(?=[\w.]+=)", text.removesuffix("]")) if text else []
+    method, values = parse_label(label)
     settings = []
-    for k, setting in enumerate(parts):
-        name, _, value = setting.partition("=")
-        others = ",".join(parts[:k] + parts[k + 1 :])
+    for name, value in values.items():
+        others = ",".join(f"{key}={text}" for key, text in values.items() if key != name)
         line = f"{method}[{others}]" if others else method
         settings.append(LabelSetting(label, line, name, value))
     return settings
