@@ -95,8 +95,8 @@ def load_conditions(
         Conditions sorted by scenario, noise and model.
     """
     files = sorted((Path(results) / study).glob("*.npz"))
-    files = [path for path in files if keys is None or path.stem in keys]
-    items = [item for path in files if (item := _read_undamaged(path)) is not None]
+    chosen = [path for path in files if keys is None or path.stem in keys]
+    items = [item for path in chosen if (item := _read_undamaged(path)) is not None]
     if not items:
         raise FileNotFoundError(_no_results_message(study, Path(results)))
     _check_distinct(items)
@@ -111,16 +111,22 @@ def load_conditions(
         members = list(group)
         separate = list_data_settings([meta for _, meta in members]) if same_data else []
         if not allow_mixed_versions:
-            where = f"the condition {' / '.join(key)}"
-            _check_equal(members, ("seed", "first_run", "runs", "steps"), where)
-            settings = set(unlabelled_settings(_label_jobs(members))) - set(separate)
-            _check_equal(members, [f"config.{name}" for name in sorted(settings)], where)
+            _check_condition(members, separate)
         for names, own in _separate_data(members, separate):
-            jobs = _label_jobs(own)
-            parts = [tuple(path for path, _ in groups[job.path]) for job in jobs]
-            joined = [job._replace(parts=p) for job, p in zip(jobs, parts, strict=True)]
-            conditions.append(Condition(*names, key[2], tuple(joined)))
+            jobs = [
+                job._replace(parts=tuple(path for path, _ in groups[job.path]))
+                for job in _label_jobs(own)
+            ]
+            conditions.append(Condition(*names, key[2], tuple(jobs)))
     return conditions
+
+
+def _check_condition(items: Sequence[_Described], separate: Sequence[str]) -> None:
+    """Raise ValueError if jobs of a scenario, noise and model differ beyond the settings of their data."""
+    where = f"the condition {' / '.join(_condition_key(items[0][1]))}"
+    _check_equal(items, ("seed", "first_run", "runs", "steps"), where)
+    settings = set(unlabelled_settings(_label_jobs(items))) - set(separate)
+    _check_equal(items, [f"config.{name}" for name in sorted(settings)], where)
 
 
 def _separate_data(
