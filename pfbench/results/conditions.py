@@ -95,8 +95,8 @@ def load_conditions(
         Conditions sorted by scenario, noise and model.
     """
     files = sorted((Path(results) / study).glob("*.npz"))
-    chosen = [path for path in files if keys is None or path.stem in keys]
-    items = [item for path in chosen if (item := _read_undamaged(path)) is not None]
+    paths = [path for path in files if keys is None or path.stem in keys]
+    items = [item for path in paths if (item := _read_undamaged(path)) is not None]
     if not items:
         raise FileNotFoundError(_no_results_message(study, Path(results)))
     _check_distinct(items)
@@ -112,10 +112,10 @@ def load_conditions(
         separate = list_data_settings([meta for _, meta in members]) if same_data else []
         if not allow_mixed_versions:
             _check_condition(members, separate)
-        for names, own in _separate_data(members, separate):
+        for names, items_of_data in _separate_data(members, separate):
             jobs = [
                 job._replace(parts=tuple(path for path, _ in groups[job.path]))
-                for job in _label_jobs(own)
+                for job in _label_jobs(items_of_data)
             ]
             conditions.append(Condition(*names, key[2], tuple(jobs)))
     return conditions

@@ -21,8 +21,8 @@ def parse_label(label: str) -> tuple[str, dict[str, str]]:
         Name, and values as text by setting.
     """
     name, _, text = label.partition("[")
-    parts = re.split(r",(?=[\w.]+=)", text.removesuffix("]")) if text else []
-    return name, {key: value for key, _, value in (part.partition("=") for part in parts)}
+    pairs = re.split(r",(?=[\w.]+=)", text.removesuffix("]")) if text else []
+    return name, {key: value for key, _, value in (pair.partition("=") for pair in pairs)}
 
 
 def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> str:
@@ -68,8 +68,8 @@ def name_data(meta: Mapping[str, Any], settings: Sequence[str]) -> tuple[str, st
     """
     names = []
     for group in _DATA_SETTINGS:
-        own = [name for name in settings if name.partition(".")[0] == group]
-        text = _format_settings(meta, own, f"{group}.")
+        of_group = [name for name in settings if name.partition(".")[0] == group]
+        text = _format_settings(meta, of_group, f"{group}.")
         name = str(meta["choices"][group])
         names.append(f"{name}[{text}]" if text else name)
     return names[0], names[1]

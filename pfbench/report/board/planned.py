@@ -117,11 +117,11 @@ def planned_entries(
     return entries
 
 
-def _find_kind(method: MethodLook, other: MethodLook) -> str:
-    """Return whether the other filter is a baseline of the paper or a tuned one; empty for neither."""
-    if parse_label(other.key)[0] in method.baselines:
+def _find_kind(method: MethodLook, baseline: MethodLook) -> str:
+    """Return whether a baseline is of the paper or a tuned one; empty for neither."""
+    if parse_label(baseline.key)[0] in method.baselines:
         return "paper"
-    return "tuned" if method.baselines and other.tuning else ""
+    return "tuned" if method.baselines and baseline.tuning else ""
 
 
 def _describe_gap(decision: Decision, track: Decision) -> str:

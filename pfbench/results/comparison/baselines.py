@@ -35,10 +35,10 @@ def list_planned_pairs(
     methods = {label: parse_label(label)[0] for label in labels}
     against = {m: (*baselines[m], *tuned) for m in methods.values() if baselines.get(m)}
     pairs = [
-        (label, other)
+        (label, baseline)
         for label in labels
-        for baseline in dict.fromkeys(against.get(methods[label], ()))
-        for other in _same_settings(label, baseline, labels)
+        for method in dict.fromkeys(against.get(methods[label], ()))
+        for baseline in _same_settings(label, method, labels)
     ]
     if pairs:
         return pairs
@@ -46,21 +46,20 @@ def list_planned_pairs(
         return list(combinations(labels, 2))
     reference = next((name for name in REFERENCES if name in methods.values()), "")
     return [
-        (label, other)
+        (label, baseline)
         for label in labels
         if methods[label] != reference
-        for other in _same_settings(label, reference, labels)
+        for baseline in _same_settings(label, reference, labels)
     ]
 
 
 def _same_settings(label: str, method: str, labels: Sequence[str]) -> list[str]:
     """List the labels of a method that do not differ in a setting that a label has too."""
     settings = parse_label(label)[1]
-    found = []
-    for other in labels:
-        name, values = parse_label(other)
-        if name == method and all(
-            settings.get(key, value) == value for key, value in values.items()
-        ):
-            found.append(other)
-    return found
+    candidates = {candidate: parse_label(candidate) for candidate in labels}
+    return [
+        candidate
+        for candidate, (name, values) in candidates.items()
+        if name == method
+        and all(settings.get(key, value) == value for key, value in values.items())
+    ]
