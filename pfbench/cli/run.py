@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from pfbench.cli.sweep.study_plan import StudyPlan, plan_study
-from pfbench.cli.sweep.sweep_progress import SWEEP_JOBS, SweepProgress
+from pfbench.cli.sweep.sweep_progress import SWEEP_JOBS, SweepProgress, note_outcome
 from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
 from pfbench.config.composition import JobConfig, register_experiments
 from pfbench.config.folders import conf_dir
@@ -167,11 +167,17 @@ def run_task(cfg: Any) -> float:
     from pfbench import job
 
     application: Any = HydraConfig.get()
-    counter = ""
+    number, counter = None, ""
     if total := os.environ.get(SWEEP_JOBS):
         number = OmegaConf.select(application, "job.num", throw_on_missing=False)
         counter = "" if number is None else f"[{number + 1}/{total}] "
-    return job.run(cfg, application.runtime.choices, counter).rmse
+    try:
+        outcome = job.run(cfg, application.runtime.choices, counter)
+    except Exception:
+        note_outcome(number, "failed")
+        raise
+    note_outcome(number, outcome.status)
+    return outcome.rmse
 
 
 def run_with_retries(sweep: Callable[[], Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -261,6 +262,20 @@ def test_a_sweep_counts_its_jobs(tmp_path: Path) -> None:
     assert second.startswith("[2/2] finished  t=")
     assert summary.startswith("sweep: 1 finished, 1 skipped, 0 failed in ")
     assert summary.endswith("Next: pfbench report study=adhoc")
+
+
+def test_a_sweep_counts_its_own_jobs_beside_another_one(tmp_path: Path) -> None:
+    compute_job = run_job.compute_job
+
+    def compute_beside(*arguments: Any) -> Any:
+        (tmp_path / "results" / "adhoc" / f"of_another_{time.time()}.npz").write_bytes(b"")
+        return compute_job(*arguments)
+
+    assert pfbench("run", *WALK, "filter=ekf", home=tmp_path).code == 0
+    with mock.patch.object(run_job, "compute_job", side_effect=compute_beside):
+        said = pfbench("run", "-m", *WALK, "filter=ekf,ckf,ukf", home=tmp_path)
+    assert "sweep: 2 finished, 1 skipped, 0 failed in " in said.out
+    assert not list(tmp_path.rglob(".sweep-*"))
 
 
 @pytest.mark.parametrize("place", range(3))

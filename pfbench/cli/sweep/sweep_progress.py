@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
+from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from pfbench.cli.sweep.study_plan import StudyPlan
 
 SWEEP_JOBS = "PFBENCH_SWEEP_JOBS"  # environment variable: number of jobs, for the counter
+SWEEP_LOG = "PFBENCH_SWEEP_LOG"  # environment variable: file to which each job appends its outcome
 
 
 @dataclass
 class SweepProgress:
-    """Counts of a sweep, from the files that its jobs write.
+    """Counts of a sweep, from a file to which its jobs append.
 
-    Any launcher can run the jobs.
+    Any launcher can run the jobs. Jobs that do not get the environment, on a running cluster, are
+    counted by the results that were written meanwhile.
 
     Attributes:
         jobs: Number of jobs, or None if unknown.
@@ -42,7 +46,9 @@ class SweepProgress:
         values = plan.first.values
         os.environ[SWEEP_JOBS] = str(plan.jobs)
         study = str(values["study"]) if plan.has_one_study else None
-        return cls(plan.jobs, study, Path(values["results_dir"]) / str(values["study"]))
+        sweep = cls(plan.jobs, study, Path(values["results_dir"]) / str(values["study"]))
+        os.environ[SWEEP_LOG] = str(sweep._log)
+        return sweep
 
     def finish(self, is_complete: bool = True, is_part: bool = False) -> None:
         """Print the counts and the next command.
@@ -52,19 +58,68 @@ class SweepProgress:
             is_part: Whether more runs may follow, so that the next command is not printed.
         """
         os.environ.pop(SWEEP_JOBS, None)
+        os.environ.pop(SWEEP_LOG, None)
         if self.study is None or self.jobs is None:
             return
-        finished = self._count("*.npz")
-        failed = self._count("*.failed.json")
-        others = max(0, self.jobs - finished - failed)
-        # an error without a note is of the command, which then stopped before these jobs
-        state = "skipped" if is_complete or failed else "not run"
-        counts = f"{finished} finished, {others} {state}, {failed} failed"
+        counts = self._count_outcomes() or self._count_files(is_complete)
         elapsed = time.time() - self.start_time
         command = "" if is_part else f"  Next: pfbench report study={self.study}"
         print(f"sweep: {counts} in {elapsed:.0f} s.{command}")
+
+    @property
+    def _log(self) -> Path:
+        """File of the outcomes, in the folder of the results because remote jobs see it."""
+        name = f".sweep-{os.getpid()}-{self.start_time:.6f}"
+        return self.folder.absolute() / name
+
+    def _count_outcomes(self) -> str:
+        """Count the jobs by outcome, and remove the file. Empty if there is none."""
+        try:
+            lines = self._log.read_text().splitlines()
+            self._log.unlink()
+        except OSError:
+            return ""
+        with contextlib.suppress(OSError):  # no job wrote a file, or others are there
+            self.folder.rmdir()
+        outcomes = defaultdict(set)  # a job that a retry skips has two
+        for line in lines:
+            number, _, status = line.partition(" ")
+            outcomes[number].add(status)
+        finished = sum("finished" in of_job for of_job in outcomes.values())
+        failed = sum(of_job == {"failed"} for of_job in outcomes.values())
+        skipped = len(outcomes) - finished - failed
+        rest = (self.jobs or 0) - len(outcomes)
+        text = f"{finished} finished, {skipped} skipped, {failed} failed"
+        return f"{text}, {rest} not run" if rest > 0 else text
+
+    def _count_files(self, is_complete: bool) -> str:
+        """Count the jobs by the files that were written since the start."""
+        finished, failed = self._count("*.npz"), self._count("*.failed.json")
+        others = max(0, (self.jobs or 0) - finished - failed)
+        # an error without a note is of the command, which then stopped before these jobs
+        state = "skipped" if is_complete or failed else "not run"
+        return f"{finished} finished, {others} {state}, {failed} failed"
 
     def _count(self, pattern: str) -> int:
         """Count the files that were written since the start."""
         times = (file.stat().st_mtime for file in self.folder.glob(pattern))
         return sum(modified >= self.start_time - 0.05 for modified in times)
+
+
+def note_outcome(number: int | None, status: str) -> None:
+    """Append the outcome of a job to the file of its sweep, if it has one.
+
+    Args:
+        number: Number of the job in the sweep, None outside a sweep.
+        status: `finished`, `skipped` or `failed`.
+    """
+    path = os.environ.get(SWEEP_LOG)
+    if path is None or number is None:
+        return
+    with contextlib.suppress(OSError):  # of a full disk: the job reports it
+        os.makedirs(os.path.dirname(path), exist_ok=True)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            os.write(descriptor, f"{number} {status}\n".encode())
+        finally:
+            os.close(descriptor)
