@@ -2,14 +2,18 @@
 
 Git stores report.md, one figure (`headline.svg` or .png) and the numbers of each report. The command draws
 the figure of a study from the data of its page. For other reports it copies a figure and removes
-the references to all others from report.md. `make report` runs it after the reports. A second run
+the references to all others from report.md. The results of a script in `experiments/` are stored with six
+digits in `results.json.gz`, and its page is made of them. `make report` runs it after the reports. A second run
 changes nothing.
 """
 
 from __future__ import annotations
 
+import gzip
+import json
 import re
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +37,7 @@ HEADLINES = {
     "learn_noise_calibration": "calibration_location",
     "learn_quad_noise": "flights",
 }
+RESULTS = "results.json.gz"  # of a script in experiments/
 SUFFIXES = (".svg", ".png")  # of a headline figure, not of the copies that a folder keeps
 CAPTION = "Error of each filter relative to the baseline"
 
@@ -88,7 +93,37 @@ def publish_report(folder: Path) -> None:
                 target.remove(f"headline{other}")
             target.write(f"headline{suffix}", (folder / f"{stem}{suffix}").read_bytes())
         page = (folder / "report.md").read_text(encoding="utf-8")
+        if (folder / f"{folder.name}.json").is_file():
+            stored = json.loads((folder / f"{folder.name}.json").read_text(encoding="utf-8"))
+            text = json.dumps(round_numbers({key: stored[key] for key in ("request", "done")}))
+            target.write(RESULTS, gzip.compress(text.encode(), mtime=0))
+        if (folder / RESULTS).is_file():
+            page = write_script_page(folder)
         target.write("report.md", reduce_markdown(page, folder, stem))
+
+
+def round_numbers(value: Any) -> Any:
+    """Round all floating-point numbers of a JSON value to six digits.
+
+    Args:
+        value: JSON value.
+    """
+    if isinstance(value, dict):
+        return {key: round_numbers(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [round_numbers(item) for item in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def write_script_page(folder: Path) -> str:
+    """Write the page of a script in `experiments/` from its stored results.
+
+    Args:
+        folder: Folder of the report. Its name is that of the script.
+    """
+    stored = json.loads(gzip.decompress((folder / RESULTS).read_bytes()))
+    script = import_module(f"pfbench.experiments.{folder.name}")
+    return str(script.write_page(stored["request"], stored["done"]))
 
 
 def reduce_markdown(text: str, folder: Path, stem: str) -> str:

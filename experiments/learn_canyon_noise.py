@@ -1,14 +1,14 @@
-"""The law of pseudoranges in a Berlin canyon, learned on one stretch of the drive and scored on the other, both ways round.
+"""Pseudorange errors in a Berlin canyon: a distribution estimated on one stretch of the drive and scored on the other.
 
     PFBENCH_DATA=... python -m pfbench.experiments.learn_canyon_noise [draws [warm-up]]
 
-Learned is the mixture of `LosNlosRangeError`: share of lines of sight at 40 dB-Hz, its slope, the error's sd, the detour's mean. It is
-learned at the reference's positions, so that the state is the receiver's clock alone, which a particle filter carries along:
-with the position unknown too, estimates of the log likelihood scatter by a hundred between draws of 2000 particles, and no
-chain moves. One epoch in two seconds is taken for the posterior, since a reflection lasts. Beside it stands the law of highest
-likelihood, with the clock as straight lines between knots (`pfbench.scenario.recorded.urban_error_fit`); with 0 draws it stands alone. Scored
-are the log evidence of a range on the other stretch, and the error of a particle filter that has no reference there. What is
-done is kept in the folder, and the same command goes on from there; at its end it writes `report.md` and its figures.
+The mixture `LosNlosRangeError` has four parameters: share of direct signals at 40 dB-Hz, its slope, standard deviation, mean
+delay. They are estimated at the positions of the reference, where the clock of the receiver is the only unknown state. With an
+unknown position the log likelihood of 2000 particles has a standard deviation of about 100, and no chain moves. The posterior
+takes one epoch of two seconds, because reflections last. The maximum likelihood estimate models the clock by straight lines
+between knots (`pfbench.scenario.recorded.urban_error_fit`); with 0 draws it is the only estimate. The scores are the log
+evidence per range on the other stretch, and the error of a particle filter without reference. The command resumes from the
+parts in its folder and writes `report.md` and its figures.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -41,13 +41,13 @@ from pfbench.job import ResumableResults, instantiate
 from pfbench.model import (
     LosNlosRangeError,
     NormalExponentialMixture,
+    NormalRangeError,
     PseudorangeError,
     StateSpaceModel,
     UrbanGnss,
     UrbanInputs,
     range_change,
 )
-from pfbench.model import NormalRangeError as NormalRanges
 from pfbench.noise import NominalNoise
 from pfbench.ppl import (
     WELL_MIXED,
@@ -67,8 +67,8 @@ from pfbench.scenario import (
     find_dataset,
     range_residuals,
     read_drive,
+    select_stretch,
 )
-from pfbench.scenario import select_stretch as cut
 
 STRETCHES = {"first": (0.0, 100.0), "second": (100.0, 283.0)}  # s
 PRIOR = {
@@ -77,24 +77,24 @@ PRIOR = {
     "tail": LogNormal(math.log(30.0), 0.7),  # m
     "slope": Normal(0.0, 0.5),  # per dB-Hz
 }
-SHOWN = {"share": TransformedDistribution(PRIOR["odds"], [SigmoidTransform()])} | {
+PRIOR_OF_TABLE = {"share": TransformedDistribution(PRIOR["odds"], [SigmoidTransform()])} | {
     k: PRIOR[k] for k in ("sd", "tail", "slope")
 }
-CALLED = {"share": "share at 40 dB-Hz", "sd": "sd, m", "tail": "tail, m", "slope": "slope, 1/dB-Hz"}
-STILL = 1e-6  # of what the reference knows
+LABELS = {"share": "share at 40 dB-Hz", "sd": "sd, m", "tail": "tail, m", "slope": "slope, 1/dB-Hz"}
+STILL = 1e-6  # of states that the reference determines
 CHAINS = 8
-PARTICLES = 1000  # estimates of the log likelihood scatter by 0.7 to 1.0 with so many, by 2.1 to 5.3 with 300
-LEAPS = 3  # after each step of the walk
+PARTICLES = 1000  # sd of the log likelihood 0.7 to 1.0; 2.1 to 5.3 with 300 particles
+LEAPS = 3  # after each random-walk step of a chain
 WIDE = {
     "odds": 0.6,
     "sd": 0.3,
     "tail": 0.3,
     "slope": 0.3,
-}  # sd of where chains start (of logarithms): 3 to 8 of the posterior's
+}  # sd of the starts of the chains, of logarithms: 3 to 8 posterior sd
 
 
-class Learned(nn.Module):
-    """`LosNlosRangeError` with its numbers in buffers, so that every chain has its own."""
+class BatchedRangeError(nn.Module):
+    """`LosNlosRangeError` with its parameters in buffers, one value per chain."""
 
     odds: Tensor
     sd: Tensor
@@ -125,7 +125,7 @@ def drive(stretch: str, interval: float = 1.0) -> UrbanDrive:
 
 
 def at_reference(scenario: UrbanDrive) -> tuple[Record, Any]:
-    """The epochs with ranges, less what the way of the reference makes of them: a receiver that stands, and what is believed."""
+    """Record of the epochs with ranges, minus the changes by the motion of the reference, and the tuning for it."""
     world = scenario.draw(NominalNoise(), torch.arange(1), 1)
     way = torch.cat([world.truth["position"], world.truth["height"]], -1)[0]
     u: UrbanInputs = world.record.u
@@ -133,20 +133,20 @@ def at_reference(scenario: UrbanDrive) -> tuple[Record, Any]:
     seen = ~torch.isnan(y).all(-1)
     span = torch.diff(world.time[seen], prepend=world.time[seen][:1] - 1.0)
     parts = u._replace(duration=span[None], speed=0.0 * span[None], yaw_rate=0.0 * span[None])
-    kept = (a if a.shape[1] == len(span) else a[:, seen] for a in parts)
-    known = replace(
+    selected = (a if a.shape[1] == len(span) else a[:, seen] for a in parts)
+    tuning = replace(
         scenario.tuning, distance_density=STILL, heading_density=STILL, height_density=STILL, scale_density=STILL,
         yaw_bias_density=STILL, initial_position_sd=[STILL] * 3, initial_heading_sd_deg=STILL, initial_scale_sd=STILL,
         initial_yaw_bias_sd=STILL, initial_clock_sd=5.0,
     )  # fmt: skip
     return Record(
-        y[seen].unsqueeze(0), UrbanInputs(*kept), torch.zeros(1, 9, dtype=torch.float64)
-    ), known
+        y[seen].unsqueeze(0), UrbanInputs(*selected), torch.zeros(1, 9, dtype=torch.float64)
+    ), tuning
 
 
-def learn(stretch: str, best: LosNlosRangeError, draws: int, warmup: int) -> ParameterPosterior:
-    """The posterior of the law on a stretch. Chains start around the law of highest likelihood there, as wide as `WIDE`."""
-    record, known = at_reference(drive(stretch, 2.0))
+def estimate(stretch: str, best: LosNlosRangeError, draws: int, warmup: int) -> ParameterPosterior:
+    """Posterior on a stretch. Chains start around the maximum likelihood estimate with the sd of `WIDE`."""
+    record, tuning = at_reference(drive(stretch, 2.0))
     middle = {
         "odds": math.log(best.share / (1.0 - best.share)),
         "sd": math.log(best.sd),
@@ -158,7 +158,7 @@ def learn(stretch: str, best: LosNlosRangeError, draws: int, warmup: int) -> Par
     }  # fmt: skip
 
     def make(**values: Tensor) -> StateSpaceModel:
-        return UrbanGnss(known, Learned(**values))
+        return UrbanGnss(tuning, BatchedRangeError(**values))
 
     with tqdm(
         total=warmup + draws,
@@ -173,37 +173,46 @@ def learn(stretch: str, best: LosNlosRangeError, draws: int, warmup: int) -> Par
         )  # fmt: skip
 
 
-def evidence(law: PseudorangeError, stretch: str) -> tuple[float, float]:
-    """log evidence for each range of a stretch, at the reference: mean and sd of 4 filters with 1500 particles."""
-    record, known = at_reference(drive(stretch))
+def evidence(distribution: PseudorangeError, stretch: str) -> tuple[float, float]:
+    """Log evidence per range of a stretch, at the reference: mean and sd of 4 filters with 1500 particles."""
+    record, tuning = at_reference(drive(stretch))
     again = repeat_runs(record, 4)
     with torch.no_grad():
         estimate = run_filter(
-            ParticleFilter(1500), UrbanGnss(known, law), again, PhiloxStream(6, torch.arange(4))
+            ParticleFilter(1500),
+            UrbanGnss(tuning, distribution),
+            again,
+            PhiloxStream(6, torch.arange(4)),
         )
     each = estimate.log_evidence / (~torch.isnan(record.y)).sum()
     return float(each.mean()), float(each.std())
 
 
-def most_likely(stretch: str) -> tuple[PseudorangeError, PseudorangeError]:
-    """The normal law and the mixture of highest likelihood at the reference, all epochs of a stretch."""
+def estimate_maximum_likelihood(stretch: str) -> dict[str, Any]:
+    """Parameters of the normal distribution and the mixture of maximum likelihood, all epochs of a stretch."""
     scenario = drive(stretch)
     data = range_residuals(
-        cut(read_drive(find_dataset(scenario.root, scenario.folder)), *STRETCHES[stretch])
+        select_stretch(
+            read_drive(find_dataset(scenario.root, scenario.folder)), *STRETCHES[stretch]
+        )
     )
-    return estimate_normal(data)[0], estimate_mixture(data)[0]
+    mixture = estimate_mixture(data)[0]
+    return {
+        "normal": estimate_normal(data)[0].factor,
+        "mixture": [mixture.share, mixture.sd, mixture.tail, mixture.slope],
+    }
 
 
 def positions(
-    law: PseudorangeError, stretch: str, runs: int = 8, particles: int = 1500
+    distribution: PseudorangeError, stretch: str, runs: int = 8, particles: int = 1500
 ) -> list[float]:
-    """Horizontal rms errors of a particle filter without reference, m [runs]; runs differ in start and draws."""
+    """Horizontal RMSE of a particle filter without reference [m], one per run; runs differ in start and random numbers."""
     scenario, numbers = drive(stretch), torch.arange(runs)
     world = scenario.draw(NominalNoise(), numbers, 3)
     with torch.no_grad():
         filtered = run_filter(
             ParticleFilter(particles),
-            UrbanGnss(scenario.tuning, law),
+            UrbanGnss(scenario.tuning, distribution),
             world.record,
             PhiloxStream(8, numbers),
         )
@@ -212,129 +221,147 @@ def positions(
     return rms
 
 
-def law_of(posterior: ParameterPosterior) -> LosNlosRangeError:
+def take_posterior_mean(posterior: ParameterPosterior) -> LosNlosRangeError:
     mean = {name: float(posterior.pooled_draws(name).mean()) for name in PRIOR}
     return LosNlosRangeError(
         1.0 / (1.0 + math.exp(-mean["odds"])), mean["sd"], mean["tail"], mean["slope"]
     )
 
 
-def shown(posterior: ParameterPosterior) -> ParameterPosterior:
-    """With the share in place of its logit."""
-    drawn = {name: posterior.draws["odds" if name == "share" else name] for name in SHOWN}
+def with_share(posterior: ParameterPosterior) -> ParameterPosterior:
+    """Posterior with the share in place of its logit."""
+    drawn = {name: posterior.draws["odds" if name == "share" else name] for name in PRIOR_OF_TABLE}
     return replace(posterior, draws=drawn | {"share": torch.sigmoid(drawn["share"])})
 
 
-def told(stretch: str, best: LosNlosRangeError, draws: int, warmup: int) -> dict[str, Any]:
-    began = time.process_time()
-    posterior = learn(stretch, best, draws, warmup)
-    return {"posterior": posterior.to_dict(), "seconds": time.process_time() - began}
+def estimate_timed(
+    stretch: str, best: LosNlosRangeError, draws: int, warmup: int
+) -> dict[str, Any]:
+    start_time = time.process_time()
+    posterior = estimate(stretch, best, draws, warmup)
+    return {"posterior": posterior.to_dict(), "seconds": time.process_time() - start_time}
 
 
-Laws = Mapping[
+Distributions = Mapping[
     str, Mapping[str, PseudorangeError]
-]  # by the stretch that they were learned on, and by name
+]  # by stretch of the estimation, and by name
 Scores = Mapping[
     str, Mapping[tuple[str, str, str], list[float]]
-]  # by measure, and by law, stretch learned on and scored on
+]  # by measure, and by distribution, stretch of the estimation and of the score
 
 
-def scored(pieces: ResumableResults, laws: Laws) -> Scores:
-    """Mean and sd of the log evidence of a range; of laws learned on the other stretch the errors of the runs, too."""
-    found: dict[str, dict[tuple[str, str, str], list[float]]] = {"evidence": {}, "position": {}}
+def compute_scores(
+    results: Callable[[str, Callable[[], Any]], Any], distributions: Distributions
+) -> Scores:
+    """Mean and sd of the log evidence per range; errors of the runs for estimates of the other stretch."""
+    scores: dict[str, dict[tuple[str, str, str], list[float]]] = {"evidence": {}, "position": {}}
     jobs = [
-        (name, law, source, stretch)
-        for source in laws
-        for name, law in laws[source].items()
+        (name, distribution, source, stretch)
+        for source in distributions
+        for name, distribution in distributions[source].items()
         for stretch in STRETCHES
     ]
-    for name, law, source, stretch in tqdm(jobs, desc="scores", unit="law", leave=False):
-        label, key = f"{law}, on the {stretch}", (name, source, stretch)
-        found["evidence"][key] = pieces(f"evidence: {label}", partial(evidence, law, stretch))
+    for name, distribution, source, stretch in tqdm(
+        jobs, desc="scores", unit="distribution", leave=False
+    ):
+        label, key = f"{distribution}, on the {stretch}", (name, source, stretch)
+        scores["evidence"][key] = results(
+            f"evidence: {label}", partial(evidence, distribution, stretch)
+        )
         if source != stretch:
-            found["position"][key] = pieces(f"position: {label}", partial(positions, law, stretch))
-    return found
+            scores["position"][key] = results(
+                f"position: {label}", partial(positions, distribution, stretch)
+            )
+    return scores
 
 
-def learned_table(laws: Laws, posteriors: Mapping[str, ParameterPosterior]) -> list[str]:
+def posterior_table(
+    distributions: Distributions, posteriors: Mapping[str, ParameterPosterior]
+) -> list[str]:
     names = (
         "stretch",
-        "number",
+        "parameter",
         "prior, median and 5 to 95 %",
-        "posterior, median and 90 %",
+        "posterior, median and 5 to 95 %",
         "r-hat",
-        "effective size",
+        "effective sample size",
     )
-    lines = markdown_head(*names, "highest likelihood")
+    lines = markdown_head(*names, "maximum likelihood")
     for stretch, posterior in posteriors.items():
-        table = shown(posterior).table()
-        for name, law in SHOWN.items():
-            low, middle, high = (float(law.icdf(torch.tensor(q))) for q in (0.05, 0.5, 0.95))
-            t, best = table.loc[name], getattr(laws[stretch]["mixture"], name)
-            mine = f"{t['median']:.3g} ({t['low']:.3g} to {t['high']:.3g})"
-            met = (f"{t['r_hat']:.3f}", f"{t['ess']:.0f}")
+        table = with_share(posterior).table()
+        for name, distribution in PRIOR_OF_TABLE.items():
+            low, middle, high = (
+                float(distribution.icdf(torch.tensor(q))) for q in (0.05, 0.5, 0.95)
+            )
+            t, best = table.loc[name], getattr(distributions[stretch]["mixture"], name)
+            posterior_text = f"{t['median']:.3g} ({t['low']:.3g} to {t['high']:.3g})"
+            mixing = (f"{t['r_hat']:.3f}", f"{t['ess']:.0f}")
             lines.append(
                 markdown_row(
                     stretch,
-                    CALLED[name],
+                    LABELS[name],
                     f"{middle:.2g} ({low:.2g} to {high:.2g})",
-                    mine,
-                    *met,
+                    posterior_text,
+                    *mixing,
                     f"{best:.3g}",
                 )
             )
     return lines
 
 
-def of_chains(
-    posteriors: Mapping[str, ParameterPosterior], done: Mapping[str, Any], asked: Mapping[str, Any]
+def describe_chains(
+    posteriors: Mapping[str, ParameterPosterior],
+    done: Mapping[str, Any],
+    request: Mapping[str, Any],
 ) -> str:
-    """What is to be thought of the chains."""
-    tables = [shown(posterior).table() for posterior in posteriors.values()]
+    """Number, length, cost and convergence of the chains."""
+    tables = [with_share(posterior).table() for posterior in posteriors.values()]
     worst, least = max(t["r_hat"].max() for t in tables), min(t["ess"].min() for t in tables)
     shares = torch.cat(
         [posterior.accepted for posterior in posteriors.values() if posterior.accepted is not None]
     )
     minutes = sum(done[f"posterior, {stretch}"]["seconds"] for stretch in posteriors) / 60.0
     verdict = (
-        "have met" if worst < WELL_MIXED else "have not met, so that widths are not to be relied on"
+        "have converged"
+        if worst < WELL_MIXED
+        else "have not converged, so their intervals are not reliable"
     )
     return (
-        f"{asked['chains']} chains for each stretch, {asked['draws']} draws each after {asked['warmup']}, with filters of "
-        f"{asked['particles']} particles; {minutes:.0f} minutes of a core in all. They {verdict}: the largest r-hat is "
-        f"{worst:.3f} (of chains split in halves; {WELL_MIXED} is the bound), the least effective size {least:.0f}; "
-        f"{float(shares.min()):.0%} to {float(shares.max()):.0%} of a chain's proposals are accepted."
+        f"{request['chains']} chains for each stretch, {request['draws']} draws after a warm-up of {request['warmup']}, with filters of "
+        f"{request['particles']} particles, in {minutes:.0f} minutes of a core. The chains {verdict}: the largest r-hat of split "
+        f"chains is {worst:.3f} (limit {WELL_MIXED}), and the smallest effective sample size is {least:.0f}. "
+        f"{float(shares.min()):.0%} to {float(shares.max()):.0%} of the proposals of a chain are accepted."
     )
 
 
-def stretches_apart(posteriors: Mapping[str, ParameterPosterior]) -> str:
-    """How far the two posteriors lie apart, number by number, where each is about normal."""
+def describe_differences(posteriors: Mapping[str, ParameterPosterior]) -> str:
+    """Differences of the two posteriors by parameter, on scales where each is about normal."""
     a, b = posteriors.values()
     parts = []
-    for name, law in PRIOR.items():
+    for name, distribution in PRIOR.items():
         u, v = (
-            p.pooled_draws(name) if isinstance(law, Normal) else p.pooled_draws(name).log()
+            p.pooled_draws(name) if isinstance(distribution, Normal) else p.pooled_draws(name).log()
             for p in (a, b)
         )
         z = float((u.mean() - v.mean()) / torch.sqrt(u.var() + v.var()))
         label = {"odds": "logit of the share", "sd": "log sd", "tail": "log tail"}.get(name, name)
         parts.append(f"{label} {z:+.1f}")
     return (
-        "First stretch less second, in standard deviations of the difference (beyond 2 once in twenty if one law held on both): "
-        f"{', '.join(parts)}."
+        f"First stretch minus second, in standard deviations of the difference: {', '.join(parts)}. With the same distribution on "
+        "both stretches, about one parameter in twenty exceeds 2."
     )
 
 
-def evidence_table(laws: Laws, scores: Scores) -> list[str]:
+def evidence_table(distributions: Distributions, scores: Scores) -> list[str]:
     pairs = [(source, to) for to in STRETCHES for source in sorted(STRETCHES, key=to.__eq__)]
     lines = markdown_head(
-        "law",
+        "distribution",
         *(
-            f"on the {to}, learned on " + ("itself" if source == to else f"the {source}")
+            f"on the {to}, estimated on the " + ("same" if source == to else source)
             for source, to in pairs
         ),
     )
-    for name in laws["first"]:
+    for name in distributions["first"]:
         lines.append(
             markdown_row(
                 name, *(f"{scores['evidence'][name, source, to][0]:.4f}" for source, to in pairs)
@@ -343,8 +370,8 @@ def evidence_table(laws: Laws, scores: Scores) -> list[str]:
     return lines
 
 
-def carried_over(scores: Scores) -> str:
-    """What is left of a mixture's advantage where it was not learned."""
+def describe_scores(scores: Scores) -> str:
+    """Log evidence of the mixtures on the other stretch, relative to the normal distribution and to an estimate of that stretch."""
     parts, table = [], scores["evidence"]
     for name in dict.fromkeys(name for name, *_ in table if name != "normal"):
         pairs = [(a, b) for b in STRETCHES for a in STRETCHES if a != b]
@@ -352,22 +379,24 @@ def carried_over(scores: Scores) -> str:
             (table[name, a, b][0], table["normal", a, b][0], table[name, b, b][0]) for a, b in pairs
         ]
         ahead = " and ".join(f"{mean - usual:.3f}" for mean, usual, _ in sides)
-        lost = " and ".join(f"{own - mean:.3f}" for mean, _, own in sides)
+        below = " and ".join(f"{same - mean:.3f}" for mean, _, same in sides)
         parts.append(
-            f"the {name} is ahead of the normal law by {ahead}, and behind the same learned there by {lost}"
+            f"The {name} is above the normal distribution by {ahead}, and below the same estimated there by {below}."
         )
-    return f"Learned on the other stretch, on the first and on the second: {'; '.join(parts)}."
+    return (
+        f"Estimated on the other stretch, scored on the first and on the second. {' '.join(parts)}"
+    )
 
 
 def position_table(scores: Scores) -> list[str]:
-    """Laws learned on the other stretch against the normal one, p of Wilcoxon's test with Holm's correction."""
+    """Mixtures of the other stretch against the normal distribution, Wilcoxon's test with Holm's correction."""
     names = (
         "scored on",
-        "law, learned on the other",
-        "rms, m",
-        "normal law's rms, m",
-        "less by, m",
-        "in",
+        "distribution, estimated on the other",
+        "RMSE, m",
+        "RMSE of the normal distribution, m",
+        "median difference, m",
+        "smaller in",
         "p",
         "p, Holm",
     )
@@ -385,7 +414,7 @@ def position_table(scores: Scores) -> list[str]:
     ):
         own, normal = (f"{np.median(x):.1f} ({x.min():.1f} to {x.max():.1f})" for x in (a, b))
         cells = (
-            f"{np.median(b - a):.1f}",
+            f"{np.median(a - b):.1f}",
             f"{(a < b).sum()} of {len(a)} runs",
             f"{p:.2g}",
             f"{corrected:.2g}",
@@ -394,77 +423,107 @@ def position_table(scores: Scores) -> list[str]:
     return lines
 
 
+def read_parts(
+    results: Callable[[str, Callable[[], Any]], Any], draws: int, warmup: int
+) -> tuple[dict[str, dict[str, PseudorangeError]], dict[str, ParameterPosterior], Scores]:
+    """Distributions, posteriors and scores; `results` computes the parts that are not stored."""
+    posteriors: dict[str, ParameterPosterior] = {}
+    distributions: dict[str, dict[str, PseudorangeError]] = {}
+    for stretch in STRETCHES:
+        part = results(
+            f"maximum likelihood, {stretch}", partial(estimate_maximum_likelihood, stretch)
+        )
+        mixture = LosNlosRangeError(*part["mixture"])
+        distributions[stretch] = {"normal": NormalRangeError(part["normal"]), "mixture": mixture}
+        if draws:
+            work = partial(estimate_timed, stretch, mixture, draws, warmup)
+            stored = results(f"posterior, {stretch}", work)["posterior"]
+            posteriors[stretch] = ParameterPosterior.from_dict(stored)
+            mean = take_posterior_mean(posteriors[stretch])
+            distributions[stretch]["mixture, posterior mean"] = mean
+    return distributions, posteriors, compute_scores(results, distributions)
+
+
+def write_page(request: Mapping[str, Any], done: Mapping[str, Any]) -> str:
+    """The page of the study from its stored results."""
+    parts = read_parts(lambda name, _: done[name], request["draws"], request["warmup"])
+    return "\n".join(report(*parts, done, request))
+
+
 def report(
-    laws: Laws,
+    distributions: Distributions,
     posteriors: Mapping[str, ParameterPosterior],
     scores: Scores,
     done: Mapping[str, Any],
-    asked: Mapping[str, Any],
+    request: Mapping[str, Any],
 ) -> list[str]:
     spread = max(sd for _, sd in scores["evidence"].values())
     stretches = " and ".join(
-        f"the {name} one ({a:.0f} to {b:.0f} s)" for name, (a, b) in STRETCHES.items()
+        f"the {name} ({a:.0f} to {b:.0f} s)" for name, (a, b) in STRETCHES.items()
     )
     factors = " and ".join(
-        f"{law.factor:.2f} ({s})"
-        for s in laws
-        if isinstance(law := laws[s]["normal"], NormalRanges)
+        f"{distribution.factor:.2f} ({s})"
+        for s in distributions
+        if isinstance(distribution := distributions[s]["normal"], NormalRangeError)
     )
     lines = [
-        "# The law of ranges in a Berlin canyon, learned on one stretch and scored on the other",
+        "# Pseudorange errors in a Berlin canyon, estimated on one stretch and scored on the other",
         "",
     ]
     lines += markdown_paragraph(
-        f"`python -m pfbench.experiments.learn_canyon_noise {asked['draws']} {asked['warmup']}` writes this page. How a "
-        "pseudorange errs, as a mixture of signals seen directly and signals delayed by a detour (`SightOrTail`), is learned "
-        "where the reference says that the receiver was, on one stretch of a recorded drive, and scored on the other: "
-        f"{stretches}."
+        f"`python -m pfbench.experiments.learn_canyon_noise {request['draws']} {request['warmup']}` writes this page. The scenario is "
+        "`recorded_berlin`. Pseudorange errors are modelled as a mixture of direct and delayed signals (`LosNlosRangeError`). Its "
+        f"parameters are estimated at the reference of one stretch and scored on the other. The stretches are {stretches}."
     )
     if posteriors:
-        lines += ["## What was learned", "", *learned_table(laws, posteriors), ""]
+        lines += ["## Posterior", "", *posterior_table(distributions, posteriors), ""]
         lines += [
-            *markdown_paragraph(of_chains(posteriors, done, asked)),
-            *markdown_paragraph(stretches_apart(posteriors)),
+            *markdown_paragraph(describe_chains(posteriors, done, request)),
+            *markdown_paragraph(describe_differences(posteriors)),
         ]
         lines += [
             "![Chains and densities](posterior.png)",
             "",
-            "A colour for each stretch, a thin line for each chain.",
+            "*A colour for each stretch, a thin line for each chain.*",
             "",
         ]
-    lines += ["## What it is worth on the other stretch", ""]
+    lines += ["## Scores on the other stretch", ""]
     lines += markdown_paragraph(
-        "Log evidence of a range at the reference, all epochs: mean over four filters of 1500 particles, which scatter by an sd "
-        f"of {spread:.4f} at most. The normal law has the sd that the receiver states times {factors}, again the factor of "
-        "highest likelihood."
+        "Log evidence per range at the reference, all epochs, mean of four filters of 1500 particles. The standard deviation of the "
+        f"four is at most {spread:.4f}. The standard deviation of the normal distribution is that stated by the receiver times "
+        f"{factors}, the maximum likelihood estimates."
     )
-    lines += [*evidence_table(laws, scores), "", *markdown_paragraph(carried_over(scores))]
+    lines += [
+        *evidence_table(distributions, scores),
+        "",
+        *markdown_paragraph(describe_scores(scores)),
+    ]
     lines += markdown_paragraph(
-        "Horizontal rms error of a particle filter that has no reference, with 1500 particles, in 8 runs that differ in start "
-        "and draws: median and range over runs, median of the differences, p of Wilcoxon's test and with Holm's correction over "
-        "this table. Eight runs cannot give a p below 0.008."
+        "Horizontal RMSE of a particle filter without reference, with 1500 particles, in 8 runs that differ in start and random "
+        "numbers. Values are median and range over runs, and the median of the differences to the normal distribution. The "
+        "p-values are of Wilcoxon's test, without and with Holm's correction over this table. The smallest one of eight runs is "
+        "0.008."
     )
     lines += [*position_table(scores), "", "![Scores](scores.png)", ""]
-    lines += markdown_paragraph("Below, a mark for each run, all learned on the other stretch.")
-    return [*lines, "## What is chosen, and what is not shown", "", *markdown_bullets(*CAVEATS)]
+    lines += markdown_paragraph("Bottom: one mark per run, all estimated on the other stretch.")
+    return [*lines, "## Choices and limits", "", *markdown_bullets(*CAVEATS)]
 
 
 CAVEATS = (
-    "Ours: the priors; one epoch in two seconds for the posterior (a reflection lasts, and the model takes epochs as "
-    "independent), all epochs for the law of highest likelihood and for the scores; where the drive is cut in two; that chains "
-    "start around the law of highest likelihood, three to eight times as wide as the posterior, and leap three times in four "
-    "(`leaps` of `pmmh`).",
-    "The chains sample the posterior of the model at the reference. The model is not the street: ranges of one satellite err "
-    "alike for seconds, so that the posterior is narrower than what the stretch really tells.",
-    "Scored is the law at the posterior's mean, not the average over its draws.",
-    "One drive, one receiver, two stretches one after the other: runs differ in start and draws, not in streets, and their p say "
-    "nothing of another street or city.",
-    "Learning without a reference is not shown: it cannot be done with a plain particle filter "
-    "([why](../../docs/parameter_inference.md#study-the-canyon-of-berlin)).",
+    "Choices of this project: the priors, one epoch of two seconds for the posterior, and the boundary of the stretches. Chains "
+    "start around the maximum likelihood estimate, three to eight posterior standard deviations wide. Three of four steps are "
+    "leaps (`leaps` of `pmmh`).",
+    "Errors of one satellite are alike for seconds. The model takes epochs as independent, so the posterior is narrower than the "
+    "data support.",
+    "The scores are of the distribution at the posterior mean. They do not average over the posterior.",
+    "The data are one drive with one receiver on two consecutive stretches. Runs differ in start and random numbers only. Their "
+    "p-values say nothing about another street or city.",
+    "Estimation without a reference is not possible with a plain particle filter "
+    "([reason](../../docs/parameter_inference.md#study-the-canyon-of-berlin)).",
 )
 
 
-def compared(scores: Scores) -> Figure:
+def plot_scores(scores: Scores) -> Figure:
     """Evidence and errors, a column for each stretch scored on."""
     names = list(dict.fromkeys(name for name, *_ in scores["evidence"]))
     style = line_styles(names)
@@ -495,10 +554,13 @@ def compared(scores: Scores) -> Figure:
         bottom.set_xticks(range(len(names)), [name.replace(", ", ",\n") for name in names])
         bottom.set_xlim(-0.5, len(names) - 0.5)
         bottom.set_yscale("log")
-    for face, label in (("0.4", "learned on the other stretch"), ("none", "learned on the same")):
+    for face, label in (
+        ("0.4", "estimated on the other stretch"),
+        ("none", "estimated on the same"),
+    ):
         axes[0, 0].plot([], [], "o", color="0.4", markerfacecolor=face, label=label)
-    axes[0, 0].set_ylabel("log evidence of a range")
-    axes[1, 0].set_ylabel("horizontal rms error, m")
+    axes[0, 0].set_ylabel("log evidence per range")
+    axes[1, 0].set_ylabel("horizontal RMSE, m")
     axes[1, 0].yaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
     axes[1, 0].yaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
     axes[1, 0].yaxis.set_minor_formatter(ticker.NullFormatter())
@@ -508,7 +570,7 @@ def compared(scores: Scores) -> Figure:
 
 def main(folder: Path, draws: int = 400, warmup: int = 100) -> None:
     torch.set_num_threads(1)
-    asked = {
+    request = {
         "draws": draws,
         "warmup": warmup,
         "chains": CHAINS,
@@ -516,34 +578,17 @@ def main(folder: Path, draws: int = 400, warmup: int = 100) -> None:
         "leaps": LEAPS,
         "wide": WIDE,
     }
-    pieces = ResumableResults(folder / "learn_canyon_noise.json", asked)
-    posteriors: dict[str, ParameterPosterior] = {}
-    laws: dict[str, dict[str, PseudorangeError]] = {}
-    for stretch in STRETCHES:
-        normal, mixture = most_likely(stretch)
-        laws[stretch] = {"normal": normal, "mixture": mixture}
-        print(stretch, normal, mixture, flush=True)
-        if draws:
-            kept = pieces(f"posterior, {stretch}", partial(told, stretch, mixture, draws, warmup))
-            posteriors[stretch] = ParameterPosterior.from_dict(kept["posterior"])
-            print(
-                stretch,
-                posteriors[stretch].table().to_string(),
-                posteriors[stretch].accepted,
-                sep="\n",
-                flush=True,
-            )
-            laws[stretch]["mixture, posterior's mean"] = law_of(posteriors[stretch])
-    scores = scored(pieces, laws)
-    text = "\n".join(report(laws, posteriors, scores, pieces.state["done"], asked))
-    print(text)
-    (folder / "report.md").write_text(text)
-    drawn = {f"{stretch} stretch": shown(posterior) for stretch, posterior in posteriors.items()}
+    results = ResumableResults(folder / "learn_canyon_noise.json", request)
+    _, posteriors, scores = read_parts(results, draws, warmup)
+    (folder / "report.md").write_text(write_page(request, results.state["done"]))
+    drawn = {
+        f"{stretch} stretch": with_share(posterior) for stretch, posterior in posteriors.items()
+    }
     with matplotlib.rc_context(RC):
-        (folder / "scores.png").write_bytes(render_palette_png(compared(scores)))
+        (folder / "scores.png").write_bytes(render_palette_png(plot_scores(scores)))
         if drawn:
             (folder / "posterior.png").write_bytes(
-                render_palette_png(plot_posterior(drawn, SHOWN, names=CALLED))
+                render_palette_png(plot_posterior(drawn, PRIOR_OF_TABLE, names=LABELS))
             )
 
 

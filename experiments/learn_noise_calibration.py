@@ -1,28 +1,30 @@
-"""Are inferred noise levels calibrated? Ranks of true ones among their draws, for PMMH and SVI on a toy and on passive location.
+"""Calibration of inferred noise levels: ranks of true parameters among posterior draws, for PMMH and SVI.
 
-    python -m pfbench.experiments.learn_noise_calibration [data sets [effort [world]]]
+    python -m pfbench.experiments.learn_noise_calibration [data sets [effort [model]]]
 
-Each algorithm is tried a second time with a likelihood that is wrong on purpose, which the ranks must show: a measurement noise
-that is half as large again as the numbers say. Effort multiplies draws and steps. What is done is kept in the folder, and the
-same command goes on from there; `world` is the beginning of the names of the cases, `toy` or `location`.
+The models are a local level and passive location. Each case is repeated with a wrong likelihood, which
+assumes a larger measurement noise than the parameter. Effort multiplies draws and steps. The command
+resumes from the cases in its folder and writes `report.md`. `model` is the first word of the cases that run.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import sys
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from pyro.distributions import LogNormal
+from scipy.stats import chisquare
 
 from pfbench.core import Record
+from pfbench.files import markdown_head, markdown_paragraph, markdown_row
 from pfbench.filter import GaussianFilter, ParticleFilter, TaylorLinearisation
+from pfbench.job import ResumableResults
 from pfbench.model import (
     PassiveLocation,
     PlatformInputs,
@@ -45,11 +47,17 @@ from pfbench.ppl import (
     svi,
 )
 from pfbench.report import render_palette_png
+from pfbench.results import holm
 
-WRONG = 1.5
-BINS = 10
+WRONG = 1.5  # factor on the measurement noise of the wrong likelihood
+BINS, DRAWS = 10, 19
+LEVEL = 0.05  # of the tests
 LEVELS = {"level_sd": LogNormal(0.0, 0.7), "measurement_sd": LogNormal(0.0, 0.7)}
 SIGHTS = {"angle_sd": LogNormal(math.log(3e-3), 0.5)}  # rad; of bearing and elevation
+LABELS = {"toy": "local level, 8 measurements", "location": "passive location, 6 measurements"}
+
+Infer = Callable[[Record], ParameterPosterior]
+Case = tuple[ParameterisedModel, Record, Infer]
 
 
 def level(level_sd: Any, measurement_sd: Any, wrong: float = 1.0) -> StateSpaceModel:
@@ -57,7 +65,7 @@ def level(level_sd: Any, measurement_sd: Any, wrong: float = 1.0) -> StateSpaceM
 
 
 def location(angle_sd: Any, wrong: float = 1.0) -> StateSpaceModel:
-    """An emitter 226 km away, known to 5 km per axis, heard every 10 s."""
+    """An emitter at 226 km, its position uncertain by 5 km per axis, measured every 10 s."""
     sd = [wrong * angle_sd, wrong * angle_sd, 1e-4, 1e-4, 1.0]
     return PassiveLocation(10.0, 0.1, sd, (160e3, 160e3, -15.0, 15.0), (5e3, 5e3, 10.0, 10.0))
 
@@ -66,18 +74,16 @@ def flight(runs: int, steps: int) -> Record:
     """An aircraft at 200 m/s in level flight."""
     t = 10.0 * torch.arange(1, steps + 1, dtype=torch.float64)
     velocity = torch.tensor([200.0, 0.0, 0.0], dtype=torch.float64)
-    place = torch.tensor([0.0, 0.0, 2000.0], dtype=torch.float64) + t[:, None] * velocity
+    position = torch.tensor([0.0, 0.0, 2000.0], dtype=torch.float64) + t[:, None] * velocity
     attitude = compute_level_attitude(velocity).expand(1, steps, 3, 3)
     carrier = torch.full((1, steps), 1e10, dtype=torch.float64)
-    platform = PlatformInputs(place[None], velocity.expand(1, steps, 3), attitude, carrier)
+    platform = PlatformInputs(position[None], velocity.expand(1, steps, 3), attitude, carrier)
     return Record(torch.zeros(runs, steps, 5, dtype=torch.float64), platform)
 
 
-def by_pmmh(
-    unknown: ParameterisedModel, particles: int, draws: int, warmup: int
-) -> Callable[[Record], ParameterPosterior]:
+def by_pmmh(parameterised: ParameterisedModel, particles: int, draws: int, warmup: int) -> Infer:
     return lambda record: pmmh(
-        unknown,
+        parameterised,
         ParticleFilter(particles),
         record,
         draws,
@@ -88,13 +94,11 @@ def by_pmmh(
     )
 
 
-def by_svi(
-    unknown: ParameterisedModel, likelihood: Any, steps: int
-) -> Callable[[Record], ParameterPosterior]:
+def by_svi(parameterised: ParameterisedModel, likelihood: Any, steps: int) -> Infer:
     def infer(record: Record) -> ParameterPosterior:
-        guide = normal_guide(unknown, separate_parameters=True)
+        guide = normal_guide(parameterised, separate_parameters=True)
         return svi(
-            program(unknown, likelihood, separate_parameters=True),
+            program(parameterised, likelihood, separate_parameters=True),
             record,
             guide,
             steps,
@@ -106,99 +110,153 @@ def by_svi(
     return infer
 
 
-def studies(
-    runs: int, effort: int = 1
-) -> dict[str, tuple[ParameterisedModel, Record, Callable[[Record], ParameterPosterior]]]:
-    """The eight cases: world, shape of its records, algorithm."""
-    found = {}
-    for name, wrong in (("", 1.0), (", wrong", WRONG)):
-        toy, believed = (
-            ParameterisedModel(level, LEVELS),
-            ParameterisedModel(lambda wrong=wrong, **values: level(**values, wrong=wrong), LEVELS),
-        )
+def parameterise(
+    make: Callable[..., StateSpaceModel], prior: Mapping[str, Any], wrong: float = 1.0
+) -> ParameterisedModel:
+    return ParameterisedModel(lambda **values: make(**values, wrong=wrong), prior)
+
+
+def list_cases(runs: int, effort: int = 1) -> dict[str, Case]:
+    """The eight cases by name `model, algorithm` or `model, algorithm, wrong`."""
+    cases: dict[str, Case] = {}
+    ekf = FilterLikelihood(GaussianFilter(TaylorLinearisation()))
+    draws, warmup = 120 * effort, 60 * effort
+    for suffix, wrong in (("", 1.0), (", wrong", WRONG)):
+        truth, assumed = (parameterise(level, LEVELS, factor) for factor in (1.0, wrong))
         shape = Record(torch.zeros(runs, 8, 1, dtype=torch.float64))
-        found[f"toy, PMMH{name}"] = toy, shape, by_pmmh(believed, 100, 120 * effort, 60 * effort)
-        found[f"toy, SVI{name}"] = (
-            toy,
-            shape,
-            by_svi(believed, GaussianHmmLikelihood(), 150 * effort),
-        )
-        far, believed = (
-            ParameterisedModel(location, SIGHTS),
-            ParameterisedModel(
-                lambda wrong=wrong, **values: location(**values, wrong=wrong), SIGHTS
-            ),
-        )
+        kalman = by_svi(assumed, GaussianHmmLikelihood(), 150 * effort)
+        cases[f"toy, PMMH{suffix}"] = truth, shape, by_pmmh(assumed, 100, draws, warmup)
+        cases[f"toy, SVI{suffix}"] = truth, shape, kalman
+        truth, assumed = (parameterise(location, SIGHTS, factor) for factor in (1.0, wrong))
         shape = flight(runs, 6)
-        found[f"location, PMMH{name}"] = (
-            far,
-            shape,
-            by_pmmh(believed, 1000, 120 * effort, 60 * effort),
+        cases[f"location, PMMH{suffix}"] = truth, shape, by_pmmh(assumed, 1000, draws, warmup)
+        cases[f"location, SVI{suffix}"] = truth, shape, by_svi(assumed, ekf, 80 * effort)
+    return cases
+
+
+def compute_case(case: Case) -> dict[str, Any]:
+    """Ranks and counts of ranks in bins, by parameter."""
+    ranks = simulation_based_calibration(*case, draws=DRAWS, seed=7)
+    counts = {name: ranks.counts(name, BINS).tolist() for name in case[0].names}
+    return {"counts": counts, "ranks": {name: r.tolist() for name, r in ranks.ranks.items()}}
+
+
+def read_ranks(result: Mapping[str, Any]) -> SbcRanks:
+    return SbcRanks({name: torch.tensor(r) for name, r in result["ranks"].items()}, DRAWS)
+
+
+def list_tests(done: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """One test of uniform ranks for each case and parameter, in the order of the table."""
+    tests = []
+    for name in sorted(done, key=lambda name: name.endswith("wrong")):
+        model, algorithm, *wrong = name.split(", ")
+        for parameter, counts in done[name]["counts"].items():
+            row = {"model": model, "algorithm": algorithm, "is_wrong": bool(wrong)}
+            p = float(chisquare(counts).pvalue)
+            tests.append({**row, "parameter": parameter, "p": p, "counts": counts})
+    return tests
+
+
+def format_table(tests: list[dict[str, Any]]) -> list[str]:
+    names = ("model", "algorithm", "likelihood", "parameter")
+    lines = markdown_head(*names, "data sets in each tenth of the ranks", "p")
+    for test in tests:
+        counts = " ".join(map(str, test["counts"]))
+        likelihood = "wrong" if test["is_wrong"] else "correct"
+        label = LABELS[test["model"]]
+        name = f"`{test['parameter']}`"
+        lines.append(
+            markdown_row(label, test["algorithm"], likelihood, name, counts, f"{test['p']:.2g}")
         )
-        found[f"location, SVI{name}"] = (
-            far,
-            shape,
-            by_svi(believed, FilterLikelihood(GaussianFilter(TaylorLinearisation())), 80 * effort),
+    return lines
+
+
+def describe_tests(tests: list[dict[str, Any]], is_wrong: bool) -> str:
+    """Decisions of the tests of one likelihood, with Holm's correction over them."""
+    selected = [test for test in tests if test["is_wrong"] == is_wrong]
+    pairs = [*zip(selected, holm([test["p"] for test in selected]), strict=True)]
+
+    def names(is_significant: bool) -> str:
+        return ", ".join(
+            f"`{test['parameter']}` by {test['algorithm']} (p {test['p']:.2g})"
+            for test, p in pairs
+            if (p < LEVEL) == is_significant
         )
-    return found
+
+    least = min(test["p"] for test in selected)
+    chance = 1.0 - (1.0 - least) ** len(selected)
+    text = (
+        f"{'Wrong' if is_wrong else 'Correct'} likelihood, {len(selected)} tests, Holm's correction at {LEVEL:.0%}. "
+        f"Significant: {names(True) or 'none'}. Not significant: {names(False) or 'none'}."
+    )
+    if is_wrong:
+        return text
+    return (
+        f"{text} The smallest p-value is {least:.2g}. With independent uniform p-values, the probability of one as small is "
+        f"{chance:.2g}."
+    )
+
+
+def compute_power(runs: int, share: float, samples: int = 20000) -> float:
+    """Power of the chi-square test by simulation, if one bin has this share and the rest is uniform."""
+    shares = np.full(BINS, (1.0 - share) / (BINS - 1))
+    shares[0] = share
+    counts = np.random.default_rng(0).multinomial(runs, shares, samples)
+    return float((chisquare(counts, axis=1).pvalue < LEVEL).mean())
+
+
+def write_page(request: Mapping[str, Any], done: Mapping[str, Any]) -> str:
+    """The page of the study from its stored results."""
+    runs, tests = request["runs"], list_tests(done)
+    lines = ["# Calibration of inferred noise levels", ""]
+    lines += markdown_paragraph(
+        f"`python -m pfbench.experiments.learn_noise_calibration {runs} {request['effort']}` writes this page. It "
+        "draws parameters from their prior and measurements from the model. PMMH and SVI infer the parameters. "
+        f"The rank of the true parameter among {DRAWS} posterior draws must be uniform "
+        f"[Talts et al. 2018]. Each case has {runs} data sets, the same for both algorithms. The p-values are of a chi-square "
+        f"test of {BINS} bins."
+    )
+    lines += markdown_paragraph(
+        f"Each case is repeated with a wrong likelihood. Its measurement noise is {WRONG:g} times the parameter."
+    )
+    lines += [*format_table(tests), ""]
+    for is_wrong in sorted({test["is_wrong"] for test in tests}):
+        lines += markdown_paragraph(describe_tests(tests, is_wrong))
+    lines += markdown_paragraph(
+        "The wrong likelihood does not change the noise of the level, so that ranks of `level_sd` need not fail."
+    )
+    lines += markdown_paragraph(
+        f"Power of one test without correction: if one bin contains 17 % of the data sets, {compute_power(runs, 0.17):.2f}; "
+        f"15 %, {compute_power(runs, 0.15):.2f}. Smaller departures are not excluded."
+    )
+    lines += ["![Ranks on passive location](calibration_location.png)", ""]
+    lines += markdown_paragraph(
+        "The grey band contains 95 % of the bins of uniform ranks. Panels have different scales."
+    )
+    return "\n".join(lines)
 
 
 def main(folder: Path, runs: int = 200, effort: int = 2, only: str = "") -> None:
     torch.set_num_threads(1)
-    folder.mkdir(parents=True, exist_ok=True)
-    path, asked = folder / "learn_noise_calibration.json", {"runs": runs, "effort": effort}
-    told: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
-    if {name: told.get(name) for name in asked} != asked:  # of another call: from the beginning
-        told = dict(asked)
-    drawn: dict[str, dict[str, SbcRanks]] = {}
-    for name, (unknown, shape, infer) in studies(runs, effort).items():
-        if not name.startswith(only):
-            continue
-        if name not in told:
-            began = time.process_time()
-            found = simulation_based_calibration(unknown, shape, infer, draws=19, seed=7)
-            told[name] = {part: told_of(found, part) for part in unknown.names} | {
-                "seconds": time.process_time() - began
-            }
-            path.write_text(json.dumps(told))
-        parts = {part: told[name][part] for part in unknown.names}
-        world, label = name.split(", ", 1)
-        drawn.setdefault(world, {})[label] = SbcRanks(
-            {part: torch.tensor(kept["ranks"]) for part, kept in parts.items()}, 19
-        )
-        values = {part: (f"{kept['p']:.2g}", kept["counts"]) for part, kept in parts.items()}
-        print(name, values, f"{told[name]['seconds']:.0f} s", flush=True)
-    (folder / "table.md").write_text("\n".join(table(told)) + "\n")
-    for world, ranks in drawn.items():
-        (folder / f"calibration_{world}.png").write_bytes(render_palette_png(sbc_histograms(ranks)))
-
-
-def table(told: Mapping[str, Any]) -> list[str]:
-    """Lines of a table in Markdown: a row for each case that is done and each of its numbers."""
-    lines = [
-        "| case | number | data sets in each tenth of the ranks | p | s of the processor |",
-        "|" + " --- |" * 5,
-    ]
-    for name, case in told.items():
-        parts = (
-            {part: kept for part, kept in case.items() if part != "seconds"}
-            if isinstance(case, dict)
-            else {}
-        )
-        for part, kept in parts.items():
-            counts = " ".join(map(str, kept["counts"]))
-            lines.append(
-                f"| {name} | {part} | {counts} | {kept['p']:.2g} | {case['seconds']:.0f} |"
-            )
-    return lines
-
-
-def told_of(ranks: SbcRanks, part: str) -> dict[str, Any]:
-    return {
-        "p": ranks.p_value(part, BINS), "counts": ranks.counts(part, BINS).tolist(), "ranks": ranks.ranks[part].tolist()
-    }  # fmt: skip
+    request = {"runs": runs, "effort": effort}
+    results = ResumableResults(folder / "learn_noise_calibration.json", request)
+    for name, case in list_cases(runs, effort).items():
+        if name.startswith(only):
+            results(name, lambda case=case: compute_case(case))
+            print(name, flush=True)
+    done = results.state["done"]
+    (folder / "report.md").write_text(write_page(request, done))
+    for model in {name.split(", ")[0] for name in done}:
+        ranks = {
+            name.split(", ", 1)[1]: read_ranks(case)
+            for name, case in done.items()
+            if name.startswith(model)
+        }
+        picture = render_palette_png(sbc_histograms(ranks))
+        (folder / f"calibration_{model}.png").write_bytes(picture)
 
 
 if __name__ == "__main__":
     folder = Path(os.environ.get("PFBENCH_RESULTS", "results")) / "learn_noise_calibration"
-    main(folder, *map(int, sys.argv[1:3]), *sys.argv[3:])
+    runs, effort, only = [*sys.argv[1:], *("200", "2", "")[len(sys.argv) - 1 :]]
+    main(folder, int(runs), int(effort), only)

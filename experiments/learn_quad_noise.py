@@ -1,12 +1,12 @@
-"""Noise of a quadrotor's IMU, learned on five flights through the EKF's likelihood, and tried on the fifteen others.
+"""IMU noise of a quadrotor, estimated on five flights by the likelihood of the EKF and tested on the fifteen others.
 
     PFBENCH_DATA=... python -m pfbench.experiments.learn_quad_noise [draws [warm-up]]
 
-The receiver's errors are known (they are added to the record); what is unknown is what the IMU's errors amount to under the
-vibration of the rotors: root densities of gyro and accelerometer and the walks of their biases. Three sets of numbers are
-compared on flights from which nothing was learned: the data sheet's, those of the scene's yaml, which were set by hand, and the
-posterior's medians. Learning takes steps of 1 s, whose evidence is that of 0.2 s to 0.03 in 985; trying takes 0.2 s. What is
-done is kept in the folder, and the same command goes on from there; at its end it writes `report.md` and its figures.
+The errors of the position fixes are known, because they are added to the record. The unknown parameters describe the errors of
+the IMU under the vibration of the rotors: root densities of gyro and accelerometer, and the walks of their biases. Three sets of
+values are compared on other flights: the data sheet, the values of the scenario, which were set by hand, and the posterior
+medians. Estimation takes steps of 1 s, tests take steps of 0.2 s. The command resumes from the parts in its folder and writes
+`report.md` and its figures.
 """
 
 from __future__ import annotations
@@ -54,30 +54,30 @@ from pfbench.report import COLUMN, RC, add_legend, line_styles, render_palette_p
 from pfbench.results import holm, wilcoxon_signed_rank
 from pfbench.scenario import RecordedFlights
 
-LEARNED_ON, TRIED_ON = (1, 2, 3, 4, 5), tuple(range(6, 21))
-# of the maker's chip in this class (MTi-1): 0.007 deg/s/sqrt(Hz), 120 ug/sqrt(Hz); of bias walks it says nothing
+ESTIMATION, TEST = (1, 2, 3, 4, 5), tuple(range(6, 21))
+# data sheet of a chip of the same family (MTi-1): 0.007 deg/s/sqrt(Hz), 120 ug/sqrt(Hz), without bias walks
 SHEET = {
     "gyro_density": math.radians(0.007),
     "accelerometer_density": 120e-6 * 9.81,
 }
-PRIOR = {  # two orders of magnitude either way
+PRIOR = {
     "gyro_density": LogNormal(math.log(3e-3), 2.0),
     "accelerometer_density": LogNormal(math.log(3e-2), 2.0),
     "gyro_bias_walk": LogNormal(math.log(1e-4), 1.5),
     "accelerometer_bias_walk": LogNormal(math.log(1e-3), 1.5),
 }
-CALLED = {  # and the unit
+LABELS = {  # and units
     "gyro_density": ("gyro density", "rad/s/√Hz"),
     "accelerometer_density": ("accelerometer density", "m/s²/√Hz"),
     "gyro_bias_walk": ("gyro bias walk", "rad/s/√s"),
     "accelerometer_bias_walk": ("accelerometer bias walk", "m/s²/√s"),
 }
 CHAINS = 10
-LEAPS = 3  # after each step of the walk
-AGAIN = 3  # times that each flight is flown with new errors of receiver and start
+LEAPS = 3  # after each random-walk step of a chain
+REPEATS = 3  # of each flight, with other errors of fixes and start
 
 
-def scene(flights: tuple[int, ...], step: float) -> RecordedFlights:
+def make_scenario(flights: tuple[int, ...], step: float) -> RecordedFlights:
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         cfg = compose(
             "config",
@@ -91,55 +91,58 @@ def scene(flights: tuple[int, ...], step: float) -> RecordedFlights:
     return scenario
 
 
-def learned(draws: int, warmup: int, step: float) -> ParameterPosterior:
-    """The posterior, by Metropolis-Hastings on the likelihood of an EKF."""
-    flights = scene(LEARNED_ON, step)
-    record = flights.draw(NominalNoise(), torch.arange(len(LEARNED_ON)), 1).record
-    unknown = ParameterisedModel(
+def estimate(draws: int, warmup: int, step: float) -> ParameterPosterior:
+    """Posterior by Metropolis-Hastings with the likelihood of an EKF."""
+    flights = make_scenario(ESTIMATION, step)
+    record = flights.draw(NominalNoise(), torch.arange(len(ESTIMATION)), 1).record
+    parameterised = ParameterisedModel(
         lambda **values: StrapdownTotal(replace(flights.tuning, **values)), PRIOR
     )
     with tqdm(
         total=warmup + draws, desc="posterior", unit="iteration", mininterval=10.0, leave=False
     ) as bar:
         return pmmh(
-            unknown, GaussianFilter(TaylorLinearisation()), record, draws, warmup, chains=CHAINS, seed=2,
+            parameterised, GaussianFilter(TaylorLinearisation()), record, draws, warmup, chains=CHAINS, seed=2,
             settings=PmmhSettings(leaps=LEAPS, tick=bar.update),
         )  # fmt: skip
 
 
-def tried(believed: StrapdownTuning) -> dict[str, list[float]]:
-    """Per flight: rms errors, log evidence for each fix and share of positions in their 90 % intervals, by filter."""
-    flights, runs = scene(TRIED_ON, 0.2), torch.arange(AGAIN * len(TRIED_ON))
-    world, model = flights.draw(NominalNoise(), runs, 11), StrapdownTotal(believed)
+def evaluate(tuning: StrapdownTuning) -> dict[str, list[float]]:
+    """RMSE, log evidence per fix and share of positions in their 90 % intervals by filter, one value per flight."""
+    flights, runs = make_scenario(TEST, 0.2), torch.arange(REPEATS * len(TEST))
+    episode, model = flights.draw(NominalNoise(), runs, 11), StrapdownTotal(tuning)
     methods = {
         "ekf": GaussianFilter(TaylorLinearisation()),
         "ckf": GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
     }
-    fixes = (~torch.isnan(world.record.y[..., 0])).sum(1)
-    found = {}
+    fixes = (~torch.isnan(episode.record.y[..., 0])).sum(1)
+    results: dict[str, list[float]] = {}
     for name, method in methods.items():
         with torch.no_grad():
-            estimate = run_filter(method, model, world.record, PhiloxStream(5, runs))
-        error = model.error(estimate.mean, model.assemble(world.truth))
+            estimate = run_filter(method, model, episode.record, PhiloxStream(5, runs))
+        error = model.error(estimate.mean, model.assemble(episode.truth))
         inside = (error[..., 6:9].abs() < 1.645 * estimate.variance[..., 6:9].sqrt()).double()
-        known = ~torch.isnan(error[..., 6])
+        valid_mask = ~torch.isnan(error[..., 6])
         parts = {
-            "position": _rms(error[..., 6:9], known), "tilt": _rms(error[..., :2], known), "yaw": _rms(error[..., 2:3], known),
-            "evidence": estimate.log_evidence / fixes, "inside": (inside.mean(-1) * known).sum(1) / known.sum(1),
-        }  # fmt: skip
-        # runs of one flight are no independent cases: a flight counts once
-        found |= {
-            f"{name} {part}": value.view(AGAIN, -1).mean(0).tolist()
+            "position": compute_rms(error[..., 6:9], valid_mask),
+            "tilt": compute_rms(error[..., :2], valid_mask),
+            "yaw": compute_rms(error[..., 2:3], valid_mask),
+            "evidence": estimate.log_evidence / fixes,
+            "inside": (inside.mean(-1) * valid_mask).sum(1) / valid_mask.sum(1),
+        }
+        # runs of one flight are not independent, so a flight counts once
+        results |= {
+            f"{name} {part}": value.view(REPEATS, -1).mean(0).tolist()
             for part, value in parts.items()
         }
-    return found
+    return results
 
 
-def _rms(error: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    return torch.sqrt((error.square().sum(-1).nan_to_num() * known).sum(1) / known.sum(1))
+def compute_rms(error: torch.Tensor, valid_mask: torch.Tensor) -> torch.Tensor:
+    return torch.sqrt((error.square().sum(-1).nan_to_num() * valid_mask).sum(1) / valid_mask.sum(1))
 
 
-def compared(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
+def compare(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     """Medians over flights of a and b, the interval of the median of their difference, and Wilcoxon's p."""
     d = a - b
     interval = bootstrap(
@@ -151,198 +154,214 @@ def compared(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     }  # fmt: skip
 
 
-Scores = Mapping[str, Mapping[str, np.ndarray]]  # by set of numbers, and by filter and measure
+Scores = Mapping[str, Mapping[str, np.ndarray]]  # by set of values, and by filter and measure
 
 
-def plain(x: float, digits: int = 2) -> str:
-    """So many digits, and no power of ten; what rounding leaves of nothing is nothing."""
+def format_plain(x: float, digits: int = 2) -> str:
+    """A number with these significant digits and without a power of ten."""
     return np.format_float_positional(float(f"{x:.{digits}g}") if abs(x) > 1e-12 else 0.0, trim="-")
 
 
-def told(draws: int, warmup: int, step: float) -> dict[str, Any]:
-    began = time.process_time()
-    posterior = learned(draws, warmup, step)
-    return {"posterior": posterior.to_dict(), "seconds": time.process_time() - began}
+def estimate_timed(draws: int, warmup: int, step: float) -> dict[str, Any]:
+    start = time.process_time()
+    posterior = estimate(draws, warmup, step)
+    return {"posterior": posterior.to_dict(), "seconds": time.process_time() - start}
 
 
-def learned_table(posterior: ParameterPosterior, by_hand: StrapdownTuning) -> list[str]:
+def posterior_table(posterior: ParameterPosterior, by_hand: StrapdownTuning) -> list[str]:
     names = (
-        "number",
+        "parameter",
         "unit",
         "prior, median and 5 to 95 %",
         "posterior, median and 5 to 95 %",
-        "decades, prior and posterior",
+        "width in decades, prior and posterior",
     )
     lines, table = (
-        markdown_head(*names, "r-hat", "effective size", "by hand", "maker's"),
+        markdown_head(*names, "r-hat", "effective sample size", "by hand", "data sheet"),
         posterior.table(),
     )
     at = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
-    for name, (called, unit) in CALLED.items():
+    for name, (label, unit) in LABELS.items():
         sides = [
             [float(PRIOR[name].icdf(q)) for q in at],
             posterior.pooled_draws(name).quantile(at).tolist(),
         ]
-        spans = [f"{plain(middle)} ({plain(low)} to {plain(high)})" for low, middle, high in sides]
+        spans = [
+            f"{format_plain(middle)} ({format_plain(low)} to {format_plain(high)})"
+            for low, middle, high in sides
+        ]
         decades = " and ".join(f"{math.log10(high / low):.1f}" for low, _, high in sides)
-        met = (f"{table.r_hat[name]:.3f}", f"{table.ess[name]:.0f}")
-        sheet = plain(SHEET[name]) if name in SHEET else ""
+        mixing = (f"{table.r_hat[name]:.3f}", f"{table.ess[name]:.0f}")
+        sheet = format_plain(SHEET[name]) if name in SHEET else ""
         lines.append(
-            markdown_row(called, unit, *spans, decades, *met, plain(getattr(by_hand, name)), sheet)
+            markdown_row(
+                label, unit, *spans, decades, *mixing, format_plain(getattr(by_hand, name)), sheet
+            )
         )
     return lines
 
 
-def of_chains(posterior: ParameterPosterior, seconds: float, asked: Mapping[str, Any]) -> str:
-    """What is to be thought of the chains."""
+def describe_chains(
+    posterior: ParameterPosterior, seconds: float, request: Mapping[str, Any]
+) -> str:
+    """Number, length, cost and convergence of the chains."""
     table, shares = posterior.table(), posterior.accepted
     assert shares is not None
     verdict = (
-        "have met"
+        "have converged"
         if posterior.has_converged
-        else "have not met, so that widths are not to be relied on"
+        else "have not converged, so their intervals are not reliable"
     )
     return (
-        f"{CHAINS} chains from the prior, {asked['draws']} draws each after {asked['warmup']}; {seconds / 60.0:.0f} minutes of a "
-        f"core. They {verdict}: the largest r-hat is {table.r_hat.max():.3f} (of chains split in halves; {WELL_MIXED} is the "
-        f"bound), the least effective size {table.ess.min():.0f}; {float(shares.min()):.0%} to {float(shares.max()):.0%} of a "
-        "chain's proposals are accepted."
+        f"{CHAINS} chains start from the prior, with {request['draws']} draws after a warm-up of {request['warmup']}, in {seconds / 60.0:.0f} "
+        f"minutes of a core. The chains {verdict}: the largest r-hat of split chains is {table.r_hat.max():.3f} (limit "
+        f"{WELL_MIXED}), and the smallest effective sample size is {table.ess.min():.0f}. {float(shares.min()):.0%} to "
+        f"{float(shares.max()):.0%} of the proposals of a chain are accepted."
     )
 
 
 MEASURES = {
-    "position": "position rms, m", "tilt": "roll and pitch rms, rad", "yaw": "yaw rms, rad", "evidence": "log evidence of a fix",
-    "inside": "share in 90 % intervals",
+    "position": "position RMSE, m", "tilt": "roll and pitch RMSE, rad", "yaw": "yaw RMSE, rad", "evidence": "log evidence per fix",
+    "inside": "share of true values in 90 % intervals",
 }  # fmt: skip
 
 
-OTHERS = {"hand": "the values set by hand", "sheet": "the maker's"}
+OTHERS = {"hand": "the values set by hand", "sheet": "the data sheet"}
 
 
 def verdicts(scores: Scores, method: str) -> dict[tuple[str, str], dict[str, float]]:
-    """The learned numbers against the others by measure, with Holm's correction over the whole."""
+    """The estimated values against the others by measure, with Holm's correction over all."""
     pairs = [(part, other) for part in MEASURES for other in OTHERS]
-    found = [
-        compared(scores["learned"][f"{method.lower()} {a}"], scores[b][f"{method.lower()} {a}"])
+    results = [
+        compare(scores["estimated"][f"{method.lower()} {a}"], scores[b][f"{method.lower()} {a}"])
         for a, b in pairs
     ]
-    corrected = holm([each["p"] for each in found])
+    corrected = holm([result["p"] for result in results])
     return {
-        pair: each | {"holm": float(p)}
-        for pair, each, p in zip(pairs, found, corrected, strict=True)
+        pair: result | {"holm": float(p)}
+        for pair, result, p in zip(pairs, results, corrected, strict=True)
     }
 
 
-def scores_table(found: Mapping[tuple[str, str], Mapping[str, float]], method: str) -> list[str]:
+def scores_table(results: Mapping[tuple[str, str], Mapping[str, float]], method: str) -> list[str]:
     names = (
         method,
-        "learned",
+        "estimated",
         "by hand",
-        "learned less by hand",
+        "estimated minus by hand",
         "p, Holm",
-        "maker's",
-        "learned less maker's",
+        "data sheet",
+        "estimated minus data sheet",
         "p, Holm",
     )
     lines = markdown_head(*names)
     for part, label in MEASURES.items():
         cells = []
         for other in OTHERS:
-            v = found[part, other]
-            span = f"{plain(v['difference'])} ({plain(v['low'])} to {plain(v['high'])})"
+            v = results[part, other]
+            span = f"{format_plain(v['difference'])} ({format_plain(v['low'])} to {format_plain(v['high'])})"
             cells += [f"{v['b']:#.4g}", span, f"{v['p']:.1g}, {v['holm']:.1g}"]
-        lines.append(markdown_row(label, f"{found[part, 'hand']['a']:#.4g}", *cells))
+        lines.append(markdown_row(label, f"{results[part, 'hand']['a']:#.4g}", *cells))
     return lines
 
 
-def said(found: Mapping[tuple[str, str], Mapping[str, float]], method: str) -> str:
-    """Which of the differences are shown."""
+def describe_decisions(results: Mapping[tuple[str, str], Mapping[str, float]], method: str) -> str:
+    """Significant differences of one filter."""
     parts = []
-    for other, called in OTHERS.items():
-        shown = [
-            MEASURES[part].split(",")[0] for part in MEASURES if found[part, other]["holm"] < 0.05
+    for other, label in OTHERS.items():
+        names = [
+            MEASURES[part].split(",")[0] for part in MEASURES if results[part, other]["holm"] < 0.05
         ]
-        what = f"differences are shown in {', '.join(shown)}" if shown else "no difference is shown"
-        least = min(found[part, other]["holm"] for part in MEASURES)
-        parts.append(f"against {called} {what} (least corrected p {least:.1g})")
-    return f"{method}: {'; '.join(parts)}."
+        least = min(results[part, other]["holm"] for part in MEASURES)
+        parts.append(
+            f"Against {label}, significant differences: {', '.join(names) or 'none'} (smallest corrected p {least:.1g})."
+        )
+    return f"{method}. {' '.join(parts)}"
 
 
 CAVEATS = (
-    "Ours: the priors, with medians of densities between the maker's and those set by hand, and of walks equal to the latter; "
-    "which flights are learned on; three flights through of each, averaged before anything is tested; three leaps after each "
-    "step of the chains' walk (`leaps` of `pmmh`).",
-    "The receiver's errors are drawn and their size is known to the filter. Nothing here says what is learned where it is not.",
-    "The maker's numbers are those of the MTi-1, a chip of the same family: the data sheet of the unit flown was not at hand. "
-    "Its walks of biases are those set by hand.",
-    "Filters run with the posterior's medians, not with the average over its draws. The likelihood is an EKF's.",
-    "Twenty flights of one vehicle with one unit at one place; p are of fifteen flights.",
+    "Choices of this project: the priors, the flights of the estimation, the repeats of each flight, and the number of leaps of "
+    "`pmmh` after each step. The prior medians of the densities lie between data sheet and values set by hand. Those of the bias "
+    "walks are the values set by hand.",
+    "The errors of the fixes are simulated, and their size is known to the filter. The study does not cover unknown sizes.",
+    "The data sheet is that of the MTi-1, a chip of the same family. That of the unit was not available. It states no bias "
+    "walks, so the values set by hand are used.",
+    "Filters run with the posterior medians. They do not average over the posterior. The likelihood is that of an EKF.",
+    "The twenty flights are of one vehicle with one unit in one area. The p-values are of fifteen flights.",
 )
 
 
-def report(
-    posterior: ParameterPosterior, scores: Scores, seconds: float, asked: Mapping[str, Any]
-) -> list[str]:
-    first, last = TRIED_ON[0], TRIED_ON[-1]
-    lines = ["# Noise of a quadrotor's IMU, learned on five flights and tried on fifteen", ""]
+def read_scores(done: Mapping[str, Any]) -> Scores:
+    """Scores by set of values, from the stored parts."""
+    return {
+        name.removeprefix("scores: "): {part: np.array(values) for part, values in scores.items()}
+        for name, scores in done.items()
+        if name.startswith("scores: ")
+    }
+
+
+def write_page(request: Mapping[str, Any], done: Mapping[str, Any]) -> str:
+    """The page of the study from its stored results."""
+    posterior = ParameterPosterior.from_dict(done["posterior"]["posterior"])
+    seconds, scores = done["posterior"]["seconds"], read_scores(done)
+    first, last = TEST[0], TEST[-1]
+    lines = ["# IMU noise of a quadrotor, estimated on five flights and tested on fifteen", ""]
     lines += markdown_paragraph(
-        f"`python -m pfbench.experiments.learn_quad_noise {asked['draws']} {asked['warmup']}` writes this page. Twenty flights "
-        "of `recorded_quad_flights` carry a consumer IMU (Xsens DOT) beside rotors that shake it, and fixes once a second with 1 m of "
-        f"added error per axis. What the IMU's errors amount to is inferred from flights {LEARNED_ON[0]} to {LEARNED_ON[-1]}, "
-        f"through the EKF's likelihood, in steps of {asked['step']:g} s; filters then run with the posterior's medians on "
-        f"flights {first} to {last} in steps of 0.2 s, against the values set by hand, which the scene's yaml holds, and the "
-        "maker's."
+        f"`python -m pfbench.experiments.learn_quad_noise {request['draws']} {request['warmup']}` writes this page. The twenty "
+        "flights of `recorded_quad_flights` have a consumer IMU (Xsens DOT) near the rotors, and one fix per second with an "
+        f"added error of 1 m per axis. The errors of the IMU are estimated from flights {ESTIMATION[0]} to {ESTIMATION[-1]}, by "
+        f"the likelihood of the EKF, in steps of {request['step']:g} s. Filters then run with the posterior medians on flights "
+        f"{first} to {last} in steps of 0.2 s. Two other sets of values are those of the scenario, which were set by hand, and "
+        "those of a data sheet."
     )
-    lines += ["## What was learned", "", *learned_table(posterior, scene(TRIED_ON, 0.2).tuning), ""]
-    lines += markdown_paragraph(of_chains(posterior, seconds, asked))
+    tuning = make_scenario(TEST, 0.2).tuning
+    lines += ["## Posterior", "", *posterior_table(posterior, tuning), ""]
     lines += markdown_paragraph(
-        "Decades are the width of the interval from 5 to 95 %, as powers of ten: where the posterior's is hardly less than the "
-        "prior's, the flights said little. Fixes of 1 m bound noise from above; below the median it is the prior that speaks."
+        "Intervals are from 5 to 95 %. A posterior that is hardly narrower than its prior shows that the flights contain little "
+        "information on the parameter."
     )
-    lines += [
-        "![Chains and densities](posterior.png)",
-        "",
-        "## What it is worth on the other flights",
-        "",
-    ]
+    lines += markdown_paragraph(describe_chains(posterior, seconds, request))
+    lines += ["![Chains and densities](posterior.png)", "", "## Test on the other flights", ""]
     lines += markdown_paragraph(
-        f"Medians over the {len(TRIED_ON)} flights, each flown {AGAIN} times with new errors of receiver and start and averaged; "
-        "differences are medians over flights with their 95 % interval (bootstrap); p of Wilcoxon's test, then with Holm's "
-        "correction over the ten of a table."
+        f"Medians over the {len(TEST)} flights. Each flight is repeated {REPEATS} times with other errors of the fixes and of "
+        "the start, and averaged. Differences are medians over flights with their 95 % bootstrap interval. The p-values are of "
+        "Wilcoxon's test, without and with Holm's correction over the ten tests of a table."
     )
     for method in ("EKF", "CKF"):
-        found = verdicts(scores, method)
-        lines += [*scores_table(found, method), "", *markdown_paragraph(said(found, method))]
-    lines += ["![Differences, flight by flight](flights.png)", ""]
-    lines += markdown_paragraph("Left, below 0 the learned numbers are better; right, above 0.")
-    return [*lines, "## What is chosen, and what is not shown", "", *markdown_bullets(*CAVEATS)]
+        results = verdicts(scores, method)
+        lines += [*scores_table(results, method), ""]
+        lines += markdown_paragraph(describe_decisions(results, method))
+    lines += ["![Differences by flight](flights.png)", ""]
+    lines += markdown_paragraph(
+        "Left: below 0 the estimated values are better. Right: above 0 they are better."
+    )
+    return "\n".join([*lines, "## Choices and limits", "", *markdown_bullets(*CAVEATS)])
 
 
-def in_decades(posterior: ParameterPosterior) -> Figure:
-    """Traces and densities of the numbers' powers of ten."""
-    drawn = replace(posterior, draws={name: a.log10() for name, a in posterior.draws.items()})
+def plot_decades(posterior: ParameterPosterior) -> Figure:
+    """Traces and densities of the decimal logarithms."""
+    decades = replace(posterior, draws={name: a.log10() for name, a in posterior.draws.items()})
     prior = {
-        name: Normal(law.loc / math.log(10.0), law.scale / math.log(10.0))
-        for name, law in PRIOR.items()
+        name: Normal(d.loc / math.log(10.0), d.scale / math.log(10.0)) for name, d in PRIOR.items()
     }
-    names = {name: f"{called},\nlog₁₀ {unit}" for name, (called, unit) in CALLED.items()}
-    return plot_posterior({"posterior": drawn}, prior, names=names)
+    names = {name: f"{label},\nlog₁₀ {unit}" for name, (label, unit) in LABELS.items()}
+    return plot_posterior({"posterior": decades}, prior, names=names)
 
 
-def flown(scores: Scores) -> Figure:
+def plot_differences(scores: Scores) -> Figure:
     """Differences of the EKF's position error and evidence, flight by flight."""
-    labels = {"learned less by hand": "hand", "learned less maker's": "sheet"}
+    labels = {"estimated minus by hand": "hand", "estimated minus data sheet": "sheet"}
     style = line_styles(list(labels))
     figure = Figure(figsize=(2 * COLUMN, 2.2), layout="constrained")
     axes = figure.subplots(1, 2)
-    for axis, (part, what) in zip(
-        axes, {"position": "position rms", "evidence": "log evidence of a fix"}.items(), strict=True
+    for axis, (part, label_y) in zip(
+        axes, {"position": "position RMSE", "evidence": "log evidence per fix"}.items(), strict=True
     ):
         differences = {
-            label: scores["learned"][f"ekf {part}"] - scores[other][f"ekf {part}"]
+            label: scores["estimated"][f"ekf {part}"] - scores[other][f"ekf {part}"]
             for label, other in labels.items()
         }
-        order = np.argsort(differences["learned less by hand"])
+        order = np.argsort(differences["estimated minus by hand"])
         for label, d in differences.items():
             look = style[label]
             axis.plot(
@@ -354,40 +373,35 @@ def flown(scores: Scores) -> Figure:
                 label=label,
             )
         axis.axhline(0.0, color="0.4", linewidth=0.8)
-        axis.set_xlabel("flights, in the order of the circles")
-        axis.set_ylabel(f"difference of\n{what}" + (", m" if part == "position" else ""))
+        axis.set_xlabel("flights, ordered by the circles")
+        axis.set_ylabel(f"difference of\n{label_y}" + (", m" if part == "position" else ""))
     add_legend(figure, axes[0])
     return figure
 
 
 def main(folder: Path, draws: int = 400, warmup: int = 200, step: float = 1.0) -> None:
     torch.set_num_threads(1)
-    asked = {"draws": draws, "warmup": warmup, "step": step, "chains": CHAINS, "leaps": LEAPS}
-    pieces = ResumableResults(folder / "learn_quad_noise.json", asked)
-    kept = pieces("posterior", partial(told, draws, warmup, step))
-    posterior, by_hand = (
-        ParameterPosterior.from_dict(kept["posterior"]),
-        scene(TRIED_ON, 0.2).tuning,
-    )
+    request = {"draws": draws, "warmup": warmup, "step": step, "chains": CHAINS, "leaps": LEAPS}
+    results = ResumableResults(folder / "learn_quad_noise.json", request)
+    stored = results("posterior", partial(estimate_timed, draws, warmup, step))
+    posterior = ParameterPosterior.from_dict(stored["posterior"])
+    by_hand = make_scenario(TEST, 0.2).tuning
     print(posterior.table().to_string(), flush=True)
-    middle = {name: float(posterior.pooled_draws(name).median()) for name in PRIOR}
-    sets = {
+    medians = {name: float(posterior.pooled_draws(name).median()) for name in PRIOR}
+    tunings = {
         "sheet": replace(by_hand, **SHEET),
         "hand": by_hand,
-        "learned": replace(by_hand, **middle),
+        "estimated": replace(by_hand, **medians),
     }
-    bar = tqdm(sets.items(), desc="flights", unit="set", leave=False)
-    found = {name: pieces(f"scores: {name}", partial(tried, believed)) for name, believed in bar}
-    scores = {
-        name: {part: np.array(values) for part, values in each.items()}
-        for name, each in found.items()
-    }
-    text = "\n".join(report(posterior, scores, kept["seconds"], asked))
-    print(text)
-    (folder / "report.md").write_text(text)
+    bar = tqdm(tunings.items(), desc="flights", unit="set", leave=False)
+    for name, tuning in bar:
+        results(f"scores: {name}", partial(evaluate, tuning))
+    done = results.state["done"]
+    (folder / "report.md").write_text(write_page(request, done))
     with matplotlib.rc_context(RC):
-        (folder / "posterior.png").write_bytes(render_palette_png(in_decades(posterior)))
-        (folder / "flights.png").write_bytes(render_palette_png(flown(scores)))
+        (folder / "posterior.png").write_bytes(render_palette_png(plot_decades(posterior)))
+        differences = plot_differences(read_scores(done))
+        (folder / "flights.png").write_bytes(render_palette_png(differences))
 
 
 if __name__ == "__main__":

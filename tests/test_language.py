@@ -17,7 +17,11 @@ from checkout import ROOT
 
 PACKAGE = ROOT / "pfbench"
 RENAMED = ROOT / "docs" / "renamed.md"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "reports").glob("learn_*/report.md")),  # written by scripts without a template
+]
 TEMPLATES = sorted(PACKAGE.rglob("*.jinja"))
 LONGEST_SENTENCE = 30  # words
 

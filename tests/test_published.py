@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
+import json
 import re
 import shutil
 import subprocess
@@ -17,7 +19,7 @@ from pfbench.report.stored_page import read_page_data
 from pfbench.report.study_page import write_markdown
 
 REPORT_FILE = re.compile(
-    r"reports/(README\.md|\w+/(report\.md|verdicts\.(json(\.gz)?|csv)|runs\.parquet|page\.json\.gz"
+    r"reports/(README\.md|\w+/(report\.md|verdicts\.(json(\.gz)?|csv)|runs\.parquet|page\.json\.gz|results\.json\.gz"
     r"|headline\.(png|svg)))"
 )
 
@@ -79,6 +81,31 @@ def test_the_stored_data_of_a_page_give_its_published_text(tmp_path: Path) -> No
             write_markdown(read_page_data(folder), target)
         text = (tmp_path / folder.name / "report.md").read_text()
         assert text == (folder / "report.md").read_text(), folder.name
+
+
+def test_the_stored_results_of_a_script_give_its_published_page() -> None:
+    publish = load("publish_reports")
+    folders = [data.parent for data in (ROOT / "reports").glob(f"*/{publish.RESULTS}")]
+    assert folders
+    for folder in folders:
+        page = publish.write_script_page(folder)
+        text = publish.reduce_markdown(page, folder, publish.HEADLINES[folder.name])
+        assert text == (folder / "report.md").read_text(), folder.name
+
+
+def test_stored_results_are_rounded_and_make_the_page(tmp_path: Path) -> None:
+    publish = load("publish_reports")
+    folder = tmp_path / "learn_noise_calibration"
+    folder.mkdir()
+    counts = {"counts": {"level_sd": [20] * 10}, "other": [1.23456789e-7, 3, True, None]}
+    results = {"request": {"runs": 200, "effort": 2}, "done": {"toy, SVI": counts}}
+    (folder / f"{folder.name}.json").write_text(json.dumps({**results, "digest": "x"}))
+    (folder / "report.md").write_text("older\n")
+    publish.publish_report(folder)
+    stored = json.loads(gzip.decompress((folder / publish.RESULTS).read_bytes()))
+    counts["other"] = [1.23457e-7, 3, True, None]
+    assert stored == results
+    assert "| SVI | correct | `level_sd` | 20 20 " in (folder / "report.md").read_text()
 
 
 def test_a_report_keeps_its_headline_figure_only(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Callable
+from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,9 @@ def canyon(
 ) -> dict[str, list[tuple[Any, ...]]]:
     """The study without its data: the second stretch's share is 0.5, mixtures are ahead by 1 in evidence, elsewhere by 0.94."""
 
-    def learn(stretch: str, best: LosNlosRangeError, draws: int, warmup: int) -> ParameterPosterior:
+    def estimate(
+        stretch: str, best: LosNlosRangeError, draws: int, warmup: int
+    ) -> ParameterPosterior:
         odds = {"first": -0.8, "second": 1e-9}[stretch]
         return chains({"odds": odds, "sd": best.sd, "tail": best.tail, "slope": best.slope}, apart)
 
@@ -65,13 +68,15 @@ def canyon(
         here = (law.tail < 41.0) == (stretch == "first")
         return (-3.8 if here else -3.86), 0.002
 
-    parts = {"learn": learn, "positions": positions, "evidence": evidence}
+    parts = {"estimate": estimate, "positions": positions, "evidence": evidence}
     found = {}
     for name, work in parts.items():
         counted, found[name] = breaking(at if name == "positions" else 0, work)
         monkeypatch.setattr(learn_canyon_noise, name, counted)
     monkeypatch.setattr(
-        learn_canyon_noise, "most_likely", lambda stretch: (NormalRangeError(3.35), LAWS[stretch])
+        learn_canyon_noise,
+        "estimate_maximum_likelihood",
+        lambda stretch: {"normal": 3.35, "mixture": [*astuple(LAWS[stretch])]},
     )
     return found
 
@@ -90,7 +95,7 @@ def test_a_study_of_the_canyon_goes_on_from_where_it_stopped(
     assert not (tmp_path / "report.md").exists()
     learn_canyon_noise.main(tmp_path, 200, 10)
     assert {name: len(each) for name, each in calls.items()} == {
-        "learn": 2,
+        "estimate": 2,
         "evidence": 10,
         "positions": 7,
     }  # one normal law
@@ -100,7 +105,7 @@ def test_a_study_of_the_canyon_goes_on_from_where_it_stopped(
     assert len(calls["evidence"]) == 10
     assert (tmp_path / "report.md").read_text() == page
     learn_canyon_noise.main(tmp_path, 0)
-    assert "What was learned" not in (tmp_path / "report.md").read_text()
+    assert "Posterior" not in (tmp_path / "report.md").read_text()
 
 
 def test_the_canyon_s_page_says_what_was_found(
@@ -109,7 +114,7 @@ def test_the_canyon_s_page_says_what_was_found(
     canyon(monkeypatch)
     learn_canyon_noise.main(tmp_path, 200, 10)
     page = (tmp_path / "report.md").read_text()
-    assert "They have met: " in page
+    assert "The chains have converged: " in " ".join(page.split())
     assert "/tmp/" not in page
     share = cells(page, "first | share")
     assert share[2] == "0.5 (0.036 to 0.96)"
@@ -118,10 +123,10 @@ def test_the_canyon_s_page_says_what_was_found(
     assert share[6] == "0.32"
     assert cells(page, "normal | ") == ["normal", *["-4.8000"] * 4]
     assert cells(page, "mixture | ") == ["mixture", *["-3.8600", "-3.8000"] * 2]
-    assert page.replace("\n", " ").count("ahead of the normal law by 0.940 and 0.940, ") == 2
-    assert page.replace("\n", " ").count("behind the same learned there by 0.060 and 0.060") == 2
+    assert page.replace("\n", " ").count("above the normal distribution by 0.940 and 0.940, ") == 2
+    assert page.replace("\n", " ").count("below the same estimated there by 0.060 and 0.060") == 2
     row = cells(page, "first | mixture | ")
-    assert row[2:6] == ["13.5 (10.0 to 17.0)", "23.5 (20.0 to 27.0)", "10.0", "8 of 8 runs"]
+    assert row[2:6] == ["13.5 (10.0 to 17.0)", "23.5 (20.0 to 27.0)", "-10.0", "8 of 8 runs"]
     assert float(row[6]) == pytest.approx(0.0078)
     assert float(row[7]) == pytest.approx(4 * 0.0078, rel=0.01)
     apart = dict(re.findall(r"(logit of the share|slope) ([+-][\d.]+\d)", " ".join(page.split())))
@@ -137,7 +142,7 @@ def test_the_canyon_s_page_says_that_chains_have_not_met(
     canyon(monkeypatch, apart=3.0)
     learn_canyon_noise.main(tmp_path, 200, 10)
     page = (tmp_path / "report.md").read_text()
-    assert "They have not met" in page
+    assert "The chains have not converged" in " ".join(page.split())
     assert float(cells(page, "first | sd")[4]) > 1.5
 
 
@@ -154,11 +159,11 @@ def quad(
 ) -> list[tuple[Any, ...]]:
     """The study without its data: errors are the gyro's density times a flight's number, evidence falls with it."""
 
-    def tried(believed: Any) -> dict[str, list[float]]:
-        each = believed.gyro_density * np.arange(1, 16)
-        if equal and believed.gyro_density < 1e-3:  # learned or the maker's
+    def evaluate(tuning: Any) -> dict[str, list[float]]:
+        each = tuning.gyro_density * np.arange(1, 16)
+        if equal and tuning.gyro_density < 1e-3:  # estimated or data sheet
             each = 3e-4 + 1e-5 * np.cos(
-                np.arange(15) * (3.0 if believed.gyro_density < 2e-4 else 5.0)
+                np.arange(15) * (3.0 if tuning.gyro_density < 2e-4 else 5.0)
             )
         sign = {"evidence": -1.0}
         parts = learn_quad_noise.MEASURES
@@ -168,9 +173,9 @@ def quad(
             for part in parts
         }
 
-    counted, calls = breaking(at, tried)
-    monkeypatch.setattr(learn_quad_noise, "tried", counted)
-    monkeypatch.setattr(learn_quad_noise, "learned", lambda draws, warmup, step: chains(MIDDLES))
+    counted, calls = breaking(at, evaluate)
+    monkeypatch.setattr(learn_quad_noise, "evaluate", counted)
+    monkeypatch.setattr(learn_quad_noise, "estimate", lambda draws, warmup, step: chains(MIDDLES))
     return calls
 
 
@@ -180,7 +185,7 @@ def test_a_study_of_the_quadrotor_goes_on_from_where_it_stopped(
     calls = quad(monkeypatch, at=3)
     with pytest.raises(KeyboardInterrupt):
         learn_quad_noise.main(tmp_path, 200, 10)
-    monkeypatch.setattr(learn_quad_noise, "learned", None)  # it is not learned again
+    monkeypatch.setattr(learn_quad_noise, "estimate", None)  # stored, so not estimated again
     learn_quad_noise.main(tmp_path, 200, 10)
     assert len(calls) == 4
     assert calls[2] == calls[3]
@@ -193,11 +198,11 @@ def test_the_quadrotor_s_page_says_what_was_found(
 ) -> None:
     calls = quad(monkeypatch)
     learn_quad_noise.main(tmp_path, 200, 10)
-    assert [believed.gyro_density for (believed,) in calls] == pytest.approx(
+    assert [tuning.gyro_density for (tuning,) in calls] == pytest.approx(
         [1.22e-4, 1e-2, 3e-4], rel=0.02
     )
     page = (tmp_path / "report.md").read_text()
-    assert "They have met: " in page
+    assert "The chains have converged: " in " ".join(page.split())
     assert "/tmp/" not in page
     gyro = cells(page, "gyro density")
     assert gyro[2] == "0.003 (0.00011 to 0.081)"
@@ -215,13 +220,11 @@ def test_the_quadrotor_s_page_says_what_was_found(
     assert float(row[3].split()[0]) == pytest.approx(8 * (3e-4 - 1e-2), rel=0.02)
     assert row[4] == "6e-05, 0.0006"  # the least that fifteen flights give, ten tests
     assert evidence[0].split(" | ")[3].startswith("0.07")
-    every = (
-        "position rms, roll and pitch rms, yaw rms, log evidence of a fix, share in 90 % intervals"
-    )
+    every = "position RMSE, roll and pitch RMSE, yaw RMSE, log evidence per fix, share of true values in 90 % intervals"
     flat = " ".join(page.split())
     for method in ("EKF", "CKF"):
         assert (
-            f"{method}: against the values set by hand differences are shown in {every} (least corrected p 0.0006); "
+            f"{method}. Against the values set by hand, significant differences: {every} (smallest corrected p 0.0006). "
             in flat
         )
     for name in ("posterior.png", "flights.png"):
@@ -234,7 +237,7 @@ def test_the_quadrotor_s_page_says_what_is_not_shown(
     quad(monkeypatch, equal=True)
     learn_quad_noise.main(tmp_path, 200, 10)
     assert (tmp_path / "report.md").read_text().replace("\n", " ").count(
-        "against the maker's no difference is shown"
+        "Against the data sheet, significant differences: none"
     ) == 2
 
 

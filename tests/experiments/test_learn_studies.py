@@ -2,13 +2,15 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
 from pfbench.experiments import learn_data_efficiency, learn_noise_calibration, learn_room
-from pfbench.experiments.learn_data_efficiency import World, against, interval, volatility
+from pfbench.experiments.learn_data_efficiency import Case, against, interval, volatility
+from scipy.stats import chi2, ncx2
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
@@ -18,7 +20,6 @@ from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.particle.proposals import BootstrapProposal
 from pfbench.model.linear_gaussian import local_level
-from pfbench.ppl.sbc import SbcRanks
 
 
 def normal(r: torch.Tensor, variance: float) -> torch.Tensor:
@@ -102,16 +103,19 @@ def test_verdicts_name_the_better_one_and_tables_count_what_a_step_costs() -> No
         return found | more
 
     each = {"1": scores(1.0, 2.0, training=[3.0]), "2": scores(1.0, 2.0, training=[5.0])}
-    by_hand = {learn_data_efficiency.OWN: scores(4.0, 1.0), "as good": scores(1.0, 2.0)}
+    by_hand = {learn_data_efficiency.BOOTSTRAP: scores(4.0, 1.0), "as good": scores(1.0, 2.0)}
     told = {
         "by hand": by_hand,
         "dearer": {"as good": scores(0.5, 2.5, particles=[80])},
         "inference compilation": {"1": each},
     }
-    told["bound"] = {"1": {name: scores(1.1, 2.0, training=[1.0]) for name in each}, "3": each}
+    told["lower bound"] = {
+        "1": {name: scores(1.1, 2.0, training=[1.0]) for name in each},
+        "3": each,
+    }
     rows = [row.strip("| ").split(" | ") for row in learn_data_efficiency.verdicts(told)[2:]]
-    others = ("own noise", "as good", "as good, 80 particles", "bound, 1 world")
-    assert [row[:2] for row in rows[4:]] == [["bound, 3 worlds", name] for name in others]
+    others = ("bootstrap", "as good", "as good, 80 particles", "lower bound, 1 run")
+    assert [row[:2] for row in rows[4:]] == [["lower bound, 3 runs", name] for name in others]
     own, same, dear = rows[:3]
     assert own[2].startswith("0.250 (0.250 to 0.250)")
     assert dear[2].startswith("2.000 (2.000 to 2.000)")
@@ -120,7 +124,7 @@ def test_verdicts_name_the_better_one_and_tables_count_what_a_step_costs() -> No
     assert float(same[3]) == float(same[5]) == 1.0
     assert rows[-1][2].startswith("0.909 (0.909 to 0.909)")
 
-    world = World(volatility, "state", 10, 0.01, (1,), (1, 2), 40, particles=20)
+    world = Case(volatility, "state", 10, 0.01, (1,), (1, 2), 40, particles=20)
     table = {
         row.split(" | ")[0]: row.strip("| ").split(" | ")
         for row in learn_data_efficiency.table(told, world)
@@ -129,13 +133,13 @@ def test_verdicts_name_the_better_one_and_tables_count_what_a_step_costs() -> No
         "80.0",
         "0.2",
     ]  # 0.8 s in 10 steps, a quarter of 80 particles
-    assert table["| bound, 3 worlds"][-3:] == ["80.0", "0.1", "4"]
+    assert table["| lower bound, 3 runs"][-3:] == ["80.0", "0.1", "4"]
 
 
 def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small = World(
+    small = Case(
         volatility,
         "state",
         6,
@@ -145,10 +149,10 @@ def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(
         8,
         particles=20,
         few=4,
-        dearer={"own noise": 60},
+        dearer={"bootstrap": 60},
     )
-    monkeypatch.setattr(learn_data_efficiency, "WORLDS", {"small": small})
-    learned, taught = [], learn_data_efficiency.taught
+    monkeypatch.setattr(learn_data_efficiency, "CASES", {"small": small})
+    learned, taught = [], learn_data_efficiency.train_proposal
 
     def counted(world, count, seed, objective, path):
         learned.append((type(objective).__name__, count, seed))
@@ -156,18 +160,32 @@ def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(
             raise KeyboardInterrupt
         return taught(world, count, seed, objective, path)
 
-    monkeypatch.setattr(learn_data_efficiency, "taught", counted)
+    monkeypatch.setattr(learn_data_efficiency, "train_proposal", counted)
     with pytest.raises(KeyboardInterrupt):
         learn_data_efficiency.main(tmp_path)
     learn_data_efficiency.main(tmp_path)
     assert len(learned) == 7
     assert learned[3] == learned[4]
-    rows = (tmp_path / "tables.md").read_text().splitlines()
-    assert [row.split(" | ")[0] for row in rows if row.startswith("| bound, ")] == [
-        "| bound, 1 world", "| bound, 2 worlds", *["| bound, 2 worlds"] * 5
+    rows = (tmp_path / "report.md").read_text().splitlines()
+    assert [row.split(" | ")[0] for row in rows if row.startswith("| lower bound, ")] == [
+        "| lower bound, 1 run", "| lower bound, 2 runs", *["| lower bound, 2 runs"] * 5
     ]  # fmt: skip
-    assert len([row for row in rows if row.startswith("| own noise, 60 particles | ")]) == 1
+    assert len([row for row in rows if row.startswith("| bootstrap, 60 particles | ")]) == 1
     assert (tmp_path / "data_efficiency.png").stat().st_size > 5000
+    assert "Performance of a learned proposal" in rows[0]
+
+
+def test_the_page_of_data_efficiency_states_the_significant_comparisons() -> None:
+    head = ["| learned | other | RMSE, ratio | p | log evidence | p |", "| --- |"]
+    rows = [
+        "| lower bound, 3 runs | bootstrap | 0.800 (0.700 to 0.900) | 0.01 | 0.1 | 1 |",
+        "| lower bound, 3 runs | guided by a CKF | 0.900 (0.700 to 1.200) | 0.06 | 0.1 | 0.001 |",
+        "| lower bound, 3 runs | dearer | 1.500 (1.300 to 1.800) | 0.002 | 0.1 | 1 |",
+    ]
+    assert learn_data_efficiency.describe_comparisons(head + rows) == [
+        "Lower bound, 3 runs. RMSE smaller than with bootstrap. RMSE larger than with dearer. "
+        "Inconclusive against guided by a CKF."
+    ]
 
 
 def test_few_worlds_come_again_and_no_others_are_seen(
@@ -179,8 +197,8 @@ def test_few_worlds_come_again_and_no_others_are_seen(
         "train",
         lambda plan, method, model, own, few, path: seen.update(own=own, few=few),
     )
-    world = World(volatility, "state", 6, 0.01, (2, 40), (1,), 8)
-    learn_data_efficiency.taught(
+    world = Case(volatility, "state", 6, 0.01, (2, 40), (1,), 8)
+    learn_data_efficiency.train_proposal(
         world, 2, 1, learn_data_efficiency.EvidenceLowerBound(), tmp_path / "none.pt"
     )
     assert len(seen["own"].record.y) == 40
@@ -189,32 +207,52 @@ def test_few_worlds_come_again_and_no_others_are_seen(
         torch.testing.assert_close(
             worlds.record.y, few.repeat(len(worlds.record.y) // 2 + 1, 1, 1)[: len(worlds.record.y)]
         )
-    learn_data_efficiency.taught(
+    learn_data_efficiency.train_proposal(
         world, 40, 1, learn_data_efficiency.EvidenceLowerBound(), tmp_path / "none.pt"
     )
     torch.testing.assert_close(seen["own"].record.y[:2], few)
     assert len(seen["own"].record.y.unique(dim=0)) == 40
 
 
-def test_a_study_of_calibration_goes_on_from_where_it_stopped(
+def test_a_study_of_calibration_resumes_and_its_page_states_the_decisions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
+    """Ranks of wrong likelihoods all in the last bin: these tests fail, the uniform ones pass."""
+    requests = []
 
-    def told(unknown, shape, infer, draws, seed):
-        asked.append(len(shape.y))
-        return SbcRanks({name: torch.arange(len(shape.y)) % 20 for name in unknown.names}, draws)
+    def compute(case: learn_noise_calibration.Case) -> dict[str, Any]:
+        parameterised, record, _ = case
+        requests.append(len(record.y))
+        uniform = (torch.arange(len(record.y)) % 20).tolist()
+        is_wrong = (len(requests) - 1) % 8 >= 4
+        ranks = [19] * len(uniform) if is_wrong else uniform
+        counts = np.bincount(np.array(ranks) // 2, minlength=10).tolist()
+        names = parameterised.names
+        return {"ranks": dict.fromkeys(names, ranks), "counts": dict.fromkeys(names, counts)}
 
-    monkeypatch.setattr(learn_noise_calibration, "simulation_based_calibration", told)
+    monkeypatch.setattr(learn_noise_calibration, "compute_case", compute)
     monkeypatch.setattr(learn_noise_calibration, "sbc_histograms", lambda ranks: Figure())
-    learn_noise_calibration.main(tmp_path, 30, 1, "toy")
-    learn_noise_calibration.main(tmp_path, 30, 1)
-    assert asked == [30] * 8
-    learn_noise_calibration.main(
-        tmp_path, 31, 1, "location, SVI"
-    )  # another call, from the beginning
-    assert asked[8:] == [31, 31]
-    assert (tmp_path / "calibration_toy.png").exists()
-    rows = [row.split(" | ") for row in (tmp_path / "table.md").read_text().splitlines()[2:]]
-    assert [row[0] for row in rows] == ["| location, SVI", "| location, SVI, wrong"]
-    assert sum(map(int, rows[0][2].split())) == 31
+    learn_noise_calibration.main(tmp_path, 40, 1)
+    learn_noise_calibration.main(tmp_path, 40, 1)
+    assert requests == [40] * 8
+    page = (tmp_path / "report.md").read_text()
+    text = " ".join(page.split())
+    assert "Correct likelihood, 6 tests, Holm's correction at 5%. Significant: none." in text
+    assert "Correct likelihood, 6 tests, Holm's correction at 5%. Significant: none." in text
+    least = f"{chi2.sf(9 * 4.0 + 36.0**2 / 4.0, 9):.2g}"  # nine empty bins, one with 40 of 40
+    assert f"`angle_sd` by SVI (p {least}). Not significant: none." in text
+    rows = [row.split(" | ") for row in page.splitlines() if row.startswith("| ")][2:]
+    assert [row[2] for row in rows] == ["correct"] * 6 + ["wrong"] * 6
+    assert [row[4] for row in rows] == [" ".join("4" * 10)] * 6 + [" ".join("0" * 9) + " 40"] * 6
+    assert (tmp_path / "calibration_location.png").exists()
+    learn_noise_calibration.main(tmp_path, 41, 1, "location, SVI")  # another request
+    assert requests[8:] == [41, 41]
+
+
+def test_the_power_of_a_rank_test_is_about_that_of_the_noncentral_distribution() -> None:
+    """Its level without a departure is 5 %; with 20 data sets a bin the chi-square limit is rough."""
+    assert learn_noise_calibration.compute_power(200, 0.1) == pytest.approx(0.05, abs=0.01)
+    shares = np.full(10, 0.83 / 9)
+    shares[0] = 0.17
+    limit = ncx2.sf(chi2.isf(0.05, 9), 9, 200 * ((shares - 0.1) ** 2 / 0.1).sum())
+    assert learn_noise_calibration.compute_power(200, 0.17) == pytest.approx(limit, abs=0.07)
