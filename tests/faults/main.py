@@ -58,7 +58,10 @@ CLASSES: dict[str, FaultClass] = {
     **{name: FaultClass(partial(storage.run, name), 30, 5) for name in storage.FAULTS},
     "clock that jumps": FaultClass(clock.run, 30, 5),
     "sweeps at the same time": FaultClass(parallel.run, 30, 5),
-    "damaged logs": FaultClass(readers.run, 3000, 3000),
+    **{
+        f"damaged logs: {reader}": FaultClass(partial(readers.run, reader), 10_000, 500)
+        for reader in readers.READERS
+    },
 }
 
 

@@ -1,47 +1,36 @@
-"""Damaged logs of recorded flights: the mutations of tests/scenario/recorded, where a module offers them.
-
-A module of that folder may define `run_mutations(reader, count, seed)` and `READERS`, names of readers. It returns the
-number of mutated logs by outcome. Its words for bad outcomes begin with `SILENT` and `UNWRAPPED`.
-"""
+"""Damaged logs of recorded flights: the mutations of tests/scenario/recorded/mutations.py."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
+import sys
 from types import ModuleType
 
 from checkout import TESTS
 
 from faults.tally import FINE, Tally
 
-FOLDER = TESTS / "scenario" / "recorded"
+READERS = ("log_csv", "log_parquet", "rinex2", "rinex3", "ephemeris", "trajectory", "pseudorange", "urban")  # fmt: skip
 
 
-def find_mutations() -> ModuleType | None:
-    """Import the module that offers `run_mutations` and `READERS`; None if no module does."""
-    for file in sorted(FOLDER.glob("*.py")):
-        if "def run_mutations(" in file.read_text() and not file.name.startswith("test_"):
-            spec = importlib.util.spec_from_file_location(file.stem, file)
-            if spec is None or spec.loader is None:
-                raise ImportError(f"{file} must be a module that Python can import. Check it.")
-            module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
-            if hasattr(module, "READERS"):
-                return module
-    return None
+def load_mutations() -> ModuleType:
+    """Import the module of the mutations, which lies beside the tests of the readers."""
+    folder = str(TESTS / "scenario" / "recorded")
+    if folder not in sys.path:
+        sys.path.append(folder)
+    return importlib.import_module("mutations")
 
 
-def run(count: int, seed: int) -> Tally:
-    """Mutate the logs of all readers, `count` mutations in all."""
-    tally, module = Tally("damaged logs"), find_mutations()
-    if module is None:
-        tally.skipped = "not run"
+def run(reader: str, count: int, seed: int) -> Tally:
+    """Mutate the files of a reader `count` times."""
+    tally, module = Tally(f"damaged logs: {reader}"), load_mutations()
+    if reader not in module.READERS:
+        tally.skipped = "not run: PFBENCH_DATA is not set"
         return tally
-    for reader in module.READERS:
-        counts = module.run_mutations(reader, count // len(module.READERS), seed)
-        for text, number in counts.items():
-            outcome, remark = class_of(module, text)
-            for _ in range(number):
-                tally.add(outcome, f"{reader}: {remark}", text)
+    for text, number in module.run_mutations(reader, count, seed).items():
+        outcome, remark = class_of(module, text)
+        for _ in range(number):
+            tally.add(outcome, remark, f"batch {seed}, {text}")
     return tally
 
 
