@@ -17,7 +17,18 @@ from typing import Any, NamedTuple
 
 from checkout import ROOT
 
-from faults import clock, damage, hostile, kills, numerics, page, parallel, readers, storage
+from faults import (
+    clock,
+    damage,
+    hostile,
+    kills,
+    numerics,
+    page,
+    parallel,
+    readers,
+    sanitizers,
+    storage,
+)
 from faults.tally import Tally
 from pfbench.job.resumable import ResumableResults
 
@@ -58,6 +69,10 @@ CLASSES: dict[str, FaultClass] = {
     **{name: FaultClass(partial(storage.run, name), 30, 5) for name in storage.FAULTS},
     "clock that jumps": FaultClass(clock.run, 30, 5),
     "sweeps at the same time": FaultClass(parallel.run, 30, 5),
+    "sanitizers: random shapes": FaultClass(
+        partial(sanitizers.run, "random shapes"), 10 * sanitizers.CALLS, sanitizers.CALLS
+    ),
+    "sanitizers: operators' tests": FaultClass(partial(sanitizers.run, "operators' tests"), 1, 1),
     **{
         f"damaged logs: {reader}": FaultClass(partial(readers.run, reader), 10_000, 500)
         for reader in readers.READERS

@@ -1,20 +1,19 @@
 """Random calls of the C++ operators, valid and wrong: `random_calls.py CALLS SEED`. A wrong call must raise.
 
 With an argument `sanitize` the operators are built with AddressSanitizer and UndefinedBehaviorSanitizer. Their
-runtimes must be preloaded, see test_operator_checks.py.
+runtimes must be preloaded, see sanitized.py.
 """
 
 from __future__ import annotations
 
 import random
 import sys
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pfbench.kernels import cpp, cpp_library, library_build
+from pfbench.kernels import cpp
 from pfbench.kernels.manifest import Argument, read_operators
 from pfbench.kernels.operator_checks import check_arguments
 
@@ -152,16 +151,12 @@ def run(calls: int, seed: int) -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    if "sanitize" in sys.argv:
-        flags = (
-            "-fsanitize=address,undefined,float-cast-overflow",
-            "-fno-sanitize-recover=undefined",
-            "-g",
-            "-O1",
-        )
-        cpp_library.name_library = lambda variant: (
-            f"sanitized_{library_build.name_library(variant)}"
-        )  # type: ignore[assignment]
-        cpp_library.build_library = partial(library_build.build_library, flags=flags)  # type: ignore[assignment]
     torch.set_num_threads(1)
-    print(run(int(sys.argv[1]), int(sys.argv[2])))
+    if "sanitize" not in sys.argv:
+        print(run(int(sys.argv[1]), int(sys.argv[2])))
+    else:
+        import sanitized
+
+        outcomes = run(int(sys.argv[1]), int(sys.argv[2]))
+        sanitized.check_library()
+        print(outcomes)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import random
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,6 @@ from typing import Any
 import pytest
 import random_calls
 import torch
-from checkout import TESTS
 
 from pfbench.core import affine_map, covariance, density, random_stream
 from pfbench.filter import belief
@@ -309,36 +306,3 @@ def test_the_python_check_names_the_argument() -> None:
         with pytest.raises(ValueError, match=message):
             check_arguments(name, arguments)
     check_arguments("gather_particles", [X, torch.zeros(3, 9, dtype=torch.int64)])
-
-
-def sanitizer_libraries() -> list[str]:
-    """Paths of the runtimes of both sanitizers; empty without them."""
-    if COMPILER is None:
-        return []
-    paths = []
-    for name in ("libasan.so", "libubsan.so"):
-        command = [COMPILER, f"-print-file-name={name}"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        path = Path(done.stdout.strip())
-        if not path.is_absolute() or not path.exists():
-            return []
-        paths.append(str(path.resolve()))
-    return paths
-
-
-@pytest.mark.slow
-def test_the_sanitizers_find_nothing_in_random_calls() -> None:
-    libraries = sanitizer_libraries()
-    if not libraries:
-        pytest.skip("no runtimes of AddressSanitizer and UndefinedBehaviorSanitizer")
-    environment = {
-        **os.environ,
-        "LD_PRELOAD": " ".join(libraries),
-        "ASAN_OPTIONS": "detect_leaks=0",  # of Python and torch
-    }
-    command = [sys.executable, str(TESTS / "kernels" / "random_calls.py"), "4000", "2", "sanitize"]
-    done = subprocess.run(
-        command, capture_output=True, text=True, env=environment, check=False, timeout=1200
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert "'wrong but computed': 0, 'valid but refused': 0" in done.stdout
