@@ -48,10 +48,14 @@ MOTION = Agreement("position change and integrated velocity of the reference", "
 VELOCITY = Agreement("velocity change of the reference and integrated force of the IMU", "m/s", 3.0, 30.0)  # fmt: skip
 ATTITUDE = Agreement("rotation of the reference and integrated rate of the IMU", "rad", 0.25, 1.5)
 FIX = Agreement("position of a fix and of the reference", "m", 20.0, math.inf)
+OFFSET = Agreement("median of the fixes and of the reference along an axis", "m", 3.0, math.inf)
 FIX_VELOCITY = Agreement("velocity of a fix and of the reference", "m/s", 5.0, math.inf)
 WHEELS = Agreement("wheel speed and speed of the reference", "m/s", 3.0, 50.0)
 YAW_RATE = Agreement("yaw rate and turn of the track", "rad/s", 1.0, 10.0)
-AGREEMENTS = (MOTION, VELOCITY, ATTITUDE, FIX, FIX_VELOCITY, WHEELS, YAW_RATE)
+AGREEMENTS = (MOTION, VELOCITY, ATTITUDE, FIX, OFFSET, FIX_VELOCITY, WHEELS, YAW_RATE)
+MIN_RMS_TURN = 0.03  # rad; smallest RMS rotation in a window, about its mean, that shows a scale
+FEWEST_WINDOWS = 5  # for a scale of the rotation
+SCALES = (0.7, 1.4)  # least and largest scale of one table against another
 COMMON_TIME = 2.0  # s at an end of a table that other tables do not cover, without a note
 
 
@@ -77,7 +81,7 @@ def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ..
         if not len(x) or np.sqrt(np.mean((x / dt[straight]) ** 2)) < MIN_RMS_SPEED:
             continue
         slope = float((x * y).sum() / (x * x).sum())
-        if not 0.7 < slope < 1.4:
+        if not SCALES[0] < slope < SCALES[1]:
             raise ValueError(
                 f"{table.name}: the {name} position must change with the velocity, got {slope:.3g} "
                 "times the change. Check units (m, m/s, deg), signs and order of the columns."
@@ -128,6 +132,12 @@ def _compare_windows(
     angle = quaternion.rotation_vector_from_quaternion(
         quaternion.quaternion_multiply(inverse, turned)
     ).norm(dim=-1)
+    true_rotation = q.new_tensor([1.0, -1.0, -1.0, -1.0]) * quaternion.quaternion_multiply(
+        inverse, q[:-1]
+    )
+    pair = (rotation, true_rotation)
+    x, y = (quaternion.rotation_vector_from_quaternion(a)[angle < ATTITUDE.noted] for a in pair)
+    _check_turn_scale(table, x.numpy(), y.numpy(), float(np.median(np.diff(time))))
     level = (attitude.dcm_from_quaternion(q[:-1]) @ velocity[..., None])[..., 0].numpy()
     dt = np.diff(time)
     level[:, 2] -= gravity * dt
@@ -138,6 +148,23 @@ def _compare_windows(
         *_judge(VELOCITY, np.linalg.norm(change - level, axis=1) / scale, table, nodes[1:]),
         *_judge(ATTITUDE, angle.numpy() / scale, table, nodes[1:]),
     )
+
+
+def _check_turn_scale(table: LogTable, x: Array, y: Array, window: float) -> None:
+    """Check that rotations of the reference [n, 3] have the scale of those of the IMU."""
+    if len(x) < FEWEST_WINDOWS or window < 0.5 * _WINDOW:
+        return  # between neighbouring rows, noise has a larger part
+    x, y = x - x.mean(0), y - y.mean(0)  # a bias of the gyroscope is no scale
+    for axis, name in enumerate(("x", "y", "z")):
+        square = float((x[:, axis] ** 2).sum())
+        if np.sqrt(square / len(x)) < MIN_RMS_TURN:
+            continue
+        slope = float((x[:, axis] * y[:, axis]).sum()) / square
+        if not SCALES[0] < slope < SCALES[1]:
+            raise ValueError(
+                f"{table.name}: the attitude must turn with the angular rate about {name}, got "
+                f"{slope:.3g} times the rotation. Check units (rad, rad/s), signs and axes."
+            )
 
 
 def compare_fixes(
@@ -187,7 +214,23 @@ def compare_fixes(
     position_error = np.where(wrong_mask | np.isnan(position_error), 0.0, position_error)
     velocity_error = np.where(wrong_mask | np.isnan(velocity_error), 0.0, velocity_error)
     notes += _judge(FIX, position_error, table, rows)
+    notes += _note_offset(table, fixes.position - true[:, 7:])
     return fixes, (*notes, *_judge(FIX_VELOCITY, velocity_error, table, rows))
+
+
+def _note_offset(table: LogTable, difference: Array) -> tuple[str, ...]:
+    """Note the largest median over time of fixes minus reference [n, 3]."""
+    difference = difference[np.isfinite(difference).all(1)]
+    if len(difference) < FEWEST_WINDOWS:
+        return ()
+    offset = np.median(difference, axis=0)
+    axis = int(np.argmax(np.abs(offset)))
+    if abs(offset[axis]) <= OFFSET.noted:
+        return ()
+    return (
+        f"{table.name}: {OFFSET.quantity} differ by more than {OFFSET.noted:g} {OFFSET.unit}, "
+        f"{offset[axis]:.3g} {OFFSET.unit} {('East', 'North', 'Up')[axis]}",
+    )
 
 
 def compare_wheels(

@@ -45,6 +45,7 @@ def test_attitude_is_the_same_turn_in_other_axes(tmp_path: Path) -> None:
     log = tables()
     roll, pitch, yaw = 0.7, -1.1, 2.5
     log["reference"] = log["reference"].assign(roll=roll, pitch=pitch, yaw=yaw)
+    log["imu"] = log["imu"].assign(wz=0.0)
     q = read_log(write(tmp_path, log)).reference.attitude[0]
     ned = Rotation.from_euler(
         "ZYX", [yaw, pitch, roll]

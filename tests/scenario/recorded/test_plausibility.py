@@ -103,6 +103,26 @@ def test_a_fix_100_m_off_stays_data_and_is_named(tmp_path: Path) -> None:
     assert any("position of a fix" in note and "100 m at line 42" in note for note in read.notes)
 
 
+@pytest.mark.parametrize("factor", [0.0, 0.001, math.pi / 180, 0.3048, 3.6, -1.0])
+def test_a_heading_in_another_unit_does_not_turn_with_the_gyroscope(
+    tmp_path: Path, factor: float
+) -> None:
+    log = tables()
+    log["imu"]["wz"] += 0.05  # a bias
+    read_log(write(tmp_path / "biased", log))
+    log["reference"]["yaw"] *= factor
+    with pytest.raises(ValueError, match=r"must turn (with the angular rate about z|together)|rad"):
+        read_log(write(tmp_path / "scaled", log))
+
+
+@pytest.mark.parametrize(("offset", "is_noted"), [(2.5, False), (-2.5, False), (4.0, True)])
+def test_an_offset_of_all_fixes_is_named(tmp_path: Path, offset: float, is_noted: bool) -> None:
+    log = tables()
+    log["reference"]["pd"] += offset
+    notes = "".join(read_log(write(tmp_path, log)).notes)
+    assert ("along an axis differ by more than 3 m, 4 m Up" in notes) is is_noted
+
+
 def test_a_key_drops_single_fixes_and_names_them(tmp_path: Path) -> None:
     log = tables()
     log["gnss"].loc[40, "pe"] += 18600.0
