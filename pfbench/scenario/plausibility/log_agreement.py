@@ -48,11 +48,11 @@ MOTION = Agreement("position change and integrated velocity of the reference", "
 VELOCITY = Agreement("velocity change of the reference and integrated force of the IMU", "m/s", 3.0, 30.0)  # fmt: skip
 ATTITUDE = Agreement("rotation of the reference and integrated rate of the IMU", "rad", 0.25, 1.5)
 FIX = Agreement("position of a fix and of the reference", "m", 20.0, math.inf)
-OFFSET = Agreement("median of the fixes and of the reference along an axis", "m", 3.0, math.inf)
+FIX_OFFSET = Agreement("median of the fixes and of the reference along an axis", "m", 3.0, math.inf)
 FIX_VELOCITY = Agreement("velocity of a fix and of the reference", "m/s", 5.0, math.inf)
 WHEELS = Agreement("wheel speed and speed of the reference", "m/s", 3.0, 50.0)
 YAW_RATE = Agreement("yaw rate and turn of the track", "rad/s", 1.0, 10.0)
-AGREEMENTS = (MOTION, VELOCITY, ATTITUDE, FIX, OFFSET, FIX_VELOCITY, WHEELS, YAW_RATE)
+AGREEMENTS = (MOTION, VELOCITY, ATTITUDE, FIX, FIX_OFFSET, FIX_VELOCITY, WHEELS, YAW_RATE)
 MIN_RMS_TURN = 0.03  # rad; smallest RMS rotation in a window, about its mean, that shows a scale
 FEWEST_WINDOWS = 5  # for a scale of the rotation
 SCALES = (0.7, 1.4)  # least and largest scale of one table against another
@@ -225,11 +225,11 @@ def _note_offset(table: LogTable, difference: Array) -> tuple[str, ...]:
         return ()
     offset = np.median(difference, axis=0)
     axis = int(np.argmax(np.abs(offset)))
-    if abs(offset[axis]) <= OFFSET.noted:
+    if abs(offset[axis]) <= FIX_OFFSET.noted:
         return ()
     return (
-        f"{table.name}: {OFFSET.quantity} differ by more than {OFFSET.noted:g} {OFFSET.unit}, "
-        f"{offset[axis]:.3g} {OFFSET.unit} {('East', 'North', 'Up')[axis]}",
+        f"{table.name}: {FIX_OFFSET.quantity} differ by more than {FIX_OFFSET.noted:g} {FIX_OFFSET.unit}, "
+        f"{offset[axis]:.3g} {FIX_OFFSET.unit} {('East', 'North', 'Up')[axis]}",
     )
 
 
