@@ -81,6 +81,6 @@ def _count_tests(tally: Tally) -> None:
 
 def _reason(done: subprocess.CompletedProcess[str]) -> tuple[str, str]:
     found = _FOUND.search(done.stderr + done.stdout)
-    return (found[0].split(" on address")[0] if found else f"exit code {done.returncode}"), (done.stdout + done.stderr)[
-        -500:
-    ]
+    return (found[0].split(" on address")[0] if found else f"exit code {done.returncode}"), (
+        done.stdout + done.stderr
+    )[-500:]
