@@ -211,10 +211,12 @@ def compare_fixes(
         position[wrong_mask] = velocity[wrong_mask] = np.nan
         fixes = fixes._replace(position=position, velocity=velocity)
     rows = np.arange(len(fixes.time))
-    position_error = np.where(wrong_mask | np.isnan(position_error), 0.0, position_error)
-    velocity_error = np.where(wrong_mask | np.isnan(velocity_error), 0.0, velocity_error)
-    notes += _judge(FIX, position_error, table, rows)
+    position_error, velocity_error = (
+        np.where(wrong_mask | np.isnan(error), 0.0, error)
+        for error in (position_error, velocity_error)
+    )
     notes += _note_offset(table, fixes.position - true[:, 7:])
+    notes += _judge(FIX, position_error, table, rows)
     return fixes, (*notes, *_judge(FIX_VELOCITY, velocity_error, table, rows))
 
 
