@@ -154,7 +154,7 @@ def _check_turn_scale(table: LogTable, x: Array, y: Array, window: float) -> Non
     """Check that rotations of the reference [n, 3] have the scale of those of the IMU."""
     if len(x) < FEWEST_WINDOWS or window < 0.5 * _WINDOW:
         return  # between neighbouring rows, noise has a larger part
-    x, y = x - x.mean(0), y - y.mean(0)  # a bias of the gyroscope is no scale
+    x, y = x - x.mean(0), y - y.mean(0)  # without the bias of the gyroscope
     for axis, name in enumerate(("x", "y", "z")):
         square = float((x[:, axis] ** 2).sum())
         if np.sqrt(square / len(x)) < MIN_RMS_TURN:
