@@ -75,15 +75,15 @@ def measure_rates() -> list[dict[str, Any]]:
     return rows
 
 
-def page(text: str, rows: list[dict[str, Any]]) -> str:
+def page(text: str, rows: list[dict[str, Any]], start: str = START) -> str:
     """Return the page with the table of the rows."""
     lines = [list(rows[0]), ["---"] * len(rows[0])]
     lines += [
         [f"{v:.3f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows
     ]
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-    before, rest = text.split(START)
-    return f"{before}{START}\n{table}\n{END}{rest.split(END, 1)[1]}"
+    before, rest = text.split(start)
+    return f"{before}{start}\n{table}\n{END}{rest.split(END, 1)[1]}"
 
 
 def main() -> None:

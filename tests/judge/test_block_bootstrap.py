@@ -57,9 +57,9 @@ def alarms(steps: int, correlation: float, studies: int) -> tuple[float, float]:
 
 @pytest.mark.parametrize(("steps", "correlation"), [(400, 10.0), (1600, 40.0)])
 def test_false_alarms(steps: int, correlation: float) -> None:
-    """At most 8 % at level 5 %, plus 3.1 standard errors; single epochs as samples fail."""
+    """At most 5 %, plus 3.1 standard errors; single epochs as samples fail."""
     by_blocks, by_epochs = alarms(steps, correlation, 300)
-    assert by_blocks <= 0.08 + 3.1 * np.sqrt(0.08 * 0.92 / 300)
+    assert by_blocks <= 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 300)
     assert by_epochs > 0.4
 
 
@@ -69,7 +69,19 @@ def test_false_alarms(steps: int, correlation: float) -> None:
 )
 def test_false_alarms_of_the_design(steps: int, correlation: float) -> None:
     by_blocks, _ = alarms(steps, correlation, 2000)
-    assert by_blocks <= 0.08 + 3.1 * np.sqrt(0.08 * 0.92 / 2000)
+    assert by_blocks <= 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 2000)
+
+
+@pytest.mark.parametrize("time", [10.0, 40.0])
+def test_the_variance_of_a_long_run_is_that_of_its_correlation(time: float) -> None:
+    """Sums of two squares of a Markov process: correlation exp(-2/time) per epoch, variance 4."""
+    steps = 300_000
+    squares = markov(np.random.default_rng(8), steps, time, 4) ** 2
+    result = compare_along_run(squares[:2].sum(0), squares[2:].sum(0))
+    rho = np.exp(-2 / time)
+    ratio = result.estimate.standard_error**2 / (0.5 * (1 + rho) / (1 - rho) / steps)
+    error = np.sqrt(2 / result.blocks)
+    assert 1 - 3 * error < ratio < 1.1 + 3 * error
 
 
 def test_power_and_direction() -> None:
