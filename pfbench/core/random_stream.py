@@ -10,6 +10,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, TypeAlias
 
 import torch
@@ -151,7 +152,11 @@ class PhiloxStream(BatchRandomStream):
 
     @override
     def at_step(self, step: int) -> PhiloxStream:
-        return replace(self, step=step)
+        stream = object.__new__(type(self))  # `replace` takes four times as long at each step
+        vars(stream).update(vars(self), step=step)
+        vars(stream).pop("_key", None)
+        stream.__post_init__()
+        return stream
 
     @override
     def select_runs(self, runs: slice) -> PhiloxStream:
@@ -166,8 +171,12 @@ class PhiloxStream(BatchRandomStream):
     def uniform(self, purpose: str, n: int, w: int) -> Tensor:
         return draw_uniforms(*self._counter(purpose, n, w))[..., :n].permute(1, 2, 0)
 
+    @cached_property
+    def _key(self) -> tuple[Tensor, Tensor]:
+        return torch.as_tensor(self.seed), torch.as_tensor(self.step)
+
     def _counter(
         self, purpose: str, n: int, w: int
     ) -> tuple[Tensor, int, Tensor, Tensor, int, int]:
-        seed, step = torch.as_tensor(self.seed), torch.as_tensor(self.step)
+        seed, step = self._key
         return seed, zlib.crc32(purpose.encode()), step, self.runs, w, -(-n // 4)

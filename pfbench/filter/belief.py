@@ -133,19 +133,22 @@ class Filter(Protocol):
         """
 
 
-def gather_ancestors(belief: ParticleBelief, ancestors: Tensor) -> ParticleBelief:
+def gather_ancestors(
+    belief: ParticleBelief, ancestors: Tensor, log_w: Tensor | None = None
+) -> ParticleBelief:
     """Copy particles by their ancestors, with weights, window and memory.
 
     Args:
         belief: Weighted particles.
         ancestors: Slots, [R, M].
+        log_w: Log weights of the copies, [R, M]. Those of the ancestors by default.
 
     Returns:
         Particles, [R, M, D].
     """
     return belief._replace(
         x=_gather_states(belief.x, ancestors),
-        log_w=belief.log_w.gather(1, ancestors),
+        log_w=belief.log_w.gather(1, ancestors) if log_w is None else log_w,
         window={k: _gather_rows(v, ancestors) for k, v in belief.window.items()},
         memory={k: _gather_rows(v, ancestors) for k, v in belief.memory.items()},
         ancestors=ancestors,

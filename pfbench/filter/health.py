@@ -20,9 +20,6 @@ truth exists, `pfbench.results.status` decides by the error instead.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -31,9 +28,10 @@ from torch import Tensor
 
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.particle.particle_moments import compute_nis
+from pfbench.filter.misfit import compute_misfit, compute_misfits, uncounted_observation
+from pfbench.filter.particle.particle_moments import compute_once
 from pfbench.filter.resolution import is_coarse, is_ill_conditioned, starts_certain
-from pfbench.model.base import ModelWrapper, StateSpaceModel
+from pfbench.model.base import StateSpaceModel
 
 HEALTH = ("ok", "lost", "collapsed", "diverged", "overconfident")
 
@@ -45,7 +43,7 @@ _ROUNDING = 64.0  # of a weighted mean of equal particles, in units of the last 
 
 
 class HealthCheck(NamedTuple):
-    """Numbers of a checked step, each [R].
+    """Numbers of the checked steps, each [C, R].
 
     Attributes:
         nis: NIS under the predicted moments; NaN if the filter does not support it.
@@ -87,7 +85,9 @@ class HealthMonitor:
             dtype=torch.float64,
             device=record.y.device,
         )
-        self._checks: list[HealthCheck] = []
+        self._nis: dict[int, Tensor] = {}
+        self._has_particles = False
+        self._checks: HealthCheck | None = None
         self._collapsed = torch.zeros(len(record.y), dtype=torch.bool, device=record.y.device)
         self._first = observed[0] if observed else -1
 
@@ -101,16 +101,24 @@ class HealthMonitor:
             info: Estimate of the step.
         """
         if t in self.steps:
-            self._check(model.at_step(t), record.at_step(t), info)
+            self._has_particles = info.cloud is not None
+            with uncounted_observation(model):
+                nis = info.nis()[0] if info.nis is not None else None
+            self._nis[t] = torch.full_like(info.mean[:, 0], torch.nan) if nis is None else nis
         # the prior is widest before the first measurement, so that this step is decisive
         is_judged = info.cloud is None and info.mean.dtype != torch.float64
         if is_judged and (t in self.steps or t == self._first):
             self._collapsed |= is_ill_conditioned(info.covariance())
 
-    def check_spreads(
-        self, model: StateSpaceModel, record: Record, mean: Tensor, variance: Tensor
+    def check_moments(
+        self,
+        model: StateSpaceModel,
+        record: Record,
+        mean: Tensor,
+        variance: Tensor,
+        ess: Tensor | None = None,
     ) -> None:
-        """Mark runs whose spread is at its floor in a step with an impossible measurement.
+        """Check the moments of the checked steps, and mark runs whose spread is at its floor.
 
         The floor is checked in all steps at once. The measurement is evaluated only where it decides.
         Without an impossible measurement it is a collapse unless the initial state was certain.
@@ -120,10 +128,13 @@ class HealthMonitor:
             record: Prepared record of all steps.
             mean: Estimates, [R, T, D].
             variance: Variances, [R, T, d].
+            ess: Effective sample sizes, [R, T]; None for a Gaussian filter.
         """
+        if self._nis:
+            self._checks = self._check(model, record, mean, variance, ess)
         at_floor = ~_has_spread(model, mean, variance)
         for t in (at_floor & torch.isfinite(mean).all(-1)).any(0).nonzero().flatten().tolist():
-            misfit, observed = _compute_misfit(model.at_step(t), record.at_step(t), mean[:, t])
+            misfit, observed = compute_misfit(model.at_step(t), record.at_step(t), mean[:, t])
             self._collapsed |= at_floor[:, t] & _is_far(misfit, observed)
         is_point = at_floor if variance.dtype == torch.float64 else (variance == 0.0).all(-1)
         is_point = (is_point & torch.isfinite(mean).all(-1)).any(-1)
@@ -140,10 +151,8 @@ class HealthMonitor:
             Index in `HEALTH`, int8 [R].
         """
         health = torch.zeros(lost.shape, dtype=torch.int8, device=lost.device)
-        if self._checks:
-            nis, misfit, observed, has_spread, is_finite, coarse = (
-                torch.stack(rows) for rows in zip(*self._checks, strict=True)
-            )
+        if self._checks is not None:
+            nis, misfit, observed, has_spread, is_finite, coarse = self._checks
             limit = self._limits[observed]
             is_impossible = _in_majority(nis.double() > limit, ~torch.isnan(nis))
             is_far = _is_far(misfit, observed)
@@ -162,47 +171,33 @@ class HealthMonitor:
         health[lost] = HEALTH.index("lost")
         return health
 
-    def _check(self, model: StateSpaceModel, record: Record, info: StepInfo) -> None:
-        """Compute the numbers of a step."""
-        mean, variance = info.mean, info.variance
-        misfit, observed = _compute_misfit(model, record, mean)
-        with uncounted_observation(model):
-            nis = info.nis()[0] if info.nis is not None else torch.full_like(misfit, torch.nan)
+    def _check(
+        self,
+        model: StateSpaceModel,
+        record: Record,
+        mean: Tensor,
+        variance: Tensor,
+        ess: Tensor | None,
+    ) -> HealthCheck:
+        """Compute the numbers of the checked steps from moments [R, T, ...] of all steps."""
+        steps = list(self._nis)
+        misfit, observed = compute_misfits(model, record, mean, steps)
+        mean, variance = mean[:, steps].transpose(0, 1), variance[:, steps].transpose(0, 1)
         has_spread = _has_spread(model, mean, variance)
-        if (ess := info.trace.get("ess")) is not None:
-            has_spread = has_spread & (ess >= _MIN_ESS)
+        if ess is not None:
+            has_spread = has_spread & (ess[:, steps].T >= _MIN_ESS)
         is_finite = torch.isfinite(mean).all(-1) & (variance >= 0.0).all(-1)
         is_finite &= torch.isfinite(variance).all(-1)
         coarse = torch.zeros_like(is_finite)
-        if info.cloud is None:
+        if not self._has_particles:
             coarse = is_coarse(_distance(model, mean), variance).any(-1)
-        self._checks.append(HealthCheck(nis, misfit, observed, has_spread, is_finite, coarse))
+        nis = torch.stack(list(self._nis.values()))
+        return HealthCheck(nis, misfit, observed, has_spread, is_finite, coarse)
 
 
 def with_cached_nis(info: StepInfo) -> StepInfo:
     """Return an info whose NIS is computed once, for the health and for scores."""
-    return info if info.nis is None else info._replace(nis=cache(info.nis))
-
-
-@contextmanager
-def uncounted_observation(model: StateSpaceModel) -> Iterator[None]:
-    """Evaluate `observation` by the method of the class.
-
-    A counter of likelihood evaluations replaces that of the object. Checks are not charged to the
-    filter.
-
-    Args:
-        model: State-space model.
-    """
-    inner = model
-    while isinstance(inner, ModelWrapper):
-        inner = inner.model
-    counted = inner.__dict__.pop("observation", None)
-    try:
-        yield
-    finally:
-        if counted is not None:
-            inner.__dict__["observation"] = counted
+    return info if info.nis is None else info._replace(nis=compute_once(info.nis))
 
 
 def count_health(health: Tensor) -> dict[str, int]:
@@ -232,12 +227,6 @@ def _has_spread(model: StateSpaceModel, mean: Tensor, variance: Tensor) -> Tenso
     """Return where a component of estimates [..., D] has a variance [..., d] above rounding."""
     floor = _ROUNDING * torch.finfo(variance.dtype).eps * _distance(model, mean)
     return (variance > floor * floor).any(-1)
-
-
-def _compute_misfit(model: StateSpaceModel, record: Record, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the NIS of estimates [R, D] under the measurement noise alone, and its components."""
-    with uncounted_observation(model):
-        return compute_nis(model, mean.unsqueeze(1), torch.zeros_like(mean[:, :1]), record)
 
 
 def _is_far(misfit: Tensor, observed: Tensor) -> Tensor:

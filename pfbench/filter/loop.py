@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -108,8 +107,6 @@ class FilterPass:
         record: Measurements [R, T, Dy] and inputs, prepared by the model (`prepare_record`).
         draws: Random stream. Step 0 is the initial distribution, step t + 1 the record's step t.
         feedback: Process that the estimates correct, or None.
-        lookahead: Allow several steps in one call, where the filter can do so. The caller must then
-            not change belief or model. Not used with feedback.
 
     Attributes:
         belief: Belief after the latest step.
@@ -123,10 +120,9 @@ class FilterPass:
         record: Record,
         draws: RandomStream,
         feedback: FeedbackRun | None = None,
-        lookahead: bool = False,
     ) -> None:
         self.method, self.model, self.record, self.draws = method, model, record, draws
-        self.feedback, self.lookahead = feedback, lookahead and feedback is None
+        self.feedback = feedback
         self.belief: Any = method.init(
             model, len(record.y), draws.at_step(0), record.start, record.spread
         )
@@ -136,27 +132,37 @@ class FilterPass:
         return self.model.at_step(t)
 
     def __iter__(self) -> Iterator[PassStep]:
-        pending: deque[tuple[Any, StepInfo]] = deque()
-        limit = self.record.y.shape[1]
-        several = (
-            self.method if self.lookahead and isinstance(self.method, MultiStepFilter) else None
-        )
         for t, model, record in iterate_steps(self, self.record):
             draws = self.draws.at_step(t + 1)
-            if several is not None:
-                if not pending:
-                    results, limit = several.take_steps(
-                        self.model, self.belief, self.record, t, self.draws, limit
-                    )
-                    pending.extend(results)
-                self.belief, info = pending.popleft()
-            elif self.feedback is not None:
+            if self.feedback is not None:
                 record = prepare_record(self.model, self.feedback.at_step(t)).at_step(0)
                 belief, info = self.method.step(model, self.belief, record, draws)
                 self.belief, info = apply_feedback(self.model, self.feedback, belief, info)
             else:
                 self.belief, info = self.method.step(model, self.belief, record, draws)
             yield PassStep(t, model, record, info, draws)
+
+    def iterate_infos(self) -> Iterator[StepInfo]:
+        """Take the steps, several in one call where the filter can do so.
+
+        The caller must not change belief or model.
+
+        Yields:
+            Estimate and diagnostics of each step.
+        """
+        if self.feedback is not None or not isinstance(self.method, MultiStepFilter):
+            for step in self:
+                yield step.info
+            return
+        t, steps = 0, self.record.y.shape[1]
+        limit = steps
+        while t < steps:
+            results, limit = self.method.take_steps(
+                self.model, self.belief, self.record, t, self.draws, limit
+            )
+            t += len(results)
+            for self.belief, info in results:
+                yield info
 
 
 def prepare_record(model: StateSpaceModel, record: Record) -> Record:
@@ -214,10 +220,10 @@ def run_filter(
     check_model(model, prepared)
     batches = split_runs(prepared, draws, None if feedback is not None else run_batch)
     monitor = HealthMonitor(prepared)
-    passes = [FilterPass(method, model, *batch, feedback, lookahead=True) for batch in batches]
+    passes = [FilterPass(method, model, *batch, feedback) for batch in batches]
     means, variances, evidences, traces = [], [], [], []
-    for t, steps in enumerate(zip(*passes, strict=True)):
-        info = with_cached_nis(join_infos([step.info for step in steps]))
+    for t, infos in enumerate(zip(*[run.iterate_infos() for run in passes], strict=True)):
+        info = with_cached_nis(join_infos(list(infos)))
         means.append(info.mean)
         variances.append(info.variance)
         evidences.append(join_runs([run.belief.log_evidence for run in passes]))
@@ -230,6 +236,6 @@ def run_filter(
     mean, variance = (
         torch.where(valid, torch.stack(rows, 1), torch.nan) for rows in (means, variances)
     )
-    monitor.check_spreads(model, prepared, mean, variance)
+    monitor.check_moments(model, prepared, mean, variance, trace.get("ess"))
     health = monitor.classify(~torch.isfinite(evidences[-1]))
     return FilterResult(mean, variance, evidences[-1], trace, health)

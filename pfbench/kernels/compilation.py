@@ -32,6 +32,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 # None: operators on the CPU, where they cost nothing, and torch operations on other devices
 _fused: ContextVar[bool | None] = ContextVar("fused", default=None)
 _graph: ContextVar[bool] = ContextVar("graph", default=False)
+_peek_transform = (
+    torch._C._functorch.peek_interpreter_stack
+)  # None outside of torch.vmap and its like
 
 
 @contextmanager
@@ -62,6 +65,8 @@ def is_capturing() -> bool:
 def _plain(args: tuple[Any, ...]) -> bool:
     """Return whether no argument requires a gradient or is a batch of `torch.vmap`."""
     has_gradients, has_tangents = torch.is_grad_enabled(), forward_ad._current_level >= 0
+    if not has_gradients and not has_tangents and _peek_transform() is None:
+        return True
     for a in args:
         if isinstance(a, torch.Tensor) and (
             (has_gradients and a.requires_grad)

@@ -88,7 +88,7 @@ def test_a_single_step_without_spread_and_with_an_impossible_measurement_is_a_co
     assert (result.health[10:] == HEALTH.index("ok")).all()
     assert (result.variance[:10, 17] == 0.0).all()  # the fault that is to be seen
     assert count_health(filtered(KALMAN, y).health)["collapsed"] == 0  # its spread is as before
-    monkeypatch.setattr(HealthMonitor, "check_spreads", lambda *_: None)
+    monkeypatch.setattr(HealthMonitor, "check_moments", lambda *_: None)
     assert count_health(filtered(PARTICLES, y).health)["ok"] == 20
 
 
@@ -101,7 +101,7 @@ def test_a_point_that_agrees_with_the_measurement_is_a_collapse_unless_the_state
     mean, variance = record.y.clone(), torch.ones_like(record.y)
     variance[0, 17] = 0.0  # in one run and one step
     monitor = HealthMonitor(record)
-    monitor.check_spreads(model, record, mean, variance)
+    monitor.check_moments(model, record, mean, variance)
     health = monitor.classify(torch.zeros(2, dtype=torch.bool))
     assert [HEALTH[value] for value in health.tolist()] == [expected, "ok"]
 

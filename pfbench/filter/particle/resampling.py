@@ -111,11 +111,10 @@ class EssResampler(Resampler):
         if self.ess_threshold < 1.0:
             resampled_mask = 1.0 / a.square().sum(-1) < self.ess_threshold * n.squeeze(1)
             ancestors = torch.where(resampled_mask.unsqueeze(1), ancestors, slots)
-        copies = gather_ancestors(belief, ancestors)
         log_w = -torch.log(n.to(a.dtype))
         if log_a is not belief.log_w:  # other probabilities than the weights: correct for them
             log_w = log_w + (belief.log_w - log_a).gather(1, ancestors)
         log_w = torch.where(slots < n, log_w, -torch.inf)
         if self.ess_threshold < 1.0:
             log_w = torch.where(resampled_mask.unsqueeze(1), log_w, belief.log_w)
-        return copies._replace(log_w=log_w), resampled_mask
+        return gather_ancestors(belief, ancestors, log_w), resampled_mask
