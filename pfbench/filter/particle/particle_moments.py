@@ -161,8 +161,8 @@ def compute_nis(
     if not has_finite_moments(predicted_y):
         return torch.full_like(log_w[:, 0], torch.nan), observed_mask.sum(1)
     y, covariance = predicted_y.mean, shared_distribution_covariance(predicted_y)
-    if y.shape[1] == 1:  # a point has no spread
-        y_hat = y[:, 0] + model.residual(y[:, 0], y[:, 0])  # NaN where it is infinite
+    if y.shape[1] == 1:  # no spread
+        y_hat = y[:, 0] + model.residual(y[:, 0], y[:, 0])  # infinite becomes NaN
         covariance = covariance[:, 0]
     else:
         y_hat, covariance = _predicted_moments(model, y, covariance, normalise_log_weights(log_w))
