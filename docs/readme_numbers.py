@@ -11,8 +11,8 @@ import csv
 import gzip
 import json
 import re
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -161,30 +161,23 @@ def all_seven() -> str:
     count = f"{len(pack['worlds'])} of {len(scenarios[1].split(','))}" if scenarios else ""
     text = (folder / "report.md").read_text()
     _, first, second, *_ = text.split("\n\n")
-    planned = re.search(r"^Planned comparisons.*\n\n(?:\|.*\n)+", text, re.MULTILINE)
-    pairs = _planned_table(planned[0], pack["planned"]) if planned else ""
-    return f"The report has {count} scenarios: {names}.\n\n{first}\n\n{second}\n\n{pairs}"
+    return f"The report has {count} scenarios: {names}.\n\n{first}\n\n{second}\n\n{_planned_table(pack)}"
 
 
-def _planned_table(text: str, pairs: Sequence[Mapping[str, Any]]) -> str:
-    """Table of planned comparisons without columns of a single value, which stand above it.
+def _planned_table(pack: Mapping[str, Any]) -> str:
+    """Decisions on the planned pairs of each proposed method, by kind of baseline."""
+    names = {look["key"]: look["name"] for look in pack["filters"]}
+    groups: dict[tuple[str, str], dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    for pair in pack["planned"]:
+        groups[names[pair["a"]], pair["kind"]][pair["word"]].append(names[pair["b"]])
 
-    Comparisons with tuned baselines are counted below it.
-    """
-    entries = zip(_parse_rows(text), pairs, strict=True)
-    rows = [row for row, pair in entries if pair["kind"] != "tuned"]
-    alike = [name for name in rows[0] if len({row[name] for row in rows}) == 1 < len(rows)]
-    kept = [name for name in rows[0] if name not in alike]
-    note = "; ".join(f"{name}: {rows[0][name]}" for name in alike if rows[0][name] != "–")
-    table = format_table(kept, ([row[name] for name in kept] for row in rows))
-    tuned = Counter(pair["word"] for pair in pairs if pair["kind"] == "tuned")
-    counts = ", ".join(f"{word}: {number}" for word, number in tuned.most_common())
-    end = (
-        f"\n\nPlanned comparisons of a proposed method with a tuned baseline: {counts}."
-        if counts
-        else ""
-    )
-    return f"Planned comparisons{f' ({note})' if note else ''}:\n\n{table}{end}"
+    def describe(method: str, kind: str) -> str:
+        words = groups[method, kind].items()
+        return "; ".join(f"{word}: {', '.join(others)}" for word, others in words) or "–"
+
+    methods = dict.fromkeys(method for method, _ in groups)
+    head = ("method", "decision against the baselines of its paper", "against tuned baselines")
+    return format_table(head, ((m, describe(m, "paper"), describe(m, "tuned")) for m in methods))
 
 
 def speed() -> str:

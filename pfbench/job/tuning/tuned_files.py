@@ -41,7 +41,7 @@ def write_filter_file(
         pairs[0] = f"_target_: {node['_target_']}"
         lines += [f"  - {pairs[0]}", *(f"    {pair}" for pair in pairs[1:])]
     block = read_paper_block("filter", result.method)
-    name = {key: f"{block.get(key, result.method)}, tuned" for key in ("name", "long_name")}
+    name = {key: f"{block.get(key, result.method)} (tuned)" for key in ("name", "long_name")}
     lines += ["paper:", *(f"  {key}: {json.dumps(value)}" for key, value in name.items())]
     lines += ["  family: kalman", "  proposed: false", '  cite: ""', "  baselines: []"]
     lines.append(f"  tuning: {json.dumps(_describe_world(world))}")

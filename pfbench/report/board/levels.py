@@ -82,7 +82,9 @@ class FilterLevels(NamedTuple):
             j: Index of the second filter.
         """
         middle = float(min(self.middle[i], self.middle[j]))
-        return self._estimate(self.level[i] - self.level[j], self.parts[i] - self.parts[j], middle)
+        with np.errstate(invalid="ignore"):  # both levels are infinite
+            difference = self.level[i] - self.level[j]
+        return self._estimate(difference, self.parts[i] - self.parts[j], middle)
 
     def single(self, i: int) -> EffectEstimate:
         """Estimate the level of one filter.

@@ -112,7 +112,7 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     ])  # fmt: skip
     written = yaml.safe_load((tmp_path / "lab/filter/ekf_scaled_walk.yaml").read_text())
     assert written["noise_adaptations"][0]["r_factor"] == 4.0
-    assert written["paper"]["name"] == "Scaled EKF, tuned"
+    assert written["paper"]["name"] == "Scaled EKF (tuned)"
     world = "linear_walk (model linear_walk, seed 1001, 20 runs; noise: outliers)"
     assert written["paper"]["tuning"] == world
     record = json.loads((tmp_path / "lab/tuning/walk.json").read_text())
