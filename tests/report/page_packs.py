@@ -34,6 +34,7 @@ def build_pack(
     instants: int = 60,
     carried: int = 10,
     plane: bool = True,
+    prefix: str = "f",
 ) -> dict[str, Any]:
     """Build a pack.
 
@@ -50,6 +51,7 @@ def build_pack(
         instants: Instants of a curve.
         carried: Runs of a cell whose tracks are in the pack.
         plane: Whether the worlds have a plane.
+        prefix: Start of the label of each filter, before its number.
     """
     rng = np.random.default_rng(seed)
     shape = (filters, worlds, regimes)
@@ -61,7 +63,7 @@ def build_pack(
         errors[i] = np.nan
     for i in missing:
         errors[i] = np.nan
-    keys = [f"f{i}" for i in range(filters)]
+    keys = [f"{prefix}{i}" for i in range(filters)]
     built = _Numbers(keys, errors, set(lost), set(missing), rng)
     cells = list(itertools.product(range(worlds), range(regimes)))
     tracks = (
@@ -72,7 +74,7 @@ def build_pack(
         "title": "Invented study",
         "generated": {"commit": "0" * 7, "date": "2026-01-31", "version": "0.0"},
         "alpha": 0.05,
-        "filters": [_look(i, names or {}) for i in range(filters)],
+        "filters": [{**_look(i, names or {}), "key": key} for i, key in enumerate(keys)],
         "worlds": [
             {"key": f"w{i}", "name": f"World {i}", "words": f"Words of world {i}.", "unit": "m",
              "limit": 50.0, "family": f"w{i}"} for i in range(worlds)

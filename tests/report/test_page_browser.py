@@ -30,7 +30,7 @@ PACKS = {
     "single": page_packs.build_pack(1, 1, 1, 1),
     "lost": page_packs.build_pack(4, 2, 1, 6, lost=range(4)),
     "equal": page_packs.build_pack(5, 2, 2, 8, equal=True),
-    "many": page_packs.build_pack(33, 7, 4, 4, carried=0, instants=10),
+    "many": page_packs.build_pack(33, 7, 4, 4, carried=0, instants=10, prefix=""),
 }  # fmt: skip
 
 
@@ -248,18 +248,31 @@ def test_runs_are_selected_by_keys_and_clicks(visit):
     assert "No track of this run" in page.locator("#planenote").inner_text()
 
 
-def test_curves_and_runs_of_the_page_are_those_of_the_pack(visit):
-    pack = PACKS["usual"]
-    decoded = visit().evaluate(
-        "() => [decode(data.curves.w1.r0.filters.f2), decode(data.runs.w1.r0.values.f2), decode(data.tracks.w1.r0.plane.f2['1'])]"
+@pytest.mark.parametrize(("name", "key"), [("usual", "f2"), ("many", "7")])
+def test_curves_and_runs_of_the_page_are_those_of_the_pack(visit, name, key):
+    """Labels that are numbers have another order in a browser than in the pack."""
+    pack = PACKS[name]
+    curve, run = visit(name).evaluate(
+        "(key) => [decode(data.curves.w1.r0.filters[key]), decode(data.runs.w1.r0.values[key])]",
+        key,
     )
-    curve = pack["curves"]["w1", "r0"]["filters"]["f2"]
-    np.testing.assert_allclose(
-        decoded[0], curve["median"] + curve["q10"] + curve["q90"], rtol=0.015
-    )
-    np.testing.assert_allclose(decoded[1], pack["runs"]["w1", "r0"]["values"]["f2"], rtol=1e-3)
-    truth = np.ravel(pack["tracks"]["w1", "r0"]["plane"]["f2"]["1"])
-    np.testing.assert_allclose(decoded[2], truth, rtol=0.06, atol=1e-3 * np.abs(truth).max())
+    true = pack["curves"]["w1", "r0"]["filters"][key]
+    np.testing.assert_allclose(curve, true["median"] + true["q10"] + true["q90"], rtol=0.015)
+    np.testing.assert_allclose(run, pack["runs"]["w1", "r0"]["values"][key], rtol=1e-3)
+
+
+def test_tracks_of_the_page_are_those_of_the_pack(visit):
+    found = visit().evaluate("() => decode(data.tracks.w1.r0.plane.f2['1'])")
+    truth = np.ravel(PACKS["usual"]["tracks"]["w1", "r0"]["plane"]["f2"]["1"])
+    np.testing.assert_allclose(found, truth, rtol=0.06, atol=1e-3 * np.abs(truth).max())
+
+
+@pytest.mark.parametrize("name", ["gaps", "many"])
+def test_rows_of_the_page_are_those_of_the_pack(visit, name):
+    pack = PACKS[name]
+    rows = visit(name).evaluate("() => viewKeys.map((key) => viewOf(key).rows)")
+    for found, view in zip(rows, pack["views"].values(), strict=True):
+        assert found == view["rows"]
 
 
 def test_the_address_holds_the_view(visit):

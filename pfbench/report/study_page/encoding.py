@@ -1,21 +1,16 @@
-"""Compression of the data of a report page: logarithmic codes of one or two bytes, gzip, base64.
-
-A page of 33 filters, 28 conditions and 100 runs has millions of numbers. A figure of 400 pixels needs
-256 levels of each, on the logarithmic scale that it has.
-"""
+"""Data of a report page in a compact form: views as columns, numbers as codes."""
 
 from __future__ import annotations
 
-import base64
-import gzip
-import json
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Levels = NDArray[np.int64]
+from pfbench.report.study_page.number_codes import compress_pack, encode_decimals, encode_levels
+
+_DECIMALS = ("value", "low", "high", "ratio", "ratio_low", "ratio_high")  # columns of a view
 _MANY_RUNS = 30_000  # of all filters and conditions, from which a run has one byte
 
 
@@ -30,12 +25,12 @@ def encode_pack(pack: Mapping[str, Any], limit: int) -> str:
         limit: Greatest number of characters.
 
     Returns:
-        Text in base64.
+        Text of `compress_pack`.
     """
     base = {
         **pack,
         "opening": list(next(iter(pack["views"]))),
-        "views": _encode_views(pack["views"]),
+        "views": encode_views(pack["views"], [look["key"] for look in pack["filters"]]),
         "curves": _nest({key: _encode_curves(cell) for key, cell in pack["curves"].items()}),
         "calibration": _nest(pack["calibration"]),
         "runs": _nest(
@@ -46,16 +41,10 @@ def encode_pack(pack: Mapping[str, Any], limit: int) -> str:
     carried = max(counts, default=0)
     while True:
         tracks = {k: _encode_tracks(cell, carried) for k, cell in pack["tracks"].items()}
-        text = _compress({**base, "tracks": _nest(tracks) if carried else {}})
+        text = compress_pack({**base, "tracks": _nest(tracks) if carried else {}})
         if len(text) <= limit or carried == 0:
             return text
         carried = carried - 1 if carried <= 4 else int(carried * max(0.5, limit / len(text)))
-
-
-def _compress(pack: Mapping[str, Any]) -> str:
-    """Return the pack as JSON, gzip and base64, with the same bytes for equal content."""
-    text = json.dumps(pack, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
-    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode("ascii")
 
 
 def _nest(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
@@ -69,31 +58,54 @@ def _nest(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
     return nested
 
 
-def _encode_views(views: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
+def encode_views(views: Mapping[tuple[str, ...], Any], filters: Sequence[str]) -> dict[str, Any]:
     """Encode views as columns, which compress better side by side than view by view.
 
+    Args:
+        views: Views by key. Each has a row of each filter.
+        filters: Labels of the filters.
+
     Returns:
-        Keys of the scopes, baselines, texts by scope and baseline, and columns by scope: `shared` if
-        they are the same for all baselines, else `separate`.
+        Keys of the scopes, baselines, texts by scope and baseline, and columns by name: `fixed` by
+        place and filter if they are the same for all metrics and baselines of a place (scenario and
+        regime), `shared` by scope and row if they are the same for all baselines, else `separate`
+        by view and row.
     """
     scopes: dict[tuple[str, ...], dict[str, Any]] = {}
     for key, view in views.items():
         scopes.setdefault(tuple(key[:-1]), {})[key[-1]] = view
-    baselines = list(next(iter(scopes.values())))
-    tables = [[view["rows"] for view in scope.values()] for scope in scopes.values()]
-    columns: dict[str, dict[str, Any]] = {"shared": {}, "separate": {}}
-    for name in tables[0][0][0] if tables[0][0] else ():
-        values = [[[row[name] for row in rows] for rows in scope] for scope in tables]
-        is_shared = all(column == scope[0] for scope in values for column in scope)
-        kind = "shared" if is_shared else "separate"
-        columns[kind][name] = [scope[0] for scope in values] if is_shared else values
-    texts = [[_drop_rows(view) for view in scope.values()] for scope in scopes.values()]
+    first = next(iter(views.values()))["rows"]
+    columns: dict[str, dict[str, Any]] = {"fixed": {}, "shared": {}, "separate": {}}
+    for name in first[0] if first else ():
+        kind, values = _arrange_column(name, scopes, filters)
+        columns[kind][name] = (
+            encode_decimals(list(chain.from_iterable(values))) if name in _DECIMALS else values
+        )
     return {
         "keys": [list(key) for key in scopes],
-        "baselines": baselines,
-        "texts": texts,
+        "baselines": list(next(iter(scopes.values()))),
+        "texts": [[_drop_rows(view) for view in scope.values()] for scope in scopes.values()],
         **columns,
     }
+
+
+def _arrange_column(
+    name: str, scopes: Mapping[tuple[str, ...], Mapping[str, Any]], filters: Sequence[str]
+) -> tuple[str, list[Any]]:
+    """Return the kind of a column and its values: by place and filter, scope and row, or view and row."""
+    places: dict[tuple[str, ...], dict[str, Any]] = {}
+    is_fixed = name not in ("filter", *_DECIMALS)
+    separate = []
+    for key, scope in scopes.items():
+        separate.append([[row[name] for row in view["rows"]] for view in scope.values()])
+        for row in (row for view in scope.values() for row in view["rows"]):
+            place = places.setdefault(key[1:], {})
+            is_fixed = is_fixed and place.setdefault(row["filter"], row[name]) == row[name]
+    if is_fixed:
+        return "fixed", [[place[label] for label in filters] for place in places.values()]
+    if all(column == scope[0] for scope in separate for column in scope):
+        return "shared", [scope[0] for scope in separate]
+    return "separate", [column for scope in separate for column in scope]
 
 
 def _drop_rows(view: Mapping[str, Any]) -> dict[str, Any]:
@@ -140,51 +152,3 @@ def _encode_tracks(cell: Mapping[str, Any], carried: int) -> dict[str, Any]:
         for trace in cell.get("traces", [])
     ]
     return encoded
-
-
-def encode_levels(
-    values: Sequence[Any], bits: int = 8, *, is_signed: bool = False, is_smooth: bool = False
-) -> dict[str, Any]:
-    """Encode numbers as levels of equal ratio. Level 0 is a missing value.
-
-    Args:
-        values: Numbers, None or NaN where missing. Nested lists are flattened in the page.
-        bits: 8, or up to 16 in two bytes.
-        is_signed: Numbers of both signs: the upper half of the levels is positive, the middle is 0.
-        is_smooth: Store differences of neighbouring levels, which compress better for curves.
-
-    Returns:
-        Range of the absolute values, number of bits, flags and levels in base64.
-    """
-    numbers = np.array(values, dtype=float).ravel()
-    size = np.abs(numbers)
-    usable = np.isfinite(size) & (size > 0)
-    low, high = (
-        (float(size[usable].min()), float(size[usable].max())) if usable.any() else (1.0, 1.0)
-    )
-    if is_signed:
-        low = max(low, high / 1e4)
-    low, high = float(f"{low:.4g}"), max(float(f"{high:.4g}"), float(f"{low:.4g}") * (1 + 1e-9))
-    top = 2 ** (bits - 1) - 1 if is_signed else 2**bits - 1
-    share = np.log(np.clip(size, low, high) / low) / np.log(high / low)
-    levels = np.where(usable, 1 + np.rint(share * (top - 1)), 0).astype(np.int64)
-    if is_signed:
-        middle = 2 ** (bits - 1)
-        levels = np.where(np.isfinite(size), middle + np.sign(numbers) * levels, 0).astype(np.int64)
-    code: dict[str, Any] = {"l": low, "h": high, "b": _pack_levels(levels, bits, is_smooth)}
-    code |= {"w": bits} if bits > 8 else {}
-    code |= {"s": 1} if is_signed else {}
-    return code | ({"d": 1} if is_smooth else {})
-
-
-def _pack_levels(levels: Levels, bits: int, is_smooth: bool) -> str:
-    """Return levels as bytes in base64; of two bytes, all upper ones first."""
-    if is_smooth:
-        levels = np.diff(levels, prepend=0) % 2**bits
-    if bits == 8:
-        packed = levels.astype(np.uint8).tobytes()
-    else:
-        packed = (levels >> 8).astype(np.uint8).tobytes() + (levels & 255).astype(
-            np.uint8
-        ).tobytes()
-    return base64.b64encode(packed).decode("ascii")
