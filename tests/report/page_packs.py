@@ -34,7 +34,7 @@ def build_pack(
     instants: int = 60,
     carried: int = 10,
     plane: bool = True,
-    prefix: str = "f",
+    numbered: bool = False,
 ) -> dict[str, Any]:
     """Build a pack.
 
@@ -51,7 +51,7 @@ def build_pack(
         instants: Instants of a curve.
         carried: Runs of a cell whose tracks are in the pack.
         plane: Whether the worlds have a plane.
-        prefix: Start of the label of each filter, before its number.
+        numbered: Labels of the filters are whole numbers, in falling order.
     """
     rng = np.random.default_rng(seed)
     shape = (filters, worlds, regimes)
@@ -63,7 +63,7 @@ def build_pack(
         errors[i] = np.nan
     for i in missing:
         errors[i] = np.nan
-    keys = [f"{prefix}{i}" for i in range(filters)]
+    keys = [str(filters - i) if numbered else f"f{i}" for i in range(filters)]
     built = _Numbers(keys, errors, set(lost), set(missing), rng)
     cells = list(itertools.product(range(worlds), range(regimes)))
     tracks = (

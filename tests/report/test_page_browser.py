@@ -30,7 +30,7 @@ PACKS = {
     "single": page_packs.build_pack(1, 1, 1, 1),
     "lost": page_packs.build_pack(4, 2, 1, 6, lost=range(4)),
     "equal": page_packs.build_pack(5, 2, 2, 8, equal=True),
-    "many": page_packs.build_pack(33, 7, 4, 4, carried=0, instants=10, prefix=""),
+    "many": page_packs.build_pack(33, 7, 4, 4, carried=0, instants=10, numbered=True),
 }  # fmt: skip
 
 
