@@ -99,10 +99,10 @@ def _arrange_column(
     for key, scope in scopes.items():
         separate.append([[row[name] for row in view["rows"]] for view in scope.values()])
         for row in (row for view in scope.values() for row in view["rows"]):
-            place = places.setdefault(key[1:], {})
-            is_fixed = is_fixed and place.setdefault(row["filter"], row[name]) == row[name]
+            by_filter = places.setdefault(key[1:], {})
+            is_fixed = is_fixed and by_filter.setdefault(row["filter"], row[name]) == row[name]
     if is_fixed:
-        return "fixed", [[place[label] for label in filters] for place in places.values()]
+        return "fixed", [[by_filter[label] for label in filters] for by_filter in places.values()]
     if all(column == scope[0] for scope in separate for column in scope):
         return "shared", [scope[0] for scope in separate]
     return "separate", [column for scope in separate for column in scope]

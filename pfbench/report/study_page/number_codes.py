@@ -77,9 +77,9 @@ def encode_decimals(values: Sequence[Any]) -> dict[str, Any]:
     """
     numbers = np.array(values, dtype=float).ravel()
     usable = np.isfinite(numbers) & (numbers != 0)
-    parts = [f"{value:.3e}".split("e") for value in np.where(usable, numbers, 1.0).tolist()]
-    mantissa = np.array([int(part[0].replace(".", "")) for part in parts])
-    exponent = np.array([int(part[1]) for part in parts])
+    texts = [f"{value:.3e}".split("e") for value in np.where(usable, numbers, 1.0).tolist()]
+    mantissa = np.array([int(text[0].replace(".", "")) for text in texts])
+    exponent = np.array([int(text[1]) for text in texts])
     exact = [float(f"{m}e{e - 3}") for m, e in zip(mantissa, exponent, strict=True)]
     if np.any(usable & (np.array(exact) != numbers)) or (numbers < 0).any():
         raise ValueError(
@@ -115,14 +115,14 @@ def compress_pack(pack: Mapping[str, Any]) -> str:
 
 
 def _move_codes(value: Any, codes: list[bytes]) -> Any:
-    """Return a value with lengths in place of bytes, which are moved to a list in the order of a browser."""
+    """Return a value with lengths in place of bytes, which go to a list in the order of a browser."""
     if isinstance(value, Mapping):
         if isinstance(value.get(CODE), bytes):
             codes.append(value[CODE])
             return {**value, CODE: len(value[CODE])}
         keys = sorted(value, key=_browser_order)
-        moved = {key: _move_codes(value[key], codes) for key in keys}
-        return {key: moved[key] for key in value}
+        lengths = {key: _move_codes(value[key], codes) for key in keys}
+        return {key: lengths[key] for key in value}
     if isinstance(value, list | tuple):
         return [_move_codes(item, codes) for item in value]
     return value
