@@ -66,10 +66,10 @@ def encode_views(views: Mapping[tuple[str, ...], Any], filters: Sequence[str]) -
         filters: Labels of the filters.
 
     Returns:
-        Keys of the scopes, baselines, texts by scope and baseline, and columns by name: `fixed` by
-        place and filter if they are the same for all metrics and baselines of a place (scenario and
-        regime), `shared` by scope and row if they are the same for all baselines, else `separate`
-        by view and row.
+        Keys of the scopes, baselines, texts by scope and baseline, and columns by name. A place is a
+        scenario with a regime. `fixed` columns, by place and filter, are the same for all metrics
+        and baselines. `shared` ones, by scope and row, are the same for all baselines. All
+        others are `separate`, by view and row.
     """
     scopes: dict[tuple[str, ...], dict[str, Any]] = {}
     for key, view in views.items():
