@@ -36,7 +36,7 @@ def method_of(name: str) -> Any:
 
 DENSE = ("mcmc_bridge", "mcmc_rpf_printed", "mcmc_tail")
 
-BRANCHING = ("gpb1", "imm", "gaussian_sum")
+BRANCHING = ("gpb1", "imm", "gaussian_sum", "rbpf_discrete")
 
 REMEMBERING = ("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf")
 

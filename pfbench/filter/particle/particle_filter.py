@@ -38,7 +38,9 @@ from pfbench.filter.particle.resampling import EssResampler, Resampler
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.particle.weight_update import (
     BayesWeightUpdate,
+    MemoryWeightUpdate,
     WeightUpdate,
+    compute_updated_weights,
     deactivate_invalid_particles,
     normalise_updated_weights,
 )
@@ -72,7 +74,7 @@ class ParticleFilter(Filter):
 
     Raises:
         ValueError: If there are fewer than two particles, if moves need a past that the resampler
-            does not copy, or if they cannot share one.
+            does not copy or cannot share one, or if they would not leave the weights invariant.
     """
 
     particles: int
@@ -81,7 +83,7 @@ class ParticleFilter(Filter):
     auxiliary_weights: AuxiliaryWeights = field(default_factory=PosteriorWeights)
     moves: tuple[Move, ...] = ()
     proposal: Proposal = field(default_factory=BootstrapProposal)
-    weight_update: WeightUpdate = field(default_factory=BayesWeightUpdate)
+    weight_update: WeightUpdate | MemoryWeightUpdate = field(default_factory=BayesWeightUpdate)
     points: PointSet = field(default_factory=IidPoints)
 
     def __post_init__(self) -> None:
@@ -95,6 +97,12 @@ class ParticleFilter(Filter):
                 f"filter.particles must be at least 2, got {self.particles}. Choose more particles."
             )
         _ = self.is_exact  # warns of each stage that does not state it
+        if self.moves and isinstance(self.weight_update, MemoryWeightUpdate):
+            raise ValueError(
+                "filter.moves must be empty with a weight update that replaces the model's "
+                f"likelihood, got {len(self.moves)} with {type(self.weight_update).__name__}. "
+                "Remove the moves: they use the likelihood of the model."
+            )
         if self.history is not None and not isinstance(self.resampler, EssResampler):
             name = type(self.resampler).__name__
             raise ValueError(
@@ -171,7 +179,9 @@ class ParticleFilter(Filter):
         """
         parents, trace = self._resample_and_move(model, belief, record, draws)
         x, log_ratio, memory, w, proposal_trace = self.proposal(model, parents, record, draws)
-        log_w = self.weight_update(model, parents.log_w, x, log_ratio, record)
+        log_w, carried, counts = compute_updated_weights(
+            self.weight_update, model, parents.log_w, x, log_ratio, record, parents.memory
+        )
         x, log_w = deactivate_invalid_particles(x, log_w, parents.x)
         predicted_log_w = parents.log_w + log_ratio
         # a lost run keeps an evidence of -inf and continues with equal weights
@@ -182,13 +192,13 @@ class ParticleFilter(Filter):
             x=x,
             log_w=log_w,
             log_evidence=belief.log_evidence + total,
-            memory=memory,
+            memory=memory | carried,
             ancestors=None,
         )
         if (history := self.history) is not None:
             children = history.append(model, parents, children, w, record)
         moments = weighted_mean_variance(model, children, normalised_w)
-        return children, StepSummary(*moments, predicted_log_w, trace | proposal_trace)
+        return children, StepSummary(*moments, predicted_log_w, trace | proposal_trace | counts)
 
     def _resample_and_move(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream

@@ -165,15 +165,27 @@ def compute_nis(
         y_hat = y[:, 0] + model.residual(y[:, 0], y[:, 0])  # infinite becomes NaN
         covariance = covariance[:, 0]
     else:
-        y_hat, covariance = _predicted_moments(model, y, covariance, normalise_log_weights(log_w))
+        w = normalise_log_weights(log_w)
+        y_hat, spread, noise = predict_moments(model, y, covariance, w)
+        covariance = spread + noise
     r = torch.where(observed_mask, model.residual(record.y.nan_to_num(), y_hat), 0.0)
     return squared_length(r, mask_covariance(covariance, observed_mask)), observed_mask.sum(1)
 
 
-def _predicted_moments(
+def predict_moments(
     model: StateSpaceModel, y: Tensor, covariance: Tensor, w: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return mean [R, k] and covariance [R, k, k] of a measurement by weighted particles."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the moments of a measurement predicted by weighted particles.
+
+    Args:
+        model: State-space model.
+        y: Mean measurement of each particle, [R, N, k].
+        covariance: Covariance of the measurement noise, [R, N or 1, k, k].
+        w: Normalised weights, [R, N].
+
+    Returns:
+        Mean [R, k], covariance due to the particles [R, k, k], and mean noise covariance [R or 1, k, k].
+    """
     y_hat = around_first(model.residual)(y, w)
     deviations = torch.where(w.unsqueeze(-1) > 0.0, model.residual(y, y_hat.unsqueeze(1)), 0.0)
     noise = (
@@ -181,7 +193,7 @@ def _predicted_moments(
     )
     all_components = torch.arange(y.shape[-1], device=y.device).unsqueeze(0)
     spread = _spread(deviations, torch.zeros_like(y_hat), w, all_components).squeeze(1)
-    return y_hat, spread + noise
+    return y_hat, spread, noise
 
 
 def _count_distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -38,6 +39,76 @@ class WeightUpdate(Protocol):
         Returns:
             Log weights, [R, N], not normalised.
         """
+
+
+class UpdatedWeights(NamedTuple):
+    """Result of a weight update with memory.
+
+    Attributes:
+        log_w: Log weights, [R, N], not normalised.
+        memory: Values for the next step by name, [R, 1, ...], equal for all particles of a run.
+        trace: Numbers per run for the report, {name: [R]}.
+    """
+
+    log_w: Tensor
+    memory: dict[str, Tensor]
+    trace: dict[str, Tensor]
+
+
+class MemoryWeightUpdate(ABC):
+    """Weight update that judges a measurement by the predicted particles, with a memory."""
+
+    @abstractmethod
+    def update_weights(
+        self,
+        model: StateSpaceModel,
+        log_w: Tensor,
+        x: Tensor,
+        log_ratio: Tensor,
+        record: Record,
+        memory: dict[str, Tensor],
+    ) -> UpdatedWeights:
+        """Compute the weights after the measurement.
+
+        Args:
+            model: State-space model of the step.
+            log_w: Log weights before the measurement, [R, N].
+            x: Particles, [R, N, D].
+            log_ratio: Density ratio of the proposal, [R, N].
+            record: Record of the step.
+            memory: Memory of the particles at t-1, with the values of this update.
+
+        Returns:
+            Weights, values for the next step and numbers for the report.
+        """
+
+
+def compute_updated_weights(
+    weight_update: WeightUpdate | MemoryWeightUpdate,
+    model: StateSpaceModel,
+    log_w: Tensor,
+    x: Tensor,
+    log_ratio: Tensor,
+    record: Record,
+    memory: dict[str, Tensor],
+) -> UpdatedWeights:
+    """Apply a weight update with or without memory.
+
+    Args:
+        weight_update: Weight update of the filter.
+        model: State-space model of the step.
+        log_w: Log weights before the measurement, [R, N].
+        x: Particles, [R, N, D].
+        log_ratio: Density ratio of the proposal, [R, N].
+        record: Record of the step.
+        memory: Memory of the particles at t-1.
+
+    Returns:
+        Weights, values for the next step and numbers for the report.
+    """
+    if isinstance(weight_update, MemoryWeightUpdate):
+        return weight_update.update_weights(model, log_w, x, log_ratio, record, memory)
+    return UpdatedWeights(weight_update(model, log_w, x, log_ratio, record), {}, {})
 
 
 @dataclass(frozen=True)

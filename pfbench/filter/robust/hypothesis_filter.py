@@ -91,7 +91,7 @@ class HypothesisFilter(ABC):
             model: State-space model of the step.
             belief: Belief at t-1.
             record: Measurement and inputs of step t.
-            draws: Random stream, not used.
+            draws: Random stream of the step.
 
         Returns:
             Belief at t and diagnostics.
@@ -106,7 +106,7 @@ class HypothesisFilter(ABC):
         evidence = joint.logsumexp(1)
         log_w = torch.where(torch.isfinite(evidence)[:, None], joint - evidence[:, None], log_prior)
         mean, covariance, offset = mixture_moments(model.chart, steps.branches, log_w.exp())
-        memory = self._keep(log_w, offset, steps.branches.covariance, number)
+        memory = self._keep(log_w, offset, steps.branches.covariance, number, draws)
         variance = covariance.diagonal(dim1=-2, dim2=-1)
         trace = {"hypothesis": (log_w.exp() * (number > 0)).sum(1)}
         prior = log_prior.exp()
@@ -135,7 +135,12 @@ class HypothesisFilter(ABC):
 
     @abstractmethod
     def _keep(
-        self, log_w: Tensor, offset: Tensor, covariance: Tensor, number: Tensor
+        self,
+        log_w: Tensor,
+        offset: Tensor,
+        covariance: Tensor,
+        number: Tensor,
+        draws: RandomStream,
     ) -> dict[str, Tensor]:
         """Return the memory of K branches of L updated ones."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,15 +11,15 @@ from typing_extensions import override
 
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation
-from pfbench.filter.robust.component_groups import ComponentGrouping
-from pfbench.filter.robust.robust_update import RobustUpdate
+from pfbench.filter.robust.component_groups import ComponentGrouping, GroupDistances
+from pfbench.filter.robust.robust_update import InnovationWeight
 from pfbench.filter.robust.weight_functions import quantile_table
 
 _STREAK = "rejected_streak"
 
 
 @dataclass(frozen=True)
-class InnovationGate(RobustUpdate):
+class InnovationGate(InnovationWeight):
     """Reject groups of components whose innovation is improbable [Mehra and Peschon 1971].
 
     A group is rejected if r' S^-1 r exceeds the quantile of chi-square. S is the block of the
@@ -58,17 +58,24 @@ class InnovationGate(RobustUpdate):
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
+        weight, _, counts = self.innovation_weight(innovation, belief.memory)
+        return innovation.reject(weight == 0.0), counts
+
+    @override
+    def innovation_weight(
+        self, innovation: Innovation, memory: Mapping[str, Tensor]
+    ) -> tuple[Tensor, GroupDistances, dict[str, Tensor]]:
         s = innovation.m @ innovation.m.mT + innovation.omega
-        groups = ComponentGrouping(self.grouping, self.groups).apply(innovation, s)
+        groups = self.component_grouping.apply(innovation, s)
         rejected_mask = innovation.observed_mask & (
             groups.squared_distance(innovation.r) > quantile_table(self.probability, groups.size)
         )
         counts = {}
         if self.patience:
-            streak = belief.memory.get(_STREAK, torch.zeros_like(innovation.r))
+            streak = memory.get(_STREAK, torch.zeros_like(innovation.r))
             rejected_mask = rejected_mask & (streak < self.patience)
             counts[_STREAK] = torch.where(
                 innovation.observed_mask, (streak + 1.0) * rejected_mask, streak
             )
         counts["rejected"] = groups.count_groups(rejected_mask)
-        return innovation.reject(rejected_mask), counts
+        return (~rejected_mask).to(innovation.r), groups, counts

@@ -17,7 +17,7 @@ from pfbench.filter.robust.component_groups import (
     ComponentGrouping,
 )
 from pfbench.filter.robust.robust_update import (
-    RobustUpdate,
+    ResidualLoss,
     check_threshold,
     count_downweighted,
     finite_weight,
@@ -25,14 +25,16 @@ from pfbench.filter.robust.robust_update import (
 )
 from pfbench.filter.robust.weight_functions import (
     WeightFunction,
+    huber_log_density,
     huber_weight,
     threshold_table,
+    welsch_log_loss,
     welsch_weight,
 )
 
 
 @dataclass(frozen=True)
-class MEstimationUpdate(RobustUpdate, ABC):
+class MEstimationUpdate(ResidualLoss, ABC):
     """Iterated reweighting by the residual after the update.
 
     It minimises |xi|^2 / 2 + sum rho(d) over the groups of components, with d the distance of the
@@ -72,12 +74,24 @@ class MEstimationUpdate(RobustUpdate, ABC):
     def weight(self) -> WeightFunction:
         """Weight as a function of squared distances and thresholds."""
 
+    def table(self, size: Tensor) -> Tensor:
+        """Return the threshold of each group.
+
+        Args:
+            size: Observed components of the group, [R, k].
+        """
+        return threshold_table(self.weight, self.threshold, self.efficiency, size)
+
+    @override
+    def residual_weight(self, squared: Tensor, size: Tensor) -> Tensor:
+        return self.weight(squared, self.table(size))
+
     @override
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
-        groups = ComponentGrouping(self.grouping, self.groups).apply(innovation, innovation.noise)
-        threshold = threshold_table(self.weight, self.threshold, self.efficiency, groups.size)
+        groups = self.component_grouping.apply(innovation, innovation.noise)
+        threshold = self.table(groups.size)
         w = torch.ones_like(innovation.r)
         for _ in range(self.iterations):
             residual, _ = updated_residual(innovation.reweight(w, groups.group_mask))
@@ -89,10 +103,16 @@ class MEstimationUpdate(RobustUpdate, ABC):
 class HuberUpdate(MEstimationUpdate):
     """Huber's weight min(1, c / d): bounded influence [Huber 1964; Gandhi and Mili 2010]."""
 
+    is_density = True
+
     @property
     @override
     def weight(self) -> WeightFunction:
         return huber_weight
+
+    @override
+    def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
+        return huber_log_density(squared, size, self.table(size))
 
 
 @dataclass(frozen=True)
@@ -115,16 +135,18 @@ class CorrentropyUpdate(MEstimationUpdate):
         return welsch_weight
 
     @override
+    def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
+        return welsch_log_loss(squared, size, self.table(size))
+
+    @override
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
         if not self.weight_prior:
             return super().noise_adapt(innovation, belief)
-        groups = ComponentGrouping(self.grouping, self.groups).apply(innovation, innovation.noise)
-        threshold = threshold_table(self.weight, self.threshold, self.efficiency, groups.size)
-        prior_threshold = threshold_table(
-            self.weight, self.threshold, self.efficiency, torch.ones_like(innovation.m[:, 0])
-        )
+        groups = self.component_grouping.apply(innovation, innovation.noise)
+        threshold = self.table(groups.size)
+        prior_threshold = self.table(torch.ones_like(innovation.m[:, 0]))
         w, scale = torch.ones_like(innovation.r), torch.ones_like(innovation.m[:, 0])
         for _ in range(self.iterations):
             weighted = _scale_prior(innovation.reweight(w, groups.group_mask), scale)

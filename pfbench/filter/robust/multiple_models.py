@@ -9,6 +9,9 @@ References:
         Markovian switching coefficients".
     D. L. Alspach, H. W. Sorenson 1972, "Nonlinear Bayesian estimation using Gaussian sum
         approximations".
+    R. Chen, J. S. Liu 2000, "Mixture Kalman filters".
+    P. Fearnhead, P. Clifford 2003, "On-line inference for hidden Markov models via particle
+        filters".
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.robust.hypotheses import Branches
 from pfbench.filter.robust.hypothesis_filter import OFFSET, HypothesisFilter, branch_memory
@@ -62,7 +66,12 @@ class InteractingModelFilter(HypothesisFilter):
 
     @override
     def _keep(
-        self, log_w: Tensor, offset: Tensor, covariance: Tensor, number: Tensor
+        self,
+        log_w: Tensor,
+        offset: Tensor,
+        covariance: Tensor,
+        number: Tensor,
+        draws: RandomStream,
     ) -> dict[str, Tensor]:
         log_next = self.log_transition(log_w).expand(len(log_w), -1, -1)
         return branch_memory(offset, covariance, log_w, log_next)
@@ -113,17 +122,73 @@ class GaussianSumFilter(HypothesisFilter):
 
     @override
     def _keep(
-        self, log_w: Tensor, offset: Tensor, covariance: Tensor, number: Tensor
+        self,
+        log_w: Tensor,
+        offset: Tensor,
+        covariance: Tensor,
+        number: Tensor,
+        draws: RandomStream,
     ) -> dict[str, Tensor]:
-        heaviest_weights = log_w.topk(self.branches, 1)
-        index = heaviest_weights.indices[..., None]
-        log_weight = heaviest_weights.values - heaviest_weights.values.logsumexp(1, keepdim=True)
-        log_next = self.log_transition(log_w)[number[heaviest_weights.indices]]
+        index, log_weight = self._select(log_w, draws)
+        rows = index[..., None]
+        log_next = self.log_transition(log_w)[number[index]]
         used = (log_weight > -torch.inf)[..., None]
-        offset = torch.where(used, offset.gather(1, index.expand(-1, -1, offset.shape[-1])), 0.0)
-        rows = index[..., None].expand(-1, -1, *covariance.shape[2:])
-        covariance = covariance.gather(1, rows)
+        offset = torch.where(used, offset.gather(1, rows.expand(-1, -1, offset.shape[-1])), 0.0)
+        covariance = covariance.gather(1, rows[..., None].expand(-1, -1, *covariance.shape[2:]))
         heaviest = covariance[:, :1].expand_as(covariance)  # of branches that are never used again
         return branch_memory(
             offset, torch.where(used[..., None], covariance, heaviest), log_weight, log_next
         )
+
+    def _select(self, log_w: Tensor, draws: RandomStream) -> tuple[Tensor, Tensor]:
+        """Return the indices of the kept branches [R, K], the heaviest first, and log weights."""
+        heaviest = log_w.topk(self.branches, 1)
+        return heaviest.indices, heaviest.values - heaviest.values.logsumexp(1, keepdim=True)
+
+
+@dataclass(frozen=True)
+class MixtureKalmanFilter(GaussianSumFilter):
+    """Rao-Blackwellised particle filter with a discrete state, mixture Kalman filter.
+
+    A particle is a sequence of hypotheses with its Gaussian filter [Chen and Liu 2000]. Each is
+    continued with each hypothesis and weighed by its evidence, so that no hypothesis is drawn
+    without the measurement. K of the K M continuations are drawn by the resampling of Fearnhead and
+    Clifford (2003), which keeps the heavy ones. On a linear model the evidence is unbiased, which
+    that of the heaviest sequences is not.
+    """
+
+    @override
+    def _select(self, log_w: Tensor, draws: RandomStream) -> tuple[Tensor, Tensor]:
+        return select_unbiased(log_w, self.branches, draws.uniform("branch", 1, 1)[..., 0])
+
+
+def select_unbiased(log_w: Tensor, count: int, level: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw distinct weighted numbers such that expected weights are the weights.
+
+    A weight above the threshold 1 / c is kept. The others are drawn with probability c w by
+    systematic resampling, and receive the weight 1 / c. The expected squared error of the weights
+    is the smallest one [Fearnhead and Clifford 2003].
+
+    Args:
+        log_w: Log weights, [R, L], logsumexp 0.
+        count: Number K of draws, at most L.
+        level: Uniform random number of each run, [R, 1].
+
+    Returns:
+        Indices [R, K], the heaviest first, and log weights [R, K]. Where fewer than K weights are
+        positive, the last ones are -inf.
+    """
+    w, order = log_w.exp().sort(1, descending=True)
+    rest = w.flip(1).cumsum(1).flip(1)[:, :count]  # sum of the weights from each one on
+    slots = torch.arange(count, 0, -1, device=w.device).to(w)
+    kept = (w[:, :count] * slots <= rest).to(torch.int8).argmax(1, keepdim=True)
+    threshold = rest.gather(1, kept) / slots.to(w)[kept]
+    probability = torch.where(threshold > 0.0, w / threshold, (w > 0.0).to(w)).clamp(max=1.0)
+    probability = torch.where(torch.arange(w.shape[1], device=w.device) < kept, 1.0, probability)
+    drawn = torch.arange(count, device=w.device) + level.to(w)
+    index = torch.searchsorted(probability.cumsum(1), drawn, right=True)
+    index = index.clamp(max=w.shape[1] - 1)
+    weight = torch.where(
+        torch.arange(count, device=w.device) < kept, w.gather(1, index), threshold.expand_as(index)
+    )
+    return order.gather(1, index), weight.log()

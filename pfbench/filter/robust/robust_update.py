@@ -6,6 +6,8 @@ to the model. Since it depends on y, the evidence of the filter is not a density
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import torch
 from torch import Tensor
 from typing_extensions import override
@@ -16,6 +18,7 @@ from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.robust.component_groups import (
     DOWNWEIGHTED,
+    ComponentGrouping,
     GroupDistances,
 )
 
@@ -24,15 +27,72 @@ class RobustUpdate(NoiseAdaptation):
     """Base of the updates that judge a measurement by its residual.
 
     A filter takes at most one of them: a second would judge the residual again.
+
+    Attributes:
+        grouping: Components with a common weight, see ComponentGrouping.
+        groups: Group number of each component, instead of `grouping`.
     """
 
     has_evidence = False
+    grouping: str
+    groups: Sequence[int] | None
+
+    @property
+    def component_grouping(self) -> ComponentGrouping:
+        """The groups of components that are judged together."""
+        return ComponentGrouping(self.grouping, self.groups)
 
     @override
     def predict_scale(
         self, predicted: AffineApproximation, belief: GaussianBelief
     ) -> AffineApproximation:
         return predicted
+
+
+class ResidualLoss(RobustUpdate):
+    """Base of the updates that follow from a loss of the residual, a function of its distance.
+
+    Attributes:
+        is_density: True if exp(-loss) is a density of the measurement given the state.
+    """
+
+    is_density: bool = False
+
+    def residual_weight(self, squared: Tensor, size: Tensor) -> Tensor:
+        """Compute the weight of groups.
+
+        Args:
+            squared: Squared distances d^2 of the residual by group.
+            size: Observed components of the group.
+        """
+        raise NotImplementedError
+
+    def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
+        """Compute minus the loss of groups in whitened coordinates, with its constant.
+
+        Args:
+            squared: Squared distances d^2 of the residual by group.
+            size: Observed components of the group.
+        """
+        raise NotImplementedError
+
+
+class InnovationWeight(RobustUpdate):
+    """Base of the updates that weigh a measurement by the innovation, in one step."""
+
+    def innovation_weight(
+        self, innovation: Innovation, memory: Mapping[str, Tensor]
+    ) -> tuple[Tensor, GroupDistances, dict[str, Tensor]]:
+        """Compute the weight of each component.
+
+        Args:
+            innovation: Innovation of the step.
+            memory: Values of this update from the step before, by name.
+
+        Returns:
+            Weights [R, k], 0 for a rejected component, the groups, and values by name, [R, ...].
+        """
+        raise NotImplementedError
 
 
 def updated_residual(innovation: Innovation) -> tuple[Tensor, Tensor]:

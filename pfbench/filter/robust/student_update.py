@@ -16,15 +16,16 @@ from pfbench.filter.robust.component_groups import (
     ComponentGrouping,
 )
 from pfbench.filter.robust.robust_update import (
-    RobustUpdate,
+    ResidualLoss,
     count_downweighted,
     finite_weight,
     updated_residual,
 )
+from pfbench.filter.robust.weight_functions import student_log_density
 
 
 @dataclass(frozen=True)
-class StudentUpdate(RobustUpdate):
+class StudentUpdate(ResidualLoss):
     """Student's t errors by a variational scale [Piche, Sarkka and Hartikainen 2012].
 
     y ~ N(H x, R / lambda), lambda ~ Gamma(nu / 2, nu / 2), and q(x) q(lambda) is optimised in
@@ -46,6 +47,7 @@ class StudentUpdate(RobustUpdate):
     iterations: int = 4
     grouping: str = "component"
     groups: Sequence[int] | None = None
+    is_density = True
 
     def __post_init__(self) -> None:
         ComponentGrouping(self.grouping, self.groups)
@@ -63,10 +65,20 @@ class StudentUpdate(RobustUpdate):
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
-        groups = ComponentGrouping(self.grouping, self.groups).apply(innovation, innovation.noise)
+        groups = self.component_grouping.apply(innovation, innovation.noise)
         w = torch.ones_like(innovation.r)
         for _ in range(self.iterations if math.isfinite(self.dof) else 0):
             residual, covariance = updated_residual(innovation.reweight(w, groups.group_mask))
             gamma = groups.squared_distance(residual) + groups.trace(covariance)
-            w = finite_weight((self.dof + groups.size) / (self.dof + gamma))
+            w = finite_weight(self.residual_weight(gamma, groups.size))
         return innovation.reweight(w, groups.group_mask), count_downweighted(groups, w)
+
+    @override
+    def residual_weight(self, squared: Tensor, size: Tensor) -> Tensor:
+        if math.isinf(self.dof):
+            return torch.ones_like(squared)
+        return (self.dof + size) / (self.dof + squared)
+
+    @override
+    def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
+        return student_log_density(squared, size, self.dof)

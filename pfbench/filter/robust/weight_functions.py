@@ -4,6 +4,9 @@ A weight w(d) multiplies the information of a measurement at the distance d. Its
 efficiency in k components with normal errors is A^2 / B with A = E[w d^2] / k and
 B = E[w^2 d^2] / k, d ~ chi_k [Huber and Ronchetti 2009]. A follows from Stein's lemma, so it
 holds for rejection too.
+
+A loss is the log density of a group of components at a squared distance. Huber's and Student's have
+the constant with which they integrate to 1. Welsch's is bounded and has the constant of the normal.
 """
 
 from __future__ import annotations
@@ -14,8 +17,11 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from scipy.special import chdtri, gammaln
+from scipy import special
 from torch import Tensor
+from torch.special import gammainc, gammaincc, gammaln
+
+from pfbench.filter.whitening import LOG_2PI
 
 _NODES = 4000  # of the quadrature over the distance
 _HALVINGS = 40
@@ -51,6 +57,52 @@ def welsch_weight(squared: Tensor, threshold: Tensor) -> Tensor:
     return torch.exp(-0.5 * squared / threshold.square())
 
 
+def huber_log_density(squared: Tensor, size: Tensor, threshold: Tensor) -> Tensor:
+    """Compute the log density exp(-d^2 / 2) up to c and exp(-c d + c^2 / 2) beyond, normalised.
+
+    Args:
+        squared: Squared distances d^2.
+        size: Number of components k.
+        threshold: Thresholds c.
+    """
+    c, half = threshold, 0.5 * size.clamp(min=1.0)
+    distance = squared.clamp(min=0.0).sqrt()
+    loss = torch.where(distance <= c, 0.5 * squared, c * distance - 0.5 * c.square())
+    log_sphere = math.log(2.0) + half * math.log(math.pi) - gammaln(half)
+    log_inside = (half - 1.0) * math.log(2.0) + gammaln(half) + gammainc(half, 0.5 * c**2).log()
+    tail = gammaincc(2.0 * half, c.square())
+    log_outside = 0.5 * c.square() - 2.0 * half * c.log() + gammaln(2.0 * half) + tail.log()
+    log_outside = torch.where(tail > 0.0, log_outside, -torch.inf)  # an infinite threshold
+    return -loss - log_sphere - torch.logaddexp(log_inside, log_outside)
+
+
+def student_log_density(squared: Tensor, size: Tensor, dof: float) -> Tensor:
+    """Compute the log density of Student's t in k components; normal for infinite dof.
+
+    Args:
+        squared: Squared distances d^2.
+        size: Number of components k.
+        dof: Degrees of freedom nu.
+    """
+    if math.isinf(dof):
+        return -0.5 * squared - 0.5 * size * LOG_2PI
+    half = 0.5 * (dof + size)
+    constant = gammaln(half) - math.lgamma(0.5 * dof) - 0.5 * size * math.log(dof * math.pi)
+    return constant - half * torch.log1p(squared / dof)
+
+
+def welsch_log_loss(squared: Tensor, size: Tensor, threshold: Tensor) -> Tensor:
+    """Compute -c^2 (1 - exp(-d^2 / (2 c^2))), with the constant of the normal density.
+
+    Args:
+        squared: Squared distances d^2.
+        size: Number of components k.
+        threshold: Thresholds c.
+    """
+    c2 = threshold.square()
+    return c2 * torch.expm1(-0.5 * squared / c2) - 0.5 * size * LOG_2PI
+
+
 WeightFunction = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -77,7 +129,7 @@ def _chi_nodes(k: int) -> tuple[Tensor, Tensor]:
     """Return squared distances and their probabilities for d ~ chi_k."""
     d = np.linspace(0.0, math.sqrt(k) + 12.0, _NODES + 1)[1:]
     probability = np.exp(
-        (k - 1) * np.log(d) - d * d / 2 - (k / 2 - 1) * math.log(2.0) - gammaln(k / 2)
+        (k - 1) * np.log(d) - d * d / 2 - (k / 2 - 1) * math.log(2.0) - special.gammaln(k / 2)
     )
     probability *= d[1] - d[0]
     return torch.from_numpy(d * d), torch.from_numpy(probability)
@@ -127,7 +179,7 @@ def quantile_table(probability: float, count: Tensor) -> Tensor:
         probability: Probability of a smaller value.
         count: Degrees of freedom, [R, k].
     """
-    return _look_up([float(chdtri(n, 1.0 - probability)) for n in _counts(count)], count)
+    return _look_up([float(special.chdtri(n, 1.0 - probability)) for n in _counts(count)], count)
 
 
 def _counts(count: Tensor) -> range:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -10,11 +10,9 @@ from typing_extensions import override
 
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation
-from pfbench.filter.robust.component_groups import (
-    ComponentGrouping,
-)
+from pfbench.filter.robust.component_groups import ComponentGrouping, GroupDistances
 from pfbench.filter.robust.robust_update import (
-    RobustUpdate,
+    InnovationWeight,
     check_threshold,
     count_downweighted,
     finite_weight,
@@ -26,7 +24,7 @@ from pfbench.filter.robust.weight_functions import (
 
 
 @dataclass(frozen=True)
-class WeightedLikelihoodUpdate(RobustUpdate):
+class WeightedLikelihoodUpdate(InnovationWeight):
     """Weighted observation likelihood, WoLF [Duran-Martin et al. 2024].
 
     The power W^2 of the likelihood divides R: W^2 = 1 / (1 + d^2 / c^2), in one step without
@@ -79,8 +77,14 @@ class WeightedLikelihoodUpdate(RobustUpdate):
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
-        grouping = ComponentGrouping(self.grouping, self.groups)
-        groups = grouping.apply(innovation, innovation.noise)
+        w, groups, counts = self.innovation_weight(innovation, {})
+        return innovation.reweight(w, groups.group_mask), counts
+
+    @override
+    def innovation_weight(
+        self, innovation: Innovation, memory: Mapping[str, Tensor]
+    ) -> tuple[Tensor, GroupDistances, dict[str, Tensor]]:
+        groups = self.component_grouping.apply(innovation, innovation.noise)
         threshold = threshold_table(cauchy_weight, self.threshold, self.efficiency, groups.size)
         squared = (
             groups.sum_groups(innovation.r.square())
@@ -88,4 +92,4 @@ class WeightedLikelihoodUpdate(RobustUpdate):
             else groups.squared_distance(innovation.r)
         )
         w = finite_weight(cauchy_weight(squared, threshold))
-        return innovation.reweight(w, groups.group_mask), count_downweighted(groups, w)
+        return w, groups, count_downweighted(groups, w)

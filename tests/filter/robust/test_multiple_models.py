@@ -18,7 +18,12 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.robust.hypotheses import NoiseHypotheses
-from pfbench.filter.robust.multiple_models import GaussianSumFilter, InteractingModelFilter
+from pfbench.filter.robust.multiple_models import (
+    GaussianSumFilter,
+    InteractingModelFilter,
+    MixtureKalmanFilter,
+    select_unbiased,
+)
 from pfbench.model.linear_gaussian import LinearGaussian
 
 F = np.array([[1.0, 1.0], [0.0, 1.0]])
@@ -127,9 +132,10 @@ def test_three_hypotheses_with_impossible_transitions() -> None:
     assert float(found.log_evidence[0]) == pytest.approx(log_z, rel=1e-10)
 
 
-def test_a_gaussian_sum_of_all_sequences_is_exact() -> None:
+@pytest.mark.parametrize("method", [GaussianSumFilter, MixtureKalmanFilter])
+def test_a_gaussian_sum_of_all_sequences_is_exact(method: Any) -> None:
     mean, variance, log_z = exact_mixture(Y)
-    found = run(GaussianSumFilter(hypotheses(), branches=2 ** len(Y)))
+    found = run(method(hypotheses(), branches=2 ** len(Y)))
     np.testing.assert_allclose(found.mean[0, -1], mean, rtol=1e-10)
     np.testing.assert_allclose(found.variance[0, -1], variance, rtol=1e-10)
     assert float(found.log_evidence[0]) == pytest.approx(log_z, abs=1e-10)
@@ -154,7 +160,35 @@ def test_few_branches_and_merging_are_near_the_exact_mixture() -> None:
     assert merged[1] < 0.6
 
 
-@pytest.mark.parametrize("name", ["imm", "gpb1", "gaussian_sum"])
+def test_few_sequences_of_a_discrete_state_have_the_evidence_of_all() -> None:
+    """E Z = Z over 1500 runs of the same measurements; the heaviest sequences alone fall short."""
+    _, _, log_z = exact_mixture(Y)
+    y = np.tile(Y, (1500, 1))
+    ratio = (run(MixtureKalmanFilter(hypotheses(), branches=3), y).log_evidence - log_z).exp()
+    error = float(ratio.std()) / math.sqrt(len(ratio))
+    heaviest = float(run(GaussianSumFilter(hypotheses(), branches=3)).log_evidence[0])
+    assert abs(float(ratio.mean()) - 1.0) < 4 * error
+    assert abs(math.exp(heaviest - log_z) - 1.0) > 8 * error
+
+
+def test_sequences_are_drawn_with_their_weights() -> None:
+    """Expected weights are the weights, heavy ones stay, none is drawn twice."""
+    rng = np.random.default_rng(3)
+    w = rng.dirichlet(0.3 * np.ones(12))
+    levels = (torch.arange(4000, dtype=torch.float64)[:, None] + 0.5) / 4000
+    log_w = torch.tensor(w).log().expand(4000, -1)
+    index, kept = select_unbiased(log_w, 5, levels)
+    assert all(len(set(row)) == 5 for row in index[:500].tolist())
+    drawn = torch.zeros_like(log_w).scatter_add_(1, index, kept.exp()).numpy()
+    np.testing.assert_allclose(drawn.mean(0), w, atol=2e-4)  # an integral over the level
+    assert (drawn[:, w > w.sum() / 5] == w[w > w.sum() / 5]).all()
+    few = torch.tensor([[0.7, 0.3, 0.0, 0.0]]).log()
+    index, kept = select_unbiased(few, 3, torch.tensor([[0.4]]))
+    assert index[0, :2].tolist() == [0, 1]
+    assert kept[0].exp().tolist() == pytest.approx([0.7, 0.3, 0.0])
+
+
+@pytest.mark.parametrize("name", ["imm", "gpb1", "gaussian_sum", "rbpf_discrete"])
 def test_the_evidence_is_a_density(name: str) -> None:
     """It integrates to 1 over the second measurement, given the first."""
     grid = np.linspace(-60.0, 60.0, 2001)
@@ -163,7 +197,7 @@ def test_the_evidence_is_a_density(name: str) -> None:
     assert np.trapezoid(np.exp(both.numpy() - first), grid) == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.parametrize("method", [InteractingModelFilter, GaussianSumFilter])
+@pytest.mark.parametrize("method", [InteractingModelFilter, GaussianSumFilter, MixtureKalmanFilter])
 def test_equal_hypotheses_are_the_kalman_filter(method: Any) -> None:
     same = hypotheses(process_factors=(1.0, 1.0), measurement_factors=(1.0, 1.0))
     found, plain = run(method(same)), run(GaussianFilter(TaylorLinearisation()))
