@@ -73,7 +73,7 @@ class ParticleFilter(Filter):
         points: Point set of the initial particles. Stages have their own.
 
     Raises:
-        ValueError: If there are fewer than two particles, if moves need a past that the resampler
+        ValueError: If there are fewer than two particles. If moves need a past that the resampler
             does not copy or cannot share one, or if they would not leave the weights invariant.
     """
 
