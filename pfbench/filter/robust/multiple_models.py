@@ -181,14 +181,18 @@ def select_unbiased(log_w: Tensor, count: int, level: Tensor) -> tuple[Tensor, T
     w, order = log_w.exp().sort(1, descending=True)
     rest = w.flip(1).cumsum(1).flip(1)[:, :count]  # sum of the weights from each one on
     slots = torch.arange(count, 0, -1, device=w.device).to(w)
-    kept = (w[:, :count] * slots <= rest).to(torch.int8).argmax(1, keepdim=True)
-    threshold = rest.gather(1, kept) / slots.to(w)[kept]
+    heavy_count = (w[:, :count] * slots <= rest).to(torch.int8).argmax(1, keepdim=True)
+    threshold = rest.gather(1, heavy_count) / slots.to(w)[heavy_count]
     probability = torch.where(threshold > 0.0, w / threshold, (w > 0.0).to(w)).clamp(max=1.0)
-    probability = torch.where(torch.arange(w.shape[1], device=w.device) < kept, 1.0, probability)
-    drawn = torch.arange(count, device=w.device) + level.to(w)
-    index = torch.searchsorted(probability.cumsum(1), drawn, right=True)
+    probability = torch.where(
+        torch.arange(w.shape[1], device=w.device) < heavy_count, 1.0, probability
+    )
+    target = torch.arange(count, device=w.device) + level.to(w)
+    index = torch.searchsorted(probability.cumsum(1), target, right=True)
     index = index.clamp(max=w.shape[1] - 1)
     weight = torch.where(
-        torch.arange(count, device=w.device) < kept, w.gather(1, index), threshold.expand_as(index)
+        torch.arange(count, device=w.device) < heavy_count,
+        w.gather(1, index),
+        threshold.expand_as(index),
     )
     return order.gather(1, index), weight.log()
