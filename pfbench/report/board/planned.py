@@ -127,10 +127,14 @@ def _find_kind(method: MethodLook, baseline: MethodLook) -> str:
 def _describe_gap(decision: Decision, track: Decision) -> str:
     """Return the reason of a missing ratio or interval, empty if the pair has both.
 
-    Where tracks are not kept, the reason has the shares of runs won and those of runs that keep track.
+    Where tracks are not kept, it has the shares of runs won and of runs that keep track, short enough for
+    the cell of a table.
     """
     if decision.reason == RUNS_WON:
-        return f"{RUNS_WON}: {describe_runs_won(decision)}; track kept in {describe_shares(track)}"
+        text = f"runs won: {describe_runs_won(decision)}; track kept: {describe_shares(track)}"
+        for long, short in (("difference ", ""), ("percentage points", "points"), (" of runs", "")):
+            text = text.replace(long, short)
+        return text
     if decision.reason:
         return decision.reason
     if decision.scale == "log ratio":

@@ -157,9 +157,7 @@ def _decide(
         return MISSING, "not run in all conditions"
     if best is None or not np.isfinite(levels.level[i]):
         off = levels.off[i]
-        return NOT_KEPT, "track not kept" + f" in {off.sum()} of {off.size} conditions" * (
-            off.size > 1
-        )
+        return NOT_KEPT, "track not kept" + f", {off.sum()}/{off.size}" * (off.size > 1)
     if i == best:
         return BEST, "smallest"
     estimate = levels.difference(i, best)
