@@ -130,17 +130,17 @@ def at_reference(scenario: UrbanDrive) -> tuple[Record, Any]:
     way = torch.cat([world.truth["position"], world.truth["height"]], -1)[0]
     u: UrbanInputs = world.record.u
     y = world.record.y[0] - range_change(way.unsqueeze(1), u.line[0], u.reach[0])[:, 0]
-    seen = ~torch.isnan(y).all(-1)
-    span = torch.diff(world.time[seen], prepend=world.time[seen][:1] - 1.0)
+    mask = ~torch.isnan(y).all(-1)
+    span = torch.diff(world.time[mask], prepend=world.time[mask][:1] - 1.0)
     parts = u._replace(duration=span[None], speed=0.0 * span[None], yaw_rate=0.0 * span[None])
-    selected = (a if a.shape[1] == len(span) else a[:, seen] for a in parts)
+    selected = (a if a.shape[1] == len(span) else a[:, mask] for a in parts)
     tuning = replace(
         scenario.tuning, distance_density=STILL, heading_density=STILL, height_density=STILL, scale_density=STILL,
         yaw_bias_density=STILL, initial_position_sd=[STILL] * 3, initial_heading_sd_deg=STILL, initial_scale_sd=STILL,
         initial_yaw_bias_sd=STILL, initial_clock_sd=5.0,
     )  # fmt: skip
     return Record(
-        y[seen].unsqueeze(0), UrbanInputs(*selected), torch.zeros(1, 9, dtype=torch.float64)
+        y[mask].unsqueeze(0), UrbanInputs(*selected), torch.zeros(1, 9, dtype=torch.float64)
     ), tuning
 
 
@@ -184,8 +184,8 @@ def evidence(distribution: PseudorangeError, stretch: str) -> tuple[float, float
             again,
             PhiloxStream(6, torch.arange(4)),
         )
-    each = estimate.log_evidence / (~torch.isnan(record.y)).sum()
-    return float(each.mean()), float(each.std())
+    per_range = estimate.log_evidence / (~torch.isnan(record.y)).sum()
+    return float(per_range.mean()), float(per_range.std())
 
 
 def estimate_maximum_likelihood(stretch: str) -> dict[str, Any]:
@@ -230,8 +230,8 @@ def take_posterior_mean(posterior: ParameterPosterior) -> LosNlosRangeError:
 
 def with_share(posterior: ParameterPosterior) -> ParameterPosterior:
     """Posterior with the share in place of its logit."""
-    drawn = {name: posterior.draws["odds" if name == "share" else name] for name in PRIOR_OF_TABLE}
-    return replace(posterior, draws=drawn | {"share": torch.sigmoid(drawn["share"])})
+    draws = {name: posterior.draws["odds" if name == "share" else name] for name in PRIOR_OF_TABLE}
+    return replace(posterior, draws=draws | {"share": torch.sigmoid(draws["share"])})
 
 
 def estimate_timed(
@@ -412,14 +412,16 @@ def position_table(scores: Scores) -> list[str]:
     for ((name, _, stretch), a), b, p, corrected in zip(
         mixtures, usual, raw, holm(raw), strict=True
     ):
-        own, normal = (f"{np.median(x):.1f} ({x.min():.1f} to {x.max():.1f})" for x in (a, b))
+        mixture_text, normal_text = (
+            f"{np.median(x):.1f} ({x.min():.1f} to {x.max():.1f})" for x in (a, b)
+        )
         cells = (
             f"{np.median(a - b):.1f}",
             f"{(a < b).sum()} of {len(a)} runs",
             f"{p:.2g}",
             f"{corrected:.2g}",
         )
-        lines.append(markdown_row(stretch, name, own, normal, *cells))
+        lines.append(markdown_row(stretch, name, mixture_text, normal_text, *cells))
     return lines
 
 
@@ -430,11 +432,14 @@ def read_parts(
     posteriors: dict[str, ParameterPosterior] = {}
     distributions: dict[str, dict[str, PseudorangeError]] = {}
     for stretch in STRETCHES:
-        part = results(
+        parameters = results(
             f"maximum likelihood, {stretch}", partial(estimate_maximum_likelihood, stretch)
         )
-        mixture = LosNlosRangeError(*part["mixture"])
-        distributions[stretch] = {"normal": NormalRangeError(part["normal"]), "mixture": mixture}
+        mixture = LosNlosRangeError(*parameters["mixture"])
+        distributions[stretch] = {
+            "normal": NormalRangeError(parameters["normal"]),
+            "mixture": mixture,
+        }
         if draws:
             work = partial(estimate_timed, stretch, mixture, draws, warmup)
             stored = results(f"posterior, {stretch}", work)["posterior"]
@@ -532,16 +537,16 @@ def plot_scores(scores: Scores) -> Figure:
     for (top, bottom), stretch in zip(axes.T, STRETCHES, strict=True):
         for x, (name, look) in enumerate(style.items()):
             for source in sorted(STRETCHES, key=stretch.__eq__):
-                own, mean = source == stretch, scores["evidence"][name, source, stretch][0]
-                face = "none" if own else look.colour
+                is_same, mean = source == stretch, scores["evidence"][name, source, stretch][0]
+                face = "none" if is_same else look.colour
                 top.plot(
-                    x + 0.14 * (2 * own - 1),
+                    x + 0.14 * (2 * is_same - 1),
                     mean,
                     look.marker,
                     color=look.colour,
                     markerfacecolor=face,
                 )
-                if not own:
+                if not is_same:
                     rms = scores["position"][name, source, stretch]
                     bottom.plot(
                         x + compute_jitter(len(rms)),
@@ -581,14 +586,14 @@ def main(folder: Path, draws: int = 400, warmup: int = 100) -> None:
     results = ResumableResults(folder / "learn_canyon_noise.json", request)
     _, posteriors, scores = read_parts(results, draws, warmup)
     (folder / "report.md").write_text(write_page(request, results.state["done"]))
-    drawn = {
+    chains = {
         f"{stretch} stretch": with_share(posterior) for stretch, posterior in posteriors.items()
     }
     with matplotlib.rc_context(RC):
         (folder / "scores.png").write_bytes(render_palette_png(plot_scores(scores)))
-        if drawn:
+        if chains:
             (folder / "posterior.png").write_bytes(
-                render_palette_png(plot_posterior(drawn, PRIOR_OF_TABLE, names=LABELS))
+                render_palette_png(plot_posterior(chains, PRIOR_OF_TABLE, names=LABELS))
             )
 
 

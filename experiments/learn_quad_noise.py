@@ -123,7 +123,7 @@ def evaluate(tuning: StrapdownTuning) -> dict[str, list[float]]:
         error = model.error(estimate.mean, model.assemble(episode.truth))
         inside = (error[..., 6:9].abs() < 1.645 * estimate.variance[..., 6:9].sqrt()).double()
         valid_mask = ~torch.isnan(error[..., 6])
-        parts = {
+        measures = {
             "position": compute_rms(error[..., 6:9], valid_mask),
             "tilt": compute_rms(error[..., :2], valid_mask),
             "yaw": compute_rms(error[..., 2:3], valid_mask),
@@ -132,8 +132,8 @@ def evaluate(tuning: StrapdownTuning) -> dict[str, list[float]]:
         }
         # runs of one flight are not independent, so a flight counts once
         results |= {
-            f"{name} {part}": value.view(REPEATS, -1).mean(0).tolist()
-            for part, value in parts.items()
+            f"{name} {measure}": value.view(REPEATS, -1).mean(0).tolist()
+            for measure, value in measures.items()
         }
     return results
 
@@ -231,7 +231,7 @@ OTHERS = {"hand": "the values set by hand", "sheet": "the data sheet"}
 
 def verdicts(scores: Scores, method: str) -> dict[tuple[str, str], dict[str, float]]:
     """The estimated values against the others by measure, with Holm's correction over all."""
-    pairs = [(part, other) for part in MEASURES for other in OTHERS]
+    pairs = [(measure, rival) for measure in MEASURES for rival in OTHERS]
     results = [
         compare(scores["estimated"][f"{method.lower()} {a}"], scores[b][f"{method.lower()} {a}"])
         for a, b in pairs
@@ -255,24 +255,26 @@ def scores_table(results: Mapping[tuple[str, str], Mapping[str, float]], method:
         "p, Holm",
     )
     lines = markdown_head(*names)
-    for part, label in MEASURES.items():
+    for measure, label in MEASURES.items():
         cells = []
-        for other in OTHERS:
-            v = results[part, other]
+        for rival in OTHERS:
+            v = results[measure, rival]
             span = f"{format_plain(v['difference'])} ({format_plain(v['low'])} to {format_plain(v['high'])})"
             cells += [f"{v['b']:#.4g}", span, f"{v['p']:.1g}, {v['holm']:.1g}"]
-        lines.append(markdown_row(label, f"{results[part, 'hand']['a']:#.4g}", *cells))
+        lines.append(markdown_row(label, f"{results[measure, 'hand']['a']:#.4g}", *cells))
     return lines
 
 
 def describe_decisions(results: Mapping[tuple[str, str], Mapping[str, float]], method: str) -> str:
     """Significant differences of one filter."""
     parts = []
-    for other, label in OTHERS.items():
+    for rival, label in OTHERS.items():
         names = [
-            MEASURES[part].split(",")[0] for part in MEASURES if results[part, other]["holm"] < 0.05
+            MEASURES[measure].split(",")[0]
+            for measure in MEASURES
+            if results[measure, rival]["holm"] < 0.05
         ]
-        least = min(results[part, other]["holm"] for part in MEASURES)
+        least = min(results[measure, rival]["holm"] for measure in MEASURES)
         parts.append(
             f"Against {label}, significant differences: {', '.join(names) or 'none'} (smallest corrected p {least:.1g})."
         )
@@ -294,7 +296,9 @@ CAVEATS = (
 def read_scores(done: Mapping[str, Any]) -> Scores:
     """Scores by set of values, from the stored parts."""
     return {
-        name.removeprefix("scores: "): {part: np.array(values) for part, values in scores.items()}
+        name.removeprefix("scores: "): {
+            measure: np.array(values) for measure, values in scores.items()
+        }
         for name, scores in done.items()
         if name.startswith("scores: ")
     }
@@ -354,12 +358,12 @@ def plot_differences(scores: Scores) -> Figure:
     style = line_styles(list(labels))
     figure = Figure(figsize=(2 * COLUMN, 2.2), layout="constrained")
     axes = figure.subplots(1, 2)
-    for axis, (part, label_y) in zip(
+    for axis, (measure, label_y) in zip(
         axes, {"position": "position RMSE", "evidence": "log evidence per fix"}.items(), strict=True
     ):
         differences = {
-            label: scores["estimated"][f"ekf {part}"] - scores[other][f"ekf {part}"]
-            for label, other in labels.items()
+            label: scores["estimated"][f"ekf {measure}"] - scores[rival][f"ekf {measure}"]
+            for label, rival in labels.items()
         }
         order = np.argsort(differences["estimated minus by hand"])
         for label, d in differences.items():
@@ -374,7 +378,7 @@ def plot_differences(scores: Scores) -> Figure:
             )
         axis.axhline(0.0, color="0.4", linewidth=0.8)
         axis.set_xlabel("flights, ordered by the circles")
-        axis.set_ylabel(f"difference of\n{label_y}" + (", m" if part == "position" else ""))
+        axis.set_ylabel(f"difference of\n{label_y}" + (", m" if measure == "position" else ""))
     add_legend(figure, axes[0])
     return figure
 

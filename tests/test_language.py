@@ -23,6 +23,8 @@ PAGES = [
     *sorted((ROOT / "reports").glob("learn_*/report.md")),  # written by scripts without a template
 ]
 TEMPLATES = sorted(PACKAGE.rglob("*.jinja"))
+SCRIPTS = [*sorted((ROOT / "experiments").glob("*.py")), ROOT / "docs" / "methods" / "pictures.py"]
+PROSE_CHECKS = ("long sentences", "openings", "archaic phrases", "messages")
 LONGEST_SENTENCE = 30  # words
 
 CHECK_NAMES = (
@@ -292,6 +294,11 @@ def violations() -> dict[str, list[str]]:
             file.read_text(), str(file.relative_to(ROOT))
         ).items():
             results[check] += items
+    for file in SCRIPTS:  # docstrings of scripts have no Args
+        for check, items in violations_of_source(
+            file.read_text(), str(file.relative_to(ROOT))
+        ).items():
+            results[check] += items if check in PROSE_CHECKS else []
     for page in (*PAGES, *TEMPLATES):
         for check, items in violations_of_page(
             page.read_text(), str(page.relative_to(ROOT))

@@ -1,4 +1,4 @@
-"""The pictures of the method pages: `python docs/methods/pictures.py`, or with names of functions for some of them."""
+"""The figures of the method pages: `python docs/methods/pictures.py`, or with names of functions for some of them."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ HERE = Path(__file__).parent
 
 
 def dmc_reconstructed() -> None:
-    """Position and velocity, position seen: what the shift does to a predicted cloud, as printed and with marginal weights."""
+    """Effect of the shift on predicted particles, as printed and with marginal weights; the position is measured."""
     model = LinearGaussian(
         [[1.0, 0.0], [0.0, 1.0]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0]], [2.0], [0.0, 0.0], [[2.0, 0.0], [0.8, 0.4]],
         names=("position", "velocity"),
@@ -78,7 +78,7 @@ def dmc_reconstructed() -> None:
     seen, control = (
         Record(y),
         DmcController(control_weight=1.0),
-    )  # a gain of a half, so that the shift can be seen
+    )  # a gain of a half, so that the shift is visible
     plain = BootstrapProposal()(model, cloud, seen, draws.at_step(1))
     exact, _ = GaussianFilter(TaylorLinearisation()).step(
         model, GaussianFilter(TaylorLinearisation()).init(model, 1, draws), seen, draws
@@ -106,14 +106,14 @@ def dmc_reconstructed() -> None:
             (
                 *(part[0] for part in weighted_mean_cov(model.chart, after)),
                 "#D55E00",
-                "weighted cloud",
+                "weighted particles",
             ),
         ):
             axis.plot(*_ellipse(mean, covariance), color=colour, label=f"{label}, 2 sd")
         axis.axvline(4.0, color="0.6", linewidth=1, linestyle=":")
         axis.set_title(title, fontsize=11)
-        axis.set(xlabel="position (seen, dotted)")
-    axes[0].set_ylabel("velocity (not seen)")
+        axis.set(xlabel="position (measured, dotted)")
+    axes[0].set_ylabel("velocity (not measured)")
     axes[0].legend(loc="upper left", frameon=False)
     figure.savefig(HERE / "dmc_reconstructed.png", dpi=80)
 
@@ -142,7 +142,7 @@ def mssrckf() -> None:
         *_ellipse(cloud.mean(0), torch.cov(cloud.T)),
         color="0.35",
         linestyle="--",
-        label="moments of the cloud",
+        label="moments of the sample",
     )
     for (name, (rule, colour)), mark in zip(rules.items(), "s^oD", strict=True):
         xi, w, _ = rule(2)
@@ -158,7 +158,10 @@ def mssrckf() -> None:
             label=name,
         )
     left.set(
-        aspect="equal", title="points for N(0, I), area: weight", xlim=(-2.9, 2.9), ylim=(-2.5, 3.8)
+        aspect="equal",
+        title="points for N(0, I), area by weight",
+        xlim=(-2.9, 2.9),
+        ylim=(-2.5, 3.8),
     )
     left.set(xlabel="state 1 in sd", ylabel="state 2 in sd")
     right.set(aspect="equal", title="after a turn: ellipses of 2 sd", xlabel="east", ylabel="north")
@@ -168,7 +171,7 @@ def mssrckf() -> None:
 
 
 def fm_mssrckf() -> None:
-    """Errors of 300 runs in the last step of a burst of process noise, and what the filters believe of them."""
+    """Errors of 300 runs in the last step of a burst of process noise, with the covariances of the filters."""
     figure = _errors(
         {
             "MSSRCKF": ((), ()),
@@ -181,7 +184,7 @@ def fm_mssrckf() -> None:
 
 
 def fm_mssrckf_step() -> None:
-    """One step that surprises in velocity: what the adaptive factor makes of the cloud, as printed and weighted."""
+    """One step with a large velocity innovation: effect of the adaptive factor, as printed and as repaired."""
     model = LinearGaussian(
         [[1.0, 1.0], [0.0, 1.0]],
         torch.eye(2) * 1e-3,
@@ -217,16 +220,22 @@ def fm_mssrckf_step() -> None:
         new = method.advance(model, belief, Record(y))
         wide = new.innovation.predicted_covariance[
             0
-        ]  # of what is seen, which is the state itself: the prediction, as widened
+        ]  # the measurement is the state: prediction with the factor
         cloud = e @ torch.linalg.cholesky(wide).mT
-        at.scatter(*cloud.T, s=3, color="0.75", label="cloud predicted, as widened")
+        at.scatter(*cloud.T, s=3, color="0.75", label="prediction with the factor")
         at.plot(
             *_ellipse(new.mean[0], new.root[0] @ new.root[0].mT),
             color=colour,
             label="2 sd after the step, in colour",
         )
         at.errorbar(
-            *y.T, xerr=20.0, yerr=0.2, color="0.2", capsize=2, linewidth=1, label="seen, 2 sd"
+            *y.T,
+            xerr=20.0,
+            yerr=0.2,
+            color="0.2",
+            capsize=2,
+            linewidth=1,
+            label="measurement, 2 sd",
         )
         at.set(title=name, xlabel="position, m", xlim=(-45.0, 45.0), ylim=(-1.6, 1.8))
     axes[0].set_ylabel("velocity, m/s")
@@ -263,7 +272,7 @@ def _errors(
     r: float = 1.0,
     q: float = 1.0,
 ) -> Figure:
-    """A walk in the plane seen by five equal sensors; the last 15 of 40 steps are a burst."""
+    """A walk in the plane measured by five equal sensors; the last 15 of 40 steps are a burst."""
     h = torch.tensor(
         [[1.0, 0.0], [0.8, 0.6], [0.5, -0.9], [0.2, 1.0], [-0.7, 0.4]], dtype=torch.float64
     )
@@ -306,12 +315,12 @@ def _errors(
             found.trace["p"][:, -1].median(0).values,
         )
         at.plot(
-            *_ellipse(centre, torch.cov(error.T)), color="0.35", linestyle="--", label="their 2 sd"
+            *_ellipse(centre, torch.cov(error.T)), color="0.35", linestyle="--", label="sample 2 sd"
         )
-        at.plot(*_ellipse(centre, believed), color=colour, label="2 sd believed, in colour")
+        at.plot(*_ellipse(centre, believed), color=colour, label="2 sd of the filter, in colour")
         at.set(
             aspect="equal",
-            title=f"{name}: rms {float(error.square().sum(-1).mean().sqrt()):.2f}",
+            title=f"{name}: RMSE {float(error.square().sum(-1).mean().sqrt()):.2f}",
             xlabel="error of state 1",
         )
     axes[0].set_ylabel("error of state 2")
@@ -326,14 +335,14 @@ def _errors(
 
 
 def _ellipse(mean: Tensor, covariance: Tensor) -> Tensor:
-    """Points at two standard deviations of a normal law in the plane [2, 100]."""
+    """Points at two standard deviations of a normal distribution in the plane, [2, 100]."""
     angle = torch.linspace(0.0, 2.0 * torch.pi, 100, dtype=mean.dtype)
     circle = torch.stack([torch.cos(angle), torch.sin(angle)])
     return mean[:, None] + 2.0 * torch.linalg.cholesky(covariance) @ circle
 
 
 def cpso_escape() -> None:
-    """Position and velocity, position seen: where a chaotic swarm with escape leaves a predicted cloud, printed and corrected."""
+    """Predicted particles after a chaotic swarm with escape factor, as printed and corrected; the position is measured."""
     model = LinearGaussian(
         [[1.0, 0.0], [0.0, 1.0]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0]], [2.0], [0.0, 0.0], [[2.0, 0.0], [0.8, 0.4]],
         names=("position", "velocity"),
@@ -375,20 +384,20 @@ def cpso_escape() -> None:
             (
                 *(part[0] for part in weighted_mean_cov(model.chart, after)),
                 "#D55E00",
-                "weighted cloud",
+                "weighted particles",
             ),
         ):
             axis.plot(*_ellipse(mean, covariance), color=colour, label=f"{label}, 2 sd")
         axis.axvline(4.0, color="0.6", linewidth=1, linestyle=":")
         axis.set_title(title, fontsize=11)
-        axis.set(xlabel="position (seen, dotted)", ylim=(-4, 8))
-    axes[0].set_ylabel("velocity (not seen)")
+        axis.set(xlabel="position (measured, dotted)", ylim=(-4, 8))
+    axes[0].set_ylabel("velocity (not measured)")
     axes[0].legend(loc="upper left", frameon=False)
     figure.savefig(HERE / "cpso_escape.png", dpi=80)
 
 
 def enkf() -> None:
-    """Position and velocity, position seen: where the members of a small ensemble go, with perturbed measurements and without."""
+    """Members of a small ensemble before and after the update, with perturbed measurements and without."""
     model = LinearGaussian(
         [[1.0, 0.0], [0.0, 1.0]], [[0.1, 0.0], [0.0, 0.1]], [[1.0, 0.0]], [1.0], [0.0, 0.0], [[2.0, 0.0], [0.8, 0.4]],
         names=("position", "velocity"),
@@ -412,21 +421,21 @@ def enkf() -> None:
         start = BootstrapProposal()(model, before, seen, draws.at_step(1)).x[0]
         axis.plot(*torch.stack([start, after.x[0]]).permute(2, 0, 1), color="0.8", linewidth=0.7)
         axis.scatter(*start.T, s=10, color="#0072B2", label="predicted")
-        axis.scatter(*after.x[0].T, s=10, color="#E69F00", label="moved")
+        axis.scatter(*after.x[0].T, s=10, color="#E69F00", label="updated")
         for mean, covariance, colour, label in (
             (exact.mean[0], exact.covariance[0], "#009E73", "Kalman, 2 sd"),
             (info.mean[0], info.covariance()[0], "#D55E00", "ensemble, 2 sd"),
         ):
             axis.plot(*_ellipse(mean, covariance), color=colour, label=label)
         axis.axvline(2.5, color="0.6", linewidth=1, linestyle=":")
-        axis.set(title=title, xlabel="position (seen, dotted)")
-    axes[0].set_ylabel("velocity (not seen)")
+        axis.set(title=title, xlabel="position (measured, dotted)")
+    axes[0].set_ylabel("velocity (not measured)")
     axes[0].legend(loc="upper left", frameon=False)
     figure.savefig(HERE / "enkf.png", dpi=80)
 
 
 def rbpf() -> None:
-    """Position and velocity, position seen: 40 particles, and 40 sampled positions with a normal law of the velocity each."""
+    """40 particles, and 40 sampled positions, each with a normal distribution of the velocity."""
     model = LinearGaussian(
         [[1.0, 0.5], [0.0, 0.95]], [[0.8, 0.0], [0.0, 0.4]], [[1.0, 0.0]], [0.7], [0.0, 0.0], [1.0, 1.5],
         names=("position", "velocity"),
@@ -457,7 +466,7 @@ def rbpf() -> None:
                 fmt="none",
                 ecolor="#E69F00",
                 elinewidth=1,
-                label="conditional law, 2 sd",
+                label="conditional distribution, 2 sd",
             )
         axis.scatter(
             *cloud.x[0].T,
@@ -468,17 +477,17 @@ def rbpf() -> None:
         )
         for mean, covariance, colour, label in (
             (exact.mean[0], exact.covariance[0], "#009E73", "Kalman, 2 sd"),
-            (info.mean[0], info.covariance()[0], "#D55E00", "told, 2 sd"),
+            (info.mean[0], info.covariance()[0], "#D55E00", "estimate, 2 sd"),
         ):
             axis.plot(*_ellipse(mean, covariance), color=colour, label=label)
-        axis.set(title=title, xlabel="position (seen)")
-    axes[0].set_ylabel("velocity (not seen)")
+        axis.set(title=title, xlabel="position (measured)")
+    axes[0].set_ylabel("velocity (not measured)")
     axes[1].legend(loc="upper left", frameon=False)
     figure.savefig(HERE / "rbpf.png", dpi=80)
 
 
 def qmc_polymerised() -> None:
-    """A weighted cloud on a ridge across the axes, and what aggregation makes of it: repaired, and in two readings of eq. 18."""
+    """Weighted particles on a ridge across the axes before and after aggregation, as repaired and in two readings of eq. 18."""
     model, draws = _plain(2), PhiloxStream(5, torch.arange(1))
     z = draws.normal("x", 250, 2)
     x = torch.stack([z[..., 0] + 0.25 * z[..., 1], z[..., 0] - 0.25 * z[..., 1]], -1)
@@ -489,7 +498,7 @@ def qmc_polymerised() -> None:
         "weighted, whitened cells": None,
         "repaired: shares, pooled spread": PolymerisedResampler(),
         "eq. 18, counts by weight": PolymerisedResampler(placement=ScaledCentrePlacement()),
-        "as printed: boxes, counts kept": PolymerisedResampler(
+        "as printed: boxes, unchanged counts": PolymerisedResampler(
             AxisAlignedCells(), UnchangedAllocation(), ScaledCentrePlacement()
         ),
     }
@@ -497,7 +506,7 @@ def qmc_polymerised() -> None:
         1, 4, figsize=(13, 3.6), sharex=True, sharey=True, layout="constrained"
     )
     for axis, (title, resampler) in zip(axes, panels.items(), strict=True):
-        _scatter_refreshed(axis, model, cloud, resampler, title)
+        _scatter_resampled(axis, model, cloud, resampler, title)
     w, (mean, covariance) = (
         normalise_log_weights(cloud.log_w),
         weighted_mean_cov(model.chart, cloud),
@@ -510,7 +519,7 @@ def qmc_polymerised() -> None:
 
 
 def gpf() -> None:
-    """A bent cloud, and the normal law that a Gaussian particle filter makes of it: by chance, and on Halton points."""
+    """Particles on a curve and the normal distribution of a Gaussian particle filter, by random and by Halton points."""
     model, draws = _plain(2), PhiloxStream(5, torch.arange(1))
     z = draws.normal("x", 250, 2)
     x = torch.stack([z[..., 0], z[..., 0].square() - 1.0 + 0.3 * z[..., 1]], -1)
@@ -519,14 +528,14 @@ def gpf() -> None:
     )
     panels: dict[str, GaussianResampler | None] = {
         "weighted": None,
-        "refreshed by chance": GaussianResampler(),
-        "refreshed on Halton points": GaussianResampler(HaltonPoints()),
+        "resampled at random": GaussianResampler(),
+        "resampled on Halton points": GaussianResampler(HaltonPoints()),
     }
     figure, axes = plt.subplots(
         1, 3, figsize=(10.5, 3.6), sharex=True, sharey=True, layout="constrained"
     )
     for axis, (title, resampler) in zip(axes, panels.items(), strict=True):
-        _scatter_refreshed(axis, model, cloud, resampler, title)
+        _scatter_resampled(axis, model, cloud, resampler, title)
     axes[1].legend(loc="lower right", frameon=False, fontsize=9)
     figure.savefig(HERE / "gpf.png", dpi=75)
 
@@ -537,14 +546,14 @@ def _plain(d: int) -> LinearGaussian:
     return LinearGaussian(eye, eye, eye, [1.0] * d, [0.0] * d, [1.0] * d)
 
 
-def _scatter_refreshed(
+def _scatter_resampled(
     axis: Axes,
     model: LinearGaussian,
     belief: ParticleBelief,
     resampler: Resampler | None,
     title: str,
 ) -> None:
-    """A cloud [1, N, 2] before or after a resampler, areas by weight, with two-deviation ellipses of then and before."""
+    """Particles [1, N, 2] before or after a resampler, areas by weight, with ellipses of 2 sd of both."""
     n = torch.full((1, 1), float(belief.x.shape[1]), dtype=torch.float64)
     after = (
         belief
@@ -572,7 +581,7 @@ def _scatter_refreshed(
 
 
 def mcmc_rpf() -> None:
-    """Constant velocity in little noise, position seen: a cloud of few ancestors, smoothed, and moved; Kalman's law beside it."""
+    """Constant velocity with small noise: particles of few ancestors, smoothed, and moved, with the Kalman distribution."""
     model, n, steps = linear_walk(1.0, 0.01, 1.0), 200, 12
     draws, runs = PhiloxStream(4, torch.arange(1)), torch.ones(1, dtype=torch.bool)
     record = Record(
@@ -603,9 +612,9 @@ def mcmc_rpf() -> None:
     moved, _ = MetropolisHastings(NoiseFlowKernel(steps), 20)(model, copies, runs, draws)
     count = len(torch.unique(copies.x[0, :, 0]))
     panels = {
-        f"resampled: {count} places": copies,
-        "RPF as printed: blurred where it lies": smoothed,
-        "20 flow moves: spread, not widened": moved,
+        f"resampled: {count} different particles": copies,
+        "RPF as printed: smoothed": smoothed,
+        "20 moves with the flow kernel": moved,
     }
     figure, axes = plt.subplots(
         1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained"
@@ -616,7 +625,7 @@ def mcmc_rpf() -> None:
         axis.scatter(*shown.x[0].T, s=12, color=colour, alpha=0.7, linewidths=0)
         axis.plot(*_ellipse(law.mean[0], law.covariance[0]), color="#009E73", label="Kalman, 2 sd")
         mean, covariance = (part[0] for part in weighted_mean_cov(model.chart, shown))
-        axis.plot(*_ellipse(mean, covariance), color="#D55E00", label="cloud, 2 sd")
+        axis.plot(*_ellipse(mean, covariance), color="#D55E00", label="particles, 2 sd")
         axis.set_title(title, fontsize=11)
         axis.set_xlabel("position")
     axes[0].set_ylabel("velocity")
@@ -626,7 +635,7 @@ def mcmc_rpf() -> None:
 
 
 def cofm_amssrcpf() -> None:
-    """Position and velocity, position seen far from where it was expected: children by three proposals, areas by weight."""
+    """A position measured far from its prediction: children by three proposals, areas by weight."""
     model = linear_walk(1.0, 0.8, 0.3, (1.0, 1.0))
     guide, draws = GaussianFilter(TaylorLinearisation()), PhiloxStream(3, torch.arange(1))
     seen = Record(torch.tensor([[2.5]], dtype=torch.float64))
@@ -634,7 +643,7 @@ def cofm_amssrcpf() -> None:
     panels: dict[str, Proposal] = {
         "model's noise (SIR)": BootstrapProposal(),
         "noise given parent and y": GuidedNoiseProposal(guide),
-        "one guide for the cloud": SharedGuideProposal(guide),
+        "one guide for all particles": SharedGuideProposal(guide),
     }
     figure, axes = plt.subplots(
         1, 3, figsize=(12, 3.6), sharex=True, sharey=True, layout="constrained"

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from checkout import ROOT
 from matplotlib.figure import Figure
 from pfbench.experiments import learn_data_efficiency, learn_noise_calibration, learn_room
 from pfbench.experiments.learn_data_efficiency import Case, against, interval, volatility
@@ -53,7 +54,7 @@ def test_the_room_that_is_left_is_that_of_closed_forms(monkeypatch: pytest.Monke
         ("own", BootstrapProposal()),
         ("optimal", GuidedNoiseProposal(GaussianFilter(TaylorLinearisation()))),
     ):
-        found = learn_room.share(learn_room.weighed(proposal, model, cloud, seen, draws))
+        found = learn_room.share(learn_room.weigh_children(proposal, model, cloud, seen, draws))
         torch.testing.assert_close(
             found[0], wanted[name], rtol=0.03 if name == "own" else 1e-3, atol=0.0
         )
@@ -62,11 +63,20 @@ def test_the_room_that_is_left_is_that_of_closed_forms(monkeypatch: pytest.Monke
     )
 
 
-def test_steps_without_a_measurement_are_not_looked_at() -> None:
+def test_the_scenarios_and_models_of_the_study_of_gains_exist() -> None:
+    for words in learn_room.SCENARIOS:
+        scenario, *choices = words.split(",")
+        groups = {"scenario": scenario} | dict(choice.split("=") for choice in choices)
+        groups.pop("oracle_noise", None)
+        for group, name in groups.items():
+            assert (ROOT / "conf" / group / f"{name}.yaml").is_file(), words
+
+
+def test_steps_without_a_measurement_are_not_selected() -> None:
     y = torch.full((2, 9, 1), torch.nan)
     y[:, 2::3] = 0.0
     y[0, 5] = torch.nan
-    assert learn_room.looked_at(Record(y)) == {2, 8}
+    assert learn_room.select_steps(Record(y)) == {2, 8}
 
 
 def test_an_interval_holds_what_differs_between_worlds_and_between_trainings() -> None:

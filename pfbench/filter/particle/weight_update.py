@@ -188,7 +188,7 @@ def deactivate_invalid_particles(
     """
     if is_capturing():  # the caller of the graph checks, and repeats the step
         return x, log_w
-    if not x.is_cuda and math.isfinite(float(x.sum())):  # this check is cheap on the CPU
+    if not x.is_cuda and math.isfinite(float(x.detach().sum())):  # this check is cheap on the CPU
         return x, log_w
     healthy = torch.isfinite(x.sum(-1))
     log_w = torch.where(healthy, log_w, -torch.inf)
