@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -88,6 +88,7 @@ class StepInfo(NamedTuple):
         return self.covariance()[:, groups.unsqueeze(-1), groups.unsqueeze(-2)]
 
 
+@runtime_checkable
 class Filter(Protocol):
     """Stateless filter: computes the next belief from a belief and a record."""
 

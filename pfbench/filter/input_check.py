@@ -31,6 +31,13 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
         ValueError: If a shape or a type is wrong, if the record is empty, or if a measurement is
             infinite.
     """
+    for name, item, kind in (("model", model, StateSpaceModel), ("record", record, Record)):
+        if not isinstance(item, kind):
+            class_name = (item if isinstance(item, type) else type(item)).__name__
+            raise ValueError(
+                f"{name} must be a {kind.__name__}, got {class_name}. Pass the arguments in the order "
+                "method, model, record, draws."
+            )
     y = record.y
     if y.dim() != 3 or not y.is_floating_point():
         raise ValueError(

@@ -21,6 +21,7 @@ from pfbench.filter.exactness import check_has_evidence
 from pfbench.filter.loop import FilterPass, prepare_record
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.model.base import StateSpaceModel
+from pfbench.ppl.arguments import check_counts, check_kinds, check_number
 from pfbench.ppl.parameterised_model import ParameterisedModel, Values
 from pfbench.ppl.posterior_estimate import repeat_runs
 
@@ -85,15 +86,10 @@ def smc2(
         N. Chopin (2002), A sequential particle filter method for static models.
         N. Chopin, P. Jacob and O. Papaspiliopoulos (2013), SMC^2.
     """
-    if particles < 2 or moves < 0:
-        raise ValueError(
-            f"smc2.particles must be at least 2 and smc2.moves at least 0, got "
-            f"particles={particles} and moves={moves}. Change these values."
-        )
-    if not 0.0 <= threshold <= 1.0:
-        raise ValueError(
-            f"smc2.threshold must be from 0 to 1, got {threshold}. Give a fraction of M."
-        )
+    check_kinds("smc2", {"unknown": (unknown, ParameterisedModel), "record": (record, Record)})
+    check_kinds("smc2", {"method": (method, Filter)})
+    check_counts("smc2", {"particles": (particles, 2), "moves": (moves, 0), "seed": (seed, 0)})
+    check_number("smc2", "threshold", threshold, 0.0, 1.0, "[]")
     with torch.no_grad():
         sampler = _ParameterSampler(unknown, method, record, particles, seed)
         return sampler.run(moves, threshold)
@@ -123,7 +119,7 @@ class _ParameterSampler:
             total = log_w.logsumexp(0)
             if not bool(torch.isfinite(total)):
                 raise ValueError(
-                    f"smc2 needs at least one valid filter at step {t}, got none. Use a wider "
+                    f"smc2.method must be valid for one particle at step {t}, got none. Use a wider "
                     "prior or more particles."
                 )
             self.log_w, log_evidence = log_w - total, log_evidence + total

@@ -5,6 +5,7 @@ Pyro's samplers use torch's global random state. It is seeded and restored here 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from torch import Tensor
 from torch.distributions import biject_to
 
 from pfbench.core.record import Record
+from pfbench.ppl.arguments import check_counts, check_kinds, check_number
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.parameterised_model import ParameterisedModel, Values
 
@@ -59,7 +61,13 @@ def nuts(
 
     Returns:
         Draws and acceptance rates.
+
+    Raises:
+        ValueError: If a count is too small, or an argument is of another class.
     """
+    check_kinds("nuts", {"program": (program, Callable), "record": (record, Record)})
+    counts = {"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1), "seed": (seed, 0)}
+    check_counts("nuts", counts)
     samples: list[dict[str, Tensor]] = []
     accepted = []
     for chain in range(chains):
@@ -103,7 +111,15 @@ def svi(
 
     Returns:
         Draws and losses.
+
+    Raises:
+        ValueError: If a value is out of range, or an argument is of another class.
     """
+    kinds = {"program": (program, Callable), "record": (record, Record), "guide": (guide, Callable)}
+    check_kinds("svi", kinds)
+    counts = {"steps": (steps, 1), "draws": (draws, 1), "seed": (seed, 0)}
+    check_counts("svi", {**counts, "particles": (particles, 1)})
+    check_number("svi", "rate", rate, 0.0, math.inf, "()")
     with torch.random.fork_rng(), pyro.get_param_store().scope():
         torch.manual_seed(seed)
         optimiser = ClippedAdam({"lr": rate, "lrd": 0.1 ** (1.0 / steps)})

@@ -15,6 +15,7 @@ from torch import Tensor
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
+from pfbench.ppl.arguments import check_counts, check_kinds, check_number
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.parameter_walk import ParameterWalk
 from pfbench.ppl.parameterised_model import ParameterisedModel, Prior
@@ -52,11 +53,8 @@ class PmmhSettings:
     tick: Callable[[], object] | None = None
 
     def __post_init__(self) -> None:
-        _check_minima({"thin": (self.thin, 1), "leaps": (self.leaps, 0)})
-        if not 0.0 <= self.rho < 1.0:
-            raise ValueError(
-                f"pmmh.rho must be in [0, 1), got rho={self.rho}. Use 0 for no correlation."
-            )
+        check_counts("pmmh", {"thin": (self.thin, 1), "leaps": (self.leaps, 0)})
+        check_number("pmmh", "rho", self.rho, 0.0, 1.0, "[)")
 
 
 def pmmh(
@@ -99,7 +97,10 @@ def pmmh(
             filter is lost for all starts of a chain.
     """
     settings = settings or PmmhSettings()
-    _check_minima({"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1)})
+    check_kinds("pmmh", {"unknown": (unknown, ParameterisedModel), "record": (record, Record)})
+    check_kinds("pmmh", {"method": (method, Filter), "settings": (settings, PmmhSettings)})
+    counts = {"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1), "seed": (seed, 0)}
+    check_counts("pmmh", counts)
     start = unknown
     if settings.start is not None:
         if set(settings.start) != set(unknown.names):
@@ -159,12 +160,3 @@ def _metropolis_step(
     target.store_numbers(numbers, is_accepted)
     z = torch.where(is_accepted.unsqueeze(-1), proposed_z, z)
     return z, torch.where(is_accepted, proposed_log_p, log_p), probability, is_accepted
-
-
-def _check_minima(counts: Mapping[str, tuple[int, int]]) -> None:
-    """Raise ValueError if a count is below its minimum."""
-    for name, (value, minimum) in counts.items():
-        if value < minimum:
-            raise ValueError(
-                f"pmmh.{name} must be at least {minimum}, got {name}={value}. Increase {name}."
-            )

@@ -9,6 +9,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state, draw_measurements, simulate_steps
 from pfbench.model.base import StateSpaceModel, initial_law
+from pfbench.ppl.arguments import check_counts, check_kinds
 
 
 def simulate(model: StateSpaceModel, record: Record, seed: int) -> tuple[Record, Tensor]:
@@ -25,7 +26,12 @@ def simulate(model: StateSpaceModel, record: Record, seed: int) -> tuple[Record,
 
     Returns:
         Record with simulated measurements, and the states, [R, T, D].
+
+    Raises:
+        ValueError: If an argument is of another class, or the seed is negative.
     """
+    check_kinds("simulate", {"model": (model, StateSpaceModel), "record": (record, Record)})
+    check_counts("simulate", {"seed": (seed, 0)})
     stream = PhiloxStream(seed, torch.arange(len(record.y)), model.anchor.dtype)
     converted = record.to(model.anchor)
     with torch.no_grad():

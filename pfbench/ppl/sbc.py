@@ -19,6 +19,7 @@ from scipy.stats import binom, chisquare
 from torch import Tensor
 
 from pfbench.core.record import Record
+from pfbench.ppl.arguments import check_counts, check_kinds
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.prior_predictive import simulate
@@ -91,7 +92,13 @@ def simulation_based_calibration(
 
     Returns:
         Ranks of all parameters.
+
+    Raises:
+        ValueError: If a count is too small, or an argument is of another class.
     """
+    kinds = {"unknown": (unknown, ParameterisedModel), "template": (template, Record)}
+    check_kinds("simulation_based_calibration", {**kinds, "infer": (infer, Callable)})
+    check_counts("simulation_based_calibration", {"draws": (draws, 1), "seed": (seed, 0)})
     truth = unknown.sample(len(template.y), seed)
     record, _ = simulate(unknown.models_per_run(truth), template, seed)
     posterior = infer(record)

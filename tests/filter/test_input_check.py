@@ -120,6 +120,8 @@ WRONG: dict[str, tuple[Any, Record, PhiloxStream, str]] = {
         DRAWS,
         r"record.y must have as many components as LinearGaussian observes, 1, got 3",
     ),
+    "a class": (LinearGaussian, Record(Y), DRAWS, r"model must be a StateSpaceModel, got Linear"),
+    "a tensor": (MODEL, Y, DRAWS, r"record must be a Record, got Tensor. Pass the arguments"),  # type: ignore[dict-item]
     "no axis of runs": (MODEL, Record(Y[0]), DRAWS, r"axes \[R, T, Dy\], got float64 \[4, 1\]"),
     "whole numbers": (MODEL, Record(Y.long()), DRAWS, r"real numbers .*, got int64"),
     "no steps": (MODEL, Record(Y[:, :0]), DRAWS, "at least one time step, got 0"),

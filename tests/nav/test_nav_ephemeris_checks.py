@@ -95,6 +95,15 @@ def test_another_unit_of_all_records_is_an_error(tmp_path: Path) -> None:
         _ = constellation(tmp_path, degrees).names
 
 
+@pytest.mark.parametrize(("factor", "value"), [(0.3048, "4.26"), (3.0, "42")])
+def test_a_satellite_number_that_no_system_has_is_an_error(
+    tmp_path: Path, factor: float, value: str
+) -> None:
+    scaled = three().assign(prn=lambda table: factor * table["prn"])
+    with pytest.raises(ValueError, match=rf"out of range, the first with prn is {value}"):
+        _ = constellation(tmp_path, scaled).names
+
+
 @pytest.mark.parametrize("column", ["af0", "e", "tgd", "prn"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_blank_or_infinite_parameter_is_an_error(

@@ -43,6 +43,7 @@ RANGES = {
     "week": (0.0, 1e4, "1"),
 }
 SQRT_AXIS = {"G": (5100.0, 5200.0), "E": (5200.0, 5500.0)}  # m^(1/2), root of the semi-major axis
+LARGEST_PRN = {"G": 63, "E": 36}  # [IS-GPS-200, 3.2.1; OS SIS ICD, 3.6]
 TOE_STEP = {"G": 16.0, "E": 60.0}  # s; scale of the field
 _LONGEST = 14400.0  # s between compared neighbours
 POSITION_TOLERANCE = 30.0  # m; over one day of IGS files neighbours agree to 4.5 m
@@ -145,6 +146,9 @@ def _reason(row: Mapping[Any, Any]) -> str:
     root = float(row["sqrtA"])
     if not least <= root <= largest:
         return f"semi-major axis is {root**2:.0f} m"
+    number = float(row["prn"])
+    if number != round(number) or number > LARGEST_PRN[str(row["name"])[0]]:
+        return f"prn is {number:g}"
     for parameter, (low, high, unit) in RANGES.items():
         value = float(row["sow" if parameter == "toe" else parameter]) if parameter in row else 0.0
         if not (low <= value <= high or (math.isnan(value) and parameter in ("week", "health"))):

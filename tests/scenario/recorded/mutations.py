@@ -323,25 +323,27 @@ def run_mutations(reader: str, count: int, seed: int) -> Counter[str]:
             file = list(files)[pick(rng, len(files))]
             damage_file(folder / file, rng)
             outcome = outcome_of(reader, folder, clean, set(clean_notes), number)
-            if outcome.startswith(SILENT) and differs_everywhere(folder / file, files[file]):
-                outcome = EVERY_ROW + outcome.removeprefix(SILENT)
+            if outcome.startswith(SILENT) and (
+                names := changed_columns(folder / file, files[file])
+            ):
+                outcome = f"{EVERY_ROW}: {names}"
             outcomes[outcome] += 1
     return outcomes
 
 
-def differs_everywhere(file: Path, undamaged: bytes) -> bool:
-    """Whether the values of a column changed in more than half of the rows of a table."""
+def changed_columns(file: Path, undamaged: bytes) -> str:
+    """Names of the columns of a table whose values changed in more than half of the rows."""
     if file.suffix not in (".parquet", ".csv"):
-        return False
+        return ""
     read = pd.read_parquet if file.suffix == ".parquet" else pd.read_csv
     before, after = read(io.BytesIO(undamaged)), read(file)
     if len(before) != len(after) or list(before) != list(after):
-        return False
+        return ""
     numbers = [c for c in before if before[c].dtype.kind in "fiu"]
     changed = (before[numbers] != after[numbers]) & ~(
         before[numbers].isna() & after[numbers].isna()
     )
-    return bool((changed.mean() > 0.5).any())
+    return ", ".join(c for c in numbers if changed[c].mean() > 0.5)
 
 
 def outcome_of(
