@@ -74,10 +74,13 @@ def test_false_alarms_of_the_design(steps: int, correlation: float) -> None:
 
 @pytest.mark.parametrize("time", [10.0, 40.0])
 def test_the_variance_of_a_long_run_is_that_of_its_correlation(time: float) -> None:
-    """Sums of two squares of a Markov process: correlation exp(-2/time) per epoch, variance 4."""
+    """Sums of two squares of a Markov process: correlation exp(-2/time) per epoch, variance 4.
+
+    The length is the least one, 8 correlation times of the squares.
+    """
     steps = 300_000
     squares = markov(np.random.default_rng(8), steps, time, 4) ** 2
-    result = compare_along_run(squares[:2].sum(0), squares[2:].sum(0))
+    result = compare_along_run(squares[:2].sum(0), squares[2:].sum(0), length=4 * time)
     rho = np.exp(-2 / time)
     ratio = result.estimate.standard_error**2 / (0.5 * (1 + rho) / (1 - rho) / steps)
     error = np.sqrt(2 / result.blocks)
