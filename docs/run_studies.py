@@ -8,6 +8,7 @@ from its results where it has run, else estimated from the times per step of its
     python docs/run_studies.py --hours=2       only studies that end within 2 hours of computing time
     python docs/run_studies.py paper_003       these studies
     python docs/run_studies.py --list          the plan, without a run
+    python docs/run_studies.py --cost          only `pfbench cost` of the studies that have results
 """
 
 from __future__ import annotations
@@ -89,18 +90,34 @@ def run_study(study: str, results: Path) -> int:
     return 0
 
 
+def measure_step_times(study: str) -> int:
+    """Measure the times per step of the filters of a study in turn, and return the exit code.
+
+    Args:
+        study: Name of the study.
+    """
+    print(f"cost of {study}", flush=True)
+    words = [sys.executable, "-m", "pfbench", "cost", f"study={study}"]
+    return subprocess.run(words, cwd=TOP, check=False).returncode
+
+
 def main(words: Sequence[str]) -> int:
     """Run the planned studies and return 1 if one of them failed."""
     costs = read_costs()
     hours = [float(word.partition("=")[2]) for word in words if word.startswith("--hours=")]
     names = [word for word in words if not word.startswith("--")]
+    results = TOP / os.environ.get("PFBENCH_RESULTS", "results")
     plan = plan_studies(names or list_studies(), costs, *hours)
+    if "--cost" in words:
+        plan = [study for study in plan if any((results / study).glob("*.npz"))]
+        failed = [study for study in plan if measure_step_times(study)]
+        print(f"failed: {', '.join(failed)}" if failed else f"{len(plan)} studies measured")
+        return int(bool(failed))
     rest = sum(costs.get(study, 0.0) for study in plan)
     print(f"{len(plan)} studies, {rest / 3600:.1f} h of computing time on one core")
     if "--list" in words:
         print("\n".join(f"{costs.get(study, float('nan')):8.0f} s  {study}" for study in plan))
         return 0
-    results = TOP / os.environ.get("PFBENCH_RESULTS", "results")
     failed = []
     for number, study in enumerate(plan, start=1):
         print(f"[{number}/{len(plan)}] {study}, {rest / 3600:.1f} h left", flush=True)
@@ -109,8 +126,7 @@ def main(words: Sequence[str]) -> int:
         rest -= costs.get(study, 0.0)
         failed += [study] if code else []
         if code == 0:
-            words = [sys.executable, "-m", "pfbench", "cost", f"study={study}"]
-            code = subprocess.run(words, cwd=TOP, check=False).returncode
+            code = measure_step_times(study)
             costs[study] = round(measure_cost(study, results), 1)
             COSTS.write_text(json.dumps(dict(sorted(costs.items())), indent=1) + "\n")
         print(f"[{number}/{len(plan)}] {study}: exit code {code}, {time.monotonic() - start:.0f} s")

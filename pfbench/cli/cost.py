@@ -65,7 +65,7 @@ def _time_study(
     folder: Path, changes: dict[str, Any], numbers: tuple[int, float], overwrite: bool
 ) -> int:
     """Time the conditions of a study that are not yet in its file, and return their number."""
-    from pfbench.replay.step_timing import time_condition
+    from pfbench.replay.step_timing import estimate_time, time_condition
     from pfbench.results.conditions import load_conditions
     from pfbench.results.step_times import (
         measurement_key,
@@ -82,14 +82,18 @@ def _time_study(
     ]
     measured = {} if overwrite else read_step_times(folder)
     measured = {key: entry for key, entry in measured.items() if key in keys}
+    open_conditions = [c for k, c in zip(keys, conditions, strict=True) if k not in measured]
+    rest = sum(estimate_time(condition, rounds, seconds) for condition in open_conditions)
+    print(f"{len(open_conditions)} of {len(conditions)} conditions to measure, about {rest:.0f} s at the speed of their jobs")  # fmt: skip
     for number, (key, condition) in enumerate(zip(keys, conditions, strict=True), start=1):
         state = "skipped " if key in measured else "measured"
         if key not in measured:
+            rest -= estimate_time(condition, rounds, seconds)
             measured[key] = time_condition(condition, changes, rounds, seconds)
             write_step_times(folder, measured)
         jobs, steps = measured[key]["jobs"], measured[key]["steps"]
         used = len(next(iter(jobs.values()))["cpu"])
-        size = f"{len(jobs)} filters, {steps} steps, {used} rounds"
+        size = f"{len(jobs)} filters, {steps} steps, {used} rounds; about {rest:.0f} s left"
         print(f"[{number}/{len(conditions)}] {state}  {condition.name}   {size}", flush=True)
     return len(conditions)
 

@@ -68,6 +68,18 @@ class TimingTask:
         return (time.process_time() - cpu) * share, (time.perf_counter() - wall) * share
 
 
+def estimate_time(condition: Condition, rounds: int, seconds: float) -> float:
+    """Estimate how long the rounds of a condition last at the speed of its jobs, s.
+
+    Args:
+        condition: Condition with its stored jobs.
+        rounds: Number of rounds; one more is not counted.
+        seconds: Mean time of one filter in one round, s, see `time_condition`.
+    """
+    per_step = sum(float(job.meta["seconds"]["per_step"]) for job in condition.jobs)
+    return (rounds + 1) * _count_steps(condition.jobs, seconds) * per_step
+
+
 def time_condition(
     condition: Condition, changes: Mapping[str, Any], rounds: int, seconds: float
 ) -> dict[str, Any]:

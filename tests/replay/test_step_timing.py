@@ -27,7 +27,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_filters_take_turns_and_the_report_states_the_ratio(home: Path) -> None:
     said = pfbench("cost", "study=walks", "rounds=5", "seconds=0.001", home=home)
     assert said.code == 0, said.err
-    assert "3 filters, 20 steps, 5 rounds" in said.out
+    assert "1 of 1 conditions to measure, about" in said.out
+    assert "3 filters, 20 steps, 5 rounds; about 0 s left" in said.out
     file = home / "results/walks" / STEP_TIMES
     ((_, entry),) = read_step_times(file.parent).items()
     by_label = {row["label"]: np.array(row["cpu"]) for row in entry["jobs"].values()}
