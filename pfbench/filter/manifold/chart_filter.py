@@ -53,7 +53,8 @@ class InvariantFilter:
         if not isinstance(self.filter, (GaussianFilter, ParticleFilter)):
             raise ValueError(
                 "filter.filter must be GaussianFilter or ParticleFilter, got "
-                f"{type(self.filter).__name__}. Choose one of them."
+                f"{self.filter if isinstance(self.filter, str) else type(self.filter).__name__}. "
+                "Select it by name as filter@filter.filter=ukf."
             )
 
     @property

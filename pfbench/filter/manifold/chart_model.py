@@ -71,7 +71,8 @@ def find_group_chart(model: StateSpaceModel, side: str) -> Chart:
     if group_chart is None:
         raise ValueError(
             f"filter.chart must be an invariant chart of the model, got {side} with "
-            f"{type(inner).__name__}, which has none. Choose filter=ekf, or model=strapdown_total."
+            f"{type(inner).__name__}, which has none. Choose filter=ekf, or a scenario whose truth "
+            "has an attitude, as scenario=recorded_quad_flights with model=strapdown_total."
         )
     chart: Chart = group_chart(side)
     return chart

@@ -152,7 +152,7 @@ def test_a_model_without_a_group_is_refused_at_the_start(message: str) -> None:
     model = linear_walk(1.0, 0.3, 1.0)
     with pytest.raises(ValueError, match=message):
         run_filter(LEFT, model, Record(torch.zeros(1, 2, 1)), PhiloxStream(1, torch.arange(1)))
-    with pytest.raises(ValueError, match=r"which has none\. Choose filter=ekf"):
+    with pytest.raises(ValueError, match=r"which has none\. Choose filter=ekf, or a scenario"):
         ChartModel(model, "left")
 
 
@@ -161,3 +161,7 @@ def test_other_arguments_are_refused() -> None:
         InvariantFilter(EKF, "up")
     with pytest.raises(ValueError, match=r"filter.filter must be GaussianFilter or ParticleFilter"):
         InvariantFilter(LEFT)  # type: ignore[arg-type]
+    with pytest.raises(
+        ValueError, match=r"got ukf\. Select it by name as filter@filter\.filter=ukf"
+    ):
+        InvariantFilter("ukf")  # type: ignore[arg-type]
