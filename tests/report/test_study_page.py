@@ -170,6 +170,29 @@ def test_names_stay_text(tmp_path):
     assert "<script>" not in markdown.replace("\\<", "")
 
 
+def test_first_lines_name_severely_overconfident_runs(tmp_path):
+    """Largest share first, at most four filters by name."""
+    pack = page_packs.build_pack(7)
+    write(pack, tmp_path / "none")
+    assert "Severely overconfident runs" not in (tmp_path / "none" / "report.md").read_text()
+    for note, count in zip(pack["filter_notes"], (2, 20, 0, 5, 9, 1, 3), strict=True):
+        note["severely_overconfident"] = count
+    pack["filter_notes"][5]["runs"] = 1
+    page = write(pack, tmp_path / "some").read_text()
+    sentence = (
+        "Severely overconfident runs: Filter 1 20 of 20, Filter 5 1 of 1, Filter 4 9 of 20, "
+        "Filter 3 5 of 20 and 2 other filters."
+    )
+    assert sentence in page
+    lines = (tmp_path / "some" / "report.md").read_text().splitlines()
+    assert sentence in lines[:8]
+
+
+def test_a_page_says_in_words_why_a_budget_is_missing(tmp_path):
+    elements = write(page_packs.build_pack(), tmp_path).read_text()
+    assert "Same time: This study has no runs of that budget.</p>" in elements
+
+
 def test_equal_packs_give_equal_bytes(tmp_path):
     pages = [write(page_packs.build_pack(), tmp_path / name).read_bytes() for name in "ab"]
     assert pages[0] == pages[1]

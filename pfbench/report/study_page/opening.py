@@ -13,6 +13,7 @@ SIGNS = {
     "best": "★", "equal": "≈", "better": "▲", "open": "?", "worse": "▼", "not_kept": "✕", "missing": "–",
 }  # fmt: skip
 _DASH = "–"
+_NAMED = 4  # filters with severely overconfident runs in the first lines
 
 
 def format_short(value: float | None, digits: int = 3) -> str:
@@ -85,11 +86,32 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         "small_print": view["small_print"],
         "robustness": format_sentence(robustness),
         "robustness_text": _remove_marks(robustness),
+        "overconfidence": describe_overconfidence(pack),
         "caption": f"{'; '.join(parts)}.",
         "heads": _heads(names[baseline]["name"]),
         "rows": [_row(row, names[row["filter"]]) for row in view["rows"]],
         "has_costs": any(row.get("cost") is not None for row in view["rows"]),
     }
+
+
+def describe_overconfidence(pack: Mapping[str, Any]) -> str:
+    """Name the filters with severely overconfident runs, the largest share first; empty without any.
+
+    Args:
+        pack: Data of the page.
+    """
+    names = {look["key"]: look["name"] for look in pack["filters"]}
+    notes = [note for note in pack.get("filter_notes", ()) if note["severely_overconfident"]]
+    notes.sort(key=lambda note: -note["severely_overconfident"] / note["runs"])
+    if not notes:
+        return ""
+    counts = [
+        f"{names[note['filter']]} {note['severely_overconfident']} of {note['runs']}"
+        for note in notes[:_NAMED]
+    ]
+    others = len(notes) - len(counts)
+    end = f" and {others} other {'filter' if others == 1 else 'filters'}" if others else ""
+    return f"Severely overconfident runs: {', '.join(counts)}{end}."
 
 
 def _remove_marks(text: str) -> str:
