@@ -13,10 +13,9 @@ from types import ModuleType
 
 import pytest
 from checkout import ROOT
+from markupsafe import escape
 
-from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report.stored_page import read_page_data
-from pfbench.report.study_page import write_markdown
+from pfbench.report.stored_page import read_page_data, rebuild_page
 
 REPORT_FILE = re.compile(
     r"reports/(README\.md|\w+/(report\.md|verdicts\.(json(\.gz)?|csv)|runs\.parquet|page\.json\.gz|results\.json\.gz"
@@ -73,14 +72,21 @@ def test_published_reports_are_reduced() -> None:
         assert publish.reduce_markdown(text, folder, stem) == text, study
 
 
-def test_the_stored_data_of_a_page_give_its_published_text(tmp_path: Path) -> None:
+def test_the_stored_data_of_a_page_give_its_published_text_and_page(tmp_path: Path) -> None:
+    """As from a fresh clone, with the files of git only."""
     folders = [data.parent for data in (ROOT / "reports").glob("*/page.json.gz")]
     assert folders
     for folder in folders:
-        with RecordedFolder(tmp_path / folder.name) as target:
-            write_markdown(read_page_data(folder), target)
-        text = (tmp_path / folder.name / "report.md").read_text()
-        assert text == (folder / "report.md").read_text(), folder.name
+        copy = tmp_path / folder.name
+        copy.mkdir()
+        for name in ("page.json.gz", "verdicts.csv", "runs.parquet"):
+            (copy / name).symlink_to(folder / name)
+        page = rebuild_page(copy).read_text()
+        assert (copy / "report.md").read_text() == (folder / "report.md").read_text(), folder.name
+        links = re.findall(r'href="([^#"]+)" download', page)
+        assert set(links) == {"verdicts.csv", "runs.parquet"}, folder.name
+        title = read_page_data(folder)["title"]
+        assert f"<title>{escape(title)} – pfbench</title>" in page, folder.name
 
 
 def test_the_stored_results_of_a_script_give_its_published_page() -> None:
