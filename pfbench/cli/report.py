@@ -71,10 +71,12 @@ def check_study_exists(study: str, results: Path) -> None:
     Raises:
         ValueError: If it has neither. The message names similar studies.
     """
+    from pfbench.results.conditions import list_stored_studies
+
     experiments = {path.stem for path in experiments_dir().glob("*.yaml")}
     if study in experiments or (results / study).is_dir():
         return
-    available = sorted({path.parent.name for path in results.glob("*/*.npz")})
+    available = list_stored_studies(results)
     similar = suggest_similar(study, sorted({*available, *experiments}))
     raise ValueError(
         f"study must be a study with results, got {study}.{similar} "

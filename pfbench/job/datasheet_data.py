@@ -15,11 +15,12 @@ from pfbench.config.composition import JobConfig
 from pfbench.core.record import Episode, iterate_steps
 from pfbench.job.metadata import describe_state, make_provenance
 from pfbench.job.pcrb_cache import compute_pcrb
-from pfbench.job.plan import DATASHEETS, IGNORED_IN_KEY, instantiate_parts
+from pfbench.job.plan import IGNORED_IN_KEY, instantiate_parts
 from pfbench.job.raw_estimate import compute_raw_estimate
 from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
+from pfbench.results.conditions import DATASHEETS
 from pfbench.results.config_key import compute_config_key
 from pfbench.results.state_groups import main_component_group
 from pfbench.scenario.oracle_noise import RecordingRegime

@@ -28,8 +28,6 @@ from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
 from pfbench.scenario.base import Scenario
 from pfbench.scenario.oracle_noise import RecordingRegime
 
-DATASHEETS = "datasheets"  # folder of the results that holds the scenarios' datasheets
-
 # paths of the configuration that do not enter the key of a job
 IGNORED_IN_KEY = (
     *PLACE_SETTINGS,

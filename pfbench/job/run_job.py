@@ -19,9 +19,10 @@ from pfbench.job.allocation import EpisodeSource, apply_budget, max_runs_in_memo
 from pfbench.job.filter_pass import TimedFilterPass, pass_filter
 from pfbench.job.metadata import make_metadata
 from pfbench.job.pcrb_cache import compute_pcrb, lacks_bound
-from pfbench.job.plan import DATASHEETS, JobPlan, build_plan, job_key
+from pfbench.job.plan import JobPlan, build_plan, job_key
 from pfbench.job.settings import check_settings
 from pfbench.results import store
+from pfbench.results.conditions import DATASHEETS
 from pfbench.results.headline import describe_runs, main_rmse
 from pfbench.results.joined_runs import join_arrays, join_metadata
 

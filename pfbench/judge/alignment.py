@@ -59,6 +59,7 @@ def find_common_epochs(
     Raises:
         ValueError: If fewer than 10 epochs are common.
     """
+    _check_scored_time(reference, options)
     masks = [_scored(table.time, reference, options) for table in tables]
     coverage = _shares_covered([t.time[m] for t, m in zip(tables, masks, strict=True)])
     valid = [k for k, share in enumerate(coverage) if share >= options.coverage]
@@ -75,7 +76,7 @@ def find_common_epochs(
             f"trajectories of {reference.file} must share at least {LEAST_EPOCHS} epochs within "
             f"{options.tolerance:g} s, got {int(common.sum())} of "
             f"{', '.join(f'{len(times[k])} ({tables[k].file})' for k in valid) or 'none'}. Set "
-            "tolerance=SECONDS, or let the programs write the same epochs."
+            f"{'a smaller every' if options.every else 'tolerance=SECONDS'}, or let the programs write the same epochs."
         )
     rows = tuple(
         np.flatnonzero(masks[k])[nearest[k][common]] if k in times else None
@@ -85,6 +86,26 @@ def find_common_epochs(
     used = [0 if h is None else int((~h).sum()) for h in holes]
     unused = tuple(int(m.sum()) - n for m, n in zip(masks, used, strict=True))
     return CommonEpochs(grid[common], rows, holes, coverage, unused)
+
+
+def _check_scored_time(reference: ReferenceTrack, options: JudgeOptions) -> None:
+    """Raise ValueError if the scored time is outside the reference, or blocks are too long for it."""
+    first, last = (float(t) for t in reference.table.time[[0, -1]])
+    span = f"{first:.10g} to {last:.10g} s"
+    for name, value, is_valid in (
+        ("from", options.start, options.start < last),
+        ("to", options.end, options.end > first),
+    ):
+        if not is_valid:
+            raise ValueError(
+                f"{name} must be within {reference.file} ({span}), got {value:.10g} s. Change {name}=..."
+            )
+    seconds = min(last, options.end) - max(first, options.start)
+    if options.block > seconds / 2:
+        raise ValueError(
+            f"block must be at most half of the scored time, {seconds / 2:.10g} s, got {options.block:.10g} s. "
+            "Set block=0 for the rule."
+        )
 
 
 def _slowest(times: Sequence[Array]) -> Array:

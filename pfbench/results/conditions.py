@@ -23,6 +23,7 @@ from pfbench.results.step_times import STEP_TIME, add_step_times
 
 log = logging.getLogger("pfbench")
 
+DATASHEETS = "datasheets"  # folder of the results that holds the scenarios' datasheets
 _SHARED_SETTINGS = ("scenario", "noise", "dtype")  # settings that decide the data of a filter
 _Described = tuple[Path, dict[str, Any]]
 
@@ -140,6 +141,15 @@ def _separate_data(
     return [(names, parts[names]) for names in order]
 
 
+def list_stored_studies(results: Path) -> list[str]:
+    """List the studies with results; the data of datasheets are no study.
+
+    Args:
+        results: Folder of all studies.
+    """
+    return sorted({path.parent.name for path in results.glob("*/*.npz")} - {DATASHEETS})
+
+
 def _read_undamaged(path: Path) -> tuple[Path, dict[str, Any]] | None:
     """Read the metadata of a result. A damaged file is set aside and left out."""
     try:
@@ -228,8 +238,9 @@ def _list_files(files: Sequence[str]) -> str:
 def _no_results_message(study: str, results: Path) -> str:
     """State which studies have results, and the command that makes these."""
     folder = results / study
-    others = sorted({path.parent.name for path in results.glob("*/*.npz")})
     notes = store.list_failures(folder)
     failed = f" ({len(notes)} jobs failed, the first with {notes[0]['message']})" if notes else ""
-    available = f"Studies with results in {results}: {', '.join(others) or 'none'}."
+    available = (
+        f"Studies with results in {results}: {', '.join(list_stored_studies(results)) or 'none'}."
+    )
     return f"No results in {folder}{failed}. {available} Run: pfbench run -m +experiment={study}"

@@ -133,3 +133,23 @@ def test_a_frame_of_a_tum_file_is_required(home: Path) -> None:
     said = judge(home, f"mine={home / 'mine.tum'}")
     assert said.code == 1
     assert "frame must be ned or enu for mine.tum" in said.err
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("from=1e6", "from must be within truth.csv (0 to"),
+        ("to=-5", "to must be within truth.csv (0 to"),
+        ("block=1e9", "block must be at most half of the scored time"),
+        ("every=1e9", "Set a smaller every"),
+        ("mine.sd=sd.txt", "sd must belong to a text file of KF-GINS, got sd.txt for mine.csv"),
+        ("margin=0", "error judge: margin must be positive"),
+        ("alpha=1", "error judge: alpha must be between 0 and 1"),
+    ],
+)
+def test_an_option_that_cannot_be_is_refused(home: Path, word: str, message: str) -> None:
+    cases.write(full(cases.drive()), home / "mine.csv")
+    said = judge(home, word)
+    assert said.code == 1
+    assert message in said.err
+    assert not (home / "reports").exists()

@@ -259,6 +259,13 @@ def test_an_empty_study_says_where_to_go(results):
     assert "pfbench run -m +experiment=nothing" in message
 
 
+def test_data_of_datasheets_are_no_study(tmp_path):
+    for study in ("demo", "datasheets"):
+        synthetic.write(tmp_path / study, synthetic.Method("ekf", 1.0), **SMALL)
+    with pytest.raises(FileNotFoundError, match=r": demo\. Run"):
+        frame.load_frame("nothing", tmp_path)
+
+
 def test_a_study_that_only_failed_says_so(tmp_path):
     store.write_failure(
         tmp_path / "bad" / "00.npz", {"filter": "sir"}, RuntimeError("no particles left")

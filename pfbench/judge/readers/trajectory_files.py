@@ -96,6 +96,11 @@ def read_trajectories(
         ValueError: If the format is unknown or a check fails.
     """
     suffix = path.suffix.lower()
+    if sd is not None and suffix not in _TEXT:
+        raise ValueError(
+            f"sd must belong to a text file of KF-GINS, got {sd.name} for {path.name}. Remove the option, "
+            "and add columns sd_pn, sd_pe and sd_pd to the file."
+        )
     tables: Sequence[TrajectoryTable]
     if suffix in _TABLES:
         tables = read_csv_trajectory(path, options)
