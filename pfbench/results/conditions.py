@@ -142,7 +142,7 @@ def _separate_data(
 
 
 def list_stored_studies(results: Path) -> list[str]:
-    """List the studies with results; the data of datasheets are no study.
+    """List the studies with results, without the folder of datasheets.
 
     Args:
         results: Folder of all studies.
