@@ -126,3 +126,17 @@ def test_one_baseline_measures_all_filters(results: Path) -> None:
     missing = {entry["key"]: entry["reason_missing"] for entry in pack["budgets"]}
     assert missing["particles"] is None
     assert missing["time"] == "The study has no jobs with budget=time."
+
+
+def test_a_baseline_without_an_error_is_replaced_in_words(tmp_path: Path) -> None:
+    absent = synthetic.Method("apf", 1.2, 0.9, 200, 3.0, tuple(range(12)))
+    synthetic.study(tmp_path / "demo", runs=12, steps=10, methods=(*synthetic.METHODS, absent))
+    conditions = load_conditions("demo", tmp_path)
+    words = (
+        "[[APF]] has no error to compare in all conditions: [[EKF]] is the baseline in its place."
+    )
+    for baseline, is_said in (("apf", True), ("ukf", False)):
+        pack = build_pack("demo", conditions, ReportOptions(baseline=baseline))
+        assert [words in view["sentence"] for view in pack["views"].values()] == [is_said] * len(
+            pack["views"]
+        )

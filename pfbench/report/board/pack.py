@@ -60,8 +60,10 @@ def build_pack(
     most = _MOST_BASELINES if len(looks) * len(conditions) <= _MANY else _FEW_BASELINES
     names = StudyNames(looks, worlds, regimes, select_baselines(looks, options.baseline)[:most])
     views = build_views(table, names, options, planned_words(planned), data.times)
+    opening = next(iter(views))
+    warnings = (data.warning, _describe_baseline(looks, options.baseline, opening.baseline))
     for view in views.values():
-        view["sentence"] = f"{data.warning} {view['sentence']}".lstrip()
+        view["sentence"] = " ".join(filter(None, (*warnings, view["sentence"])))
     entries = planned_entries(planned, table, looks, worlds, options)
     first = next(iter(views.values()))["rows"]
     cells = cell_entries(table)
@@ -93,6 +95,16 @@ def build_pack(
         "provenance": [list(row) for row in provenance.list_shared_settings(conditions)],
     }
     return pack | {"bibtex": format_bibliography(pack, conditions)}
+
+
+def _describe_baseline(looks: Mapping[str, MethodLook], requested: str, baseline: str) -> str:
+    """State that another baseline is shown than the selected one; empty if it is shown."""
+    if requested in ("", baseline):
+        return ""
+    return (
+        f"[[{looks[requested].name}]] has no error to compare in all conditions: "
+        f"[[{looks[baseline].name}]] is the baseline in its place."
+    )
 
 
 def _describe_methods(conditions: Sequence[Condition], options: ReportOptions, pairs: int) -> str:
