@@ -347,8 +347,9 @@ def main() -> None:
         f"One thread each, one process at a time, {' or '.join(map(str, sorted(rounds)))} interleaved rounds after a warm-up; "
         "CPU time of the process; systematic resampling at every step. Every contestant delivers mean, variance and effective "
         "sample size at every step and, where it has one, the log evidence (of W4 and W5: minus the exact one). Ratios are taken "
-        "round by round. The default settings are float64 and the engine that a job of the size takes by `engine=auto`. Written by "
-        "`benchmarks/compare.py` from compare.json.", *lines, "",
+        "round by round. The default settings are float64 and the engine that a job of the size takes by `engine=auto`. Workloads "
+        "are timed one by one (`--only`), so pfbench's edition may differ between them. Written by `benchmarks/compare.py` from "
+        "compare.json.", *lines, "",
         ", ".join([f"{cpu_name()}; Python {platform.python_version()}", *map(" ".join, versions.items())]) + ".",
         "",
     ]  # fmt: skip
