@@ -89,6 +89,13 @@ def test_a_parameter_out_of_range_is_ignored_and_named(tmp_path: Path, column: s
         assert any("is ignored because its" in note for note in satellites.notes), satellites.notes
 
 
+def test_an_axis_beyond_the_largest_number_is_named(tmp_path: Path) -> None:
+    table = three()
+    table.loc[2, "sqrtA"] = 1e200
+    notes = constellation(tmp_path, table).notes
+    assert any("its semi-major axis is inf m" in note for note in notes), notes
+
+
 def test_another_unit_of_all_records_is_an_error(tmp_path: Path) -> None:
     degrees = three().assign(i0=lambda table: np.degrees(table["i0"]))
     with pytest.raises(ValueError, match=r"100% out of range.*i0 is 49.*Check the units"):

@@ -145,7 +145,7 @@ def _reason(row: Mapping[Any, Any]) -> str:
     least, largest = SQRT_AXIS[str(row["name"])[0]]
     root = float(row["sqrtA"])
     if not least <= root <= largest:
-        return f"semi-major axis is {root**2:.0f} m"
+        return f"semi-major axis is {root * root:.0f} m"
     number = float(row["prn"])
     if number != round(number) or number > LARGEST_PRN[str(row["name"])[0]]:
         return f"prn is {number:g}"
