@@ -8,6 +8,7 @@ from torch import Tensor
 from pfbench.core.record import FeedbackRun
 from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
 from pfbench.filter.gaussian.linearisation_rules import DifferenceSpace, TaylorLinearisation
+from pfbench.filter.particle.weight_update import WEIGHT_UPDATE_MEMORY
 from pfbench.model.base import StateSpaceModel
 
 
@@ -38,7 +39,9 @@ def apply_feedback(
     uncorrected, correct = feedback.correct(torch.where(valid, info.mean, 0.0))
     info = info._replace(mean=torch.where(valid, uncorrected.to(info.mean), info.mean))
     if isinstance(belief, ParticleBelief):
-        if belief.window or belief.memory:
+        # the memory of a weight update counts measurements of a run; it holds no states
+        past = [name for name in belief.memory if not name.startswith(WEIGHT_UPDATE_MEMORY)]
+        if belief.window or past:
             raise ValueError(
                 "filter must not store a particle's past in a scenario with feedback, got one with "
                 "moves or a proposal's memory. Choose another filter, or set "

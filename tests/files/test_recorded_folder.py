@@ -244,6 +244,7 @@ REMOVALS = {
     "files/recorded_folder.py": 1,
     "results/store.py": 1,
     "learn/training_job.py": 2,
+    "cli/sweep/sweep_progress.py": 2,  # its own log, and the folder of the study if it is empty
 }
 
 

@@ -16,6 +16,8 @@ from pfbench.kernels import cpp
 from pfbench.kernels.compilation import compilable, is_capturing
 from pfbench.model.base import StateSpaceModel
 
+WEIGHT_UPDATE_MEMORY = "weight_update."  # start of the names of its values in the particles' memory
+
 
 class WeightUpdate(Protocol):
     """Weight update by the measurement."""

@@ -22,13 +22,15 @@ from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.principal_axes import diagonal_axes
 from pfbench.filter.linearisation import mask_covariance
 from pfbench.filter.particle.particle_moments import predict_moments
-from pfbench.filter.particle.weight_update import MemoryWeightUpdate, UpdatedWeights
+from pfbench.filter.particle.weight_update import (
+    WEIGHT_UPDATE_MEMORY,
+    MemoryWeightUpdate,
+    UpdatedWeights,
+)
 from pfbench.filter.robust.component_groups import DOWNWEIGHTED, GroupDistances
 from pfbench.filter.robust.robust_update import InnovationWeight, ResidualLoss
 from pfbench.filter.whitening import LOG_2PI
 from pfbench.model.base import StateSpaceModel
-
-_PREFIX = "weight_update."  # start of the names in the memory of the particles
 
 
 @dataclass(frozen=True)
@@ -90,12 +92,16 @@ class RobustWeightUpdate(MemoryWeightUpdate):
             counts = {"downweighted": groups.count_groups(weight < DOWNWEIGHTED)}
         else:
             before = {
-                k.removeprefix(_PREFIX): v[:, 0] for k, v in memory.items() if k.startswith(_PREFIX)
+                k.removeprefix(WEIGHT_UPDATE_MEMORY): v[:, 0]
+                for k, v in memory.items()
+                if k.startswith(WEIGHT_UPDATE_MEMORY)
             }
             power, groups, counts = self.update.innovation_weight(innovation, before)
             log_normal = -0.5 * white.square() - log_scale - 0.5 * LOG_2PI
             log_w = prior_log_w + ((power * groups.observed).unsqueeze(1) * log_normal).sum(-1)
-        carried = {_PREFIX + k: v.unsqueeze(1) for k, v in counts.items() if v.dim() > 1}
+        carried = {
+            WEIGHT_UPDATE_MEMORY + k: v.unsqueeze(1) for k, v in counts.items() if v.dim() > 1
+        }
         trace = {k: v for k, v in counts.items() if v.dim() == 1}
         return UpdatedWeights(torch.where(log_w == log_w, log_w, -torch.inf), carried, trace)
 
