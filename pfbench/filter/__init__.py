@@ -137,7 +137,14 @@ __getattr__, __dir__ = lazy_attributes(
         "robust.variational_covariances": ("VariationalCovarianceAdaptation",),
         "robust.weighted_likelihood": ("WeightedLikelihoodUpdate",),
         "robust.windowed_noise": ("WindowedNoiseAdaptation",),
-        "smoothing": ("smooth", "sample_trajectories"),
+        "smoothing.backward_samplers": (
+            "BackwardSampler",
+            "ExactBackwardSampler",
+            "RejectionBackwardSampler",
+            "MetropolisBackwardSampler",
+        ),
+        "smoothing.backward_sampling": ("sample_trajectories",),
+        "smoothing.gaussian_smoother": ("smooth",),
         "swarm.chaotic_sequences": (
             "SwarmStart",
             "PriorStart",

@@ -1,0 +1,1 @@
+"""Smoothing: distributions of states given all measurements."""
