@@ -37,8 +37,8 @@ mutants: $(VENV)/.installed     ## plant each fault of tests/mutants.toml and ch
 studies: $(VENV)/.installed     ## run all published studies, cheapest first: about four hours on one idle core; repeat to continue
 	$(BIN)/python docs/run_studies.py
 
-recompute: $(VENV)/.installed      ## compute the decisions of a report a second time, without code of pfbench
-	$(BIN)/python tests/decision_oracle.py results/$(STUDY) reports/$(STUDY)/decisions.json
+recompute: $(VENV)/.installed      ## compute the decisions of a report a second time, without code of pfbench; STUDY= for all published ones
+	$(BIN)/python tests/recompute.py $(STUDY)
 
 faults: $(VENV)/.installed      ## disturb pfbench and count the outcomes in docs/reliability.md: hours; repeat to continue
 	PYTHONPATH=tests $(BIN)/python -m faults.main

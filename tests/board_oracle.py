@@ -12,7 +12,7 @@ import json
 import re
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,25 +24,52 @@ OPPOSITE = {"better": "worse", "worse": "better"}
 NUMBERS = ("rank", "value", "low", "high", "ratio", "ratio_low", "ratio_high", "track", "lost", "coverage", "nees", "ms")  # fmt: skip
 
 
+class Cell(NamedTuple):
+    """Trimmed mean log error of a filter in one condition, with contributions of the runs.
+
+    Attributes:
+        location: Trimmed mean, NaN without a run.
+        parts: Contribution of each run; empty if lost runs reach the trimmed middle.
+        middle: Number of runs that the trimmed mean uses.
+        runs: Number of runs.
+    """
+
+    location: float
+    parts: pd.Series
+    middle: int
+    runs: int
+
+
+Cells = dict[tuple[str, str, str], Cell]
+
+
+def make_cells(table: pd.DataFrame, metric: str) -> Cells:
+    """Cells of all filters and conditions."""
+    cells = {}
+    table = table[~(table["keeps_track"] & table[metric].isna())]
+    for key, runs in table.groupby(["filter", "scenario", "regime"]):
+        log_error = np.log(runs[metric]).where(runs["keeps_track"], np.inf).to_numpy()
+        n, cut = len(log_error), int(TRIM * len(log_error) + 1e-9)
+        location = float(stats.trim_mean(log_error, TRIM))
+        parts = pd.Series(dtype=float)
+        if np.isfinite(location):
+            clipped = mstats.winsorize(np.ma.array(log_error), limits=(cut / n, cut / n))
+            names = 10**6 * runs["seed"] + runs["run"]
+            influence = (np.asarray(clipped, float) - clipped.mean()) / (n - 2 * cut)
+            parts = pd.Series(influence, index=names.to_numpy())
+        cells[key] = Cell(location, parts, n - 2 * cut, n)
+    return cells
+
+
 class Level:
     """Mean over conditions of the trimmed mean log error of a filter, with contributions of the runs."""
 
-    def __init__(self, conditions: list[tuple[float, pd.Series]]) -> None:
-        self.value, self.middle, self.runs = 0.0, np.inf, np.inf
-        parts = []
-        for weight, log_error in conditions:
-            n = len(log_error)
-            cut = int(TRIM * n + 1e-9)
-            location = float(stats.trim_mean(log_error.to_numpy(), TRIM)) if n else np.nan
-            self.value += weight * location
-            self.middle, self.runs = min(self.middle, n - 2 * cut), min(self.runs, n)
-            if np.isfinite(location):
-                ordered = np.ma.array(log_error.to_numpy())
-                clipped = np.asarray(mstats.winsorize(ordered, limits=(cut / n, cut / n)), float)
-                influence = (clipped - clipped.mean()) / (n - 2 * cut)
-                parts.append(pd.Series(weight * influence, index=log_error.index))
-        if parts:
-            self.parts = pd.concat(parts).groupby(["seed", "run"]).sum()
+    def __init__(self, cells: list[tuple[float, Cell]]) -> None:
+        self.value = sum(weight * cell.location for weight, cell in cells)
+        self.middle = min(cell.middle for _, cell in cells)
+        self.runs = min(cell.runs for _, cell in cells)
+        parts = [weight * cell.parts for weight, cell in cells if len(cell.parts)]
+        self.parts = pd.concat(parts).groupby(level=0).sum() if parts else pd.Series(dtype=float)
 
 
 def interval(value: float, parts: pd.Series, middle: float, alpha: float) -> tuple[float, float]:
@@ -62,57 +89,62 @@ def difference(a: Level, b: Level, alpha: float) -> tuple[float, float, float]:
     return value, *interval(value, parts, min(a.middle, b.middle), alpha)
 
 
-def levels_of(rows: pd.DataFrame, metric: str, filters: list[str]) -> dict[str, Level]:
+def levels_of(conditions: pd.DataFrame, cells: Cells, filters: list[str]) -> dict[str, Level]:
     """Levels of all filters in the conditions of a view."""
-    conditions = rows[["family", "scenario", "regime"]].drop_duplicates()
-    levels = {}
-    for name in filters:
-        parts = []
-        for _, row in conditions.iterrows():
-            family = conditions[conditions["family"] == row["family"]]
-            scenario = family[family["scenario"] == row["scenario"]]
-            weight = (
-                1 / conditions["family"].nunique() / family["scenario"].nunique() / len(scenario)
-            )
-            runs = rows[(rows["filter"] == name) & (rows["scenario"] == row["scenario"]) & (rows["regime"] == row["regime"])]  # fmt: skip
-            runs = runs[~(runs["keeps_track"] & runs[metric].isna())].set_index(["seed", "run"])
-            parts.append((weight, np.log(runs[metric]).where(runs["keeps_track"], np.inf)))
-        levels[name] = Level(parts)
-    return levels
+    absent = Cell(np.nan, pd.Series(dtype=float), 0, 0)
+    weights = []
+    for _, row in conditions.iterrows():
+        family = conditions[conditions["family"] == row["family"]]
+        regimes = (family["scenario"] == row["scenario"]).sum()
+        weights.append(1 / conditions["family"].nunique() / family["scenario"].nunique() / regimes)
+    names = list(conditions[["scenario", "regime"]].itertuples(index=False, name=None))
+    return {
+        name: Level(
+            [(w, cells.get((name, *c), absent)) for w, c in zip(weights, names, strict=True)]
+        )
+        for name in filters
+    }
 
 
-def view_rows(
-    rows: pd.DataFrame, key: tuple[str, str, str, str], words: dict[Any, str]
-) -> list[Any]:
+class Scope:
+    """Levels and shares of all filters in the conditions of a view, before a baseline is chosen."""
+
+    def __init__(self, rows: pd.DataFrame, cells: Cells, world: str, regime: str) -> None:
+        filters = sorted(rows["filter"].unique())
+        if world != "all":
+            rows = rows[rows["scenario"] == world]
+        if regime != "all":
+            rows = rows[rows["regime"] == regime]
+        conditions = rows[["family", "scenario", "regime"]].drop_duplicates()
+        self.levels = levels_of(conditions, cells, filters)
+        self.is_single = len(conditions) == 1
+        parts = rows.groupby(["filter", "scenario", "regime"])
+        names = {"keeps_track": "track", "coverage_90": "coverage", "nees_ratio": "nees"}
+        shares = parts[list(names)].mean().groupby("filter").mean().rename(columns=names)
+        shares["lost"] = rows.groupby("filter")["lost"].sum()
+        shares["ms"] = parts["ms"].first().groupby("filter").agg(stats.gmean)
+        self.shares = shares.reindex(filters)
+
+
+def view_rows(scope: Scope, baseline: str, words: dict[Any, str]) -> list[Any]:
     """Rows of one view."""
-    metric, world, regime, baseline = key
-    filters = sorted(rows["filter"].unique())
-    selected = rows[((world == "all") | (rows["scenario"] == world)) & ((regime == "all") | (rows["regime"] == regime))]  # fmt: skip
-    levels = levels_of(selected, metric, filters)
+    levels = scope.levels
     finite = {name: level.value for name, level in levels.items() if np.isfinite(level.value)}
     best = min(finite, key=lambda name: (finite[name], name)) if finite else None
-    is_single = len(selected[["scenario", "regime"]].drop_duplicates()) == 1
     result = []
     for name, level in levels.items():
-        runs = selected[selected["filter"] == name]
-        cells = runs.groupby(["scenario", "regime"])
         row: dict[str, Any] = dict.fromkeys(NUMBERS, np.nan)
-        row |= {"filter": name, "track": cells["keeps_track"].mean().mean(), "lost": runs["lost"].sum(),
-                "coverage": cells["coverage_90"].mean().mean(), "nees": cells["nees_ratio"].mean().mean(),
-                "ms": stats.gmean(cells["ms"].first())}  # fmt: skip
+        row |= {"filter": name, **scope.shares.loc[name]}
         if name in finite:
             row["rank"] = 1 + sum(value < level.value - 1e-6 for value in finite.values())
-            if is_single:
+            if scope.is_single:
                 ends = interval(level.value, level.parts, level.middle, 0.05)
-                row |= dict(
-                    zip(("value", "low", "high"), np.exp([level.value, *ends]), strict=True)
-                )
+                values = np.exp([level.value, *ends])
+                row |= dict(zip(("value", "low", "high"), values, strict=True))
             if baseline in finite:
                 ends = difference(level, levels[baseline], 0.05)
                 row |= dict(zip(("ratio", "ratio_low", "ratio_high"), np.exp(ends), strict=True))
-        row["verdict"] = verdict_of(
-            name, best, levels, words if key[:3] == ("rmse", "all", "all") else {}
-        )
+        row["verdict"] = verdict_of(name, best, levels, words)
         result.append(row)
     return result
 
@@ -149,14 +181,25 @@ def planned_words(decisions: Path) -> dict[Any, str]:
     return words
 
 
-def find_differences(folder: Path, tolerance: float = 6e-4) -> list[str]:
-    """Compare every row of verdicts.csv, which has four digits, with an independent computation."""
+def find_differences(
+    folder: Path, words: dict[Any, str] | None = None, tolerance: float = 6e-4
+) -> list[str]:
+    """Compare every row of verdicts.csv, which has four digits, with an independent computation.
+
+    Without words of planned pairs, those of decisions.json are used.
+    """
     runs = pd.read_parquet(folder / "runs.parquet")
     stored = pd.read_csv(folder / "verdicts.csv")
-    words = planned_words(folder / "decisions.json")
+    words = planned_words(folder / "decisions.json") if words is None else words
     different = []
+    cells = {metric: make_cells(runs, metric) for metric in stored["metric"].unique()}
+    scopes: dict[Any, Scope] = {}
     for key, view in stored.groupby(["metric", "world", "regime", "baseline"], sort=False):
-        own = pd.DataFrame(view_rows(runs, key, words)).set_index("filter")
+        place = metric, world, regime = key[:3]
+        scope = scopes.setdefault(place, scopes.get(place) or Scope(runs, cells[metric], world, regime))  # fmt: skip
+        is_opening = place == (stored["metric"][0], "all", "all")
+        rows = view_rows(scope, key[3], words if is_opening else {})
+        own = pd.DataFrame(rows).set_index("filter")
         for _, row in view.iterrows():
             expected = own.loc[row["filter"]]
             numbers = expected[list(NUMBERS)].to_numpy(float)

@@ -1,19 +1,15 @@
-"""Decisions of a study computed a second time from its stored files, without any code of pfbench.
+"""Decisions on pairs of filters computed a second time, without any code of pfbench.
 
-It reads the result files with numpy and follows docs/statistics.md. Trimmed means, tests and corrections are
-those of scipy and statsmodels. The exchange test enumerates all exchanges. Studies with equal runs in all
-conditions and one part per job are read.
-
-Run: make recompute STUDY=quickstart
+It follows docs/statistics.md. Trimmed means, tests and corrections are those of scipy and statsmodels. The
+exchange test counts all exchanges in exact fractions. `recompute.py` applies it to stored studies.
 """
 
 from __future__ import annotations
 
-import json
-import sys
+import math
+from fractions import Fraction
 from itertools import groupby
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -21,179 +17,193 @@ from scipy import stats
 from scipy.stats import mstats
 from statsmodels.stats.multitest import multipletests
 
-ALPHA, TRIM = 0.05, 0.2
-FAMILIES = ("planned pairs, track and error", "planned pairs, secondary metrics")
+ALPHA, TRIM, FEWEST, SAME = 0.05, 0.2, 10, 1e-6
 METRICS = {
     "error": "ratio", "CRPS": "ratio", "energy score": "ratio", "largest error": "ratio",
     "log score per step": "score", "overconfident runs": "share", "keeps track": "track",
 }  # fmt: skip
 
 
-def read_runs(folder: Path) -> pd.DataFrame:
-    """One row per run: condition, filter, status and all metrics of the main group."""
-    tables = []
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path) as file:
-            data = {name: file[name] for name in file.files}
-        tables.append(runs_of(data, json.loads(str(data["meta"]))))
-    return pd.concat(tables, ignore_index=True)
+class Cell(NamedTuple):
+    """Runs of a pair in one condition, by the name of the run.
+
+    Attributes:
+        weight: Weight in its world; the weights of a world have sum 1.
+        d: Differences, negative if the first filter is better.
+        logs: Log errors of both filters, infinite where the track is lost; None without a ratio.
+        both: Whether both filters keep track.
+    """
+
+    weight: Fraction
+    d: pd.Series
+    logs: tuple[pd.Series, pd.Series] | None
+    both: pd.Series
 
 
-def runs_of(data: dict[str, np.ndarray], meta: dict[str, Any]) -> pd.DataFrame:
-    """Runs of one result file. The main group has one unit: the first of a mixed group."""
-    groups, units = meta["state"]["groups"], meta["state"]["units"]
-    name = "position" if "position" in groups else next(iter(groups))
-    places = [k for k in groups[name] if units[k] == units[groups[name][0]]]
-    index, is_whole = list(groups).index(name), len(places) == len(groups[name])
-    norm = np.sqrt((data["error"][..., places].astype(float) ** 2).sum(-1))
-    nees = data["nees"][..., index].astype(float).mean(1)
-    paper = meta["config"]["scenario"].get("paper") or {}
-    limit = paper.get("divergence_threshold") or np.inf
-    is_lost = data["lost"]
-    diverged = ((norm > limit).mean(1) >= 0.1) | (norm[:, -1] > limit)
-    energy = data["energy_score"][..., index].astype(float).mean(1)
-    overconfident = (nees > stats.chi2.ppf(0.999, len(groups[name]))).astype(float)
-    scenario = meta["choices"]["scenario"]
-    others = {}
-    for other, index_of_group in groups.items():
-        for unit in dict.fromkeys(units[k] for k in index_of_group):
-            part = [k for k in index_of_group if units[k] == unit]
-            title = other if len(part) == len(index_of_group) else f"{other} [{unit}]"
-            square = (data["error"][..., part].astype(float) ** 2).sum(-1)
-            if part != places:
-                others[f"{title} error"] = np.sqrt(square.mean(1))
-    return pd.DataFrame({
-        "filter": meta["label"], "scenario": scenario, "world": paper.get("family") or scenario,
-        "regime": meta["choices"]["noise"], "run": np.arange(len(norm)),
-        "keeps": ~is_lost & ~diverged,
-        "error": np.sqrt((norm**2).mean(1)),
-        "largest error": norm.max(1),
-        "CRPS": data["crps"][..., places].astype(float).mean((1, 2)),
-        "energy score": energy if is_whole else np.nan,
-        "log score per step": data["log_evidence"] / norm.shape[1],
-        "overconfident runs": np.where(is_lost, np.nan, overconfident),
-        **others,
-    })  # fmt: skip
+Worlds = dict[str, list[Cell]]
 
 
-# of each condition: weight, differences of the runs, and log errors of both filters if it has a ratio
-Levels = tuple[np.ndarray, np.ndarray] | None
-Worlds = dict[str, list[tuple[float, np.ndarray, Levels]]]
-
-
-def paired_values(runs: pd.DataFrame, a: str, b: str, metric: str) -> Worlds:
-    """Differences of a pair by world, over the runs in their order; weights of a world have sum 1."""
-    worlds: dict[str, dict[str, list[tuple[np.ndarray, Levels]]]] = {}
+def pair_cells(runs: pd.DataFrame, a: str, b: str, metric: str) -> Worlds:
+    """Runs that a pair shares, by world and condition."""
+    kind = METRICS.get(metric, "ratio")
+    worlds: dict[str, dict[str, list[Cell]]] = {}
+    runs = runs[runs["filter"].isin((a, b))]
     for (world, scenario, _), rows in runs.groupby(["world", "scenario", "regime"]):
         first, second = (rows[rows["filter"] == name].set_index("run") for name in (a, b))
-        if metric == "keeps track" or first.get(metric, pd.Series(dtype=float)).notna().any():
-            values = differences(first, second, metric), log_errors(first, second, metric)
-            worlds.setdefault(str(world), {}).setdefault(str(scenario), []).append(values)
+        if metric in rows:
+            if metric != "error" and not first[metric].notna().any():
+                continue  # the condition lacks the metric
+            first, second = (x[x[metric].notna() | ~x["keeps"]] for x in (first, second))
+        names = first.index.intersection(second.index).sort_values()
+        if len(names):
+            first, second = first.loc[names], second.loc[names]
+            logs = log_errors(first, second, metric) if kind == "ratio" else None
+            cell = Cell(
+                Fraction(1),
+                differences(first, second, metric),
+                logs,
+                first["keeps"] & second["keeps"],
+            )
+            worlds.setdefault(str(world), {}).setdefault(str(scenario), []).append(cell)
     return {
-        world: [(1 / len(scenarios) / len(rows), *v) for rows in scenarios.values() for v in rows]
+        world: [
+            cell._replace(weight=Fraction(1, len(scenarios) * len(cells)))
+            for cells in scenarios.values()
+            for cell in cells
+        ]
         for world, scenarios in worlds.items()
     }
 
 
-def differences(first: pd.DataFrame, second: pd.DataFrame, metric: str) -> np.ndarray:
+def differences(first: pd.DataFrame, second: pd.DataFrame, metric: str) -> pd.Series:
     """Differences of the runs of one condition, negative if the first filter is better."""
     kind = METRICS.get(metric, "ratio")
-    keeps_a, keeps_b = first["keeps"].to_numpy(), second["keeps"].to_numpy()
     if kind == "track":
-        return np.asarray(keeps_b.astype(float) - keeps_a.astype(float))
-    x, y = first[metric].to_numpy(float), second[metric].to_numpy(float)
+        return second["keeps"].astype(float) - first["keeps"].astype(float)
+    x, y = first[metric].astype(float), second[metric].astype(float)
     if kind == "share":
-        return np.asarray(x - y)
-    d = np.log(x / y) if kind == "ratio" else y - x
-    d[np.abs(d) <= 1e-6] = 0.0
-    d[keeps_a & ~keeps_b], d[keeps_b & ~keeps_a] = -np.inf, np.inf
-    d[~keeps_a & ~keeps_b] = 0.0
-    return np.asarray(d)
+        return (x - y)[x.notna() & y.notna()]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        d = np.log(x / y) if kind == "ratio" else y - x
+    d[d.abs() <= SAME] = 0.0
+    d[first["keeps"] & ~second["keeps"]] = -np.inf
+    d[second["keeps"] & ~first["keeps"]] = np.inf
+    d[~first["keeps"] & ~second["keeps"]] = 0.0
+    return d
 
 
-def log_errors(first: pd.DataFrame, second: pd.DataFrame, metric: str) -> Levels:
+def log_errors(
+    first: pd.DataFrame, second: pd.DataFrame, metric: str
+) -> tuple[pd.Series, pd.Series]:
     """Log errors of both filters, infinite where the track is lost."""
-    if METRICS.get(metric, "ratio") != "ratio":
-        return None
     a, b = (
-        np.where(rows["keeps"], np.log(rows[metric].to_numpy(float)), np.inf)
-        for rows in (first, second)
+        np.log(rows[metric].astype(float)).where(rows["keeps"], np.inf) for rows in (first, second)
     )
     return a, b
 
 
-def level_difference(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, int]:
-    """Difference of two trimmed means, with the differences of the contributions of the runs."""
-    (x, parts_x, middle), (y, parts_y, _) = trimmed(a), trimmed(b)
-    with np.errstate(invalid="ignore"):
-        return x - y, parts_x - parts_y, middle
-
-
-def trimmed(d: np.ndarray) -> tuple[float, np.ndarray, int]:
+def trimmed(d: pd.Series) -> tuple[float, pd.Series, int]:
     """Trimmed mean, contribution of each run to it, and number of runs that it uses."""
     n, cut = len(d), int(TRIM * len(d) + 1e-9)
     middle = n - 2 * cut
     with np.errstate(invalid="ignore"):
-        location = float(stats.trim_mean(d, TRIM))
+        location = float(stats.trim_mean(d.to_numpy(), TRIM)) if n else np.nan
     if not np.isfinite(location):
-        return location, np.zeros(n), middle
-    ordered = np.asarray(mstats.winsorize(np.ma.array(d), limits=(cut / n, cut / n)), float)
-    return location, (ordered - ordered.mean()) / middle, middle
+        return location, 0.0 * d.where(np.isfinite(d), 0.0), middle
+    clipped = np.asarray(mstats.winsorize(np.ma.array(d.to_numpy()), limits=(cut / n, cut / n)))
+    influence = (clipped.astype(float) - clipped.mean()) / middle
+    return location, pd.Series(influence, index=d.index), middle
 
 
-def plain_mean(d: np.ndarray) -> tuple[float, np.ndarray, int]:
-    return float(d.mean()), (d - d.mean()) / len(d), len(d)
+def locate(cell: Cell, kind: str) -> tuple[float, pd.Series, int]:
+    """Effect of one condition: difference of levels, trimmed mean of differences, or share."""
+    if cell.logs:
+        (x, parts_x, middle), (y, parts_y, _) = map(trimmed, cell.logs)
+        with np.errstate(invalid="ignore"):
+            return x - y, parts_x - parts_y, middle
+    if kind == "score":
+        return trimmed(cell.d)
+    return float(cell.d.mean()), (cell.d - cell.d.mean()) / len(cell.d), len(cell.d)
 
 
-def exchange_p(contributions: np.ndarray) -> float:
-    """Exact two-sided p-value over all exchanges of whole runs."""
-    x = contributions[np.abs(contributions) > 1e-12]
-    sums = np.zeros(1)
-    for value in x:
-        sums = np.concatenate([sums + value, sums - value])
-    return float((np.abs(sums) >= abs(x.sum()) - 1e-9).mean())
+def exchange_test(worlds: Worlds) -> tuple[pd.Series, float]:
+    """Contribution of each run to a mean of signs, and the exact p-value over all exchanges of runs."""
+    total: dict[Any, Fraction] = {}
+    for cells in worlds.values():
+        for cell in cells:
+            step = cell.weight / (len(cell.d) * len(worlds))
+            for run, value in cell.d.items():
+                total[run] = total.get(run, Fraction(0)) + step * int(value)
+    unit = math.lcm(*(x.denominator for x in total.values()))
+    steps = [int(x * unit) for x in total.values()]
+    chances = np.ones(1)
+    for step in map(abs, filter(None, steps)):
+        padded = np.zeros(len(chances) + 2 * step)
+        padded[: len(chances)] += chances / 2
+        padded[2 * step :] += chances / 2
+        chances = padded
+    sums = np.arange(len(chances)) - len(chances) // 2
+    p = min(1.0, float(chances[np.abs(sums) >= abs(sum(steps))].sum()))
+    return pd.Series({run: float(x) for run, x in total.items()}), p
+
+
+def sum_by_run(parts: list[pd.Series]) -> float:
+    """Sum of squares of contributions that are added run by run."""
+    return float((pd.concat(parts).groupby(level=0).sum() ** 2).sum())
 
 
 def estimate(worlds: Worlds, kind: str) -> dict[str, Any]:
     """Estimate, standard error, degrees of freedom and p-value for both questions."""
-    location = trimmed if kind == "score" else plain_mean
-    parts = {
-        w: [(g, *(level_difference(*logs) if logs else location(d))) for g, d, logs in conditions]
-        for w, conditions in worlds.items()
-    }
-    theta = np.array([sum(g * x for g, x, _, _ in conditions) for conditions in parts.values()])
-    psi = np.array([sum(g * row for g, _, row, _ in conditions) for conditions in parts.values()])
-    middle = min(c[3] for conditions in parts.values() for c in conditions)
-    count = len(theta)
-    correction = middle / (middle - 1)
-    error = np.sqrt(correction * (psi.mean(0) ** 2).sum())
-    if kind in ("ratio", "score") and not (np.isfinite(theta).all() and error > 0):
-        won = {w: [(g, np.sign(d), None) for g, d, _ in c] for w, c in worlds.items()}
-        return estimate(won, "won")
-    value = theta.mean()
-    here = (value, error, middle - 1)
-    p = 2 * stats.t.sf(abs(value) / error, middle - 1) if error > 0 else np.nan
-    joint = (correction * (psi.sum(0) ** 2).sum()) - sum(correction * (row**2).sum() for row in psi)
-    shared = max(0.0, joint / (count * (count - 1))) if count > 1 else np.nan
+    effects = {w: [(float(c.weight), *locate(c, kind)) for c in cells] for w, cells in worlds.items()}  # fmt: skip
+    theta = np.array([sum(g * x for g, x, _, _ in cells) for cells in effects.values()])
+    parts = [[g * row for g, _, row, _ in cells] for cells in effects.values()]
+    middles = [min(cell[3] for cell in cells) for cells in effects.values()]
+    correction = [m / (m - 1) if m > 1 else np.nan for m in middles]
+    least, count = min(middles), len(theta)
+    joint = min(correction) if least < 2 else least / (least - 1)
+    total = joint * sum_by_run([row for rows in parts for row in rows])
+    value, error = float(theta.mean()), math.sqrt(total) / count
+    is_constant = all(np.ptp(c.d.to_numpy()) <= 1e-9 for cells in worlds.values() for c in cells if np.isfinite(c.d).all())  # fmt: skip
+    is_same = all((c.d.abs() <= SAME).all() for cells in worlds.values() for c in cells)
+    if kind in ("ratio", "score") and not is_same and not (np.isfinite(value) and (error > 0 or is_constant)):  # fmt: skip
+        won = {w: [c._replace(d=np.sign(c.d), logs=None) for c in cells] for w, cells in worlds.items()}  # fmt: skip
+        return estimate(won, "won") | {"both": both_kept(worlds, kind)}
+    here = (value, error, least - 1.0)
+    p = 2 * stats.t.sf(abs(value) / error, least - 1) if error > 0 else np.nan
+    own = sum(f * sum_by_run(rows) for f, rows in zip(correction, parts, strict=True))
+    shared = max(0.0, (total - own) / (count * (count - 1))) if count > 1 else np.nan
     between = theta.std(ddof=1) ** 2 / count + shared if count > 1 else np.nan
     if kind in ("track", "share", "won"):
-        x = np.mean([sum(g * d for g, d, _ in c) for c in worlds.values()], axis=0)
-        n = len(x)  # x: contribution of each run, times the number of runs
-        p = exchange_p(x / n)
+        contributions, p = exchange_test(worlds)
+        n = len(contributions)
+        x = contributions.to_numpy() * n
         shrunk = x.sum() / (n + 2)
-        variance = ((x**2).sum() + 1) / (n + 2) - shrunk**2
-        error = np.sqrt(variance / (n + 2))
-        here = (shrunk, error, n - 1)
-        between = max(between, error**2)
-    new = (value, np.sqrt(between), count - 1)
-    p_new = 2 * stats.t.sf(abs(value) / new[1], count - 1) if count > 1 else np.nan
-    is_identical = all((np.abs(d) <= 1e-6).all() for c in worlds.values() for _, d, _ in c)
-    if is_identical:
+        error = math.sqrt((((x**2).sum() + 1) / (n + 2) - shrunk**2) / (n + 2))
+        value, here, between = x.mean(), (shrunk, error, n - 1.0), max(between, error**2)
+    new = (float(theta.mean()), math.sqrt(between), count - 1.0)
+    p_new = 2 * stats.t.sf(abs(new[0]) / new[1], count - 1) if count > 1 else np.nan
+    if min(len(c.d) for cells in worlds.values() for c in cells) < FEWEST:
+        p = np.nan
+    if is_same:
         p = p_new = np.nan
     return {
         "value": value, "a": here, "b": new, "p_a": p, "p_b": p_new, "won": kind == "won",
-        "identical": is_identical,
+        "identical": is_same, "theta": theta, "both": both_kept(worlds, kind),
+        "has_error": any(c.both.any() for cells in worlds.values() for c in cells),
     }  # fmt: skip
+
+
+def both_kept(worlds: Worlds, kind: str) -> float:
+    """Effect among the runs in which both filters keep track; NaN without one."""
+    if kind in ("track", "share"):
+        return np.nan
+    pairs = [
+        (float(c.weight), float(stats.trim_mean(c.d[c.both].to_numpy(), TRIM)))
+        for cells in worlds.values()
+        for c in cells
+        if c.both.any()
+    ]
+    return sum(g * x for g, x in pairs) / sum(g for g, _ in pairs) if pairs else np.nan
 
 
 def word_of(low: float, high: float, is_decided: bool, value: float, margin: float) -> str:
@@ -203,47 +213,60 @@ def word_of(low: float, high: float, is_decided: bool, value: float, margin: flo
     return "equivalent" if -margin < low and high < margin else "inconclusive"
 
 
+def decide(estimates: list[dict[str, Any]], question: str) -> list[dict[str, Any]]:
+    """Holm's correction and simultaneous intervals of a family.
+
+    Args:
+        estimates: Results of `estimate`, with the margin, and whether the metric has ratios.
+        question: "a" or "b".
+    """
+    p = np.array([e[f"p_{question}"] for e in estimates], dtype=float)
+    tested = np.isfinite(p)
+    corrected = np.full(len(p), np.nan)
+    if tested.any():
+        corrected[tested] = multipletests(p[tested], method="holm")[1]
+    rows = []
+    for e, p_single, p_holm in zip(estimates, p, corrected, strict=True):
+        centre, error, df = e[question]
+        half = stats.t.ppf(1 - ALPHA / max(tested.sum(), 1) / 2, df) * error
+        low, high = centre - half, centre + half
+        is_decided = bool(np.nan_to_num(p_holm, nan=1.0) <= ALPHA)
+        if is_decided:
+            low, high = (low, min(high, 0.0)) if e["value"] < 0 else (max(low, 0.0), high)
+        else:
+            low, high = min(low, 0.0), max(high, 0.0)
+        word = word_of(low, high, is_decided, e["value"], 0.0 if e["won"] else e["margin"])
+        if np.isnan(p_single):
+            low, high, word = -np.inf, np.inf, "not tested"
+        if e["identical"] and (not e["is_ratio"] or e["has_error"]):
+            low, high, word = 0.0, 0.0, "identical"
+        rows.append({
+            "estimate": e["value"], "low": low, "high": high, "p": p_single, "p_corrected": p_holm,
+            "word": word,
+        })  # fmt: skip
+    return rows
+
+
 def recompute(runs: pd.DataFrame, records: list[dict[str, Any]]) -> pd.DataFrame:
     """Decide the same pairs, metrics and questions as the records, family by family."""
     rows = []
     records = sorted(records, key=lambda r: (r["family"], r["question"]))
-    for _, family in groupby(records, key=lambda r: (r["family"], r["question"])):
+    for (_, question), family in groupby(records, key=lambda r: (r["family"], r["question"])):
         members = list(family)
         estimates = []
         for r in members:
             is_known = r["metric"] in METRICS or r["metric"] in runs
             metric = r["metric"] if is_known else "error"  # "main group error"
+            worlds = pair_cells(runs, r["a"], r["b"], metric)
             kind = METRICS.get(metric, "ratio")
-            estimates.append(estimate(paired_values(runs, r["a"], r["b"], metric), kind))
-        question = members[0]["question"]
-        p = np.array([e[f"p_{question}"] for e in estimates])
-        tested = np.isfinite(p)
-        corrected = np.full(len(p), np.nan)
-        corrected[tested] = multipletests(p[tested], method="holm")[1]
-        for r, e, p_single, p_holm in zip(members, estimates, p, corrected, strict=True):
-            centre, error, df = e[question]
-            half = stats.t.ppf(1 - ALPHA / tested.sum() / 2, df) * error
-            low, high = centre - half, centre + half
-            is_decided = bool(np.nan_to_num(p_holm, nan=1.0) <= ALPHA)
-            if is_decided:
-                low, high = (low, min(high, 0.0)) if e["value"] < 0 else (max(low, 0.0), high)
-            else:
-                low, high = min(low, 0.0), max(high, 0.0)
-            word = word_of(low, high, is_decided, e["value"], 0.0 if e["won"] else r["margin"])
-            if np.isnan(p_single):
-                low, high, word = -np.inf, np.inf, "not tested"
-            if e["identical"] and (
-                r["scale"] != "log ratio" or max(r["share_a"], r["share_b"]) > 0.0
-            ):
-                low, high, word = 0.0, 0.0, "identical"
-            rows.append({
-                "family": r["family"], "question": question, "a": r["a"], "b": r["b"],
-                "metric": r["metric"], "estimate": e["value"], "low": low, "high": high,
-                "p": p_single, "p_corrected": p_holm, "word": word,
-                "stored_estimate": float(r["estimate"]), "stored_low": float(r["low"]),
-                "stored_high": float(r["high"]), "stored_p": float(r["p"]),
-                "stored_p_corrected": float(r["p_corrected"]), "stored_word": r["word"],
+            estimates.append(estimate(worlds, kind) | {
+                "margin": r["margin"], "is_ratio": r["scale"] == "log ratio",
             })  # fmt: skip
+        for r, row in zip(members, decide(estimates, question), strict=True):
+            names = {k: r[k] for k in ("family", "question", "a", "b", "metric")}
+            numbers = ("estimate", "low", "high", "p", "p_corrected")
+            stored = {f"stored_{k}": float(r[k]) for k in numbers}
+            rows.append(names | row | stored | {"stored_word": r["word"]})
     return pd.DataFrame(rows)
 
 
@@ -254,17 +277,3 @@ def find_differences(table: pd.DataFrame, tolerance: float = 1e-8) -> pd.DataFra
         own, stored = table[name].to_numpy(float), table[f"stored_{name}"].to_numpy(float)
         is_different |= ~np.isclose(own, stored, rtol=tolerance, atol=tolerance, equal_nan=True)
     return table[is_different]
-
-
-def main(results: Path, decisions: Path) -> int:
-    """Compare all records of a report with an independent computation."""
-    records = [r for r in json.loads(decisions.read_text()) if r["family"] in FAMILIES]
-    table = recompute(read_runs(results), records)
-    different = find_differences(table)
-    print(f"{len(table)} decisions computed again, {len(different)} differ")
-    print(different.to_string() if len(different) else "", end="")
-    return int(len(different) > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2])))
