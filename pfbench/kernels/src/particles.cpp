@@ -112,7 +112,8 @@ void affine(T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t
                 if (const T c = b[d * noises + k]; c != 0) terms[count++] = {w + k * plane + r * particles, c};
             last[d] = count;
         }
-        if (particles >= 4 * WIDE) summed<T, 4>(to, terms.data(), last, plane, particles);
+        if (particles >= 8 * WIDE) summed<T, 8>(to, terms.data(), last, plane, particles);
+        else if (particles >= 4 * WIDE) summed<T, 4>(to, terms.data(), last, plane, particles);
         else if (particles >= WIDE) summed<T, 1>(to, terms.data(), last, plane, particles);
         else
             for (int64_t d = 0, t = 0; d < rows; ++d) {

@@ -25,22 +25,29 @@ inline void words(word first, word component, word step, word run, word k0, word
     };
     const __m256i m0 = _mm256_set1_epi32(static_cast<int>(generator::M0)), m1 = _mm256_set1_epi32(static_cast<int>(generator::M1));
     const __m256i lanes = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
-    for (; i < n; i += 8) {  // beyond n lie words that nobody reads
-        __m256i c0 = _mm256_add_epi32(_mm256_set1_epi32(static_cast<int>(first) + i), lanes);
-        __m256i c1 = _mm256_set1_epi32(static_cast<int>(component));
-        __m256i c2 = _mm256_set1_epi32(static_cast<int>(step)), c3 = _mm256_set1_epi32(static_cast<int>(run)), low0, low1;
-        word x = k0, y = k1;
-        for (int round = 0; round < 10; ++round, x += generator::W0, y += generator::W1) {
-            const __m256i high0 = multiply(c0, m0, low0), high1 = multiply(c2, m1, low1);
-            c0 = _mm256_xor_si256(_mm256_xor_si256(high1, c1), _mm256_set1_epi32(static_cast<int>(x)));
-            c2 = _mm256_xor_si256(_mm256_xor_si256(high0, c3), _mm256_set1_epi32(static_cast<int>(y)));
-            c1 = low1;
-            c3 = low0;
+    for (; i < n; i += 16) {  // two chains of products at a time; beyond n lie words that nobody reads
+        __m256i c0[2], c1[2], c2[2], c3[2], low0, low1;
+        for (int j = 0; j < 2; ++j) {
+            c0[j] = _mm256_add_epi32(_mm256_set1_epi32(static_cast<int>(first) + i + 8 * j), lanes);
+            c1[j] = _mm256_set1_epi32(static_cast<int>(component));
+            c2[j] = _mm256_set1_epi32(static_cast<int>(step));
+            c3[j] = _mm256_set1_epi32(static_cast<int>(run));
         }
-        _mm256_store_si256(reinterpret_cast<__m256i*>(out[0] + i), c0);
-        _mm256_store_si256(reinterpret_cast<__m256i*>(out[1] + i), c1);
-        _mm256_store_si256(reinterpret_cast<__m256i*>(out[2] + i), c2);
-        _mm256_store_si256(reinterpret_cast<__m256i*>(out[3] + i), c3);
+        word x = k0, y = k1;
+        for (int round = 0; round < 10; ++round, x += generator::W0, y += generator::W1)
+            for (int j = 0; j < 2; ++j) {
+                const __m256i high0 = multiply(c0[j], m0, low0), high1 = multiply(c2[j], m1, low1);
+                c0[j] = _mm256_xor_si256(_mm256_xor_si256(high1, c1[j]), _mm256_set1_epi32(static_cast<int>(x)));
+                c2[j] = _mm256_xor_si256(_mm256_xor_si256(high0, c3[j]), _mm256_set1_epi32(static_cast<int>(y)));
+                c1[j] = low1;
+                c3[j] = low0;
+            }
+        for (int j = 0; j < 2; ++j) {
+            _mm256_store_si256(reinterpret_cast<__m256i*>(out[0] + i + 8 * j), c0[j]);
+            _mm256_store_si256(reinterpret_cast<__m256i*>(out[1] + i + 8 * j), c1[j]);
+            _mm256_store_si256(reinterpret_cast<__m256i*>(out[2] + i + 8 * j), c2[j]);
+            _mm256_store_si256(reinterpret_cast<__m256i*>(out[3] + i + 8 * j), c3[j]);
+        }
     }
 #endif
     for (; i < n; ++i) {
