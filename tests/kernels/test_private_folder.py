@@ -73,5 +73,3 @@ def test_a_library_that_others_can_write_is_not_loaded(tmp_path: Path) -> None:
     assert load() == "loaded\n"
     library.chmod(0o666)
     assert load().startswith("refused")
-    library.chmod(0o600)
-    assert load() == "loaded\n"

@@ -19,14 +19,14 @@ STUDY = [
     "scenario.steps=40",
     "scenario.interval_s=1.0,2.0",
     "noise=nominal,outliers",
-    "filter=ekf,ukf,sir,gpf",
+    "filter=ekf,ukf,sir",
     "particles=100",
     "runs=20",
 ]
 PUBLISHED = ("paper_003_biases", "paper_002_fading")  # settings of the scenario, and of the filters
 
 
-@pytest.mark.slow  # 32 jobs and a report: two worlds with two settings, two regimes and six pairs
+@pytest.mark.slow  # 24 jobs and a report: two worlds with two settings, two regimes and three pairs
 def test_decisions_of_a_study_are_those_of_an_independent_computation(tmp_path: Path) -> None:
     folders = f"results_dir={tmp_path}/results", f"reports_dir={tmp_path}/reports"
     assert cli.pfbench("run", "-m", *STUDY, "study=oracle", folders[0], home=tmp_path).code == 0
@@ -34,7 +34,7 @@ def test_decisions_of_a_study_are_those_of_an_independent_computation(tmp_path: 
     records = json.loads((tmp_path / "reports" / "oracle" / "decisions.json").read_text())
     runs = read_runs(tmp_path / "results" / "oracle")
     table = recompute(runs, records)
-    assert len(table) >= 90
+    assert len(table) >= 45
     assert set(runs["scenario"]) > {"passive_1[interval_s=1.0]", "linear_walk[interval_s=2.0]"}
     assert not len(find_differences(table)), find_differences(table).to_string()
     # the study has lost tracks, and words of several kinds, so that an error of each kind is seen
