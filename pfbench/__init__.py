@@ -11,6 +11,24 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pandas as pd
 
+    from pfbench import (
+        claims as claims,
+        core as core,
+        files as files,
+        filter as filter,  # noqa: A004
+        job as job,
+        judge as judge,
+        learn as learn,
+        model as model,
+        nav as nav,
+        noise as noise,
+        ppl as ppl,
+        report as report,
+        results as results,
+        scenario as scenario,
+        testing as testing,
+    )
+
 try:
     __version__ = version("pfbench")
 except PackageNotFoundError:  # a checkout on the path that is not installed

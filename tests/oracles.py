@@ -10,9 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pfbench.testing import KalmanResult as Filtered
-from pfbench.testing import kalman_filter as kalman
-from pfbench.testing import rts_smoother
+from pfbench.testing import KalmanResult as Filtered, kalman_filter as kalman, rts_smoother
 
 __all__ = ["Filtered", "benes", "grid_filter", "kalman", "normal_density", "rts_smoother"]
 

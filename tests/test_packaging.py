@@ -192,7 +192,7 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     }
     data = [
         file
-        for ending in ("jinja", "css", "js", "bib", "yaml", "toml", "cpp", "cu", "h")
+        for ending in ("pyi", "jinja", "css", "js", "bib", "yaml", "toml", "cpp", "cu", "h")
         for file in (ROOT / "pfbench").rglob(f"*.{ending}")
     ]
     assert len(data) > 10

@@ -113,6 +113,20 @@ def test_every_public_name_imports(module: ModuleType) -> None:
         module.Chaos  # noqa: B018
 
 
+@pytest.mark.parametrize("file", ["__init__.py", *(f"{name}/__init__.pyi" for name in FOLDERS)])
+def test_type_checkers_know_every_public_name(file: str) -> None:
+    """They take an import of a package as public only if it is written `x as x`."""
+    statements = ast.walk(ast.parse((ROOT / "pfbench" / file).read_text()))
+    imports = [s for s in statements if isinstance(s, ast.ImportFrom)]
+    names = [a for s in imports if str(s.module).startswith("pfbench") for a in s.names]
+    exported = sorted(alias.name for alias in names if alias.asname == alias.name)
+    assert len(set(exported)) == len(exported)
+    if file == "__init__.py":
+        assert exported == sorted(FOLDERS)
+    else:
+        assert exported == sorted(exports(f"pfbench.{file.partition('/')[0]}"))
+
+
 def test_the_public_names_are_imported_on_first_use() -> None:
     code = (
         "import sys, pfbench; before = sorted(m for m in sys.modules if m.startswith('pfbench'));"

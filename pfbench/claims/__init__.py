@@ -5,11 +5,4 @@ The public names of this folder are imported on first use.
 
 from pfbench.core.lazy_import import lazy_attributes
 
-__getattr__, __dir__ = lazy_attributes(
-    __name__,
-    {
-        "claim_records": ("read_claims",),
-    },
-)
-
-__all__ = __dir__()
+__getattr__, __dir__, __all__ = lazy_attributes(__name__, __file__)

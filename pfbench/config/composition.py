@@ -101,8 +101,7 @@ def compose_tree(words: Sequence[str]) -> DictConfig:
     Raises:
         UntrustedConfigError: If a file sets a key that only the command line may set.
     """
-    from hydra import compose as compose_config
-    from hydra import initialize_config_dir
+    from hydra import compose as compose_config, initialize_config_dir
 
     def compose_words(some: Sequence[str]) -> DictConfig:
         with initialize_config_dir(str(conf_dir()), version_base="1.3"):

@@ -2,36 +2,43 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 
 def lazy_attributes(
-    package: str, modules: Mapping[str, Sequence[str]]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Make the module functions `__getattr__` and `__dir__` of a package that imports on first use.
+    package: str, file: str
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Make the functions of a package that imports its public names on first use.
 
-    A package door would otherwise import every module, torch included, for a single name.
+    A package would otherwise import every module, torch included, for a single name. The names and
+    their modules are the import statements of `__init__.pyi` in the folder of the package,
+    from which type checkers and editors know them too.
 
     Args:
-        package: Name of the package.
-        modules: Public names by module, relative to the package: `base`, or `.core.normal` for a
-            module of the parent package.
+        package: Name of the package, `__name__`.
+        file: File of the package, `__file__`.
 
     Returns:
-        `__getattr__` and `__dir__` (PEP 562).
+        `__getattr__`, `__dir__` and `__all__` (PEP 562).
     """
-    homes = {name: module for module, names in modules.items() for name in names}
+    stub = ast.parse(Path(file).with_name("__init__.pyi").read_text(encoding="utf-8"))
+    homes = {
+        alias.name: str(statement.module)
+        for statement in stub.body
+        if isinstance(statement, ast.ImportFrom)
+        for alias in statement.names
+    }
+    names = sorted(homes)
 
     def get_attribute(name: str) -> Any:
         if name not in homes:
             raise AttributeError(
                 f"{package} does not define {name!r}. Choose a name of dir({package})."
             )
-        return getattr(importlib.import_module(f".{homes[name]}", package), name)
+        return getattr(importlib.import_module(homes[name]), name)
 
-    def list_names() -> list[str]:
-        return sorted(homes)
-
-    return get_attribute, list_names
+    return get_attribute, names.copy, names

@@ -5,23 +5,4 @@ The public names of this folder are imported on first use.
 
 from pfbench.core.lazy_import import lazy_attributes
 
-__getattr__, __dir__ = lazy_attributes(
-    __name__,
-    {
-        "atomic_write": ("write_atomically",),
-        "digest": (
-            "DIGEST",
-            "has_valid_digest",
-            "hash_content",
-        ),
-        "markdown": (
-            "markdown_bullets",
-            "markdown_head",
-            "markdown_paragraph",
-            "markdown_row",
-        ),
-        "recorded_folder": ("RecordedFolder",),
-    },
-)
-
-__all__ = __dir__()
+__getattr__, __dir__, __all__ = lazy_attributes(__name__, __file__)

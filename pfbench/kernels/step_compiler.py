@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.fx import Graph as Operations
-from torch.fx import Node
+from torch.fx import Graph as Operations, Node
 
 from pfbench.kernels import step_table
 from pfbench.kernels.compilation import kept_validation

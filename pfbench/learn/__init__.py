@@ -2,17 +2,4 @@
 
 from pfbench.core.lazy_import import lazy_attributes
 
-__all__ = [
-    "Training",
-    "draw_training_data",
-    "train",
-]
-
-__getattr__, __dir__ = lazy_attributes(
-    __name__,
-    {
-        "training_config": ("Training",),
-        "training_data": ("draw_training_data",),
-        "training_job": ("train",),
-    },
-)
+__getattr__, __dir__, __all__ = lazy_attributes(__name__, __file__)

@@ -6,8 +6,7 @@ import math
 import sys
 from collections.abc import Callable
 from functools import cache
-from types import ModuleType
-from types import SimpleNamespace as Work
+from types import ModuleType, SimpleNamespace as Work
 
 import numpy as np
 import oracles

@@ -6,8 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, QuaternionBlock, wrap_angle
 from pfbench.core.random_stream import PhiloxStream

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from pyro import distributions as dist
-from pyro import poutine
+from pyro import distributions as dist, poutine
 from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent

@@ -17,8 +17,8 @@ from pfbench.filter import (
     TaylorLinearisation,
     health,
     input_check,
+    resolution as module,
 )
-from pfbench.filter import resolution as module
 from pfbench.filter.health import HEALTH
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model import LinearGaussian

@@ -10,8 +10,7 @@ import pytest
 import torch
 from pyro import poutine
 from pyro.distributions import Beta, LogNormal, Normal
-from scipy.stats import f as f_law
-from scipy.stats import kstest, multivariate_t
+from scipy.stats import f as f_law, kstest, multivariate_t
 from torch import Tensor
 from torch.distributions import Independent
 

@@ -13,8 +13,7 @@ from escape_cases import HOSTILE, faults_of_folder, find_faults
 from hostile_report import disguise, write_hostile_report
 
 from pfbench import job
-from pfbench.claims import claim_records
-from pfbench.claims import page as claims_page
+from pfbench.claims import claim_records, page as claims_page
 from pfbench.report import datasheet
 from pfbench.results import store
 

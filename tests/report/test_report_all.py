@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 from command_line import pfbench
 
-from pfbench.claims import claim_records
-from pfbench.claims import page as claims_page
+from pfbench.claims import claim_records, page as claims_page
 from pfbench.report import page
 
 

@@ -21,12 +21,12 @@ from pfbench.claims import (
     claim_records,
     claim_samples,
     claim_tables,
+    figures as claims_figures,
     measurements,
+    page as claims_page,
     schema,
     verdicts,
 )
-from pfbench.claims import figures as claims_figures
-from pfbench.claims import page as claims_page
 from pfbench.claims.schema import Claim, ClaimTest
 from pfbench.results import store
 from pfbench.results.statistics import intervals, power, signed_rank

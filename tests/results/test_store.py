@@ -10,8 +10,7 @@ import textwrap
 import numpy as np
 import pytest
 from checkout import TESTS
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pfbench.results import config_key, store
 from pfbench.results.config_key import compute_config_key

@@ -19,8 +19,7 @@ from command_line import pfbench
 from hydra import compose, initialize_config_dir
 from pyro.distributions import MultivariateNormal
 from scipy import stats
-from torch.distributions import Independent
-from torch.distributions import Laplace as LaplaceLaw
+from torch.distributions import Independent, Laplace as LaplaceLaw
 
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream

@@ -30,8 +30,11 @@ from pfbench.filter.guided.guide_memory import (
     pack_guide_belief,
     unpack_guide_belief,
 )
-from pfbench.filter.linearisation import is_normal, mask_covariance
-from pfbench.filter.linearisation import linearised_innovation as innovation_at
+from pfbench.filter.linearisation import (
+    is_normal,
+    linearised_innovation as innovation_at,
+    mask_covariance,
+)
 from pfbench.filter.particle.point_sets import IidPoints, PointSet
 from pfbench.filter.particle.proposals import Proposal, ProposalSample
 from pfbench.filter.whitening import compute_half_square, fill_missing, log_determinant, whiten

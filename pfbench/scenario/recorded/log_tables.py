@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pfbench.files.table_file import Array as Array
-from pfbench.files.table_file import read_table_file
+from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_range
 from pfbench.scenario.plausibility.log_table import LogTable

@@ -35,10 +35,10 @@ from pfbench.filter.square_root_update import condition_on, kalman_update_root
 from pfbench.job import conf_dir
 from pfbench.model.azimuth_errors import (
     ErrorEquations,
+    ExactErrorEquations as ExactForm,
     LinearisedRateEquations,
     PrintedErrorEquations,
 )
-from pfbench.model.azimuth_errors import ExactErrorEquations as ExactForm
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.ins_gnss import InsGnss
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk

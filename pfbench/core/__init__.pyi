@@ -1,0 +1,9 @@
+"""Public names of `pfbench.core` and the modules that define them."""
+
+from pfbench.core.random_stream import PhiloxStream as PhiloxStream, RandomStream as RandomStream
+from pfbench.core.record import (
+    Episode as Episode,
+    MeasurementChannels as MeasurementChannels,
+    Record as Record,
+    map_inputs as map_inputs,
+)

@@ -1,0 +1,22 @@
+"""Public names of `pfbench.report` and the modules that define them."""
+
+from pfbench.report.journal.headline import (
+    HEADLINE as HEADLINE,
+    render_headline as render_headline,
+)
+from pfbench.report.journal.page_format import find_page_format as find_page_format
+from pfbench.report.journal.text_width import text_width as text_width
+from pfbench.report.plots.figure_files import render_palette_png as render_palette_png
+from pfbench.report.plots.plotting import (
+    COLUMN as COLUMN,
+    RC as RC,
+    add_legend as add_legend,
+    compute_jitter as compute_jitter,
+    line_styles as line_styles,
+)
+from pfbench.report.stored_page import (
+    PAGE_DATA as PAGE_DATA,
+    read_page_data as read_page_data,
+    write_page_data as write_page_data,
+)
+from pfbench.report.study_page import write_markdown as write_markdown
