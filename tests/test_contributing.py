@@ -17,6 +17,7 @@ from checkout import ROOT
 from command_line import pfbench
 
 import pfbench as package
+from pfbench.report.plots.paper import paper_catalogue
 from pfbench.results import metrics, store
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
@@ -105,6 +106,22 @@ def test_the_metric_appears_in_the_table(
         np.testing.assert_allclose(group_rows.value, np.median(error, -1))
 
 
+def test_the_figure_appears_in_the_report(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    entry = follow("Add a report figure", folder)["FINAL_ERROR"]
+    monkeypatch.setitem(paper_catalogue.FIGURES, "final-error", entry)
+    small_study(tmp_path)
+    printed = pfbench("report", "study=small", "report.paper_figures=[final-error]", home=tmp_path)
+    assert printed.code == 0, printed.err
+    report = tmp_path / "reports" / "small"
+    assert len(list((report / "figures").glob("paper_final-error_*.svg"))) == 1
+    assert "Final error, here local_level / nominal: error of state at the last step" in " ".join(
+        (report / "index.html").read_text().split()
+    )
+
+
 def small_study(home: Path) -> None:
     """Run two filters for five steps."""
     words = "run -m scenario=local_level scenario.steps=5 runs=3 particles=50 filter=sir,ekf study=small"
@@ -113,7 +130,9 @@ def small_study(home: Path) -> None:
 
 
 def test_every_kind_of_part_has_a_recipe() -> None:
-    kinds = ("resampler", "filter", "model", "scenario", "noise regime", "metric")
+    kinds = (
+        *("resampler", "filter", "model", "scenario", "noise regime", "metric", "report figure"),
+    )
     assert list(RECIPES) == [f"Add a {kind}" for kind in kinds]
 
 

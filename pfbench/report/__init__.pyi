@@ -6,13 +6,22 @@ from pfbench.report.journal.headline import (
 )
 from pfbench.report.journal.page_format import find_page_format as find_page_format
 from pfbench.report.journal.text_width import text_width as text_width
-from pfbench.report.plots.figure_files import render_palette_png as render_palette_png
+from pfbench.report.plots.figure_files import (
+    FigureSpec as FigureSpec,
+    render_palette_png as render_palette_png,
+)
+from pfbench.report.plots.paper.paper_specs import (
+    PaperFigure as PaperFigure,
+    PaperFigureInput as PaperFigureInput,
+)
 from pfbench.report.plots.plotting import (
     COLUMN as COLUMN,
     RC as RC,
+    LineStyle as LineStyle,
     add_legend as add_legend,
     compute_jitter as compute_jitter,
     line_styles as line_styles,
+    stacked_axes as stacked_axes,
 )
 from pfbench.report.stored_page import (
     PAGE_DATA as PAGE_DATA,
