@@ -20,6 +20,7 @@ from pfbench.report.plots.plotting import (
     LineStyle as LineStyle,
     add_legend as add_legend,
     compute_jitter as compute_jitter,
+    format_axis_label as format_axis_label,
     line_styles as line_styles,
     stacked_axes as stacked_axes,
 )
