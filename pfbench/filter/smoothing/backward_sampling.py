@@ -56,9 +56,8 @@ def sample_trajectories(
         Sampled paths, [R, paths, T, D]. NaN where a run is lost.
 
     Raises:
-        ValueError: If paths is below 1, the filter is not a particle filter, the model lacks a
-            transition density, the sampler needs parents that the filter does not have, or the
-            record has feedback.
+        ValueError: If paths is below 1, the filter is not a particle filter, or the record has
+            feedback. If the model lacks a transition density, or the sampler lacks parents.
 
     References:
         S. Godsill, A. Doucet and M. West (2004), Monte Carlo smoothing for nonlinear time series.
