@@ -3,7 +3,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STUDY  ?= quickstart
 
-.PHONY: demo studies report test test-fast test-slow mutants recompute faults format lint bench clean
+.PHONY: demo studies report test test-fast test-slow mutants recompute faults faults-short format lint bench clean
 
 # Python compiles modules at first import. Compiling all installed packages took half of the set-up time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -42,6 +42,9 @@ recompute: $(VENV)/.installed      ## compute the decisions of a report a second
 
 faults: $(VENV)/.installed      ## disturb pfbench and count the outcomes in docs/reliability.md: hours; repeat to continue
 	PYTHONPATH=tests $(BIN)/python -m faults.main
+
+faults-short: $(VENV)/.installed   ## a few trials of each class of faults: minutes; writes nothing
+	PYTHONPATH=tests $(BIN)/python -m faults.main --short
 
 format: $(VENV)/.installed      ## format the code and apply safe fixes of the linter
 	$(BIN)/ruff check --fix-only --quiet .

@@ -35,6 +35,8 @@ def later_by_two_hours(table: pd.DataFrame) -> pd.DataFrame:
         M0=(table["M0"] + motion * 7200.0) % (2 * math.pi),
         Omega0=table["Omega0"] + table["Omegadot"] * 7200.0,
         i0=table["i0"] + table["idot"] * 7200.0,
+        af0=table["af0"] + (table["af1"] + 7200.0 * table["af2"]) * 7200.0,
+        af1=table["af1"] + 2.0 * 7200.0 * table["af2"],
     )
 
 

@@ -50,6 +50,7 @@ QUANTITIES = {
         "m", -1000.0, 40000.0, source="Dead Sea with a margin; above all aircraft", key="height_m"
     ),
     "local position": Quantity("m", -2.1e7, 2.1e7, source="half the circumference of the Earth"),
+    "geocentric position": Quantity("m", -6.5e6, 6.5e6, source="radius of the Earth and 120 km"),
     "velocity": Quantity(
         "m/s", -1000.0, 1000.0, 200.0, 10.0, "fastest aircraft 980 m/s; 20 g", key="speed_m_s"
     ),
@@ -92,6 +93,7 @@ LIMIT_COLUMNS = {
     "lon_deg": "longitude",
     "h_m": "height",
     **dict.fromkeys(("pn", "pe", "pd", "rx_pn", "rx_pe", "rx_pd"), "local position"),
+    **dict.fromkeys(("x", "y", "z"), "geocentric position"),
     **dict.fromkeys(("vn", "ve", "vd", "vn_d", "ve_d", "vd_d"), "velocity"),
     "roll": "roll",
     "pitch": "pitch",

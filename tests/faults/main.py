@@ -2,6 +2,7 @@
 
 Batches are stored in results/faults, so that the same command continues after an interruption.
 `--only` selects classes by the start of their names, `--table` writes the table of the stored batches.
+`--short` runs a few trials of each class in minutes, and neither stores nor writes anything.
 """
 
 from __future__ import annotations
@@ -42,16 +43,18 @@ class FaultClass(NamedTuple):
         run: Function of number of trials and seed.
         required: Number of trials of the whole harness.
         batch: Number of trials of one batch.
+        short: Number of trials of the short form.
     """
 
     run: Callable[[int, int], Tally]
     required: int
     batch: int
+    short: int = 1
 
 
 CLASSES: dict[str, FaultClass] = {
     **{
-        f"damaged files: {kind}": FaultClass(partial(damage.run, kind), 3000, 500)
+        f"damaged files: {kind}": FaultClass(partial(damage.run, kind), 3000, 500, 20)
         for kind in damage.KINDS
     },
     "hostile files": FaultClass(hostile.run, hostile.CASES, hostile.BATCH),
@@ -70,11 +73,11 @@ CLASSES: dict[str, FaultClass] = {
     "clock that jumps": FaultClass(clock.run, 30, 5),
     "sweeps at the same time": FaultClass(parallel.run, 30, 5),
     "sanitizers: random shapes": FaultClass(
-        partial(sanitizers.run, "random shapes"), 10 * sanitizers.CALLS, sanitizers.CALLS
+        partial(sanitizers.run, "random shapes"), 10 * sanitizers.CALLS, sanitizers.CALLS, 500
     ),
     "sanitizers: operators' tests": FaultClass(partial(sanitizers.run, "operators' tests"), 1, 1),
     **{
-        f"damaged logs: {reader}": FaultClass(partial(readers.run, reader), 10_000, 500)
+        f"damaged logs: {reader}": FaultClass(partial(readers.run, reader), 10_000, 500, 20)
         for reader in readers.READERS
     },
 }
@@ -114,6 +117,17 @@ def run_class(name: str) -> None:
             return
 
 
+def run_short(name: str) -> bool:
+    """Run a few trials of a class and return whether none is bad."""
+    start = time.perf_counter()
+    tally = CLASSES[name].run(CLASSES[name].short, 0)
+    text = tally.skipped or f"{tally.trials} trials, {tally.bad or 'nothing'} bad"
+    print(f"{name}: {text}, {time.perf_counter() - start:.0f} s", flush=True)
+    for example in tally.examples.values():
+        print(f"  {example[0]}", flush=True)
+    return not tally.bad
+
+
 def collect(name: str) -> dict[str, Any]:
     """Return the row of a class from its finished batches."""
     parts = stored_parts(name).state["done"].values()
@@ -130,10 +144,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", default=[""], help="starts of names of classes")
     parser.add_argument("--table", action="store_true", help="only write the table")
+    parser.add_argument("--short", action="store_true", help="a few trials of each class")
     options = parser.parse_args()
     names = [name for name in CLASSES if name.startswith(tuple(options.only))]
     if not names:
         parser.error(f"--only must be the start of a class, got {options.only}: {list(CLASSES)}")
+    if options.short:
+        return int(not all([run_short(name) for name in names]))
     if not options.table:
         for name in names:
             run_class(name)

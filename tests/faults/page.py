@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from checkout import ROOT
 
+from faults import readers
 from faults.tally import BAD, Tally
 
 DATA = ROOT / "docs" / "reliability.json"
 PAGE = ROOT / "docs" / "reliability.md"
 _BLOCK = re.compile(r"<!-- numbers:reliability -->\n.*?<!-- numbers:end -->", re.DOTALL)
+
+
+def is_in_history(commit: str) -> bool:
+    """Return whether a commit, perhaps with `+` for local changes, is an ancestor of the checkout."""
+    words = ["git", "-C", str(ROOT), "merge-base", "--is-ancestor", commit.rstrip("+"), "HEAD"]
+    return subprocess.run(words, capture_output=True).returncode == 0
 
 
 def format_row(row: dict[str, Any]) -> list[str]:
@@ -31,12 +39,25 @@ def format_row(row: dict[str, Any]) -> list[str]:
     return [row["name"], trials, *bad, row["date"] or "–", commits]
 
 
+def format_reasons(row: dict[str, Any]) -> list[str]:
+    """Return a line for each way in which trials of a class were false, with its reason."""
+    lines, prefix = [], f"{readers.load_mutations().EVERY_ROW}: "
+    for remark, trials in sorted(row["remarks"].items()):
+        columns = remark.removeprefix(prefix)
+        if remark != columns:
+            reason = readers.REASONS.get((row["name"], columns), "The cause is not known.")
+            lines.append(f"- {row['name']}, `{columns}` changed in all rows: {trials}. {reason}")
+    return lines
+
+
 def format_block(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the generated block of the page."""
+    """Return the generated block of the page: the table, and reasons of false trials."""
     head = ["class", "trials", *BAD, "date", "commits"]
     lines = [head, ["---"] * len(head), *map(format_row, rows)]
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-    return f"<!-- numbers:reliability -->\n{table}\n<!-- numbers:end -->"
+    reasons = "".join(f"\n{line}" for row in rows for line in format_reasons(row))
+    reasons = f"\n\nFalse trials of damaged logs:\n{reasons}" if reasons else ""
+    return f"<!-- numbers:reliability -->\n{table}{reasons}\n<!-- numbers:end -->"
 
 
 def fill_page(text: str, rows: Sequence[dict[str, Any]]) -> str:
@@ -52,7 +73,13 @@ def keep_published(rows: Sequence[dict[str, Any]], data: Path) -> list[dict[str,
 
 
 def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE, data: Path = DATA) -> None:
-    """Write the data of all classes and the table of the page."""
-    rows = keep_published(rows, data)
+    """Write the data of all classes and the table of the page.
+
+    A commit that a rebase has replaced is not written: nobody else can look it up.
+    """
+    rows = [
+        row | {"commits": list(filter(is_in_history, row["commits"]))}
+        for row in keep_published(rows, data)
+    ]
     data.write_text(json.dumps(rows, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
     page.write_text(fill_page(page.read_text(), rows))

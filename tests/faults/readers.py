@@ -12,6 +12,15 @@ from faults.tally import FINE, Tally
 
 READERS = ("log_csv", "log_parquet", "rinex2", "rinex3", "ephemeris", "trajectory", "pseudorange", "urban")  # fmt: skip
 
+_ORBIT = "The orbit remains a possible one, and its neighbours change alike."
+REASONS = {  # why a file alone does not show a change of a column in all rows, by class and columns
+    ("damaged logs: trajectory", "pd"): (
+        "The drive is level, so that no other column depends on its height."
+    ),
+    ("damaged logs: ephemeris", "e"): _ORBIT,
+    ("damaged logs: ephemeris", "omega"): _ORBIT,
+}
+
 
 def load_mutations() -> ModuleType:
     """Import the module of the mutations, which lies beside the tests of the readers."""

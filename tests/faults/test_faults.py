@@ -9,12 +9,16 @@ import os
 import random
 import re
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
 import pytest
 import torch
+from checkout import ROOT
 
 from faults import (
     clock,
@@ -201,6 +205,71 @@ def test_the_page_states_the_stored_counts() -> None:
     text = page.PAGE.read_text()
     assert page.fill_page(text, rows) == text
     assert all(f"**{name}**" in text for name in BAD)
+
+
+def git(*words: str) -> str:
+    done = subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True)
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+@pytest.mark.skipif(
+    git("rev-parse", "--is-shallow-repository") != "false", reason="needs the history of git"
+)
+def test_each_commit_of_the_page_is_in_the_history() -> None:
+    commits = {commit for row in json.loads(page.DATA.read_text()) for commit in row["commits"]}
+    assert commits
+    assert [commit for commit in sorted(commits) if not page.is_in_history(commit)] == []
+    assert set(re.findall(r"`([0-9a-f]{10}\+?)`", page.PAGE.read_text())) == commits
+    assert not page.is_in_history("0123456789")
+
+
+def test_a_commit_that_is_not_in_the_history_is_not_written(tmp_path: Path) -> None:
+    rows = [planted_row("planted", "tried") | {"commits": ["0123456789", "0123456789+"]}]
+    (tmp_path / "page.md").write_text(page.format_block([]))
+    page.write_table(rows, tmp_path / "page.md", tmp_path / "data.json")
+    assert json.loads((tmp_path / "data.json").read_text())[0]["commits"] == []
+    assert "| 2026-01-01 | – |" in (tmp_path / "page.md").read_text()
+
+
+def planted_row(name: str, remark: str) -> dict[str, Any]:
+    tally = Tally(name)
+    tally.add("false", remark)
+    return tally.to_dict() | {"required": 1, "date": "2026-01-01", "commits": []}
+
+
+def test_false_trials_of_a_reader_have_a_reason_or_say_that_there_is_none() -> None:
+    every_row = readers.load_mutations().EVERY_ROW
+    block = page.format_block(
+        [
+            planted_row("damaged logs: trajectory", f"{every_row}: pd"),
+            planted_row("damaged logs: urban", f"{every_row}: v_fwd"),
+        ]
+    )
+    assert "- damaged logs: trajectory, `pd` changed in all rows: 1. The drive is level" in block
+    assert "`v_fwd` changed in all rows: 1. The cause is not known." in block
+
+
+def test_the_short_form_runs_each_class_and_fails_with_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(outcome: str, count: int, seed: int) -> Tally:
+        tally = Tally(outcome)
+        for _ in range(count):
+            tally.add(outcome, "tried", "why")
+        return tally
+
+    good = main.FaultClass(partial(run, FINE), 5, 2, 3)
+    monkeypatch.setattr(main, "CLASSES", {"good": good})
+    monkeypatch.setattr(sys, "argv", ["faults", "--short"])
+    monkeypatch.setattr(main.page, "write_table", lambda rows: pytest.fail("must not write"))
+    assert main.main() == 0
+    monkeypatch.setattr(
+        main, "CLASSES", {"good": good, "bad": good._replace(run=partial(run, "lost"))}
+    )
+    assert main.main() == 1
+    text = capsys.readouterr().out
+    assert "good: 3 trials, nothing bad" in text
+    assert "bad: 3 trials, {'lost': 3} bad" in text
 
 
 # what the harness found

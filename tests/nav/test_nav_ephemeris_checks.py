@@ -102,6 +102,35 @@ def test_another_unit_of_all_records_is_an_error(tmp_path: Path) -> None:
         _ = constellation(tmp_path, degrees).names
 
 
+@pytest.mark.parametrize("factor", [math.pi / 180, 0.3048, 3.6, -1.0])
+def test_clock_offsets_in_another_unit_do_not_follow_their_drifts(
+    tmp_path: Path, factor: float
+) -> None:
+    scaled = three().assign(af0=lambda table: factor * table["af0"])
+    (note,) = constellation(tmp_path, scaled).notes
+    assert f"clock offsets change {factor:.3g} times as fast as their drifts state" in note
+
+
+def test_noise_of_clocks_is_no_other_unit(tmp_path: Path) -> None:
+    """Offsets off by 2 ns each, about what a day of GPS clocks leaves, and drifts as small as that."""
+    first = EPHEMERIDES.assign(af1=0.1 * EPHEMERIDES["af1"])
+    second = later_by_two_hours(first)
+    table = pd.concat([first, second, later_by_two_hours(second)], ignore_index=True)
+    for seed in range(5):
+        noise = np.random.default_rng(seed).normal(0.0, 2e-9, len(table))
+        assert constellation(tmp_path, table.assign(af0=table["af0"] + noise)).notes == ()
+
+
+@pytest.mark.parametrize(("row", "value"), [(0, 0.05), (1, 0.05), (1, 1e-4)])
+def test_an_eccentricity_that_no_orbit_of_this_size_has_is_named(
+    tmp_path: Path, row: int, value: float
+) -> None:
+    table = three()
+    table.loc[row, "e"] = value
+    notes = constellation(tmp_path, table).notes
+    assert any("for its semi-major axis" in note for note in notes), notes
+
+
 @pytest.mark.parametrize(("factor", "value"), [(0.3048, "4.26"), (3.0, "42")])
 def test_a_satellite_number_that_no_system_has_is_an_error(
     tmp_path: Path, factor: float, value: str

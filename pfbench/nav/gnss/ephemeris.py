@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from pfbench.files.table_file import read_table_file
 from pfbench.nav import earth
-from pfbench.nav.gnss.ephemeris_checks import check_numbers
 from pfbench.nav.gnss.rinex import CLOCK, LINES, ORBIT, WEEK, read_rinex
 
 GM_GPS = 3.986005e14  # [IS-GPS-200, table 20-IV], Galileo uses earth.GM [OS SIS ICD]
@@ -38,6 +38,40 @@ def read_ephemeris(root: str | None, path: str) -> pd.DataFrame:
         raise ValueError(f"data.root must contain {path}, got {root} without {file}. {remedy}")
     table = read_table_file(file).rows if file.suffix == ".parquet" else read_rinex(file)
     return check_numbers(table, path)
+
+
+def check_numbers(table: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Convert the parameters to numbers.
+
+    Args:
+        table: Ephemerides with RINEX names.
+        name: Name of the file, for the message.
+
+    Returns:
+        Table with numeric columns. `week`, `health` and `ttx` may be NaN.
+
+    Raises:
+        ValueError: If a parameter is blank, text, or infinite. The message names column and row.
+    """
+    table = table.copy()
+    for column in ("prn", *CLOCK, *ORBIT, "tgd", "week", "health", "ttx"):
+        if column not in table:
+            continue
+        values = pd.to_numeric(table[column], errors="coerce").to_numpy(float)
+        blank_mask = (
+            table[column].isna().to_numpy()
+            if column in ("week", "health", "ttx")
+            else np.zeros(len(values), bool)
+        )
+        bad = np.flatnonzero(~np.isfinite(values) & ~blank_mask)
+        if bad.size:
+            raise ValueError(
+                f"{name}: column {column} must have finite numbers, got "
+                f"{table[column].iloc[bad[0]]} in row {bad[0]} (from 0, {bad.size} such rows). "
+                "Remove rows without data."
+            )
+        table[column] = values
+    return table
 
 
 def parse_epochs(table: pd.DataFrame, epoch: float) -> pd.DataFrame:

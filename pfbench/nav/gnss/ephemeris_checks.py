@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from pfbench.nav.gnss.broadcast_elements import broadcast_elements
+from pfbench.nav.gnss.clock_agreement import describe_clock_scale
 from pfbench.nav.gnss.orbit_dynamics import describe_unexplained
 from pfbench.nav.gnss.rinex import CLOCK, ORBIT, WEEK
 
@@ -24,7 +25,6 @@ _TURN = 2 * math.pi
 RANGES = {
     "prn": (1.0, 63.0, "1"),
     "toe": (0.0, WEEK, "s"),
-    "e": (0.0, 0.2, "1"),  # the Galileo satellites E14 and E18: 0.166
     "i0": (0.8, 1.2, "rad"),
     "M0": (-_TURN, _TURN, "rad"),
     "Omega0": (-_TURN, _TURN, "rad"),
@@ -42,7 +42,11 @@ RANGES = {
     "health": (0.0, 511.0, "1"),
     "week": (0.0, 1e4, "1"),
 }
-SQRT_AXIS = {"G": (5100.0, 5200.0), "E": (5200.0, 5500.0)}  # m^(1/2), root of the semi-major axis
+# least and largest root of the semi-major axis, m^(1/2), and eccentricity. E14 and E18 missed their orbit
+ORBITS = {
+    "G": ((5100.0, 5200.0, 0.0, 0.04),),
+    "E": ((5200.0, 5350.0, 0.1, 0.2), (5350.0, 5500.0, 0.0, 0.01)),
+}
 LARGEST_PRN = {"G": 63, "E": 36}  # [IS-GPS-200, 3.2.1; OS SIS ICD, 3.6]
 TOE_STEP = {"G": 16.0, "E": 60.0}  # s; scale of the field
 _LONGEST = 14400.0  # s between compared neighbours
@@ -63,40 +67,6 @@ class EphemerisSelection(NamedTuple):
 
     mask: NDArray[np.bool_]
     notes: tuple[str, ...]
-
-
-def check_numbers(table: pd.DataFrame, name: str) -> pd.DataFrame:
-    """Convert the parameters to numbers.
-
-    Args:
-        table: Ephemerides with RINEX names.
-        name: Name of the file, for the message.
-
-    Returns:
-        Table with numeric columns. `week`, `health` and `ttx` may be NaN.
-
-    Raises:
-        ValueError: If a parameter is blank, text, or infinite. The message names column and row.
-    """
-    table = table.copy()
-    for column in ("prn", *CLOCK, *ORBIT, "tgd", "week", "health", "ttx"):
-        if column not in table:
-            continue
-        values = pd.to_numeric(table[column], errors="coerce").to_numpy(float)
-        blank_mask = (
-            table[column].isna().to_numpy()
-            if column in ("week", "health", "ttx")
-            else np.zeros(len(values), bool)
-        )
-        bad = np.flatnonzero(~np.isfinite(values) & ~blank_mask)
-        if bad.size:
-            raise ValueError(
-                f"{name}: column {column} must have finite numbers, got "
-                f"{table[column].iloc[bad[0]]} in row {bad[0]} (from 0, {bad.size} such rows). "
-                "Remove rows without data."
-            )
-        table[column] = values
-    return table
 
 
 def check_ephemerides(table: pd.DataFrame, name: str) -> EphemerisSelection:
@@ -137,15 +107,20 @@ def check_ephemerides(table: pd.DataFrame, name: str) -> EphemerisSelection:
         alone += [] if compared else [satellite]
     if alone:
         notes.append(f"{name}: ephemerides without a neighbour to compare with: {', '.join(alone)}")
-    return EphemerisSelection(mask, (*notes, *describe_unexplained(table[mask], name)))
+    clean = table[mask]
+    notes += [*describe_unexplained(clean, name), *describe_clock_scale(clean, name)]
+    return EphemerisSelection(mask, tuple(notes))
 
 
 def _reason(row: Mapping[Any, Any]) -> str:
     """Describe the first parameter that is out of range, or return ''."""
-    least, largest = SQRT_AXIS[str(row["name"])[0]]
-    root = float(row["sqrtA"])
-    if not least <= root <= largest:
+    root, eccentricity = float(row["sqrtA"]), float(row["e"])
+    orbits = [orbit for orbit in ORBITS[str(row["name"])[0]] if orbit[0] <= root <= orbit[1]]
+    if not orbits:
         return f"semi-major axis is {root * root:.0f} m"
+    if not orbits[0][2] <= eccentricity <= orbits[0][3]:
+        low, high = orbits[0][2:]
+        return f"e is {eccentricity:g}, not between {low:g} and {high:g} for its semi-major axis"
     number = float(row["prn"])
     if number != round(number) or number > LARGEST_PRN[str(row["name"])[0]]:
         return f"prn is {number:g}"

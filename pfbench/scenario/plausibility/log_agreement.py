@@ -19,13 +19,18 @@ from pfbench.nav import attitude
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.nav.preintegration import preintegrate
 from pfbench.scenario.plausibility.log_table import LogTable
+from pfbench.scenario.plausibility.table_scales import (
+    FEWEST_WINDOWS,
+    MIN_RMS_SPEED,
+    WINDOW,
+    check_position_scale,
+    check_turn_scale,
+)
 from pfbench.scenario.recorded.log_tables import Array
 from pfbench.scenario.recorded.navigation_log import GnssLog, ImuLog, ReferenceLog
 from pfbench.scenario.recorded.time_grid import interpolate, split_samples
 
-_WINDOW = 1.0  # s; IMU and reference are compared over windows of about this length
 _STRAIGHT = 1.5  # s; longest interval over which the velocity is taken as linear
-MIN_RMS_SPEED = 1.0  # m/s; smallest RMS velocity at which position and velocity have a common scale
 
 
 class Agreement(NamedTuple):
@@ -53,9 +58,6 @@ FIX_VELOCITY = Agreement("velocity of a fix and of the reference", "m/s", 5.0, m
 WHEELS = Agreement("wheel speed and speed of the reference", "m/s", 3.0, 50.0)
 YAW_RATE = Agreement("yaw rate and turn of the track", "rad/s", 1.0, 10.0)
 AGREEMENTS = (MOTION, VELOCITY, ATTITUDE, FIX, FIX_OFFSET, FIX_VELOCITY, WHEELS, YAW_RATE)
-MIN_RMS_TURN = 0.03  # rad; smallest RMS rotation in a window, about its mean, that shows a scale
-FEWEST_WINDOWS = 5  # for a scale of the rotation
-SCALES = (0.7, 1.4)  # least and largest scale of one table against another
 COMMON_TIME = 2.0  # s at an end of a table that other tables do not cover, without a note
 
 
@@ -75,17 +77,9 @@ def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ..
     dt = np.diff(reference.time)
     expected = 0.5 * dt[:, None] * (reference.velocity[1:] + reference.velocity[:-1])
     displacement = np.diff(reference.position, axis=0)
-    straight = dt <= _STRAIGHT
-    for axis, name in enumerate(("East", "North", "Up")):
-        x, y = expected[straight, axis], displacement[straight, axis]
-        if not len(x) or np.sqrt(np.mean((x / dt[straight]) ** 2)) < MIN_RMS_SPEED:
-            continue
-        slope = float((x * y).sum() / (x * x).sum())
-        if not SCALES[0] < slope < SCALES[1]:
-            raise ValueError(
-                f"{table.name}: the {name} position must change with the velocity, got {slope:.3g} "
-                "times the change. Check units (m, m/s, deg), signs and order of the columns."
-            )
+    straight = (dt <= _STRAIGHT)[:, None]
+    sums = (np.where(straight, a, 0.0) for a in (expected, displacement))
+    check_position_scale(table, reference.time, *sums)
     # the error of the straight line grows with the square of the interval
     slack = np.maximum(1.0, dt / _STRAIGHT) ** 2
     difference = np.linalg.norm(displacement - expected, axis=1) / slack
@@ -108,7 +102,7 @@ def compare_inertial(table: LogTable, imu: ImuLog, reference: ReferenceLog, grav
         ValueError: If IMU and reference contradict each other.
     """
     inside = np.flatnonzero((reference.time >= imu.time[0]) & (reference.time <= imu.time[-1]))
-    stride = max(1, round(_WINDOW / float(np.median(np.diff(reference.time)))))
+    stride = max(1, round(WINDOW / float(np.median(np.diff(reference.time)))))
     notes = [
         note
         for nodes in (inside, inside[::stride])
@@ -137,34 +131,17 @@ def _compare_windows(
     )
     pair = (rotation, true_rotation)
     x, y = (quaternion.rotation_vector_from_quaternion(a)[angle < ATTITUDE.noted] for a in pair)
-    _check_turn_scale(table, x.numpy(), y.numpy(), float(np.median(np.diff(time))))
+    check_turn_scale(table, x.numpy(), y.numpy(), float(np.median(np.diff(time))))
     level = (attitude.dcm_from_quaternion(q[:-1]) @ velocity[..., None])[..., 0].numpy()
     dt = np.diff(time)
     level[:, 2] -= gravity * dt
     change = np.diff(reference.velocity[nodes], axis=0)
     # errors of an unaided IMU grow with the window, which a gap of the reference extends
-    scale = np.maximum(1.0, dt / _WINDOW)
+    scale = np.maximum(1.0, dt / WINDOW)
     return (
         *_judge(VELOCITY, np.linalg.norm(change - level, axis=1) / scale, table, nodes[1:]),
         *_judge(ATTITUDE, angle.numpy() / scale, table, nodes[1:]),
     )
-
-
-def _check_turn_scale(table: LogTable, x: Array, y: Array, window: float) -> None:
-    """Check that rotations of the reference [n, 3] have the scale of those of the IMU."""
-    if len(x) < FEWEST_WINDOWS or window < 0.5 * _WINDOW:
-        return  # between neighbouring rows, noise has a larger part
-    x, y = x - x.mean(0), y - y.mean(0)  # without the bias of the gyroscope
-    for axis, name in enumerate(("x", "y", "z")):
-        square = float((x[:, axis] ** 2).sum())
-        if np.sqrt(square / len(x)) < MIN_RMS_TURN:
-            continue
-        slope = float((x[:, axis] * y[:, axis]).sum()) / square
-        if not SCALES[0] < slope < SCALES[1]:
-            raise ValueError(
-                f"{table.name}: the attitude must turn with the angular rate about {name}, got "
-                f"{slope:.3g} times the rotation. Check units (rad, rad/s), signs and axes."
-            )
 
 
 def compare_fixes(
@@ -280,6 +257,26 @@ def compare_times(tables: tuple[tuple[str, Array], ...]) -> tuple[str, ...]:
         f"{name} covers t = {time[0]:.3f} to {time[-1]:.3f} s of {first:.3f} to {last:.3f} s"
         for name, time in tables
         if max(time[0] - first, last - time[-1]) > COMMON_TIME + 2 * np.median(np.diff(time))
+    )
+
+
+def describe_missing_times(name: str, time: Array, steps: Array) -> tuple[str, ...]:
+    """Name a table that does not cover the steps of a filter.
+
+    Args:
+        name: Name of the table.
+        time: Times of its rows, s, [n].
+        steps: Times of the steps, s, [T].
+
+    Returns:
+        One note, or none.
+    """
+    missing = max(time[0] - steps[0], steps[-1] - time[-1])
+    if len(time) > 1 and missing <= COMMON_TIME + 2 * np.median(np.diff(time)):
+        return ()
+    return (
+        f"{name} covers t = {time[0]:.3f} to {time[-1]:.3f} s of steps from {steps[0]:.3f} to "
+        f"{steps[-1]:.3f} s. Check the clock of t",
     )
 
 

@@ -13,6 +13,7 @@ import torch
 from pfbench.model.strapdown.tight import TightMemsInputs
 from pfbench.nav import earth
 from pfbench.nav.preintegration import PreintegratedImu
+from pfbench.scenario.plausibility.log_agreement import describe_missing_times
 from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.recorded.log_tables import (
     Array,
@@ -123,7 +124,8 @@ def read_sky(
     reported = value["sd_pr"], value["sd_prr"], (position - centre) @ axes.T, velocity @ axes.T
     angles = np.radians(value["az"]), np.radians(value["el"])
     columns = [fill(column) for column in (*corrected, *reported, *angles)]
-    return RawGnssLog._make([tuple(names.tolist()), *columns, table.notes])
+    notes = (*table.notes, *describe_missing_times(table.name, np.unique(value["t"]), time))
+    return RawGnssLog._make([tuple(names.tolist()), *columns, notes])
 
 
 def _local(table: LogTable, origin: Sequence[float] | None) -> tuple[Array, Array]:

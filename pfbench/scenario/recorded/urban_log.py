@@ -20,6 +20,7 @@ from pfbench.nav import earth
 from pfbench.nav.gnss.orbits import LIGHT, azimuth_elevation
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_changes
+from pfbench.scenario.plausibility.drive_checks import check_geocentric, check_wheel_direction
 from pfbench.scenario.plausibility.log_agreement import compare_reference, compare_wheels
 from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.plausibility.satellite_agreement import check_orbits, compare_ranges
@@ -121,6 +122,7 @@ def read_drive(folder: Path, limits: PlausibleLimits | None = None) -> UrbanLog:
 def _check_drive(drive: UrbanLog, tables: tuple[LogTable, LogTable, LogTable]) -> tuple[str, ...]:
     """Check satellites, ranges, wheels and reference against each other; return notes."""
     pseudoranges, wheels, truth = tables
+    check_geocentric(truth)
     receiver = earth.ecef(torch.from_numpy(drive.position)).numpy()
     check_orbits(pseudoranges.name, drive.satellites, drive.time, drive.satellite_position)
     distance = np.linalg.norm(
@@ -134,6 +136,7 @@ def _check_drive(drive: UrbanLog, tables: tuple[LogTable, LogTable, LogTable]) -
     return (
         *(note for table in tables for note in table.notes),
         *compare_reference(truth, motion),
+        *check_wheel_direction(wheels, drive.time, drive.speed),
         *compare_wheels(wheels, drive.speed, drive.yaw_rate, motion),
         *compare_ranges(
             pseudoranges.name,

@@ -89,9 +89,10 @@ def rotation_part(q: np.ndarray) -> np.ndarray:
 
 
 def three_ephemerides() -> pd.DataFrame:
-    second = later_by_two_hours(EPHEMERIDES.assign(health=0.0, iode=1.0))
-    first = EPHEMERIDES.assign(health=0.0, iode=1.0)
-    return pd.concat([first, second, later_by_two_hours(second)], ignore_index=True)
+    first = EPHEMERIDES.assign(health=0.0)
+    second = later_by_two_hours(first)
+    table = pd.concat([first, second, later_by_two_hours(second)], ignore_index=True)
+    return table.assign(iode=np.arange(len(table)) + 11.0)  # a number of each upload
 
 
 def read_orbits(folder: Path, name: str) -> Reading:
