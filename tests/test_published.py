@@ -58,6 +58,20 @@ def test_git_stores_only_the_published_files_of_a_report() -> None:
         assert f"reports/{study}/report.md" in stored
 
 
+def test_a_drawing_that_differs_in_the_last_digit_is_not_written_again() -> None:
+    """As of two processors. A moved line, another text and another colour are differences."""
+    is_equal = load("publish_reports").is_equal_drawing
+    drawing = (
+        b'<path d="M 74.119688 51.399375" style="fill: #0b4f8a"/><text x="12.5">CPF 1.00</text>'
+    )
+    assert is_equal(drawing, drawing.replace(b"74.119688", b"74.119687"))
+    assert not is_equal(drawing, drawing.replace(b"74.119688", b"74.129688"))
+    assert not is_equal(drawing, drawing.replace(b"CPF 1.00", b"CPF 1.01"))
+    assert not is_equal(drawing, drawing.replace(b"CPF", b"CKF"))
+    assert not is_equal(drawing, drawing.replace(b"#0b4f8a", b"#0b4f8b"))
+    assert not is_equal(drawing, drawing.replace(b'<text x="12.5">', b""))
+
+
 def test_no_figure_is_stored_in_two_formats() -> None:
     figures = [Path(name) for name in list_git_files() if name.endswith((".png", ".svg"))]
     stems = [figure.with_suffix("") for figure in figures]

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.compose import compose_study
-from pfbench.cli.report import check_study_exists, make_report_options
+from pfbench.cli.report import check_study_exists, find_page_data, make_report_options
+from pfbench.config.composition import JobConfig
+
+if TYPE_CHECKING:
+    from pfbench.files.recorded_folder import RecordedFolder
 
 HELP = """\
 pfbench paper study=NAME journal=ieee|elsevier|springer [key=value ...]
@@ -14,7 +19,8 @@ pfbench paper study=NAME width=120mm [key=value ...]
 
 Write the paper export of a study to REPORTS/STUDY/paper/: figures as PDF (and PGF if pdflatex is installed),
 tables, methods paragraph, references, paper.tex, and the values of all runs. A table that does not fit the page
-is refused.
+is refused. Without results, the paper is made of the stored data of the report (page.json.gz, verdicts.csv,
+runs.parquet).
 
   pfbench paper study=quickstart journal=ieee
   pfbench paper study=mine width=345pt report.alpha=0.01
@@ -37,22 +43,43 @@ def write_study_paper(words: Sequence[str]) -> None:
     values = {key: _value(words, key) for key in ("journal", "width")}
     page = find_page_format(values["journal"], values["width"])
     config = compose_study([word for word in words if word.partition("=")[0] not in values])
-    study, results = config.values["study"], Path(config.values["results_dir"])
-    check_study_exists(study, results)
     from pfbench.files.recorded_folder import RecordedFolder
-    from pfbench.report.board import write_report_data
     from pfbench.report.journal.paper_folder import write_paper
-    from pfbench.results.conditions import load_conditions
 
-    options = make_report_options(config)
-    conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
-    with RecordedFolder(Path(config.values["reports_dir"]) / study / "paper") as folder:
-        pack = write_report_data(study, conditions, options, folder)
-        methods = pack["methods_paragraph"].split("\n\n")
-        remarks = write_paper(pack, conditions, methods, page, folder)
+    study, reports = config.values["study"], Path(config.values["reports_dir"])
+    stored = find_page_data(config, words)
+    if stored is None:
+        check_study_exists(study, Path(config.values["results_dir"]))
+    with RecordedFolder(reports / study / "paper") as folder:
+        pack = _decide_results(config, folder) if stored is None else _copy_data(stored, folder)
+        remarks = write_paper(pack, page, folder)
+    if stored is not None:
+        print(f"note: without results, the paper is made of {stored}")
     for remark in remarks:
         print(f"note: {remark}")
     print(f"paper: {(folder.path / 'paper.tex').resolve()}")
+
+
+def _decide_results(config: JobConfig, folder: RecordedFolder) -> dict[str, Any]:
+    """Decide the results of a study, write the values of all views and runs, and return the data."""
+    from pfbench.report.board import write_report_data
+    from pfbench.results.conditions import load_conditions
+
+    study, results = config.values["study"], config.values["results_dir"]
+    options = make_report_options(config)
+    conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
+    return write_report_data(study, conditions, options, folder)
+
+
+def _copy_data(stored: Path, folder: RecordedFolder) -> dict[str, Any]:
+    """Copy the values of all views and runs that git stores with the data of a page, and return the data."""
+    from pfbench.report.stored_page import read_page_data
+
+    pack = read_page_data(stored.parent)
+    for name in ("verdicts.csv", "runs.parquet"):
+        if (stored.parent / name).is_file():
+            folder.write(name, (stored.parent / name).read_bytes())
+    return pack
 
 
 def _value(words: Sequence[str], key: str) -> str:

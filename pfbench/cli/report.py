@@ -56,7 +56,7 @@ def report_study(words: Sequence[str]) -> None:
         raise ValueError(
             "study must be a study, got datasheets. Use: pfbench datasheet scenario=NAME"
         )
-    if not _find_page_data(config):
+    if not find_page_data(config, words):
         check_study_exists(study, Path(config.values["results_dir"]))
     print(f"report: {_write_page(config).resolve()}")
 
@@ -107,7 +107,7 @@ def _write_page(config: JobConfig) -> Path:
     from pfbench.report.stored_page import rebuild_page
 
     values = config.values
-    if data := _find_page_data(config):
+    if data := find_page_data(config):
         print(f"{values['study']}: without results, the page is made of {data}")
         return rebuild_page(data.parent)
     return write_report(
@@ -115,14 +115,31 @@ def _write_page(config: JobConfig) -> Path:
     )
 
 
-def _find_page_data(config: JobConfig) -> Path | None:
-    """Return the stored data of the page of a study without results, if there are any."""
+def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
+    """Return the stored data of the page of a study without results, if there are any.
+
+    Args:
+        config: Composed configuration.
+        words: Words of the command.
+
+    Raises:
+        ValueError: If the words set an option of the report, which stored data cannot follow.
+    """
     from pfbench.report.stored_page import PAGE_DATA
 
-    study = config.values["study"]
+    study, results = (
+        config.values["study"],
+        Path(config.values["results_dir"]) / config.values["study"],
+    )
     data = Path(config.values["reports_dir"]) / study / PAGE_DATA
-    has_results = any((Path(config.values["results_dir"]) / study).glob("*.npz"))
-    return None if has_results or not data.is_file() else data
+    if any(results.glob("*.npz")) or not data.is_file():
+        return None
+    if options := [word for word in words if word.lstrip("+").startswith(("report.", "report="))]:
+        raise ValueError(
+            f"options of the report need results, got {', '.join(options)} and no results in {results}. "
+            f"Leave them out to use {data}, or run: pfbench run -m +experiment={study}"
+        )
+    return data
 
 
 def _report_all(words: list[str]) -> None:
@@ -148,7 +165,10 @@ def _report_all(words: list[str]) -> None:
     if "claims" not in page_names:
         required &= published
     if missing := sorted((required - studies) | (required & set(failed))):
-        print(f"claims: the page is unchanged, since results of {', '.join(missing)} are missing")
+        print(
+            f"claims: the page is unchanged, since {results} holds no results of {', '.join(missing)}. "
+            "Next: make studies"
+        )
     else:
         print(f"claims: {write_claims_page(words).resolve()}")
     if failed:
@@ -164,9 +184,15 @@ def _renew_published(study: str, folder: Path, results: Path) -> str:
 
     if (folder / PAGE_DATA).is_file():
         return f"{study}: {rebuild_page(folder).resolve()}, of the stored data"
+    is_script = (experiments_dir() / f"{study}.py").is_file()
+    command = (
+        f"python -m pfbench.experiments.{study}"
+        if is_script
+        else f"pfbench run -m +experiment={study}"
+    )
     return (
         f"{study}: the published report is unchanged, since {results} holds no results. "
-        f"Next: pfbench run -m +experiment={study}"
+        f"Next: {command}"
     )
 
 

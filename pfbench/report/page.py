@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import cost, provenance, writers
@@ -16,10 +15,8 @@ from pfbench.report.plots.plotting import line_styles
 from pfbench.report.stored_page import write_page_data
 from pfbench.report.study_files import write_study_files
 from pfbench.report.study_page import write_page
-from pfbench.results import store
 from pfbench.results.conditions import (
     Condition,
-    differing_settings,
     load_conditions,
     natural_sort_key,
 )
@@ -70,10 +67,8 @@ def write_report(
             "paper_figures": writers.render_figures(
                 drawings, "paper", folder, options.figure_formats
             ),
-            "failures": store.list_failures(Path(results) / study),
             "definitions": [(metric.name, metric.caption) for metric in METRICS],
         }
-        _state_limits(pack, conditions)
         write_page_data(pack, folder)
         return write_page(pack, folder)
 
@@ -95,22 +90,6 @@ def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> l
     rows += provenance.compute_cost(conditions, planned)
     rows += provenance.training_cost(conditions)
     return [list(row) for row in rows]
-
-
-def _state_limits(pack: dict[str, Any], conditions: Sequence[Condition]) -> None:
-    """Put the number of failed jobs first in each view, and name conditions whose jobs differ in their data."""
-    number = len(pack["failures"])
-    jobs = "1 job failed and is" if number == 1 else f"{number} jobs failed and are"
-    differing = "".join(
-        f" Jobs of {condition.name} differ in {', '.join(settings)}: "
-        "their runs share random numbers, but not the data."
-        for condition in conditions
-        if (settings := differing_settings(condition.jobs))
-    )
-    for view in pack["views"].values():
-        view["small_print"] += differing
-        if number:
-            view["sentence"] = f"{jobs} missing from all tables. {view['sentence']}"
 
 
 def _check_groups(conditions: Sequence[Condition], thresholds: Mapping[str, float]) -> None:

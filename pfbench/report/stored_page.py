@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.journal.references import renew_bibliography
 from pfbench.report.study_page import write_page
 
 PAGE_DATA = "page.json.gz"
@@ -63,6 +64,7 @@ def rebuild_page(folder: Path) -> Path:
         Path of index.html.
     """
     pack = read_page_data(folder)
+    pack["bibtex"] = renew_bibliography(pack)
     pack["downloads"] = [d for d in pack["downloads"] if (folder / d["href"]).is_file()]
     with RecordedFolder(folder, is_complete=False) as target:
         return write_page(pack, target)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pandas as pd
@@ -9,12 +10,13 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.cli.paper import write_study_paper
+from pfbench.report.page import write_report
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("paper")
-    synthetic.study(folder / "results" / "demo", runs=12, steps=20)
+    synthetic.study(folder / "results" / "demo", runs=6, steps=10)
     return folder
 
 
@@ -31,6 +33,27 @@ def test_it_writes_figures_tables_text_and_data(home: Path) -> None:
     rows = pd.read_csv(folder / "verdicts.csv").query("metric == 'rmse' and baseline == 'sir'")
     runs = pd.read_parquet(folder / "runs.parquet")
     assert set(rows["filter"]) == set(runs["filter"]) == {m.name for m in synthetic.METHODS}
+
+
+def test_without_results_it_uses_the_stored_data_of_the_report(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same files as from results, byte for byte."""
+    words = ["study=demo", "width=120mm", f"reports_dir={tmp_path}"]
+    write_study_paper([*words, f"results_dir={home}/results"])
+    paper = tmp_path / "demo" / "paper"
+    expected = {path.name: path.read_bytes() for path in paper.iterdir()}
+    shutil.rmtree(paper)
+    write_report("demo", home / "results", tmp_path)
+    capsys.readouterr()
+    write_study_paper([*words, f"results_dir={tmp_path}/none"])
+    assert {path.name: path.read_bytes() for path in paper.iterdir()} == expected
+    data = tmp_path / "demo" / "page.json.gz"
+    assert f"note: without results, the paper is made of {data}" in capsys.readouterr().out
+    with pytest.raises(
+        ValueError, match=r"options of the report need results, got report\.alpha=0\.1"
+    ):
+        write_study_paper([*words, f"results_dir={tmp_path}/none", "report.alpha=0.1"])
 
 
 @pytest.mark.parametrize(

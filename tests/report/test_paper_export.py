@@ -17,10 +17,12 @@ from synthetic_results import study
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.journal import paper_folder, references
+from pfbench.report.journal.error_columns import format_error_value
 from pfbench.report.journal.figure_style import FigureSetting
-from pfbench.report.journal.main_table import format_error_value, make_main_tables, make_supplement
+from pfbench.report.journal.main_table import make_main_tables, make_supplement
 from pfbench.report.journal.methods_text import describe_methods
 from pfbench.report.journal.page_format import JOURNALS, SUPERSCRIPTS, find_page_format
+from pfbench.report.journal.pair_table import make_planned_table
 from pfbench.report.journal.paper_folder import (
     draw_paper_figure,
     render_pdf,
@@ -56,9 +58,11 @@ def write(
     folder: Path, pack: dict[str, Any], conditions: list[Condition], journal: str, width: str = ""
 ) -> list[str]:
     page = find_page_format(journal, width)
+    paragraphs = describe_methods(conditions, pairs=len(pack["planned"]))
+    pack["methods_paragraph"] = "\n\n".join(paragraphs)
+    pack["bibtex"] = references.format_bibliography(pack, conditions)
     with RecordedFolder(folder) as target:
-        methods = describe_methods(conditions, pairs=len(pack["planned"]))
-        return paper_folder.write_paper(pack, conditions, methods, page, target)
+        return paper_folder.write_paper(pack, page, target)
 
 
 @pytest.mark.parametrize(
@@ -125,13 +129,48 @@ def test_tables_split_by_regime_and_move_intervals_to_a_supplement() -> None:
 def test_a_table_that_does_not_fit_is_refused_with_advice(
     conditions: list[Condition], tmp_path: Path
 ) -> None:
-    wide = build_pack(3, 8, 1, runs=3, instants=4, carried=0)
-    with pytest.raises(ValueError, match=r"table_main must fit 252 pt, got \d+ pt. Choose fewer"):
+    wide = build_pack(3, 1, 1, runs=3, instants=4, carried=0, names={0: "long name " * 9})
+    with pytest.raises(ValueError, match=r"table_main must fit 252 pt, got \d+ pt. Use a wider"):
         write(tmp_path / "paper", wide, conditions, "", "252pt")
     assert not list(tmp_path.rglob("*.tex"))
     high = build_pack(70, 1, 1, runs=3, instants=4, carried=0)
-    with pytest.raises(ValueError, match=r"at most 63 rows, got 71. Choose fewer filters"):
+    with pytest.raises(ValueError, match=r"at most 63 rows, got 72. Run a study of fewer filters"):
         write(tmp_path / "paper", high, conditions, "ieee")
+
+
+def test_worlds_that_do_not_fit_are_split_and_none_is_left_out() -> None:
+    """Any law of widths: here at most three worlds in a table."""
+    pack = build_pack(3, 8, 1, runs=3, instants=4, carried=0)
+    whole = make_main_tables(pack)
+    parts = make_main_tables(pack, lambda table: len(table.columns) <= 1 + 2 * 3)
+    assert [table.name for table in whole] == ["main"]
+    assert [table.name for table in parts] == ["main_1", "main_2", "main_3"]
+    heads = [cell.tex for table in parts for cell in table.head[-1][1:]]
+    assert heads == [cell.tex for cell in whole[0].head[-1][1:]]
+    for row, *others in zip(whole[0].groups[0], *(table.groups[0] for table in parts), strict=True):
+        assert row[1:] == [cell for other in others for cell in other[1:]]
+
+
+@pytest.mark.parametrize("journal", JOURNALS)
+def test_a_legend_is_within_its_figure(journal: str) -> None:
+    names = {i: f"A method with a long name {i}" for i in range(9)}
+    pack = build_pack(9, 1, 1, runs=5, instants=10, carried=0, names=names)
+    figure = draw_paper_figure(
+        select_figures(pack)["over_time"], pack, FigureSetting(find_page_format(journal))
+    )
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert 0 <= box.x0 <= box.x1 <= figure.bbox.width
+    assert 0 <= box.y0 <= box.y1 <= figure.bbox.height
+    assert len(figure.legends[0].get_texts()) == 9
+
+
+def test_a_ratio_that_differs_from_one_is_not_printed_as_one() -> None:
+    pack = build_pack(3, 1, 1, runs=3, instants=4, carried=0)
+    pair = pack["planned"][0] | {"estimate": 0.95, "low": 0.9, "high": 0.9989, "word": "better"}
+    table = make_planned_table({**pack, "planned": [pair]})
+    assert table is not None
+    assert [cell.tex for cell in table.groups[0][1]][1:3] == [r"\textbf{0.95}", "{[}0.90, 0.999]"]
 
 
 def test_bold_is_the_smallest_printed_number_and_worse_has_a_dagger() -> None:

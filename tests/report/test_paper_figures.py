@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from itertools import combinations, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,11 +77,46 @@ def test_every_figure_is_of_filters_and_studies_that_there_are() -> None:
         ), name
         assert figure.noise == "" or (conf / "noise" / f"{figure.noise}.yaml").exists(), name
         ran = [yaml.safe_load(path.read_text()) for path in studies.glob(f"paper_{name[:3]}*.yaml")]
-        swept = [
-            set(str(one["hydra"]["sweeper"]["params"].get("filter", "")).split(",")) for one in ran
-        ]
+        swept = [set(_swept_labels(one)) for one in ran]
         assert any(set(figure.filters) & filters for filters in swept), name
         assert any(char.isdigit() for char in figure.title) or "section" in figure.title
+
+
+def _swept_labels(experiment: dict[str, Any]) -> Iterator[str]:
+    """Labels of an experiment: of its sweep of filters, or of one filter with a swept key."""
+    params = experiment["hydra"]["sweeper"]["params"]
+    yield from str(params.get("filter", "")).split(",")
+    base = next(
+        (d["override /filter"] for d in experiment["defaults"] if "override /filter" in d), ""
+    )
+    for key, values in params.items():
+        if key.startswith("filter."):
+            for value in str(values).split(","):
+                yield f"{base}[{key.removeprefix('filter.')}={value}]"
+
+
+def test_values_of_a_parameter_have_a_line_each(tmp_path: Path) -> None:
+    """Two values of one method: other colours, the median of each, and what is missing in the caption."""
+    name = "cofm_mssrckf[gain_adaptations.1.max_ratio={}]".format
+    for value, size in (("1.0", 1.0), ("1000000000.0", 3.0)):
+        synthetic.write(
+            tmp_path / "paper_002_bound", synthetic.Method(name(value), size), runs=20, steps=30
+        )
+    found = load_conditions("paper_002_bound", tmp_path)
+    style = line_styles([job.label for cell in found for job in cell.jobs])
+    (drawing,) = paper_figures.paper_figures("paper_002_bound", found, style, ["002-3-bound"])
+    figure = drawing.make()
+    lines = [line(figure, 0, f"ratio bound {value}") for value in ("1.0", "1000000000.0")]
+    results = {r.meta["label"]: r for r in store.list_results(tmp_path / "paper_002_bound")}
+    for (_, values), key in zip(lines, ("1.0", "1000000000.0"), strict=True):
+        error = results[name(key)].data["error"][..., 0]
+        np.testing.assert_allclose(values, np.median(error, 0), rtol=1e-6)
+    colours = {
+        one.get_color() for one in figure.axes[0].lines if one.get_label().startswith("ratio")
+    }
+    assert len(colours) == 2
+    assert "these values are ours" in drawing.caption
+    assert "No study varies the forgetting factor" in drawing.caption
 
 
 def test_a_study_shows_the_figures_of_its_own_paper(results: Path) -> None:

@@ -67,14 +67,9 @@ def test_what_has_results_is_made_again_and_what_has_none_stays(
     assert "paper_001: the published report is unchanged" in said.out
     assert "pfbench run -m +experiment=paper_001" in said.out
     studies = sorted({study for claim in claim_records.read_claims() for study in claim.studies})
-    assert (
-        f"claims: the page is unchanged, since results of {', '.join(studies)} are missing"
-        in said.out
-    )
+    assert f"holds no results of {', '.join(studies)}. Next: make studies" in said.out
     there(tmp_path, *(f"results/{study}/a.npz" for study in studies[1:]))
-    assert (
-        f"since results of {studies[0]} are missing" in pfbench("report", "all", home=tmp_path).out
-    )
+    assert f"holds no results of {studies[0]}." in pfbench("report", "all", home=tmp_path).out
     there(tmp_path, f"results/{studies[0]}/a.npz")
     assert pfbench("report", "all", home=tmp_path).code == 0
     assert list(made)[-1] == "claims"  # after the pages that it links to
@@ -116,3 +111,12 @@ def test_without_any_results_everything_stays(made: dict[str, Any], tmp_path: Pa
     assert said.code == 0
     assert made == {}
     assert said.out.count("is unchanged") == 2
+
+
+def test_a_page_of_a_script_names_the_command_that_writes_it(
+    made: dict[str, Any], tmp_path: Path
+) -> None:
+    there(tmp_path, "reports/learn_quad_noise/report.md", "reports/claims/report.md")
+    said = pfbench("report", "all", home=tmp_path)
+    assert "Next: python -m pfbench.experiments.learn_quad_noise" in said.out
+    assert made == {}

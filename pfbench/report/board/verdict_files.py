@@ -14,7 +14,8 @@ from pfbench.report.board.study_data import StudyData, read_study
 from pfbench.report.board.study_views import ViewKey
 from pfbench.report.options import ReportOptions
 from pfbench.report.table_formats import format_csv
-from pfbench.results.conditions import Condition
+from pfbench.results import store
+from pfbench.results.conditions import Condition, differing_settings
 
 
 def write_report_data(
@@ -38,6 +39,8 @@ def write_report_data(
     """
     data = data or read_study(conditions, options)
     pack = build_pack(study, conditions, options, data)
+    pack["failures"] = store.list_failures(conditions[0].jobs[0].path.parent)
+    _state_limits(pack, conditions)
     return pack | {"downloads": write_verdict_files(pack, data.table, folder)}
 
 
@@ -71,3 +74,19 @@ def write_verdict_files(
         size = folder.write(name, content).stat().st_size
         downloads.append({"name": title, "href": name, "bytes": size, "group": group})
     return downloads
+
+
+def _state_limits(pack: dict[str, Any], conditions: Sequence[Condition]) -> None:
+    """Put the number of failed jobs first in each view, and name conditions whose jobs differ in their data."""
+    number = len(pack["failures"])
+    jobs = "1 job failed and is" if number == 1 else f"{number} jobs failed and are"
+    differing = "".join(
+        f" Jobs of {condition.name} differ in {', '.join(settings)}: "
+        "their runs share random numbers, but not the data."
+        for condition in conditions
+        if (settings := differing_settings(condition.jobs))
+    )
+    for view in pack["views"].values():
+        view["small_print"] += differing
+        if number:
+            view["sentence"] = f"{jobs} missing from all tables. {view['sentence']}"

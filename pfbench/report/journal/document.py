@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 from pfbench.files.escapes import escape_latex
 from pfbench.report.journal.page_format import PageFormat
 from pfbench.report.journal.references import SELF, cite, list_cited_keys
-from pfbench.report.journal.study_pack import Pack
+from pfbench.report.journal.study_pack import Pack, find_rows, is_number
 
 _PACKAGES = (
     r"\usepackage[T1]{fontenc}",
@@ -16,6 +17,7 @@ _PACKAGES = (
     r"\sisetup{mode=text,input-symbols=<}",
     r"\emergencystretch=3em",
 )
+_MINUS = re.compile(r"(?<![\w-])-(?=\d)")  # a sign, not a hyphen
 CAPTIONS = {
     "leaderboard": (
         "{metric} relative to {baseline}, mean over worlds and noise regimes on a log scale, with {level}\\,\\% intervals. "
@@ -68,7 +70,14 @@ def format_caption(name: str, pack: Pack) -> str:
     text = CAPTIONS[name]
     for word, value in words.items():
         text = text.replace(word, value)
-    return text
+    rows = find_rows(pack).values()
+    absent = sum(not is_number(row["ratio"]) for row in rows)
+    is_ratio = name in ("leaderboard", "cost")
+    return text + (
+        f" {absent} of {len(rows)} filters have no error to compare in all conditions."
+        if is_ratio and absent
+        else ""
+    )
 
 
 def format_document(
@@ -96,11 +105,12 @@ def format_document(
     plain = str(sentence).replace("[[", "").replace("]]", "")
     cited = list_cited_keys(pack)
     methods = f"The methods are those of{cite(cited)}." if cited else ""
-    floats = [_format_figure(name, pack, is_wide) for name, is_wide in figures.items()]
+    narrow_first = sorted(figures.items(), key=lambda item: item[1])  # wide floats hold up others
+    floats = [_format_figure(name, pack, is_wide) for name, is_wide in narrow_first]
     return "\n".join([
         f"% Written by pfbench for {escape_latex(page.name)}: {page.column:.1f} pt columns, {page.text:.1f} pt text",
         page.head, *_PACKAGES, r"\begin{document}", *start,
-        r"\section{Experiments}", r"\input{methods.tex}", methods, "", r"\section{Results}", escape_latex(plain), "",
+        r"\section{Experiments}", r"\input{methods.tex}", methods, "", r"\section{Results}", _MINUS.sub("$-$", escape_latex(plain)), "",
         *floats, *(rf"\input{{{name}.tex}}" for name in tables),
         rf"\bibliographystyle{{{page.bibliography}}}", r"\bibliography{pfbench}", r"\end{document}", "",
     ])  # fmt: skip

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
-
-import numpy as np
+from collections.abc import Callable, Sequence
 
 from pfbench.files.escapes import escape_latex
+from pfbench.report.journal.error_columns import ErrorColumn, is_printed_number, make_column
 from pfbench.report.journal.study_pack import (
     Pack,
     filters_by_family,
-    find_rows,
-    is_number,
     list_cells,
     name_of,
     name_with_star,
@@ -30,96 +25,78 @@ from pfbench.report.journal.table_layout import (
 from pfbench.report.journal.text_width import text_width
 
 ONE_TABLE, WITH_INTERVALS = 8, 16  # cells at most of one table, and of tables with intervals
-_KILO = {"m": "km", "": ""}
 _DAGGER = r"\rlap{\textsuperscript{\textdagger}}"
 
 
-class ErrorColumn(NamedTuple):
-    """Errors of one condition.
-
-    Attributes:
-        world: Key of the world.
-        regime: Key of the regime.
-        unit: Unit that is printed.
-        entries: Text, interval and verdict by filter.
-    """
-
-    world: str
-    regime: str
-    unit: str
-    entries: dict[str, tuple[str, str, str]]
-
-    def best(self) -> set[str]:
-        """Return the filters whose printed number is the smallest of those not shown to be worse."""
-        numbers = {
-            key: float(text)
-            for key, (text, _, verdict) in self.entries.items()
-            if verdict != "worse" and _is_printed_number(text)
-        }
-        least = min(numbers.values(), default=math.nan)
-        return {key for key, number in numbers.items() if number == least}
+Fits = Callable[[LatexTable], bool]
 
 
-def make_main_tables(pack: Pack) -> list[LatexTable]:
+def _fit_always(_: LatexTable) -> bool:
+    """Accept a table of any width."""
+    return True
+
+
+def make_main_tables(pack: Pack, fits: Fits = _fit_always) -> list[LatexTable]:
     """Build the main table: one, or one per regime above eight conditions.
 
     Args:
         pack: Data of the report.
+        fits: Whether a table fits the page. The worlds of one that does not are split.
 
     Returns:
         Tables of the paper. Above 16 conditions they lack intervals, see `make_supplement`.
     """
     cells = list_cells(pack)
-    return _split(pack, cells, "main", has_intervals=len(cells) <= WITH_INTERVALS)
+    return _split(pack, cells, "main", fits, has_intervals=len(cells) <= WITH_INTERVALS)
 
 
-def make_supplement(pack: Pack) -> list[LatexTable]:
+def make_supplement(pack: Pack, fits: Fits = _fit_always) -> list[LatexTable]:
     """Build the tables with intervals that the main tables lack, one per regime; empty if they have them.
 
     Args:
         pack: Data of the report.
+        fits: Whether a table fits the page. The worlds of one that does not are split.
     """
     cells = list_cells(pack)
     if len(cells) <= WITH_INTERVALS:
         return []
-    return _split(pack, cells, "supplement", has_intervals=True)
-
-
-def format_error_value(value: Any, digits: int = 3) -> str:
-    """Format an error with some significant digits, without an exponent below a million.
-
-    Args:
-        value: Error; None if no number exists.
-        digits: Number of digits.
-    """
-    if not is_number(value):
-        return "--"
-    if value and not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}"
-    return np.format_float_positional(
-        float(f"{value:.{digits - 1}e}"), trim="-" if value >= 10 ** (digits - 1) else "k",
-        precision=digits, unique=False, fractional=False,
-    ).rstrip(".")  # fmt: skip
+    return _split(pack, cells, "supplement", fits, has_intervals=True)
 
 
 def _split(
-    pack: Pack, cells: Sequence[tuple[str, str]], name: str, *, has_intervals: bool
+    pack: Pack, cells: Sequence[tuple[str, str]], name: str, fits: Fits, *, has_intervals: bool
 ) -> list[LatexTable]:
-    """Build one table, or one per regime if there are many cells."""
-    regimes = list(dict.fromkeys(regime for _, regime in cells))
-    if len(cells) <= ONE_TABLE and name == "main":
-        return [_make_table(pack, cells, name, has_intervals)]
-    groups = [[cell for cell in cells if cell[1] == regime] for regime in regimes]
-    return [
-        _make_table(pack, group, f"{name}_{i}", has_intervals) for i, group in enumerate(groups, 1)
+    """Build one table, or one per regime if there are many cells, each with as many worlds as fit."""
+    groups = [list(cells)]
+    if len(cells) > ONE_TABLE or name != "main":
+        regimes = dict.fromkeys(regime for _, regime in cells)
+        groups = [[cell for cell in cells if cell[1] == regime] for regime in regimes]
+    parts: list[list[tuple[str, str]]] = []
+    for group in groups:
+        for count in range(1, len({world for world, _ in group}) + 1):
+            split = _split_worlds(group, count)
+            if all(fits(_make_table(pack, part, name, has_intervals)) for part in split):
+                break
+        parts += split
+    if len(parts) == 1 and name == "main":
+        return [_make_table(pack, parts[0], name, has_intervals)]
+    return [_make_table(pack, p, f"{name}_{i}", has_intervals) for i, p in enumerate(parts, 1)]
+
+
+def _split_worlds(cells: Sequence[tuple[str, str]], count: int) -> list[list[tuple[str, str]]]:
+    """Split cells into parts with about as many worlds each."""
+    worlds = list(dict.fromkeys(world for world, _ in cells))
+    parts = [
+        worlds[i * len(worlds) // count : (i + 1) * len(worlds) // count] for i in range(count)
     ]
+    return [[cell for cell in cells if cell[0] in part] for part in parts]
 
 
 def _make_table(
     pack: Pack, cells: Sequence[tuple[str, str]], name: str, has_intervals: bool
 ) -> LatexTable:
     """Build the table of some conditions."""
-    columns = [_make_column(pack, *cell) for cell in cells]
+    columns = [make_column(pack, *cell) for cell in cells]
     per_cell = 2 if has_intervals else 1
     specs = [Column("l")]
     for _ in columns:
@@ -140,43 +117,42 @@ def _make_head(
     pack: Pack, columns: Sequence[ErrorColumn], per_cell: int, has_one_regime: bool
 ) -> tuple[list[list[LatexCell]], list[tuple[int, int]]]:
     """Build the rows of the head: worlds with units, then regimes unless there is one."""
+    if has_one_regime:
+        return _make_world_head(pack, columns, per_cell), []
     worlds = list(dict.fromkeys(column.world for column in columns))
-    first, rules, start = [text_cell("Method" if has_one_regime else "")], [], 2
+    first, rules, start = [text_cell("")], [], 2
     for world in worlds:
         members = [column for column in columns if column.world == world]
         span = per_cell * len(members)
-        unit = f" ({members[0].unit})" if members[0].unit else ""
-        first.append(text_cell(f"{name_of(pack, 'worlds', world)}{unit}", span=span))
+        first.append(text_cell(_name_world(pack, members[0]), span=span))
         rules.append((start, start + span - 1))
         start += span
-    if has_one_regime:
-        return [first], []
     second = [text_cell("Method")]
     for column in columns:
         second.append(text_cell(name_of(pack, "regimes", column.regime), span=per_cell))
     return [first, second], rules
 
 
-def _make_column(pack: Pack, world: str, regime: str) -> ErrorColumn:
-    """Collect the entries of one condition, in a unit without many zeros."""
-    rows = find_rows(pack, world, regime)
-    values = [row["value"] for row in rows.values() if is_number(row["value"])]
-    unit = next((str(row["unit"]) for row in rows.values() if row["unit"]), "")
-    is_kilo = unit == "m" and bool(values) and float(np.median(values)) >= 1e3
-    scale = 1e-3 if is_kilo else 1.0
-    entries = {}
-    for key, row in rows.items():
-        value, low, high = (
-            scale * row[name] if is_number(row[name]) else None for name in ("value", "low", "high")
-        )
-        interval = (
-            ""
-            if low is None or high is None
-            else f"[{format_error_value(low, 2)}, {format_error_value(high, 2)}]"
-        )
-        text = "lost" if value is None and row.get("lost") else format_error_value(value)
-        entries[key] = (text, interval, str(row["verdict"]))
-    return ErrorColumn(world, regime, _KILO.get(unit, unit) if is_kilo else unit, entries)
+def _make_world_head(
+    pack: Pack, columns: Sequence[ErrorColumn], per_cell: int
+) -> list[list[LatexCell]]:
+    """Build the head of a table of one regime, with the names of worlds in lines of about equal width."""
+    lines = [_break_name(_name_world(pack, column)) for column in columns]
+    upper = [text_cell(""), *(text_cell(line[0], span=per_cell) for line in lines)]
+    lower = [text_cell("Method"), *(text_cell(line[1], span=per_cell) for line in lines)]
+    return [upper, lower] if any(line[0] for line in lines) else [lower]
+
+
+def _break_name(name: str) -> tuple[str, str]:
+    """Break a name at the space that gives the least width; the first line is empty without a space."""
+    words = name.split(" ")
+    breaks = [(" ".join(words[:i]), " ".join(words[i:])) for i in range(1, len(words))]
+    return min(breaks, key=lambda lines: max(map(len, lines)), default=("", name))
+
+
+def _name_world(pack: Pack, column: ErrorColumn) -> str:
+    """Return the name of the world of a column with its unit."""
+    return f"{name_of(pack, 'worlds', column.world)}{f' ({column.unit})' if column.unit else ''}"
 
 
 def _name_cell(pack: Pack, key: str) -> LatexCell:
@@ -194,7 +170,7 @@ def _error_cells(columns: Sequence[ErrorColumn], key: str, has_intervals: bool) 
     for column in columns:
         text, interval, verdict = column.entries.get(key, ("--", "", ""))
         is_best, is_worse = key in column.best(), verdict == "worse"
-        number = rf"\num{{{text}}}" if _is_printed_number(text) else text
+        number = rf"\num{{{text}}}" if is_printed_number(text) else text
         tex = rf"\textbf{{{text}}}" if is_best else number
         tex = rf"\textcolor{{black!62}}{{{number}{_DAGGER}}}" if is_worse else tex
         cells.append(
@@ -214,8 +190,3 @@ def _error_width(text: str, is_best: bool) -> float:
     """Return the width of a number and the dagger after it."""
     printed = text.replace("e", "×10") if "e" in text and text != "lost" else text
     return text_width(printed, SIZE, is_bold=is_best) + text_width("†", INTERVAL_SIZE)
-
-
-def _is_printed_number(text: str) -> bool:
-    """Return whether an entry is a number."""
-    return text not in ("--", "lost")

@@ -106,14 +106,14 @@ _SPRINGER = (_millimetres(84), _millimetres(174), 660.0)
 JOURNALS = {
     "ieee": PageFormat(
         "ieee", 252.0, 516.0, 690.0, True, 8.0, 7.0,
-        r"\documentclass[journal]{IEEEtran}", "IEEEtran",
+        r"\documentclass[journal]{IEEEtran}" "\n" r"\usepackage{cite}", "IEEEtran",
     ),
     "elsevier": PageFormat(
         "elsevier", *_ELSEVIER, False, 7.0, 6.5,
         "\\documentclass[final,5p,times,twocolumn]{elsarticle}\n"
         f"\\geometry{{textwidth={_ELSEVIER[1]:.3f}pt,"
         f"columnsep={_ELSEVIER[1] - 2 * _ELSEVIER[0]:.3f}pt,textheight=690pt}}\n"
-        "\\journal{}",
+        "\\biboptions{sort&compress}\n\\journal{}",
         "elsarticle-num",
     ),
     "springer": PageFormat(

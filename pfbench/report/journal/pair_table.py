@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pfbench.files.escapes import escape_latex
-from pfbench.report.journal.main_table import format_error_value
+from pfbench.report.journal.error_columns import format_error_value
 from pfbench.report.journal.study_pack import (
     Pack,
     Row,
@@ -27,6 +27,8 @@ from pfbench.report.journal.table_layout import (
 )
 from pfbench.report.journal.text_width import text_width
 
+_INDENT = 6.0  # points, of a baseline below its method
+_EQUAL = 5e-4  # ratios further from 1 are not printed as 1.00
 _LEAST_P = 0.001
 _ROUNDS = "Times: medians of rounds in which the filters took turns; ratio to the baseline by round with its interval."
 
@@ -41,27 +43,26 @@ def make_planned_table(pack: Pack) -> LatexTable | None:
     if not pairs:
         return None
     looks = filters_by_key(pack)
-    rows, last = [], ""
+    groups: dict[str, list[list[LatexCell]]] = {}
     for pair in pairs:
         a, b = str(pair["a"]), str(pair["b"])
-        name = text_cell("" if a == last else str(looks[a]["name"]))
         interval = f"[{_ratio(pair['low'])}, {_ratio(pair['high'])}]"
         word = str(pair["word"])
-        rows.append([
-            name, text_cell(str(looks[b]["name"])), _ratio_cell(pair["estimate"], word),
+        name = f"{looks[a]['name']} against"
+        groups.setdefault(a, [[text_cell(name, span=5)._replace(alignment="@{}l")]]).append([
+            _indent(text_cell(str(looks[b]["name"]))), _ratio_cell(pair["estimate"], word),
             text_cell(interval), text_cell(_p_value(pair.get("p"))), text_cell(word),
         ])  # fmt: skip
-        last = a
-    head = [["Method", "baseline", "ratio", "interval", "p", "decision"]]
-    heads = [[text_cell(text) for text in line] for line in head]
-    columns = [Column("l"), Column("l"), Column("r"), Column("l"), Column("r"), Column("l")]
+    head = ["Method and baseline", "ratio", "interval", "p", "decision"]
+    columns = [Column("l"), Column("r"), Column("l"), Column("r"), Column("l")]
     worlds = len(pack["worlds"])
     caption = (
         r"Planned pairs: error of the method divided by that of the baseline, mean over "
         rf"{'these ' + str(worlds) + ' worlds' if worlds > 1 else 'the runs of this world'} on a log scale, with "
         r"simultaneous intervals and Holm's correction of \textit{p} over all pairs. Decisions are for these worlds."
     )
-    return LatexTable("planned", caption, columns, heads, [rows])
+    heads = [[text_cell(text) for text in head]]
+    return LatexTable("planned", caption, columns, heads, list(groups.values()))
 
 
 def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
@@ -113,6 +114,11 @@ def _cost_cells(row: Row, particles: str, has_rounds: bool) -> list[LatexCell]:
     return [text_cell(particles or "--"), *cells]
 
 
+def _indent(cell: LatexCell) -> LatexCell:
+    """Indent a cell."""
+    return cell._replace(tex=rf"\hspace*{{{_INDENT:g}pt}}{cell.tex}", width=cell.width + _INDENT)
+
+
 def _head_cell(text: str) -> LatexCell:
     """Return a cell of the head, protected from siunitx."""
     return LatexCell(f"{{{escape_latex(text)}}}", text_width(text, SIZE))
@@ -125,9 +131,11 @@ def _whole_digits(rows: dict[str, Row], name: str) -> int:
 
 
 def _ratio(value: Any) -> str:
-    """Format a ratio with two places, or two digits if it is large."""
+    """Format a ratio with two places, three near 1, or two digits if it is large."""
     if not is_number(value):
         return r"--"
+    if f"{value:.2f}" == "1.00" and abs(value - 1) > _EQUAL:
+        return f"{value:.3f}"
     return f"{value:.2f}" if 0.095 <= value < 9.995 else format_error_value(value, 2)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 from matplotlib.figure import Figure
 
@@ -20,7 +20,7 @@ from pfbench.report.journal.ratio_figures import (
     plot_leaderboard,
     plot_planned,
 )
-from pfbench.report.journal.references import format_bibliography
+from pfbench.report.journal.references import renew_bibliography
 from pfbench.report.journal.study_pack import ALL, Pack, find_rows, is_number
 from pfbench.report.journal.table_layout import (
     LINE,
@@ -30,7 +30,6 @@ from pfbench.report.journal.table_layout import (
     measure_table,
 )
 from pfbench.report.journal.time_figures import plot_calibration, plot_over_time
-from pfbench.results.conditions import Condition, natural_sort_key
 
 _CAPTION_LINES = 8
 _PDF_METADATA = {"CreationDate": None, "ModDate": None, "Producer": "pfbench", "Creator": "pfbench"}
@@ -63,8 +62,6 @@ def select_figures(pack: Pack) -> dict[str, Plot]:
 
 def write_paper(
     pack: Pack,
-    conditions: Sequence[Condition],
-    methods: Sequence[str],
     page: PageFormat,
     folder: RecordedFolder,
 ) -> list[str]:
@@ -72,8 +69,6 @@ def write_paper(
 
     Args:
         pack: Data of the report.
-        conditions: Conditions of the study.
-        methods: Methods paragraph.
         page: Page format.
         folder: Target folder.
 
@@ -83,7 +78,7 @@ def write_paper(
     Raises:
         ValueError: If a table does not fit the page. Nothing is written then.
     """
-    tables = _format_tables(pack, conditions, page)
+    tables = _format_tables(pack, page)
     remarks = [f"{name}.tex has the intervals" for name in tables if "supplement" in name]
     plots = select_figures(pack)
     has_latex = shutil.which("pdflatex") is not None
@@ -98,9 +93,10 @@ def write_paper(
         remarks.append("figures are PDF only: PGF needs pdflatex")
     for name, text in tables.items():
         folder.write(f"{name}.tex", text)
-    folder.write("methods.tex", format_methods(methods))
-    folder.write("pfbench.bib", format_bibliography(pack, conditions))
+    folder.write("methods.tex", format_methods(pack["methods_paragraph"].split("\n\n")))
+    folder.write("pfbench.bib", renew_bibliography(pack))
     main = [name for name in tables if "supplement" not in name]
+    main.sort(key=lambda name: "{table*}" in tables[name])  # wide floats hold up others
     folder.write("paper.tex", format_document(pack, page, widths, main))
     if len(main) < len(tables):
         supplement = [name for name in tables if "supplement" in name]
@@ -147,14 +143,27 @@ def render_pgf(plot: Plot, pack: Pack, page: PageFormat) -> str:
     return buffer.getvalue().translate(SUPERSCRIPTS)
 
 
-def _format_tables(pack: Pack, conditions: Sequence[Condition], page: PageFormat) -> dict[str, str]:
+def _format_tables(pack: Pack, page: PageFormat) -> dict[str, str]:
     """Format all tables by file name; refuse those that do not fit."""
     planned = make_planned_table(pack)
+
+    def fits(table: LatexTable) -> bool:
+        return _find_width(table, page) is not None
+
     tables = [
-        *make_main_tables(pack), *([planned] if planned else []),
-        make_cost_table(pack, _list_particles(conditions)), *make_supplement(pack),
+        *make_main_tables(pack, fits), *([planned] if planned else []),
+        make_cost_table(pack, _list_particles(pack)), *make_supplement(pack, fits),
     ]  # fmt: skip
     return {f"table_{table.name}": _format_fitting(table, page) for table in tables}
+
+
+def _find_width(table: LatexTable, page: PageFormat) -> tuple[float, bool] | None:
+    """Return the separation of columns, and whether a table spans the text; None if it does not fit."""
+    for width, is_wide in ((page.column, False), (page.text, page.has_columns)):
+        separation = fit_table(table, width)
+        if separation is not None:
+            return separation, is_wide
+    return None
 
 
 def _format_fitting(table: LatexTable, page: PageFormat) -> str:
@@ -163,26 +172,22 @@ def _format_fitting(table: LatexTable, page: PageFormat) -> str:
     if table.rows > most:
         raise ValueError(
             f"table_{table.name} must have at most {most} rows, got {table.rows}. "
-            "Choose fewer filters: filter=a,b,c."
+            "Run a study of fewer filters: filter=a,b,c."
         )
-    for width, is_wide in ((page.column, False), (page.text, page.has_columns)):
-        separation = fit_table(table, width)
-        if separation is not None:
-            return format_table(table, separation, is_wide=is_wide)
-    raise ValueError(
-        f"table_{table.name} must fit {page.text:.0f} pt, got {measure_table(table, 2.4):.0f} pt. "
-        "Choose fewer worlds or regimes (scenario=a,b noise=c), or a wider page (width=...)."
-    )
+    place = _find_width(table, page)
+    if place is None:
+        raise ValueError(
+            f"table_{table.name} must fit {page.text:.0f} pt, got {measure_table(table, 2.4):.0f} pt. "
+            "Use a wider page (width=...)."
+        )
+    return format_table(table, place[0], is_wide=place[1])
 
 
-def _list_particles(conditions: Sequence[Condition]) -> Mapping[str, str]:
+def _list_particles(pack: Pack) -> Mapping[str, str]:
     """Return the numbers of particles by filter; several numbers as a range."""
-    numbers: dict[str, set[int]] = {}
-    for job in (job for condition in conditions for job in condition.jobs):
-        if job.meta.get("particles"):
-            numbers.setdefault(job.label, set()).add(int(job.meta["particles"]))
-    labels = sorted(numbers, key=natural_sort_key)
+    texts = {str(note["filter"]): str(note["particles"]) for note in pack["filter_notes"]}
+    numbers = {key: sorted(map(int, text.split(" or "))) for key, text in texts.items() if text}
     return {
-        label: "--".join(map(str, sorted({min(numbers[label]), max(numbers[label])})))
-        for label in labels
+        key: "--".join(map(str, dict.fromkeys((values[0], values[-1]))))
+        for key, values in numbers.items()
     }

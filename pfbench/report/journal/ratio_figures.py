@@ -137,7 +137,8 @@ def plot_error_against_cost(pack: Pack, setting: FigureSetting) -> Figure:
     axis.set_ylabel(setting.escape(f"{pack['metrics'][0]['name']} / {baseline}"))
     figure.draw_without_rendering()
     points = np.column_stack([cost, ratio])
-    place_labels(axis, points, names, np.full(len(points), 2.5), path)
+    line = [(np.nan, np.nan), *((x, 1.0) for x in axis.get_xlim())]  # a gap, then the line at 1
+    place_labels(axis, points, names, np.full(len(points), 2.5), np.concatenate([path, line]))
     return figure
 
 

@@ -44,6 +44,16 @@ def format_bibliography(pack: Pack, conditions: Sequence[Condition]) -> str:
     return f"{format_bibtex(conditions)}\n{find_entries(list_cited_keys(pack))}"
 
 
+def renew_bibliography(pack: Pack) -> str:
+    """Format the BibTeX file of stored data: its entry of pfbench, then the present references of the filters.
+
+    Args:
+        pack: Data of the report, with its BibTeX entries.
+    """
+    own, end, _ = str(pack["bibtex"]).partition("\n}\n")
+    return f"{own}{end}\n{find_entries(list_cited_keys(pack))}"
+
+
 def cite(keys: Sequence[str]) -> str:
     """Return the citation of keys, empty without one.
 

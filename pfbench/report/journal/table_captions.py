@@ -34,7 +34,24 @@ def describe_columns(
         f"{metric}: trimmed mean over runs on the logarithmic scale{interval}{where}. Bold: smallest. "
         r"\textsuperscript{\textdagger}: shown to be worse than the smallest, jointly for all comparisons "
         r"of the column; the others are not told apart from it. \textsuperscript{*}: proposed methods."
+        + _describe_absent(pack, cells)
         + _describe_lost(pack, cells)
+    )
+
+
+def _describe_absent(pack: Pack, cells: Sequence[tuple[str, str]]) -> str:
+    """Explain the dash of filters without an error in a condition; empty if there is none."""
+    rows = [find_rows(pack, world, regime) for world, regime in cells]
+    keys = [str(look["key"]) for look in pack["filters"]]
+    has_dash = any(
+        key not in row or (row[key]["value"] is None and not row[key].get("lost"))
+        for row in rows
+        for key in keys
+    )
+    return (
+        " --: no error to compare, because the track is not kept or the filter was not run."
+        if has_dash
+        else ""
     )
 
 

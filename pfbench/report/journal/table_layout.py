@@ -22,11 +22,13 @@ class LatexCell(NamedTuple):
         tex: LaTeX.
         width: Width in points.
         span: Number of columns.
+        alignment: Alignment over several columns.
     """
 
     tex: str
     width: float
     span: int = 1
+    alignment: str = "c"
 
 
 class Column(NamedTuple):
@@ -176,7 +178,9 @@ def _gap(column: Column, separation: float) -> float:
 def _format_row(row: Sequence[LatexCell]) -> str:
     """Format a row."""
     cells = [
-        cell.tex if cell.span == 1 else rf"\multicolumn{{{cell.span}}}{{c}}{{{cell.tex}}}"
+        cell.tex
+        if cell.span == 1
+        else rf"\multicolumn{{{cell.span}}}{{{cell.alignment}}}{{{cell.tex}}}"
         for cell in row
     ]
     return " & ".join(cells) + r" \\"

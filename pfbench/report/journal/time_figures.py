@@ -27,6 +27,7 @@ from pfbench.report.plots.axis_ticks import use_log_if_wide
 _CURVES = 9  # filters at most
 _PANELS = 6  # worlds at most
 _MARKS = 6  # marks of a curve
+_LEGEND_ROW = 0.15  # inches
 _WIDE = 4.0  # inches, width from which a legend has four columns
 
 
@@ -155,7 +156,13 @@ def _add_legend(figure: Figure, axis: Axes, looks: list[Pack], setting: FigureSe
         return
     handles = [axis.plot([], [], **line_style(look))[0] for look in looks]
     names = [setting.escape(str(look["name"])) for look in looks]
-    columns = min(len(names), 4 if figure.get_size_inches()[0] > _WIDE else 3)
-    figure.legend(handles, names, loc="outside lower center", ncols=columns, handlelength=2.4)
     width, height = figure.get_size_inches()
-    figure.set_size_inches(width, height + 0.15 * -(-len(names) // columns))
+    for columns in range(min(len(names), 4 if width > _WIDE else 3), 0, -1):
+        legend = figure.legend(
+            handles, names, loc="outside lower center", ncols=columns, handlelength=2.4
+        )
+        figure.set_size_inches(width, height + _LEGEND_ROW * -(-len(names) // columns))
+        figure.draw_without_rendering()
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 
 from pfbench.report.plots.plotting import LETTER, SMALL
 
+_PASSES = 5  # after two, a label may stand far from its mark
 _CLOSE = 9  # points; marks closer than this get a line to their label
 _FRACTIONS = np.linspace(0, 1, 25)[:, None]  # positions along a line at which overlap is checked
 
@@ -39,21 +40,21 @@ def place_labels(
 
     Each label takes the position of a grid with the smallest cost. The cost counts the distance
     to its point, and overlap with marks, with the path, and with other labels and their lines.
-    A second pass places every label again. The panel must have its final layout.
+    Later passes place every label again. The panel must have its final layout.
 
     Args:
         axis: Panel.
         points: All marks in data coordinates, [n, 2].
         labels: Label texts by row of `points`.
         reach: Radius of each mark in points of print, [n].
-        path: Corners of a line through the panel in data coordinates, [m, 2].
+        path: Corners of a line through the panel in data coordinates, [m, 2]; NaN for a gap.
     """
     scale = 72 / axis.figure.dpi
     marks, corners = (axis.transData.transform(values) * scale for values in (points, path))
     window = axis.get_window_extent().get_points() * scale
     obstacles = _build_obstacles(marks, corners, reach)
     placements: dict[int, _Placement] = {}
-    for k in 2 * sorted(labels, key=lambda k: tuple(marks[k])):
+    for k in _PASSES * sorted(labels, key=lambda k: tuple(marks[k])):
         placements.pop(k, None)
         size = _text_size(labels[k])
         boxes = _candidate_boxes(window, size)

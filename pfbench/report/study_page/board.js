@@ -61,7 +61,7 @@ function drawSwitches() {
   find("#budget").innerHTML = data.budgets
     .map(
       (budget) =>
-        `<button type="button" aria-pressed="${!budget.reason_missing}"${budget.reason_missing ? ` disabled title="${esc(budget.reason_missing)}"` : ""}>${esc(budget.name)}</button>`,
+        `<button type="button" data-budget="${esc(budget.key)}" aria-pressed="${budget.key === state.budget}"${budget.reason_missing ? ` disabled title="${esc(budget.reason_missing)}"` : ""}>${esc(budget.name)}</button>`,
     )
     .join("");
 }
@@ -168,7 +168,7 @@ function drawBoard() {
         ? items[0].name
         : `all ${items.length} ${noun}s`;
   find("#caption").textContent =
-    `${metricOf().name}; ${scope("world", data.worlds, "scenario")}; ${scope("regime", data.regimes, "noise regime")}; ratio to ${looks[state.baseline].name}.`;
+    `${metricOf().name}; ${scope("world", data.worlds, "scenario")}; ${scope("regime", data.regimes, "noise regime")}; ratio to ${looks[state.baseline].name}${budgetOf().words ? `; ${budgetOf().words}` : ""}.`;
   const columns = heads();
   find("#heads").innerHTML = columns
     .map((head) => {

@@ -128,6 +128,14 @@ function yAxis(ticks, scale, left, right, format = tidy) {
 
 // Names cut to a width, with the whole name in the tooltip of the mark.
 const cut = (text, letters) => (text.length > letters ? `${text.slice(0, letters - 1)}…` : text);
+// A text cut to a width in px. Fonts differ between systems, so that the width is measured.
+const pen = document.createElement("canvas").getContext("2d");
+function fit(text, width, size = 12, bold = false) {
+  pen.font = `${bold ? 700 : 400} ${size}px system-ui, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-serif`;
+  let letters = text.length;
+  while (letters > 1 && pen.measureText(cut(text, letters)).width > width) letters--;
+  return cut(text, letters);
+}
 // Heights of labels, moved apart so that none covers another.
 function spread(heights, gap, low, high) {
   const order = heights.map((y, k) => [y, k]).sort((a, b) => a[0] - b[0]);

@@ -50,7 +50,7 @@ function showTip(words, x, y) {
 const hideTip = () => (tipBox.style.display = "none");
 
 function press(target) {
-  const { sort, row, regime, toggle: chip, dot, copy } = target.dataset;
+  const { sort, row, regime, budget, toggle: chip, dot, copy } = target.dataset;
   if (sort) {
     state.down = state.sort === sort ? !state.down : false;
     state.sort = sort;
@@ -67,6 +67,10 @@ function press(target) {
     choose("regime", regime);
     drawView();
     (findAll("[data-regime]").find((button) => button.dataset.regime === regime) || target).focus();
+  } else if (budget) {
+    chooseBudget(budget);
+    drawView();
+    find(`[data-budget="${budget}"]`).focus();
   } else if (chip) {
     toggle(chip);
     redraw(drawTime);
@@ -95,7 +99,7 @@ function selectText(id) {
 function listen() {
   document.addEventListener("click", (event) => {
     const target = event.target.closest(
-      "[data-sort],[data-row],[data-regime],[data-toggle],[data-dot],[data-copy],#theme",
+      "[data-sort],[data-row],[data-regime],[data-budget],[data-toggle],[data-dot],[data-copy],#theme",
     );
     if (target) press(target);
   });

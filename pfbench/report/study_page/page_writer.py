@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.study_page.encoding import encode_pack
+from pfbench.report.study_page.equal_time import offer_budgets
 from pfbench.report.study_page.opening import describe_opening, describe_pairs, find_front
 from pfbench.report.writers import template_environment
 
@@ -51,6 +52,7 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
         key: {**view, "front": find_front(view["rows"])} for key, view in pack["views"].items()
     }
     pack = {**dict.fromkeys(_OPTIONAL, ()), **pack, "views": views}
+    pack["budgets"] = offer_budgets(pack)
     names = {look["key"]: look["name"] for look in pack["filters"]}
     context = {
         "pack": pack,

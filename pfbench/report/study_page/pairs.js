@@ -6,8 +6,8 @@ function drawForest(part) {
   const pairs = data.planned.filter((pair) => pair.estimate > 0);
   if (!pairs.length) return void (part.innerHTML = "");
   const width = widthOf(part);
-  const narrow = width < 700;
-  const [left, right] = narrow ? [8, 8] : [Math.min(310, width * 0.27), Math.min(290, width * 0.25)];
+  const narrow = width < 800;
+  const [left, right] = narrow ? [8, 8] : [Math.min(310, width * 0.27), 290];
   const ends = pairs
     .flatMap((pair) => [
       pair.low,
@@ -27,7 +27,7 @@ function drawForest(part) {
   for (const pair of pairs) {
     const group = `${pair.question}${pair.kind === "tuned" ? ", against tuned baselines" : pair.kind === "paper" ? ", against the baselines of the paper" : ""}`;
     if (group !== question) {
-      content += label(0, y + 12, cut(group, Math.floor(width / 7.4)), ' class="strong"');
+      content += label(0, y + 12, fit(group, width, 12, true), ' class="strong"');
       y += 22;
       question = group;
     }
@@ -43,7 +43,7 @@ function drawForest(part) {
     const middle = y + rise + 11;
     if (narrow)
       content +=
-        label(left, y + 12, cut(names, Math.floor((width - 110) / 6.2)), ' style="font-size:11.5px"') +
+        label(left, y + 12, fit(names, width - 150, 11.5), ' style="font-size:11.5px"') +
         label(
           width,
           y + 12,
@@ -52,7 +52,7 @@ function drawForest(part) {
         );
     else
       content +=
-        label(left - 12, middle + 4, cut(names, Math.floor(left / 6.6)), ' text-anchor="end"') +
+        label(left - 12, middle + 4, fit(names, left - 12), ' text-anchor="end"') +
         label(
           width - right + 12,
           middle + 4,
@@ -116,7 +116,7 @@ function drawSweep(panel, sweep) {
   content += label(
     0,
     12,
-    cut(`${named(data.worlds, sweep.world)}${sweep.regime ? `, ${named(data.regimes, sweep.regime)}` : ""}`, 60),
+    fit(`${named(data.worlds, sweep.world)}${sweep.regime ? `, ${named(data.regimes, sweep.regime)}` : ""}`, width, 12, true),
     ' class="strong"',
   );
   content += label(
@@ -145,7 +145,7 @@ function drawSweep(panel, sweep) {
     content += label(
       width - right + 8,
       heights[k] + 4,
-      cut(look.name, 16),
+      fit(look.name, right - 8, 11, look.proposed),
       ` style="font-size:11px"${look.proposed ? ' class="strong"' : ""}`,
     );
   });

@@ -48,7 +48,7 @@ function drawRuns(part) {
     content += label(
       left - 8,
       level(k) + 4,
-      cut(look.name, 18),
+      fit(look.name, left - 8, 11.5, look.proposed),
       ` text-anchor="end" style="font-size:11.5px"${look.proposed ? ' class="strong"' : ""}`,
     );
     const circles = runValues(look.key)

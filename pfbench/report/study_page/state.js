@@ -4,6 +4,7 @@ const state = {
   world: "",
   regime: "",
   baseline: "",
+  budget: "",
   sort: "rank",
   down: false,
   open: null,
@@ -93,7 +94,12 @@ function decodeLevels({ code, w, s, d, l, h }) {
 }
 
 // The view: the choice of the switches, kept in the address after #.
-const view = () => viewOf(axes.map((axis) => state[axis]));
+const budgetOf = () => data.budgets.find((budget) => budget.key === state.budget) || {};
+function view() {
+  const whole = viewOf(axes.map((axis) => state[axis]));
+  const { filters } = budgetOf();
+  return filters ? { ...whole, rows: whole.rows.filter((row) => filters.includes(row.filter)), front: [] } : whole;
+}
 const single = (cell) => viewOf([state.metric, cell.world, cell.regime, state.baseline]);
 
 // A view from its columns (encoding.py): of its place, of all its baselines, and its own.
@@ -153,6 +159,7 @@ function selectCell(cell) {
 }
 function openView() {
   axes.forEach((axis, k) => (state[axis] = data.opening[k]));
+  state.budget = (data.budgets.find((budget) => !budget.reason_missing && !budget.filters) || {}).key || "";
   state.cell = data.cells.find(hasRuns) || null;
   followAddress();
   const rows = view().rows;
@@ -162,14 +169,19 @@ function openView() {
 function followAddress() {
   const wish = new URLSearchParams(location.hash.slice(1));
   for (const axis of axes) if (wish.has(axis)) choose(axis, wish.get(axis));
+  chooseBudget(wish.get("budget"));
   const sort = wish.get("sort") || "";
   if (heads().some((head) => head.key === sort.replace("-", ""))) {
     state.sort = sort.replace("-", "");
     state.down = sort.startsWith("-");
   }
 }
+function chooseBudget(key) {
+  if (data.budgets.some((budget) => budget.key === key && !budget.reason_missing)) state.budget = key;
+}
 function writeAddress() {
   const words = new URLSearchParams(axes.map((axis) => [axis, state[axis]]));
+  if (budgetOf().filters) words.set("budget", state.budget);
   if (state.sort !== "rank" || state.down) words.set("sort", (state.down ? "-" : "") + state.sort);
   history.replaceState(null, "", `#${words}`);
 }

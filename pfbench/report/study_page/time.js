@@ -45,7 +45,7 @@ function curveFigure(part, { t, lines, band = null, head, unit, height = 360, ca
     const end = item.values.length - 1 - [...item.values].reverse().findIndex(usable);
     content += mark(item.look, x(t[end]), y(last[k]), 3.6);
     if (shown.length <= 40)
-      content += `<text class="${item.look.proposed ? "strong" : ""}" x="${px(width - right + 12)}" y="${px(heights[k] + 4)}" style="font-size:11px">${esc(cut(item.look.name, narrow ? 12 : 21))}</text>`;
+      content += `<text class="${item.look.proposed ? "strong" : ""}" x="${px(width - right + 12)}" y="${px(heights[k] + 4)}" style="font-size:11px">${esc(fit(item.look.name, right - 12, 11, item.look.proposed))}</text>`;
   });
   content += `<line class="cross" y1="${top}" y2="${height - bottom}" stroke="var(--faint)" visibility="hidden"/>`;
   part.innerHTML = svg(

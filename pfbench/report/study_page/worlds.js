@@ -10,7 +10,7 @@ function drawWorlds(part) {
 function drawWorld(panel, world) {
   const cells = data.cells.filter((cell) => cell.world === world.key && single(cell));
   const width = widthOf(panel);
-  const [left, right, top] = [118, 10, 22];
+  const [left, right, top] = [width < 340 ? 118 : 150, 10, 22];
   const step = cells.length > 1 ? 7 : 0;
   const rowHeight = Math.max(17, 6 + step * cells.length);
   const filters = order();
@@ -20,7 +20,7 @@ function drawWorld(panel, world) {
   const all = rows.flatMap((row) => Object.values(row));
   const values = sorted(all.map((row) => row.value));
   const ends = sorted(all.flatMap((row) => [row.value, row.low, row.high]));
-  let content = label(0, 12, cut(world.name, Math.floor(width / 8)), ' class="strong"');
+  let content = label(0, 12, fit(world.name, width, 12, true), ' class="strong"');
   if (!values.length)
     return void (panel.innerHTML = svg(
       width,
@@ -38,7 +38,7 @@ function drawWorld(panel, world) {
     content += label(
       left - 8,
       y + 4,
-      cut(look.name, 17),
+      fit(look.name, left - 8, 11, look.proposed),
       ` text-anchor="end" style="font-size:11px"${look.proposed ? ' class="strong"' : ""}`,
     );
     rows.forEach((row, r) => {
@@ -71,7 +71,7 @@ function drawCalibration(part) {
   const filters = order().filter((look) => shares[look.key]);
   const width = widthOf(part);
   const narrow = width < 640;
-  const [left, right, top, rowHeight] = [narrow ? 112 : 150, narrow ? 12 : 210, 24, 21];
+  const [left, right, top, rowHeight] = [narrow ? 112 : 150, narrow ? 12 : 240, 24, 21];
   const bottom = top + rowHeight * filters.length;
   if (!filters.length) return void (part.innerHTML = '<p class="note">This view has no regions.</p>');
   const x = linear(0, 1, left, width - right);
@@ -95,7 +95,7 @@ function drawCalibration(part) {
     content += label(
       left - 8,
       y + 4,
-      cut(look.name, 20),
+      fit(look.name, left - 8, 11.5, look.proposed),
       ` text-anchor="end" style="font-size:11.5px"${look.proposed ? ' class="strong"' : ""}`,
     );
     if (c50 === null || c90 === null) return;

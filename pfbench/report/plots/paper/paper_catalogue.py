@@ -19,6 +19,7 @@ from pfbench.report.plots.paper.paper_specs import (
     make_time_figure,
     make_trace_figures,
 )
+from pfbench.report.plots.paper.parameter_figures import make_parameter_figures
 
 _BEFORE = partial(make_error_figures, before=True)
 
@@ -32,6 +33,16 @@ _MODIFIED = ("sir", "rpf_printed", "mcmc_rpf", "mcmc_rpf_printed")
 _PASSIVE = ("sir", "gpf", "qmc_gpf", "qmc_polymerised_printed", "qmc_polymerised")
 _RULES = ("ckf", "hckf", "mssrckf")
 _CUBATURE = ("cpf", "fmcpf", "cofm_amssrcpf_printed", "cofm_amssrcpf")
+
+
+_BOUNDS = tuple(f"cofm_mssrckf[gain_adaptations.1.max_ratio={v}]" for v in ("1.0", "1000000000.0"))
+_FADINGS = tuple(
+    f"fm_mssrckf[noise_adaptations.0.fading_factor={v}]" for v in ("1.002", "1.01", "1.05")
+)
+_ALPHA = (
+    "The copy of the paper lacks the definition and the values of its parameter alpha: these values are ours. "
+    "No study varies the forgetting factor of the noise adaptation, the third reading."
+)
 
 
 _CORRECTED = (
@@ -62,6 +73,12 @@ FIGURES: Mapping[str, PaperFigure] = {
     "001-3": PaperFigure(f"{_PU}, figure 3", _PASSIVE, make_time_figure),
     "001-4": PaperFigure(f"{_PU}, figure 4", _PASSIVE, make_ess_figure),
     "001-position": PaperFigure(f"{_PU}, position behind figure 2", _PASSIVE, make_error_figures, groups=("position",)),
+    "002-3-bound": PaperFigure(
+        f"{_COFM}, figure 3, read as the ratio bound", _BOUNDS, partial(make_parameter_figures, "ratio bound", _ALPHA), groups=("position",)
+    ),
+    "002-3-fading": PaperFigure(
+        f"{_COFM}, figure 3, read as the fading factor", _FADINGS, partial(make_parameter_figures, "fading factor", _ALPHA), groups=("position",)
+    ),
     "002-6": PaperFigure(
         f"{_COFM}, figures 6 to 9", ("mssrckf",), _BEFORE, "nominal", ("gyro_bias", "accelerometer_bias")
     ),
