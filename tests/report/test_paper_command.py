@@ -13,6 +13,12 @@ from pfbench.cli.paper import write_study_paper
 from pfbench.report.page import write_report
 
 
+@pytest.fixture(autouse=True)
+def without_latex(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PGF, a minute of pdflatex, has a test of its own."""
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("paper")
