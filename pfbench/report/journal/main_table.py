@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from pfbench.files.escapes import escape_latex
-from pfbench.report.journal.error_columns import ErrorColumn, is_printed_number, make_column
+from pfbench.report.journal.error_columns import (
+    ErrorColumn,
+    describe_columns,
+    is_printed_number,
+    make_column,
+)
 from pfbench.report.journal.study_pack import (
     Pack,
     filters_by_family,
@@ -13,7 +18,6 @@ from pfbench.report.journal.study_pack import (
     name_of,
     name_with_star,
 )
-from pfbench.report.journal.table_captions import describe_columns
 from pfbench.report.journal.table_layout import (
     INTERVAL_SIZE,
     SIZE,
