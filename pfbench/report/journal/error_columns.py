@@ -58,7 +58,13 @@ def format_error_value(value: Any, digits: int = 3) -> str:
 
 
 def make_column(pack: Pack, world: str, regime: str) -> ErrorColumn:
-    """Collect the entries of one condition, in a unit without many zeros."""
+    """Collect the entries of one condition, in a unit without many zeros.
+
+    Args:
+        pack: Data of the report.
+        world: Key of the world.
+        regime: Key of the regime.
+    """
     rows = find_rows(pack, world, regime)
     values = [row["value"] for row in rows.values() if is_number(row["value"])]
     unit = next((str(row["unit"]) for row in rows.values() if row["unit"]), "")

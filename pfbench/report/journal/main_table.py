@@ -79,7 +79,7 @@ def _split(
     for group in groups:
         for count in range(1, len({world for world, _ in group}) + 1):
             split = _split_worlds(group, count)
-            if all(fits(_make_table(pack, part, name, has_intervals)) for part in split):
+            if all(fits(_make_table(pack, members, name, has_intervals)) for members in split):
                 break
         parts += split
     if len(parts) == 1 and name == "main":
@@ -93,7 +93,7 @@ def _split_worlds(cells: Sequence[tuple[str, str]], count: int) -> list[list[tup
     parts = [
         worlds[i * len(worlds) // count : (i + 1) * len(worlds) // count] for i in range(count)
     ]
-    return [[cell for cell in cells if cell[0] in part] for part in parts]
+    return [[cell for cell in cells if cell[0] in members] for members in parts]
 
 
 def _make_table(

@@ -174,13 +174,13 @@ def _format_fitting(table: LatexTable, page: PageFormat) -> str:
             f"table_{table.name} must have at most {most} rows, got {table.rows}. "
             "Run a study of fewer filters: filter=a,b,c."
         )
-    place = _find_width(table, page)
-    if place is None:
+    width = _find_width(table, page)
+    if width is None:
         raise ValueError(
             f"table_{table.name} must fit {page.text:.0f} pt, got {measure_table(table, 2.4):.0f} pt. "
             "Use a wider page (width=...)."
         )
-    return format_table(table, place[0], is_wide=place[1])
+    return format_table(table, width[0], is_wide=width[1])
 
 
 def _list_particles(pack: Pack) -> Mapping[str, str]:

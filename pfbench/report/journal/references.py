@@ -50,8 +50,8 @@ def renew_bibliography(pack: Pack) -> str:
     Args:
         pack: Data of the report, with its BibTeX entries.
     """
-    own, end, _ = str(pack["bibtex"]).partition("\n}\n")
-    return f"{own}{end}\n{find_entries(list_cited_keys(pack))}"
+    entry, end, _ = str(pack["bibtex"]).partition("\n}\n")
+    return f"{entry}{end}\n{find_entries(list_cited_keys(pack))}"
 
 
 def cite(keys: Sequence[str]) -> str:

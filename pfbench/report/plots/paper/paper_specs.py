@@ -106,7 +106,7 @@ def make_error_figures(source: PaperFigureInput, before: bool = False) -> list[F
     """
     figures = []
     for data, group, results in source.list_groups():
-        text = f"{source.format_head(data)}: error of {group} over time, {describe_runs(data)}."
+        text = f"{source.format_head(data)}: error of {group} over time, {describe_band(data)}."
         text += (_FIRST if before else "") + time_plots.SYMLOG
         make = partial(time_plots.plot_errors, results, source.style, before)
         figures.append(FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make))
@@ -129,7 +129,7 @@ def make_trace_figures(
     for data in source.data:
         results = {label: r for label, r in data.results.items() if name in r.data}
         if results:
-            text = f"{source.format_head(data)}: {words} over time, {describe_runs(data)}."
+            text = f"{source.format_head(data)}: {words} over time, {describe_band(data)}."
             text += f" Grey: {low:g} to {high:g}, as printed." if np.isfinite(low) else ""
             make = partial(
                 time_plots.plot_paper_trace, results, name, unit, source.style, (low, high)
@@ -164,7 +164,7 @@ def make_relative_error_figures(source: PaperFigureInput) -> list[FigureSpec]:
     if not experiments:
         return []
     quantity = "Err, the horizontal error in % of the horizontal range [eq. 20 as repaired]"
-    head, runs = f"{source.figure.title}: {quantity}", describe_runs(*source.data)
+    head, runs = f"{source.figure.title}: {quantity}", describe_band(*source.data)
     values = {
         name: {label: experiment_plots.mean_relative_error(r) for label, r in results.items()}
         for name, results in experiments.items()
@@ -198,7 +198,7 @@ def make_ess_figure(source: PaperFigureInput) -> list[FigureSpec]:
         return []
     text = (
         f"{source.figure.title}: effective number of particles, mean over time [eq. 21], "
-        f"{describe_runs(*source.data)}."
+        f"{describe_band(*source.data)}."
     )
     make = partial(experiment_plots.plot_against, values, source.style, "mean Neff")
     return [FigureSpec("", text, make)]
@@ -231,14 +231,14 @@ def make_maximum_figures(source: PaperFigureInput) -> list[FigureSpec]:
         start = data.start_time_s
         since = f" after {start:g} s" if start else ""
         quantity = f"maximum error of {group}{since} (filled) and RMSE (open)"
-        text = f"{source.format_head(data)}: {quantity}, {describe_runs(data)}."
+        text = f"{source.format_head(data)}: {quantity}, {describe_band(data)}."
         text += " Crosses: maximum errors as printed." if set(printed) & set(results) else ""
         make = partial(experiment_plots.plot_maxima, results, source.style, start, printed)
         figures.append(FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make))
     return figures
 
 
-def describe_runs(*conditions: PaperFigureData) -> str:
+def describe_band(*conditions: PaperFigureData) -> str:
     """Format the band, the number of runs and of lost runs for a caption."""
     results = [(data, label, r) for data in conditions for label, r in data.results.items()]
     runs = sorted({int(r.meta["runs"]) for _, _, r in results})

@@ -6,7 +6,7 @@ from functools import partial
 
 from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.paper import time_plots
-from pfbench.report.plots.paper.paper_specs import PaperFigureInput, describe_runs
+from pfbench.report.plots.paper.paper_specs import PaperFigureInput, describe_band
 from pfbench.report.plots.plotting import format_slug, line_styles
 
 
@@ -29,7 +29,7 @@ def make_parameter_figures(name: str, remark: str, source: PaperFigureInput) -> 
         style = line_styles(list(values), {})  # values of one method would have one colour
         text = (
             f"{source.format_head(data)}: error of {group} over time for values of the {name}, "
-            f"{describe_runs(data)}. {remark}{time_plots.SYMLOG}"
+            f"{describe_band(data)}. {remark}{time_plots.SYMLOG}"
         )
         make = partial(time_plots.plot_errors, values, style)
         figures.append(FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make))
