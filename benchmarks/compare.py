@@ -229,8 +229,11 @@ def summary(found: Mapping[Case, Mapping[Contestant, Result]]) -> list[str]:
         low, middle, high = ratio(results[theirs], results[ours])
         behind = ratio(results[ours], limit)[1] if limit else 0.0
         if middle < goal.must:
+            # what a program for this one model reaches on the same machine
+            fused = ratio(results[theirs], results[LIMIT])[1] if LIMIT in results else 0.0
+            bound = f" (fused C: {fused:.2f})" if fused else ""
             missed.append(
-                f"{goal.workload}, {ours.label}: {middle:.2f} times {theirs.label}, must {goal.must:g}"
+                f"{goal.workload}, {ours.label}: {middle:.2f} times {theirs.label}, must {goal.must:g}{bound}"
             )
         if goal.limit and behind > goal.limit:
             missed.append(

@@ -14,11 +14,11 @@ REPORT = "==7==ERROR: AddressSanitizer: heap-buffer-overflow on address 0x1"
 
 @pytest.mark.slow
 def test_the_sanitizers_find_nothing_in_random_calls() -> None:
-    tally = sanitizers.run("random shapes", 3000, 2)
+    tally = sanitizers.run("random shapes", 1000, 2)
     if tally.skipped:
         pytest.skip(tally.skipped)
     assert tally.bad == {}, tally.examples
-    assert tally.trials == 3000
+    assert tally.trials == 1000  # `make faults` makes 100 times as many
 
 
 @pytest.mark.parametrize(
