@@ -109,7 +109,10 @@ def test_values_of_a_parameter_have_a_line_each(tmp_path: Path) -> None:
     lines = [line(figure, 0, f"ratio bound {value}") for value in ("1.0", "1000000000.0")]
     results = {r.meta["label"]: r for r in store.list_results(tmp_path / "paper_002_bound")}
     for (_, values), key in zip(lines, ("1.0", "1000000000.0"), strict=True):
-        error = results[name(key)].data["error"][..., 0]
+        result = results[name(key)]
+        groups = component_groups(result.meta["state"])
+        block = next(block for block in groups if block.group == "position")
+        error = result.data["error"][..., block.places[0]] * block.scale
         np.testing.assert_allclose(values, np.median(error, 0), rtol=1e-6)
     colours = {
         one.get_color() for one in figure.axes[0].lines if one.get_label().startswith("ratio")
