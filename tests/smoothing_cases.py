@@ -79,3 +79,27 @@ class Tumbler(StateSpaceModel):
 
     def observation(self, x: Tensor, u: Any) -> Any:
         return independent_normal(self.chart.subtract(x, self.origin), self.p0)
+
+
+class Swing(StateSpaceModel):
+    """Two states driven by one noise, a bent step and a bent measurement of the first state."""
+
+    noise_dim, names, units, groups = 1, ("a", "b"), ("1", "1"), {"all": (0, 1)}
+    p0: Tensor
+    r: Tensor
+
+    def __init__(self, noise: float = 0.6, measurement_sd: float = 0.3) -> None:
+        super().__init__()
+        self.noise_sd = noise
+        self.register_buffer("p0", torch.tensor([1.0, 1.0], dtype=torch.float64))
+        self.register_buffer("r", torch.tensor([measurement_sd], dtype=torch.float64))
+
+    def initial(self, runs: int) -> Any:
+        return normal_batch(runs, self.p0)
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        a, b = x[..., :1], x[..., 1:]
+        return torch.cat([a + 0.5 * b, 0.9 * b - 0.5 * torch.sin(a) + self.noise_sd * w], -1)
+
+    def observation(self, x: Tensor, u: Any) -> Any:
+        return independent_normal(x[..., :1] + x[..., :1] ** 3 / 4.0, self.r)
