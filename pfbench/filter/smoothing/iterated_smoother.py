@@ -61,8 +61,8 @@ def smooth_iteratively(
 ) -> IteratedSmoothing:
     """Compute smoothed means and covariances by repeated linearisation.
 
-    A pass linearises each step about the smoothed distribution of its first state and each
-    measurement about the distribution of its state, and solves the linear problem by a Kalman filter and the
+    A pass linearises each step about the smoothed distribution of its first state, and each
+    measurement about that of its state. It solves the linear problem by a Kalman filter and the
     recursion of Rauch, Tung and Striebel. With Taylor expansion a pass is a Gauss-Newton step on
     the posterior density of the path, with sigma points it is a posterior linearisation. It
     does not use a transition density: a model may have fewer noises than states. On a curved
@@ -122,32 +122,32 @@ def _linearise(
     """Linearise all steps about the present distributions of their states."""
     chart, d, steps = model.chart, model.chart.dimension, []
     for t, step_model, step_record in iterate_steps(model, record):
-        before, law = laws[t], laws[t + 1]
+        before, state = laws[t], laws[t + 1]
         zero = torch.zeros_like(before.mean[:, 0])
         belief = GaussianBelief(before.mean, before.root @ before.root.mT, zero)
         predicted, _ = method.predict(step_model, belief, step_record.u)
         noise_columns = predicted.m[..., d:]  # of noise inside the linearisation rule
-        offset = chart.subtract(predicted.y, law.mean).unsqueeze(-1)
+        offset = chart.subtract(predicted.y, state.mean).unsqueeze(-1)
         slope, noise = predicted.m[..., :d], noise_columns @ noise_columns.mT + predicted.omega
         whitened = torch.linalg.solve_triangular(
-            law.root, torch.cat([slope, offset, noise], -1), upper=False
+            state.root, torch.cat([slope, offset, noise], -1), upper=False
         )
-        noise = torch.linalg.solve_triangular(law.root, whitened[..., d + 1 :].mT, upper=False)
+        noise = torch.linalg.solve_triangular(state.root, whitened[..., d + 1 :].mT, upper=False)
 
-        def state_at(xi: Tensor, law: _Law = law) -> Tensor:
-            return chart.add(law.mean.unsqueeze(1), xi @ law.root.mT)
+        def state_at(xi: Tensor, state: _Law = state) -> Tensor:
+            return chart.add(state.mean.unsqueeze(1), xi @ state.root.mT)
 
-        seen = compute_innovation(
-            method.linearisation, step_model, state_at, law.mean, step_record, law.root
+        innovation = compute_innovation(
+            method.linearisation, step_model, state_at, state.mean, step_record, state.root
         )
         steps.append(
             _LinearStep(
                 whitened[..., :d],
                 whitened[..., d],
                 0.5 * (noise + noise.mT),
-                seen.r,
-                seen.m,
-                seen.omega,
+                innovation.r,
+                innovation.m,
+                innovation.omega,
             )
         )
     return steps
@@ -184,10 +184,10 @@ def _solve(
         results.append((mean, covariance))
     new = [
         _Law(
-            model.chart.add(law.mean, (law.root @ z.unsqueeze(-1)).squeeze(-1)),
-            law.root @ factor(c)[0],
+            model.chart.add(state.mean, (state.root @ z.unsqueeze(-1)).squeeze(-1)),
+            state.root @ factor(c)[0],
         )
-        for law, (z, c) in zip(laws, results[::-1], strict=True)
+        for state, (z, c) in zip(laws, results[::-1], strict=True)
     ]
     return new, torch.stack([z for z, _ in results], 1).abs().amax((1, 2))
 

@@ -57,11 +57,19 @@ class NoiseSpace:
         self.size = model.chart.dimension + len(self.steps) * model.noise_dim
 
     def start(self, xi: Tensor) -> Tensor:
-        """Return initial states [R, M, D] of whitened ones [R, M, d]."""
+        """Return initial states [R, M, D] of whitened vectors [R, M, d]."""
         return self.model.chart.add(self._origin, self._mean + xi @ self._root.mT)
 
     def noise(self, theta: Tensor, t: int) -> Tensor:
-        """Return the whitened noise of step t, [R, M, W], of vectors [R, M, size]."""
+        """Return the whitened noise of a step.
+
+        Args:
+            theta: Vectors, [R, M, size].
+            t: Step from 0.
+
+        Returns:
+            Noise, [R, M, W].
+        """
         begin = self.model.chart.dimension + t * self.model.noise_dim
         return theta[..., begin : begin + self.model.noise_dim]
 
@@ -112,10 +120,10 @@ class NoiseSpace:
         for t, (model, record) in enumerate(self.steps):
             distribution: Any = model.observation(states[:, :, t], record.u)
             y = record.y.unsqueeze(1)
-            seen = ~torch.isnan(y)
-            r = torch.where(seen, model.residual(y, distribution.mean), 0.0)
+            observed_mask = ~torch.isnan(y)
+            r = torch.where(observed_mask, model.residual(y, distribution.mean), 0.0)
             covariance = distribution_covariance(distribution)
-            pairs = seen.unsqueeze(-1) & seen.unsqueeze(-2)
+            pairs = observed_mask.unsqueeze(-1) & observed_mask.unsqueeze(-2)
             eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
             root, _ = factor(torch.where(pairs, covariance, eye))
             row = torch.linalg.solve_triangular(root, r.unsqueeze(-1), upper=False)

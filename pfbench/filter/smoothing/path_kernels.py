@@ -184,8 +184,8 @@ def sample_smoothed_paths(
         Paths at the end of the chains.
 
     Raises:
-        ValueError: If paths or mcmc_steps is below 1, a distribution is not normal, or the record
-            has feedback.
+        ValueError: If paths or mcmc_steps is below 1. If a distribution is not normal, or the
+            record has feedback.
     """
     for name, value in (("paths", paths), ("mcmc_steps", mcmc_steps)):
         if value < 1:
