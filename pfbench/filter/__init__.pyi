@@ -49,6 +49,7 @@ from pfbench.filter.gaussian.spherical_radial import (
     SphericalRadialPoints as SphericalRadialPoints,
     SphericalRule as SphericalRule,
 )
+from pfbench.filter.guided.initial_guide import GuidedInitialProposal as GuidedInitialProposal
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal as GuidedNoiseProposal
 from pfbench.filter.guided.particle_guide import ParticleGuideProposal as ParticleGuideProposal
 from pfbench.filter.guided.shared_guide import SharedGuideProposal as SharedGuideProposal
@@ -133,6 +134,7 @@ from pfbench.filter.particle.point_sets import (
 )
 from pfbench.filter.particle.proposals import (
     BootstrapProposal as BootstrapProposal,
+    InitialProposal as InitialProposal,
     Proposal as Proposal,
 )
 from pfbench.filter.particle.regularised_resampling import (
@@ -221,7 +223,17 @@ from pfbench.filter.smoothing.backward_samplers import (
     RejectionBackwardSampler as RejectionBackwardSampler,
 )
 from pfbench.filter.smoothing.backward_sampling import sample_trajectories as sample_trajectories
+from pfbench.filter.smoothing.conditional_smc import ConditionalSmcKernel as ConditionalSmcKernel
 from pfbench.filter.smoothing.gaussian_smoother import smooth as smooth
+from pfbench.filter.smoothing.iterated_smoother import smooth_iteratively as smooth_iteratively
+from pfbench.filter.smoothing.noise_space import NoiseSpace as NoiseSpace
+from pfbench.filter.smoothing.path_kernels import (
+    CrankNicolsonKernel as CrankNicolsonKernel,
+    PathKernel as PathKernel,
+    PathLaplace as PathLaplace,
+    fit_path_laplace as fit_path_laplace,
+    sample_smoothed_paths as sample_smoothed_paths,
+)
 from pfbench.filter.swarm.chaotic_sequences import (
     ChaoticPerturbation as ChaoticPerturbation,
     ChaoticPoints as ChaoticPoints,

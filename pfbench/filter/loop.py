@@ -17,6 +17,7 @@ from pfbench.filter.belief import Filter, StepInfo
 from pfbench.filter.feedback import apply_feedback, correctable_groups
 from pfbench.filter.health import HealthMonitor, with_cached_nis
 from pfbench.filter.input_check import check_model, check_record
+from pfbench.filter.particle.proposals import RecordStartedFilter
 from pfbench.filter.run_batches import join_infos, join_runs, split_runs
 from pfbench.model.base import StateSpaceModel
 
@@ -123,9 +124,7 @@ class FilterPass:
     ) -> None:
         self.method, self.model, self.record, self.draws = method, model, record, draws
         self.feedback = feedback
-        self.belief: Any = method.init(
-            model, len(record.y), draws.at_step(0), record.start, record.spread
-        )
+        self.belief: Any = _start(method, model, record, draws.at_step(0))
 
     def at_step(self, t: int) -> StateSpaceModel:
         """Return the present model of step t."""
@@ -163,6 +162,13 @@ class FilterPass:
             t += len(results)
             for self.belief, info in results:
                 yield info
+
+
+def _start(method: Filter, model: StateSpaceModel, record: Record, draws: RandomStream) -> Any:
+    """Return the initial belief."""
+    if isinstance(method, RecordStartedFilter):
+        return method.init_from_record(model, record, draws)
+    return method.init(model, len(record.y), draws, record.start, record.spread)
 
 
 def prepare_record(model: StateSpaceModel, record: Record) -> Record:

@@ -14,7 +14,12 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record, map_inputs
-from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo
+from pfbench.filter.belief import (
+    Filter,
+    GaussianBelief,
+    ParticleBelief,
+    StepInfo,
+)
 from pfbench.filter.loop import MultiStepFilter
 from pfbench.filter.particle.compiled_step import (
     CallCounter,
@@ -23,13 +28,14 @@ from pfbench.filter.particle.compiled_step import (
     tensors_in,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.proposals import RecordStartedFilter
 from pfbench.model.base import StateSpaceModel
 
 log = logging.getLogger("pfbench")
 
 
 @dataclass(eq=False)
-class CompiledParticleFilter(Filter, MultiStepFilter):
+class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     """Particle filter with compiled steps.
 
     Random numbers are the same, and results agree to rounding. The first step runs uncompiled,
@@ -73,6 +79,12 @@ class CompiledParticleFilter(Filter, MultiStepFilter):
         spread: Tensor | None = None,
     ) -> ParticleBelief | GaussianBelief:
         return self.method.init(model, runs, draws, start, spread)
+
+    @override
+    def init_from_record(
+        self, model: StateSpaceModel, record: Record, draws: RandomStream
+    ) -> ParticleBelief:
+        return self.method.init_from_record(model, record, draws)
 
     @override
     def step(

@@ -1,6 +1,6 @@
 """The particle filter: resample, move, propose, weight.
 
-Each method is a choice of stages.
+Each method is a choice of stages. The file is long, since it checks how stages fit to each other.
 """
 
 from __future__ import annotations
@@ -33,7 +33,13 @@ from pfbench.filter.particle.particle_moments import (
     weighted_mean_variance,
 )
 from pfbench.filter.particle.point_sets import IidPoints, PointSet
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
+from pfbench.filter.particle.proposals import (
+    HELD_STEPS,
+    BootstrapProposal,
+    InitialProposal,
+    Proposal,
+    hold_resampling,
+)
 from pfbench.filter.particle.resampling import EssResampler, Resampler
 from pfbench.filter.particle.resampling_schemes import Systematic
 from pfbench.filter.particle.weight_update import (
@@ -71,6 +77,7 @@ class ParticleFilter(Filter):
         proposal: Draws the particles at t.
         weight_update: Weight update by the measurement.
         points: Point set of the initial particles. Stages have their own.
+        initial_proposal: Draws the initial particles. None for the initial distribution.
 
     Raises:
         ValueError: If there are fewer than two particles. If moves need a past that the resampler
@@ -85,6 +92,7 @@ class ParticleFilter(Filter):
     proposal: Proposal = field(default_factory=BootstrapProposal)
     weight_update: WeightUpdate | MemoryWeightUpdate = field(default_factory=BayesWeightUpdate)
     points: PointSet = field(default_factory=IidPoints)
+    initial_proposal: InitialProposal | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.particles, int):
@@ -97,6 +105,8 @@ class ParticleFilter(Filter):
                 f"filter.particles must be at least 2, got {self.particles}. Choose more particles."
             )
         _ = self.is_exact  # warns of each stage that does not state it
+        if self.initial_proposal is not None:
+            _check_initial_proposal(self.moves, self.particle_count)
         if self.moves and isinstance(self.weight_update, MemoryWeightUpdate):
             raise ValueError(
                 "filter.moves must be empty with a weight update that replaces the model's "
@@ -121,6 +131,7 @@ class ParticleFilter(Filter):
             "proposal",
             "weight_update",
             "points",
+            *(() if self.initial_proposal is None else ("initial_proposal",)),
         )
         moves = {f"moves[{i}]": move for i, move in enumerate(self.moves)}
         return is_every_part_exact(self, **{name: getattr(self, name) for name in stages}, **moves)
@@ -140,6 +151,10 @@ class ParticleFilter(Filter):
         spread: Tensor | None = None,
     ) -> ParticleBelief:
         """Draw N equally weighted particles of the initial distribution."""
+        if self.initial_proposal is not None:
+            raise ValueError(
+                "filter.initial_proposal needs the record. Use run_filter or remove the proposal."
+            )
         initial: Any = initial_law(model, runs, spread)
         x = draw_initial_state(model, initial, self.points(draws), "initial", self.particles, start)
         first = self.particle_count.initial_count(self.particles)
@@ -154,6 +169,27 @@ class ParticleFilter(Filter):
         mean = model.chart.add(origin, initial.mean).expand(runs, -1)
         covariance = distribution_covariance(initial).expand(runs, -1, -1)
         return self.history.start(model, belief, mean, covariance)
+
+    def init_from_record(
+        self, model: StateSpaceModel, record: Record, draws: RandomStream
+    ) -> ParticleBelief:
+        """Draw the initial particles, by the initial proposal if there is one.
+
+        Args:
+            model: State-space model.
+            record: All steps of the record, prepared by the model.
+            draws: Random stream of step 0.
+
+        Returns:
+            Weighted particles. Their log evidence is that of the proposal's ratio.
+        """
+        if self.initial_proposal is None:
+            return self.init(model, len(record.y), draws, record.start, record.spread)
+        stream = self.points(draws)
+        x, log_ratio = self.initial_proposal(model, record, self.particles, stream)
+        log_w, total, *_ = normalise_updated_weights(log_ratio - math.log(self.particles))
+        memory = {HELD_STEPS: torch.full_like(log_w[:, :1], self.initial_proposal.steps)}
+        return ParticleBelief(x=x, log_w=log_w, log_evidence=total.double(), memory=memory)
 
     @override
     def step(
@@ -206,6 +242,8 @@ class ParticleFilter(Filter):
         """Return the parents of the particles at t, and diagnostics."""
         trace: dict[str, Tensor] = {}
         log_a = self.auxiliary_weights(model, belief, record)
+        if self.initial_proposal is not None:
+            log_a, belief = hold_resampling(log_a, belief)
         belief, trace["resampled"] = self.resampler(
             model, belief, log_a, count_particles(self.particle_count, belief), draws
         )
@@ -242,3 +280,12 @@ class ParticleFilter(Filter):
             return compute_nis(model, belief.x, summary.predicted_log_w, get_record())
 
         return make_step_info(model, belief, summary.mean, summary.variance, summary.trace, nis)
+
+
+def _check_initial_proposal(moves: tuple[Move, ...], count: ParticleCount) -> None:
+    """Raise an error for stages that need equal weights of the initial distribution."""
+    if moves or not isinstance(count, FixedCount):
+        raise ValueError(
+            "filter.initial_proposal must be used without moves and with a fixed number of "
+            f"particles, got {len(moves)} moves and {type(count).__name__}. Remove one of them."
+        )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -15,6 +16,8 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.model.base import StateSpaceModel
+
+HELD_STEPS = "held_steps"  # in the memory of particles: steps left without resampling, [R, 1]
 
 
 class ProposalSample(NamedTuple):
@@ -58,6 +61,50 @@ class Proposal(Protocol):
         """
 
 
+class InitialProposal(Protocol):
+    """Proposal distribution of the particles at step 0."""
+
+    @property
+    def is_exact(self) -> bool:
+        """True if the ratio is that of the densities."""
+
+    @property
+    def steps(self) -> int:
+        """Number of the first measurements that the particles depend on."""
+
+    def __call__(
+        self, model: StateSpaceModel, record: Record, n: int, draws: RandomStream
+    ) -> tuple[Tensor, Tensor]:
+        """Draw initial particles.
+
+        Args:
+            model: State-space model.
+            record: All steps of the record, prepared by the model, with initial states and factors.
+            n: Number of particles.
+            draws: Random stream of step 0.
+
+        Returns:
+            Particles [R, n, D] and log p(x_0) - log q(x_0), [R, n].
+        """
+
+
+@runtime_checkable
+class RecordStartedFilter(Protocol):
+    """A filter whose initial belief may use the record."""
+
+    def init_from_record(self, model: StateSpaceModel, record: Record, draws: RandomStream) -> Any:
+        """Return the initial belief.
+
+        Args:
+            model: State-space model.
+            record: All steps of the record, prepared by the model.
+            draws: Random stream of step 0.
+
+        Returns:
+            Belief of all runs.
+        """
+
+
 @dataclass(frozen=True)
 class BootstrapProposal(Proposal):
     """Noise of the model, x = propagate(x, u, w), with ratio 0.
@@ -76,6 +123,25 @@ class BootstrapProposal(Proposal):
         return ProposalSample(
             model.propagate(belief.x, record.u, w), torch.zeros_like(belief.log_w), belief.memory, w
         )
+
+
+def hold_resampling(log_a: Tensor, belief: ParticleBelief) -> tuple[Tensor, ParticleBelief]:
+    """Make resampling probabilities equal while measurements that placed the particles remain.
+
+    A particle that fits later measurements has a small weight until these are processed. Resampling
+    by the weights would remove it.
+
+    Args:
+        log_a: Log resampling probabilities, [R, N].
+        belief: Weighted particles.
+
+    Returns:
+        Log resampling probabilities, and the particles with one such step less in their memory.
+    """
+    remaining = belief.memory[HELD_STEPS]
+    equal = torch.full_like(log_a, -math.log(log_a.shape[1]))
+    memory = belief.memory | {HELD_STEPS: (remaining - 1.0).clamp(min=0.0)}
+    return torch.where(remaining > 0.0, equal, log_a), belief._replace(memory=memory)
 
 
 def draw_noise(model: StateSpaceModel, n: int, draws: RandomStream) -> Tensor:

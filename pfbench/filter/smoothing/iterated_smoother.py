@@ -116,6 +116,32 @@ def smooth_iteratively(
     )
 
 
+def smooth_initial_state(
+    method: GaussianFilter, model: StateSpaceModel, record: Record, passes: int = 3
+) -> tuple[Tensor, Tensor]:
+    """Compute the distribution of the initial state, given all measurements.
+
+    Args:
+        method: Gaussian filter without noise or gain adaptations.
+        model: State-space model of the filter.
+        record: Measurements [R, T, Dy] and inputs, prepared by the model.
+        passes: Number of linearisations after that of the filter.
+
+    Returns:
+        Mean [R, D] and covariance in the chart, [R, d, d]. NaN where a covariance is not positive.
+    """
+    draws = PhiloxStream(0, torch.arange(len(record.y)))
+    belief = method.init(model, len(record.y), draws, record.start, record.spread)
+    laws = [_Law(belief.mean, factor(belief.covariance)[0])]
+    for _, step_model, step_record in iterate_steps(model, record):
+        belief, _ = method.step(step_model, belief, step_record, draws)
+        laws.append(_Law(belief.mean, factor(belief.covariance)[0]))
+    start = laws[0]
+    for _ in range(passes):
+        laws, _ = _solve(model, start, laws, _linearise(method, model, record, laws))
+    return laws[0].mean, laws[0].root @ laws[0].root.mT
+
+
 def _linearise(
     method: GaussianFilter, model: StateSpaceModel, record: Record, laws: list[_Law]
 ) -> list[_LinearStep]:
