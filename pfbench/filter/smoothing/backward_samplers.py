@@ -159,7 +159,7 @@ class MetropolisBackwardSampler(BackwardSampler):
         mcmc_steps: Number of steps.
 
     Raises:
-        ValueError: If steps is below 1.
+        ValueError: If mcmc_steps is below 1.
 
     References:
         P. Bunch and S. Godsill (2013), Improved particle approximations to the joint smoothing
