@@ -10,6 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pfbench.config.hydra_messages import format_choice_error, format_value_error
+
 # extra of the package that installs a launcher
 _EXTRAS = {"ray": "ray", "submitit": "slurm", "joblib": "launch"}
 # errors of the file system: remedy
@@ -20,6 +22,9 @@ _STORAGE = {
     errno.EROFS: "Make the folder writable or set another one",
     errno.EACCES: "Change its permissions or set another folder",
     errno.EPERM: "Change its permissions or set another folder",
+    errno.ENOTDIR: "Set a folder instead of a file",
+    errno.EISDIR: "Set a file instead of a folder",
+    errno.ENAMETOOLONG: "Use a shorter name",
 }
 _ALL_KEYS = " List all: pfbench run --cfg job"
 
@@ -48,34 +53,14 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
     if match := re.search(rf"[Cc]ould not (?:find|load) 'hydra/launcher/({launchers})", text):
         launcher = next((word for word in words if word.startswith("hydra/launcher=")), "launcher")
         return f'{launcher} is not installed. Run pip install "pfbench[{_EXTRAS[match[1]]}]"'
+    if message := format_choice_error(text, words):
+        return message
     if match := re.search(r"Could not find '(.+)/([^/']*)'", text):
         return _format_unknown_choice(match[1], match[2], re.findall(r"^\t(\w+)$", text, re.M))
-    if message := _format_value_error(text):
+    if message := format_value_error(text):
         return message
     renamed = next((find_renamed(word) for word in words if find_renamed(word)), None)
     return f"{text} {renamed[0]}: renamed to {renamed[1]}" if renamed else text
-
-
-def _format_value_error(text: str) -> str:
-    """Format an error of Hydra about a single value; empty for other errors."""
-    if match := re.search(r"Ambiguous value for argument '([^']+)'", text):
-        return f"{match[1]} must be one value, got several. Add -m to run all: pfbench run -m ..."
-    if match := re.search(r"Interpolation key '([^']+)' not found\s+full_key: (\S+)", text):
-        group, _, name = match[1].partition(".")
-        return (
-            f"{match[2]} must be set, since {match[1]} does not exist. "
-            f"Set {match[2]}=... or choose a {group} that defines {name}."
-        )
-    if match := re.search(r"Missing mandatory value: (\S+)", text):
-        return f"{match[1]} must be set. Set {match[1]}=..."
-    if "LexerNoViableAlt" in text or text.startswith(("mismatched input", "extraneous input")):
-        return "each word must be key=value. Quote a value with spaces or signs."
-    if match := re.search(r"tried to allocate (\d+) bytes", text):
-        size = int(match[1]) / 2**30
-        return f"memory must hold an array of {size:.3g} GiB. Reduce runs, particles or steps."
-    if match := re.search(r"Error parsing override '([^']*)'", text):
-        return f"'{match[1]}' must be key=value. Quote it if the shell reads brackets or spaces."
-    return ""
 
 
 def _format_storage(error: OSError) -> str:

@@ -35,14 +35,27 @@ def check_files(words: Sequence[str]) -> None:
     Raises:
         UntrustedConfigError: If a file sets a node of Hydra, a default has an interpolation, a value
             reads the environment, or aliases make the file huge.
+        ValueError: If a folder does not exist, or a file that the words choose is not keys and
+            values in UTF-8.
     """
     for word in words:
         match = _SEARCH_PATH.match(word)
         for entry in match[1].split(",") if match else ():
             folder = entry.strip(" '\"")
-            if folder and not folder.startswith("pkg://"):  # Hydra takes a bare path as a file
-                for path in sorted(Path(folder.removeprefix("file://")).rglob("*.yaml")):
-                    _check_file(path)
+            if folder and "://" not in folder.removeprefix("file://"):  # Hydra takes a bare path
+                _check_folder(Path(folder.removeprefix("file://")), words)
+
+
+def _check_folder(folder: Path, words: Sequence[str]) -> None:
+    """Check the files of a folder, which Hydra ignores if it does not exist."""
+    if "${" not in f"{folder}" and not folder.is_dir():
+        raise ValueError(
+            f"hydra.searchpath must have existing folders, got {folder}. Use file:// and a full path."
+        )
+    for path in sorted(folder.rglob("*.yaml")):
+        _check_file(path)
+        if f"{path.parent.name}={path.stem}" in words:
+            _check_form(path)
 
 
 def _check_file(path: Path) -> None:
@@ -72,6 +85,26 @@ def _check_file(path: Path) -> None:
                 f"got {text_of_default!r}. Choose the file on the command line."
             )
     _check_hydra_node(path, content.get("hydra"))
+
+
+def _check_form(path: Path) -> None:
+    """Check that a chosen file has keys and values, which Hydra only finds out by what is missing."""
+    import yaml
+
+    try:
+        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{path} must be text in UTF-8, got the byte 0x{error.object[error.start]:02x}. Save it as UTF-8."
+        ) from error
+    except yaml.YAMLError:  # Hydra reports it with its line
+        return
+    if not isinstance(root, yaml.MappingNode):
+        kind = "an empty file" if root is None else f"a {root.id}"
+        raise ValueError(
+            f"{path} must be keys and values, got {kind}. Write key: value on each line, or choose "
+            f"another one: pfbench list {path.parent.name}"
+        )
 
 
 def _check_values(path: Path, text: str) -> None:

@@ -66,9 +66,11 @@ def register_step(library: Tensor, outputs: int, arguments: list[Tensor]) -> int
     if name:  # the operator refuses all else
         try:
             library = encode_path(find_compiled_code(Path(name)))
-        except FileNotFoundError as error:
+        except PermissionError:
+            raise
+        except OSError as error:  # missing, or no possible name of a file
             raise RuntimeError(
-                f"register_step: library must be a step of torch's compiler, got {name}."
+                f"register_step: library must be a step of torch's compiler, got {name[:200]!r}."
             ) from error
     return int(torch.ops.pfbench.register_step.default(library, outputs, arguments))
 

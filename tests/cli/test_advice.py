@@ -34,6 +34,72 @@ def test_advice(tmp_path: Path, words: tuple[str, ...], advice: str) -> None:
     assert not list(tmp_path.rglob("*.npz"))
 
 
+FORMS = {
+    "text": (b"hello world\n", "must be keys and values, got a scalar"),
+    "list": (b"- a\n- b\n", "must be keys and values, got a sequence"),
+    "number": (b"42\n", "must be keys and values, got a scalar"),
+    "empty": (b"", "must be keys and values, got an empty file"),
+    "bytes": (b"a: \x80\n", "must be text in UTF-8, got the byte 0x80"),
+}
+
+
+@pytest.mark.parametrize(
+    ("group", "form"), [("filter", "number"), *(("scenario", form) for form in FORMS)]
+)
+def test_a_file_of_another_form_is_named(tmp_path: Path, group: str, form: str) -> None:
+    content, message = FORMS[form]
+    (tmp_path / "mine" / group).mkdir(parents=True)
+    file = tmp_path / "mine" / group / "other.yaml"
+    file.write_bytes(content)
+    words = (f"hydra.searchpath=[file://{tmp_path / 'mine'}]", f"{group}=other")
+    said = pfbench("run", *WALK, *words, home=tmp_path)
+    assert said.code == 1
+    assert f"{file} {message}" in said.err
+
+
+def test_a_file_of_another_form_that_is_not_chosen_is_no_error(tmp_path: Path) -> None:
+    (tmp_path / "mine" / "filter").mkdir(parents=True)
+    (tmp_path / "mine" / "filter" / "draft.yaml").write_text("")
+    path = f"hydra.searchpath=[file://{tmp_path / 'mine'}]"
+    said = pfbench("run", *WALK, path, "filter=ekf", home=tmp_path)
+    assert said.code == 0, said.err
+
+
+@pytest.mark.parametrize(
+    ("word", "advice"),
+    [
+        ("noise=null", "noise=null must name a file of the group. Choose one: pfbench list noise"),
+        ("filter=/etc/hostname", "filter=/etc/hostname must be a name, got a path. Add its folder"),
+        ("+experiment=../mine", "+experiment=../mine must be a name, got a path"),
+        ("hydra.searchpath=[http://a.invalid/x]", "hydra.searchpath must have folders (file://"),
+        ("hydra.searchpath=[file:///no/folder]", "must have existing folders, got /no/folder"),
+    ],
+)
+def test_a_choice_of_another_kind_is_named(tmp_path: Path, word: str, advice: str) -> None:
+    said = pfbench("run", *WALK, word, home=tmp_path)
+    assert said.code == 1
+    assert advice in said.err
+    assert not list(tmp_path.rglob("*.npz"))
+
+
+@pytest.mark.parametrize(
+    ("word", "advice"),
+    [
+        ("reports_dir=FILE", "FILE/judge must be accessible, got 'Not a directory'. Set a folder"),
+        ("reference=FOLDER", "FOLDER must be a file, got none. Check the path"),
+    ],
+)
+def test_a_file_in_place_of_a_folder_is_named(tmp_path: Path, word: str, advice: str) -> None:
+    file = tmp_path / "a.csv"
+    file.write_text("t,pn,pe,pd\n" + "".join(f"{0.1 * i},{i},0,0\n" for i in range(50)))
+    words = {"reference": f"reference={file}", "a": f"a={file}", "b": f"b={file}"}
+    word = word.replace("FILE", f"{file}").replace("FOLDER", f"{tmp_path}")
+    words[word.partition("=")[0]] = word
+    said = pfbench("judge", *words.values(), home=tmp_path)
+    assert said.code == 1
+    assert advice.replace("FILE", f"{file}").replace("FOLDER", f"{tmp_path}") in said.err
+
+
 def test_a_key_of_swept_scenarios_is_set_in_all_jobs(tmp_path: Path) -> None:
     words = ("scenario=linear_walk,local_level", "scenario.steps=3", "filter=ekf", "runs=2")
     said = pfbench("run", "-m", *words, home=tmp_path)

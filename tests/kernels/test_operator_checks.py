@@ -207,7 +207,7 @@ def test_a_step_is_called_by_its_number_only() -> None:
         with pytest.raises(RuntimeError, match="must be the number of a registered step"):
             step_table.run_steps(number, [], [], [torch.rand(2, 1)], [])
     loaded = str(Path(torch.__file__).parent / "lib/libc10.so").encode()  # may be another user's
-    names = [b"", b"no such file", b"libc10.so", loaded]
+    names = [b"", b"no such file", b"libc10.so", loaded, b"\xff" * 5000]
     for name in names:
         with pytest.raises(
             RuntimeError if name != loaded else (RuntimeError, PermissionError),

@@ -1,0 +1,64 @@
+"""Messages for errors of Hydra, which name neither key nor remedy."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+
+def format_value_error(text: str) -> str:
+    """Format an error of Hydra about a single value.
+
+    Args:
+        text: Message of the error.
+
+    Returns:
+        The key, the value given, and a remedy. Empty for other errors.
+    """
+    if match := re.search(r"Ambiguous value for argument '([^']+)'", text):
+        return f"{match[1]} must be one value, got several. Add -m to run all: pfbench run -m ..."
+    if match := re.search(r"Interpolation key '([^']+)' not found\s+full_key: (\S+)", text):
+        group, _, name = match[1].partition(".")
+        return (
+            f"{match[2]} must be set, since {match[1]} does not exist. "
+            f"Set {match[2]}=... or choose a {group} that defines {name}."
+        )
+    if match := re.search(r"Missing mandatory value: (\S+)", text):
+        return f"{match[1]} must be set. Set {match[1]}=..."
+    if "LexerNoViableAlt" in text or text.startswith(("mismatched input", "extraneous input")):
+        return "each word must be key=value. Quote a value with spaces or signs."
+    if match := re.search(r"tried to allocate (\d+) bytes", text):
+        size = int(match[1]) / 2**30
+        return f"memory must hold an array of {size:.3g} GiB. Reduce runs, particles or steps."
+    if match := re.search(r"Error parsing override '([^']*)'", text):
+        return f"'{match[1]}' must be key=value. Quote it if the shell reads brackets or spaces."
+    return ""
+
+
+def format_choice_error(text: str, words: Sequence[str]) -> str:
+    """Format an error of Hydra about the choice of a file or the search path.
+
+    Args:
+        text: Message of the error.
+        words: Overrides of the command.
+
+    Returns:
+        The key, the value given, and a remedy. Empty for other errors.
+    """
+    path = next((word for word in words if re.match(r"\+?\w+=\.{0,2}/", word)), "")
+    if path and re.search(r"Could not (find|load)", text) and path.partition("=")[2] in text:
+        group = path.lstrip("+").partition("=")[0]
+        return (
+            f"{path} must be a name, got a path. Add its folder with hydra.searchpath=[file://FOLDER], "
+            f"or choose a name: pfbench list {group}"
+        )
+    if "Config group override must be a string or a list" in text:
+        word = next((w for w in words if w.partition("=")[2] == "null"), "a group")
+        group = word.lstrip("+").partition("=")[0]
+        return f"{word} must name a file of the group. Choose one: pfbench list {group}"
+    if match := re.search(r"No config source registered for schema (\w+)", text):
+        return (
+            f"hydra.searchpath must have folders (file://FOLDER) or packages (pkg://MODULE), got "
+            f"{match[1]}://. Copy the files into a folder."
+        )
+    return ""
