@@ -1,30 +1,43 @@
-"""Table of the decisions of a study by earlier rules and by the rules of today, for its planned pairs.
+"""Decisions of all_seven by the earlier rules and by the present ones: `python docs/compare_decisions.py`.
 
-The earlier ones are those of report.md at a commit, by default the first one of all_seven. The others are those of
-decisions.json, which `pfbench report` writes.
-
-    python docs/compare_decisions.py reports/all_seven/decisions.json [COMMIT]
+It writes the table of docs/statistics.md for the planned pairs of the first published page. Its words are in
+early_decisions.csv, since a fresh clone may lack the history; `--history` reads them again from git. The earlier
+rule is also applied to the runs of today, so that a change by the rule differs from a change by the data.
 """
 
 from __future__ import annotations
 
+import csv
+import gzip
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pfbench.files import markdown_head, markdown_row
+import numpy as np
+import pandas as pd
+from scipy.stats import wilcoxon
 
-_FIRST_FAMILY, _TRACK = "planned pairs, track and error", "keeps track"  # words of decisions.json
+from pfbench.files import markdown_head, markdown_row
+from pfbench.results.statistics.signed_rank import holm
 
 TOP = Path(__file__).parents[1]
+STUDY = TOP / "reports" / "all_seven"
+PAGE, EARLY = TOP / "docs" / "statistics.md", TOP / "docs" / "early_decisions.csv"
 FIRST = "f32489b"  # the oldest commit that has reports/all_seven/report.md
 OPPOSITE = {"better": "worse", "worse": "better"}
+_BLOCK = re.compile(r"<!-- numbers:early_decisions -->\n.*?<!-- numbers:end -->", re.DOTALL)
+_HEADS = (
+    "method", "baseline", "first page", "earlier rule, present runs", "in these worlds",
+    "error ratio, or runs won", "in a new world", "changed by the rule",
+)  # fmt: skip
+Words = dict[tuple[str, str], str]
 
 
-def read_early_words(page: str) -> dict[tuple[str, str], str]:
+def read_early_words(page: str) -> Words:
     """Read the words of the planned pairs of an early page.
 
     Args:
@@ -45,49 +58,138 @@ def read_early_words(page: str) -> dict[tuple[str, str], str]:
     return words
 
 
-def select_words(decisions: Sequence[Mapping[str, Any]], a: str, b: str) -> dict[str, str]:
-    """Return the word of a pair by question, from the records of its error in the first family.
+def read_history() -> Words:
+    """Read the words of the first published page from git.
+
+    Raises:
+        subprocess.CalledProcessError: if the clone lacks the commit.
+    """
+    command = ["git", "-C", str(TOP), "show", f"{FIRST}:reports/all_seven/report.md"]
+    return read_early_words(
+        subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    )
+
+
+def read_stored_words() -> Words:
+    """Read the words of early_decisions.csv."""
+    with EARLY.open(newline="") as file:
+        return {(row["method"], row["baseline"]): row["word"] for row in csv.DictReader(file)}
+
+
+def apply_early_rule(
+    runs: pd.DataFrame, pairs: Sequence[tuple[str, str]], alpha: float = 0.05
+) -> Words:
+    """Decide pairs as the first page did: Wilcoxon's test over conditions of median log errors, with Holm.
+
+    Conditions of one world were taken for independent, and diverged runs kept their error.
 
     Args:
-        decisions: Records of decisions.json.
+        runs: Runs of a report.
+        pairs: Methods and baselines.
+        alpha: Error of all pairs together.
+
+    Returns:
+        better, worse or inconclusive by pair.
+    """
+    log_error = np.log(runs["rmse"].fillna(np.inf))
+    median = log_error.groupby([runs["scenario"], runs["regime"], runs["filter"]]).median()
+    table = median.unstack("filter")
+    differences = [(table[a] - table[b]).dropna() for a, b in pairs]
+    corrected = holm([float(wilcoxon(d).pvalue) for d in differences])
+    return {
+        pair: "inconclusive" if p > alpha else "better" if d.median() < 0 else "worse"
+        for pair, d, p in zip(pairs, differences, corrected, strict=True)
+    }
+
+
+def select_decision(planned: Sequence[Mapping[str, Any]], a: str, b: str) -> tuple[str, str, str]:
+    """Return the words of a pair in these worlds and in a new one, with the error ratio or the runs won.
+
+    Args:
+        planned: Planned pairs of the data of a page, in either direction.
         a: Method.
         b: Baseline.
     """
-    words = {}
-    for d in decisions:
-        is_first = d["family"] == _FIRST_FAMILY and d["metric"] != _TRACK
-        if is_first and {d["a"], d["b"]} == {a, b}:
-            word = str(d["pair_word"])
-            words[str(d["question"])] = word if d["a"] == a else OPPOSITE.get(word, word)
-    return words
+    for entry in planned:
+        if {entry["a"], entry["b"]} == {a, b}:
+            new = (entry["new_world"] or {"word": "not tested"})["word"]
+            words = [entry["word"], new]
+            if entry["a"] != a:
+                return (
+                    OPPOSITE.get(words[0], words[0]),
+                    f"of `{b}`: {_describe(entry)}",
+                    OPPOSITE.get(new, new),
+                )
+            return words[0], _describe(entry), words[1]
+    return "missing", "", "missing"
 
 
-def compare(early: Mapping[tuple[str, str], str], decisions: Sequence[Mapping[str, Any]]) -> str:
-    """Format the table of both. A decision is changed if the word in these worlds is another one.
+def _describe(entry: Mapping[str, Any]) -> str:
+    """Format the ratio of a planned pair with its interval, or the runs won."""
+    if entry["estimate"] is None:
+        return str(entry["reason"] or "").partition(";")[0]
+    low, high = (
+        f"{entry[name]:.3g}" if entry[name] is not None else "-" for name in ("low", "high")
+    )
+    return f"{entry['estimate']:.3g} ({low} to {high})"
+
+
+def compare(early: Words, rule: Words, planned: Sequence[Mapping[str, Any]]) -> str:
+    """Format the table of all three. The rule changes a decision if its word on the same runs is another one.
 
     Args:
-        early: Words of `read_early_words`.
-        decisions: Records of decisions.json.
+        early: Words of the first page.
+        rule: Words of the earlier rule with the present runs.
+        planned: Planned pairs of the data of the present page.
     """
-    heads = ("method", "baseline", "earlier rules", "in these worlds", "in a new world", "changed")
-    lines, changes, missing = markdown_head(*heads), 0, 0
+    lines, by_rule, by_runs, missing = markdown_head(*_HEADS), 0, 0, 0
     for (a, b), old in early.items():
-        words = select_words(decisions, a, b)
-        new = [words.get(question, "missing") for question in ("a", "b")]
-        is_changed = new[0] not in (old, "missing")
-        missing += new[0] == "missing"
-        changes += is_changed
-        lines.append(markdown_row(f"`{a}`", f"`{b}`", old, *new, "yes" if is_changed else ""))
-    end = f"{changes} of {len(early)} decisions changed, {missing} are missing."
+        here, effect, new = select_decision(planned, a, b)
+        is_changed = here not in (rule[a, b], "missing")
+        by_rule, by_runs, missing = (
+            by_rule + is_changed,
+            by_runs + (rule[a, b] != old),
+            missing + (here == "missing"),
+        )
+        cells = f"`{a}`", f"`{b}`", old, rule[a, b], here, effect, new
+        lines.append(markdown_row(*cells, "yes" if is_changed else ""))
+    counts = [_count_decided(planned, early, place) for place in (0, 2)]
+    end = (
+        f"The present rule changes {by_rule} of {len(early)} decisions, and the present runs change {by_runs}. "
+        f"The earlier rule decides {sum(word in OPPOSITE for word in rule.values())}, the present one {counts[0]} in these "
+        f"worlds and {counts[1]} in a new world. {missing} pairs are missing."
+    )
     return "\n".join([*lines, "", end])
 
 
+def _count_decided(planned: Sequence[Mapping[str, Any]], early: Words, place: int) -> int:
+    """Count the pairs whose word is better or worse."""
+    return sum(select_decision(planned, *pair)[place] in OPPOSITE for pair in early)
+
+
+def fill_page(text: str) -> str:
+    """Replace the table of a page by that of the stored files.
+
+    Args:
+        text: Content of docs/statistics.md.
+    """
+    early = read_stored_words()
+    planned = json.loads(gzip.decompress((STUDY / "page.json.gz").read_bytes()))["planned"]
+    rule = apply_early_rule(pd.read_parquet(STUDY / "runs.parquet"), list(early))
+    table = (
+        f"<!-- numbers:early_decisions -->\n{compare(early, rule, planned)}\n<!-- numbers:end -->"
+    )
+    return _BLOCK.sub(lambda _: table, text)
+
+
 def main(words: Sequence[str]) -> None:
-    """Print the table."""
-    path, commit = words[0], (words[1] if len(words) > 1 else FIRST)
-    command = ["git", "-C", str(TOP), "show", f"{commit}:reports/all_seven/report.md"]
-    page = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    print(compare(read_early_words(page), json.loads(Path(path).read_text())))
+    """Write the table, and early_decisions.csv if the history is requested."""
+    if "--history" in words:
+        with EARLY.open("w", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(("method", "baseline", "word"))
+            writer.writerows((*pair, word) for pair, word in read_history().items())
+    PAGE.write_text(fill_page(PAGE.read_text()))
 
 
 if __name__ == "__main__":

@@ -217,21 +217,39 @@ def test_the_cost_of_a_study_is_the_computing_time_of_its_jobs(
     assert studies.measure_cost("none", tmp_path) == 0.0
 
 
-def test_old_and_new_decisions_are_compared_in_the_direction_of_the_early_page():
-    """The pairs are stored in either direction; other metrics and families do not count."""
+def test_old_and_new_decisions_are_compared_in_the_direction_of_the_early_page() -> None:
+    """The pairs are stored in either direction; a change by other runs is not one by the rule."""
     script = load("compare_decisions")
     head = "| method | baseline | cells | p | across cells |\n|---|---|--:|--:|---|\n"
     rows = "| a | b | 24 | 0.1 | a |\n| a | c | 24 | 0.1 | c |\n| a | d | 24 | 0.1 | no difference shown |\n\n| x |"
     early = script.read_early_words(head + rows)
     assert early == {("a", "b"): "better", ("a", "c"): "worse", ("a", "d"): "inconclusive"}
-    first = {"family": "planned pairs, track and error", "metric": "position error"}
-    decisions = [
-        {"a": "b", "b": "a", "question": "a", "pair_word": "worse", **first},
-        {"a": "a", "b": "c", "question": "a", "pair_word": "better", **first},
-        {"a": "a", "b": "c", "question": "a", "pair_word": "worse", **first, "metric": "CRPS", "family": "second"},
-        {"a": "a", "b": "b", "question": "b", "pair_word": "inconclusive", **first},
+    new = {"word": "inconclusive"}
+    planned = [
+        {"a": "b", "b": "a", "word": "worse", "estimate": 2.0, "low": 1.5, "high": 2.5, "new_world": new},
+        {"a": "a", "b": "c", "word": "better", "estimate": None, "reason": "runs won: 5; x", "new_world": None},
     ]  # fmt: skip
-    text = script.compare(early, decisions)
-    assert "| `a` | `b` | better | better | inconclusive |  |" in text
-    assert "| `a` | `c` | worse | better | missing | yes |" in text
-    assert "1 of 3 decisions changed, 1 are missing." in text
+    rule = {("a", "b"): "inconclusive", ("a", "c"): "better", ("a", "d"): "inconclusive"}
+    text = script.compare(early, rule, planned)
+    assert (
+        "| `a` | `b` | better | inconclusive | better | of `b`: 2 (1.5 to 2.5) | inconclusive | yes |"
+        in text
+    )
+    assert "| `a` | `c` | worse | better | better | runs won: 5 | not tested |  |" in text
+    assert "changes 1 of 3 decisions, and the present runs change 2." in text
+    assert "decides 1, the present one 2 in these worlds and 0 in a new world. 1 pairs" in text
+
+
+def test_the_table_of_earlier_decisions_is_that_of_the_stored_files() -> None:
+    script = load("compare_decisions")
+    text = script.PAGE.read_text()
+    assert script.fill_page(text) == text, "run: python docs/compare_decisions.py"
+    changed = text.replace("| `mcmc_rpf` | `sir` | better |", "| `mcmc_rpf` | `sir` | worse |", 1)
+    assert changed != text
+    assert script.fill_page(changed) == text
+    has_history = not subprocess.run(
+        ["git", "-C", str(ROOT), "cat-file", "-e", f"{script.FIRST}:reports/all_seven/report.md"],
+        capture_output=True,
+        check=False,
+    ).returncode
+    assert not has_history or script.read_history() == script.read_stored_words()
