@@ -20,7 +20,7 @@ from pfbench.results.decisions.decision import Decision
 from pfbench.results.decisions.filter_sets import order_filters
 from pfbench.results.decisions.options import MetricRule
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs, decide_secondary_metrics
-from pfbench.results.state_groups import main_component_group
+from pfbench.results.frame import list_main_groups
 from pfbench.results.step_times import STEP_TIMES
 from pfbench.results.study_decisions.common_conditions import select_common_runs
 from pfbench.results.study_decisions.consistency_bands import decide_consistency
@@ -54,10 +54,7 @@ def write_study_files(
     Returns:
         Entries of the downloads of the page.
     """
-    mains = {
-        (c.scenario, c.noise, c.model): main_component_group(c.jobs[0].meta["state"]).group
-        for c in conditions
-    }
+    mains = list_main_groups(conditions)
     names = set(mains.values())
     name = names.pop() if len(names) == 1 else MAIN
     others = tidy_other_groups(table, mains)

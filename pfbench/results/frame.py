@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import logging
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +13,10 @@ import pandas as pd
 from pfbench.results import metrics, status, store
 from pfbench.results.conditions import Condition, JobFile, load_conditions
 from pfbench.results.error_measures import convergence_time
-from pfbench.results.state_groups import component_groups
+from pfbench.results.state_groups import component_groups, main_component_group
+from pfbench.results.study_decisions.independent_runs import select_independent_runs
+
+log = logging.getLogger("pfbench")
 
 _WHOLE_RUN_ARRAYS = ("log_evidence", "lost", "health", "run")
 _SHARED_ARRAYS = ("time", "pcrb", "range")  # without an axis of runs
@@ -27,6 +31,8 @@ def load_frame(
     convergence_threshold: Mapping[str, float] | None = None,
 ) -> pd.DataFrame:
     """Read all metrics of all runs of a study.
+
+    Runs with the errors of another run are left out, as in a report, and a warning states them.
 
     Args:
         study: Name of the folder in `results`.
@@ -46,12 +52,30 @@ def load_frame(
         FileNotFoundError: If results of the study are missing. The message lists other studies.
         ValueError: if files do not belong together. The message lists them.
     """
+    conditions = load_conditions(study, results, allow_mixed_versions=allow_mixed_versions)
     rows = [
         to_long_rows(condition, job, job.load(), start_time_s, convergence_threshold or {})
-        for condition in load_conditions(study, results, allow_mixed_versions=allow_mixed_versions)
+        for condition in conditions
         for job in condition.jobs
     ]
-    return pd.concat(rows, ignore_index=True)
+    independent = select_independent_runs(
+        pd.concat(rows, ignore_index=True), list_main_groups(conditions)
+    )
+    if independent.sentence:
+        log.warning("warning  study %s: %s", study, independent.sentence)
+    return independent.rows
+
+
+def list_main_groups(conditions: Sequence[Condition]) -> dict[tuple[str, str, str], str]:
+    """Return the main group by scenario, noise and model.
+
+    Args:
+        conditions: Conditions of the study.
+    """
+    return {
+        (c.scenario, c.noise, c.model): main_component_group(c.jobs[0].meta["state"]).group
+        for c in conditions
+    }
 
 
 def select_indices(size: int, most: int = 180) -> np.ndarray:

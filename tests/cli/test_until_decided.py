@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,43 @@ def test_a_damaged_part_is_computed_again(home: Path, said: Said) -> None:
     (home / "results" / "growing" / "looks.json").unlink()
     assert lines(pfbench(*GROWING, home=home)) == lines(said)
     np.testing.assert_array_equal(store.read_result(broken).data["error"], error)
+
+
+def copy_runs(folder: Path, target: int) -> None:
+    """Write the arrays of the first runs of each filter over those of its part that begins at a run."""
+    parts = {}
+    for file in folder.glob("*.npz"):
+        result = store.read_result(file)
+        parts[result.meta["label"], result.meta["first_run"]] = file, result
+    for (label, first), (file, result) in parts.items():
+        if first == target:
+            file.unlink()
+            store.write_result(file, result.meta, parts[label, 0][1].data)
+
+
+def test_copies_of_runs_are_not_counted(
+    home: Path, said: Said, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Twenty runs that are stored twice decide as twenty, in the look and in a loaded table."""
+    shutil.copytree(home / "results", tmp_path / "results")
+    folder = tmp_path / "results" / "growing"
+    (folder / "looks.json").unlink()
+    copy_runs(folder, 20)
+    sentence = "20 runs have the errors of another run (run 1 20 is equal to run 1 0)"
+    first, second, _ = lines(pfbench(*GROWING, home=tmp_path))
+    assert first == lines(said)[0]
+    assert sentence in second
+    assert [re.findall(r"ratio [^)]+", line) for line in (first, second)] == [
+        re.findall(r"ratio [^)]+", first)
+    ] * 2
+    table = package.load("growing", tmp_path / "results")
+    assert sentence in caplog.text
+    assert sorted(table.run.unique()) == list(range(20))
+    full = package.load("growing", home / "results")
+    columns = ["label", "run", "group", "component", "metric"]
+    expected = full[full.run < 20].sort_values(columns).reset_index(drop=True)
+    found = table.sort_values(columns).reset_index(drop=True)
+    assert found.equals(expected)
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,8 @@ class GrowingSweep:
             table = self._compute_look(number, run_part)
             seconds = table.seconds
             earlier, states = states, self._decide(table)
-            lines.append(format_look(number, self.schedule, states, earlier))
+            line = format_look(number, self.schedule, states, earlier)
+            lines.append(". ".join(filter(None, (line, table.warning))))
             print(lines[-1], flush=True)
             state = describe_end(number, self.schedule, states)
             record.write(lines, state)
@@ -204,6 +205,12 @@ class GrowingSweep:
             raise ValueError(
                 "filter must be at least two filters with runs=until-decided, got one per condition. "
                 "Add a filter (filter=ekf,sir), or set a number of runs."
+            )
+        runs, required = table.runs["run"].nunique(), self.schedule.runs[0]
+        if runs < required:
+            raise ValueError(
+                f"runs must be at least {required} independent ones, got {runs}. {table.warning} Use a "
+                "scenario whose data differ from run to run, or set a number of runs."
             )
         names = ("alpha", "equivalence_margin", "metric")
         report = ReportOptions(**{name: self.report[name] for name in names})

@@ -14,15 +14,9 @@ from pfbench.report.board.tracks import count_carried_runs, make_tracks
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import Condition
 from pfbench.results.frame import drop_before, to_long_rows
-from pfbench.results.statistics.run_dependence import (
-    describe_copies,
-    describe_dependence,
-    drop_runs,
-    find_copied_runs,
-)
+from pfbench.results.statistics.run_dependence import assess_runs, drop_runs
 from pfbench.results.step_times import StepTimes
-
-_RUN = ["seed", "run"]
+from pfbench.results.study_decisions.independent_runs import RUN
 
 
 class StudyData(NamedTuple):
@@ -93,11 +87,9 @@ def read_study(
 
 def _leave_out_copies(data: StudyData) -> StudyData:
     """Leave out copies of runs, and state runs that are not independent."""
-    copies = find_copied_runs(data.table, "rmse", _RUN)
-    table = drop_runs(data.table, copies, _RUN)
-    sentences = (describe_copies(copies), describe_dependence(table, "rmse", _RUN))
+    copies, warning = assess_runs(data.table, "rmse", RUN)
     return data._replace(
-        table=table,
-        metrics=drop_runs(data.metrics, copies, _RUN),
-        warning=" ".join(filter(None, sentences)),
+        table=drop_runs(data.table, copies, RUN),
+        metrics=drop_runs(data.metrics, copies, RUN),
+        warning=warning,
     )

@@ -6,7 +6,7 @@ References:
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,31 @@ from pfbench.results.error_measures import Array
 
 ALARM_LEVEL = 0.001  # of the test of all filters together: a study has many readers [ours]
 _FEWEST = 10  # runs of a test
+
+
+class RunAssessment(NamedTuple):
+    """Runs of a study that are not independent.
+
+    Attributes:
+        copies: The earlier run by each copy.
+        sentence: What is left out, and whether neighbouring runs are alike; empty for independent runs.
+    """
+
+    copies: dict[Any, Any]
+    sentence: str
+
+
+def assess_runs(table: pd.DataFrame, value: str, run: list[str]) -> RunAssessment:
+    """Find copies of runs, and test the other runs for errors that are alike in neighbouring runs.
+
+    Args:
+        table: One row per filter, scenario, regime and run.
+        value: Column of the error, a number with many digits.
+        run: Columns that name a run, in the order of the runs.
+    """
+    copies = find_copied_runs(table, value, run)
+    dependence = describe_dependence(drop_runs(table, copies, run), value, run)
+    return RunAssessment(copies, " ".join(filter(None, (describe_copies(copies), dependence))))
 
 
 def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[Any, Any]:

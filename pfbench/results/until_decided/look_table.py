@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from pfbench.results.conditions import Condition, load_conditions
-from pfbench.results.frame import to_long_rows
-from pfbench.results.state_groups import main_component_group
+from pfbench.results.conditions import load_conditions
+from pfbench.results.frame import list_main_groups, to_long_rows
+from pfbench.results.study_decisions.independent_runs import select_independent_runs
 from pfbench.results.study_decisions.main_metrics import select_main_metrics, tidy_main
 
 _MAIN = "main"  # the main groups of the scenarios may have different names
@@ -32,16 +32,18 @@ class LookTable(NamedTuple):
     """Results of a study until a look.
 
     Attributes:
-        runs: Table for decisions, see `study_runs.to_study_runs`.
+        runs: Table for decisions, see `study_runs.to_study_runs`, without copies of runs.
         pairs: Planned pairs that share a condition.
         parts: Number of result files.
         seconds: Time that the simulation and the filters used, s.
+        warning: Sentence on runs that are not independent; empty if none is shown.
     """
 
     runs: pd.DataFrame
     pairs: list[tuple[str, str]]
     parts: int
     seconds: float
+    warning: str = ""
 
 
 def read_look_table(
@@ -69,9 +71,17 @@ def read_look_table(
     """
     metric = metric or LookMetric()
     conditions = load_conditions(study, results, keys=keys)
-    rows = pd.concat(
-        [_main_rows(condition, metric.start_s) for condition in conditions], ignore_index=True
+    table = pd.concat(
+        [
+            to_long_rows(condition, job, job.load(), metric.start_s, {})
+            for condition in conditions
+            for job in condition.jobs
+        ],
+        ignore_index=True,
     )
+    mains = list_main_groups(conditions)
+    independent = select_independent_runs(table, mains)
+    rows = select_main_metrics(independent.rows, mains, _MAIN)
     labels = {job.label for condition in conditions for job in condition.jobs}
     labels_by_condition = [{job.label for job in condition.jobs} for condition in conditions]
     pairs = [
@@ -82,12 +92,5 @@ def read_look_table(
     jobs = [job for condition in conditions for job in condition.jobs]
     seconds = sum(job.meta["seconds"]["world"] + job.meta["seconds"]["filter"] for job in jobs)
     parts = sum(len(job.parts) for job in jobs)
-    return LookTable(tidy_main(rows, metric.name, _MAIN), pairs, parts, float(seconds))
-
-
-def _main_rows(condition: Condition, start_s: float) -> pd.DataFrame:
-    """Return the metrics of the main group of a condition."""
-    tables = [to_long_rows(condition, job, job.load(), start_s, {}) for job in condition.jobs]
-    main = main_component_group(condition.jobs[0].meta["state"]).group
-    mains = {(condition.scenario, condition.noise, condition.model): main}
-    return select_main_metrics(pd.concat(tables, ignore_index=True), mains, _MAIN)
+    runs = tidy_main(rows, metric.name, _MAIN)
+    return LookTable(runs, pairs, parts, float(seconds), independent.sentence)
