@@ -154,8 +154,7 @@ class GrowingSweep:
             table = self._compute_look(number, run_part)
             seconds = table.seconds
             earlier, states = states, self._decide(table)
-            line = format_look(number, self.schedule, states, earlier)
-            lines.append(". ".join(filter(None, (line, table.warning))))
+            lines.append(format_look(number, self.schedule, states, earlier, table.warning))
             print(lines[-1], flush=True)
             state = describe_end(number, self.schedule, states)
             record.write(lines, state)

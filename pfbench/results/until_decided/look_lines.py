@@ -15,6 +15,7 @@ def format_look(
     schedule: LookSchedule,
     states: Sequence[PairState],
     earlier: Sequence[PairState] = (),
+    warning: str = "",
 ) -> str:
     """Format what is decided and what is open after a look.
 
@@ -23,6 +24,7 @@ def format_look(
         schedule: Looks of the study.
         states: State of each pair.
         earlier: States at the look before.
+        warning: Sentence on runs that are not independent; empty without one.
 
     Returns:
         One line.
@@ -34,7 +36,7 @@ def format_look(
     parts = [f"look {number}, {runs} runs: {count} of {len(states)} pairs decided"]
     parts += [f"new: {_list_states(new)}"] if new else []
     parts += [f"open: {_list_states(unresolved)}"] if unresolved else []
-    return "; ".join(parts)
+    return ". ".join(filter(None, ("; ".join(parts), warning)))
 
 
 def describe_end(number: int, schedule: LookSchedule, states: Sequence[PairState]) -> str:
