@@ -66,10 +66,11 @@ def find_common_epochs(
     times = {k: tables[k].time[masks[k]] for k in valid}
     grid = _slowest(list(times.values()))
     nearest = {k: _nearest(times[k], grid) for k in valid}
-    has_row = {k: np.abs(times[k][nearest[k]] - grid) <= options.tolerance for k in valid}
+    has_row = {k: _has_row(times[k], grid, options.tolerance) for k in valid}
     common = np.ones(len(grid), dtype=bool)
-    for k in valid:
-        common &= has_row[k] | _is_in_hole(times[k], grid)
+    for k in valid:  # a row that rounding puts outside the scored time is no hole
+        is_absent = ~_has_row(tables[k].time, grid, options.tolerance)
+        common &= has_row[k] | (_is_in_hole(times[k], grid) & is_absent)
     common &= _thinned(grid, common, options.every)
     if common.sum() < LEAST_EPOCHS:
         raise ValueError(
@@ -114,6 +115,11 @@ def _slowest(times: Sequence[Array]) -> Array:
     longest = max(steps, default=0.0)
     candidates = [t for t, step in zip(times, steps, strict=True) if step >= 0.9 * longest]
     return max(candidates, key=len, default=np.zeros(0))
+
+
+def _has_row(time: Array, grid: Array, tolerance: float) -> np.ndarray:
+    """Return the epochs of a grid at which a trajectory has a row."""
+    return np.asarray(np.abs(time[_nearest(time, grid)] - grid) <= tolerance)
 
 
 def _is_in_hole(time: Array, grid: Array) -> np.ndarray:

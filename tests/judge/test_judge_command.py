@@ -87,6 +87,21 @@ def test_a_program_gains_nothing_by_leaving_out_its_bad_epochs(tmp_path: Path) -
     assert judged.along_runs[0].decision.word != "better"
 
 
+@pytest.mark.parametrize("options", [{}, {"start": 10.0, "end": 100.0}, {"every": 2.0}])
+def test_times_that_are_rounded_make_no_holes(tmp_path: Path, options: dict[str, float]) -> None:
+    """The first and the last epoch lie outside the scored time by the rounding of the clock."""
+    truth = cases.drive()
+    reference = cases.write(truth, tmp_path / "truth.csv")
+    files = {}
+    for name, shift in (("early", -1e-4), ("exact", 0.0), ("late", 1e-4)):
+        table = cases.estimate(truth, 1.0, 1)
+        table["t"] += shift
+        files[name] = str(cases.write(table, tmp_path / f"{name}.csv"))
+    (sequence,) = judge_programs(str(reference), files, JudgeOptions(**options)).sequences
+    assert not np.any(sequence.epochs.holes)
+    assert len(sequence.epochs.time) > 30
+
+
 def test_removed_motion_is_stated(tmp_path: Path) -> None:
     truth = cases.drive()
     reference = cases.write(truth, tmp_path / "truth.csv")
