@@ -11,10 +11,11 @@ from pfbench.results.config_key import compute_config_key
 
 NOMINAL = "_target_: pfbench.noise.NominalNoise\n"
 CLASS = "noise must be keys and values with the key _target_"
+FORM = r"\S*/noise/mine\.yaml must be keys and values"
 FILES = {
-    "text": ("just a text", rf"{CLASS}, got just a text\. Write .* pfbench list noise"),
-    "list": ("[1, 2]", rf"{CLASS}, got \[1, 2\]\. "),
-    "empty": ("", rf"{CLASS}, got \{{\}}\. "),
+    "text": ("just a text", rf"{FORM}, got a scalar\. Write key: value .* pfbench list noise"),
+    "list": ("[1, 2]", rf"{FORM}, got a sequence\. "),
+    "empty": ("", rf"{FORM}, got an empty file\. "),
     "keys": ("sd: 1.0", rf"{CLASS}, got \{{'sd': 1\.0\}}\. "),
     "circle": (
         f"{NOMINAL}a: ${{noise.b}}\nb: ${{noise.a}}",

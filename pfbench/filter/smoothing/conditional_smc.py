@@ -52,7 +52,7 @@ class ConditionalSmcKernel(PathKernel):
         noises = [self._draw(theta[..., :d], draws.at_step(0))]
         x = space.start(noises[0].flatten(1, 2))
         log_w, parents = torch.zeros_like(noises[0][..., 0]), []
-        for t in range(len(space.steps)):
+        for t, _ in enumerate(space.steps):
             stream = draws.at_step(t + 1)
             u = stream.uniform("parent", theta.shape[1], self.particles)
             slots = draw_by_weight(log_w.flatten(0, 1), u.flatten(0, 1)).view(log_w.shape)

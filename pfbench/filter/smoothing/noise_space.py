@@ -99,7 +99,7 @@ class NoiseSpace:
         """
         x = self.start(theta[..., : self.model.chart.dimension])
         states, total = [], torch.zeros_like(x[..., 0])
-        for t in range(len(self.steps)):
+        for t, _ in enumerate(self.steps):
             x, log_likelihood = self.advance(t, x, self.noise(theta, t))
             states.append(x)
             total = total + log_likelihood
