@@ -68,7 +68,7 @@ def find_common_epochs(
     nearest = {k: _nearest(times[k], grid) for k in valid}
     has_row = {k: _has_row(times[k], grid, options.tolerance) for k in valid}
     common = np.ones(len(grid), dtype=bool)
-    for k in valid:  # a row that rounding puts outside the scored time is no hole
+    for k in valid:  # a row that rounding puts outside the scored time is not a hole
         is_absent = ~_has_row(tables[k].time, grid, options.tolerance)
         common &= has_row[k] | (_is_in_hole(times[k], grid) & is_absent)
     common &= _thinned(grid, common, options.every)

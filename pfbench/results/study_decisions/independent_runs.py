@@ -17,7 +17,7 @@ class IndependentRows(NamedTuple):
     """Rows of all metrics without copies of runs.
 
     Attributes:
-        rows: Rows of the runs that are no copies.
+        rows: Rows of the runs that are not copies.
         sentence: What is left out, and whether neighbouring runs are alike; empty for independent runs.
     """
 
