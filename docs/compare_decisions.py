@@ -22,7 +22,7 @@ import pandas as pd
 from scipy.stats import wilcoxon
 
 from pfbench.files import markdown_head, markdown_row
-from pfbench.results.statistics.signed_rank import holm
+from pfbench.results import holm
 
 TOP = Path(__file__).parents[1]
 STUDY = TOP / "reports" / "all_seven"
