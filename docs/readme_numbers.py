@@ -157,7 +157,7 @@ def all_seven() -> str:
     pack = json.loads(gzip.decompress((folder / "page.json.gz").read_bytes()))
     experiment = (TOP / "experiments" / "all_seven.yaml").read_text()
     scenarios = re.search(r"^      scenario: (.+)$", experiment, re.MULTILINE)
-    names = ", ".join(world["name"] for world in pack["worlds"])
+    names = "; ".join(world["name"] for world in pack["worlds"])
     count = f"{len(pack['worlds'])} of {len(scenarios[1].split(','))}" if scenarios else ""
     text = (folder / "report.md").read_text()
     _, first, second, *_ = text.split("\n\n")

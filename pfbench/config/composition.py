@@ -5,6 +5,7 @@ This module imports Hydra only on use and never imports torch, so that the comma
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 CHOICES = ("scenario", "noise", "filter", "model")  # groups that name a job
+
+_HYDRA_STATE = threading.RLock()  # Hydra has one state for all threads of a process
 
 
 @dataclass(frozen=True)
@@ -195,14 +198,15 @@ def _load_experiment(path: Path) -> Any:
 
 @contextmanager
 def _preserved_hydra_state() -> Iterator[None]:
-    """Clear Hydra's global state for one composition and restore it afterwards."""
+    """Clear Hydra's global state for one composition and restore it afterwards, in one thread at a time."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.hydra_config import HydraConfig
 
-    application, job = GlobalHydra.instance(), HydraConfig.instance()
-    saved = application.hydra, job.cfg
-    application.clear()
-    try:
-        yield
-    finally:
-        GlobalHydra.instance().hydra, HydraConfig.instance().cfg = saved
+    with _HYDRA_STATE:
+        application, job = GlobalHydra.instance(), HydraConfig.instance()
+        saved = application.hydra, job.cfg
+        application.clear()
+        try:
+            yield
+        finally:
+            GlobalHydra.instance().hydra, HydraConfig.instance().cfg = saved

@@ -1,5 +1,11 @@
 """Public names of `pfbench.core` and the modules that define them."""
 
+from pfbench.core.chart import (
+    AngleBlock as AngleBlock,
+    Chart as Chart,
+    EuclideanBlock as EuclideanBlock,
+)
+from pfbench.core.distribution_sampling import NumberSource as NumberSource
 from pfbench.core.random_stream import PhiloxStream as PhiloxStream, RandomStream as RandomStream
 from pfbench.core.record import (
     Episode as Episode,

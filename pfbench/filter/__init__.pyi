@@ -2,9 +2,12 @@
 
 from pfbench.filter.belief import (
     Filter as Filter,
+    GaussianBelief as GaussianBelief,
     ParticleBelief as ParticleBelief,
+    gather_ancestors as gather_ancestors,
     normalise_log_weights as normalise_log_weights,
 )
+from pfbench.filter.exactness import is_every_part_exact as is_every_part_exact
 from pfbench.filter.gaussian.covariance_matching import (
     MatrixNoiseAdaptation as MatrixNoiseAdaptation,
 )

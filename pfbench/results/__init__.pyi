@@ -1,5 +1,6 @@
 """Public names of `pfbench.results` and the modules that define them."""
 
+from pfbench.results.decisions.options import DecisionOptions as DecisionOptions
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs as decide_planned_pairs
 from pfbench.results.decisions.sentences import describe_pair as describe_pair
 from pfbench.results.decisions.tidy_table import tidy_runs as tidy_runs
@@ -17,6 +18,7 @@ from pfbench.results.statistics.signed_rank import (
     holm as holm,
     wilcoxon_signed_rank as wilcoxon_signed_rank,
 )
+from pfbench.results.statistics.study_size import detectable_effects as detectable_effects
 from pfbench.results.status import is_diverged as is_diverged
 from pfbench.results.store import read_metadata as read_metadata
 from pfbench.results.until_decided.look_lines import (

@@ -225,7 +225,8 @@ def _check_equal(items: Sequence[_Described], names: Sequence[str], where: str) 
             )
             raise ValueError(
                 f"{name} must be equal in {where}, but its results differ in {name} ({listed}). "
-                "Delete the files that do not belong and repeat their jobs, or set report.allow_mixed_versions=true."
+                "Delete the files that do not belong and repeat their jobs, or set report.allow_mixed_versions=true "
+                "(from Python allow_mixed_versions=True)."
             )
 
 
