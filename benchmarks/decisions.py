@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from pfbench.files import write_atomically
+from pfbench.results import DecisionOptions
 from pfbench.results.decisions import words
 from pfbench.results.decisions.family_tests import decide_family, stack_questions
-from pfbench.results.decisions.options import DecisionOptions
 from pfbench.results.decisions.simulated_studies import StudySetting, assess_pairs
 
 HERE = Path(__file__).parent
