@@ -30,8 +30,16 @@ PACKS = {
     "single": page_packs.build_pack(1, 1, 1, 1),
     "lost": page_packs.build_pack(4, 2, 1, 6, lost=range(4)),
     "equal": page_packs.build_pack(5, 2, 2, 8, equal=True),
+    "budget": page_packs.build_pack(8, 1, 1, 8, names=dict.fromkeys(range(8), "DMC-PF (printed) [1000]")),
     "many": page_packs.build_pack(33, 7, 4, 4, carried=0, instants=10, numbered=True),
 }  # fmt: skip
+
+
+FITTING = ["f1", "f4", "f6"]  # filters at equal time
+PACKS["budget"]["budgets"][1] |= {"reason_missing": None, "filters": FITTING, "words": "up to 2 ms"}
+for view in PACKS["budget"]["views"].values():  # times of rounds make the widest board
+    for row in view["rows"]:
+        row |= {"ms_low": 10.8 * row["ms"], "ms_high": 11.2 * row["ms"], "ms": 11.0 * row["ms"]}
 
 
 @pytest.fixture(scope="module")
@@ -285,6 +293,31 @@ def test_the_address_holds_the_view(visit):
     strange = visit(address="#metric=none&world=<img>&sort=__proto__")
     shown = strange.evaluate("axes.map((axis) => state[axis])")
     assert tuple(shown) == next(iter(PACKS["usual"]["views"]))
+
+
+def test_equal_time_shows_its_filters_alone(visit):
+    page = visit("budget")
+    shown = "[...document.querySelectorAll('#rows > tr')].map((row) => row.dataset.filter)"
+    assert len(page.evaluate(shown)) == 8
+    page.click("[data-budget=time]")
+    assert sorted(page.evaluate(shown)) == FITTING
+    assert "budget=time" in page.evaluate("location.hash")
+    address = page.evaluate("location.hash")
+    assert sorted(visit("budget", address=address).evaluate(shown)) == FITTING
+    page.click("[data-budget=particles]")
+    assert len(page.evaluate(shown)) == 8
+    assert "budget" not in page.evaluate("location.hash")
+
+
+def test_the_front_has_all_that_no_other_beats(visit):
+    rng = np.random.default_rng(2)
+    rows = [{"ms": m, "ratio": r} for m, r in rng.uniform(0, 1, (40, 2)).tolist()]
+    front = [
+        row
+        for row in sorted(rows, key=lambda row: row["ms"])
+        if not any(o["ms"] < row["ms"] and o["ratio"] < row["ratio"] for o in rows)
+    ]
+    assert visit("single").evaluate("(rows) => frontOf(rows)", rows) == front
 
 
 def test_dark_colours_follow_the_system_and_the_button(visit):

@@ -14,7 +14,7 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.study_page import write_page
 from pfbench.report.study_page.encoding import encode_pack, encode_views
 from pfbench.report.study_page.number_codes import encode_decimals, encode_levels
-from pfbench.report.study_page.opening import find_front, format_short
+from pfbench.report.study_page.opening import format_short
 
 
 def write(pack, path):
@@ -231,18 +231,3 @@ def test_report_md_is_one_screen_with_every_filter(tmp_path):
 )  # fmt: skip
 def test_numbers_have_three_digits(value, text):
     assert format_short(value) == text
-
-
-def test_the_front_has_all_that_no_other_beats():
-    rng = np.random.default_rng(2)
-    rows = [
-        {"filter": str(i), "ms": m, "ratio": r}
-        for i, (m, r) in enumerate(rng.uniform(0, 1, (40, 2)))
-    ]
-    expected = {
-        row["filter"]
-        for row in rows
-        if not any(o["ms"] < row["ms"] and o["ratio"] < row["ratio"] for o in rows)
-    }  # fmt: skip
-    rows.append({"filter": "lost", "ms": 0.0, "ratio": None})
-    assert set(find_front(rows)) == expected

@@ -14,12 +14,7 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record, map_inputs
-from pfbench.filter.belief import (
-    Filter,
-    GaussianBelief,
-    ParticleBelief,
-    StepInfo,
-)
+from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo
 from pfbench.filter.loop import MultiStepFilter
 from pfbench.filter.particle.compiled_step import (
     CallCounter,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,7 +34,7 @@ from pfbench.filter.robust.weight_functions import (
 
 
 @dataclass(frozen=True)
-class MEstimationUpdate(ResidualLoss, ABC):
+class MEstimationUpdate(ResidualLoss):
     """Iterated reweighting by the residual after the update.
 
     It minimises |xi|^2 / 2 + sum rho(d) over the groups of components, with d the distance of the

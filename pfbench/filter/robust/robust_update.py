@@ -6,6 +6,7 @@ to the model. Since it depends on y, the evidence of the filter is not a density
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -49,7 +50,7 @@ class RobustUpdate(NoiseAdaptation):
         return predicted
 
 
-class ResidualLoss(RobustUpdate):
+class ResidualLoss(RobustUpdate, ABC):
     """Base of the updates that follow from a loss of the residual, a function of its distance.
 
     Attributes:
@@ -58,6 +59,7 @@ class ResidualLoss(RobustUpdate):
 
     is_density: bool = False
 
+    @abstractmethod
     def residual_weight(self, squared: Tensor, size: Tensor) -> Tensor:
         """Compute the weight of groups.
 
@@ -65,8 +67,8 @@ class ResidualLoss(RobustUpdate):
             squared: Squared distances d^2 of the residual by group.
             size: Observed components of the group.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
         """Compute minus the loss of groups in whitened coordinates, with its constant.
 
@@ -74,12 +76,12 @@ class ResidualLoss(RobustUpdate):
             squared: Squared distances d^2 of the residual by group.
             size: Observed components of the group.
         """
-        raise NotImplementedError
 
 
-class InnovationWeight(RobustUpdate):
+class InnovationWeight(RobustUpdate, ABC):
     """Base of the updates that weigh a measurement by the innovation, in one step."""
 
+    @abstractmethod
     def innovation_weight(
         self, innovation: Innovation, memory: Mapping[str, Tensor]
     ) -> tuple[Tensor, GroupDistances, dict[str, Tensor]]:
@@ -92,7 +94,6 @@ class InnovationWeight(RobustUpdate):
         Returns:
             Weights [R, k], 0 for a rejected component, the groups, and values by name, [R, ...].
         """
-        raise NotImplementedError
 
 
 def updated_residual(innovation: Innovation) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from pfbench.core.derived_stream import relabel
 from pfbench.core.random_stream import BatchRandomStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
-from pfbench.filter.loop import run_filter
+from pfbench.filter.loop import prepare_record, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.resampling import EssResampler, Resampler
 from pfbench.filter.smoothing.backward_samplers import (
@@ -66,7 +66,7 @@ def sample_trajectories(
         raise ValueError(f"trajectories: paths must be at least 1, got {paths}. Increase it.")
     check_no_feedback(record)
     sampler = sampler or ExactBackwardSampler()
-    inputs = model.prepare(record.to(model.anchor)).to(model.anchor)
+    inputs = prepare_record(model, record)
     _check_dense(model, inputs, record)
     clouds, parents, lost = _filter_forward(method, model, record, draws, sampler)
     x, log_w = clouds[-1]

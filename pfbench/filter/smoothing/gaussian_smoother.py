@@ -13,7 +13,7 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, StepInfo
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
-from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.loop import FilterResult, prepare_record, run_filter
 from pfbench.model.base import StateSpaceModel
 
 
@@ -67,7 +67,7 @@ def smooth(method: GaussianFilter, model: StateSpaceModel, record: Record) -> Sm
 
     runs = torch.arange(len(record.y))
     filtered = run_filter(method, model, record, PhiloxStream(0, runs), store)
-    inputs, chart = model.prepare(record.to(model.anchor)).to(model.anchor), model.chart
+    inputs, chart = prepare_record(model, record), model.chart
     mean, covariance = filtered_moments[-1]
     means, covariances = [mean], [covariance]
     for t in reversed(range(len(filtered_moments) - 1)):

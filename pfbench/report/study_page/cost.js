@@ -1,3 +1,10 @@
+// The filters that no other beats in both ratio and cost, by cost.
+function frontOf(rows) {
+  let least = Infinity;
+  const beaten = ({ ratio }) => ratio >= least || ((least = ratio), false);
+  return [...rows].sort((a, b) => a.ms - b.ms || a.ratio - b.ratio).filter((row) => !beaten(row));
+}
+
 // Error ratio against the cost of a step, with the steps of the filters that no other beats in both.
 function drawCost(part) {
   const rows = view().rows.filter((row) => row.ratio > 0 && row.ms > 0);
@@ -26,17 +33,11 @@ function drawCost(part) {
     ' class="axis" text-anchor="middle"',
   );
   content += `<text class="axis" transform="translate(11 ${(top + height - bottom) / 2}) rotate(-90)" text-anchor="middle">${esc(`error ÷ ${cut(looks[state.baseline].name, 20)} (log) → worse`)}</text>`;
-  const front = view()
-    .front.map((key) => rows.find((row) => row.filter === key))
-    .filter(Boolean);
-  if (front.length) {
-    const path = front
-      .map((row, k) =>
-        k ? `H${px(x(row.ms))}V${px(inside(row.ratio))}` : `M${px(x(row.ms))} ${px(inside(row.ratio))}`,
-      )
-      .join("");
-    content += `<path d="${path}H${px(width - right)}" fill="none" stroke="var(--faint)" stroke-dasharray="1.5 3"/>`;
-  }
+  const front = frontOf(rows);
+  const path = front
+    .map((row, k) => (k ? `H${px(x(row.ms))}V${px(inside(row.ratio))}` : `M${px(x(row.ms))} ${px(inside(row.ratio))}`))
+    .join("");
+  content += `<path d="${path}H${px(width - right)}" fill="none" stroke="var(--faint)" stroke-dasharray="1.5 3"/>`;
   const boxes = rows.map((row) => [x(row.ms) - 6, inside(row.ratio) - 6, x(row.ms) + 6, inside(row.ratio) + 6]);
   for (const row of rows) {
     const look = looks[row.filter];
@@ -48,7 +49,7 @@ function drawCost(part) {
     content += `<g${spoken(words)}>${mark(looks[row.filter], x(row.ms), inside(row.ratio), 5)}</g>`;
   }
   const important = (row) =>
-    looks[row.filter].proposed ? 0 : view().front.includes(row.filter) || row.filter === state.baseline ? 1 : 2;
+    looks[row.filter].proposed ? 0 : front.includes(row) || row.filter === state.baseline ? 1 : 2;
   for (const row of [...rows].sort((a, b) => important(a) - important(b)))
     content += nameBeside(row, x(row.ms), inside(row.ratio), y(row.ratio), boxes, [left, top, width, height - bottom]);
   const first = looks[view().rows[0].filter].name;

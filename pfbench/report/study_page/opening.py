@@ -174,25 +174,6 @@ def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
     ]
 
 
-def find_front(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the filters that no other filter beats in both ratio and cost, by cost.
-
-    Args:
-        rows: Rows of a view.
-    """
-    points = sorted(
-        (row["ms"], row["ratio"], row["filter"])
-        for row in rows
-        if row["ms"] is not None and row["ratio"] is not None
-    )
-    front, least = [], float("inf")
-    for _, ratio, key in points:
-        if ratio < least:
-            least = ratio
-            front.append(key)
-    return front
-
-
 def _name(items: Sequence[Mapping[str, Any]], key: str) -> str:
     """Return the name of a key."""
     return next((str(item["name"]) for item in items if item["key"] == key), key)

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.study_page.encoding import encode_pack
 from pfbench.report.study_page.equal_time import offer_budgets
-from pfbench.report.study_page.opening import describe_opening, describe_pairs, find_front
+from pfbench.report.study_page.opening import describe_opening, describe_pairs
 from pfbench.report.writers import template_environment
 
 PAGE_BYTES = 1_500_000
@@ -48,10 +48,7 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
     Raises:
         ValueError: If a colour is not of the form #rrggbb.
     """
-    views = {
-        key: {**view, "front": find_front(view["rows"])} for key, view in pack["views"].items()
-    }
-    pack = {**dict.fromkeys(_OPTIONAL, ()), **pack, "views": views}
+    pack = {**dict.fromkeys(_OPTIONAL, ()), **pack}
     pack["budgets"] = offer_budgets(pack)
     names = {look["key"]: look["name"] for look in pack["filters"]}
     context = {

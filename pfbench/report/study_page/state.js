@@ -98,7 +98,7 @@ const budgetOf = () => data.budgets.find((budget) => budget.key === state.budget
 function view() {
   const whole = viewOf(axes.map((axis) => state[axis]));
   const { filters } = budgetOf();
-  return filters ? { ...whole, rows: whole.rows.filter((row) => filters.includes(row.filter)), front: [] } : whole;
+  return filters ? { ...whole, rows: whole.rows.filter((row) => filters.includes(row.filter)) } : whole;
 }
 const single = (cell) => viewOf([state.metric, cell.world, cell.regime, state.baseline]);
 

@@ -79,7 +79,9 @@ def test_noise_of_the_velocity_is_no_other_unit(tmp_path: Path) -> None:
     table["pd"] = 3.0 + 0.2 * np.cos(0.5 * table["t"])
     table["vd"] = -0.1 * np.sin(0.5 * table["t"]) + np.repeat(noise[::20], 20)[: len(noise)]
     write(tmp_path, {"reference": table})
-    read_motion(tmp_path, "reference", [40.0, -105.0, 1500.0])
+    motion = read_motion(tmp_path, "reference", [40.0, -105.0, 1500.0])
+    np.testing.assert_allclose(motion.pos[:, 2].numpy(), 1500.0 - table["pd"], atol=1e-9)
+    np.testing.assert_allclose(motion.vel[:, 2].numpy(), -table["vd"], atol=1e-9)
 
 
 @pytest.mark.parametrize(
