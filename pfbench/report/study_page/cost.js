@@ -39,6 +39,7 @@ function drawCost(part) {
     .join("");
   content += `<path d="${path}H${px(width - right)}" fill="none" stroke="var(--faint)" stroke-dasharray="1.5 3"/>`;
   const boxes = rows.map((row) => [x(row.ms) - 6, inside(row.ratio) - 6, x(row.ms) + 6, inside(row.ratio) + 6]);
+  boxes.push([left, y(1) - 1, width - right, y(1) + 1]); // the line of the baseline
   for (const row of rows) {
     const look = looks[row.filter];
     if (row.ratio_low > 0)
