@@ -153,7 +153,8 @@ class ParticleFilter(Filter):
         """Draw N equally weighted particles of the initial distribution."""
         if self.initial_proposal is not None:
             raise ValueError(
-                "filter.initial_proposal needs the record. Use run_filter or remove the proposal."
+                "filter.initial_proposal needs the record, got a start without it. Use the filter "
+                "alone, by run_filter, not inside another filter, or remove the proposal."
             )
         initial: Any = initial_law(model, runs, spread)
         x = draw_initial_state(model, initial, self.points(draws), "initial", self.particles, start)

@@ -1,14 +1,22 @@
 """The proposal of the initial state: unbiased evidence by any guide, and particles that survive sharp first measurements."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
+from config_cases import composed
+from filter_cases import method_of
 
+from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
+    SigmaPointLinearisation,
+    TaylorLinearisation,
+)
 from pfbench.filter.gaussian.noise_adaptation import FadingMemory
 from pfbench.filter.guided.initial_guide import GuidedInitialProposal
 from pfbench.filter.loop import run_filter
@@ -17,9 +25,11 @@ from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.noise.white import NominalNoise
 from pfbench.testing import check_evidence, run_kalman_filter
 
 GUIDE = GaussianFilter(TaylorLinearisation())
+CKF = GaussianFilter(SigmaPointLinearisation(CubaturePoints()))
 # a wide start and measurements much sharper than it, with small noise: what decides is who survives the first steps
 SHARP = LinearGaussian(
     [[1.0, 1.0], [0.0, 1.0]], [[0.0], [0.1]], [[1.0, 0.0]], [0.2], [0.0, 0.0], [5.0, 2.0]
@@ -94,3 +104,19 @@ def test_what_has_no_initial_proposal_says_why() -> None:
         GuidedInitialProposal(
             GaussianFilter(TaylorLinearisation(), noise_adaptations=[FadingMemory()])
         )
+
+
+def test_the_configured_filter_is_sir_with_this_start() -> None:
+    """More of its particles fit the first measurement of passive location, whose start is wide."""
+    named, sir = method_of("guided_start"), method_of("sir")
+    assert named == replace(sir, initial_proposal=GuidedInitialProposal(CKF))
+    assert named.is_exact
+    chosen = composed("scenario=passive_1")
+    model, runs = job.instantiate(chosen["model"]), torch.arange(20)
+    record = job.instantiate(chosen["scenario"]).draw(NominalNoise(), runs, 3).record
+    draws, first = PhiloxStream(2, runs), record.select_steps(slice(0, 1))
+    ess = [
+        float(run_filter(replace(m, particles=300), model, first, draws).trace["ess"].mean())
+        for m in (named, sir)
+    ]
+    assert ess[0] > 3.0 * ess[1], ess
