@@ -102,7 +102,7 @@ def decide_study(
     values = [*metrics.values(), *(others or {}).values()]
     tables = {rule.name: table for rule, table in zip(rules, values, strict=True)}
     secondary = decide_secondary_metrics(tables, pairs, rules, settings) if pairs else []
-    common, _ = select_common_runs(tidy)
+    common = select_common_runs(tidy)
     orders = order_filters(common, rule, settings, planned) if len(common) else ()
     return [
         *planned, *secondary, *(d for order in orders for d in order.decisions if d not in planned)

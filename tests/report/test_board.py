@@ -24,6 +24,7 @@ from pfbench.report.board.levels import (
 )
 from pfbench.report.board.planned import decide_planned, planned_entries
 from pfbench.report.board.sentence import describe_view
+from pfbench.report.board.study_views import StudyNames, build_views
 from pfbench.report.board.view import (
     BoardRow,
     Scope,
@@ -149,6 +150,32 @@ def test_lost_runs_and_missing_conditions() -> None:
     part = part[(part["filter"] != "ukf") | (part["scenario"] == "w0")]
     assert board(part)["ukf"].verdict == "missing"
     assert board(part)["ukf"].rank is None
+
+
+def test_filters_are_compared_where_all_of_them_were_run() -> None:
+    data = table()
+    part = data[data["filter"].eq("sir") | data["scenario"].eq("w0")]
+    looks = find_looks(list(EFFECTS))
+    worlds = {w: PartName(w, w, "", "m", None, w) for w in ("w0", "w1")}
+    names = StudyNames(looks, worlds, {}, ["sir"])
+    views = build_views(part, names, ReportOptions(), {("ukf", "mcmc_rpf"): "equivalent"})
+    opening = next(iter(views.values()))
+    common = board(data[data["scenario"] == "w0"])
+    assert [row["filter"] for row in opening["rows"]] == list(common)
+    for row in opening["rows"]:
+        expected = common[row["filter"]]
+        assert row["ratio"] == pytest.approx(expected.ratio, rel=1e-3)
+        assert row["verdict"] == expected.verdict  # the planned word is of more conditions
+    assert opening["sentence"].startswith(
+        "2 of 4 conditions are compared: not all 3 filters were run in the others. [[MCMC-RPF]] has"
+    )
+    whole = next(iter(build_views(data, names, ReportOptions(), {}).values()))
+    assert "compared:" not in whole["sentence"]
+    apart = data[data["filter"].eq("sir") != data["scenario"].eq("w0")]
+    split = next(
+        iter(build_views(apart[apart["filter"] != "ukf"], names, ReportOptions(), {}).values())
+    )
+    assert "No filter has an error to compare" in split["sentence"]
 
 
 def test_the_planned_word_decides() -> None:

@@ -29,6 +29,7 @@ from pfbench.report.setting_names import describe_data_settings, describe_settin
 from pfbench.results.error_measures import Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.step_times import StepTimes
+from pfbench.results.study_decisions.common_conditions import select_conditions
 
 
 class ViewKey(NamedTuple):
@@ -85,14 +86,17 @@ def build_views(
     baselines: list[str] = []
     for metric in list_metrics(table, options.metric):
         levels = compute_condition_levels(runs, metric)
-        for world, regime, mask in _list_scopes(runs.conditions):
+        for world, regime, whole in _list_scopes(runs.conditions):
+            mask = _select_common(runs, whole)
             selected = runs.select(mask)
             of_scope = groups.loc[list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))]  # fmt: skip
             scope = _assess_scope(selected, levels, mask, of_scope, options)
             scope = scope._replace(times=[(times or {}).get(key, {}) for key in of_scope.index])
             is_opening = (metric, world, regime) == (options.metric, ALL, ALL)
-            view_options = ViewOptions(
-                options.alpha, options.equivalence_margin, words if is_opening else None
+            view_options = ViewOptions(  # planned words are of all conditions of a pair
+                options.alpha,
+                options.equivalence_margin,
+                words if is_opening and mask.sum() == whole.sum() else None,
             )
             where = _describe_scope(selected.conditions, names)
             name = METRIC_NAMES[metric]
@@ -114,7 +118,8 @@ def build_views(
             for baseline in baselines:
                 rows = build_rows(scope, baseline, view_options)
                 views[ViewKey(metric, world, regime, baseline)] = {
-                    "sentence": describe_view(
+                    "sentence": _describe_common(mask, whole, len(rows))
+                    + describe_view(
                         rows,
                         names.looks,
                         baseline,
@@ -147,6 +152,22 @@ def _list_scopes(conditions: pd.DataFrame) -> Iterator[tuple[str, str, Flags]]:
             )
             if mask.any():
                 yield world, regime, mask.to_numpy()
+
+
+def _select_common(runs: StudyArrays, mask: Flags) -> Flags:
+    """Select the conditions of a scope in which its filters are compared; all if none is common."""
+    present = runs.present.any(axis=2) & mask
+    common = select_conditions(present).conditions
+    return common if common.any() else mask
+
+
+def _describe_common(mask: Flags, whole: Flags, filters: int) -> str:
+    """State that filters are compared in a part of the conditions; empty if in all."""
+    if mask.sum() == whole.sum():
+        return ""
+    count = f"{mask.sum()} of {count_words(int(whole.sum()), 'condition')}"
+    verb = "is" if mask.sum() == 1 else "are"
+    return f"{count} {verb} compared: not all {filters} filters were run in the others. "
 
 
 def _assess_scope(

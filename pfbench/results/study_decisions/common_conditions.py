@@ -1,61 +1,63 @@
-"""Runs from which an order of filters can be taken if a filter lacks a condition."""
+"""Conditions in which filters can be ordered if a filter lacks some of them."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
-from pfbench.results.conditions import natural_sort_key
+from pfbench.results.error_measures import Flags
 
 _CONDITION = ["scenario", "regime"]
 
 
-class CommonRuns(NamedTuple):
-    """Runs of several filters in the same conditions.
+class CommonConditions(NamedTuple):
+    """Filters and conditions of which every pair has results.
 
     Attributes:
-        table: Table of `to_study_runs`; empty if no two filters share a condition.
-        text: Sentence on what is left out; empty if nothing is.
+        filters: Selected filters, [F].
+        conditions: Selected conditions, [C].
     """
 
-    table: pd.DataFrame
-    text: str
+    filters: Flags
+    conditions: Flags
 
 
-def select_common_runs(table: pd.DataFrame) -> CommonRuns:
-    """Select the runs from which an order of filters is taken.
+def select_conditions(present: Flags) -> CommonConditions:
+    """Select the conditions that all filters have, or the filters that have all conditions.
 
-    The order uses the conditions that all filters have, or the filters that have all conditions:
-    whichever keeps more results. If both keep equally many, no filter is left out.
+    The selection that keeps more results wins. If both keep equally many, no filter is left out.
+    If neither has two filters, nothing is selected.
+
+    Args:
+        present: Whether a filter has results in a condition, [F, C]. Filters without any result
+            and conditions without any are left out.
+    """
+    filters, conditions = present.any(axis=1), present.any(axis=0)
+    shared = conditions & present[filters].all(axis=0)
+    complete = filters & present[:, conditions].all(axis=1)
+    keeps_filters = filters.sum() * shared.sum() if filters.sum() >= 2 else 0
+    keeps_conditions = complete.sum() * conditions.sum() if complete.sum() >= 2 else 0
+    if keeps_filters == keeps_conditions == 0:
+        return CommonConditions(np.zeros_like(filters), np.zeros_like(conditions))
+    if keeps_conditions > keeps_filters:
+        return CommonConditions(complete, conditions)
+    return CommonConditions(filters, shared)
+
+
+def select_common_runs(table: pd.DataFrame) -> pd.DataFrame:
+    """Select the runs of `select_conditions`, from which an order of filters is taken.
 
     Args:
         table: Table of `to_study_runs`.
 
     Returns:
-        The runs of at least two filters in the same conditions.
+        The runs of at least two filters in the same conditions; empty if there are none.
     """
-    results = table[["filter", *_CONDITION]].drop_duplicates()
-    filters = sorted(map(str, results["filter"].unique()), key=natural_sort_key)
-    per_condition = results.groupby(_CONDITION, sort=False)["filter"].size()
-    per_filter = results.groupby("filter")["filter"].size()
-    count = len(per_condition)
-    shared = per_condition[per_condition == len(filters)].index
-    complete = [name for name in filters if per_filter[name] == count]
-    if len(filters) < 2 or (len(complete) < 2 and not len(shared)):
-        return CommonRuns(table.iloc[:0], "")
-    if len(complete) == len(filters):
-        return CommonRuns(table, "")
-    if len(complete) >= 2 and len(complete) * count > len(filters) * len(shared):
-        missing = [name for name in filters if name not in complete]
-        text = (
-            f"Order of the {len(complete)} filters that have all {count} conditions. "
-            f"Without {', '.join(missing)}."
-        )
-        return CommonRuns(table[table["filter"].astype(str).isin(complete)], text)
-    keys = pd.MultiIndex.from_frame(table[_CONDITION])
-    noun = "condition" if len(shared) == 1 else "conditions"
-    text = (
-        f"Order over {len(shared)} of {count} {noun}: those that all {len(filters)} filters have."
-    )
-    return CommonRuns(table[keys.isin(shared)], text)
+    labels, filters = pd.factorize(table["filter"])
+    names, conditions = pd.factorize(pd.MultiIndex.from_frame(table[_CONDITION]))
+    present = np.zeros((len(filters), len(conditions)), dtype=bool)
+    present[labels, names] = True
+    selected = select_conditions(present)
+    return table[selected.filters[labels] & selected.conditions[names]]
