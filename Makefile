@@ -18,7 +18,7 @@ demo: $(VENV)/.installed        ## quickstart study: run, compare, report
 	$(BIN)/pfbench run -m +experiment=quickstart
 	$(BIN)/pfbench report study=quickstart
 
-report: $(VENV)/.installed      ## all reports, from results/
+report: $(VENV)/.installed      ## all reports, from results/ or stored runs
 	$(BIN)/pfbench report all
 	$(BIN)/python docs/publish_reports.py
 

@@ -1,4 +1,8 @@
-"""Data of a page as a file, from which the page is written again where the results are missing."""
+"""Data of a page as a file, from which the page is written again where the results are missing.
+
+All that follows from the runs is decided again from runs.parquet, so that a published page has the
+rules and the words of the program. Times, tracks and curves are those of the file.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+import pyarrow as pa
+
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.board.decided_parts import StudyFacts, decide_parts
+from pfbench.report.board.verdict_files import format_verdicts
 from pfbench.report.journal.references import renew_bibliography
 from pfbench.report.study_page import write_page
 
@@ -44,6 +53,8 @@ def read_page_data(folder: Path) -> dict[str, Any]:
     path = folder / PAGE_DATA
     try:
         pack: dict[str, Any] = json.loads(gzip.decompress(path.read_bytes()))
+        if "facts" not in pack:
+            raise ValueError("no facts of its decisions")
         for name in _KEYED:
             keys = [tuple(key) for key in pack[name]["keys"]]
             pack[name] = dict(zip(keys, pack[name]["values"], strict=True))
@@ -54,17 +65,51 @@ def read_page_data(folder: Path) -> dict[str, Any]:
     return pack
 
 
+def decide_again(pack: Mapping[str, Any], runs: Path) -> dict[str, Any]:
+    """Decide the parts of a page again from the runs of a study.
+
+    Args:
+        pack: Data of the page.
+        runs: File runs.parquet of the report.
+
+    Raises:
+        ValueError: If the file has no runs of the filters of the page.
+    """
+    try:
+        table = pd.read_parquet(runs)
+        labels = {look["key"] for look in pack["facts"]["looks"]}
+        if missing := labels - set(table["filter"]):
+            raise ValueError(f"no runs of {', '.join(sorted(missing))}")
+        parts = decide_parts(table, StudyFacts.from_pack(pack))
+    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
+        raise ValueError(
+            f"{runs} must have the runs of the page beside it, got {error}. "
+            "Run the study and write its report again."
+        ) from error
+    return {**pack, **parts}
+
+
 def rebuild_page(folder: Path) -> Path:
-    """Write index.html and report.md from the data of a page. Files that are missing are not offered.
+    """Write the page of a study again, from the data of the page and from its runs if they are there.
+
+    Files that are missing are not offered.
 
     Args:
         folder: Folder of the report.
 
     Returns:
         Path of index.html.
+
+    Raises:
+        ValueError: If a file is damaged.
     """
-    pack = read_page_data(folder)
+    pack, runs = read_page_data(folder), folder / "runs.parquet"
+    if has_runs := runs.is_file():
+        pack = decide_again(pack, runs)
     pack["bibtex"] = renew_bibliography(pack)
-    pack["downloads"] = [d for d in pack["downloads"] if (folder / d["href"]).is_file()]
     with RecordedFolder(folder, is_complete=False) as target:
+        if has_runs:
+            target.write("verdicts.csv", format_verdicts(pack))
+            write_page_data(pack, target)
+        pack["downloads"] = [d for d in pack["downloads"] if (folder / d["href"]).is_file()]
         return write_page(pack, target)

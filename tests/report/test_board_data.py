@@ -9,7 +9,7 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.report.board import build_pack
-from pfbench.report.board.pack import select_baselines
+from pfbench.report.board.decided_parts import select_baselines
 from pfbench.report.board.sweeps import read_settings
 from pfbench.report.board.tracks import select_telling_runs
 from pfbench.report.looks import find_looks

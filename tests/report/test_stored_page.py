@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import synthetic_results as synthetic
@@ -15,7 +17,12 @@ from command_line import pfbench
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import read_page_data, write_page_data
+from pfbench.report.board.decided_parts import StudyFacts
+from pfbench.report.looks import PartName, find_looks
+from pfbench.report.options import ReportOptions
 from pfbench.report.page import write_report
+from pfbench.report.stored_page import rebuild_page
+from pfbench.results.step_times import StepTimes
 
 
 @pytest.fixture(scope="module")
@@ -104,3 +111,46 @@ def test_a_table_of_the_readme_is_the_opening_view(
         names = ("value", "low", "high", "ratio", "ratio_low", "ratio_high")
         assert numbers_shown == pytest.approx([row[name] for name in names], rel=5e-3)
         assert cells[3] == f"{100 * row['track']:.0f} %"
+
+
+def test_a_stored_page_is_decided_again_from_its_runs(study: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(study, tmp_path / "demo"))
+    files = ("report.md", "verdicts.csv", "page.json.gz", "index.html")
+    first = {name: (folder / name).read_bytes() for name in files[:3]}
+    rebuild_page(folder)
+    assert first == {name: (folder / name).read_bytes() for name in first}
+    runs, rows = pd.read_parquet(folder / "runs.parquet"), pd.read_csv(folder / "verdicts.csv")
+    best = rows["filter"].iloc[0]
+    runs.loc[runs["filter"] == best, "rmse"] *= 50.0
+    runs.to_parquet(folder / "runs.parquet")
+    rebuild_page(folder)
+    changed = pd.read_csv(folder / "verdicts.csv").query("metric == 'rmse'")
+    assert changed["filter"].iloc[0] != best
+    ratios = [
+        table[(table["filter"] == best) & (table["baseline"] != best)]["ratio"].iloc[0]
+        for table in (rows, changed)
+    ]
+    assert ratios[1] == pytest.approx(50.0 * ratios[0], rel=1e-3)
+    runs[runs["filter"] != best].to_parquet(folder / "runs.parquet")
+    with pytest.raises(ValueError, match=rf"must have the runs of the page .* no runs of {best}"):
+        rebuild_page(folder)
+
+
+def test_facts_of_a_page_are_restored(study: Path) -> None:
+    pack = read_page_data(study)
+    times = StepTimes(np.array([1e-3, 2e-3, 4e-3]), "group")
+    regime = PartName("nominal", "Nominal", "nominal noise")
+    options = ReportOptions(alpha=0.01, equivalence_margin=0.1, metric="crps", baseline="sir")
+    cell = ("world", "nominal")
+    facts = StudyFacts(
+        find_looks(["ekf", "sir"]), {}, {"nominal": regime}, options, {cell: {"sir": times}},
+        [], "Runs are copies.", "Jobs differ.",
+    )  # fmt: skip
+    entries = json.loads(json.dumps(facts.to_entries()))
+    restored = StudyFacts.from_pack({**pack, "worlds": [], "failures": [], "facts": entries})
+    assert restored.times[cell]["sir"].seconds.tolist() == times.seconds.tolist()
+    assert restored.times[cell]["sir"].group == "group"
+    assert restored._replace(times=facts.times) == facts
+    entries["looks"][0]["key"] = "own_filter"  # not installed: the stored look
+    own = StudyFacts.from_pack({**pack, "worlds": [], "failures": [], "facts": entries})
+    assert own.looks["own_filter"].name == facts.looks["ekf"].name

@@ -73,6 +73,17 @@ def count_words(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def count_failing(number: int, total: int) -> str:
+    """Format the subject and verb of a sentence on the filters that do not keep track.
+
+    Args:
+        number: Number of these filters.
+        total: Number of all filters.
+    """
+    verb = "is lost or diverges" if number == 1 else "are lost or diverge"
+    return f"{number} of {count_words(total, 'filter')} {verb}"
+
+
 def _name(row: BoardRow, looks: Mapping[str, MethodLook]) -> str:
     return f"[[{looks[row.filter].name}]]"
 
@@ -100,17 +111,16 @@ def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]
         worst = min(off, key=lambda row: row.track)
         share = f"{100 * (1 - worst.track):.0f} %"
         if len(off) == 1:
-            text = f"{_name(worst, looks)} does not keep track in {share} of runs."
+            text = f"{_name(worst, looks)} is lost or diverges in {share} of runs."
         else:
             text = (
-                f"{len(off)} of {len(rows)} filters do not keep track in over a fifth of runs "
-                f"({_name(worst, looks)}: {share})."
+                f"{count_failing(len(off), len(rows))} in over a fifth of runs "
+                f"({_name(worst, looks)}: in {share})."
             )
     if without > len(off):
-        verb = "does" if without == 1 else "do"
         text += (
-            f" {without} of {count_words(len(rows), 'filter')} {verb} not keep track in over a fifth of the runs "
-            "of a condition, and no error of theirs is compared."
+            f" {count_failing(without, len(rows))} in over a fifth of the runs "
+            f"of at least one condition: no error of {'its' if without == 1 else 'theirs'} is compared."
         )
     if missing:
         verb = "was" if missing == 1 else "were"

@@ -20,7 +20,7 @@ from pfbench.report.board.levels import (
 )
 from pfbench.report.board.pack_entries import format_interval_level, list_metrics, round_values
 from pfbench.report.board.run_table import METRIC_NAMES
-from pfbench.report.board.sentence import count_words, describe_view
+from pfbench.report.board.sentence import count_failing, count_words, describe_view
 from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_filters
 from pfbench.report.journal.study_pack import ALL
 from pfbench.report.looks import MethodLook, PartName, describe_tuning
@@ -214,7 +214,7 @@ def _describe_hard_condition(scope: Scope, conditions: pd.DataFrame, names: Stud
         return ""
     hardest = conditions.iloc[[int(counts.argmax())]]
     return (
-        f"Over a fifth of runs do not keep track in {counts.max()} of {count_words(len(scope.filters), 'filter')} "
+        f"{count_failing(int(counts.max()), len(scope.filters))} in over a fifth of runs "
         f"{_describe_scope(hardest, names)}, the most of a condition."
     )
 

@@ -14,8 +14,7 @@ from pfbench.report.board.study_data import StudyData, read_study
 from pfbench.report.board.study_views import ViewKey
 from pfbench.report.options import ReportOptions
 from pfbench.report.table_formats import format_csv
-from pfbench.results import store
-from pfbench.results.conditions import Condition, differing_settings
+from pfbench.results.conditions import Condition
 
 
 def write_report_data(
@@ -39,8 +38,6 @@ def write_report_data(
     """
     data = data or read_study(conditions, options)
     pack = build_pack(study, conditions, options, data)
-    pack["failures"] = store.list_failures(conditions[0].jobs[0].path.parent)
-    _state_limits(pack, conditions)
     return pack | {"downloads": write_verdict_files(pack, data.table, folder)}
 
 
@@ -57,15 +54,10 @@ def write_verdict_files(
     Returns:
         Entries of the downloads of the page.
     """
-    rows = [
-        {**dict(zip(ViewKey._fields, key, strict=True)), **row}
-        for key, view in pack["views"].items()
-        for row in view["rows"]
-    ]
     buffer = io.BytesIO()
     table.to_parquet(buffer, index=False, compression="zstd")
     contents: list[tuple[str, str, str, str | bytes]] = [
-        ("Numbers", "Verdicts of all views (CSV)", "verdicts.csv", format_csv(pd.DataFrame(rows))),
+        ("Numbers", "Verdicts of all views (CSV)", "verdicts.csv", format_verdicts(pack)),
         ("Numbers", "Values of all runs (Parquet)", "runs.parquet", buffer.getvalue()),
         ("LaTeX", "References (BibTeX)", "pfbench.bib", pack["bibtex"]),
     ]
@@ -76,17 +68,15 @@ def write_verdict_files(
     return downloads
 
 
-def _state_limits(pack: dict[str, Any], conditions: Sequence[Condition]) -> None:
-    """Put the number of failed jobs first in each view, and name conditions whose jobs differ in their data."""
-    number = len(pack["failures"])
-    jobs = "1 job failed and is" if number == 1 else f"{number} jobs failed and are"
-    differing = "".join(
-        f" Jobs of {condition.name} differ in {', '.join(settings)}: "
-        "their runs share random numbers, but not the data."
-        for condition in conditions
-        if (settings := differing_settings(condition.jobs))
-    )
-    for view in pack["views"].values():
-        view["small_print"] += differing
-        if number:
-            view["sentence"] = f"{jobs} missing from all tables. {view['sentence']}"
+def format_verdicts(pack: Mapping[str, Any]) -> str:
+    """Format all rows of all views as CSV.
+
+    Args:
+        pack: Data of the page.
+    """
+    rows = [
+        {**dict(zip(ViewKey._fields, key, strict=True)), **row}
+        for key, view in pack["views"].items()
+        for row in view["rows"]
+    ]
+    return format_csv(pd.DataFrame(rows))

@@ -22,6 +22,7 @@ _SCRIPTS = ("kit", "state", "board", "cost", "pairs", "worlds", "time", "runs", 
 _OPTIONAL = ("paper_figures", "failures", "definitions", "filter_notes", "choices", "robustness")
 _STATIC = (
     *_OPTIONAL,
+    "facts",
     "methods_paragraph",
     "bibtex",
     "provenance",

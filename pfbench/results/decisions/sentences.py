@@ -176,9 +176,9 @@ def _describe_trade_off(error: Decision) -> str:
         else f"different by {error.both_keep:.3g}"
     )
     return (
-        f"Trade-off in {format_worlds(error)}: {error.a} does not keep track in {off_a} %, {error.b} in {off_b} % of "
-        f"runs. If both keep it, the {error.metric} of {error.a} is {both}. The choice depends on the "
-        "cost of a track that is not kept."
+        f"Trade-off in {format_worlds(error)}: {error.a} is lost or diverges in {off_a} %, {error.b} in {off_b} % of "
+        f"runs. Where both keep track, the {error.metric} of {error.a} is {both}. The choice depends on the "
+        "cost of a run that is lost or diverges."
     )
 
 

@@ -34,9 +34,9 @@ def select_conditions(present: Flags) -> CommonConditions:
         present: Whether a filter has results in a condition, [F, C]. Filters without any result
             and conditions without any are left out.
     """
-    filters, conditions = present.any(axis=1), present.any(axis=0)
-    shared = conditions & present[filters].all(axis=0)
-    complete = filters & present[:, conditions].all(axis=1)
+    filters, conditions = np.asarray(present.any(axis=1)), np.asarray(present.any(axis=0))
+    shared = np.asarray(conditions & present[filters].all(axis=0))
+    complete = np.asarray(filters & present[:, conditions].all(axis=1))
     keeps_filters = filters.sum() * shared.sum() if filters.sum() >= 2 else 0
     keeps_conditions = complete.sum() * conditions.sum() if complete.sum() >= 2 else 0
     if keeps_filters == keeps_conditions == 0:
