@@ -62,7 +62,7 @@ def write_study_paper(words: Sequence[str]) -> None:
 
 def _decide_results(config: JobConfig, folder: RecordedFolder) -> dict[str, Any]:
     """Decide the results of a study, write the values of all views and runs, and return the data."""
-    from pfbench.report.board import write_report_data
+    from pfbench.report.verdict_files import write_report_data
     from pfbench.results.conditions import load_conditions
 
     study, results = config.values["study"], config.values["results_dir"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import cost, provenance, writers
-from pfbench.report.board import read_study, write_report_data
+from pfbench.report.board import read_study
 from pfbench.report.looks import study_looks
 from pfbench.report.options import ReportOptions
 from pfbench.report.plots.paper import paper_figures
@@ -15,6 +15,7 @@ from pfbench.report.plots.plotting import line_styles
 from pfbench.report.stored_page import write_page_data
 from pfbench.report.study_files import write_study_files
 from pfbench.report.study_page import write_page
+from pfbench.report.verdict_files import write_report_data
 from pfbench.results.conditions import (
     Condition,
     load_conditions,

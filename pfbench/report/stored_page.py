@@ -17,9 +17,9 @@ import pyarrow as pa
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.board.decided_parts import StudyFacts, decide_parts
-from pfbench.report.board.verdict_files import format_verdicts
 from pfbench.report.journal.references import renew_bibliography
 from pfbench.report.study_page import write_page
+from pfbench.report.verdict_files import format_verdicts
 
 PAGE_DATA = "page.json.gz"
 _OMITTED: dict[str, Any] = {"paper_figures": [], "tracks": {}}  # too large; they need the results

@@ -14,7 +14,6 @@ import pytest
 from scipy import stats
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report.board import write_verdict_files
 from pfbench.report.board.levels import (
     StudyArrays,
     arrange_runs,
@@ -35,6 +34,7 @@ from pfbench.report.board.view import (
 from pfbench.report.looks import PartName, find_looks
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_page.opening import describe_pairs
+from pfbench.report.verdict_files import write_verdict_files
 
 ONE_CONDITION = pd.DataFrame({"family": ["w"], "scenario": ["w"], "regime": ["nominal"]})
 EFFECTS = {"mcmc_rpf": -0.3, "sir": 0.0, "ukf": 0.5}

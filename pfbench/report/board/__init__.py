@@ -4,13 +4,10 @@ from pfbench.report.board.pack import build_pack
 from pfbench.report.board.run_table import build_run_table
 from pfbench.report.board.study_data import read_study
 from pfbench.report.board.study_views import ViewKey
-from pfbench.report.board.verdict_files import write_report_data, write_verdict_files
 
 __all__ = [
     "ViewKey",
     "build_pack",
     "build_run_table",
     "read_study",
-    "write_report_data",
-    "write_verdict_files",
 ]
