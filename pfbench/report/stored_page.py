@@ -73,7 +73,7 @@ def decide_again(pack: Mapping[str, Any], runs: Path) -> dict[str, Any]:
         runs: File runs.parquet of the report.
 
     Raises:
-        ValueError: If the file has no runs of the filters of the page.
+        ValueError: If the file lacks runs of a filter of the page.
     """
     try:
         table = pd.read_parquet(runs)
@@ -83,7 +83,7 @@ def decide_again(pack: Mapping[str, Any], runs: Path) -> dict[str, Any]:
         parts = decide_parts(table, StudyFacts.from_pack(pack))
     except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
         raise ValueError(
-            f"{runs} must have the runs of the page beside it, got {error}. "
+            f"{runs} must have the runs of the page in its folder, got {error}. "
             "Run the study and write its report again."
         ) from error
     return {**pack, **parts}

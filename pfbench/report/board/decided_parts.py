@@ -1,4 +1,4 @@
-"""Decided parts of a page: all that follows from the runs of a study, and what is needed beside them.
+"""Decided parts of a page: all that follows from the runs of a study, and its other inputs.
 
 A published study keeps its runs and these facts, so that its page is decided again without results.
 """
@@ -32,7 +32,7 @@ _OPTIONS = ("alpha", "equivalence_margin", "metric", "baseline")  # that decide
 
 
 class StudyFacts(NamedTuple):
-    """All that decisions need beside the runs.
+    """Inputs of decisions other than the runs.
 
     Attributes:
         looks: Looks by label.
@@ -104,7 +104,7 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
 
     Args:
         table: Table of `build_run_table`.
-        facts: All that decisions need beside it.
+        facts: Inputs of decisions other than the runs.
     """
     looks, worlds, options = facts.looks, facts.worlds, facts.options
     planned = decide_planned(table, looks, options)

@@ -86,8 +86,8 @@ def build_views(
     baselines: list[str] = []
     for metric in list_metrics(table, options.metric):
         levels = compute_condition_levels(runs, metric)
-        for world, regime, whole in _list_scopes(runs.conditions):
-            mask = _select_common(runs, whole)
+        for world, regime, in_scope in _list_scopes(runs.conditions):
+            mask = _select_common(runs, in_scope)
             selected = runs.select(mask)
             of_scope = groups.loc[list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))]  # fmt: skip
             scope = _assess_scope(selected, levels, mask, of_scope, options)
@@ -96,29 +96,23 @@ def build_views(
             view_options = ViewOptions(  # planned words are of all conditions of a pair
                 options.alpha,
                 options.equivalence_margin,
-                words if is_opening and mask.sum() == whole.sum() else None,
+                words if is_opening and mask.sum() == in_scope.sum() else None,
             )
             where = _describe_scope(selected.conditions, names)
             name = METRIC_NAMES[metric]
             if of_scope["group"].nunique() == 1:
                 name = f"{of_scope['group'].iloc[0]} {name}"
-            small_print = _small_print(selected, options, names)
-            small_print = " ".join(
-                filter(
-                    None,
-                    (
-                        small_print,
-                        _describe_hard_condition(scope, selected.conditions, names),
-                        _describe_timing(scope, options),
-                    ),
-                )
+            notes = (
+                _small_print(selected, options, names),
+                _describe_hard_condition(scope, selected.conditions, names),
+                _describe_timing(scope, options),
             )
             if not views:  # the page opens with a baseline that has an error
                 baselines = _order_baselines(scope, names.baselines)
             for baseline in baselines:
                 rows = build_rows(scope, baseline, view_options)
                 views[ViewKey(metric, world, regime, baseline)] = {
-                    "sentence": _describe_common(mask, whole, len(rows))
+                    "sentence": _describe_common(mask, in_scope, len(rows))
                     + describe_view(
                         rows,
                         names.looks,
@@ -128,7 +122,7 @@ def build_views(
                         format_interval_level(options.alpha),
                         partial(compare_track_shares, selected, alpha=options.alpha),
                     ),
-                    "small_print": small_print,
+                    "small_print": " ".join(filter(None, notes)),
                     "rows": [round_values(asdict(row)) for row in rows],
                 }
     return views
@@ -161,11 +155,11 @@ def _select_common(runs: StudyArrays, mask: Flags) -> Flags:
     return common if common.any() else mask
 
 
-def _describe_common(mask: Flags, whole: Flags, filters: int) -> str:
+def _describe_common(mask: Flags, in_scope: Flags, filters: int) -> str:
     """State that filters are compared in a part of the conditions; empty if in all."""
-    if mask.sum() == whole.sum():
+    if mask.sum() == in_scope.sum():
         return ""
-    count = f"{mask.sum()} of {count_words(int(whole.sum()), 'condition')}"
+    count = f"{mask.sum()} of {count_words(int(in_scope.sum()), 'condition')}"
     verb = "is" if mask.sum() == 1 else "are"
     return f"{count} {verb} compared: not all {filters} filters were run in the others. "
 

@@ -13,7 +13,7 @@ _CONDITION = ["scenario", "regime"]
 
 
 class CommonConditions(NamedTuple):
-    """Filters and conditions of which every pair has results.
+    """Filters and conditions such that each filter has results in each condition.
 
     Attributes:
         filters: Selected filters, [F].
