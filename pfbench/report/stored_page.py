@@ -53,8 +53,7 @@ def read_page_data(folder: Path) -> dict[str, Any]:
     path = folder / PAGE_DATA
     try:
         pack: dict[str, Any] = json.loads(gzip.decompress(path.read_bytes()))
-        if "facts" not in pack:
-            raise ValueError("no facts of its decisions")
+        pack["facts"]["looks"]  # a file of an early version has none
         for name in _KEYED:
             keys = [tuple(key) for key in pack[name]["keys"]]
             pack[name] = dict(zip(keys, pack[name]["values"], strict=True))
@@ -77,15 +76,18 @@ def decide_again(pack: Mapping[str, Any], runs: Path) -> dict[str, Any]:
     """
     try:
         table = pd.read_parquet(runs)
-        labels = {look["key"] for look in pack["facts"]["looks"]}
-        if missing := labels - set(table["filter"]):
-            raise ValueError(f"no runs of {', '.join(sorted(missing))}")
-        parts = decide_parts(table, StudyFacts.from_pack(pack))
+        missing = {look["key"] for look in pack["facts"]["looks"]} - set(table["filter"])
+        parts = {} if missing else decide_parts(table, StudyFacts.from_pack(pack))
     except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
         raise ValueError(
             f"{runs} must have the runs of the page in its folder, got {error}. "
             "Run the study and write its report again."
         ) from error
+    if missing:
+        raise ValueError(
+            f"{runs} must have runs of all filters of the page, got none of "
+            f"{', '.join(sorted(missing))}. Run the study and write its report again."
+        )
     return {**pack, **parts}
 
 

@@ -132,7 +132,9 @@ def test_a_stored_page_is_decided_again_from_its_runs(study: Path, tmp_path: Pat
     ]
     assert ratios[1] == pytest.approx(50.0 * ratios[0], rel=1e-3)
     runs[runs["filter"] != best].to_parquet(folder / "runs.parquet")
-    with pytest.raises(ValueError, match=rf"must have the runs of the page in its folder, got no runs of {best}"):
+    with pytest.raises(
+        ValueError, match=rf"must have runs of all filters of the page, got none of {best}"
+    ):
         rebuild_page(folder)
 
 
