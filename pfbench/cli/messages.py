@@ -153,7 +153,8 @@ def _format_unknown_choice(group: str, name: str, options: Sequence[str]) -> str
 def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> str:
     """Format an error of a class under the full key that the user gave."""
     location = re.search(r"full_key: (\S+)", text)
-    key = location[1] if location else "configuration"
+    # Hydra writes the place in a list without a point: filter.noise_adaptations0
+    key = re.sub(r"(?<=[a-z_])(\d+)(?=\.|$)", r".\1", location[1]) if location else "configuration"
     message = " ".join(f"{cause}".split())
     if unknown := re.search(r"got an unexpected keyword argument '(\w+)'", message):
         return _format_unknown_key(f"{key}.{unknown[1]}", words)
@@ -166,7 +167,10 @@ def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> st
             "installed. Install it, or set PYTHONPATH to its parent folder."
         )
     if type(cause) is not ValueError:
-        overrides = [word for word in words if word.lstrip("+").startswith(f"{key}.")]
+        overrides = [word.lstrip("+") for word in words if word.lstrip("+").startswith(f"{key}.")]
+        if len(overrides) == 1 and "not supported between instances of" in message:
+            name, _, value = overrides[0].partition("=")
+            return f"{name} must be a number, got {value}. Write it as 0.5 or 1e-3."
         source = " ".join(overrides) or "its YAML file"
         return f"{key}: a value is not valid ({type(cause).__name__}: {message}). Check {source}."
     match = re.match(r"(?:\w+\.)*(\w+)(?=[=:]| must | is not )", message)

@@ -47,6 +47,24 @@ def check_positive(name: str, values: Any) -> Tensor:
     return tensor
 
 
+def check_whole_number(name: str, value: Any, least: int, remedy: str) -> None:
+    """Check a whole number.
+
+    Args:
+        name: Configuration key, for the message.
+        value: Number.
+        least: Least value.
+        remedy: Sentence of the message that says what to do.
+
+    Raises:
+        ValueError: If the value is not a whole number, or is too small.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(
+            f"{name} must be a whole number of at least {least}, got {value}. {remedy}"
+        )
+
+
 def check_three_positive(name: str, values: Sequence[float]) -> Tensor:
     """Check and return three positive numbers, [3].
 

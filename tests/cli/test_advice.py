@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from command_line import pfbench
 
+from pfbench import job
 from pfbench.cli import messages
+from pfbench.config.composition import compose
 from pfbench.config.trust import split_trust
 from pfbench.results import store
 
@@ -154,6 +156,18 @@ def test_a_module_that_is_not_installed_is_named() -> None:
     message = messages.format_error(error)
     assert "filter._target_ must be importable, got mylab.A: the module mylib is not" in message
     assert "PYTHONPATH" in message
+
+
+def test_text_in_place_of_a_number_is_named_by_its_override() -> None:
+    """Hydra writes the place in a list without a point, and the class raises a TypeError."""
+    word = "filter.noise_adaptations.0.dof=four"
+    config = compose(["scenario=linear_walk", "filter=student", word])
+    with pytest.raises(Exception, match="not supported between instances") as caught:
+        job.build_plan(config)
+    message = messages.format_error(caught.value, ["filter=student", word])
+    assert message == (
+        "filter.noise_adaptations.0.dof must be a number, got four. Write it as 0.5 or 1e-3."
+    )
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import GainAdaptation, Innovation, NoiseAdaptation
 
@@ -63,13 +64,10 @@ def check_adaptations(
         iterations: Number of updates.
 
     Raises:
-        ValueError: If iterations is below 1, or above 1 with an adaptation that uses the innovation, or
+        ValueError: If iterations is not a whole number from 1, or above 1 with an adaptation that uses the innovation, or
             if two noise adaptations use it.
     """
-    if iterations < 1:
-        raise ValueError(
-            f"filter.iterations must be at least 1, got {iterations}. Use 1 for a single update."
-        )
+    check_whole_number("filter.iterations", iterations, 1, "Use 1 for a single update.")
     if iterations > 1 and (noise_adaptations or gain_adaptations):
         raise ValueError(
             "filter.iterations must be 1 with noise_adaptations or gain_adaptations, got "

@@ -170,7 +170,7 @@ class UnscentedPoints:
         squared_radius = self.alpha**2 * (d + self.kappa)
         if not squared_radius > 0.0:
             raise ValueError(
-                f"linearisation.points.kappa must be greater than -d = {-d}, got {self.kappa}. "
+                f"filter.linearisation.points.kappa must be greater than -d = {-d}, got {self.kappa}. "
                 "Increase it."
             )
         offsets = math.sqrt(squared_radius) * torch.eye(d, dtype=torch.float64)

@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from pfbench.core.covariance import factor
 from pfbench.core.distribution_sampling import draw_values
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -44,7 +45,7 @@ class GuidedInitialProposal(InitialProposal):
         passes: Linearisations of the guide after that of its filter.
 
     Raises:
-        ValueError: If steps is below 1, the fraction is outside (0, 1), the factor is not positive,
+        ValueError: If steps or passes is not a count, the fraction is outside (0, 1), the factor is not positive,
             or the guide adapts noise or gain.
     """
 
@@ -57,15 +58,16 @@ class GuidedInitialProposal(InitialProposal):
 
     def __post_init__(self) -> None:
         check_covariance_factor(self.covariance_factor)
-        if self.steps < 1 or not 0.0 < self.prior_fraction < 1.0:
+        check_whole_number("initial_proposal.steps", self.steps, 1, "Use 1 for causal estimates.")
+        check_whole_number("initial_proposal.passes", self.passes, 0, "Use 3.")
+        if not 0.0 < self.prior_fraction < 1.0:
             raise ValueError(
-                "initial_proposal must have steps of at least 1 and prior_fraction in (0, 1), got "
-                f"{self.steps} and {self.prior_fraction}. Change them."
+                f"initial_proposal.prior_fraction must be in (0, 1), got {self.prior_fraction}. Use 0.2."
             )
-        if not self.guide_filter.plain:
+        if not isinstance(self.guide_filter, GaussianFilter) or not self.guide_filter.plain:
             raise ValueError(
-                "initial_proposal.guide_filter must use the model's noise and gain, got a filter "
-                "that adapts them. Remove the adaptations."
+                "initial_proposal.guide_filter must be a Gaussian filter without adaptations, got "
+                f"{type(self.guide_filter).__name__}. Choose ekf, ukf or ckf."
             )
 
     @override

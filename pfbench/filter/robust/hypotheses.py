@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -56,8 +56,8 @@ class NoiseHypotheses:
                 "hypotheses.measurement_factors must be as many as process_factors, got "
                 f"{len(self.measurement_factors)} and {m}. Give both for each hypothesis."
             )
-        rows = [list(row) for row in self.transition]
-        is_square = len(rows) == m and all(len(row) == m for row in rows)
+        rows = [list(row) if _is_row(row) else row for row in self.transition]
+        is_square = len(rows) == m and all(_is_row(row) and len(row) == m for row in rows)
         if not is_square or not all(_is_distribution(row) for row in rows):
             raise ValueError(
                 f"hypotheses.transition must be {m} rows of {m} probabilities with sum 1, got "
@@ -77,6 +77,11 @@ class NoiseHypotheses:
         system = np.concatenate([p.T - np.eye(m), np.ones((1, m))])
         stationary = np.linalg.lstsq(system, np.eye(m + 1)[m], rcond=None)[0].clip(min=0.0)
         return (stationary / stationary.sum()).tolist()
+
+
+def _is_row(row: Any) -> bool:
+    """Return whether a row of a matrix is a sequence."""
+    return isinstance(row, Sequence) and not isinstance(row, str)
 
 
 def _is_distribution(row: Sequence[float]) -> bool:

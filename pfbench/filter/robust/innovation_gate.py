@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.robust.component_groups import ComponentGrouping, GroupDistances
@@ -49,10 +50,7 @@ class InnovationGate(InnovationWeight):
                 f"InnovationGate.probability must be in (0, 1], got {self.probability}. Use 0.999, "
                 "or 1 for no gate."
             )
-        if self.patience < 0:
-            raise ValueError(
-                f"InnovationGate.patience must be at least 0, got {self.patience}. Use 0 for no limit."
-            )
+        check_whole_number("InnovationGate.patience", self.patience, 0, "Use 0 for no limit.")
 
     @override
     def noise_adapt(

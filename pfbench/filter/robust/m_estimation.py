@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.kalman_update import kalman_gain_update
@@ -18,6 +19,7 @@ from pfbench.filter.robust.component_groups import (
 )
 from pfbench.filter.robust.robust_update import (
     ResidualLoss,
+    check_efficiency,
     check_threshold,
     count_downweighted,
     finite_weight,
@@ -49,7 +51,8 @@ class MEstimationUpdate(ResidualLoss):
         groups: Group number of each component, instead of `grouping`.
 
     Raises:
-        ValueError: If an argument is outside its range.
+        ValueError: If an argument is outside its range. On use, if every threshold of a group has a
+            larger efficiency.
     """
 
     threshold: float | None = None
@@ -62,12 +65,8 @@ class MEstimationUpdate(ResidualLoss):
         name = type(self).__name__
         check_threshold(name, self.threshold)
         ComponentGrouping(self.grouping, self.groups)
-        if not 0.0 < self.efficiency < 1.0:
-            raise ValueError(
-                f"{name}.efficiency must be in (0, 1), got {self.efficiency}. Use 0.95."
-            )
-        if self.iterations < 1:
-            raise ValueError(f"{name}.iterations must be at least 1, got {self.iterations}. Use 4.")
+        check_efficiency(name, self.efficiency)
+        check_whole_number(f"{name}.iterations", self.iterations, 1, "Use 4.")
 
     @property
     @abstractmethod

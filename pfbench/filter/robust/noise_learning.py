@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.principal_axes import diagonal_axes
@@ -97,11 +98,7 @@ class VariationalNoiseAdaptation(RobustUpdate):
                 "VariationalNoiseAdaptation.prior_count must be positive and finite, got "
                 f"{self.prior_count}. Use 10."
             )
-        if self.iterations < 1:
-            raise ValueError(
-                "VariationalNoiseAdaptation.iterations must be at least 1, got "
-                f"{self.iterations}. Use 4."
-            )
+        check_whole_number("VariationalNoiseAdaptation.iterations", self.iterations, 1, "Use 4.")
 
     @override
     def noise_adapt(

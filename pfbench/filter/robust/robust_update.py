@@ -129,6 +129,20 @@ def count_downweighted(groups: GroupDistances, weight: Tensor) -> dict[str, Tens
     return {"downweighted": groups.count_groups(weight < DOWNWEIGHTED)}
 
 
+def check_efficiency(name: str, efficiency: float) -> None:
+    """Check that an efficiency is between 0 and 1.
+
+    Args:
+        name: Class for the message.
+        efficiency: Value to check.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if not 0.0 < efficiency < 1.0:
+        raise ValueError(f"{name}.efficiency must be in (0, 1), got {efficiency}. Use 0.95.")
+
+
 def check_threshold(name: str, threshold: float | None) -> None:
     """Check that a threshold is positive.
 

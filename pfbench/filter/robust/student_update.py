@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.robust.component_groups import (
@@ -52,14 +53,8 @@ class StudentUpdate(ResidualLoss):
     def __post_init__(self) -> None:
         ComponentGrouping(self.grouping, self.groups)
         if not self.dof > 0.0:
-            raise ValueError(
-                f"StudentUpdate.dof must be positive, got {self.dof}. Use 4 to 8, or .inf for "
-                "normal errors."
-            )
-        if self.iterations < 1:
-            raise ValueError(
-                f"StudentUpdate.iterations must be at least 1, got {self.iterations}. Use 4."
-            )
+            raise ValueError(f"StudentUpdate.dof must be positive, got {self.dof}. Use 4 to 8.")
+        check_whole_number("StudentUpdate.iterations", self.iterations, 1, "Use 4.")
 
     @override
     def noise_adapt(

@@ -10,6 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.covariance import factor
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.kalman_update import kalman_gain_update
@@ -58,13 +59,9 @@ class VariationalCovarianceAdaptation(RobustUpdate):
             )
         if not self.prediction_count > 0.0:
             raise ValueError(
-                f"{_NAME}.prediction_count must be positive, got {self.prediction_count}. Use 5, or "
-                ".inf for the predicted covariance of the model."
+                f"{_NAME}.prediction_count must be positive, got {self.prediction_count}. Use 5."
             )
-        if self.iterations < 1:
-            raise ValueError(
-                f"{_NAME}.iterations must be at least 1, got {self.iterations}. Use 4."
-            )
+        check_whole_number(f"{_NAME}.iterations", self.iterations, 1, "Use 4.")
 
     @override
     def noise_adapt(

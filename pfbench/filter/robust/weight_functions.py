@@ -25,6 +25,7 @@ from pfbench.filter.whitening import LOG_2PI
 
 _NODES = 4000  # of the quadrature over the distance
 _HALVINGS = 40
+_SMALLEST = 1e-3  # smallest threshold
 
 
 def huber_weight(squared: Tensor, threshold: Tensor) -> Tensor:
@@ -145,9 +146,12 @@ def threshold_for_efficiency(weight: WeightFunction, efficiency: float, k: int) 
         k: Number of components.
 
     Returns:
-        The threshold.
+        The threshold. NaN if every threshold has a larger efficiency: Huber's weight of small
+        thresholds has an efficiency of (E d)^2 / k, 0.64 for k = 1 and 0.95 for k = 10.
     """
-    low, high = 1e-3, 1e3
+    low, high = _SMALLEST, 1.0 / _SMALLEST
+    if compute_efficiency(weight, low, k) > efficiency:
+        return math.nan
     for _ in range(_HALVINGS):
         middle = math.sqrt(low * high)
         is_above = compute_efficiency(weight, middle, k) > efficiency
@@ -165,11 +169,32 @@ def threshold_table(
         threshold: Threshold of all groups; None for that of the efficiency.
         efficiency: Efficiency in (0, 1).
         count: Number of observed components of the group, [R, k].
+
+    Raises:
+        ValueError: If every threshold of a group has a larger efficiency.
     """
     if threshold is not None:
         return torch.full_like(count, threshold)
     values = [threshold_for_efficiency(weight, efficiency, n) for n in _counts(count)]
-    return _look_up(values, count)
+    table = _look_up(values, count)
+    if any(map(math.isnan, values)) and not torch.compiler.is_compiling():
+        _check_efficiency_reached(weight, table, efficiency, count)
+    return table
+
+
+def _check_efficiency_reached(
+    weight: WeightFunction, table: Tensor, efficiency: float, count: Tensor
+) -> None:
+    """Raise an error if a group lacks a threshold."""
+    missing = table.isnan()
+    if bool(missing.any()):
+        k = int(count[missing].max())
+        least = compute_efficiency(weight, _SMALLEST, k)
+        raise ValueError(
+            f"efficiency must be at least {math.ceil(1e3 * least) / 1e3:g} for a group with k = {k} "
+            f"measured components, got {efficiency:g}. Increase it, set a threshold, or use "
+            "grouping=component."
+        )
 
 
 def quantile_table(probability: float, count: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.robust.component_groups import ComponentGrouping, GroupDistances
 from pfbench.filter.robust.robust_update import (
     InnovationWeight,
+    check_efficiency,
     check_threshold,
     count_downweighted,
     finite_weight,
@@ -58,10 +59,7 @@ class WeightedLikelihoodUpdate(InnovationWeight):
                 f"{name}.distance must be mahalanobis or plain, got {self.distance}. Use "
                 "mahalanobis."
             )
-        if not 0.0 < self.efficiency < 1.0:
-            raise ValueError(
-                f"{name}.efficiency must be in (0, 1), got {self.efficiency}. Use 0.95."
-            )
+        check_efficiency(name, self.efficiency)
         if self.distance == "plain" and self.threshold is None:
             raise ValueError(
                 f"{name}.threshold must be a number in the unit of the measurement with "

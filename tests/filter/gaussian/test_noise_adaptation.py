@@ -990,7 +990,9 @@ REFUSED = {
     "threshold must be positive, got 0": lambda: AdaptiveFactorGain(0.0),
     "min_factor must be in .0, 1., got 0": lambda: AdaptiveFactorGain(1.5, 0.0),
     "min_ratio=2": lambda: BoundedRatioGain(1.0, 2.0),
-    "iterations must be at least 1, got 0": lambda: GaussianFilter(MIXED, iterations=0),
+    "iterations must be a whole number of at least 1, got 0": lambda: GaussianFilter(
+        MIXED, iterations=0
+    ),
     "iterations must be 1 with .*, got 2": lambda: GaussianFilter(MIXED, FADING, iterations=2),
     "groups must have 11 group numbers": lambda: run(
         GaussianFilter(MIXED, (ConstrainedNoiseAdaptation(groups=[0, 1]),)),

@@ -97,13 +97,13 @@ def test_what_has_no_initial_proposal_says_why() -> None:
         ParticleFilter(10, initial_proposal=guide).init(SHARP, 1, PhiloxStream(0, torch.arange(1)))
     with pytest.raises(ValueError, match="without moves"):
         ParticleFilter(10, moves=(MetropolisHastings(NoiseFlowKernel(3)),), initial_proposal=guide)
-    for settings in ({"steps": 0}, {"prior_fraction": 0.0}, {"prior_fraction": 1.0}):
-        with pytest.raises(ValueError, match="initial_proposal must have"):
-            GuidedInitialProposal(GUIDE, **settings)
-    with pytest.raises(ValueError, match="adapts"):
-        GuidedInitialProposal(
-            GaussianFilter(TaylorLinearisation(), noise_adaptations=[FadingMemory()])
-        )
+    for name, value in (("steps", 0), ("steps", 2.5), ("passes", -1), ("prior_fraction", 1.0)):
+        with pytest.raises(ValueError, match=rf"initial_proposal\.{name} must .*got {value}\. Use"):
+            GuidedInitialProposal(GUIDE, **{name: value})
+    adapts = GaussianFilter(TaylorLinearisation(), noise_adaptations=[FadingMemory()])
+    for other in (adapts, ParticleFilter(10)):
+        with pytest.raises(ValueError, match="must be a Gaussian filter without adaptations"):
+            GuidedInitialProposal(other)  # type: ignore[arg-type]
 
 
 def test_the_configured_filter_is_sir_with_this_start() -> None:

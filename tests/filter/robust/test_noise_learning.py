@@ -216,7 +216,7 @@ BAD: dict[str, Any] = {
     r"VariationalNoiseAdaptation.prior_count must be .*got inf": lambda: VariationalNoiseAdaptation(
         prior_count=math.inf
     ),
-    r"VariationalNoiseAdaptation.iterations must be at least 1, got 0": lambda: (
+    r"VariationalNoiseAdaptation.iterations must be .* at least 1, got 0": lambda: (
         VariationalNoiseAdaptation(iterations=0)
     ),
 }

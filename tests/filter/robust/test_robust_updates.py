@@ -32,8 +32,10 @@ from pfbench.filter.robust.student_update import StudentUpdate
 from pfbench.filter.robust.weight_functions import (
     WeightFunction,
     cauchy_weight,
+    compute_efficiency,
     huber_weight,
     threshold_for_efficiency,
+    threshold_table,
     welsch_weight,
 )
 from pfbench.filter.robust.weighted_likelihood import WeightedLikelihoodUpdate
@@ -163,10 +165,13 @@ def test_thresholds_are_those_of_the_literature(weight: WeightFunction, constant
 
 
 def test_the_efficiency_is_that_of_simulated_locations() -> None:
-    """M-estimates of 3-component locations by SciPy have the variance that the threshold promises."""
+    """M-estimates of 3-component locations by SciPy have the variance that the threshold promises.
+
+    The mean is efficient, so it is not correlated with its difference to another estimate.
+    """
     rng, n, repeats = np.random.default_rng(1), 40, 150
-    c = threshold_for_efficiency(huber_weight, 0.8, 3)
-    ratio = []
+    c = threshold_for_efficiency(huber_weight, 0.9, 3)
+    excess = []
     for _ in range(repeats):
         e = rng.normal(size=(n, 3))
 
@@ -174,8 +179,31 @@ def test_the_efficiency_is_that_of_simulated_locations() -> None:
             d = np.linalg.norm(e - x, axis=1)
             return float(np.where(d < c, 0.5 * d * d, c * d - 0.5 * c * c).sum())
 
-        ratio.append(np.square(optimize.minimize(loss, e.mean(0)).x).sum() * n / 3)
-    assert abs(np.mean(ratio) - 1 / 0.8) < 4 * np.std(ratio) / math.sqrt(repeats)
+        difference = optimize.minimize(loss, e.mean(0)).x - e.mean(0)
+        excess.append(np.square(difference).sum() * n / 3)
+    assert abs(np.mean(excess) - (1 / 0.9 - 1)) < 4 * np.std(excess) / math.sqrt(repeats)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 9, 10, 16])
+def test_an_efficiency_below_that_of_small_thresholds_has_no_threshold(k: int) -> None:
+    """The least efficiency of Huber's weight is (E d)^2 / k of a chi-distributed d."""
+    mean = math.sqrt(2.0) * math.exp(math.lgamma((k + 1) / 2) - math.lgamma(k / 2))
+    least = mean**2 / k
+    assert math.isnan(threshold_for_efficiency(huber_weight, least - 2e-3, k))
+    c = threshold_for_efficiency(huber_weight, least + 2e-3, k)
+    assert compute_efficiency(huber_weight, c, k) == pytest.approx(least + 2e-3, abs=1e-6)
+    assert (least > 0.95) == (k >= 10)
+
+
+def test_groups_without_a_threshold_are_refused_and_others_are_not() -> None:
+    sixteen = torch.full((1, 16), 16.0)
+    with pytest.raises(
+        ValueError, match=r"at least 0\.97 for a group with k = 16 .*got 0\.95\. Inc"
+    ):
+        threshold_table(huber_weight, None, 0.95, sixteen)
+    assert torch.equal(threshold_table(huber_weight, 2.0, 0.95, sixteen), 2.0 * sixteen / 16)
+    single = threshold_table(huber_weight, None, 0.95, torch.ones(1, 16))
+    assert torch.allclose(single, torch.full_like(single, 1.345), atol=1.5e-3)
 
 
 def objective(step: Innovation, run_index: int, threshold: float) -> Any:
@@ -435,17 +463,26 @@ def test_outliers_are_counted() -> None:
 
 BAD: dict[str, Any] = {
     r"InnovationGate.probability must be in \(0, 1\], got 1.5": lambda: InnovationGate(1.5),
-    r"InnovationGate.patience must be at least 0, got -1": lambda: InnovationGate(patience=-1),
+    r"InnovationGate.patience must be a whole number of at least 0, got -1": lambda: InnovationGate(
+        patience=-1
+    ),
+    r"InnovationGate.patience must be .* got 2.5": lambda: InnovationGate(patience=2.5),  # type: ignore[arg-type]
     r"grouping must be all, sensor, component or satellite, got range": lambda: HuberUpdate(
         grouping="range"
     ),
     r"HuberUpdate.threshold must be positive, got 0": lambda: HuberUpdate(0.0),
     r"HuberUpdate.efficiency must be in \(0, 1\), got 1": lambda: HuberUpdate(efficiency=1.0),
-    r"CorrentropyUpdate.iterations must be at least 1, got 0": lambda: CorrentropyUpdate(
+    r"CorrentropyUpdate.iterations must be .* of at least 1, got 0": lambda: CorrentropyUpdate(
         iterations=0
     ),
     r"StudentUpdate.dof must be positive, got 0": lambda: StudentUpdate(0.0),
-    r"StudentUpdate.iterations must be at least 1, got 0": lambda: StudentUpdate(iterations=0),
+    r"StudentUpdate.iterations must be .* at least 1, got 0": lambda: StudentUpdate(iterations=0),
+    r"filter.iterations must be .* at least 1, got 1.5": lambda: GaussianFilter(
+        EKF, iterations=1.5
+    ),  # type: ignore[arg-type]
+    r"efficiency must be at least .* k = 1 .*, got 0.5": lambda: filtered(
+        HuberUpdate(efficiency=0.5), measurements(steps=1)
+    ),
     r"distance must be mahalanobis or plain, got imq": lambda: WeightedLikelihoodUpdate("imq"),
     r"threshold must be a number in the unit": lambda: WeightedLikelihoodUpdate("plain"),
     r"grouping must be sensor or component with": lambda: WeightedLikelihoodUpdate("plain", 4.0),
