@@ -13,10 +13,29 @@ from pfbench.core.density import check_event_dimension
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
+from pfbench.filter.model_jacobians import check_noise_gain
 from pfbench.filter.resolution import check_measurement_resolution
 from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law
 
 _STATES = 4  # of each run that the model is tried with
+
+
+def check_is_filter(method: object) -> None:
+    """Check that an object is an instance with the calls of a filter.
+
+    Args:
+        method: Filter.
+
+    Raises:
+        ValueError: If it is a class, or has no `init` or `step`.
+    """
+    calls = (getattr(method, name, None) for name in ("init", "step"))
+    if isinstance(method, type) or not all(map(callable, calls)):
+        kind = f"the class {method.__name__}" if isinstance(method, type) else type(method).__name__
+        raise ValueError(
+            f"method must be a filter, with the calls init and step, got {kind}. Pass an instance, "
+            "such as ParticleFilter(100)."
+        )
 
 
 def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) -> None:
@@ -80,8 +99,8 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
         record: Prepared record, see `prepare_record`.
 
     Raises:
-        ValueError: If states have another shape, if none is finite, or if the model
-            observes another number of components than `record.y` has. If the number type does not
+        ValueError: If states have another shape, if none is finite, if `propagate` contradicts
+            `noise_gain`, or if the model observes another number of components than `record.y` has. If the number type does not
             resolve the measurements. If a measurement is outside the support of its distribution.
         TypeError: If a distribution has not one event dimension.
     """
@@ -104,6 +123,8 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
                 "first step. Check the inputs and the parameters of the model."
             )
         _check_independence(step_model, x, first.u, w, next_x)
+        moving = 1 if model.observes_initial and record.y.shape[1] > 1 else 0
+        check_noise_gain(model.at_step(moving), x, record.at_step(moving).u)
         observed = _observe(step_model, next_x, first.u)
         check_event_dimension(observed, f"{name}.observation", width)
     shape = (*observed.batch_shape, *observed.event_shape)

@@ -13,13 +13,16 @@ from torch.distributions import Distribution, Independent, MultivariateNormal, N
 from pfbench.core.density import has_finite_moments
 from pfbench.core.jacobian import jacobian
 from pfbench.core.record import Record
-from pfbench.filter.model_jacobians import find_observation_jacobian, find_propagation_jacobian
+from pfbench.filter.model_jacobians import (
+    find_observation_jacobian,
+    find_propagation_jacobian,
+    is_noise_gain,
+)
 from pfbench.kernels.compilation import is_capturing
 from pfbench.model.base import StateSpaceModel
 
 _POINTS = 200_000  # states differentiated at a time
 _PROBES = 4  # states and noises at which additive noise is verified
-_ROUNDING = 1e3 * 2.2e-16  # relative rounding error that `propagate` may have
 
 
 def derivative(
@@ -94,12 +97,7 @@ def compute_additive_gain(model: StateSpaceModel, x: Tensor, root: Tensor, u: An
         spread = root.diagonal(dim1=-2, dim2=-1).unsqueeze(1)
         states = chart.add(at, waves[:, :d] @ root.mT + waves[:, :d] * (0.1 * spread + 0.01))
         w = (sd * waves[:, d:]).expand(len(x), -1, -1)
-        quiet_states = model.propagate(states, u, centre + torch.zeros_like(w))
-        shift = w @ gain.mT
-        off = chart.subtract(model.propagate(states, u, centre + w), chart.add(quiet_states, shift))
-        size = quiet_states.abs().amax(1, keepdim=True)
-        size = size if chart.flat else size.amax(-1, keepdim=True)
-        additive = bool((off.abs() <= _ROUNDING * (size + shift.abs())).all())
+        additive = is_noise_gain(model, states, u, w, gain)
     return gain if additive else None
 
 

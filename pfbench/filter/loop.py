@@ -16,7 +16,7 @@ from pfbench.core.record import FeedbackRun, Record, iterate_steps
 from pfbench.filter.belief import Filter, StepInfo
 from pfbench.filter.feedback import apply_feedback, correctable_groups
 from pfbench.filter.health import HealthMonitor, with_cached_nis
-from pfbench.filter.input_check import check_model, check_record
+from pfbench.filter.input_check import check_is_filter, check_model, check_record
 from pfbench.filter.particle.proposals import RecordStartedFilter
 from pfbench.filter.run_batches import join_infos, join_runs, split_runs
 from pfbench.model.base import StateSpaceModel
@@ -215,9 +215,10 @@ def run_filter(
         Means, variances, evidence and diagnostics.
 
     Raises:
-        ValueError: If record, model and random stream do not fit, or if model or filter do not
-            support the record's feedback.
+        ValueError: If `method` is not a filter, if record, model and random stream do not fit, or
+            if model or filter do not support the record's feedback.
     """
+    check_is_filter(method)
     check_record(model, record, draws)
     feedback = None
     if record.feedback is not None:

@@ -1,12 +1,14 @@
 """Public names of `pfbench.testing` and the modules that define them."""
 
-from pfbench.testing.filters import (
-    check_causality as check_causality,
+from pfbench.testing.averages import (
     check_convergence as check_convergence,
     check_evidence as check_evidence,
+    filter_record as filter_record,
+)
+from pfbench.testing.filters import (
+    check_causality as check_causality,
     check_filter as check_filter,
     check_independence as check_independence,
-    filter_record as filter_record,
 )
 from pfbench.testing.jacobians import check_jacobians as check_jacobians
 from pfbench.testing.moves import (

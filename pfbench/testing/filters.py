@@ -1,13 +1,10 @@
-"""Tests of filters: evidence, convergence, causality, independence of runs."""
+"""Tests of filters: causality, independence of runs, and all tests that apply."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,130 +13,18 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import linear_walk
-from pfbench.testing.reference import (
-    FilterMoments,
-    case_or_default,
-    reference_moments,
-    run_kalman_filter,
+from pfbench.testing.averages import (
+    check_convergence,
+    check_evidence,
+    filter_record,
+    has_particles,
 )
-from pfbench.testing.results import LawCheck, check_means
+from pfbench.testing.reference import case_or_default
+from pfbench.testing.results import LawCheck
+from pfbench.testing.subjects import check_count, check_subject, repeat
 
 Runner = Callable[[Filter, StateSpaceModel, Tensor], FilterResult]
-
-
-def filter_record(
-    method: Filter, model: StateSpaceModel, y: Tensor, seed: int = 1, **options: Any
-) -> FilterResult:
-    """Filter one record in many runs, or one record per run.
-
-    Args:
-        method: Filter to run.
-        model: State-space model.
-        y: One record [T, Dy], or one per run [R, T, Dy].
-        seed: Seed of the random stream.
-        **options: `runs` (number of runs of one record), `u` (inputs), `start` [R, D], and options
-            of `run_filter`.
-
-    Returns:
-        Estimate of all runs.
-    """
-    if y.dim() == 2:
-        y = y.expand(options.pop("runs", 1), -1, -1)
-    draws = PhiloxStream(seed, torch.arange(y.shape[0]), model.anchor.dtype)
-    record = Record(y, options.pop("u", ()), options.pop("start", None))
-    return run_filter(method, model, record, draws, **options)
-
-
-def check_evidence(
-    method: Filter,
-    model: StateSpaceModel | None = None,
-    y: Tensor | None = None,
-    exact: FilterMoments | None = None,
-    runs: int = 2000,
-    limit: float = 4.5,
-) -> LawCheck:
-    """Check E[Z_hat f_hat] = Z E[f | y] for f = 1, x and x^2 [Del Moral 2004].
-
-    It holds for any number of particles.
-
-    Args:
-        method: Particle filter that is asymptotically exact.
-        model: Model with a known answer. A walk with constant velocity by default.
-        y: One record, [T, Dy]. Required with `model`.
-        exact: Exact answer. The answer of the Kalman filter by default, for linear-Gaussian models.
-        runs: Number of independent runs.
-        limit: Largest number of standard errors.
-
-    Returns:
-        The average with the most standard errors.
-
-    Raises:
-        AssertionError: If the statement does not hold.
-    """
-    model, y = case_or_default(model, y)
-    answer = reference_moments(model, y) if exact is None else exact  # type: ignore[arg-type]
-    estimate = filter_record(method, model, y, runs=runs)
-    ratio = torch.exp(estimate.log_evidence - answer.log_evidence).numpy()
-    mean, variance = estimate.mean[:, -1].numpy(), estimate.variance[:, -1].numpy()
-    mean, variance = (
-        np.where(ratio[:, None] > 0.0, a, 0.0) for a in (mean, variance)
-    )  # a lost run counts with Z = 0
-    scale = np.sqrt(answer.square)
-    deviations = {"Z_hat / Z - 1": ratio - 1.0}
-    for i in range(mean.shape[1]):
-        deviations[f"Z_hat x[{i}]"] = ratio * (mean[:, i] - answer.mean[i]) / scale[i]
-        deviations[f"Z_hat x[{i}]^2"] = ratio * (
-            (variance[:, i] + mean[:, i] ** 2) / answer.square[i] - 1.0
-        )
-    return check_means("the evidence is unbiased", deviations, limit)
-
-
-def check_convergence(
-    method: Any,
-    sizes: Sequence[int] = (128, 512, 2048),
-    runs: int = 100,
-    faster: bool = False,
-    limit: float = 4.0,
-) -> LawCheck:
-    """Check that errors fall with the root of the number of particles.
-
-    The error is the distance to the Kalman filter's mean over 20 steps of a walk with constant
-    velocity, in its standard deviations.
-
-    Args:
-        method: Filter with a field `particles`, or a function from their number to a filter.
-        sizes: Numbers of particles.
-        runs: Number of independent runs of each.
-        faster: Whether a steeper fall passes, as with low-discrepancy points.
-        limit: Largest number of standard errors between the slope and -1/2.
-
-    Returns:
-        The slope of log error against log particles.
-
-    Raises:
-        AssertionError: If the slope is not -1/2.
-    """
-    model, rng = linear_walk(1.0, 0.5, 1.0), np.random.default_rng(2)
-    y = torch.tensor(np.cumsum(rng.normal(size=(20, 1)), 0) + rng.normal(size=(20, 1)))
-    exact = run_kalman_filter(model, y)
-    sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
-    logs, errors = [], []
-    for n in sizes:
-        sized: Any = method(n) if not is_dataclass(method) else replace(method, particles=n)  # type: ignore[type-var]
-        estimate = filter_record(sized, model, y, runs=runs)
-        squares = (((estimate.mean.numpy() - exact.mean) / sd) ** 2).mean((1, 2))
-        logs.append(0.5 * math.log(squares.mean()))
-        errors.append(0.5 * squares.std() / squares.mean() / math.sqrt(runs))
-    x = np.log(sizes) - np.log(sizes).mean()
-    slope, error = float(x @ logs / (x @ x)), float(math.sqrt((x**2) @ np.square(errors)) / (x @ x))
-    statement = "errors fall with the root of the number of particles"
-    excess = slope + 0.5 if faster else abs(slope + 0.5)
-    assert excess < limit * error, (
-        f"{statement}: the slope must be -0.5, got {slope:.3f} +- {error:.3f}. "
-        f"The limit is {limit:g} errors"
-    )
-    return LawCheck(statement, slope, limit, error)
+_NAMES = ("mean", "variance", "log_evidence")
 
 
 def check_causality(
@@ -160,15 +45,20 @@ def check_causality(
         The largest difference, which is 0.
 
     Raises:
-        AssertionError: If a change of y after step t changes an estimate up to t.
+        AssertionError: If the filter is not repeatable, or if a change of y after step t changes an
+            estimate up to t.
+        ValueError: If the filter, the model or the measurements are of another type.
     """
-    model, y = _records(model, y)
-    statement, before = "an estimate uses no later measurement", run(method, model, y)
+    check_subject("check_causality", method, model, y, "R, T, Dy")
+    case_model, y = _records(model, y)
+    statement = "an estimate uses no later measurement"
+    record = y
+    before = repeat("filter", lambda: run(method, case_model, record), _estimates)
     for t in range(1, y.shape[1]):
         changed_y = y.clone()
         changed_y[:, t:] = changed_y[:, t:] + 0.7
         changed_y[:, t + 1 :: 2] = torch.nan
-        after = run(method, model, changed_y)
+        after = run(method, case_model, changed_y)
         for name in ("mean", "variance"):
             old, new = (getattr(estimate, name)[:, :t] for estimate in (before, after))
             difference = float((new - old).abs().nan_to_num().max())
@@ -198,16 +88,18 @@ def check_independence(
         The largest difference.
 
     Raises:
-        AssertionError: If a run alone differs from the same run in its batch.
+        AssertionError: If the filter is not repeatable, or if a run alone differs from the same run
+            in its batch.
+        ValueError: If the filter, the model or the measurements are of another type.
     """
-    model, y = _records(model, y)
-    statement, last = "a run does not depend on others", y.shape[0] - 1
-    joint = filter_record(method, model, y)
-    alone = run_filter(
-        method, model, Record(y[last:]), PhiloxStream(1, torch.tensor([last]), model.anchor.dtype)
-    )
+    check_subject("check_independence", method, model, y, "R, T, Dy")
+    case_model, records = _records(model, y)
+    statement, last = "a run does not depend on others", records.shape[0] - 1
+    joint = repeat("filter", lambda: filter_record(method, case_model, records), _estimates)
+    stream = PhiloxStream(1, torch.tensor([last]), case_model.anchor.dtype)
+    alone = run_filter(method, case_model, Record(records[last:]), stream)
     largest = 0.0
-    for name in ("mean", "variance", "log_evidence"):
+    for name in _NAMES:
         a, b = getattr(alone, name)[0], getattr(joint, name)[last]
         difference = float((a - b).abs().nan_to_num().max())
         same = torch.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True)
@@ -230,14 +122,20 @@ def check_filter(method: Any, runs: int = 1000) -> dict[str, LawCheck]:
         Results by the name of the check.
 
     Raises:
-        AssertionError: If a statement does not hold.
+        AssertionError: If the filter is not repeatable, or a statement does not hold.
+        ValueError: If it is not a filter.
     """
+    check_count("check_filter", 2, runs=runs)
     results = {"causality": check_causality(method), "independence": check_independence(method)}
-    has_particles = is_dataclass(method) and "particles" in {field.name for field in fields(method)}
-    if method.is_exact and has_particles:
+    if has_particles(method) and method.is_exact:
         results["evidence"] = check_evidence(method, runs=runs)
         results["convergence"] = check_convergence(method, runs=max(40, runs // 10), faster=True)
     return results
+
+
+def _estimates(result: FilterResult) -> dict[str, Tensor]:
+    """Return what a repeated call must give again."""
+    return {name: getattr(result, name) for name in _NAMES}
 
 
 def _records(model: StateSpaceModel | None, y: Tensor | None) -> tuple[StateSpaceModel, Tensor]:

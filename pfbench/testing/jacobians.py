@@ -1,4 +1,4 @@
-"""Test of the Jacobians that a model states: they equal finite differences."""
+"""Test of the derivatives that a model states: they equal finite differences."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from torch import Tensor
 
 from pfbench.filter.model_jacobians import find_observation_jacobian, find_propagation_jacobian
 from pfbench.model.base import StateSpaceModel
+from pfbench.testing.subjects import check_is_model
 
 
 def check_jacobians(
     model: StateSpaceModel, x: Tensor, u: Any, step: float = 1e-4, limit: float = 1e-5
 ) -> dict[str, float]:
-    """Compare `propagation_jacobian` and `observation_jacobian` with central differences.
+    """Compare stated Jacobians and the noise gain with central differences.
+
+    The methods are `propagation_jacobian`, `observation_jacobian` and `noise_gain`. The differences
+    of the noise gain are taken about the mean of the noise, one standard deviation wide.
 
     Args:
         model: State-space model in double precision.
@@ -25,11 +29,17 @@ def check_jacobians(
         limit: Largest error, relative to the largest entry of the Jacobian.
 
     Returns:
-        Relative error of each Jacobian that the model states, by name.
+        Relative error of each derivative that the model states, by name.
 
     Raises:
         AssertionError: If the model states none, or an error exceeds the limit.
+        ValueError: If the model is no `StateSpaceModel`, or the states have another shape.
     """
+    check_is_model("check_jacobians", model)
+    if x.dim() != 3 or x.shape[-1] != model.chart.size:
+        raise ValueError(
+            f"check_jacobians: x must have shape [R, N, {model.chart.size}], got {list(x.shape)}."
+        )
     mean = model.noise.mean.expand(*x.shape[:2], -1)
     maps: dict[str, tuple[Any, Callable[[Tensor], Tensor], Any]] = {
         "propagation_jacobian": (
@@ -43,19 +53,38 @@ def check_jacobians(
             model.residual,
         ),
     }
-    errors = {}
-    for name, (value, f, subtract) in maps.items():
-        if value is None:
-            continue
-        expected = _difference_quotients(model, x, f, subtract, step)
-        scale = expected.abs().max().clamp(min=1e-300)
-        errors[name] = float((value - expected).abs().max() / scale)
-        assert errors[name] <= limit, (
+    pairs = {
+        name: (value, _difference_quotients(model, x, f, subtract, step))
+        for name, (value, f, subtract) in maps.items()
+        if value is not None
+    }
+    gain = model.noise_gain(u)
+    if gain is not None:
+        for side in (1.0, -1.0):  # both, since a square in the noise has no central difference
+            pairs[f"noise_gain ({side:+g} sd)"] = gain[:, None], _noise_quotients(model, x, u, side)
+    errors: dict[str, float] = {}
+    for label, (value, expected) in pairs.items():
+        name, scale = label.split(" ")[0], expected.abs().max().clamp(min=1e-300)
+        error = float((value - expected).abs().max() / scale)
+        assert error <= limit, (
             f"{type(model).__name__}.{name} must be the derivative, got a relative error of "
-            f"{errors[name]:.2g}."
+            f"{error:.2g}."
         )
+        errors[name] = max(error, errors.get(name, 0.0))
     assert errors, f"{type(model).__name__} must state a Jacobian, got none."
     return errors
+
+
+def _noise_quotients(model: StateSpaceModel, x: Tensor, u: Any, side: float) -> Tensor:
+    """Return difference quotients of the step in the noise, [R, N, d, W]."""
+    noise = model.noise
+    mean, steps = noise.mean.expand(*x.shape[:2], -1), side * noise.stddev
+    quiet_x = model.propagate(x, u, mean)
+    columns = [
+        model.chart.subtract(model.propagate(x, u, mean + e), quiet_x) / steps[i]
+        for i, e in enumerate(torch.diag(steps))
+    ]
+    return torch.stack(columns, -1)
 
 
 def _difference_quotients(

@@ -18,6 +18,7 @@ from pfbench.filter.moves.metropolis import McmcKernel, MetropolisHastings, Move
 from pfbench.filter.moves.path_history import PathHistory
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.testing.results import LawCheck, check_p_values
+from pfbench.testing.subjects import check_count, describe, find_kind, repeat
 
 STEPS = 10  # so 11 states of 2 components
 PATH_SIZE = 2 * (STEPS + 1)
@@ -177,18 +178,21 @@ def check_move(
         The smaller p-value, with the acceptance rate and the fraction moved as details.
 
     Raises:
-        AssertionError: If the statement does not hold, or too few particles moved.
+        AssertionError: If the statement does not hold, if too few particles moved, or if the move
+            is not repeatable.
+        ValueError: If the move is an instance of neither kind.
     """
-    kernel: Any = move
-    chain: Any = MetropolisHastings(kernel, mcmc_steps) if hasattr(move, "propose") else move
+    check_count("check_move", mcmc_steps=mcmc_steps)
+    check_count("check_move", PATH_SIZE, paths=paths)
+    chain = _as_move(move, mcmc_steps)
     case = simulate_path_posterior(noise_sd, paths)
     statement = "a move leaves the distribution of the path invariant"
     moved_runs = torch.ones(1, dtype=torch.bool)
-    after, rate = chain(
-        case.model,
-        case.belief(chain.required_history),
-        moved_runs,
-        PhiloxStream(1, torch.arange(1)),
+    before, stream = case.belief(chain.required_history), PhiloxStream(1, torch.arange(1))
+    after, rate = repeat(
+        "move",
+        lambda: chain(case.model, before, moved_runs, stream),
+        lambda pair: {"states": pair[0].x},
     )
     result = case.paths_after(after)
     share = float((result != case.paths).any(1).mean())
@@ -209,3 +213,17 @@ def check_move(
         "mean log densities": case.log_density_p_value(result),
     }
     return check_p_values(statement, p_values, limit, **details)
+
+
+def _as_move(stage: Any, mcmc_steps: int) -> Any:
+    """Return a move, or Metropolis-Hastings steps of a kernel."""
+    if isinstance(stage, type) or not hasattr(stage, "required_history"):
+        raise ValueError(
+            "check_move: stage must be a move or a kernel, with the attribute required_history, got "
+            f"{describe(stage, 'MetropolisHastings(LastStateKernel())')}"
+        )
+    if hasattr(stage, "propose"):
+        return MetropolisHastings(stage, mcmc_steps)
+    kinds = {"move": ("model", "belief", "resampled", "draws")}
+    find_kind("check_move", stage, kinds, "MetropolisHastings(LastStateKernel())")
+    return stage

@@ -12,6 +12,7 @@ from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.particle.proposals import Proposal
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing.results import LawCheck, check_means
+from pfbench.testing.subjects import check_count, find_kind, repeat
 
 _STATEMENT = "a proposal returns log p(w) - log q(w)"
 
@@ -35,8 +36,13 @@ def check_proposal(
         The average with the most standard errors.
 
     Raises:
-        AssertionError: If the statement does not hold.
+        AssertionError: If the statement does not hold, or if the proposal is not repeatable.
+        ValueError: If the proposal is no instance that is called with these arguments.
     """
+    kinds = {"proposal": ("model", "belief", "record", "draws")}
+    find_kind("check_proposal", proposal, kinds, "BootstrapProposal()")
+    check_count("check_proposal", particles=particles)
+    check_count("check_proposal", 2, runs=runs)
     model = linear_walk(1.0, 0.5, 2.0)
     streams = PhiloxStream(seed, torch.arange(runs))
     flat = torch.full((runs, particles), -math.log(particles), dtype=torch.float64)
@@ -44,7 +50,11 @@ def check_proposal(
         streams.normal("state", particles, 2), flat, torch.zeros(runs, dtype=torch.float64)
     )
     record = Record(torch.full((runs, 1), 0.7, dtype=torch.float64))
-    proposed = proposal(model, belief, record, streams.at_step(1))
+    proposed = repeat(
+        "proposal",
+        lambda: proposal(model, belief, record, streams.at_step(1)),
+        lambda sample: {"states": sample.x, "ratio": sample.log_ratio},
+    )
     ratio = torch.exp(proposed.log_ratio).unsqueeze(-1)
     parent = belief.x @ model.f.mT
     variance = (model.g @ model.g.mT).diagonal()

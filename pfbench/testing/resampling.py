@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,13 @@ from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.particle.resampling import EssResampler, Resampler, ResamplingScheme
 from pfbench.model.linear_gaussian import local_level
 from pfbench.testing.results import LawCheck, check_p_values
+from pfbench.testing.subjects import check_count, find_kind, repeat
 
 _STATEMENT = "a resampler gives each particle its weight on average"
+_KINDS = {
+    "scheme": ("a", "n", "draws"),
+    "resampler": ("model", "belief", "log_a", "n", "draws"),
+}
 
 
 def check_resampling(
@@ -46,10 +51,14 @@ def check_resampling(
         The smaller of the p-values.
 
     Raises:
-        AssertionError: If the statement does not hold.
+        AssertionError: If the statement does not hold, or if the stage is not repeatable.
+        ValueError: If the stage is an instance of neither kind, or there are too few particles.
     """
+    kind = find_kind("check_resampling", stage, _KINDS, "Systematic()")
+    check_count("check_resampling", 4, particles=particles)
     count = particles if slots is None else slots
-    resampler: Any = EssResampler(stage, 1.0) if _is_scheme(stage) else stage  # type: ignore[arg-type]
+    check_count("check_resampling", slots=count, runs=runs)
+    resampler: Any = EssResampler(stage, 1.0) if kind == "scheme" else stage  # type: ignore[arg-type]
     p_values, deviations = {}, {}
     for name, (a, log_a) in _weight_cases(particles).items():
         cases = max(runs, 20_000)  # a copy of a light particle is rare
@@ -66,14 +75,11 @@ def check_resampling(
                 resampler, log_w.expand(few, -1), log_probabilities, count, seed, step=4
             )
             p_values["two steps"] = _correlation(shares[:few], later)
+            compute = partial(_shares, resampler, log_w.expand(64, -1), log_w, count, seed)
+            repeat("resampler", compute, lambda array: {"copies": array})
     return check_p_values(
         _STATEMENT, p_values, 1e-4, largest_deviation_in_copies=max(deviations.values())
     )
-
-
-def _is_scheme(stage: object) -> bool:
-    """Return whether a stage takes (a, n, draws), not a belief."""
-    return len(inspect.signature(stage).parameters) == 3  # type: ignore[arg-type]
 
 
 def _uneven_weights(n: int, rng: np.random.Generator) -> np.ndarray:

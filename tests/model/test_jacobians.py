@@ -16,6 +16,7 @@ from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.linearisation import measurement_jacobian, transition_jacobian
 from pfbench.filter.loop import prepare_record, run_filter
 from pfbench.filter.model_jacobians import find_observation_jacobian, find_propagation_jacobian
+from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model import Benes, Lorenz63, UnivariateGrowth
 from pfbench.noise import NominalNoise
 from pfbench.scenario import ModelSimulation
@@ -36,7 +37,7 @@ def test_stated_jacobians_are_difference_quotients(name: str) -> None:
     runs = len(record.y)
     noise = PhiloxStream(5, torch.arange(runs)).normal("states", 4, model.chart.dimension)
     x = model.chart.add(model.origin.expand(runs, 4, -1), 0.7 * model.initial(1).stddev * noise)
-    assert check_jacobians(model, x, record.u).keys() == STATED[name]
+    assert check_jacobians(model, x, record.u).keys() == STATED[name] | {"noise_gain"}
     # the derivative by automatic differentiation, which shares nothing with the stated one
     h = find_observation_jacobian(model, x, record.u)
     f = find_propagation_jacobian(model, x, record.u)
@@ -77,8 +78,54 @@ def test_a_wrong_jacobian_and_a_missing_one_are_reported() -> None:
     u = prepare_record(model, record).at_step(1).u
     with pytest.raises(AssertionError, match=r"WrongGrowth\.observation_jacobian must be"):
         check_jacobians(model, x, u)
+    silent = SlowLorenz()
+    silent.noise_gain = lambda u: None  # type: ignore[method-assign]
     with pytest.raises(AssertionError, match="SlowLorenz must state a Jacobian, got none"):
-        check_jacobians(SlowLorenz(), x.expand(2, 4, 3), None)
+        check_jacobians(silent, x.expand(2, 4, 3), None)
+
+
+class ScaledNoise(UnivariateGrowth):
+    """A model whose noise gain is off by a factor, or whose noise is not additive."""
+
+    def __init__(self, factor: float, square: float) -> None:
+        super().__init__(3.0, 1.0, 1.4)
+        self.factor, self.square = factor, square
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return super().propagate(x, u, w + self.square * w * w)
+
+    def noise_gain(self, u: Any) -> Tensor:
+        return self.factor * super().noise_gain(u)
+
+
+@pytest.mark.parametrize(("factor", "square"), [(1.001, 0.0), (-1.0, 0.0), (1.0, 1e-3)])
+def test_a_wrong_noise_gain_is_refused_by_the_check_and_by_every_filter(
+    factor: float, square: float
+) -> None:
+    right = ScaledNoise(1.0, 0.0)
+    draw = ModelSimulation(right, steps=2).draw
+    record = draw(NominalNoise(), torch.arange(2), seed=1).record
+    u = prepare_record(right, record).at_step(1).u
+    x = torch.linspace(-3.0, 3.0, 8, dtype=torch.float64).view(2, 4, 1)
+    assert check_jacobians(right, x, u)["noise_gain"] < 1e-12
+    model, stream = ScaledNoise(factor, square), PhiloxStream(1, torch.arange(2))
+    with pytest.raises(AssertionError, match=r"ScaledNoise\.noise_gain must be the derivative"):
+        check_jacobians(model, x, u)
+    for method in (ParticleFilter(10), GaussianFilter(TaylorLinearisation())):
+        run_filter(method, right, record, stream)
+        with pytest.raises(ValueError, match=r"ScaledNoise\.noise_gain must be the L of propagate"):
+            run_filter(method, model, record, stream)
+    right.noise_gain = lambda u: torch.ones(1, 2, 1)  # type: ignore[method-assign, assignment]
+    with pytest.raises(ValueError, match=r"must have shape \[2 or 1, 1, 1\].*got \[1, 2, 1\]"):
+        run_filter(ParticleFilter(10), right, record, stream)
+
+
+def test_the_noise_gain_of_a_model_that_observes_its_initial_state_is_checked_too() -> None:
+    model = ScaledNoise(1.1, 0.0)
+    model.observes_initial = True
+    record = ModelSimulation(model, steps=2).draw(NominalNoise(), torch.arange(2), seed=1).record
+    with pytest.raises(ValueError, match="noise_gain must be the L"):
+        run_filter(ParticleFilter(10), model, record, PhiloxStream(1, torch.arange(2)))
 
 
 @pytest.mark.parametrize("iterations", [1, 3])

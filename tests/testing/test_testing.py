@@ -35,6 +35,7 @@ from pfbench.filter.particle.resampling_schemes import Multinomial, Residual, Ss
 from pfbench.filter.particle.sqmc import HilbertSortedResampler, SqmcProposal, SqmcScheme
 from pfbench.filter.particle.weight_update import BayesWeightUpdate
 from pfbench.model.base import StateSpaceModel
+from pfbench.model.linear_gaussian import linear_walk
 from pfbench.ppl.correlated_numbers import SortedResampler
 from pfbench.testing import (
     check_causality,
@@ -42,6 +43,7 @@ from pfbench.testing import (
     check_evidence,
     check_filter,
     check_independence,
+    check_jacobians,
     check_move,
     check_proposal,
     check_resampling,
@@ -120,6 +122,41 @@ class Mixing(BootstrapProposal):
         return sent._replace(x=sent.x + 1e-6 * sent.x.mean(0, keepdim=True))
 
 
+@dataclasses.dataclass(frozen=True)
+class GlobalNoise(BootstrapProposal):
+    """A proposal that draws from the generator of torch."""
+
+    is_exact = True
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample:
+        w = torch.randn(*belief.x.shape[:2], model.noise_dim, dtype=belief.x.dtype)
+        x = model.propagate(belief.x, record.u, w)
+        return ProposalSample(x, torch.zeros_like(belief.log_w), belief.memory, w)
+
+
+@dataclasses.dataclass(frozen=True)
+class GlobalScheme:
+    """Multinomial resampling with the generator of torch."""
+
+    is_exact = True
+
+    def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
+        return torch.multinomial(a, a.shape[1], replacement=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class GlobalKernel(LastStateKernel):
+    """A kernel with steps of the generator of torch."""
+
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        x = belief.x + 1e-3 * torch.randn_like(belief.x)
+        return belief._replace(x=x), torch.zeros_like(belief.log_w)
+
+
 def peek(method: Any, model: StateSpaceModel, y: Tensor) -> FilterResult:
     """Filters records that come one step early."""
     return filter_record(method, model, torch.cat([y[:, 1:], y[:, -1:]], 1))
@@ -185,6 +222,11 @@ FAULTS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "a filter that peeks": (lambda: check_causality(ParticleFilter(50), run=peek), "must not change, got"),
     "runs that mix": (lambda: check_independence(ParticleFilter(50, proposal=Mixing())), "differs by"),
+    "a proposal with other random numbers": (lambda: check_proposal(GlobalNoise()), "not repeatable.*from `draws`"),
+    "a scheme with other random numbers": (lambda: check_resampling(GlobalScheme()), "not repeatable.*from `draws`"),
+    "a kernel with other random numbers": (lambda: check_move(GlobalKernel()), "not repeatable.*from `draws`"),
+    "a filter with other random numbers": (lambda: check_filter(ParticleFilter(50, proposal=GlobalNoise())), "a filter.* not repeatable.*from `draws`"),
+    "runs with other random numbers": (lambda: check_independence(ParticleFilter(50, proposal=GlobalNoise())), "a filter.* not repeatable"),
     "too few runs": (lambda: check_evidence(ParticleFilter(3), runs=20), "too uncertain"),
 }  # fmt: skip
 
@@ -199,6 +241,55 @@ def test_planted_faults_fail_with_numbers(fault: str) -> None:
 def test_a_model_without_its_record_is_refused() -> None:
     with pytest.raises(ValueError, match="model and y must be given together"):
         check_evidence(ParticleFilter(10), y=torch.zeros(1, 1))
+
+
+class NoStage:
+    """An object that is no stage."""
+
+
+NOT_TESTED = {
+    "5": ("5", 5),
+    "a class": ("the class NoStage", NoStage),
+    "a class of a stage": ("the class Systematic", Systematic),
+    "an object": ("NoStage", NoStage()),
+}
+
+
+@pytest.mark.parametrize("name", NOT_TESTED)
+def test_what_is_no_stage_is_refused_with_a_remedy(name: str) -> None:
+    text, item = NOT_TESTED[name]
+    for check in (check_resampling, check_move, check_proposal, check_convergence):
+        with pytest.raises(ValueError, match=f"{check.__name__}: .* must be .*got {text}. Pass an"):
+            check(item)
+    kind = "int" if name == "5" else text
+    for tester in (check_filter, check_evidence, check_causality, check_independence):
+        with pytest.raises(ValueError, match=f"method must be a filter.*got {kind}. Pass an inst"):
+            tester(item)  # type: ignore[operator]
+
+
+def test_a_filter_in_place_of_a_stage_is_refused_with_a_remedy() -> None:
+    for check in (check_resampling, check_move, check_proposal):
+        with pytest.raises(ValueError, match=r"got the filter ParticleFilter\. .*by check_filter"):
+            check(ParticleFilter(10))  # type: ignore[arg-type]
+
+
+NOT_TESTABLE: dict[str, tuple[Callable[[], Any], str]] = {
+    "a model of another type": (lambda: check_evidence(ParticleFilter(10), 5, torch.zeros(3, 1)), "model must be a StateSpaceModel, got 5"),  # type: ignore[arg-type]
+    "a list": (lambda: check_causality(ParticleFilter(10), linear_walk(1.0, 1.0, 1.0), [0.0]), r"y must be a tensor \[R, T, Dy\], got list"),  # type: ignore[arg-type]
+    "another shape": (lambda: check_evidence(ParticleFilter(10), linear_walk(1.0, 1.0, 1.0), torch.zeros(3)), r"y must be a tensor \[T, Dy\], got shape \[3\]"),
+    "no model": (lambda: filter_record(ParticleFilter(10), None, torch.zeros(3, 1)), "filter_record: model must be"),  # type: ignore[arg-type]
+    "one run": (lambda: check_filter(ParticleFilter(10), runs=1), "runs must be a whole number of at least 2, got 1"),
+    "two particles": (lambda: check_resampling(Systematic(), particles=2), "particles must be a whole number of at least 4, got 2"),
+    "half a path": (lambda: check_move(MetropolisHastings(LastStateKernel()), paths=0.5), "paths must be .*got 0.5"),  # type: ignore[arg-type]
+    "states of another size": (lambda: check_jacobians(linear_walk(1.0, 1.0, 1.0), torch.zeros(3, 1), ()), r"x must have shape \[R, N, 2\], got \[3, 1\]"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NOT_TESTABLE)
+def test_wrong_arguments_are_refused_with_key_value_and_remedy(name: str) -> None:
+    check, message = NOT_TESTABLE[name]
+    with pytest.raises(ValueError, match=message):
+        check()
 
 
 # exactness is asked of every part
