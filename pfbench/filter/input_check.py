@@ -27,7 +27,7 @@ def check_is_filter(method: object) -> None:
         method: Filter.
 
     Raises:
-        ValueError: If it is a class, or has no `init` or `step`.
+        ValueError: If it is a class, or lacks `init` or `step`.
     """
     calls = (getattr(method, name, None) for name in ("init", "step"))
     if isinstance(method, type) or not all(map(callable, calls)):
@@ -122,9 +122,7 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
                 f"{name}.propagate must return finite states {list(x.shape)}, got {state} for the "
                 "first step. Check the inputs and the parameters of the model."
             )
-        _check_independence(step_model, x, first.u, w, next_x)
-        moving = 1 if model.observes_initial and record.y.shape[1] > 1 else 0
-        check_noise_gain(model.at_step(moving), x, record.at_step(moving).u)
+        _check_propagation(model, record, x, w, next_x)
         observed = _observe(step_model, next_x, first.u)
         check_event_dimension(observed, f"{name}.observation", width)
     shape = (*observed.batch_shape, *observed.event_shape)
@@ -167,6 +165,15 @@ def _fixed_support(distribution: Any) -> Constraint | None:
     if not isinstance(support, Constraint) or is_dependent(support) or support.event_dim:
         return None
     return support
+
+
+def _check_propagation(
+    model: StateSpaceModel, record: Record, x: Tensor, w: Tensor, next_x: Tensor
+) -> None:
+    """Check that particles move by themselves, and that noise has the gain that the model states."""
+    _check_independence(model.at_step(0), x, record.at_step(0).u, w, next_x)
+    moving = 1 if model.observes_initial and record.y.shape[1] > 1 else 0
+    check_noise_gain(model.at_step(moving), x, record.at_step(moving).u)
 
 
 def _check_independence(

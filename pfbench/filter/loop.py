@@ -166,6 +166,7 @@ class FilterPass:
 
 def _start(method: Filter, model: StateSpaceModel, record: Record, draws: RandomStream) -> Any:
     """Return the initial belief."""
+    check_is_filter(method)
     if isinstance(method, RecordStartedFilter):
         return method.init_from_record(model, record, draws)
     return method.init(model, len(record.y), draws, record.start, record.spread)
@@ -218,7 +219,6 @@ def run_filter(
         ValueError: If `method` is not a filter, if record, model and random stream do not fit, or
             if model or filter do not support the record's feedback.
     """
-    check_is_filter(method)
     check_record(model, record, draws)
     feedback = None
     if record.feedback is not None:

@@ -23,7 +23,7 @@ from pfbench.results import store
 from pfbench.results.conditions import DATASHEETS
 from pfbench.results.config_key import compute_config_key
 from pfbench.results.state_groups import main_component_group
-from pfbench.scenario.oracle_noise import RecordingRegime
+from pfbench.scenario.recording_regime import RecordingRegime
 
 RUNS = 20  # default: spreads to a sixth, in seconds [ours]
 _CONFIG_KEYS = ("scenario", "model", "noise", "seed", "first_run", "runs", "pcrb")

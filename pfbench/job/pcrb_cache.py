@@ -16,7 +16,7 @@ from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.white import NominalNoise
 from pfbench.scenario.episode_cache import load_or_build
-from pfbench.scenario.oracle_noise import RecordingRegime
+from pfbench.scenario.recording_regime import RecordingRegime
 
 
 def compute_pcrb(

@@ -26,7 +26,7 @@ from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
 from pfbench.scenario.base import Scenario
-from pfbench.scenario.oracle_noise import RecordingRegime
+from pfbench.scenario.recording_regime import RecordingRegime
 
 # paths of the configuration that do not enter the key of a job
 IGNORED_IN_KEY = (

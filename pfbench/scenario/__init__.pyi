@@ -3,7 +3,6 @@
 from pfbench.scenario.base import Scenario as Scenario
 from pfbench.scenario.emitter_prior import EmitterPrior as EmitterPrior
 from pfbench.scenario.model_simulation import ModelSimulation as ModelSimulation
-from pfbench.scenario.oracle_noise import RecordingRegime as RecordingRegime
 from pfbench.scenario.passive_location import PassiveLocationScenario as PassiveLocationScenario
 from pfbench.scenario.quadrature_prior import QuadratureEmitterPrior as QuadratureEmitterPrior
 from pfbench.scenario.recorded.aided_flight import (
@@ -37,4 +36,5 @@ from pfbench.scenario.recorded.urban_log import (
     read_drive as read_drive,
     select_stretch as select_stretch,
 )
+from pfbench.scenario.recording_regime import RecordingRegime as RecordingRegime
 from pfbench.scenario.simulated_flight import SimulatedFlight as SimulatedFlight

@@ -25,6 +25,7 @@ from pfbench.model.base import StateSpaceModel
 from pfbench.noise.base import NoiseRegime, process_variance_factors
 from pfbench.noise.white import NominalNoise
 from pfbench.scenario.base import Scenario
+from pfbench.scenario.recording_regime import regime_name
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def _measurements(
     if not torch.equal(torch.where(missing_mask, nominal, errors), nominal):
         raise ValueError(
             f"noise must be nominal for {type(model).__name__}, whose measurement errors are not "
-            f"independent normal, got {type(noise).__name__}. Choose noise=nominal."
+            f"independent normal, got {regime_name(noise)}. Choose noise=nominal."
         )
     y = draw_measurements(distributions, stream, "world.receiver")
     return torch.where(missing_mask, torch.nan, y)

@@ -22,6 +22,7 @@ from pfbench.model.passive_location import (
 from pfbench.noise.base import NoiseRegime, process_variance_factors
 from pfbench.scenario.base import Scenario
 from pfbench.scenario.emitter_prior import EmitterPrior, FirstMeasurement, LinearisedEmitterPrior
+from pfbench.scenario.recording_regime import regime_name
 
 _KINDS = ("angle", "angle", "rate", "rate", "rate")
 
@@ -141,7 +142,7 @@ class PassiveLocationScenario(Scenario):
         if bool(torch.isnan(y[:, 0]).any()):
             raise ValueError(
                 "noise must not remove the first measurement, from which filters start, "
-                f"got {type(noise).__name__}. Start the windows after 0 s."
+                f"got {regime_name(noise)}. Start the windows after 0 s."
             )
         first = PlatformInputs(*(a[:, 0] for a in assumed))
         limits = self.range_limits[0], self.range_limits[1]

@@ -28,7 +28,7 @@ from pfbench.testing.subjects import (
     check_count,
     check_is_model,
     check_subject,
-    describe,
+    describe_subject,
     takes_arguments,
 )
 
@@ -135,7 +135,7 @@ def check_convergence(
 
     Raises:
         AssertionError: If the slope is not -1/2.
-        ValueError: If `method` is no filter with particles, and no function that returns one.
+        ValueError: If `method` is neither a filter with particles nor a function that returns one.
     """
     check_count("check_convergence", 2, runs=runs)
     model, rng = linear_walk(1.0, 0.5, 1.0), np.random.default_rng(2)
@@ -165,7 +165,7 @@ def _with_particles(method: Any, n: int) -> Any:
     if has_particles(method):
         return replace(method, particles=n)
     if not (callable(method) and takes_arguments(method, 1)):
-        got = describe(method, "ParticleFilter(100)")
+        got = describe_subject(method, "ParticleFilter(100)")
         raise ValueError(
             "check_convergence: method must be a dataclass with a field `particles`, or a function "
             f"from their number to a filter, got {got}"

@@ -21,7 +21,7 @@ from pfbench.testing.averages import (
 )
 from pfbench.testing.reference import case_or_default
 from pfbench.testing.results import LawCheck
-from pfbench.testing.subjects import check_count, check_subject, repeat
+from pfbench.testing.subjects import check_count, check_subject, compute_twice
 
 Runner = Callable[[Filter, StateSpaceModel, Tensor], FilterResult]
 _NAMES = ("mean", "variance", "log_evidence")
@@ -53,7 +53,7 @@ def check_causality(
     case_model, y = _records(model, y)
     statement = "an estimate uses no later measurement"
     record = y
-    before = repeat("filter", lambda: run(method, case_model, record), _estimates)
+    before = compute_twice("filter", lambda: run(method, case_model, record), _estimates)
     for t in range(1, y.shape[1]):
         changed_y = y.clone()
         changed_y[:, t:] = changed_y[:, t:] + 0.7
@@ -95,7 +95,7 @@ def check_independence(
     check_subject("check_independence", method, model, y, "R, T, Dy")
     case_model, records = _records(model, y)
     statement, last = "a run does not depend on others", records.shape[0] - 1
-    joint = repeat("filter", lambda: filter_record(method, case_model, records), _estimates)
+    joint = compute_twice("filter", lambda: filter_record(method, case_model, records), _estimates)
     stream = PhiloxStream(1, torch.tensor([last]), case_model.anchor.dtype)
     alone = run_filter(method, case_model, Record(records[last:]), stream)
     largest = 0.0

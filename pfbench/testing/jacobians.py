@@ -33,7 +33,7 @@ def check_jacobians(
 
     Raises:
         AssertionError: If the model states none, or an error exceeds the limit.
-        ValueError: If the model is no `StateSpaceModel`, or the states have another shape.
+        ValueError: If the model is not a `StateSpaceModel`, or the states have another shape.
     """
     check_is_model("check_jacobians", model)
     if x.dim() != 3 or x.shape[-1] != model.chart.size:
@@ -60,7 +60,7 @@ def check_jacobians(
     }
     gain = model.noise_gain(u)
     if gain is not None:
-        for side in (1.0, -1.0):  # both, since a square in the noise has no central difference
+        for side in (1.0, -1.0):  # both: the central difference of a square is 0
             pairs[f"noise_gain ({side:+g} sd)"] = gain[:, None], _noise_quotients(model, x, u, side)
     errors: dict[str, float] = {}
     for label, (value, expected) in pairs.items():

@@ -18,7 +18,7 @@ from pfbench.filter.moves.metropolis import McmcKernel, MetropolisHastings, Move
 from pfbench.filter.moves.path_history import PathHistory
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.testing.results import LawCheck, check_p_values
-from pfbench.testing.subjects import check_count, describe, find_kind, repeat
+from pfbench.testing.subjects import check_count, compute_twice, describe_subject, find_kind
 
 STEPS = 10  # so 11 states of 2 components
 PATH_SIZE = 2 * (STEPS + 1)
@@ -189,7 +189,7 @@ def check_move(
     statement = "a move leaves the distribution of the path invariant"
     moved_runs = torch.ones(1, dtype=torch.bool)
     before, stream = case.belief(chain.required_history), PhiloxStream(1, torch.arange(1))
-    after, rate = repeat(
+    after, rate = compute_twice(
         "move",
         lambda: chain(case.model, before, moved_runs, stream),
         lambda pair: {"states": pair[0].x},
@@ -220,7 +220,7 @@ def _as_move(stage: Any, mcmc_steps: int) -> Any:
     if isinstance(stage, type) or not hasattr(stage, "required_history"):
         raise ValueError(
             "check_move: stage must be a move or a kernel, with the attribute required_history, got "
-            f"{describe(stage, 'MetropolisHastings(LastStateKernel())')}"
+            f"{describe_subject(stage, 'MetropolisHastings(LastStateKernel())')}"
         )
     if hasattr(stage, "propose"):
         return MetropolisHastings(stage, mcmc_steps)

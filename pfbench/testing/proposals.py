@@ -12,7 +12,7 @@ from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.particle.proposals import Proposal
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing.results import LawCheck, check_means
-from pfbench.testing.subjects import check_count, find_kind, repeat
+from pfbench.testing.subjects import check_count, compute_twice, find_kind
 
 _STATEMENT = "a proposal returns log p(w) - log q(w)"
 
@@ -37,7 +37,7 @@ def check_proposal(
 
     Raises:
         AssertionError: If the statement does not hold, or if the proposal is not repeatable.
-        ValueError: If the proposal is no instance that is called with these arguments.
+        ValueError: If the proposal is not an instance that is called with these arguments.
     """
     kinds = {"proposal": ("model", "belief", "record", "draws")}
     find_kind("check_proposal", proposal, kinds, "BootstrapProposal()")
@@ -50,7 +50,7 @@ def check_proposal(
         streams.normal("state", particles, 2), flat, torch.zeros(runs, dtype=torch.float64)
     )
     record = Record(torch.full((runs, 1), 0.7, dtype=torch.float64))
-    proposed = repeat(
+    proposed = compute_twice(
         "proposal",
         lambda: proposal(model, belief, record, streams.at_step(1)),
         lambda sample: {"states": sample.x, "ratio": sample.log_ratio},

@@ -16,7 +16,7 @@ from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.particle.resampling import EssResampler, Resampler, ResamplingScheme
 from pfbench.model.linear_gaussian import local_level
 from pfbench.testing.results import LawCheck, check_p_values
-from pfbench.testing.subjects import check_count, find_kind, repeat
+from pfbench.testing.subjects import check_count, compute_twice, find_kind
 
 _STATEMENT = "a resampler gives each particle its weight on average"
 _KINDS = {
@@ -76,7 +76,7 @@ def check_resampling(
             )
             p_values["two steps"] = _correlation(shares[:few], later)
             compute = partial(_shares, resampler, log_w.expand(64, -1), log_w, count, seed)
-            repeat("resampler", compute, lambda array: {"copies": array})
+            compute_twice("resampler", compute, lambda array: {"copies": array})
     return check_p_values(
         _STATEMENT, p_values, 1e-4, largest_deviation_in_copies=max(deviations.values())
     )

@@ -37,10 +37,10 @@ def find_kind(
     expected = " or ".join(
         f"a {kind}, called with ({', '.join(arguments)})" for kind, arguments in kinds.items()
     )
-    raise ValueError(f"{tester}: stage must be {expected}, got {describe(stage, example)}")
+    raise ValueError(f"{tester}: stage must be {expected}, got {describe_subject(stage, example)}")
 
 
-def describe(item: object, example: str) -> str:
+def describe_subject(item: object, example: str) -> str:
     """Return what a test received, with the remedy.
 
     Args:
@@ -94,7 +94,7 @@ def check_is_model(tester: str, model: object) -> None:
         ValueError: If it is not.
     """
     if not isinstance(model, StateSpaceModel):
-        got = describe(model, "linear_walk(1.0, 0.5, 1.0)")
+        got = describe_subject(model, "linear_walk(1.0, 0.5, 1.0)")
         raise ValueError(f"{tester}: model must be a StateSpaceModel, got {got}")
 
 
@@ -117,7 +117,7 @@ def check_count(tester: str, least: int = 1, **counts: object) -> None:
             )
 
 
-def repeat(
+def compute_twice(
     subject: str, compute: Callable[[], Any], values: Callable[[Any], Mapping[str, Any]]
 ) -> Any:
     """Return a result that is computed twice with the same inputs and the same random stream.

@@ -36,6 +36,7 @@ from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.prior_predictive import simulate
 from pfbench.ppl.pyro_program import latent_program
 from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.scenario.recording_regime import RecordingRegime
 
 RUNS = 20_000
 
@@ -338,10 +339,13 @@ def test_measurements_have_the_distribution_of_the_model_under_the_nominal_regim
 
 def test_a_regime_that_changes_errors_needs_normal_ones_but_an_outage_does_not() -> None:
     world = ModelSimulation(HeavyTailed(WHITE), 5)
-    with pytest.raises(
-        ValueError, match=r"noise must be nominal for HeavyTailed.*got OutlierNoise"
-    ):
-        world.draw(OutlierNoise(0.5, 10.0), torch.arange(20), 1)
+    outliers = OutlierNoise(0.5, 10.0)
+    for noise in (outliers, RecordingRegime(outliers)):  # a job records the channels of its regime
+        with pytest.raises(
+            ValueError,
+            match=r"noise must be nominal for HeavyTailed.*got OutlierNoise\. Choose noise=nominal",
+        ):
+            world.draw(noise, torch.arange(20), 1)
     nominal = world.draw(NominalNoise(), torch.arange(20), 1).record.y
     outage = world.draw(MeasurementOutage(((2.0, 4.0),)), torch.arange(20), 1).record.y
     assert torch.isnan(outage).any(2).tolist() == [[False, True, True, False, False]] * 20

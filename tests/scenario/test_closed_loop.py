@@ -39,7 +39,7 @@ from pfbench.noise.base import NoiseRegime
 from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import VarianceSurge
 from pfbench.noise.white import NominalNoise
-from pfbench.scenario.oracle_noise import RecordingRegime
+from pfbench.scenario.recording_regime import RecordingRegime
 from pfbench.scenario.simulated_flight import SimulatedFlight
 
 IMU = ImuErrors(

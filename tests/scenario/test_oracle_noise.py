@@ -42,7 +42,8 @@ from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import BiasStep, VarianceSurge
 from pfbench.noise.white import GlintNoise, LaplaceNoise, NominalNoise, OutlierNoise, StudentTNoise
 from pfbench.scenario.model_simulation import ModelSimulation
-from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime
+from pfbench.scenario.oracle_noise import OracleNoiseModel
+from pfbench.scenario.recording_regime import RecordingRegime
 
 CONF = job.conf_dir()
 KALMAN = GaussianFilter(TaylorLinearisation())

@@ -20,7 +20,7 @@ from pfbench.model.strapdown.tuning import AidedTuning
 from pfbench.noise.outage import MeasurementOutage
 from pfbench.noise.time_varying import VarianceSurge
 from pfbench.noise.white import NominalNoise
-from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime
+from pfbench.scenario.oracle_noise import OracleNoiseModel
 from pfbench.scenario.recorded.aided_flight import (
     BaroMagSensors,
     RecordedAidedFlight,
@@ -29,6 +29,7 @@ from pfbench.scenario.recorded.aided_flight import (
 from pfbench.scenario.recorded.assembly import FixReceiver
 from pfbench.scenario.recorded.drive import RecordedDrive
 from pfbench.scenario.recorded.fix_holdout import FixHoldout
+from pfbench.scenario.recording_regime import RecordingRegime
 
 FIELD, IRON = [0.17, 0.01, 0.52], [0.4, -0.2, 0.3]  # North, East, Down; forward, right, down
 MOTION = believed([1.0, 1.0, 2.0], [0.1, 0.1, 0.1])
