@@ -44,6 +44,8 @@ SETTINGS = [
     replace(BASE, worlds=1, regimes=1, runs=50, lost_a=0.4, lost_b=0.4),
     *(replace(BASE, worlds=6, world_correlation=c) for c in (0.0, 0.3)),
     *(replace(BASE, worlds=6, world_sd=s) for s in (0.06, 0.6)),
+    *(replace(BASE, mean_sd=s) for s in (0.1, 0.8)),
+    *(replace(BASE, estimate="paired", noise=name) for name in ("t3", "exponential")),
 ]
 
 
@@ -59,7 +61,7 @@ def count_words(setting: StudySetting, question: str, effect: str, chunk: int) -
     name = name_of(setting)
     rng = np.random.default_rng([zlib.crc32(f"{name} {question} {effect}".encode()), chunk])
     pairs = setting.draw(rng, CHUNK, EFFECTS[effect], fixed_worlds=question == "a")
-    track, error = assess_pairs(pairs, setting.weights)
+    track, error = assess_pairs(pairs, setting.weights, estimate=setting.estimate)
     members = [getattr(effects, QUESTIONS[question]) for effects in (track, error)]
     tests = decide_family(stack_questions(members), OPTIONS.alpha)
     counts: Counter[str] = Counter()

@@ -65,4 +65,4 @@ class ReportOptions:
     @property
     def decision_options(self) -> DecisionOptions:
         """Options of all decisions: planned pairs are decided by the levels of the board."""
-        return DecisionOptions(self.alpha, self.equivalence_margin, estimate="levels")
+        return DecisionOptions(self.alpha, self.equivalence_margin)

@@ -44,9 +44,9 @@ class DecisionOptions:
         track_margin: Difference of shares within which filters are equivalent.
         prior_sd: Scale of the prior of the SD between worlds.
         shared_runs: Whether runs of equal name have the same random numbers in all worlds.
-        estimate: Estimate of a log ratio: "paired" is the trimmed mean of the ratios of runs,
-            "levels" the difference of the trimmed means of both filters. A report uses "levels",
-            so that its planned pairs agree with its order of filters.
+        estimate: Estimate of a log ratio: "levels" is the difference of the trimmed means of both
+            filters, so that pairs agree with the order of a report. "paired" is the trimmed mean of
+            the ratios of runs.
 
     Raises:
         ValueError: if a value is out of range.
@@ -57,7 +57,7 @@ class DecisionOptions:
     track_margin: float = 0.05
     prior_sd: float = PRIOR_SD
     shared_runs: bool = True
-    estimate: Estimate = "paired"
+    estimate: Estimate = "levels"
 
     def __post_init__(self) -> None:
         if not 0 < self.alpha < 1:

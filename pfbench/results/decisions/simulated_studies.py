@@ -14,9 +14,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
+from pfbench.results.decisions.options import Estimate
 from pfbench.results.decisions.pair_effects import PairEffects, location_effects, share_effects
 from pfbench.results.error_measures import Array, Flags
-from pfbench.results.statistics.paired_effects import order_failed_runs, trimmed_effects
+from pfbench.results.statistics.paired_effects import (
+    log_levels,
+    order_failed_runs,
+    subtract_levels,
+    trimmed_effects,
+)
 
 NoiseName = Literal["normal", "t3", "exponential"]
 _DIFFICULTY = 0.6  # share of the variance of difficulty that both filters have in common
@@ -27,11 +33,13 @@ class SimulatedPairs(NamedTuple):
 
     Attributes:
         d: Log ratios, [S, W, R, N].
+        mean: Mean log errors of both filters, [S, W, R, N]: the difficulty of a run.
         keeps_a: Runs in which the first filter keeps track, [S, W, R, N].
         keeps_b: Runs in which the second filter keeps track, [S, W, R, N].
     """
 
     d: Array
+    mean: Array
     keeps_a: Flags
     keeps_b: Flags
 
@@ -46,13 +54,16 @@ class StudySetting:
         runs: Number of runs of each condition.
         world_sd: SD of effects over worlds.
         regime_sd: SD of effects over regimes of a world.
-        run_sd: SD of a condition over runs.
+        run_sd: SD of the log ratio of a condition over runs.
+        mean_sd: SD over runs of the mean log error of both filters. The median of its ratio to
+            `run_sd` is 0.99 over pairs of filters in the conditions of all_seven.
         regime_correlation: Share of the run variance that the regimes of a world have in common,
             with that of worlds.
         world_correlation: Share of the run variance that all worlds have in common.
         noise: Distribution of the runs.
         lost_a: Share of runs in which the first filter does not keep track.
         lost_b: Share of runs in which the second filter does not keep track.
+        estimate: Estimate whose expectation is the effect; skewed noise has another one for each.
     """
 
     worlds: int = 3
@@ -61,11 +72,13 @@ class StudySetting:
     world_sd: float = 0.25
     regime_sd: float = 0.2
     run_sd: float = 0.4
+    mean_sd: float = 0.4
     regime_correlation: float = 0.34
     world_correlation: float = 0.15
     noise: NoiseName = "t3"
     lost_a: float = 0.0
     lost_b: float = 0.0
+    estimate: Estimate = "levels"
 
     @property
     def weights(self) -> Array:
@@ -104,7 +117,8 @@ class StudySetting:
             np.sqrt(share) * draw_run_noise(rng, self.noise, size)
             for share, size in zip(shares, shapes, strict=True)
         )
-        centre = _noise_centre(self.noise, tuple(map(float, shares)))
+        ratio = self.mean_sd / self.run_sd if self.estimate == "levels" else None
+        centre = _noise_centre(self.noise, tuple(map(float, shares)), ratio)
         d = effect + worlds + self.run_sd * (runs - centre)
         common = self._difficulty(rng, studies)
         keeps = [
@@ -112,7 +126,8 @@ class StudySetting:
             <= -ndtri(lost) if lost > 0 else np.ones(shape, dtype=bool)
             for lost in (self.lost_a, self.lost_b)
         ]  # fmt: skip
-        return SimulatedPairs(d, keeps[0], keeps[1])
+        mean = self.mean_sd * rng.standard_normal(shape)
+        return SimulatedPairs(d, mean, keeps[0], keeps[1])
 
     def _difficulty(self, rng: np.random.Generator, studies: int) -> Array:
         """Draw standard normal difficulties of runs with shared draws over regimes and worlds."""
@@ -140,7 +155,7 @@ def draw_run_noise(rng: np.random.Generator, noise: NoiseName, size: tuple[int, 
 
 
 def assess_pairs(
-    pairs: SimulatedPairs, weights: Array, shared_runs: bool = True
+    pairs: SimulatedPairs, weights: Array, shared_runs: bool = True, estimate: Estimate = "levels"
 ) -> tuple[PairEffects, PairEffects]:
     """Estimate track and error of simulated studies by the functions of a report.
 
@@ -148,20 +163,41 @@ def assess_pairs(
         pairs: Simulated studies.
         weights: Weights of the conditions, [W, R].
         shared_runs: Whether runs share draws over worlds.
+        estimate: Estimate of the log ratio, as in `DecisionOptions`.
 
     Returns:
         Effects of track and of error.
     """
     d = order_failed_runs(pairs.d, pairs.keeps_a, pairs.keeps_b)
     track = share_effects(pairs.keeps_b.astype(float) - pairs.keeps_a, weights, shared_runs)
-    return track, location_effects(d, weights, shared_runs=shared_runs)
+    levels = None
+    if estimate == "levels":
+        present = np.ones(d.shape, dtype=bool)
+        first, second = np.exp(pairs.mean + pairs.d / 2), np.exp(pairs.mean - pairs.d / 2)
+        levels = subtract_levels(
+            log_levels(first, pairs.keeps_a, present), log_levels(second, pairs.keeps_b, present)
+        )
+    return track, location_effects(d, weights, shared_runs=shared_runs, conditions=levels)
 
 
 @cache
-def _noise_centre(noise: NoiseName, shares: tuple[float, ...]) -> float:
-    """Compute the trimmed mean of skewed noise, so that the effect is exact."""
+def _noise_centre(noise: NoiseName, shares: tuple[float, ...], ratio: float | None) -> float:
+    """Compute the location of skewed noise, so that the effect is exact.
+
+    Args:
+        noise: Name of the distribution.
+        shares: Shares of the variance of the noise.
+        ratio: SD of the mean log error over that of the noise for a difference of levels, None for
+            the trimmed mean of the noise.
+    """
     if noise != "exponential":
         return 0.0
     rng = np.random.default_rng(0)
-    sample = sum(np.sqrt(share) * draw_run_noise(rng, noise, (2_000_000,)) for share in shares)
-    return float(trimmed_effects(np.asarray(sample)).location)
+    sample = np.asarray(
+        sum(np.sqrt(share) * draw_run_noise(rng, noise, (2_000_000,)) for share in shares)
+    )
+    if ratio is None:
+        return float(trimmed_effects(sample).location)
+    mean = ratio * rng.standard_normal(sample.shape)
+    ends = [trimmed_effects(mean + sign * sample / 2).location for sign in (1, -1)]
+    return float(ends[0] - ends[1])

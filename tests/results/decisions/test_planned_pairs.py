@@ -40,9 +40,10 @@ def select(decisions, question, metric="error"):
 
 
 def table_of(pairs, study):
-    """Write one simulated study as a table; filter B has the value 1."""
+    """Write one simulated study as a table."""
     keeps = {"A": pairs.keeps_a[study], "B": pairs.keeps_b[study]}
-    value = {"A": np.exp(pairs.d[study]), "B": np.ones(pairs.d.shape[1:])}
+    mean, half = pairs.mean[study], pairs.d[study] / 2
+    value = {"A": np.exp(mean + half), "B": np.exp(mean - half)}
     rows = [
         {"filter": f, "scenario": f"s{w:02d}", "family": f"s{w:02d}", "regime": r, "run": n,
          "value": value[f][w, r, n], "keeps_track": keeps[f][w, r, n]}
@@ -51,16 +52,18 @@ def table_of(pairs, study):
     return pd.DataFrame(rows)
 
 
+@pytest.mark.parametrize("estimate", ["levels", "paired"])
 @pytest.mark.parametrize("lost", [0.0, 0.15, 0.4])
-def test_a_table_takes_the_path_of_the_simulations(lost):
+def test_a_table_takes_the_path_of_the_simulations(lost, estimate):
     setting = StudySetting(3, 2, 20, lost_a=lost, lost_b=lost)
     pairs = setting.draw(np.random.default_rng(1), 4)
-    track, error = assess_pairs(pairs, setting.weights)
+    track, error = assess_pairs(pairs, setting.weights, estimate=estimate)
+    options = DecisionOptions(estimate=estimate)
     for question, name in (("a", "same_worlds"), ("b", "new_world")):
         members = [getattr(effects, name) for effects in (track, error)]
         tests = decide_family(stack_questions(members), 0.05)
         for s in range(4):
-            decisions = decide_planned_pairs(table_of(pairs, s), PAIR)
+            decisions = decide_planned_pairs(table_of(pairs, s), PAIR, None, options)
             for k, metric in enumerate(("keeps track", "error")):
                 (record,) = select(decisions, question, metric)
                 assert record.estimate == pytest.approx(members[k].value[s], abs=1e-12)
