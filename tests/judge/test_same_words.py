@@ -12,6 +12,7 @@ from pfbench.judge.block_decisions import METRIC
 from pfbench.judge.judgement import judge_programs
 from pfbench.report.options import ReportOptions
 from pfbench.results.decisions.growing_study import decide_at_looks
+from pfbench.results.decisions.options import DecisionOptions
 from pfbench.results.decisions.planned_pairs import decide_planned_pairs
 from pfbench.results.decisions.tidy_table import tidy_runs
 from pfbench.results.frame import load_frame
@@ -64,5 +65,6 @@ def test_report_judgement_and_look_agree(tmp_path: Path, effect: float, word: st
     assert report.pair_word == word
     assert judged.pair_word == look.pair_word == state.word == word
     np.testing.assert_allclose([judged.estimate, look.estimate], report.estimate, atol=1e-4)
-    paired = decide_planned_pairs(table, [("a", "b")])[1]
+    other = DecisionOptions(estimate="paired")
+    paired = decide_planned_pairs(table, [("a", "b")], None, other)[1]
     assert abs(paired.estimate - report.estimate) > 1e-3  # the other estimate is another number

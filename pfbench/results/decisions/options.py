@@ -44,9 +44,8 @@ class DecisionOptions:
         track_margin: Difference of shares within which filters are equivalent.
         prior_sd: Scale of the prior of the SD between worlds.
         shared_runs: Whether runs of equal name have the same random numbers in all worlds.
-        estimate: Estimate of a log ratio: "levels" is the difference of the trimmed means of both
-            filters, so that pairs agree with the order of a report. "paired" is the trimmed mean of
-            the ratios of runs.
+        estimate: Estimate of a log ratio. "levels" is the difference of the trimmed means of both
+            filters, which agrees with the order of a report. "paired" is the trimmed mean over runs.
 
     Raises:
         ValueError: if a value is out of range.
