@@ -44,8 +44,8 @@ class DecisionOptions:
         track_margin: Difference of shares within which filters are equivalent.
         prior_sd: Scale of the prior of the SD between worlds.
         shared_runs: Whether runs of equal name have the same random numbers in all worlds.
-        estimate: Estimate of a log ratio. "levels" is the difference of the trimmed means of both
-            filters, which agrees with the order of a report. "paired" is the trimmed mean over runs.
+        estimate: Log ratio of two filters. It is the difference of their trimmed means for "levels", as
+            in the order of a report. For "paired", it is the trimmed mean over runs.
 
     Raises:
         ValueError: if a value is out of range.
