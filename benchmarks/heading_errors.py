@@ -4,7 +4,8 @@ A vehicle weaves at 10 m/s from rest, with position fixes of 1 m each second. Th
 the model of the filter, so the filters have no model error. The heading of the start is wrong by plus or minus
 the angle, with the angle as its standard deviation. Results are kept in heading_errors.json.
 
-Run: python benchmarks/heading_errors.py [--runs 24]; --page writes the page from the stored results alone.
+Run: python benchmarks/heading_errors.py [--runs 24]; --page writes the page from the stored results alone, --filter
+NAME adds or replaces the rows of one filter, with the CPU time of the EKF beside it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import json
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +122,7 @@ def filters() -> dict[str, Filter]:
     return {
         "EKF": ekf,
         "invariant EKF, left": InvariantFilter(ekf, "left"),
+        "invariant EKF, left, reset": InvariantFilter(replace(ekf, reset_covariance=True), "left"),
         "invariant EKF, right": InvariantFilter(ekf, "right"),
         "UKF, alpha 1": points[1.0],
         "UKF, alpha 0.3": points[0.3],
@@ -210,7 +213,7 @@ def page(stored: dict[str, Any]) -> str:
         lines.append(
             f"| {row['angle']} | {row['filter']} | {row['settled']} | {settle} | "
             f"{_nees(row['nees_10_30'])} | {_nees(row['nees_half'])} | {row['position']:.2f} | "
-            f"{row['cpu_s'] / ekf['cpu_s']:.2g} |"
+            f"{row['cpu_s'] / row.get('ekf_cpu_s', ekf['cpu_s']):.2g} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -220,13 +223,30 @@ def _nees(value: float) -> str:
     return f"{value:.3g}" if 0.0 <= value < 1e6 else "–"
 
 
+def add_rows(name: str) -> None:
+    """Measure one filter at all angles and store its rows in the order of the table."""
+    stored, methods = json.loads(STORE.read_text()), filters()
+    rows = {(row["angle"], row["filter"]): row for row in stored["rows"]}
+    for angle in ANGLES:
+        ekf_cpu_s = measure(methods["EKF"], angle, stored["runs"])["cpu_s"]
+        values = measure(methods[name], angle, stored["runs"])
+        rows[angle, name] = {"angle": angle, "filter": name, **values, "ekf_cpu_s": ekf_cpu_s}
+        print(rows[angle, name], flush=True)
+    keys = [(angle, key) for angle in ANGLES for key in methods if (angle, key) in rows]
+    stored["rows"] = [rows[key] for key in keys]
+    STORE.write_text(json.dumps(stored, indent=1) + "\n")
+
+
 def main() -> None:
     """Measure all filters and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=24)
     parser.add_argument("--page", action="store_true")
+    parser.add_argument("--filter", choices=filters())
     options = parser.parse_args()
-    if not options.page:
+    if options.filter:
+        add_rows(options.filter)
+    elif not options.page:
         rows = []
         for angle in ANGLES:
             for name, method in filters().items():

@@ -28,6 +28,7 @@ from pfbench.filter.gaussian.innovation import (
 from pfbench.filter.gaussian.kalman_update import (
     GaussianStep,
     kalman_gain_update,
+    move_root,
     remove_negative_eigenvalues,
 )
 from pfbench.filter.gaussian.linearisation_rules import (
@@ -56,8 +57,7 @@ class GaussianFilter:
     `noise_gain` is probed for additive noise, see `compute_additive_gain`.
 
     Attributes:
-        linearisation: TaylorLinearisation (EKF), or SigmaPointLinearisation (unscented and
-            cubature filters).
+        linearisation: TaylorLinearisation (EKF), or SigmaPointLinearisation (UKF and CKF).
         noise_adaptations: Noise adaptations in order: fading, constrained noise.
         gain_adaptations: Gain adaptations in order, applied last: adaptive factor, ratio bound.
         iterations: Number of updates, fixed for all runs [ours]. Each linearises about the updated
@@ -66,10 +66,12 @@ class GaussianFilter:
         repair_covariance: Whether to remove negative eigenvalues from the linearisation error
             [ours], which negative weights can cause. The trace counts `repairs`. Otherwise the run
             is lost.
+        reset_covariance: Whether to move the covariance to the updated mean, see `move_root`. It
+            matters on curved charts for corrections of about a radian, as of a wrong heading.
 
     Raises:
-        ValueError: If iterations is below 1, or above 1 with adaptations or gains, which evaluate
-            the first innovation, or if two noise adaptations use the innovation. On use, if a mean or variance of a distribution is not finite.
+        ValueError: If iterations is below 1, or above 1 with adaptations or gains, or if two noise
+            adaptations use the innovation. On use, if a mean or variance is not finite.
     """
 
     linearisation: LinearisationRule
@@ -77,6 +79,7 @@ class GaussianFilter:
     gain_adaptations: Sequence[GainAdaptation] = ()
     iterations: int = 1
     repair_covariance: bool = False
+    reset_covariance: bool = False
     is_exact = False  # it is exact on linear-Gaussian models only
 
     @property
@@ -181,9 +184,12 @@ class GaussianFilter:
         if self.repair_covariance:
             trace["repairs"] = repaired.to(root) + repaired_update.to(root)
         root = innovation.root
-        mean = model.chart.add(prior, (root @ shift.unsqueeze(-1)).squeeze(-1))
+        correction, updated = (root @ shift.unsqueeze(-1)).squeeze(-1), root @ updated
+        mean = model.chart.add(prior, correction)
+        if self.reset_covariance:
+            updated = move_root(model.chart, prior, correction, updated)
         log_like = torch.where(has_root & is_positive & log_like.isfinite(), log_like, -torch.inf)
-        return GaussianStep(prior, root, mean, root @ updated, innovation, log_like, memory, trace)
+        return GaussianStep(prior, root, mean, updated, innovation, log_like, memory, trace)
 
     def predict(
         self, model: StateSpaceModel, belief: GaussianBelief, u: Any

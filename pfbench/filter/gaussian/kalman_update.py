@@ -7,7 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pfbench.core.chart import Chart
 from pfbench.core.covariance import factor
+from pfbench.core.jacobian import jacobian
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.whitening import LOG_2PI
 from pfbench.kernels import cpp
@@ -129,3 +131,30 @@ def remove_negative_eigenvalues(
     values, vectors = torch.linalg.eigh(torch.where(finite_mask, excess, 0.0))
     excess = (vectors * values.clamp(min=0.0).unsqueeze(-2)) @ vectors.mT
     return torch.where(bad[:, None, None] & finite_mask, noise + excess * scale, omega), bad
+
+
+def move_root(chart: Chart, prior: Tensor, correction: Tensor, root: Tensor) -> Tensor:
+    """Move the root of a covariance from the predicted to the updated mean, to first order.
+
+    The update is linear in differences d from the predicted mean. With the correction s, the
+    difference from the updated mean is ((m (+) (s + e)) (-) (m (+) s)) = J e + O(e^2) for d = s + e. On a
+    group J is the right or left Jacobian of its exponential at s.
+
+    Args:
+        chart: Chart of the state.
+        prior: Predicted mean m, [R, D].
+        correction: s, [R, d].
+        root: Root of the covariance of d, [R, d, d].
+
+    Returns:
+        Root of the covariance about the updated mean, [R, d, d].
+
+    References:
+        M. Mueller, M. Hehn and R. D'Andrea (2017), Covariance correction step for Kalman filtering
+        with an attitude.
+    """
+    if chart.flat:
+        return root
+    centre, s = prior.unsqueeze(1), correction.unsqueeze(1)
+    mean = chart.add(centre, s)
+    return jacobian(lambda e: chart.add(centre, s + e), mean, s.shape[-1], chart.subtract) @ root

@@ -125,15 +125,32 @@ def test_series_have_the_digits_of_their_type(
 
 
 @pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-4, 1e-2, 0.49, 0.51, 2.0])
+def test_single_precision_is_kept_from_angles_of_zero_on(side: str, angle: float) -> None:
+    """States of about 3 m have seven digits, so their differences have an error of some 1e-6."""
+    block = LieGroupBlock(10, side)
+    x, d, _ = (torch.from_numpy(a).float() for a in cases(10, 5, angle))
+    moved = block.add(x, d)
+    exact = element(x.double().numpy())
+    factor = expm(algebra(d.double().numpy()))
+    exact = exact @ factor if side == "left" else factor @ exact
+    assert np.allclose(element(moved.double().numpy()), exact, rtol=0, atol=4e-6)
+    assert torch.allclose(block.subtract(moved, x), d, rtol=0, atol=4e-6)
+
+
+@pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("size", SIZES)
-def test_derivative_at_zero_is_the_identity_in_both_modes(size: int, side: str) -> None:
+@pytest.mark.parametrize(("dtype", "limit"), [(torch.float64, 1e-13), (torch.float32, 2e-6)])
+def test_derivative_at_zero_is_the_identity_in_both_modes(
+    size: int, side: str, dtype: torch.dtype, limit: float
+) -> None:
     block = LieGroupBlock(size, side)
-    x = torch.from_numpy(np.stack([cases(size, i, 1.0)[0] for i in range(3)]))[:, None]
-    eye = torch.eye(size - 1, dtype=torch.float64).expand(3, -1, -1)
+    x = torch.from_numpy(np.stack([cases(size, i, 1.0)[0] for i in range(3)]))[:, None].to(dtype)
+    eye = torch.eye(size - 1, dtype=dtype).expand(3, -1, -1)
     for mode in (torch.no_grad, torch.enable_grad):  # backward and forward
         with mode():
             slope = jacobian(lambda d: block.add(x, d), x, size - 1, block.subtract)
-        assert torch.allclose(slope, eye, rtol=0, atol=1e-13)
+        assert torch.allclose(slope, eye, rtol=0, atol=limit)
 
 
 @pytest.mark.parametrize("side", SIDES)
