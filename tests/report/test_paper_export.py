@@ -263,12 +263,24 @@ def test_other_formats_compile(
 
 def test_methods_list_what_was_not_done(conditions: list[Condition]) -> None:
     done, limits = describe_methods(conditions, pairs=2)
-    assert "4 filters with pfbench in 1 world" in done
+    assert "4 filters with pfbench in 1 world (flight) under 1 noise regime (surge)" in done
+    assert "2 planned pairs are decided" in done
+    assert "The metric is the RMS error over the time of a run" in done
     assert "4 Monte Carlo runs of 5 steps" in done
     assert "commit 0123abc" in done
     assert limits.startswith("Not done: one seed (5)")
     assert "simulated" in limits
     assert "4 runs per condition are fewer than the 10" in limits
+    assert "Times were measured once" in limits
+    for job in (job for condition in conditions for job in condition.jobs):
+        job.meta["step_time"] = {"rounds": [1.0] * 7}
+    done, limits = describe_methods(conditions, pairs=1, metric="CRPS")
+    assert "medians of 7 or more rounds" in done
+    assert "1 planned pair is decided" in done
+    assert "The metric is the CRPS over" in done
+    assert "Times were measured once" not in limits
+    for job in (job for condition in conditions for job in condition.jobs):
+        del job.meta["step_time"]
 
 
 def test_each_reference_of_a_filter_has_an_entry_and_each_entry_a_filter() -> None:

@@ -13,6 +13,7 @@ from pfbench.report.board.pack_entries import (
     describe_versions,
     regime_entries,
 )
+from pfbench.report.board.run_table import METRIC_NAMES
 from pfbench.report.board.study_data import StudyData, read_study
 from pfbench.report.journal.methods_text import describe_methods
 from pfbench.report.journal.references import format_bibliography
@@ -79,7 +80,11 @@ def build_pack(
 def _describe_methods(conditions: Sequence[Condition], options: ReportOptions, pairs: int) -> str:
     """Describe what was done and what was not, in paragraphs."""
     paragraphs = describe_methods(
-        conditions, alpha=options.alpha, margin=options.equivalence_margin, pairs=pairs
+        conditions,
+        alpha=options.alpha,
+        margin=options.equivalence_margin,
+        pairs=pairs,
+        metric=METRIC_NAMES[options.metric],
     )
     return "\n\n".join(paragraphs)
 

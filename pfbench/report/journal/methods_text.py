@@ -5,17 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pfbench.report.looks import describe_tuning, study_looks
+from pfbench.report.looks import describe_tuning, study_looks, study_part_names
 from pfbench.report.provenance import distinct_values
 from pfbench.results import store
-from pfbench.results.conditions import Condition, natural_sort_key
+from pfbench.results.conditions import Condition
 from pfbench.results.status import divergence_threshold, scenario_family
+from pfbench.results.step_times import STEP_TIME
 
 _FEW_RUNS, _FEW_WORLDS = 10, 6
 
 
 def describe_methods(
-    conditions: Sequence[Condition], *, alpha: float = 0.05, margin: float = 0.05, pairs: int = 0
+    conditions: Sequence[Condition],
+    *,
+    alpha: float = 0.05,
+    margin: float = 0.05,
+    pairs: int = 0,
+    metric: str = "RMS error",
 ) -> list[str]:
     """Describe how the results of a study were made.
 
@@ -24,6 +30,7 @@ def describe_methods(
         alpha: Level of the families of tests.
         margin: Relative margin of equivalence.
         pairs: Number of planned pairs.
+        metric: Name of the metric that decides.
 
     Returns:
         Two paragraphs of plain text: what was done, and what was not done.
@@ -32,7 +39,8 @@ def describe_methods(
     done = [
         *_describe_design(conditions, jobs),
         *_describe_particles(jobs),
-        *_describe_decisions(alpha, margin, pairs),
+        *_describe_decisions(alpha, margin, pairs, metric),
+        *_describe_times(jobs),
         *_describe_software(jobs),
     ]
     return [" ".join(done), " ".join(["Not done:", *list_limits(conditions)])]
@@ -75,7 +83,8 @@ def list_limits(conditions: Sequence[Condition]) -> list[str]:
     limits.append(
         f"{tuning} Parameters of {others} were not tuned for this comparison unless the paper says so.".lstrip()
     )
-    limits.append("Times were measured once on a machine that may have been shared.")
+    if not _count_rounds(jobs):
+        limits.append("Times were measured once on a machine that may have been shared.")
     return limits
 
 
@@ -84,16 +93,20 @@ def _describe_design(
 ) -> list[str]:
     """Describe filters, worlds, runs, seed and pairing."""
     filters = len({job.label for condition in conditions for job in condition.jobs})
-    scenarios = sorted({condition.scenario for condition in conditions}, key=natural_sort_key)
-    regimes = sorted({condition.noise for condition in conditions}, key=natural_sort_key)
+    scenarios, regimes = (
+        [name.name for name in study_part_names(conditions, group).values()]
+        for group in ("scenario", "noise")
+    )
     runs = distinct_values(str(job["runs"]) for job in jobs)
     seeds = distinct_values(str(job["seed"]) for job in jobs)
     families = len(_families(conditions))
     steps = distinct_values(str(job["steps"]) for job in jobs)
+    worlds = _count(families, "world")
+    if len(scenarios) > families:
+        worlds = f"{_count(len(scenarios), 'scenario')} of {worlds}"
     return [
-        f"This study compares {_count(filters, 'filter')} with pfbench in {_count(families, 'world')} "
-        f"({', '.join(scenarios)}) under {_count(len(regimes), 'noise regime')} ({', '.join(regimes)}), with "
-        f"{' and '.join(runs)} Monte Carlo runs of {' and '.join(steps)} steps per condition.",
+        f"This study compares {_count(filters, 'filter')} with pfbench in {worlds} ({', '.join(scenarios)}) under {_count(len(regimes), 'noise regime')} ({', '.join(regimes)}), with "
+        f"{_join(runs, 'and')} Monte Carlo runs of {_join(steps, 'and')} steps per condition.",
         "All filters of a condition receive the same truths, measurements and random numbers "
         f"(seed {', '.join(seeds)}), so that comparisons are paired by run.",
     ]
@@ -105,26 +118,38 @@ def _describe_particles(jobs: Sequence[Mapping[str, Any]]) -> list[str]:
     budgets = {str(job["config"].get("budget", store.SAME_N)) for job in jobs}
     if not numbers:
         return []
-    text = f"Particle filters used {' or '.join(numbers)} particles"
+    text = f"Particle filters used {_join(numbers, 'or')} particles"
     if budgets != {store.SAME_N}:
         return [f"{text}, chosen for equal cost ({', '.join(sorted(budgets - {store.SAME_N}))})."]
     return [f"{text}."]
 
 
-def _describe_decisions(alpha: float, margin: float, pairs: int) -> list[str]:
+def _describe_decisions(alpha: float, margin: float, pairs: int, metric: str) -> list[str]:
     """Describe metric, intervals, tests and lost runs."""
     level = f"{100 * (1 - alpha):g} %"
     tests = (
-        f"The {_count(pairs, 'planned pair')} are decided from the differences of these trimmed means, paired by run, "
+        f"{_count(pairs, 'planned pair')} {'is' if pairs == 1 else 'are'} decided from the differences of these trimmed means, paired by run, "
         "with runs as units and Holm's correction over all pairs, separately for track and error; "
         if pairs
         else "No pair was planned; "
     )
     return [
-        "The metric is the root mean square error over time of a run; a lost run counts as the largest error.",
+        f"The metric is the {metric} over the time of a run; a run that is lost or diverges counts as the largest.",
         f"Values are 20 % trimmed means over runs on the logarithmic scale, averaged over conditions; ratios to a baseline are paired by run, with {level} intervals.",
         f"{tests}intervals are simultaneous ({level}), and filters within {100 * margin:g} % are called equivalent.",
     ]
+
+
+def _count_rounds(jobs: Sequence[Mapping[str, Any]]) -> int:
+    """Count the rounds in which the times of all jobs were measured; 0 if a job has none."""
+    return min(len(job.get(STEP_TIME, {}).get("rounds", ())) for job in jobs)
+
+
+def _describe_times(jobs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Describe how times per step were measured in rounds; empty if they were not."""
+    rounds = _count_rounds(jobs)
+    text = f"Times per step are medians of {rounds} or more rounds in which the filters took turns."
+    return [text] if rounds else []
 
 
 def _describe_software(jobs: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -155,6 +180,11 @@ def _is_recorded(meta: Mapping[str, Any]) -> bool:
     """Return whether the scenario of a job reads recorded data."""
     node = meta["config"].get("scenario")
     return isinstance(node, Mapping) and "root" in node
+
+
+def _join(texts: Sequence[str], word: str) -> str:
+    """List texts with a word before the last one."""
+    return f" {word} ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
 
 
 def _count(number: int, noun: str) -> str:
