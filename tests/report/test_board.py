@@ -21,6 +21,7 @@ from pfbench.report.board.levels import (
     compare_track_shares,
     compute_condition_levels,
 )
+from pfbench.report.board.pack_entries import metric_entries
 from pfbench.report.board.planned import decide_planned, planned_entries
 from pfbench.report.board.sentence import describe_view
 from pfbench.report.board.study_views import StudyNames, build_views
@@ -176,6 +177,25 @@ def test_filters_are_compared_where_all_of_them_were_run() -> None:
         iter(build_views(apart[apart["filter"] != "ukf"], names, ReportOptions(), {}).values())
     )
     assert "No filter has an error to compare" in split["sentence"]
+
+
+def test_the_log_score_orders_a_board() -> None:
+    """A difference of 0.3 per step is a ratio of predictive densities."""
+    data = table({"ekf": 0.0, "sir": 0.0}, worlds=1).drop(columns="rmse")
+    score = np.random.default_rng(1).normal(-5.0, 1.0, len(data))
+    order = data.groupby("filter").cumcount().to_numpy()
+    data["log_score"] = score[order] + np.where(data["filter"] == "ekf", 0.3, 0.0)
+    data["rmse"] = np.nan
+    looks = find_looks(["ekf", "sir"])
+    names = StudyNames(looks, {"w0": PartName("w0", "w0", "", "m", None, "w0")}, {}, ["sir"])
+    views = build_views(data, names, ReportOptions(metric="log_score"), {})
+    opening = next(iter(views.values()))
+    first, second = opening["rows"]
+    assert (first["filter"], first["unit"], second["filter"]) == ("ekf", None, "sir")
+    assert first["ratio"] == pytest.approx(math.exp(-0.3), rel=1e-3)
+    assert "has the smallest inverse predictive density per step" in opening["sentence"]
+    (entry,) = metric_entries(data, "log_score")[:1]
+    assert (entry["key"], entry["unit"]) == ("log_score", "")
 
 
 def test_the_planned_word_decides() -> None:

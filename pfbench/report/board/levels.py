@@ -15,11 +15,13 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from pfbench.report.board.run_table import LOG_SCORE
 from pfbench.results.decisions.pair_effects import estimate_share_difference
 from pfbench.results.error_measures import Array, Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects, log_levels
 from pfbench.results.statistics.world_effects import EffectEstimate
 
+_LARGEST_LOG = 700.0  # whose exponential is finite
 _CONDITION = ["family", "scenario", "regime"]
 
 
@@ -133,9 +135,11 @@ def compute_condition_levels(runs: StudyArrays, metric: str) -> ConditionEffects
 
     Args:
         runs: Runs of the study.
-        metric: Column of the error.
+        metric: Column of the error. Of the log score, the level is minus its trimmed mean.
     """
     value = runs.values[metric]
+    if metric == LOG_SCORE:
+        value = np.exp(np.minimum(-value, _LARGEST_LOG))
     return log_levels(value, runs.keeps, runs.present & ~(runs.keeps & np.isnan(value)))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from pfbench.report.board.run_table import METRIC_NAMES
+from pfbench.report.board.run_table import LOG_SCORE, METRIC_NAMES
 from pfbench.report.looks import MethodLook, PartName
 from pfbench.results.conditions import Condition
 from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
@@ -127,6 +127,7 @@ def metric_entries(table: pd.DataFrame, main: str) -> list[dict[str, Any]]:
     units, groups = table["unit"].unique(), table["group"].unique()
     unit, group = units[0] if len(units) == 1 else "", groups[0] if len(groups) == 1 else "main"
     return [
-        {"key": key, "name": METRIC_NAMES[key], "unit": unit, "direction": "lower",
-         "caption": f"{METRIC_NAMES[key]} of the group {group}."} for key in list_metrics(table, main)
+        {"key": key, "name": METRIC_NAMES[key], "unit": "" if key == LOG_SCORE else unit, "direction": "lower",
+         "caption": f"{METRIC_NAMES[key]} of the {'filter' if key == LOG_SCORE else f'group {group}'}."}
+        for key in list_metrics(table, main)
     ]  # fmt: skip

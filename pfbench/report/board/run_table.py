@@ -18,9 +18,11 @@ from pfbench.results.step_times import STEP_TIME
 # metrics of the main group that a board can show, each with the component of its value
 SHOWN_METRICS: Mapping[str, str] = {"rmse": "norm", "max_error": "norm", "crps": "mean"}
 # metrics that can decide a study, but are shown only if they do
-_MAIN_ONLY: Mapping[str, str] = {"energy": "norm", "log_score": ""}
+LOG_SCORE = "log_score"  # of a filter, not of a group: a logarithm without unit
+_MAIN_ONLY: Mapping[str, str] = {"energy": "norm", LOG_SCORE: ""}
 METRIC_NAMES = {
     "rmse": "RMS error", "max_error": "largest error", "crps": "CRPS", "energy": "energy score",
+    LOG_SCORE: "inverse predictive density per step",
 }  # fmt: skip
 
 

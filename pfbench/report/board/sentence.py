@@ -240,5 +240,7 @@ def _describe_ties(ranked: Sequence[BoardRow]) -> str:
         (sum(row.verdict == EQUAL for row in others), "equal to the best within the margin"),
         (sum(row.verdict == OPEN for row in others), "not decided against the best"),
     ]
+    if len(others) == 1:
+        return "".join(f"The other filter is {state}." for n, state in counts if n)
     parts = [f"{n} {'is' if n == 1 else 'are'} {state}" for n, state in counts if n]
     return f"Of {count_words(len(others), 'other filter')}, {' and '.join(parts)}." if parts else ""

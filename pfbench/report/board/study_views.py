@@ -19,7 +19,7 @@ from pfbench.report.board.levels import (
     compute_condition_levels,
 )
 from pfbench.report.board.pack_entries import format_interval_level, list_metrics, round_values
-from pfbench.report.board.run_table import METRIC_NAMES
+from pfbench.report.board.run_table import LOG_SCORE, METRIC_NAMES
 from pfbench.report.board.sentence import count_failing, count_words, describe_view
 from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_filters
 from pfbench.report.journal.study_pack import ALL
@@ -92,6 +92,11 @@ def build_views(
             of_scope = groups.loc[list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))]  # fmt: skip
             scope = _assess_scope(selected, levels, mask, of_scope, options)
             scope = scope._replace(times=[(times or {}).get(key, {}) for key in of_scope.index])
+            name = METRIC_NAMES[metric]
+            if metric == LOG_SCORE:
+                scope = scope._replace(unit="")
+            elif of_scope["group"].nunique() == 1:
+                name = f"{of_scope['group'].iloc[0]} {name}"
             is_opening = (metric, world, regime) == (options.metric, ALL, ALL)
             view_options = ViewOptions(  # planned words are of all conditions of a pair
                 options.alpha,
@@ -99,9 +104,6 @@ def build_views(
                 words if is_opening and mask.sum() == in_scope.sum() else None,
             )
             where = _describe_scope(selected.conditions, names)
-            name = METRIC_NAMES[metric]
-            if of_scope["group"].nunique() == 1:
-                name = f"{of_scope['group'].iloc[0]} {name}"
             notes = (
                 _small_print(selected, options, names),
                 _describe_hard_condition(scope, selected.conditions, names),
