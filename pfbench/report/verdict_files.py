@@ -10,8 +10,8 @@ import pandas as pd
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.board.pack import build_pack
+from pfbench.report.board.pack_entries import ViewKey
 from pfbench.report.board.study_data import StudyData, read_study
-from pfbench.report.board.study_views import ViewKey
 from pfbench.report.options import ReportOptions
 from pfbench.report.table_formats import format_csv
 from pfbench.results.conditions import Condition

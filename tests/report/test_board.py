@@ -21,10 +21,10 @@ from pfbench.report.board.levels import (
     compare_track_shares,
     compute_condition_levels,
 )
-from pfbench.report.board.pack_entries import metric_entries
+from pfbench.report.board.pack_entries import StudyNames, metric_entries
 from pfbench.report.board.planned import decide_planned, planned_entries
 from pfbench.report.board.sentence import describe_view
-from pfbench.report.board.study_views import StudyNames, build_views
+from pfbench.report.board.study_views import build_views
 from pfbench.report.board.view import (
     BoardRow,
     Scope,

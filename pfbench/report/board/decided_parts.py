@@ -14,10 +14,10 @@ import pandas as pd
 
 from pfbench.config.paper_files import list_named_parts
 from pfbench.report.board.curves import CellKey, list_calibration, list_runs
-from pfbench.report.board.pack_entries import filter_entry, metric_entries
+from pfbench.report.board.pack_entries import StudyNames, filter_entry, metric_entries
 from pfbench.report.board.planned import decide_planned, planned_entries, planned_words
 from pfbench.report.board.robust_word import describe_robustness
-from pfbench.report.board.study_views import StudyNames, build_views
+from pfbench.report.board.study_views import build_views
 from pfbench.report.board.sweeps import list_sweeps
 from pfbench.report.looks import MethodLook, PartName, find_looks
 from pfbench.report.options import ReportOptions

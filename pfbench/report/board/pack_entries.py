@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -14,6 +14,38 @@ from pfbench.results.conditions import Condition
 from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
 
 _BUDGET_NAMES = {"particles": "Equal N", "time": "Equal time", "likelihoods": "Equal likelihoods"}
+
+
+class ViewKey(NamedTuple):
+    """Key of a view.
+
+    Attributes:
+        metric: Column of the error.
+        world: Key of the scenario, or "all".
+        regime: Key of the regime, or "all".
+        baseline: Label of the baseline.
+    """
+
+    metric: str
+    world: str
+    regime: str
+    baseline: str
+
+
+class StudyNames(NamedTuple):
+    """Names of the parts of a study.
+
+    Attributes:
+        looks: Looks by label.
+        worlds: Names of the scenarios by key.
+        regimes: Names of the noise regimes by key.
+        baselines: Labels of the baselines.
+    """
+
+    looks: Mapping[str, MethodLook]
+    worlds: Mapping[str, PartName]
+    regimes: Mapping[str, PartName]
+    baselines: Sequence[str]
 
 
 def list_metrics(table: pd.DataFrame, main: str = "rmse") -> list[str]:

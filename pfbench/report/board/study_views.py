@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,50 +18,24 @@ from pfbench.report.board.levels import (
     compare_track_shares,
     compute_condition_levels,
 )
-from pfbench.report.board.pack_entries import format_interval_level, list_metrics, round_values
+from pfbench.report.board.pack_entries import (
+    StudyNames,
+    ViewKey,
+    format_interval_level,
+    list_metrics,
+    round_values,
+)
 from pfbench.report.board.run_table import LOG_SCORE, METRIC_NAMES
 from pfbench.report.board.sentence import count_failing, count_words, describe_view
 from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_filters
 from pfbench.report.journal.study_pack import ALL
-from pfbench.report.looks import MethodLook, PartName, describe_tuning
+from pfbench.report.looks import describe_tuning
 from pfbench.report.options import ReportOptions
 from pfbench.report.setting_names import describe_data_settings, describe_settings
 from pfbench.results.error_measures import Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.step_times import StepTimes
 from pfbench.results.study_decisions.common_conditions import select_conditions
-
-
-class ViewKey(NamedTuple):
-    """Key of a view.
-
-    Attributes:
-        metric: Column of the error.
-        world: Key of the scenario, or "all".
-        regime: Key of the regime, or "all".
-        baseline: Label of the baseline.
-    """
-
-    metric: str
-    world: str
-    regime: str
-    baseline: str
-
-
-class StudyNames(NamedTuple):
-    """Names of the parts of a study.
-
-    Attributes:
-        looks: Looks by label.
-        worlds: Names of the scenarios by key.
-        regimes: Names of the noise regimes by key.
-        baselines: Labels of the baselines.
-    """
-
-    looks: Mapping[str, MethodLook]
-    worlds: Mapping[str, PartName]
-    regimes: Mapping[str, PartName]
-    baselines: Sequence[str]
 
 
 def build_views(
@@ -90,13 +64,10 @@ def build_views(
             mask = _select_common(runs, in_scope)
             selected = runs.select(mask)
             of_scope = groups.loc[list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))]  # fmt: skip
-            scope = _assess_scope(selected, levels, mask, of_scope, options)
-            scope = scope._replace(times=[(times or {}).get(key, {}) for key in of_scope.index])
-            name = METRIC_NAMES[metric]
-            if metric == LOG_SCORE:
-                scope = scope._replace(unit="")
-            elif of_scope["group"].nunique() == 1:
-                name = f"{of_scope['group'].iloc[0]} {name}"
+            scope = _assess_scope(selected, levels, mask, options)._replace(
+                unit="" if metric == LOG_SCORE or len(of_scope) > 1 else of_scope["unit"].iloc[0],
+                times=[(times or {}).get(key, {}) for key in of_scope.index],
+            )
             is_opening = (metric, world, regime) == (options.metric, ALL, ALL)
             view_options = ViewOptions(  # planned words are of all conditions of a pair
                 options.alpha,
@@ -120,7 +91,7 @@ def build_views(
                         names.looks,
                         baseline,
                         where,
-                        name,
+                        _name_metric(metric, of_scope["group"]),
                         format_interval_level(options.alpha),
                         partial(compare_track_shares, selected, alpha=options.alpha),
                     ),
@@ -150,6 +121,12 @@ def _list_scopes(conditions: pd.DataFrame) -> Iterator[tuple[str, str, Flags]]:
                 yield world, regime, mask.to_numpy()
 
 
+def _name_metric(metric: str, groups: pd.Series[str]) -> str:
+    """Name a metric with its group, if all conditions have the same main group."""
+    is_one = groups.nunique() == 1 and metric != LOG_SCORE
+    return f"{groups.iloc[0]} {METRIC_NAMES[metric]}" if is_one else METRIC_NAMES[metric]
+
+
 def _select_common(runs: StudyArrays, mask: Flags) -> Flags:
     """Select the conditions of a scope in which its filters are compared; all if none is common."""
     present = runs.present.any(axis=2) & mask
@@ -167,21 +144,16 @@ def _describe_common(mask: Flags, in_scope: Flags, filters: int) -> str:
 
 
 def _assess_scope(
-    runs: StudyArrays,
-    levels: ConditionEffects,
-    mask: Flags,
-    groups: pd.DataFrame,
-    options: ReportOptions,
+    runs: StudyArrays, levels: ConditionEffects, mask: Flags, options: ReportOptions
 ) -> Scope:
     """Average the levels of the conditions of a scope, and describe the filters there."""
     selected = ConditionEffects(*(array[:, mask] for array in levels))
-    is_single = len(runs.conditions) == 1
     return Scope(
         runs.filters,
         average_levels(selected, runs.conditions),
         describe_filters(runs, options.alpha),
-        str(groups["unit"].iloc[0]) if is_single else "",
-        is_single,
+        "",
+        len(runs.conditions) == 1,
     )
 
 

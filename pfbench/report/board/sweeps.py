@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pfbench.report.board.study_views import ViewKey
+from pfbench.report.board.pack_entries import ViewKey
 from pfbench.report.journal.study_pack import ALL
 from pfbench.report.looks import MethodLook
 from pfbench.results.job_labels import parse_label

@@ -79,9 +79,8 @@ def list_limits(conditions: Sequence[Condition]) -> list[str]:
     if any(names != set.union(*labels) for names in labels):
         limits.append("Not every filter was run in every condition.")
     tuning = describe_tuning(study_looks(conditions))
-    others = "the other filters" if tuning else "the filters"
     limits.append(
-        f"{tuning} Parameters of {others} were not tuned for this comparison unless the paper says so.".lstrip()
+        f"{tuning} Parameters of the {'other ' if tuning else ''}filters were not tuned for this comparison unless the paper says so.".lstrip()
     )
     if not _count_rounds(jobs):
         limits.append("Times were measured once on a machine that may have been shared.")
