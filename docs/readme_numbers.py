@@ -22,6 +22,8 @@ TOP = Path(__file__).parents[1]
 PAGES = (TOP / "README.md", *sorted((TOP / "docs" / "methods").glob("*.md")))
 
 _BLOCK = re.compile(r"<!-- numbers:(\w+) -->\n.*?<!-- numbers:end -->", re.DOTALL)
+_MARKS = "[vacuous or circular](docs/glossary.md#results)"
+_STUDIES = "benchmarks/campaigns.md"
 _UNDECIDED = ("undecided", "cannot be decided")
 
 Row = dict[str, str]
@@ -148,7 +150,9 @@ def claims() -> str:
     ]
     total = sum(counts.values(), Counter())
     rows.append(["all", *(str(total[verdict]) for verdict in verdicts), str(total.total())])
-    return format_table(("paper", *verdicts, "claims"), rows)
+    names = ", ".join(sorted(record["id"] for record in records if record["id"] in marked))
+    sentence = f"The claims {names} count as undecided: their tests are {_MARKS}."
+    return f"{format_table(('paper', *verdicts, 'claims'), rows)}\n\n{sentence}"
 
 
 def all_seven() -> str:
@@ -188,9 +192,10 @@ def speed() -> str:
         (f"{row['workload']}: {models[row['workload']]}", row["fastest peer"], row)
         for row in read_table(page)
     ]
+    studies = re.search(r"^# Whole processes: (\w+) ", (TOP / _STUDIES).read_text())
     entries += [
-        ("six studies of W4, whole process", row["against"], row)
-        for row in read_table("benchmarks/campaigns.md")
+        (f"{studies[1] if studies else ''} studies of W4, whole process", row["against"], row)
+        for row in read_table(_STUDIES)
     ]
     return format_table(
         ("workload", "pfbench", "compared with", "times as fast (quartiles)"),

@@ -9,6 +9,7 @@ from importlib import import_module
 
 import pfbench
 from pfbench.cli.messages import format_error, suggest_similar
+from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import ENVIRONMENT, split_trust
 
 # command: function of the module of the same name, summary
@@ -80,6 +81,9 @@ def _run_command(command: str, options: Sequence[str]) -> None:
     shows_traceback = "--traceback" in options or bool(os.environ.get("PFBENCH_TRACEBACK"))
     words = [word for word in options if word != "--traceback"]
     try:
+        flag = next((w for w in words if w.startswith("--") and w != "--multirun"), None)
+        if flag and command != "run":  # which has the flags of Hydra
+            raise ValueError(format_flag(words, flag, command))
         words, packages = split_trust(words)
         os.environ[ENVIRONMENT] = ",".join(
             packages
@@ -96,6 +100,8 @@ def _run_command(command: str, options: Sequence[str]) -> None:
         if shows_traceback:
             raise
         print(f"\nerror {command}: {format_error(error, words)}", file=sys.stderr)
+        for note in getattr(error, "__notes__", []):  # of a job: the file of its traceback
+            print(note, file=sys.stderr)
         print("(add --traceback to see the traceback)", file=sys.stderr)
         raise SystemExit(1) from error
 

@@ -9,6 +9,11 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from pfbench.cli.sweep.job_errors import (
+    hide_hydra_line,
+    report_failed_job,
+    summarise_failed_jobs,
+)
 from pfbench.cli.sweep.study_plan import StudyPlan, plan_study
 from pfbench.cli.sweep.sweep_progress import SWEEP_JOBS, SweepProgress, note_outcome
 from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
@@ -74,7 +79,8 @@ def run_jobs(words: Sequence[str]) -> None:
         run_sweep(application, [*flags, *overrides], plan)
         return
     sys.argv = ["pfbench run", *overrides]
-    application()
+    with hide_hydra_line():
+        application()
 
 
 def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:
@@ -123,9 +129,12 @@ def run_sweep(
     sys.argv = ["pfbench run", *words]
     sweep = SweepProgress.start(plan)
     try:
-        run_with_retries(application)
-    except BaseException:
+        with hide_hydra_line():
+            run_with_retries(application)
+    except BaseException as error:
         sweep.finish(is_complete=False, is_part=is_part)
+        if isinstance(error, Exception):
+            raise summarise_failed_jobs(error, words) from error
         raise
     sweep.finish(is_part=is_part)
 
@@ -167,15 +176,20 @@ def run_task(cfg: Any) -> float:
     from pfbench import job
 
     application: Any = HydraConfig.get()
-    number, counter = None, ""
-    if total := os.environ.get(SWEEP_JOBS):
-        number = OmegaConf.select(application, "job.num", throw_on_missing=False)
-        counter = "" if number is None else f"[{number + 1}/{total}] "
+    number = OmegaConf.select(
+        application, "job.num", throw_on_missing=False
+    )  # None outside a sweep
+    total, choices = os.environ.get(SWEEP_JOBS), application.runtime.choices
+    counter = "" if number is None else f"[{number + 1}{f'/{total}' if total else ''}] "
     try:
-        outcome = job.run(cfg, application.runtime.choices, counter)
-    except Exception:
+        outcome = job.run(cfg, choices, counter)
+    except Exception as error:
         note_outcome(number, "failed")
-        raise
+        if number is None:
+            raise
+        name = " / ".join(str(choices[group]) for group in ("scenario", "noise", "filter"))
+        words = list(application.overrides.task)
+        raise report_failed_job(error, counter, name, words) from error
     note_outcome(number, outcome.status)
     return outcome.rmse
 

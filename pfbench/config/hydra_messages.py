@@ -35,6 +35,27 @@ def format_value_error(text: str) -> str:
     return ""
 
 
+def format_flag(words: Sequence[str], flag: str, command: str) -> str:
+    """Format an error about a flag that does not exist, such as `--scenario`.
+
+    Args:
+        words: Words of the command.
+        flag: The flag, one of the words.
+        command: Name of the command.
+
+    Returns:
+        The flag, and how the override is written.
+    """
+    key, _, value = flag.lstrip("-").partition("=")
+    following = words[words.index(flag) + 1 :] if flag in words else []
+    if not value and following and not re.match(r"-|.*=", following[0]):
+        value = following[0]
+    return (
+        f"{flag} is not an option. Overrides have no dashes: write {key}={value or 'VALUE'} "
+        f"(pfbench {command} --help)"
+    )
+
+
 def format_choice_error(text: str, words: Sequence[str]) -> str:
     """Format an error of Hydra about the choice of a file or the search path.
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
 
 from pfbench.config.composition import JobConfig, compose, compose_tree
 from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
+from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import UntrustedConfigError, check_study
 
 
@@ -25,10 +27,9 @@ def check_words(words: Sequence[str]) -> JobConfig | None:
     Raises:
         UntrustedConfigError: If a file sets what only the command line may set, or names what is
             not trusted.
+        ValueError: If a word is a flag that Hydra does not have.
     """
-    from hydra._internal.utils import get_args_parser
-
-    args = get_args_parser().parse_args(list(words))
+    args = _parse_flags(list(words))
     if args.config_path or args.config_name:
         raise UntrustedConfigError(
             "--config-path and --config-name must not be used, since pfbench has its own main file. "
@@ -39,6 +40,21 @@ def check_words(words: Sequence[str]) -> JobConfig | None:
         overrides.append(f"hydra.searchpath=[file://{args.config_dir}]")
     check_files(overrides)
     return _check_sweep(overrides) if args.multirun else _check_composition(overrides)
+
+
+def _parse_flags(words: list[str]) -> Any:
+    """Split words into Hydra's flags and overrides."""
+    from hydra._internal.utils import get_args_parser
+
+    def refuse(message: str) -> NoReturn:
+        raise ValueError(f"a flag is not valid: {message}. See pfbench run --help")
+
+    parser: Any = get_args_parser()
+    parser.error = refuse  # argparse would print its usage and end the process
+    args, unknown = parser.parse_known_args(words)
+    if unknown:
+        raise ValueError(format_flag(words, unknown[0], "run"))
+    return args
 
 
 def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:

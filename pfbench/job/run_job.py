@@ -59,15 +59,16 @@ def run(
     Args:
         config: Configuration, for instance `job.compose(["scenario=flight_300s", "filter=sir"])`.
         choices: Names of scenario, noise, filter and model, if `config` does not contain them.
-        counter: Start of the log line, for instance `"[3/40] "`.
+        counter: Start of the log line of a job in a sweep, for instance `"[3/40] "`. Empty for a
+            job alone.
 
     Returns:
         The outcome.
 
     Raises:
-        ValueError: If a value of the configuration is invalid.
+        ValueError: If a value of the configuration is invalid. Nothing is written for a job alone.
         Exception: If the job fails. The traceback is written to `<key>.failed.json` in the folder
-            of the results.
+            of the results, which a note of the error names.
     """
     config = resolve_config(config, choices)
     values = config.values
@@ -81,14 +82,7 @@ def run(
         repeat = "(overwrite=true to repeat)"
         log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
         return outcome
-    try:
-        meta, outputs = compute_job(config, name)
-    except Exception as error:
-        note = store.write_failure(path, job_choices, error)
-        remark = f"traceback: {note}" if note else f"previous result kept: {path}"
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"  # on one line
-        log.error("%sfailed    %s   %s   %s", counter, name, reason, remark)
-        raise
+    meta, outputs = _compute_or_note(config, name, path, is_alone=not counter)
     head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
     store.write_result(path, {**head, **meta}, outputs)
     outcome = JobOutcome(path, "finished", main_rmse(outputs, meta))
@@ -104,27 +98,47 @@ def run(
     return outcome
 
 
-def compute_job(config: JobConfig, label: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _compute_or_note(
+    config: JobConfig, name: str, path: Path, is_alone: bool
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Compute a job, and write a note if it fails.
+
+    A job alone whose configuration is not valid is refused and leaves no note. The report of a
+    sweep states all jobs that it lacks.
+    """
+    plan = None
+    try:
+        plan = build_plan(config)
+        return compute_job(plan, name)
+    except Exception as error:
+        if plan is None and is_alone:
+            raise
+        choices = {group: config.choices[group] for group in CHOICES}
+        note = store.write_failure(path, choices, error)
+        error.add_note(f"traceback: {note}" if note else f"previous result kept: {path}")
+        raise
+
+
+def compute_job(plan: JobPlan, label: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Compute a job without writing it.
 
-    The configuration is instantiated once and the episode drawn once. Only if all runs do not fit
-    into memory, they are computed in batches, with the same numbers.
+    The episode is drawn once. Only if all runs do not fit into memory, they are computed in batches,
+    with the same numbers.
 
     Args:
-        config: Resolved configuration.
+        plan: Plan of the job, see `build_plan`.
         label: Title of the progress bar.
 
     Returns:
         Metadata and arrays, see `store.Result`.
 
     Raises:
-        ValueError: If a value is invalid, if a single run does not fit into memory, or if runs that
-            are drawn in batches have different durations.
+        ValueError: If a single run does not fit into memory, or if runs that are drawn in batches
+            have different durations.
     """
-    plan = build_plan(config)
-    values, total = config.values, len(plan.runs)
+    values, total = plan.values, len(plan.runs)
     trained = checkpoint_provenance(
-        values["filter"], config.choices["scenario"], values["seed"], plan.runs
+        values["filter"], plan.config.choices["scenario"], values["seed"], plan.runs
     )
     episodes = EpisodeSource(plan)
     plan, allocation = apply_budget(plan, episodes)

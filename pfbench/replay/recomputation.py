@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pfbench.config.composition import CHOICES, JobConfig
+from pfbench.job.plan import build_plan
 from pfbench.job.run_job import compute_job
 from pfbench.replay.run_selection import StoredRun
 from pfbench.results import store
@@ -97,7 +98,7 @@ def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobRes
     config = replay_config(stored, changes)
     choices = {group: config.choices[group] for group in CHOICES}
     title = " / ".join(choices[group] for group in ("scenario", "noise", "filter"))
-    meta, outputs = compute_job(config, f"{title}, run {stored.run}")
+    meta, outputs = compute_job(build_plan(config), f"{title}, run {stored.run}")
     head = {"key": stored.job.path.stem, "study": stored.job.path.parent.name}
     full = {**head, "choices": choices, "config": config.values, **meta}
     return store.JobResult(full, outputs)

@@ -134,6 +134,17 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("scenario.model.measurement_sd=2",),
         ("Similar: model.measurement_sd.",),
     ),
+    "a flag": (
+        ("--filter", "ekf"),
+        ("--filter is not an option. Overrides have no dashes: write filter=ekf",),
+    ),
+    "a flag with its value": (("--filter=ekf",), ("write filter=ekf",)),
+    "a flag without a value": (("--overwrite", "runs=3"), ("write overwrite=VALUE",)),
+    "a value of a flag": (("--cfg", "all_of_it"), ("invalid choice: 'all_of_it'", "run --help")),
+    "a missing folder": (
+        ("hydra.searchpath=[file:///no/such]",),
+        ("hydra.searchpath must have existing folders, got /no/such. Use file://",),
+    ),
     "no equals sign": (("ekf",), ("'ekf' must be key=value",)),
     "own log without a folder": (
         ("scenario=user_log",),
@@ -157,7 +168,33 @@ def test_a_mistake_is_reported_and_leaves_nothing_behind(tmp_path: Path, mistake
     for part in parts:
         assert part in message
     assert "Traceback" not in said.err + said.out
+    assert all((said.err + said.out).count(part) == 1 for part in parts if len(part) > 40)
     assert not [file for file in tmp_path.rglob("*") if file.suffix in (".npz", ".tmp")]
+
+
+MISSING = "hydra.searchpath=[file:///no/such]"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("run", "-m", *WALK, MISSING), "hydra.searchpath must have existing folders, got /no/such. U"),
+        (("report", "study=x", MISSING), "hydra.searchpath must have existing folders, got /no/such. U"),
+        (("train", *WALK, MISSING), "hydra.searchpath must have existing folders, got /no/such. Use"),
+        (("run", "-m", "--filter", "ekf,sir"), "--filter is not an option. Overrides have no dashes: write filter=ekf,sir"),
+        (("report", "--study", "x"), "write study=x (pfbench report --help)"),
+        (("train", "--filter"), "write filter=VALUE (pfbench train --help)"),
+    ],
+)  # fmt: skip
+def test_each_command_refuses_a_missing_folder_and_a_flag(
+    words: tuple[str, ...], message: str, tmp_path: Path
+) -> None:
+    said = pfbench(*words, home=tmp_path)
+    assert said.code == 1
+    assert f"\nerror {words[0]}: " in said.err
+    assert said.err.count(message) == 1
+    assert "usage:" not in said.err
+    assert "Traceback" not in said.err
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import torch
 from command_line import Said, pfbench, process
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import InstantiationException
 
 from pfbench import job
 from pfbench.core.record import Episode, Record
@@ -409,22 +410,49 @@ def test_jobs_run_within_a_hydra_application(tmp_path: Path) -> None:
 def test_a_failed_job_leaves_a_note_and_its_success_takes_it_away(tmp_path: Path) -> None:
     words = ("run", *WALK, "filter=ekf", "runs=2")
     folder = tmp_path / "results" / "adhoc"
-    failed = pfbench(*words, "threads=0", home=tmp_path)
+    failed = pfbench(*words, "memory_limit_gib=1e-6", home=tmp_path)
     assert failed.code == 1
     (note,) = folder.iterdir()
     assert note.name.endswith(".failed.json")
     said = json.loads(note.read_text())
-    assert (
-        said["message"]
-        == "ValueError: threads must be a whole number of at least 1, got 0. Change this value."
-    )
+    message = "memory must be at least 0.25 GiB for a single run, got 1e-06 GiB."
+    assert said["message"].startswith(f"ValueError: {message}")
     assert said["choices"]["filter"] == "ekf"
     assert "Traceback" in said["traceback"]
-    assert str(note) in failed.out
-    done = pfbench(*words, home=tmp_path)  # threads are no part of the name
+    assert (failed.out + failed.err).count(message) == 1
+    assert f"\ntraceback: {note}\n" in failed.err
+    done = pfbench(*words, home=tmp_path)  # the limit is no part of the name
     assert done.code == 0
     (file,) = folder.iterdir()
     assert file.name == note.name.replace(".failed.json", ".npz")
+
+
+REFUSED = {
+    "dtype=double": "dtype must be float64 (default) or float32, got double. Change this value.",
+    "runs=ten": "runs must be a whole number of at least 1, got ten. Change this value.",
+    "runs=0": "runs must be a whole number of at least 1, got 0. Change this value.",
+    "seed=-1": "seed must be a whole number of at least 0, got -1. Change this value.",
+    "filter.particles=0": "filter.particles must be at least 2, got 0. Choose more particles.",
+    "particles=0": "filter.particles must be at least 2, got 0. Choose more particles.",
+    "particles=many": "filter.particles must be a whole number, got 'many'. Write it without",
+    "scenario.steps=0": "scenario.steps must be a whole number of at least 1, got 0. Change",
+}
+
+
+@pytest.mark.parametrize("word", REFUSED)
+def test_a_value_that_is_not_valid_is_refused_once_and_leaves_nothing(
+    word: str, tmp_path: Path
+) -> None:
+    said = pfbench("run", *WALK, "filter=sir", "runs=2", word, home=tmp_path)
+    assert said.code == 1
+    assert f"\nerror run: {REFUSED[word]}" in said.err
+    assert (said.out + said.err).count(REFUSED[word]) == 1
+    assert "Error executing job" not in said.err
+    assert list((tmp_path / "results").rglob("*.json")) == []
+    with pytest.raises((ValueError, InstantiationException)) as caught:
+        job.run(job.compose([*WALK, "filter=sir", "runs=2", word, f"results_dir={tmp_path}"]))
+    assert REFUSED[word] in str(caught.value)
+    assert list(tmp_path.rglob("*.json")) == []
 
 
 def test_a_failure_does_not_touch_a_good_result(tmp_path: Path) -> None:
@@ -433,6 +461,9 @@ def test_a_failure_does_not_touch_a_good_result(tmp_path: Path) -> None:
     (file,) = (tmp_path / "results" / "adhoc").iterdir()
     before = file.read_bytes()
     assert pfbench(*words, "overwrite=true", "threads=0", home=tmp_path).code == 1
+    failed = pfbench(*words, "overwrite=true", "memory_limit_gib=1e-6", home=tmp_path)
+    assert failed.code == 1
+    assert f"previous result kept: {file}" in failed.err
     assert list((tmp_path / "results" / "adhoc").iterdir()) == [file]
     assert file.read_bytes() == before
 
@@ -442,7 +473,13 @@ def test_a_sweep_goes_on_after_a_bad_cell_and_says_so(tmp_path: Path) -> None:
         "run", "-m", *WALK, "filter=sir", "runs=2", "filter.particles=0,50,1,60", home=tmp_path
     )
     assert said.code == 1
-    assert "filter.particles must be at least 2, got 0" in said.err
+    for number, particles in ((1, 0), (3, 1)):  # once each, on the line of the job
+        message = f"filter.particles must be at least 2, got {particles}. Choose more particles."
+        assert f"[{number}/4] failed    linear_walk / nominal / sir   {message}   trace" in said.out
+        assert (said.out + said.err).count(message) == 1
+    assert "Error executing job" not in said.err
+    assert "error run: all jobs of the sweep must finish, got failed jobs." in said.err
+    assert "sweep: 2 finished, 0 skipped, 2 failed" in said.out
     folder = tmp_path / "results" / "adhoc"
     assert sorted(stored(file)[0]["particles"] for file in folder.glob("*.npz")) == [50, 60]
     notes = list(folder.glob("*.failed.json"))

@@ -235,7 +235,7 @@ def test_a_job_is_instantiated_once_and_drawn_once(
             f"results_dir={tmp_path}",
         ]
     )
-    meta, arrays = job.compute_job(config, "test")
+    meta, arrays = job.compute_job(job.build_plan(config), "test")
     assert sorted(node.rpartition(".")[2] for node in built) == [
         "ModelSimulation",
         "NominalNoise",
