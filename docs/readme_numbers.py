@@ -145,7 +145,11 @@ def claims() -> str:
         for paper in papers
     }
     rows = [
-        [title, *(str(counts[paper][v]) for v in verdicts), str(counts[paper].total())]
+        [
+            f"{paper}: {title}",
+            *(str(counts[paper][v]) for v in verdicts),
+            str(counts[paper].total()),
+        ]
         for title, paper in zip(titles, papers, strict=True)
     ]
     total = sum(counts.values(), Counter())

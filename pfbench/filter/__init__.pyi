@@ -139,6 +139,7 @@ from pfbench.filter.particle.proposals import (
     BootstrapProposal as BootstrapProposal,
     InitialProposal as InitialProposal,
     Proposal as Proposal,
+    ProposalSample as ProposalSample,
 )
 from pfbench.filter.particle.regularised_resampling import (
     GaussianSmoothing as GaussianSmoothing,
