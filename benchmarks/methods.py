@@ -1,14 +1,16 @@
 """What a step of each method costs, relative to the bootstrap filter with as many particles: benchmarks/methods.md.
 
-    python benchmarks/methods.py [--particles 500] [--runs 50] [--steps 10] [--rounds 5]
+    python benchmarks/methods.py [--below 10] [--particles 500] [--runs 50] [--steps 10] [--rounds 3]
 
 All methods filter the same flights, one core, one after the other in interleaved rounds; Gaussian filters have no particles and
-are on the same axis.
+are on the same axis. Results are stored in methods.json. Filters that are not in it are measured beside SIR, and with
+--below those again whose stored ratio is smaller. --page writes page and figure from the stored results alone.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import platform
 import statistics
 import sys
@@ -24,12 +26,13 @@ from race import cpu_name
 
 from pfbench import job
 from pfbench.core import PhiloxStream, Record, map_inputs
-from pfbench.filter import GaussianFilter, ParticleFilter, run_filter
+from pfbench.filter import ParticleFilter, run_filter
 from pfbench.kernels import compilation, process_memory
 from pfbench.noise import NominalNoise
 
 HERE = Path(__file__).parent
 FIRST = "sir"
+STORE = HERE / "methods.json"
 
 
 def methods(particles: int) -> dict[str, Any]:
@@ -76,69 +79,126 @@ def begins_with(method: Any) -> str:
     """Particles at the start; a method that adapts their number may have its own."""
     if isinstance(method, ParticleFilter):
         return str(method.particle_count.initial_count(method.particles))
-    return "none" if isinstance(method, GaussianFilter) else str(method.particles)
+    return str(method.particles) if hasattr(method, "particles") else "none"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    for name, default in (("particles", 500), ("runs", 50), ("steps", 10), ("rounds", 5)):
-        parser.add_argument(f"--{name}", type=int, default=default)
-    chosen = parser.parse_args()
-    torch.set_num_threads(1)
-    process_memory.keep_freed_memory()
-    warnings.simplefilter("ignore")  # of methods that say what they cost
-    model, record = flights(chosen.runs, chosen.steps)
-    found = methods(chosen.particles)
-    with compilation.use_compiled(), torch.no_grad():
-        spent = race(found, model, record, chosen.rounds)
-    ratios = {
-        name: [a / b for a, b in zip(times, spent[FIRST], strict=True)]
-        for name, times in spent.items()
-    }
-    order = sorted(ratios, key=lambda name: statistics.median(ratios[name]))
+def refusals(found: dict[str, Any], model: Any, record: Record) -> dict[str, str]:
+    """Return the reason of each filter that refuses the model."""
+    reasons = {}
+    first = record.select_steps(slice(0, 1))
+    for name, method in found.items():
+        try:
+            run_filter(method, model, first, PhiloxStream(0, torch.arange(len(record.y))))
+        except ValueError as error:
+            reasons[name] = str(error)
+    return reasons
+
+
+def rows_of(found: dict[str, Any], spent: dict[str, list[float]]) -> dict[str, Any]:
+    """Return the stored rows: median time, and the ratio to SIR in the same round with its range."""
+    rows = {}
+    for name, times in spent.items():
+        ratios = [a / b for a, b in zip(times, spent[FIRST], strict=True)]
+        rows[name] = {
+            "particles": begins_with(found[name]),
+            "ms": statistics.median(times),
+            "ratio": [min(ratios), statistics.median(ratios), max(ratios)],
+        }
+    return rows
+
+
+def page(stored: dict[str, Any]) -> str:
+    """Return the page of the stored results."""
+    setting = stored["setting"]
     lines = [
         "# What a step costs",
         "",
-        f"18-state INS/GNSS, {chosen.runs} runs in a batch, {chosen.particles} particles, double precision, inner loops "
-        f"compiled, one core; medians of {chosen.rounds} interleaved rounds of {chosen.steps} steps, and their range. Written by "
-        "`python benchmarks/methods.py`.",
+        f"18-state INS/GNSS, {setting['runs']} runs in a batch, {setting['particles']} particles, double precision, inner loops "
+        f"compiled, one core; medians of {setting['rounds']} interleaved rounds of {setting['steps']} steps, and their range. "
+        "Rows may be of different days, each measured beside SIR: their ratios compare, their milliseconds need not. "
+        "Written by `python benchmarks/methods.py`.",
         "",
         "| filter | particles at the start | ms per step | times SIR (range) |",
         "|---|---|---|---|",
     ]
-    for name in order:
-        own = ratios[name]
-        low, middle, high = min(own), statistics.median(own), max(own)
-        cost = f"{statistics.median(spent[name]):.2f} | {middle:.2f} ({low:.2f}-{high:.2f})"
-        lines.append(f"| `{name}` | {begins_with(found[name])} | {cost} |")
-    lines += [
-        "",
-        f"{cpu_name()}; Python {platform.python_version()}, torch {torch.__version__}.",
-        "",
-    ]
-    (HERE / "methods.md").write_text("\n".join(lines))
-    draw(order, ratios, found, chosen)
-    print("\n".join(lines))
+    for name in order_of(stored):
+        row = stored["rows"][name]
+        low, middle, high = row["ratio"]
+        lines.append(
+            f"| `{name}` | {row['particles']} | {row['ms']:.2f} | {middle:.2f} ({low:.2f}-{high:.2f}) |"
+        )
+    if stored["refused"]:
+        lines += ["", "Filters that refuse this model:", ""]
+        lines += [f"- `{name}`: {reason}" for name, reason in sorted(stored["refused"].items())]
+    return "\n".join([*lines, "", f"{stored['machine']}.", ""])
 
 
-def draw(
-    order: list[str],
-    ratios: dict[str, list[float]],
-    found: dict[str, Any],
-    chosen: argparse.Namespace,
-) -> None:
+def order_of(stored: dict[str, Any]) -> list[str]:
+    """Return the filters by their median ratio."""
+    return sorted(stored["rows"], key=lambda name: stored["rows"][name]["ratio"][1])
+
+
+def measure(stored: dict[str, Any], options: argparse.Namespace) -> dict[str, Any]:
+    """Return the stored results with those of the filters that they lack, or of all."""
+    setting = {key: getattr(options, key) for key in ("particles", "runs", "steps", "rounds")}
+    stored = stored or {"setting": setting, "rows": {}, "refused": {}}
+    if setting != stored["setting"]:
+        raise ValueError(
+            f"settings must be {stored['setting']}, got {setting}. Remove {STORE.name}."
+        )
+    slow = {name: row for name, row in stored["rows"].items() if row["ratio"][1] >= options.below}
+    process_memory.keep_freed_memory()
+    warnings.simplefilter("ignore")  # of methods that say what they cost
+    model, record = flights(options.runs, options.steps)
+    found = {
+        name: method
+        for name, method in methods(options.particles).items()
+        if name == FIRST or name not in (*slow, *stored["refused"])
+    }
+    with compilation.use_compiled(), torch.no_grad():
+        refused = refusals(found, model, record)
+        found = {name: method for name, method in found.items() if name not in refused}
+        rows = rows_of(found, race(found, model, record, options.rounds))
+    version = f"Python {platform.python_version()}, torch {torch.__version__}"
+    return {
+        "setting": setting,
+        "machine": f"{cpu_name()}; {version}",
+        "rows": slow | rows,
+        "refused": stored["refused"] | refused,
+    }
+
+
+def main() -> None:
+    """Measure what is missing, and write page and figure."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    for name, default in (("particles", 500), ("runs", 50), ("steps", 10), ("rounds", 3)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--below", type=float, default=0.0, help="measure cheaper filters again")
+    parser.add_argument("--page", action="store_true", help="write page and figure only")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    stored = json.loads(STORE.read_text()) if STORE.exists() else {}
+    if not options.page:
+        stored = measure(stored, options)
+        STORE.write_text(json.dumps(stored, indent=1) + "\n")
+    (HERE / "methods.md").write_text(page(stored))
+    draw(stored)
+
+
+def draw(stored: dict[str, Any]) -> None:
     """One bar per method on a logarithmic axis."""
+    order, rows, setting = order_of(stored), stored["rows"], stored["setting"]
     figure = Figure(figsize=(6.5, 0.6 + 0.19 * len(order)), layout="constrained")
     axis = figure.subplots()
     for place, name in enumerate(order):
-        colour = "#E69F00" if isinstance(found[name], GaussianFilter) else "#0072B2"
-        middle = statistics.median(ratios[name])
-        axis.plot([min(ratios[name]), max(ratios[name])], [place, place], color=colour, lw=1)
+        colour = "#E69F00" if rows[name]["particles"] == "none" else "#0072B2"
+        low, middle, high = rows[name]["ratio"]
+        axis.plot([low, high], [place, place], color=colour, lw=1)
         axis.plot(middle, place, "o" if colour == "#0072B2" else "s", color=colour, ms=4)
         said = f"{middle:.2g}" if middle < 9.5 else f"{middle:.0f}"
         axis.annotate(
             said,
-            (max(ratios[name]), place),
+            (high, place),
             (5, 0),
             textcoords="offset points",
             va="center",
@@ -150,11 +210,12 @@ def draw(
     axis.set(xscale="log")
     axis.margins(x=0.08)
     axis.set_xlabel(
-        "cost of a step, times that of SIR; circles: particles, squares: Gaussian filters",
+        "cost of a step, times that of SIR; circles: particles, squares: Gaussian filters and their mixtures",
         fontsize=8,
     )
     axis.set_title(
-        f"18-state INS/GNSS, {chosen.runs} runs, {chosen.particles} particles, one core", fontsize=9
+        f"18-state INS/GNSS, {setting['runs']} runs, {setting['particles']} particles, one core",
+        fontsize=9,
     )
     axis.tick_params(axis="x", labelsize=8)
     axis.spines[["top", "right"]].set_visible(False)
