@@ -104,7 +104,7 @@ def _describe_design(
     if len(scenarios) > families:
         worlds = f"{_count(len(scenarios), 'scenario')} of {worlds}"
     return [
-        f"This study compares {_count(filters, 'filter')} with pfbench in {worlds} ({', '.join(scenarios)}) under {_count(len(regimes), 'noise regime')} ({', '.join(regimes)}), with "
+        f"This study compares {_count(filters, 'filter')} with pfbench in {worlds} ({'; '.join(scenarios)}) under {_count(len(regimes), 'noise regime')} ({'; '.join(regimes)}), with "
         f"{_join(runs, 'and')} Monte Carlo runs of {_join(steps, 'and')} steps per condition.",
         "All filters of a condition receive the same truths, measurements and random numbers "
         f"(seed {', '.join(seeds)}), so that comparisons are paired by run.",
