@@ -261,23 +261,34 @@ def compare_times(tables: tuple[tuple[str, Array], ...]) -> tuple[str, ...]:
 
 
 def describe_missing_times(name: str, time: Array, steps: Array) -> tuple[str, ...]:
-    """Name a table that does not cover the steps of a filter.
+    """Name a table that does not cover the steps of a filter, or has a hole between them.
+
+    A clock that jumps forward leaves a hole. The rows after it still agree with each other.
 
     Args:
         name: Name of the table.
-        time: Times of its rows, s, [n].
+        time: Increasing times of its rows, s, [n].
         steps: Times of the steps, s, [T].
 
     Returns:
-        One note, or none.
+        Notes.
     """
-    missing = max(time[0] - steps[0], steps[-1] - time[-1])
-    if len(time) > 1 and missing <= COMMON_TIME + 2 * np.median(np.diff(time)):
-        return ()
-    return (
-        f"{name} covers t = {time[0]:.3f} to {time[-1]:.3f} s of steps from {steps[0]:.3f} to "
-        f"{steps[-1]:.3f} s. Check the clock of t",
-    )
+    missing, interval = max(time[0] - steps[0], steps[-1] - time[-1]), np.diff(time)
+    longest = COMMON_TIME + 2 * np.median(interval) if len(interval) else 0.0
+    notes = []
+    if missing > longest:
+        notes.append(
+            f"{name} covers t = {time[0]:.3f} to {time[-1]:.3f} s of steps from {steps[0]:.3f} to "
+            f"{steps[-1]:.3f} s. Check the clock of t"
+        )
+    inside = (time[1:] > steps[0]) & (time[:-1] < steps[-1]) & (interval > longest)
+    if inside.any():
+        i, count = int(np.argmax(np.where(inside, interval, 0.0))), int(inside.sum())
+        notes.append(
+            f"{name} has {count} hole{'' if count == 1 else 's'} of more than {longest:.3g} s between steps, the longest "
+            f"from t = {time[i]:.3f} to {time[i + 1]:.3f} s. Check the clock of t"
+        )
+    return tuple(notes)
 
 
 def _judge(agreement: Agreement, difference: Array, table: LogTable, rows: NDArray[np.intp]) -> tuple[str, ...]:  # fmt: skip

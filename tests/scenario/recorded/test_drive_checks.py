@@ -92,3 +92,15 @@ def test_a_table_that_does_not_cover_the_steps_is_named(shift: float, is_noted: 
     steps = np.arange(0.0, 8.0, 0.25)
     notes = describe_missing_times("pseudorange.csv", np.arange(0.0, 8.1, 0.5) + shift, steps)
     assert any("Check the clock of t" in note for note in notes) is is_noted
+
+
+@pytest.mark.parametrize(("jump", "is_noted"), [(0.0, False), (0.5, False), (5.0, True)])
+def test_a_clock_that_jumps_leaves_a_hole(jump: float, is_noted: bool) -> None:
+    time = np.arange(0.0, 20.1, 0.5)
+    time[15:] += jump
+    notes = describe_missing_times("pseudorange.csv", time, np.arange(0.0, 20.0, 0.25))
+    assert (
+        any("1 hole of" in note and "t = 7.000 to 12.500 s" in note for note in notes) is is_noted
+    )
+    later = describe_missing_times("pseudorange.csv", time, np.arange(0.0, 6.0, 0.25))
+    assert later == ()  # the hole is after the steps
