@@ -105,7 +105,9 @@ def check_published_page(folder: Path, copy: Path) -> None:
 
 
 def test_published_pages_are_decided_by_the_present_rules(tmp_path: Path) -> None:
+    listed = (ROOT / "reports" / "README.md").read_text()  # a user's own reports are not
     folders = [data.parent for data in (ROOT / "reports").glob("*/page.json.gz")]
+    folders = [folder for folder in folders if f"({folder.name}/report.md)" in listed]
     assert len(folders) > 20
     for folder in folders:
         if folder.name != LARGE:
