@@ -74,5 +74,5 @@ def method_past(name: str) -> bool:
     return (
         bool(getattr(method_of(name), "moves", ()))
         or name.startswith(("cpso", "pso"))
-        or name in REMEMBERING
+        or name in (*REMEMBERING, "guided_start")
     )

@@ -44,7 +44,7 @@ def apply_feedback(
         if belief.window or past:
             raise ValueError(
                 "filter must not store a particle's past in a scenario with feedback, got one with "
-                "moves or a proposal's memory. Choose another filter, or set "
+                "moves, a guided start or a proposal's memory. Choose another filter, or set "
                 "scenario.closed_loop=false."
             )
         return belief._replace(x=correct(belief.x)), info

@@ -28,7 +28,10 @@ def test_the_page_shows_the_stored_counts() -> None:
 
 
 def test_wrong_words_keep_their_rates() -> None:
-    """All settings were simulated; over 46 of them, 3.5 standard errors allow for chance."""
+    """All settings were simulated; over 50 of them, 3.5 standard errors allow for chance.
+
+    Skewed noise moves the error of levels to one side, as the page says: two sides together keep it.
+    """
     for setting in decisions.SETTINGS:
         for question in decisions.QUESTIONS:
             if question == "b" and setting.worlds == 1:
@@ -38,6 +41,10 @@ def test_wrong_words_keep_their_rates() -> None:
             assert excess(f"{head} | none", ("pair decided",), 0.05) < 3.5, head
             assert excess(f"{head} | none", ("error better",), 0.025) < 3.5, head
             assert excess(f"{head} | margin", ("error equivalent",), 0.025) < 3.5, head
+            if setting.noise == "exponential" and setting.estimate == "levels":
+                both = ("more than margin", "claim fails")
+                assert excess(f"{head} | margin", both, 0.05) < 3.5, head
+                continue
             assert excess(f"{head} | margin", ("more than margin",), 0.025) < 3.5, head
             assert excess(f"{head} | margin", ("claim fails",), 0.025) < 3.5, head
 

@@ -310,6 +310,9 @@ class Crossed(Moved):
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
         return super().propagate(x, u, w.flip(-1))
 
+    def noise_gain(self, u: Any) -> Tensor:
+        return super().noise_gain(u).flip(-1)
+
 
 @compiler
 @pytest.mark.parametrize("particles", [60, 61])  # with and without draws that nobody wants
