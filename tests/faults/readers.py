@@ -17,6 +17,7 @@ REASONS = {  # why a file alone does not show a change of a column in all rows, 
     ("damaged logs: trajectory", "pd"): (
         "The drive is level, so that no other column depends on its height."
     ),
+    ("damaged logs: ephemeris", "cuc, cus"): _ORBIT,
     ("damaged logs: ephemeris", "e"): _ORBIT,
     ("damaged logs: ephemeris", "omega"): _ORBIT,
 }
