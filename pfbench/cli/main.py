@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 import pfbench
-from pfbench.cli.messages import format_error, suggest_similar
+from pfbench.cli.messages import format_error, notes_of, suggest_similar
 from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import ENVIRONMENT, split_trust
 
@@ -100,7 +100,7 @@ def _run_command(command: str, options: Sequence[str]) -> None:
         if shows_traceback:
             raise
         print(f"\nerror {command}: {format_error(error, words)}", file=sys.stderr)
-        for note in getattr(error, "__notes__", []):  # of a job: the file of its traceback
+        for note in notes_of(error):
             print(note, file=sys.stderr)
         print("(add --traceback to see the traceback)", file=sys.stderr)
         raise SystemExit(1) from error

@@ -72,6 +72,11 @@ def _format_storage(error: OSError) -> str:
     )
 
 
+def notes_of(error: BaseException) -> list[str]:
+    """Return the remarks that a job has added to its error, such as the file of the traceback."""
+    return list(getattr(error, "__notes__", []))
+
+
 def suggest_similar(name: str, options: Sequence[str]) -> str:
     """Return a sentence with the options that are similar to a misspelt name.
 

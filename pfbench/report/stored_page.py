@@ -1,7 +1,7 @@
 """Data of a page as a file, from which the page is written again where the results are missing.
 
 All that follows from the runs is decided again from runs.parquet, so that a published page has the
-rules and the words of the program. Times, tracks and curves are those of the file.
+rules and the words of the program. Times per step and curves are those of the file.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.filter.input_check import check_is_filter
 from pfbench.model.base import StateSpaceModel
 
@@ -110,11 +111,7 @@ def check_count(tester: str, least: int = 1, **counts: object) -> None:
         ValueError: If a number is not whole or is too small.
     """
     for name, value in counts.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(
-                f"{tester}: {name} must be a whole number of at least {least}, got {value!r}. "
-                "Choose a larger one."
-            )
+        check_whole_number(f"{tester}: {name}", value, least, "Choose a larger one.")
 
 
 def compute_twice(

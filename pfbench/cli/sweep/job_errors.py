@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from pfbench.cli.messages import format_error
+from pfbench.cli.messages import format_error, notes_of
 
 log = logging.getLogger("pfbench")
 
@@ -57,11 +57,6 @@ def report_failed_job(error: Exception, start: str, name: str, words: Sequence[s
     message = " ".join(format_error(error, words).split())
     log.error("%sfailed    %s", start, "   ".join([name, message, *notes_of(error)]))
     return SweepJobError(message)
-
-
-def notes_of(error: BaseException) -> list[str]:
-    """Return the remarks that a job has added to its error, such as the file of the traceback."""
-    return list(getattr(error, "__notes__", []))
 
 
 def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
