@@ -21,7 +21,7 @@ from pfbench.report.board.decided_parts import StudyFacts
 from pfbench.report.looks import PartName, find_looks
 from pfbench.report.options import ReportOptions
 from pfbench.report.page import write_report
-from pfbench.report.stored_page import rebuild_page
+from pfbench.report.stored_page import decide_again, rebuild_page
 from pfbench.results.step_times import StepTimes
 
 
@@ -156,3 +156,14 @@ def test_facts_of_a_page_are_restored(study: Path) -> None:
     entries["looks"][0]["key"] = "own_filter"  # not installed: the stored look
     own = StudyFacts.from_pack({**pack, "worlds": [], "failures": [], "facts": entries})
     assert own.looks["own_filter"].name == facts.looks["ekf"].name
+
+
+def test_warnings_stand_first_in_each_view_that_is_decided_again(study: Path) -> None:
+    pack = read_page_data(study)
+    pack["failures"] = [{}, {}]
+    pack["facts"] |= {"warning": "Runs are copies.", "differing": "Jobs differ."}
+    pack["facts"]["options"]["baseline"] = pack["baselines"][0]
+    for view in decide_again(pack, study / "runs.parquet")["views"].values():
+        start = "2 jobs failed and are missing from all tables. Runs are copies. "
+        assert view["sentence"].startswith(start)
+        assert view["small_print"].endswith(" Jobs differ.")
