@@ -188,6 +188,7 @@ def estimate(worlds: Worlds, kind: str) -> dict[str, Any]:
         p = p_new = np.nan
     return {
         "value": value, "a": here, "b": new, "p_a": p, "p_b": p_new, "won": kind == "won",
+        "is_share": kind in ("track", "share", "won"),
         "identical": is_same, "theta": theta, "both": both_kept(worlds, kind),
         "has_error": any(c.both.any() for cells in worlds.values() for c in cells),
     }  # fmt: skip
@@ -236,6 +237,8 @@ def decide(estimates: list[dict[str, Any]], question: str) -> list[dict[str, Any
         else:
             low, high = min(low, 0.0), max(high, 0.0)
         word = word_of(low, high, is_decided, e["value"], 0.0 if e["won"] else e["margin"])
+        if e["is_share"]:  # a difference of shares is within 1
+            low, high = max(low, -1.0), min(high, 1.0)
         if np.isnan(p_single):
             low, high, word = -np.inf, np.inf, "not tested"
         if e["identical"] and (not e["is_ratio"] or e["has_error"]):

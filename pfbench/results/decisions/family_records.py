@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ ONE_WORLD = "one world"
 RUNS_WON = "share of runs won in place of the error"
 NO_ERROR = "no run of either filter keeps track"
 _FEW_WORLDS = range(2, 6)  # worlds with which the posterior is shown
+_SHARES = ("share", "runs won")  # scales of a difference of shares, which is within 1
 _LARGE_EFFECT = 2.0  # SD between worlds, for the statement on the worlds required
 
 
@@ -98,6 +100,8 @@ def describe(
     size = max(int(tests.size), 1)
     word, statement = _word(comparison, tests, k)
     low, high, *plain = _intervals(word, effect, tests, k, options.alpha)
+    if word != NOT_TESTED and comparison.scale in _SHARES:
+        low, high, *plain = (min(max(end, -1.0), 1.0) for end in (low, high, *plain))
     spread, location = float(run_sd(effects)), effects.worlds.location
     share_a, share_b = pair.shares
     return Decision(
@@ -173,8 +177,10 @@ def _new_world_values(
 ) -> dict[str, float]:
     """Return the interval of one new world and the posterior interval."""
     worlds = comparison.effects.worlds
-    ends = prediction_interval(worlds.location, options.alpha)
-    values = {"new_low": float(ends[0]), "new_high": float(ends[1])}
+    ends = [float(end) for end in prediction_interval(worlds.location, options.alpha)]
+    if comparison.scale in _SHARES and all(map(math.isfinite, ends)):
+        ends = [max(ends[0], -1.0), min(ends[1], 1.0)]
+    values = {"new_low": ends[0], "new_high": ends[1]}
     errors = worlds.standard_error
     is_regular = bool(np.isfinite(worlds.location).all() and (errors > 0).all())
     if (

@@ -69,9 +69,10 @@ def test_a_table_takes_the_path_of_the_simulations(lost, estimate):
                 assert record.estimate == pytest.approx(members[k].value[s], abs=1e-12)
                 assert record.p == pytest.approx(members[k].p[s], rel=1e-9, nan_ok=True)
                 if record.word not in ("identical", "not tested"):
-                    assert (record.low, record.high) == pytest.approx(
-                        (tests.low[s, k], tests.high[s, k]), rel=1e-9, abs=1e-12
-                    )
+                    ends = np.array([tests.low[s, k], tests.high[s, k]])
+                    if record.scale in ("share", "runs won"):
+                        ends = ends.clip(-1.0, 1.0)
+                    assert (record.low, record.high) == pytest.approx(ends, rel=1e-9, abs=1e-12)
                     assert (record.word in ("better", "worse")) == tests.is_decided[s, k]
 
 
@@ -346,3 +347,16 @@ def test_error_rate_of_the_function_of_a_report():
         cells += min(p) <= 0.05 / len(pairs)
     assert wrong / 80 <= 0.13
     assert cells / 80 > 0.2  # the control: conditions are taken for worlds
+
+
+def test_a_difference_of_shares_stays_within_one():
+    """One filter keeps track in all runs of three worlds, the other in none."""
+    setting = StudySetting(3, 1, 20)
+    pairs = setting.draw(np.random.default_rng(3), 1)
+    none = np.zeros_like(pairs.keeps_a)
+    decisions = decide_planned_pairs(table_of(pairs._replace(keeps_a=~none, keeps_b=none), 0), PAIR)
+    for record in decisions:
+        assert record.estimate == pytest.approx(-1.0)
+        assert -1.0 <= record.low < record.high <= 1.0
+        assert -1.0 <= record.plain_low < record.plain_high <= 1.0
+    assert decisions[0].word == "better"
