@@ -1,9 +1,15 @@
-"""One thread for each test process, and less work for the garbage collector."""
+"""Compiled modules are kept, one thread for each test process, and less work for the garbage collector."""
 
 import gc
+import os
+import sys
 
-import torch
-from hypothesis import HealthCheck, settings
+# Packages are installed without compiled modules. Else each process that a test starts compiles them again: seconds.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+import torch  # noqa: E402
+from hypothesis import HealthCheck, settings  # noqa: E402
 
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")  # a machine with other work is no fault of a test
