@@ -159,6 +159,13 @@ def list_groups() -> dict[str, list[Path]]:
     return groups | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
 
 
+class _SharedNodes(dict[str, Any]):
+    """Experiments in Hydra's store. Hydra copies the store for each composition and the chosen node once more."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _SharedNodes:
+        return self
+
+
 _registered: dict[str, tuple[Path, int]] = {}  # experiments in Hydra's store, with the file's time
 
 
@@ -171,7 +178,7 @@ def register_experiments() -> None:
     from hydra.core.config_store import ConfigStore
 
     store = ConfigStore.instance()
-    stored_names = store.repo.get("experiment", {})
+    stored_names = store.repo.setdefault("experiment", _SharedNodes())
     for path in experiments_dir().glob("*.yaml"):
         version = path, path.stat().st_mtime_ns
         if _registered.get(path.stem) != version or path.name not in stored_names:
