@@ -139,9 +139,9 @@ def _check_hydra(
 ) -> None:
     """Check that Hydra's settings are those of pfbench and of the command line."""
     actual = _hydra_sections(values)
-    if actual == _default_sections():
-        return
     hydra_words = [word for word in words if re.match(r"[+~]*hydra[/.@=]", word)]
+    if actual == _default_sections() | _read_search_path(hydra_words):
+        return
     expected = _hydra_sections(to_plain(compose_reference(hydra_words)))
     for name in HYDRA_SECTIONS:
         if actual[name] != expected[name]:
@@ -155,6 +155,15 @@ def _check_hydra(
                 f"hydra.{key} must name a class of Hydra, of its plugins or of logging, "
                 f"got {name!r}. Remove it."
             )
+
+
+def _read_search_path(hydra_words: Sequence[str]) -> dict[str, Any]:
+    """Return the search path that the command line sets; empty if it sets none."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    parsed = OverridesParser.create().parse_overrides(list(hydra_words))
+    paths = [word.value() for word in parsed if word.key_or_group == "hydra.searchpath"]
+    return {"searchpath": paths[0]} if paths else {}
 
 
 def _hydra_sections(values: Mapping[str, Any]) -> dict[str, Any]:
