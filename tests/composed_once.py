@@ -1,7 +1,7 @@
 """Compositions by Hydra, each made once in a process: tests compose the same words a dozen times, and each takes 0.1 s.
 
-Files of conf/ do not change during a test. Words that read more than these files and the stored nodes are composed each
-time, and processes that a test starts compose as users do.
+Files of conf/ do not change during a test. Words that read more than these files, and those about Hydra itself, are composed
+each time, and processes that a test starts compose as users do.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from hydra import version
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_store import ConfigStore
 from hydra.core.utils import JobRuntime
+from hydra.types import RunMode
 from omegaconf import _utils
 
 from pfbench.config.folders import conf_dir
 
-READS_MORE = re.compile(r"\$|searchpath|env_|config_dir")
+READS_MORE = re.compile(r"\$|hydra")
 
 with mock.patch.object(yaml, "SafeLoader", getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
     _Loader = _utils.get_yaml_loader()  # a subclass, here of the parser in C, which is faster
-_compose = ConfigLoaderImpl._load_configuration_impl
+compose_by_hydra = ConfigLoaderImpl._load_configuration_impl
 _store = ConfigStore.store
 _composed: dict[Any, Any] = {}
 
@@ -42,14 +43,29 @@ def store_node(self: ConfigStore, *args: Any, **more: Any) -> None:
     _store(self, *args, **more)
 
 
-def compose_once(self: ConfigLoaderImpl, *args: Any, **more: Any) -> Any:
-    """Compose a configuration, or copy the one of the same words, search path and working directory."""
+def compose_once(
+    self: ConfigLoaderImpl, config_name: str | None, overrides: list[str], **more: Any
+) -> Any:
+    """Compose a configuration, or copy that of the same words, search path and working directory.
+
+    `hydra.mode`, which Hydra adds to the words of a command, and the name of the application are written into the copy.
+    `from_shell` changes messages of errors alone, which are not copied.
+    """
     path = [entry.path for entry in self.config_search_path.get_path()]
-    words = str((args, sorted(more.items())))
-    if path != ["pkg://hydra.conf", str(conf_dir()), "structured://"] or READS_MORE.search(words):
-        return _compose(self, *args, **more)
-    key = (words, version.getbase(), JobRuntime().get("name"), os.getcwd())
+    modes = [word for word in overrides if re.fullmatch(r"hydra\.mode=(RUN|MULTIRUN)", word)]
+    words = [word for word in overrides if word not in modes]
+    is_own = path == ["pkg://hydra.conf", str(conf_dir()), "structured://"]
+    if not is_own or len(modes) > 1 or READS_MORE.search(" ".join(words)):
+        return compose_by_hydra(self, config_name, overrides, **more)
+    options = {name: value for name, value in more.items() if name != "from_shell"}
+    key = (config_name, *words, str(sorted(options.items())), version.getbase(), os.getcwd())
     if key not in _composed:
         with mock.patch.object(_utils, "get_yaml_loader", return_value=_Loader):
-            _composed[key] = _compose(self, *args, **more)
-    return copy.deepcopy(_composed[key])
+            _composed[key] = compose_by_hydra(self, config_name, words, **more)
+    copied = copy.deepcopy(_composed[key])
+    if "hydra" in copied:
+        copied.hydra.job.name = JobRuntime().get("name")
+    if modes:
+        copied.hydra.mode = RunMode[modes[0].partition("=")[2]]
+        copied.hydra.overrides.hydra = modes
+    return copied
