@@ -15,11 +15,12 @@ import pytest
 from checkout import ROOT
 from markupsafe import escape
 
+from pfbench.claims.page import write_claims
 from pfbench.report.stored_page import read_page_data, rebuild_page
 
 REPORT_FILE = re.compile(
     r"reports/(README\.md|\w+/(report\.md|verdicts\.(json(\.gz)?|csv)|runs\.parquet|page\.json\.gz|results\.json\.gz"
-    r"|headline\.(png|svg)))"
+    r"|headline\.(png|svg))|claims/(measurements\.parquet|jobs\.json))"
 )
 
 
@@ -117,6 +118,21 @@ def test_published_pages_are_decided_by_the_present_rules(tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_the_largest_published_page_is_decided_by_the_present_rules(tmp_path: Path) -> None:
     check_published_page(ROOT / "reports" / LARGE, tmp_path / LARGE)
+
+
+def test_the_published_claims_are_decided_by_the_present_rules(tmp_path: Path) -> None:
+    """From the measurements in git, without results of a study."""
+    published, publish = ROOT / "reports" / "claims", load("publish_reports")
+    copy = tmp_path / "claims"
+    copy.mkdir()
+    for name in ("measurements.parquet", "jobs.json"):
+        shutil.copy(published / name, copy)
+    write_claims(tmp_path / "none", tmp_path, 0.05, ROOT / "conf", ROOT / "experiments")
+    text = (copy / "report.md").read_text()
+    reduced = publish.reduce_markdown(text, copy, publish.HEADLINES["claims"])
+    assert reduced == (published / "report.md").read_text()
+    for name in ("verdicts.json", "measurements.parquet", "jobs.json"):
+        assert (copy / name).read_bytes() == (published / name).read_bytes(), name
 
 
 def test_the_stored_results_of_a_script_give_its_published_page() -> None:

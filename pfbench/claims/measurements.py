@@ -17,7 +17,7 @@ from pfbench.results.frame import drop_before, select_steps
 from pfbench.results.state_groups import ComponentGroup, component_groups
 
 Side = tuple[str, str, str]  # study, condition, label
-_COLUMNS = ["study", "cell", "label", "measure", "seed", "run", "lost", "unit", "value"]
+MEASURED_COLUMNS = ["study", "cell", "label", "measure", "seed", "run", "lost", "unit", "value"]
 
 
 def load_claim_measurements(
@@ -37,14 +37,18 @@ def load_claim_measurements(
         ValueError: if results do not belong together, or lack a group or component.
     """
     tests_by_side: dict[Side, dict[str, ClaimTest]] = {}
-    for test in _list_tests(claims):
+    for test in list_tests(claims):
         for side in test.sides:
             tests_by_side.setdefault(side, {})[test.measure] = test
     rows: list[pd.DataFrame] = []
     for side, job in _find_jobs(tests_by_side, results, allow_mixed_versions):
-        head = dict(zip(_COLUMNS, side, strict=False))
+        head = dict(zip(MEASURED_COLUMNS, side, strict=False))
         rows += _measure_job(job.load(), head, tests_by_side[side])
-    return pd.concat(rows, ignore_index=True)[_COLUMNS] if rows else pd.DataFrame(columns=_COLUMNS)
+    return (
+        pd.concat(rows, ignore_index=True)[MEASURED_COLUMNS]
+        if rows
+        else pd.DataFrame(columns=MEASURED_COLUMNS)
+    )
 
 
 def claim_job_metadata(
@@ -60,7 +64,7 @@ def claim_job_metadata(
     Returns:
         Metadata by study, condition and label.
     """
-    sides = {side for test in _list_tests(claims) for side in test.sides}
+    sides = {side for test in list_tests(claims) for side in test.sides}
     return {side: job.meta for side, job in _find_jobs(sides, results, mixed)}
 
 
@@ -99,8 +103,12 @@ def measure_claim_test(result: store.JobResult, test: ClaimTest) -> np.ndarray:
     return next(iter(values.values()), np.full(lost.size, np.nan))
 
 
-def _list_tests(claims: Sequence[Claim]) -> Iterator[ClaimTest]:
-    """Yield the tests of all claims."""
+def list_tests(claims: Sequence[Claim]) -> Iterator[ClaimTest]:
+    """Yield the tests of all claims.
+
+    Args:
+        claims: Records.
+    """
     return (test for claim in claims for tests in claim.tests.values() for test in tests)
 
 

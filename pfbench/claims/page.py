@@ -23,8 +23,8 @@ from pfbench.claims.claim_tables import (
     list_commits,
 )
 from pfbench.claims.claim_tests import NOT_DECIDED, ClaimTestResult
-from pfbench.claims.measurements import claim_job_metadata, load_claim_measurements
 from pfbench.claims.schema import PAPERS, Claim, ClaimTest
+from pfbench.claims.stored_measurements import load_claim_data, write_claim_data
 from pfbench.claims.stored_verdicts import check_stored_verdicts
 from pfbench.claims.verdicts import VERDICTS, ClaimVerdict, decide_claims
 from pfbench.files.recorded_folder import RecordedFolder
@@ -43,12 +43,12 @@ def write_claims(
     allow_mixed_versions: bool = False,
     formats: tuple[str, ...] = ("svg", "png"),
 ) -> Path:
-    """Write `<out>/claims/`: index.html, report.md, verdicts.json, figures/, tables/.
+    """Write `<out>/claims/`: index.html, report.md, verdicts.json, the measurements, figures/, tables/.
 
-    Equal results give equal bytes.
+    Measurements of studies without results are read from the folder. Equal results give equal bytes.
 
     Args:
-        results: Folder of all studies. Claims are not run if results of their studies are missing.
+        results: Folder of all studies. Claims without results and without stored measurements are not run.
         out: Folder of all reports, which the page links to.
         alpha: Level after correction.
         conf: Folder of configurations, as in `read_claims`.
@@ -63,13 +63,10 @@ def write_claims(
         ValueError: if a record is wrong, results do not belong together, or those of stored verdicts are missing.
     """
     claims = read_claims(conf, experiments)
-    verdicts = decide_claims(
-        claims,
-        load_claim_measurements(claims, results, allow_mixed_versions=allow_mixed_versions),
-        alpha,
-    )
+    stored = Path(out) / CLAIMS_STUDY
+    data = load_claim_data(claims, results, stored, allow_mixed_versions=allow_mixed_versions)
+    verdicts, jobs = decide_claims(claims, data.rows, alpha), data.jobs
     studies = {study for claim in claims for study in claim.studies}
-    jobs = claim_job_metadata(claims, results, mixed=allow_mixed_versions)
     choices = {}
     if conf is not None and experiments is not None:
         choices = {claim.id: list_choices(claim, conf, experiments) for claim in claims}
@@ -83,9 +80,10 @@ def write_claims(
         "n": len(verdicts),
     }
     records = [{**_to_json(v), "choices": choices.get(v.claim.id, [])} for v in verdicts]
-    check_stored_verdicts(Path(out) / CLAIMS_STUDY / "verdicts.json", records)
+    check_stored_verdicts(stored / "verdicts.json", records)
     text = json.dumps(records, indent=1, allow_nan=False)
-    with RecordedFolder(Path(out) / CLAIMS_STUDY) as folder:
+    with RecordedFolder(stored) as folder:
+        write_claim_data(data, folder)
         writers.write_table(folder, CLAIMS_STUDY, claims_table(verdicts))
         folder.write("verdicts.json", text + "\n")
         if len(context["made"]):

@@ -12,7 +12,8 @@ HELP = """\
 pfbench claims [key=value ...]
 
 Write the page of all claims of the five papers, with the verdict of the studies on each.
-Claims whose study has no results are listed as not run. They never replace stored verdicts.
+Studies without results count with the measurements that are stored beside the page. Claims
+that have neither are listed as not run. They never replace stored verdicts.
 
   pfbench claims
   pfbench claims report.figure_formats=[svg]"""

@@ -27,6 +27,7 @@ Write the report of a study: figures, tables and statistical tests, as index.htm
 See also: pfbench claims, pfbench datasheet scenario=NAME"""
 
 _NOT_STUDIES = ("datasheets", "claims")  # folders of other reports
+_PAGES = ("report.md", "index.html")
 
 
 def report_study(words: Sequence[str]) -> None:
@@ -147,9 +148,8 @@ def _report_all(words: list[str]) -> None:
     values = compose(words).values
     results, reports = Path(values["results_dir"]), Path(values["reports_dir"])
     studies = {path.parent.name for path in results.glob("*/*.npz")} - {"datasheets"}
-    pages = [path for name in ("report.md", "index.html") for path in reports.glob(f"*/{name}")]
-    page_names = {path.parent.name for path in pages}
-    published = page_names - set(_NOT_STUDIES)
+    pages = [path for name in _PAGES for path in reports.glob(f"*/{name}")]
+    published = {path.parent.name for path in pages} - set(_NOT_STUDIES)
     failed = []
     for study in sorted(studies):
         has_experiment = (experiments_dir() / f"{study}.yaml").exists()
@@ -161,21 +161,34 @@ def _report_all(words: list[str]) -> None:
             print(f"{study}: failed: {format_error(error, words)}", file=sys.stderr)
     for study in sorted(published - studies):
         print(_renew_published(study, reports / study, results))
-    required = _claimed_studies()
-    if "claims" not in page_names:
-        required &= published
-    if missing := sorted((required - studies) | (required & set(failed))):
-        print(
-            f"claims: the page is unchanged, since {results} holds no results of {', '.join(missing)}. "
-            "Next: make studies"
-        )
-    else:
-        print(f"claims: {write_claims_page(words).resolve()}")
+    print(_write_claims(words, studies, published, failed))
     if failed:
         raise ValueError(
             f"all {len(studies)} reports must be written, got {len(failed)} failures: "
             f"{', '.join(failed)}. The messages above give the reasons."
         )
+
+
+def _write_claims(
+    words: list[str], studies: set[str], published: set[str], failed: Sequence[str]
+) -> str:
+    """Write the page of the claims if their studies have results or measurements; return a line for the user."""
+    from pfbench.claims.claim_records import read_claims
+    from pfbench.claims.stored_measurements import MEASUREMENTS
+
+    values = compose(words).values
+    folder = Path(values["reports_dir"]) / "claims"
+    required = {study for claim in read_claims() for study in claim.studies}
+    missing = required & set(failed)
+    if not (folder / MEASUREMENTS).is_file():
+        has_page = any((folder / name).is_file() for name in _PAGES)
+        missing |= (required if has_page else required & published) - studies
+    if missing:
+        return (
+            f"claims: the page is unchanged, since {values['results_dir']} holds no results of "
+            f"{', '.join(sorted(missing))}. Next: make studies"
+        )
+    return f"claims: {write_claims_page(words).resolve()}"
 
 
 def _renew_published(study: str, folder: Path, results: Path) -> str:
@@ -194,10 +207,3 @@ def _renew_published(study: str, folder: Path, results: Path) -> str:
         f"{study}: the published report is unchanged, since {results} holds no results. "
         f"Next: {command}"
     )
-
-
-def _claimed_studies() -> set[str]:
-    """Return the studies that the claims refer to."""
-    from pfbench.claims import claim_records
-
-    return {study for claim in claim_records.read_claims() for study in claim.studies}
