@@ -20,9 +20,9 @@ Subtract: TypeAlias = Callable[[Tensor, Tensor], Tensor]
 def jacobian(f: Map, value: Tensor, d: int, subtract: Subtract = torch.subtract) -> Tensor:
     """Compute the derivative of a map at zero.
 
-    Backward mode is used unless a gradient of the result is required. In forward mode torch
-    computes a shape for each operation between values with and without a tangent, which costs a
-    third of a millisecond. In backward mode the branch that `torch.where` does not select can spoil
+    Backward mode is used unless a gradient of the result is required, which the value at zero shows.
+    In forward mode torch computes a shape for each operation between values with and without a
+    tangent, which costs a third of a millisecond. In backward mode the branch that `torch.where` does not select can spoil
     a derivative (0 times infinity). The derivative is then computed forward.
 
     Args:
@@ -35,7 +35,7 @@ def jacobian(f: Map, value: Tensor, d: int, subtract: Subtract = torch.subtract)
         Derivative, [R, k, d].
     """
     derivative = None
-    if not (torch.is_grad_enabled() or value.is_cuda or is_capturing()):
+    if not (value.requires_grad or value.is_cuda or is_capturing()):
         derivative = _backward(f, value, d, subtract)
     return _forward(f, value, d, subtract) if derivative is None else derivative
 
