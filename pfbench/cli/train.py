@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
 from pfbench.config.composition import compose
 
@@ -52,4 +53,19 @@ def train_network(words: Sequence[str]) -> None:
     path = fit(values, choices, regimes, job.instantiate, about, print)
     shared = [word for word in words if not word.startswith(_NOT_OF_A_JOB)]
     command = shlex.join(["pfbench", "run", *shared, f"checkpoint={path}"])  # brackets for zsh
-    print(f"checkpoint: {path.resolve()}\nNext: {command}")
+    figure = _draw_losses(path)
+    print(
+        f"checkpoint: {path.resolve()}\nfigure of the losses: {figure.resolve()}\nNext: {command}"
+    )
+
+
+def _draw_losses(checkpoint: Path) -> Path:
+    """Draw the losses of the epochs, in the folder of the checkpoint."""
+    import pandas as pd
+
+    from pfbench.report.plots.training_figures import write_training_figure
+
+    losses = pd.read_csv(checkpoint.with_suffix(".csv"))
+    return write_training_figure(
+        checkpoint.with_suffix(".svg"), {str(name): losses[name].tolist() for name in losses}
+    )
