@@ -90,7 +90,7 @@ def write_claim_data(data: ClaimData, folder: RecordedFolder) -> None:
     rows.astype(dict.fromkeys(texts, "category")).to_parquet(buffer, index=False)
     folder.write(MEASUREMENTS, buffer.getvalue())
     jobs = [[*side, _shorten(data.jobs[side])] for side in sorted(data.jobs)]
-    folder.write(JOBS, json.dumps(jobs, indent=0, allow_nan=False) + "\n")
+    folder.write(JOBS, json.dumps(jobs, indent=0, sort_keys=True, allow_nan=False) + "\n")
 
 
 def _read_claim_data(folder: Path) -> ClaimData:
