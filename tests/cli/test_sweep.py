@@ -81,7 +81,7 @@ def test_a_killed_sweep_is_finished_by_the_same_command(tmp_path: Path, undistur
     assert 1 <= len(finished) < len(FILTERS)
     for file in finished:
         store.read_result(file)  # whole
-    again = process(*SWEEP, home=tmp_path, cwd=tmp_path)
+    again = pfbench(*SWEEP, home=tmp_path)
     assert again.code == 0, again.err
     assert again.out.count("skipped   ") == len(finished)
     assert {file: file.stat().st_mtime_ns for file in finished} == finished
