@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,6 @@ from pfbench.files.recorded_folder import RecordedFolder
 
 MEASUREMENTS = "measurements.parquet"
 JOBS = "jobs.json"
-_REMEDY = "Remove it and run: make studies, then pfbench claims"
 # What the page says of a job: `cost.format_budget` and `list_commits` read these values.
 _JOB_KEYS = (
     *("key", "label", "runs", "particles", "particles_used"),
@@ -103,18 +102,14 @@ def _read_claim_data(folder: Path) -> ClaimData:
         rows = pd.read_parquet(table)[MEASURED_COLUMNS]
         rows = rows.astype({name: object for name in rows.select_dtypes("category")})
         path = jobs
-        metadata = {(study, cell, label): meta for study, cell, label, meta in _read_jobs(jobs)}
+        entries = json.loads(jobs.read_text("utf-8"))
+        metadata = {(study, cell, label): meta for study, cell, label, meta in entries}
     except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
         raise ValueError(
-            f"{path} must be written by pfbench claims, got {error}. {_REMEDY}."
+            f"{path} must be written by pfbench claims, got {error}. "
+            "Remove it and run: make studies, then pfbench claims."
         ) from error
     return ClaimData(rows, metadata)
-
-
-def _read_jobs(path: Path) -> Iterable[tuple[str, str, str, Mapping[str, Any]]]:
-    """Read the entries of the jobs."""
-    entries: list[tuple[str, str, str, Mapping[str, Any]]] = json.loads(path.read_text("utf-8"))
-    return entries
 
 
 def _shorten(meta: Mapping[str, Any]) -> dict[str, Any]:

@@ -60,12 +60,12 @@ def train_network(words: Sequence[str]) -> None:
 
 
 def _draw_losses(checkpoint: Path) -> Path:
-    """Draw the losses of the epochs, in the folder of the checkpoint."""
-    import pandas as pd
-
+    """Draw the losses that a checkpoint contains, in its folder."""
+    from pfbench.filter.learned.checkpoint import read_checkpoint
     from pfbench.report.plots.training_figures import write_training_figure
 
-    losses = pd.read_csv(checkpoint.with_suffix(".csv"))
-    return write_training_figure(
-        checkpoint.with_suffix(".svg"), {str(name): losses[name].tolist() for name in losses}
-    )
+    lines = read_checkpoint(checkpoint)["losses"]
+    losses = {
+        name: [line[name] for line in lines] for name in ("epoch", "loss", "validation", "ess")
+    }
+    return write_training_figure(checkpoint.with_suffix(".svg"), losses)

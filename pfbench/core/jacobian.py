@@ -20,10 +20,11 @@ Subtract: TypeAlias = Callable[[Tensor, Tensor], Tensor]
 def jacobian(f: Map, value: Tensor, d: int, subtract: Subtract = torch.subtract) -> Tensor:
     """Compute the derivative of a map at zero.
 
-    Backward mode is used unless a gradient of the result is required, which the value at zero shows.
-    In forward mode torch computes a shape for each operation between values with and without a
-    tangent, which costs a third of a millisecond. In backward mode the branch that `torch.where` does not select can spoil
-    a derivative (0 times infinity). The derivative is then computed forward.
+    Backward mode is used unless a gradient of the result is required, which the value at zero
+    shows. In forward mode torch computes a shape for each operation between values with and without
+    a tangent, which costs a third of a millisecond. In backward mode the branch that `torch.where`
+    does not select can spoil a derivative (0 times infinity). The derivative is then computed
+    forward.
 
     Args:
         f: The map.

@@ -21,8 +21,8 @@ REASONS = {  # why a file alone does not show a change of a column in all rows, 
     ("damaged logs: ephemeris", "e"): _ORBIT,
     ("damaged logs: ephemeris", "omega"): _ORBIT,
     ("damaged logs: pseudorange", "t"): (
-        "Three times all epochs after one are 0.5 s late, as of a receiver that was restarted. Once all times are "
-        "multiplied by 3.6: no other column states the interval of the epochs."
+        "Three times all epochs after one are 0.5 s late. Once all times are multiplied by 3.6. No other column "
+        "states the interval of the epochs."
     ),
 }
 

@@ -21,7 +21,7 @@ def write_training_figure(path: Path, losses: Losses) -> Path:
 
     Args:
         path: File, replaced if it exists.
-        losses: Columns of the file of losses: epoch, loss, validation, ess.
+        losses: Values of each epoch by name: epoch, loss, validation, ess.
 
     Returns:
         The path.
@@ -36,14 +36,14 @@ def plot_training(losses: Losses) -> Figure:
     """Plot the losses and the effective sample size over the epochs.
 
     Args:
-        losses: Columns as in `write_training_figure`.
+        losses: Values as in `write_training_figure`.
     """
     figure, (top, bottom) = stacked_axes(2, 1.5)
     epoch, validation = np.asarray(losses["epoch"]), np.asarray(losses["validation"])
     top.plot(epoch, losses["loss"], color=PLAIN_COLOURS[5], lw=1.0, label="training runs")
     top.plot(epoch, validation, color=PLAIN_COLOURS[0], lw=1.3, label="validation runs")
     if np.isfinite(validation).any():
-        best = np.nanargmin(np.where(np.isfinite(validation), validation, np.nan))
+        best = np.where(np.isfinite(validation), validation, np.inf).argmin()
         top.plot(
             epoch[best], validation[best], "o", ls="none", ms=5, mfc="white", mec=PLAIN_COLOURS[0],
             label="kept weights",
