@@ -81,7 +81,7 @@ def weave(seconds: float) -> PreintegratedImu:
 
 
 def draw(
-    angle: float, runs: int, seconds: float, seed: int
+    angle: float, runs: int, seconds: float, seed: int, is_random: bool = False
 ) -> tuple[StrapdownTotal, Record, Tensor]:
     """Draw truth and fixes from the model.
 
@@ -90,6 +90,7 @@ def draw(
         runs: Number of runs, with errors of alternating signs.
         seconds: Duration.
         seed: Seed.
+        is_random: Whether the heading error is drawn with this standard deviation instead.
 
     Returns:
         Model, record, and true states [R, T, D].
@@ -99,7 +100,8 @@ def draw(
     u = PreintegratedImu(*(a.expand(runs, *a.shape[1:]) for a in u))
     stream = PhiloxStream(seed, torch.arange(runs))
     d = stream.normal("start", 1, 15).squeeze(1) * model.p0
-    d[:, 2] = math.radians(angle) * (1 - 2 * (torch.arange(runs) % 2))
+    if not is_random:
+        d[:, 2] = math.radians(angle) * (1 - 2 * (torch.arange(runs) % 2))
     x = model.chart.add(model.origin.expand(runs, -1), d).unsqueeze(1)
     truth, y = [], torch.full((runs, steps, 3), torch.nan).double()
     noise, errors = stream.normal("noise", steps, 12), stream.normal("fix", steps, 3)
@@ -115,10 +117,7 @@ def draw(
 def filters() -> dict[str, Filter]:
     """Return the filters of the table by name."""
     ekf = GaussianFilter(TaylorLinearisation())
-    points = {
-        alpha: GaussianFilter(SigmaPointLinearisation(UnscentedPoints(alpha=alpha)))
-        for alpha in (1.0, 0.3)
-    }
+    points = {alpha: unscented_filter(alpha) for alpha in (1.0, 0.3)}
     return {
         "EKF": ekf,
         "invariant EKF, left": InvariantFilter(ekf, "left"),
@@ -131,7 +130,15 @@ def filters() -> dict[str, Filter]:
     }
 
 
-def measure(method: Filter, angle: float, runs: int, seconds: float = 60.0) -> dict[str, Any]:
+def unscented_filter(alpha: float) -> GaussianFilter:
+    """Return the UKF with a spread of the points, which may pass half a turn."""
+    points = UnscentedPoints(alpha=alpha)
+    return GaussianFilter(SigmaPointLinearisation(points, largest_angle=None))
+
+
+def measure(
+    method: Filter, angle: float, runs: int, seconds: float = 60.0, is_random: bool = False
+) -> dict[str, Any]:
     """Run a filter and compare it with the truth.
 
     NEES is the squared error in the filter's own chart, over the 15 components of the state.
@@ -141,11 +148,12 @@ def measure(method: Filter, angle: float, runs: int, seconds: float = 60.0) -> d
         angle: Heading error, deg.
         runs: Number of runs.
         seconds: Duration.
+        is_random: Whether the heading error is drawn with this standard deviation instead.
 
     Returns:
         Share of runs that settle, seconds until they do, NEES over its dimension, position error.
     """
-    model, record, truth = draw(angle, runs, seconds, seed=1)
+    model, record, truth = draw(angle, runs, seconds, seed=1, is_random=is_random)
     chart = model.chart
     if isinstance(method, InvariantFilter):
         chart = model.group_chart(method.chart)

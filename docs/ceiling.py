@@ -190,7 +190,7 @@ def measure(condition: str, runs: int) -> dict[str, Any]:
     episode, model = plan.draw_episode(plan.runs), plan.model
     group = "position" if "position" in model.groups else next(iter(model.groups))
     index = list(model.groups[group])
-    method = GaussianFilter(SigmaPointLinearisation(CubaturePoints()))
+    method = GaussianFilter(SigmaPointLinearisation(CubaturePoints(), largest_angle=None))
     try:
         result = smooth_iteratively(method, model, episode.record, PASSES)
     except ValueError as error:

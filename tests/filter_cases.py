@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import is_dataclass
 from functools import cache
 from typing import Any
 
@@ -11,6 +13,8 @@ from hydra import compose, initialize_config_dir
 
 from pfbench import job
 from pfbench.core.record import Record
+from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation
+from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.linearisation import compute_additive_gain
 from pfbench.model.base import StateSpaceModel
 
@@ -54,6 +58,8 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
         return "additive noise"
     if name == "rbpf" and not (model.linear or model.linear_given):
         return "no component that is linear given the rest"
+    if _has_far_points(method_of(name), model, record):
+        return "must lie within 115 degrees"
     is_single = not method_past(name) and name != "rbpf" and name not in BRANCHING
     if record.feedback is not None and not is_single:
         return "scenario with feedback"
@@ -67,6 +73,26 @@ def _needs_many_points(name: str, model: StateSpaceModel, u: Any) -> bool:
     if compute_additive_gain(model, model.origin.expand(1, -1), root, u) is None:
         d += model.noise_dim
     return int(name[-1]) ** d > 20_000
+
+
+def _has_far_points(part: Any, model: StateSpaceModel, record: Record) -> bool:
+    """Return whether a rule in a filter or its guide has an initial point beyond 2 rad in an angle."""
+    if isinstance(part, SigmaPointLinearisation):
+        if record.spread is not None:
+            variance = record.spread.square().sum(-1).amax(0)
+        else:
+            variance = model.initial(1).variance[0]
+        d = len(variance)
+        xi = part.points(d)[0] * variance.sqrt()
+        zero = model.origin.expand(1, -1)
+        step = model.chart.add(zero, torch.full((d, d), 1e-3).double() * torch.eye(d))
+        turned = model.chart.add(step, 2 * math.pi * torch.eye(d).double())
+        is_angle = (model.chart.subtract(turned, step).norm(dim=-1) < 1e-6).double()
+        return float((xi * is_angle).norm(dim=-1).amax()) > 2.0
+    if isinstance(part, GuidedNoiseProposal):
+        return False  # its points are about particles, not about the initial mean
+    parts = vars(part).values() if is_dataclass(part) else ()
+    return any(_has_far_points(value, model, record) for value in parts)
 
 
 def method_past(name: str) -> bool:

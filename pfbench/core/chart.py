@@ -55,6 +55,17 @@ class ChartBlock(ABC):
             Difference, [..., dimension].
         """
 
+    def rotation_angles(self, d: Tensor) -> Tensor:
+        """Compute the angles of a difference that a full turn does not change.
+
+        Args:
+            d: Difference, [..., dimension].
+
+        Returns:
+            Absolute angles, [..., A], rad. A block without them has A = 0.
+        """
+        return d[..., :0]
+
 
 @dataclass(frozen=True)
 class EuclideanBlock(ChartBlock):
@@ -81,6 +92,10 @@ class AngleBlock(ChartBlock):
     def subtract(self, y: Tensor, x: Tensor) -> Tensor:
         return wrap_angle(y - x)
 
+    @override
+    def rotation_angles(self, d: Tensor) -> Tensor:
+        return d.abs()
+
 
 @dataclass(frozen=True)
 class QuaternionBlock(ChartBlock):
@@ -104,6 +119,10 @@ class QuaternionBlock(ChartBlock):
         return quaternion.rotation_vector_from_quaternion(
             quaternion.quaternion_multiply(conjugate, y)
         )
+
+    @override
+    def rotation_angles(self, d: Tensor) -> Tensor:
+        return d.norm(dim=-1, keepdim=True)
 
 
 @dataclass(frozen=True)
@@ -162,6 +181,18 @@ class Chart:
         sizes = [b.size for b in self.blocks]
         pairs = zip(self.blocks, y.split(sizes, -1), x.split(sizes, -1), strict=True)
         return torch.cat([b.subtract(p, q) for b, p, q in pairs], -1)
+
+    def rotation_angles(self, d: Tensor) -> Tensor:
+        """Compute the angles of all blocks of a difference.
+
+        Args:
+            d: Differences, [..., d].
+
+        Returns:
+            Absolute angles, [..., A], rad.
+        """
+        ds = d.split([b.dimension for b in self.blocks], -1)
+        return torch.cat([b.rotation_angles(p) for b, p in zip(self.blocks, ds, strict=True)], -1)
 
     def mean(self, x: Tensor, w: Tensor, passes: int = 3) -> Tensor:
         """Compute a weighted mean.

@@ -1,4 +1,4 @@
-"""The page of wrong headings states the stored results."""
+"""The pages of wrong headings and of the reach of sigma points state the stored results."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from checkout import ROOT
 
 sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
 import heading_errors
+import point_reach
+
+from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, SigmaPointLinearisation
 
 
 def test_the_page_is_written_from_the_stored_results() -> None:
@@ -18,3 +21,31 @@ def test_the_page_is_written_from_the_stored_results() -> None:
     assert {(r["angle"], r["filter"]) for r in stored["rows"]} == {
         (angle, name) for angle in heading_errors.ANGLES for name in names
     }
+
+
+def test_the_page_of_the_reach_is_written_from_the_stored_results() -> None:
+    stored = json.loads(point_reach.STORE.read_text())
+    assert (ROOT / "benchmarks" / "point_reach.md").read_text() == point_reach.page(stored)
+    assert {(r["heading_sd"], r["reach"]) for r in stored["rows"]} == {
+        (sd, reach) for sd in point_reach.HEADING_SDS for reach in point_reach.REACHES
+    }
+
+
+def test_the_limit_of_the_filters_is_the_largest_reach_that_settles() -> None:
+    """At the limit all runs settle up to 60 degrees, at the next reach some runs do not."""
+    stored = json.loads(point_reach.STORE.read_text())
+    settled = {(r["heading_sd"], r["reach"]): r["settled"] / stored["runs"] for r in stored["rows"]}
+    limit = SigmaPointLinearisation(CubaturePoints()).largest_angle
+    beyond = min(reach for reach in point_reach.REACHES if reach > limit)
+    for sd in (30, 45, 60):
+        assert settled[sd, limit] == 1.0 > settled[sd, beyond]
+
+
+def test_the_spread_decides_at_ninety_degrees() -> None:
+    """Measured again with few runs: points at 2 rad settle, points at 6 rad do not."""
+    near, far = (
+        heading_errors.measure(heading_errors.unscented_filter(alpha), 90.0, 6)
+        for alpha in (0.33, 1.0)
+    )
+    assert near["settled"] == 6
+    assert far["settled"] == 0

@@ -432,7 +432,7 @@ def test_the_take_off_shows_the_heading() -> None:
     truth = model.assemble(episode.truth)
     with torch.no_grad():
         estimate = run_filter(
-            GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
+            GaussianFilter(SigmaPointLinearisation(CubaturePoints(), largest_angle=None)),
             model,
             episode.record,
             PhiloxStream(1, runs),

@@ -91,6 +91,10 @@ class LieGroupBlock(ChartBlock):
         exponent = apply_inverse_left_jacobian(phi.unsqueeze(-2), vectors)
         return torch.cat([phi, exponent.flatten(-2)], -1)
 
+    @override
+    def rotation_angles(self, d: Tensor) -> Tensor:
+        return d[..., :3].norm(dim=-1, keepdim=True)
+
 
 def _vectors(a: Tensor) -> Tensor:
     """Return components [..., 3 k] as vectors [..., k, 3]."""

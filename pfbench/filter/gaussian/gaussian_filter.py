@@ -37,7 +37,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     LinearisationRule,
     SigmaPointLinearisation,
 )
-from pfbench.filter.gaussian.point_reach import warn_of_point_reach
+from pfbench.filter.gaussian.point_reach import check_point_reach
 from pfbench.filter.linearisation import check_moments, compute_additive_gain
 from pfbench.filter.model_jacobians import find_propagation_jacobian
 from pfbench.model.base import StateSpaceModel, initial_law
@@ -116,7 +116,7 @@ class GaussianFilter:
             The belief.
 
         Raises:
-            ValueError: If mean or variance of the initial or the noise distribution is not finite.
+            ValueError: If a mean or variance is not finite, or if sigma points reach too far in angles.
         """
         initial: Any = initial_law(model, runs, spread)
         for name, distribution in (("initial", initial), ("noise", model.noise)):
@@ -124,7 +124,7 @@ class GaussianFilter:
         origin = model.origin.expand(runs, -1) if start is None else start
         mean, covariance = model.chart.add(origin, initial.mean), distribution_covariance(initial)
         if isinstance(self.linearisation, SigmaPointLinearisation):
-            warn_of_point_reach(self.linearisation.points, model.chart, covariance)
+            check_point_reach(self.linearisation, model.chart, covariance)
         log_z = torch.zeros(runs, dtype=torch.float64, device=mean.device)
         return GaussianBelief(mean, covariance, log_z)
 

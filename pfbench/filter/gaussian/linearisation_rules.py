@@ -23,6 +23,9 @@ from pfbench.kernels.compilation import compilable
 ConditionalMoments: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
 """xi [R, P, d] -> mean [R, P, k] and covariance [R or 1, P or 1, k, k] given each point."""
 
+SigmaPoints: TypeAlias = Callable[[int], tuple[Tensor, Tensor, Tensor]]
+"""d -> whitened points [P, d], mean weights [P] and covariance weights [P]; sum w_c xi xi' = I."""
+
 
 class DifferenceSpace(NamedTuple):
     """Difference and average of the values of a map, and its slope if the model states it.
@@ -105,11 +108,22 @@ class SigmaPointLinearisation(LinearisationRule):
     """Linearisation by sigma points and weights: unscented and cubature filters.
 
     Attributes:
-        points: d -> whitened points [P, d], mean weights [P] and covariance weights [P], with
-            sum w_c xi xi' = I.
+        points: Points and weights.
+        largest_angle: Largest angle of a point of the initial distribution from the mean, in angles and
+            rotations, rad. A filter refuses a larger one at its start. None accepts any angle.
+
+    Raises:
+        ValueError: If the largest angle is not positive.
     """
 
-    points: Callable[[int], tuple[Tensor, Tensor, Tensor]]
+    points: SigmaPoints
+    largest_angle: float | None = 2.0
+
+    def __post_init__(self) -> None:
+        if self.largest_angle is not None and not self.largest_angle > 0.0:
+            raise ValueError(
+                f"linearisation.largest_angle must be positive, got {self.largest_angle}. Use 2."
+            )
 
     @override
     def __call__(

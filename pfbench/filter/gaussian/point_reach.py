@@ -1,61 +1,54 @@
-"""Warning of sigma points that pass half a turn in angles and rotations."""
+"""Check of sigma points whose angles are so large that a rule sees another distribution."""
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
-from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.chart import Chart
+from pfbench.core.covariance import factor
+from pfbench.filter.gaussian.linearisation_rules import (
+    SigmaPointLinearisation,
+    SigmaPoints,
+    UnscentedPoints,
+)
 
-log = logging.getLogger("pfbench")
 
-_SAFE_REACH = 2.0  # rad: points at 1.8 rad settle from any heading, points at 3.0 rad do not [ours]
+def check_point_reach(rule: SigmaPointLinearisation, chart: Chart, covariance: Tensor) -> None:
+    """Check the largest angle between the mean and a point of the initial distribution.
 
-
-def warn_of_point_reach(
-    points: Callable[[int], tuple[Tensor, Tensor, Tensor]], chart: Chart, covariance: Tensor
-) -> None:
-    """Warn if a point lies half a turn or more from the mean, with a spread that avoids it.
-
-    A point beyond half a turn has the shorter angle on the other side, so that the rule sees another
-    distribution. It is not refused, since papers compare rules at such uncertainties.
+    A point beyond half a turn has the shorter angle on the other side. Closer points fail too, because
+    the first measurements move the mean: benchmarks/point_reach.md.
 
     Args:
-        points: Points of the rule.
+        rule: Linearisation rule.
         chart: Chart of the state.
         covariance: Initial covariance, [R, d, d].
+
+    Raises:
+        ValueError: If the angle of a point exceeds `rule.largest_angle`.
     """
-    reach = _largest_angle(points, chart, covariance)
-    if not reach < math.pi:
-        spread = getattr(points, "alpha", 1.0) * _SAFE_REACH / reach
-        log.warning(
-            "warning filter: filter.linearisation.points must lie within 180 degrees of the mean in "
-            "angles and rotations, got %.0f degrees for the initial distribution. Use filter=ukf "
-            "filter.linearisation.points.alpha=%s.",
-            math.degrees(reach),
-            _round_down(spread),
+    limit = rule.largest_angle
+    if limit is None or chart.flat:
+        return
+    reach = _largest_angle(rule.points, chart, covariance)
+    if reach > limit:
+        unscented = rule.points if isinstance(rule.points, UnscentedPoints) else UnscentedPoints()
+        spread = unscented.alpha * limit / _largest_angle(unscented, chart, covariance)
+        raise ValueError(
+            f"filter.linearisation.points must lie within {math.degrees(limit):.0f} degrees of the "
+            f"mean in angles and rotations, got {math.degrees(reach):.0f} degrees for the initial "
+            f"distribution. Use filter=ukf filter.linearisation.points.alpha={_round_down(spread)}. "
+            "To compare rules at this uncertainty, add +filter.linearisation.largest_angle=null."
         )
 
 
-def _largest_angle(
-    points: Callable[[int], tuple[Tensor, Tensor, Tensor]], chart: Chart, covariance: Tensor
-) -> float:
+def _largest_angle(points: SigmaPoints, chart: Chart, covariance: Tensor) -> float:
     """Return the largest angle of a point from the mean over all blocks and runs, rad."""
-    if chart.flat:
-        return 0.0
     xi = points(chart.dimension)[0].to(covariance)
-    rows = xi @ torch.linalg.cholesky_ex(covariance)[0].mT
-    offsets = rows.split([block.dimension for block in chart.blocks], -1)
-    angles = [
-        offset.norm(dim=-1) if isinstance(block, QuaternionBlock) else offset.abs()
-        for offset, block in zip(offsets, chart.blocks, strict=True)
-        if not isinstance(block, EuclideanBlock)
-    ]
-    return max(float(angle.amax()) for angle in angles)
+    angles = chart.rotation_angles(xi @ factor(covariance)[0].mT)
+    return float(angles.nan_to_num().amax()) if angles.numel() else 0.0
 
 
 def _round_down(value: float) -> float:
