@@ -14,14 +14,17 @@ import pandas as pd
 
 from pfbench.config.paper_files import list_named_parts
 from pfbench.report.board.curves import CellKey, list_calibration, list_runs
-from pfbench.report.board.pack_entries import StudyNames, filter_entry, metric_entries
+from pfbench.report.board.pack_entries import StudyNames, ViewKey, filter_entry, metric_entries
 from pfbench.report.board.planned import decide_planned, planned_entries, planned_words
 from pfbench.report.board.robust_word import describe_robustness
 from pfbench.report.board.study_views import build_views
 from pfbench.report.board.sweeps import list_sweeps
+from pfbench.report.board.view import BEST, EQUAL, MISSING, NOT_KEPT, OPEN
+from pfbench.report.journal.study_pack import ALL
 from pfbench.report.looks import MethodLook, PartName, find_looks
 from pfbench.report.options import ReportOptions
 from pfbench.results.comparison.baselines import REFERENCES
+from pfbench.results.decisions.words import WORSE
 from pfbench.results.job_labels import parse_label
 from pfbench.results.step_times import StepTimes
 
@@ -29,6 +32,14 @@ _BASELINES = (*REFERENCES, "ukf", "ckf")  # offered first if they are in the stu
 _MOST_BASELINES, _FEW_BASELINES = 3, 2
 _MANY = 300  # filters times conditions, from which a page offers few baselines
 _OPTIONS = ("alpha", "equivalence_margin", "metric", "baseline")  # that decide
+_OUTCOMES = {  # in the order in which methods are ranked
+    BEST: "smallest error in {}",
+    EQUAL: "equal to it in {}",
+    OPEN: "not decided in {}",
+    WORSE: "worse in {}",
+    NOT_KEPT: "track not kept in {}",
+    MISSING: "not run in {}",
+}
 
 
 class StudyFacts(NamedTuple):
@@ -119,8 +130,9 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
         facts.warning,
         _describe_baseline(looks, options.baseline, next(iter(views)).baseline),
     )
-    for view in views.values():
-        view["sentence"] = " ".join(filter(None, (*warnings, view["sentence"])))
+    for key, view in views.items():
+        proposed = _describe_best_proposed(views, key, looks)
+        view["sentence"] = " ".join(filter(None, (*warnings, view["sentence"], proposed)))
         view["small_print"] = " ".join(filter(None, (view["small_print"], facts.differing)))
     first = next(iter(views.values()))["rows"]
     return {
@@ -143,6 +155,42 @@ def _count_failures(number: int) -> str:
     """State how many jobs failed; empty if none did."""
     jobs = "1 job failed and is" if number == 1 else f"{number} jobs failed and are"
     return f"{jobs} missing from all tables." if number else ""
+
+
+def _describe_best_proposed(
+    views: Mapping[ViewKey, Mapping[str, Any]], key: ViewKey, looks: Mapping[str, MethodLook]
+) -> str:
+    """Count the verdicts of the best proposed method over the conditions of a view, each decided alone.
+
+    Empty for a view of one condition, without a proposed method, and where one has an error in all conditions.
+    """
+    proposed = [row["filter"] for row in views[key]["rows"] if looks[row["filter"]].proposed]
+    ranked = {row["filter"] for row in views[key]["rows"] if row["rank"] is not None}
+    conditions = [
+        view
+        for view_key, view in views.items()
+        if (view_key.metric, view_key.baseline) == (key.metric, key.baseline)
+        and ALL not in (view_key.world, view_key.regime)
+        and key.world in (ALL, view_key.world)
+        and key.regime in (ALL, view_key.regime)
+    ]
+    if len(conditions) < 2 or not proposed or ranked & set(proposed):
+        return ""
+    counts = {label: dict.fromkeys(_OUTCOMES, 0) for label in proposed}
+    for view in conditions:
+        for row in view["rows"]:
+            if row["filter"] in counts:
+                counts[row["filter"]][row["verdict"]] += 1
+    best = max(proposed, key=lambda label: tuple(counts[label].values()))
+    parts = [
+        text.format(n)
+        for text, n in zip(_OUTCOMES.values(), counts[best].values(), strict=True)
+        if n
+    ]
+    return (
+        f"Best proposed method in single conditions, each decided alone: [[{looks[best].name}]]. "
+        f"Of {len(conditions)} conditions: {', '.join(parts)}."
+    )
 
 
 def _describe_baseline(looks: Mapping[str, MethodLook], requested: str, baseline: str) -> str:
