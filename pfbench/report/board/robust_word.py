@@ -63,34 +63,54 @@ def describe_robustness(
     Returns:
         Sentences, empty for a study without outliers.
     """
-    runs = arrange_runs(table, tuple(looks))
-    noise = runs.conditions["regime"].str.partition(" + ")[0]
-    scenario = runs.conditions["scenario"]
-    masks = [(noise == name).to_numpy() for name in (OUTLIER_REGIME, NOMINAL_REGIME)]
-    common = set(scenario[masks[0]]) & set(scenario[masks[1]])
-    if not masks[0].any():
+    noise, scenario = table["regime"].str.partition(" + ")[0], table["scenario"]
+    regimes = (OUTLIER_REGIME, NOMINAL_REGIME)
+    common = set.intersection(*(set(scenario[noise == name]) for name in regimes))
+    if OUTLIER_REGIME not in set(noise):
         return ""
     lacking = [] if CONTROL in looks else [f"the control {find_looks([CONTROL])[CONTROL].name}"]
     lacking += [] if common else ["nominal noise in the worlds with outliers"]
     if lacking:
         return f"No filter can be called robust: the study lacks {' and '.join(lacking)}."
-    levels = compute_condition_levels(runs, options.metric)
-    selected = [mask & scenario.isin(common).to_numpy() for mask in masks]
-    outliers, nominal = (_average(runs, levels, mask) for mask in selected)
-    present = np.minimum(outliers.runs, nominal.runs)
-    control = runs.filters.index(CONTROL)
-    if present[control] < MIN_RUNS:
+    evidence = compare_with_control(table[scenario.isin(common)], tuple(looks), options.metric)
+    if evidence is None:
         return f"No filter can be called robust: the control {looks[CONTROL].name} has fewer than {MIN_RUNS} runs in a condition."  # fmt: skip
-    evidence = {
-        label: RobustnessEvidence(outliers.difference(i, control), nominal.difference(i, control))
-        for i, label in enumerate(runs.filters)
-        if i != control and present[i] >= MIN_RUNS
-    }
     names = {label: looks[label].name for label in evidence}
     text = describe_robust_filters(names, find_robust_filters(evidence, options.alpha))
     tuning = looks[CONTROL].tuning
     is_foreign = tuning and not any(tuning.startswith(f"{key} ") for key in common)
     return f"{text} The control was tuned in another world, {tuning}." if is_foreign else text
+
+
+def compare_with_control(
+    table: pd.DataFrame, filters: tuple[str, ...], metric: str = "rmse", control: str = CONTROL
+) -> dict[str, RobustnessEvidence] | None:
+    """Compare the errors of filters with those of a control, in outliers and in nominal noise.
+
+    Args:
+        table: Table of `build_run_table`, of scenarios that have both regimes.
+        filters: Labels of all filters, the control included.
+        metric: Column of the error.
+        control: Label of the control.
+
+    Returns:
+        Differences by label of the filters with enough runs; None if the control has not enough.
+    """
+    runs = arrange_runs(table, filters)
+    noise = runs.conditions["regime"].str.partition(" + ")[0]
+    levels = compute_condition_levels(runs, metric)
+    outliers, nominal = (
+        _average(runs, levels, (noise == name).to_numpy())
+        for name in (OUTLIER_REGIME, NOMINAL_REGIME)
+    )
+    present, k = np.minimum(outliers.runs, nominal.runs), filters.index(control)
+    if present[k] < MIN_RUNS:
+        return None
+    return {
+        label: RobustnessEvidence(outliers.difference(i, k), nominal.difference(i, k))
+        for i, label in enumerate(filters)
+        if i != k and present[i] >= MIN_RUNS
+    }
 
 
 def _average(runs: StudyArrays, levels: ConditionEffects, mask: Flags) -> FilterLevels:
