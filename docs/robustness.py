@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from ceiling import STORE, largest_limit, root_mean
 
 from pfbench.files import markdown_head, markdown_row
 from pfbench.report import read_page_data
@@ -28,15 +29,18 @@ from pfbench.report.board.robust_word import (
 from pfbench.results.statistics.intervals import order_statistic_interval
 
 TOP = Path(__file__).parents[1]
-PAGE, LIMITS = TOP / "docs" / "robustness.md", TOP / "docs" / "ceiling.json"
+PAGE = TOP / "docs" / "robustness.md"
 STUDIES = ("robust_flight", "robust_simulated", "robust_quad", "robust_car", "robust_canyon")
 RECORDED = STUDIES[2:]
 CONTROLS = (CONTROL, "ekf_scaled", "ekf")
 SAMPLED_HYPOTHESES = "rbpf_discrete"  # particles of noise hypotheses, a Kalman filter for each
 KALMAN = "kalman"
+KINDS = ("particles of the state", "particles of hypotheses")
 LEVEL = 0.95
 _BLOCK = re.compile(r"<!-- numbers:(\w+) -->\n.*?<!-- numbers:end -->", re.DOTALL)
 _WORSE = ("worse", "not_kept")
+
+Row = dict[Any, Any]
 
 
 class Study(NamedTuple):
@@ -51,6 +55,17 @@ class Study(NamedTuple):
     runs: pd.DataFrame
     rows: pd.DataFrame
     facts: StudyFacts
+
+    def list_rows(self, world: str = "") -> list[Row]:
+        """List the rows of a scenario or of all, the best filter first.
+
+        Args:
+            world: Scenario, empty for all.
+        """
+        records = self.rows.sort_values(["world", "regime", "rank"]).to_dict("records")
+        order = list(self.facts.regimes)
+        selected = [row for row in records if world in ("", row["world"])]
+        return sorted(selected, key=lambda row: order.index(row["regime"]))
 
 
 @cache
@@ -73,11 +88,6 @@ def _digits(value: float) -> str:
     return f"{float(f'{value:.3g}'):.15g}" if np.isfinite(value) else "–"
 
 
-def _join(names: Iterable[str], empty: str) -> str:
-    """Join labels in code style."""
-    return ", ".join(f"`{name}`" for name in names) or empty
-
-
 def format_median(errors: np.ndarray) -> str:
     """Format the median of the errors of runs with its interval. A run without an error counts as the largest.
 
@@ -91,46 +101,34 @@ def format_median(errors: np.ndarray) -> str:
     return f"{_digits(median)} [{_digits(interval.low)}, {_digits(interval.high)}]"
 
 
-def world_table(study: Study, world: str) -> str:
-    """Table of one scenario: filters by regimes, with the limit of its nominal noise.
-
-    Args:
-        study: Files of a study.
-        world: Scenario.
-    """
-    rows = study.rows[study.rows["world"] == world].set_index(["regime", "filter"])
+def _world_table(study: Study, world: str) -> str:
+    """Table of one scenario: filters by regimes, with the limit of its nominal noise."""
+    rows = {(r["regime"], r["filter"]): r for r in study.list_rows(world)}
     runs = study.runs[study.runs["scenario"] == world]
-    regimes = [name for name in study.facts.regimes if name in set(rows.index.get_level_values(0))]
-    unit = str(runs["unit"].iloc[0])
-    lines = markdown_head("filter", *(f"{name} [{unit}]" for name in regimes), "ms/step")
+    errors = {key: part["rmse"].to_numpy() for key, part in runs.groupby(["regime", "filter"])}
+    regimes = list(dict.fromkeys(regime for regime, _ in rows))
+    lines = markdown_head("filter", *(f"{r} [{runs['unit'].iloc[0]}]" for r in regimes), "ms/step")
     for label, look in study.facts.looks.items():
-        cells = []
-        for regime in regimes:
-            selected = runs[(runs["regime"] == regime) & (runs["filter"] == label)]
-            if not len(selected):
-                cells.append("failed")
-                continue
-            row = rows.loc[regime, label]
-            marks = f"{100 * row['track']:.0f} / {100 * row['coverage']:.0f} %"
-            cells.append(f"{format_median(selected['rmse'].to_numpy())}, {marks}")
+        present = [(regime, label) for regime in regimes if (regime, label) in errors]
+        cells = {
+            key: f"{format_median(errors[key])}, {100 * rows[key]['track']:.0f} / {100 * rows[key]['coverage']:.0f} %"
+            for key in present
+        }
+        times = float(np.median([rows[key]["ms"] for key in present]))
+        words = (cells.get((regime, label), "failed") for regime in regimes)
         tier = " (B)" if look.tuning else ""
-        times = rows.xs(label, level="filter")["ms"]
-        lines.append(markdown_row(f"`{label}`{tier}", *cells, _digits(times.median())))
-    return "\n".join([*lines, "", describe_limit(world)])
+        lines.append(markdown_row(f"`{label}`{tier}", *words, _digits(times)))
+    return "\n".join([*lines, "", _describe_limit(world)])
 
 
-def describe_limit(world: str) -> str:
-    """State the limit of the error in a scenario in nominal noise, or why there is none.
-
-    Args:
-        world: Scenario.
-    """
-    stored: dict[str, Any] = json.loads(LIMITS.read_text())[world]
-    smoother = _digits(float(np.sqrt(np.nanmean(stored["smoother"]))))
-    reached = f"The iterated smoother with cubature points has {smoother} {stored['unit']} in nominal noise."
-    if stored["bound"] is not None:
-        bound = f"{_digits(stored['bound'])} {stored['unit']}"
-        return f"Limit in nominal noise, the PCRB of the model of the data: {bound}. {reached}"
+def _describe_limit(world: str) -> str:
+    """State the limit of the error in a scenario in nominal noise, or why there is none."""
+    stored: Row = json.loads(STORE.read_text())[world]
+    unit, smoother = stored["unit"], _digits(root_mean(stored["smoother"]))
+    reached = f"The iterated smoother has an error of {smoother} {unit} in nominal noise."
+    if (limit := largest_limit(stored)) is not None:
+        error = root_mean(limit) if isinstance(limit, list) else limit
+        return f"Limit of every causal filter in nominal noise: {_digits(error)} {unit}. {reached}"
     return f"No limit holds: {stored['reason'].removeprefix('no bound: ').rstrip('.')}. {reached}"
 
 
@@ -146,96 +144,86 @@ def find_strictly_robust(study: Study, world: str) -> tuple[str, ...]:
     table = study.runs[study.runs["scenario"] == world]
     labels = tuple(study.facts.looks)
     alpha = study.facts.options.alpha / len(CONTROLS)
-    sets = []
-    for control in CONTROLS:
-        evidence = compare_with_control(table, labels, control=control)
-        sets.append(find_robust_filters(evidence or {}, alpha))
+    evidence = (compare_with_control(table, labels, control=control) for control in CONTROLS)
+    sets = [find_robust_filters(pairs or {}, alpha) for pairs in evidence]
     return tuple(name for name in labels if all(name in names for names in sets))
 
 
-def describe_robust(name: str) -> str:
-    """Describe the robust filters of each scenario of a study.
-
-    Args:
-        name: Name of the study.
-    """
+def _describe_robust(name: str) -> str:
+    """Describe the robust filters of each scenario of a study."""
     study, lines = read_study(name), []
     for world in study.facts.worlds:
         table = study.runs[study.runs["scenario"] == world]
         if text := describe_robustness(table, study.facts.looks, study.facts.options):
-            strict = _join(find_strictly_robust(study, world), "none")
+            strict = ", ".join(f"`{name}`" for name in find_strictly_robust(study, world)) or "none"
             plain = text.replace("[[", "").replace("]]", "")
             lines.append(f"- `{world}`: {plain} Against all three controls: {strict}.")
     return "\n".join(lines)
 
 
-def compare_sampled(study: Study, world: str, regime: str, candidates: Sequence[str]) -> str:
-    """Compare filters with the best Kalman filter of a condition, by the verdicts against its best filter.
+def compare_sampled(study: Study, rows: Sequence[Row], kind: str) -> tuple[str, bool]:
+    """Compare particle filters with the best Kalman filter of a condition, by the verdicts of the board.
 
     Args:
         study: Files of a study.
-        world: Scenario.
-        regime: Noise regime.
-        candidates: Labels of the filters that are compared with the Kalman filters.
+        rows: Rows of a condition, the best filter first.
+        kind: One of `KINDS`.
 
     Returns:
-        Words on the comparison.
+        Words on the comparison, and whether the particle filter is shown to be better.
     """
-    rows = study.rows[(study.rows["world"] == world) & (study.rows["regime"] == regime)]
-    rows = rows.sort_values("rank")
-    is_kalman = rows["filter"].map(
-        lambda label: study.facts.looks[label].family == KALMAN and label != SAMPLED_HYPOTHESES
-    )
-    kalman, sampled = rows[is_kalman].iloc[0], rows[rows["filter"].isin(candidates)]
-    if not len(sampled):
-        return "not in the study"
-    first = sampled.iloc[0]
-    if first["rank"] < kalman["rank"] and first["verdict"] == "best":
-        word = "better than" if kalman["verdict"] in _WORSE else "not decided against"
-    else:
-        word = "not better than"
-    return f"`{first['filter']}` {word} `{kalman['filter']}`"
+    kinds = {label: _kind(look.family, label) for label, look in study.facts.looks.items()}
+    kalman = next(row for row in rows if kinds[row["filter"]] == KALMAN)
+    first = next((row for row in rows if kinds[row["filter"]] == kind), None)
+    if first is None:
+        return "not in the study", False
+    is_ahead = first["rank"] < kalman["rank"]
+    is_better = is_ahead and first["verdict"] == "best" and kalman["verdict"] in _WORSE
+    word = "better than" if is_better else "not decided against" if is_ahead else "not better than"
+    return f"`{first['filter']}` {word} `{kalman['filter']}`", is_better
+
+
+def _kind(family: str, label: str) -> str:
+    """Return the kind of a filter: KALMAN or one of `KINDS`."""
+    if label == SAMPLED_HYPOTHESES:
+        return KINDS[1]
+    return KALMAN if family == KALMAN else KINDS[0]
 
 
 def recorded() -> str:
     """Compare particle filters with the best Kalman filter in each condition of recorded data."""
-    lines = markdown_head("world", "regime", "particles of the state", "particles of hypotheses")
-    wins: list[list[str]] = [[], []]
-    for name in RECORDED:
-        study = read_study(name)
-        families = {label: look.family for label, look in study.facts.looks.items()}
-        groups = [label for label, family in families.items() if family != KALMAN], [SAMPLED_HYPOTHESES]  # fmt: skip
-        for world, regime in study.rows[["world", "regime"]].drop_duplicates().to_numpy():
-            words = [compare_sampled(study, world, regime, group) for group in groups]
-            lines.append(markdown_row(f"`{world}`", regime, *words))
-            for won, word in zip(wins, words, strict=True):
-                won += [f"`{world}` with {regime}"] if " better than" in word and "not better" not in word else []  # fmt: skip
-    kinds = ("particles of the state", "particles of hypotheses")
+    lines = markdown_head("world", "regime", *KINDS)
+    wins: dict[str, list[str]] = {kind: [] for kind in KINDS}
+    for study in map(read_study, RECORDED):
+        for world, regime in dict.fromkeys((r["world"], r["regime"]) for r in study.list_rows()):
+            rows = [r for r in study.list_rows(world) if r["regime"] == regime]
+            outcomes = {kind: compare_sampled(study, rows, kind) for kind in KINDS}
+            lines.append(
+                markdown_row(f"`{world}`", regime, *(words for words, _ in outcomes.values()))
+            )
+            for kind, (_, is_better) in outcomes.items():
+                wins[kind] += [f"`{world}`, {regime}"] * is_better
     ends = [
-        f"A filter with {kind} is better than the best Kalman filter in: {'; '.join(won)}."
+        f"Filters with {kind} are better than the best Kalman filter in {len(won)} conditions: {'; '.join(won)}."
         if won
-        else f"No filter with {kind} is shown to be better than the best Kalman filter in any recorded world."
-        for kind, won in zip(kinds, wins, strict=True)
+        else f"No filter with {kind} is shown to be better than the best Kalman filter in any recorded condition."
+        for kind, won in wins.items()
     ]
     return "\n".join([*lines, "", *ends])
 
 
-def study_tables(name: str) -> str:
-    """Tables of all scenarios of a study.
-
-    Args:
-        name: Name of the study.
-    """
+def _study_tables(name: str) -> str:
+    """Tables of all scenarios of a study."""
     study = read_study(name)
     return "\n\n".join(
-        f"`{world}`: {look.words}.\n\n{world_table(study, world)}"
+        f"`{world}`: {look.words}.\n\n{_world_table(study, world)}"
         for world, look in study.facts.worlds.items()
     )
 
 
 def robust() -> str:
     """Describe the robust filters of all studies."""
-    return "\n".join(filter(None, map(describe_robust, STUDIES)))
+    return "\n".join(filter(None, map(_describe_robust, STUDIES)))
 
 
 BLOCKS: dict[str, Callable[[], str]] = {"robust": robust, "recorded": recorded}
@@ -250,7 +238,7 @@ def fill_page(text: str) -> str:
 
     def replace(match: re.Match[str]) -> str:
         name = match[1]
-        content = BLOCKS[name]() if name in BLOCKS else study_tables(name)
+        content = BLOCKS[name]() if name in BLOCKS else _study_tables(name)
         return f"<!-- numbers:{name} -->\n{content}\n<!-- numbers:end -->"
 
     return _BLOCK.sub(replace, text)

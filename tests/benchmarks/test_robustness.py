@@ -1,0 +1,104 @@
+"""The page of robust filters is that of the stored reports, and its sentences follow from their verdicts."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from checkout import ROOT
+from scipy import stats
+
+from pfbench.report.board.decided_parts import StudyFacts
+from pfbench.report.looks import find_looks
+from pfbench.report.options import ReportOptions
+
+sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
+import robustness
+
+WORLD, RUNS = "flight_300s", 40
+
+
+def make_study(ratios: dict[str, tuple[float, float]], rows: pd.DataFrame | None = None) -> Any:
+    """Runs of filters whose errors are those of the EKF times a ratio, in nominal noise and in outliers."""
+    random = np.random.default_rng(3)
+    parts = []
+    for k, regime in enumerate(("nominal", "outliers")):
+        level = 5.0 * np.exp(0.3 * random.standard_normal(RUNS))
+        for label, ratio in ratios.items():
+            errors = ratio[k] * level * np.exp(0.02 * random.standard_normal(RUNS))
+            parts.append(pd.DataFrame({
+                "filter": label, "scenario": WORLD, "family": WORLD, "regime": regime, "model": "", "particles": np.nan,
+                "seed": 1, "run": range(RUNS), "lost": False, "keeps_track": True, "unit": "m", "rmse": errors,
+            }))  # fmt: skip
+    facts = StudyFacts(find_looks(list(ratios)), {}, {}, ReportOptions(), {})
+    return robustness.Study(pd.concat(parts), rows if rows is not None else pd.DataFrame(), facts)
+
+
+def test_the_page_is_that_of_the_published_reports() -> None:
+    text = robustness.PAGE.read_text()
+    assert robustness.fill_page(text) == text, "run: python docs/robustness.py"
+    number = text.partition("| `gate` | ")[2].partition(" ")[0]
+    assert float(number) > 0
+    changed = text.replace(f"| `gate` | {number} ", "| `gate` | 99.9 ", 1)
+    assert changed != text
+    assert robustness.fill_page(changed) == text
+
+
+def test_the_interval_of_a_median_has_its_level() -> None:
+    """Ranks by the binomial distribution. A lost run is the largest error."""
+    errors = np.arange(1.0, 21.0)
+    errors[[3, 11]] = np.nan
+    ordered = np.sort(np.nan_to_num(errors, nan=np.inf))
+    k = next(k for k in range(10) if stats.binom.cdf(k, 20, 0.5) > 0.025)
+    expected = [(ordered[9] + ordered[10]) / 2, ordered[k - 1], ordered[20 - k]]
+    text = robustness.format_median(errors)
+    assert [float(word.strip("[],")) for word in text.split()] == pytest.approx(expected, rel=5e-3)
+    assert robustness.format_median(np.full(20, np.nan)) == "– [–, –]"
+
+
+def test_a_filter_that_beats_a_weak_control_only_is_not_strictly_robust() -> None:
+    """Tier B is 1.5 times worse than the EKF here. A rule with this control alone would accept `huber`."""
+    ratios = {"ekf": (1.0, 1.0), "ekf_scaled": (1.0, 1.0), robustness.CONTROL: (1.5, 1.5)}
+    study = make_study({**ratios, "huber": (1.1, 0.8), "gate": (1.0, 0.7), "wolf": (0.9, 1.0)})
+    assert robustness.find_strictly_robust(study, WORLD) == ("gate",)
+    controls = robustness.CONTROLS
+    assert set(controls) == set(ratios)
+    text = robustness.describe_robustness(study.runs, study.facts.looks, study.facts.options)
+    assert all(study.facts.looks[name].name in text for name in ("huber", "gate"))
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "words", "is_better"),
+    [
+        ((("rpf", "best"), ("ekf", "worse")), "`rpf` better than `ekf`", True),
+        ((("rpf", "best"), ("ekf", "not_kept")), "`rpf` better than `ekf`", True),
+        ((("rpf", "best"), ("ekf", "open")), "`rpf` not decided against `ekf`", False),
+        ((("ekf", "best"), ("rpf", "equal")), "`rpf` not better than `ekf`", False),
+        ((("rbpf_discrete", "best"), ("rpf", "open"), ("ekf", "worse")), "`rpf` not decided against `ekf`", False),
+        ((("rbpf_discrete", "best"), ("ekf", "worse")), "not in the study", False),
+    ],
+)  # fmt: skip
+def test_a_particle_filter_is_better_only_by_a_verdict(
+    verdicts: tuple[tuple[str, str], ...], words: str, is_better: bool
+) -> None:
+    study = make_study({label: (1.0, 1.0) for label, _ in verdicts})
+    rows = [
+        {"filter": label, "verdict": verdict, "rank": k + 1}
+        for k, (label, verdict) in enumerate(verdicts)
+    ]
+    assert robustness.compare_sampled(study, rows, robustness.KINDS[0]) == (words, is_better)
+    if rows[0]["filter"] == robustness.SAMPLED_HYPOTHESES:
+        assert robustness.compare_sampled(study, rows, robustness.KINDS[1])[1]
+
+
+def test_the_limit_of_a_scenario_is_that_of_the_page_of_limits() -> None:
+    text = (ROOT / "docs" / "ceiling.md").read_text()
+    row = next(line for line in text.splitlines() if line.startswith("| `flight_500s` "))
+    bound = float(row.split("|")[10])
+    stated = robustness._describe_limit("flight_500s").partition(": ")[2].partition(" ")[0]
+    assert math.isclose(float(stated), bound, rel_tol=5e-3)
+    assert robustness._describe_limit("recorded_car_drive").startswith("No limit holds")
