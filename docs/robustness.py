@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -30,8 +31,8 @@ from pfbench.results.statistics.intervals import order_statistic_interval
 
 TOP = Path(__file__).parents[1]
 PAGE = TOP / "docs" / "robustness.md"
-STUDIES = ("robust_flight", "robust_simulated", "robust_quad", "robust_car", "robust_canyon")
-RECORDED = STUDIES[2:]
+STUDIES = ("robust_flight", "robust_canyon")
+RECORDED = ("recorded_quad", "recorded_car", "robust_canyon")
 CONTROLS = (CONTROL, "ekf_scaled", "ekf")
 SAMPLED_HYPOTHESES = "rbpf_discrete"  # particles of noise hypotheses, a Kalman filter for each
 KALMAN = "kalman"
@@ -44,13 +45,7 @@ Row = dict[Any, Any]
 
 
 class Study(NamedTuple):
-    """Stored files of the report of a study.
-
-    Attributes:
-        runs: Values of all runs of the main group.
-        rows: Rows of verdicts.csv of the RMSE of each scenario and regime, once per filter.
-        facts: Names and options.
-    """
+    """Stored files of a study: all runs, rows of verdicts.csv of the RMSE per condition, names and options."""
 
     runs: pd.DataFrame
     rows: pd.DataFrame
@@ -108,7 +103,10 @@ def _world_table(study: Study, world: str) -> str:
     errors = {key: part["rmse"].to_numpy() for key, part in runs.groupby(["regime", "filter"])}
     regimes = list(dict.fromkeys(regime for regime, _ in rows))
     lines = markdown_head("filter", *(f"{r} [{runs['unit'].iloc[0]}]" for r in regimes), "ms/step")
-    for label, look in study.facts.looks.items():
+    ranks: Counter[str] = Counter()
+    for row in rows.values():
+        ranks[row["filter"]] += row["rank"]
+    for label in sorted(ranks, key=lambda label: ranks[label]):
         present = [(regime, label) for regime in regimes if (regime, label) in errors]
         cells = {
             key: f"{format_median(errors[key])}, {100 * rows[key]['track']:.0f} / {100 * rows[key]['coverage']:.0f} %"
@@ -116,7 +114,7 @@ def _world_table(study: Study, world: str) -> str:
         }
         times = float(np.median([rows[key]["ms"] for key in present]))
         words = (cells.get((regime, label), "failed") for regime in regimes)
-        tier = " (B)" if look.tuning else ""
+        tier = " (B)" if study.facts.looks[label].tuning else ""
         lines.append(markdown_row(f"`{label}`{tier}", *words, _digits(times)))
     return "\n".join([*lines, "", _describe_limit(world)])
 
@@ -192,17 +190,18 @@ def _kind(family: str, label: str) -> str:
 
 def recorded() -> str:
     """Compare particle filters with the best Kalman filter in each condition of recorded data."""
-    lines = markdown_head("world", "regime", *KINDS)
+    lines = markdown_head("study", "regime", *KINDS)
     wins: dict[str, list[str]] = {kind: [] for kind in KINDS}
-    for study in map(read_study, RECORDED):
+    for name in RECORDED:
+        study = read_study(name)
         for world, regime in dict.fromkeys((r["world"], r["regime"]) for r in study.list_rows()):
             rows = [r for r in study.list_rows(world) if r["regime"] == regime]
             outcomes = {kind: compare_sampled(study, rows, kind) for kind in KINDS}
             lines.append(
-                markdown_row(f"`{world}`", regime, *(words for words, _ in outcomes.values()))
+                markdown_row(f"`{name}`", regime, *(words for words, _ in outcomes.values()))
             )
             for kind, (_, is_better) in outcomes.items():
-                wins[kind] += [f"`{world}`, {regime}"] * is_better
+                wins[kind] += [f"`{name}`, {regime}"] * is_better
     ends = [
         f"Filters with {kind} are better than the best Kalman filter in {len(won)} conditions: {'; '.join(won)}."
         if won
