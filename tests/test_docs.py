@@ -9,7 +9,12 @@ from checkout import ROOT
 # glossary.md and renamed.md contain tables only
 TABLES = {"glossary.md", "renamed.md"}
 ALL_PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
-PAGES = [page for page in ALL_PAGES if page.name not in TABLES | {"use_your_data.md"}]
+METHODS = (
+    page
+    for page in sorted((ROOT / "docs" / "methods").glob("*.md"))
+    if "```python" in page.read_text()
+)
+PAGES = [*(page for page in ALL_PAGES if page.name not in TABLES | {"use_your_data.md"}), *METHODS]
 FOLDERS = ("docs", "reports", "benchmarks")
 LINKING_PAGES = (ROOT / "README.md", *(page for f in FOLDERS for page in (ROOT / f).rglob("*.md")))
 

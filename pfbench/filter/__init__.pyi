@@ -7,6 +7,10 @@ from pfbench.filter.belief import (
     gather_ancestors as gather_ancestors,
     normalise_log_weights as normalise_log_weights,
 )
+from pfbench.filter.error_distributions.observation_updates import (
+    MixtureObservationUpdate as MixtureObservationUpdate,
+    StudentObservationUpdate as StudentObservationUpdate,
+)
 from pfbench.filter.exactness import is_every_part_exact as is_every_part_exact
 from pfbench.filter.gaussian.covariance_matching import (
     MatrixNoiseAdaptation as MatrixNoiseAdaptation,

@@ -116,9 +116,12 @@ def check_moments(model: StateSpaceModel, name: str, distribution: Any) -> None:
     """
     if not has_finite_moments(distribution):
         kind = type(unwrap_independent(distribution)).__name__
+        choice = (
+            "measurement_update=StudentObservationUpdate(), or " if name == "observation" else ""
+        )
         raise ValueError(
             f"{type(model).__name__}.{name} must have a finite mean and variance for a Gaussian "
-            f"filter, got {kind}. Use a particle filter, for example filter=sir."
+            f"filter, got {kind}. Use {choice}a particle filter, for example filter=sir."
         )
 
 

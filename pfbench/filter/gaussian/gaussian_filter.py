@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,24 +25,22 @@ from pfbench.filter.gaussian.innovation import (
     compute_innovation,
     linearise_about_posterior,
 )
-from pfbench.filter.gaussian.kalman_update import (
-    GaussianStep,
-    kalman_gain_update,
-    move_root,
-    remove_negative_eigenvalues,
-)
+from pfbench.filter.gaussian.kalman_update import GaussianStep, move_root, repair_fit
 from pfbench.filter.gaussian.linearisation_rules import (
     AffineApproximation,
     DifferenceSpace,
     LinearisationRule,
-    SigmaPointLinearisation,
+)
+from pfbench.filter.gaussian.measurement_update import (
+    MeasurementUpdate,
+    WhitenedPosterior,
+    check_measurement_update,
+    measurement_posterior,
 )
 from pfbench.filter.gaussian.point_reach import check_point_reach
 from pfbench.filter.linearisation import check_moments, compute_additive_gain
 from pfbench.filter.model_jacobians import find_propagation_jacobian
 from pfbench.model.base import StateSpaceModel, initial_law
-
-Fit = TypeVar("Fit", Innovation, AffineApproximation)
 
 
 @dataclass(frozen=True)
@@ -53,8 +51,8 @@ class GaussianFilter:
     least 1, so P+ is positive for any prior, however ill-conditioned. A covariance without a square
     root marks the run as lost.
 
-    Initial, noise and observation distributions need finite means and variances. A model without
-    `noise_gain` is probed for additive noise, see `compute_additive_gain`.
+    Distributions need finite means and variances. A model without `noise_gain` is probed for
+    additive noise, see `compute_additive_gain`.
 
     Attributes:
         linearisation: TaylorLinearisation (EKF), or SigmaPointLinearisation (UKF and CKF).
@@ -68,10 +66,11 @@ class GaussianFilter:
             is lost.
         reset_covariance: Whether to move the covariance to the updated mean, see `move_root`. It
             matters on curved charts for corrections of about a radian, as of a wrong heading.
+        measurement_update: Update by a distribution that is not normal. None uses its moments.
 
     Raises:
-        ValueError: If iterations is below 1, or above 1 with adaptations or gains, or if two noise
-            adaptations use the innovation. On use, if a mean or variance is not finite.
+        ValueError: If iterations is below 1, or above 1 with adaptations or gains, or if two parts
+            use the innovation. On use, if a mean or variance is not finite.
     """
 
     linearisation: LinearisationRule
@@ -80,20 +79,27 @@ class GaussianFilter:
     iterations: int = 1
     repair_covariance: bool = False
     reset_covariance: bool = False
+    measurement_update: MeasurementUpdate | None = None
     is_exact = False  # it is exact on linear-Gaussian models only
 
     @property
     def plain(self) -> bool:
-        """True without adaptations and gains: the Kalman filter on linear models."""
-        return not self.noise_adaptations and not self.gain_adaptations
+        """True for the Kalman filter on linear models: no adaptation, gain or other update."""
+        return not self._adaptations and self.measurement_update is None
+
+    @property
+    def _adaptations(self) -> tuple[NoiseAdaptation | GainAdaptation, ...]:
+        return (*self.noise_adaptations, *self.gain_adaptations)
 
     def __post_init__(self) -> None:
         check_adaptations(self.noise_adaptations, self.gain_adaptations, self.iterations)
+        check_measurement_update(self.measurement_update, self._adaptations)
 
     @property
     def has_evidence(self) -> bool:
         """True if the log evidence is a log density of the measurements."""
-        return all(states_evidence(a) for a in (*self.noise_adaptations, *self.gain_adaptations))
+        update = () if self.measurement_update is None else (self.measurement_update,)
+        return all(map(states_evidence, (*self._adaptations, *update)))
 
     def init(
         self,
@@ -123,8 +129,7 @@ class GaussianFilter:
             check_moments(model, name, distribution)
         origin = model.origin.expand(runs, -1) if start is None else start
         mean, covariance = model.chart.add(origin, initial.mean), distribution_covariance(initial)
-        if isinstance(self.linearisation, SigmaPointLinearisation):
-            check_point_reach(self.linearisation, model.chart, covariance)
+        check_point_reach(self.linearisation, model.chart, covariance)
         log_z = torch.zeros(runs, dtype=torch.float64, device=mean.device)
         return GaussianBelief(mean, covariance, log_z)
 
@@ -166,21 +171,21 @@ class GaussianFilter:
         for adaptation in self.noise_adaptations:
             predicted = adaptation.predict_scale(predicted, belief)
         prior, covariance = predicted.y, predicted.m @ predicted.m.mT
-        predicted, repaired = self._repair(predicted, covariance)
+        predicted, repaired = repair_fit(predicted, covariance, self.repair_covariance)
         root, is_positive = factor(covariance + predicted.omega)
 
         def state_at(xi: Tensor) -> Tensor:
             return model.chart.add(prior.unsqueeze(1), xi @ root.mT)
 
         innovation = compute_innovation(
-            self.linearisation, model, state_at, prior, record, root
+            self.linearisation, model, state_at, prior, record, root, self.measurement_update
         )._replace(root=root)
         innovation, memory, trace = adapt_innovation(
             self.noise_adaptations, self.gain_adaptations, innovation, belief
         )
-        shift, updated, log_like, repaired_update, innovation = self._update(
-            model, prior, innovation, record
-        )
+        posterior, repaired_update = self._update(model, prior, innovation, record)
+        shift, updated, log_like, innovation, update_trace = posterior
+        trace |= update_trace
         if self.repair_covariance:
             trace["repairs"] = repaired.to(root) + repaired_update.to(root)
         root = innovation.root
@@ -229,22 +234,17 @@ class GaussianFilter:
 
     def _update(
         self, model: StateSpaceModel, mean: Tensor, innovation: Innovation, record: Record
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Innovation]:
-        """Return mean, root and log evidence of xi, the repaired runs [R], the last innovation."""
-        rule, root, zero = self.linearisation, innovation.root, torch.zeros_like(innovation.omega)
+    ) -> tuple[WhitenedPosterior, Tensor]:
+        """Return the posterior of xi by the last of the updates, and the repaired runs [R]."""
+        rule, update, root = self.linearisation, self.measurement_update, innovation.root
+        zero, is_active = torch.zeros_like(innovation.omega), self.repair_covariance
         # Omega alone must be positive: the update takes its root, not that of M M' + Omega
-        innovation, repaired = self._repair(innovation, zero)
-        shift, updated, log_like = kalman_gain_update(innovation)
+        innovation, repaired = repair_fit(innovation, zero, is_active)
+        posterior = measurement_posterior(update, innovation)
         for _ in range(self.iterations - 1):
-            new = linearise_about_posterior(rule, model, mean, root, shift, updated, record)
-            innovation, repaired_again = self._repair(new, zero)
-            shift, updated, log_like = kalman_gain_update(innovation)
+            shift, updated, *_ = posterior
+            new = linearise_about_posterior(rule, model, mean, root, shift, updated, record, update)
+            innovation, repaired_again = repair_fit(new, zero, is_active)
+            posterior = measurement_posterior(update, innovation)
             repaired = repaired | repaired_again
-        return shift, updated, log_like, repaired, innovation
-
-    def _repair(self, fit: Fit, addend: Tensor) -> tuple[Fit, Tensor]:
-        """Return a fit whose Omega + addend has a root, and the changed runs [R]."""
-        if not self.repair_covariance:
-            return fit, fit.omega.new_zeros(len(fit.omega), dtype=torch.bool)
-        omega, repaired = remove_negative_eigenvalues(fit.omega, fit.noise, addend)
-        return fit._replace(omega=omega), repaired
+        return posterior, repaired

@@ -11,6 +11,7 @@ from torch import Tensor
 from pfbench.core.covariance import shared_distribution_covariance, squared_length
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief
+from pfbench.filter.error_distributions.observation_reader import ObservationReader
 from pfbench.filter.gaussian.linearisation_rules import (
     AffineApproximation,
     DifferenceSpace,
@@ -35,6 +36,7 @@ class Innovation(NamedTuple):
         noise: Measurement noise in use, [R, k, k]; 1 for missing components.
         nominal: Measurement noise of the model, all components, [R, k, k].
         root: Root of the predicted covariance that whitens xi, [R, d, d].
+        parameters: Values of an `ObservationReader`, [R, ...].
     """
 
     r: Tensor
@@ -44,6 +46,7 @@ class Innovation(NamedTuple):
     noise: Tensor = torch.zeros(())
     nominal: Tensor = torch.zeros(())
     root: Tensor = torch.zeros(())
+    parameters: tuple[Tensor, ...] = ()
 
     @property
     def predicted_covariance(self) -> Tensor:
@@ -164,6 +167,7 @@ def compute_innovation(
     template: Tensor,
     record: Record,
     root: Tensor | None = None,
+    reader: ObservationReader | None = None,
 ) -> Innovation:
     """Compute the innovation by statistical linearisation.
 
@@ -174,6 +178,7 @@ def compute_innovation(
         template: Tensor of the runs and dtype, [R, ...].
         record: Measurement and inputs of the step.
         root: Derivative of the state in xi at 0, [R, d, d]. None if it is not known.
+        reader: Use of a distribution that is not normal. None takes its mean and covariance.
 
     Returns:
         The innovation, without the root of the predicted covariance.
@@ -181,14 +186,17 @@ def compute_innovation(
 
     def observe_points(xi: Tensor) -> tuple[Tensor, Tensor]:
         distribution: Any = model.observation(state_at(xi), record.u)
+        if reader is not None:
+            return reader.observe(model, distribution)
         check_moments(model, "observation", distribution)
         return distribution.mean, shared_distribution_covariance(distribution)
+
+    zero = template.new_zeros(len(template), 1, model.chart.dimension)
 
     def slope() -> Tensor | None:
         if root is None:
             return None
-        x = state_at(root.new_zeros(len(template), 1, root.shape[-1]))
-        h = find_observation_jacobian(model, x, record.u)
+        h = find_observation_jacobian(model, state_at(zero), record.u)
         return None if h is None else h[:, 0] @ root
 
     space = DifferenceSpace(model.residual, around_first(model.residual), slope)
@@ -199,7 +207,11 @@ def compute_innovation(
     eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
     m = torch.where(observed_mask.unsqueeze(-1), m, 0.0)
     omega, noise_in_use = (torch.where(pair_mask, a, eye) for a in (omega, noise))
-    return Innovation(r, observed_mask, m, omega, noise_in_use, noise)
+    innovation = Innovation(r, observed_mask, m, omega, noise_in_use, noise)
+    if reader is None:
+        return innovation
+    distribution = model.observation(state_at(zero), record.u)
+    return innovation._replace(parameters=reader.read_parameters(model, distribution))
 
 
 def linearise_about_posterior(
@@ -210,6 +222,7 @@ def linearise_about_posterior(
     shift: Tensor,
     updated: Tensor,
     record: Record,
+    reader: ObservationReader | None = None,
 ) -> Innovation:
     """Compute the innovation about the updated distribution, in the coordinates of the prior.
 
@@ -221,6 +234,7 @@ def linearise_about_posterior(
         shift: Updated mean of xi, [R, d].
         updated: Upper triangular root of the updated covariance of xi, [R, d, d].
         record: Measurement and inputs of the step.
+        reader: Use of a distribution that is not normal.
 
     Returns:
         The innovation.
@@ -231,6 +245,6 @@ def linearise_about_posterior(
         return model.chart.add(mean.unsqueeze(1), whitened @ root.mT)
 
     slope = root @ updated if model.chart.flat else None  # else the chart bends away from the mean
-    new = compute_innovation(linearisation, model, state_at, mean, record, slope)
+    new = compute_innovation(linearisation, model, state_at, mean, record, slope, reader)
     m = torch.linalg.solve_triangular(updated, new.m, upper=True, left=False)
     return new._replace(m=m, r=new.r + (m @ shift.unsqueeze(-1)).squeeze(-1), root=root)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,9 +11,12 @@ from pfbench.core.chart import Chart
 from pfbench.core.covariance import factor
 from pfbench.core.jacobian import jacobian
 from pfbench.filter.gaussian.innovation import Innovation
+from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.whitening import LOG_2PI
 from pfbench.kernels import cpp
 from pfbench.kernels.compilation import compilable
+
+Fit = TypeVar("Fit", Innovation, AffineApproximation)
 
 
 class GaussianStep(NamedTuple):
@@ -104,6 +107,23 @@ def _triangle(white: Tensor) -> tuple[Tensor, Tensor]:
     diagonal = triangle.diagonal(dim1=-2, dim2=-1)[:, :d]
     sign = torch.where(diagonal < 0, -1, 1).to(triangle).unsqueeze(-1)
     return sign * triangle[:, :d], triangle[:, d, d].square()
+
+
+def repair_fit(fit: Fit, addend: Tensor, is_active: bool) -> tuple[Fit, Tensor]:
+    """Return a fit whose Omega + addend has a root.
+
+    Args:
+        fit: Linearised map or innovation.
+        addend: Covariance that is added to Omega before the root is taken, [R, k, k].
+        is_active: Whether to change the fit at all.
+
+    Returns:
+        The fit, and the runs that were changed, bool [R].
+    """
+    if not is_active:
+        return fit, fit.omega.new_zeros(len(fit.omega), dtype=torch.bool)
+    omega, repaired = remove_negative_eigenvalues(fit.omega, fit.noise, addend)
+    return fit._replace(omega=omega), repaired
 
 
 def remove_negative_eigenvalues(

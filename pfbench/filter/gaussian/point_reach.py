@@ -9,29 +9,30 @@ from torch import Tensor
 from pfbench.core.chart import Chart
 from pfbench.core.covariance import factor
 from pfbench.filter.gaussian.linearisation_rules import (
+    LinearisationRule,
     SigmaPointLinearisation,
     SigmaPoints,
     UnscentedPoints,
 )
 
 
-def check_point_reach(rule: SigmaPointLinearisation, chart: Chart, covariance: Tensor) -> None:
+def check_point_reach(rule: LinearisationRule, chart: Chart, covariance: Tensor) -> None:
     """Check the largest angle between the mean and a point of the initial distribution.
 
     A point beyond half a turn has the shorter angle on the other side. Closer points fail too, because
     the first measurements move the mean: benchmarks/point_reach.md.
 
     Args:
-        rule: Linearisation rule.
+        rule: Linearisation rule. One without points is valid.
         chart: Chart of the state.
         covariance: Initial covariance, [R, d, d].
 
     Raises:
         ValueError: If the angle of a point exceeds `rule.largest_angle`.
     """
-    limit = rule.largest_angle
-    if limit is None or chart.flat:
+    if not isinstance(rule, SigmaPointLinearisation) or rule.largest_angle is None or chart.flat:
         return
+    limit = rule.largest_angle
     reach = _largest_angle(rule.points, chart, covariance)
     if reach > limit:
         unscented = rule.points if isinstance(rule.points, UnscentedPoints) else UnscentedPoints()

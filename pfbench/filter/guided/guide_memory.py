@@ -94,3 +94,20 @@ def check_covariance_factor(widen: float) -> None:
         raise ValueError(
             f"proposal.covariance_factor must be positive, got {widen}. Use 1 for no change."
         )
+
+
+def check_normal_guide(guide_filter: object) -> None:
+    """Check that a guide filter takes the measurement errors as normal.
+
+    Args:
+        guide_filter: Gaussian filter of the proposal.
+
+    Raises:
+        ValueError: If it has an update for another distribution.
+    """
+    update = getattr(guide_filter, "measurement_update", None)
+    if update is not None:
+        raise ValueError(
+            "proposal.guide_filter.measurement_update must be null in a proposal, got "
+            f"{type(update).__name__}. Remove it: the weights contain the distribution."
+        )

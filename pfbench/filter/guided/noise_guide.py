@@ -23,6 +23,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.guided.guide_memory import (
     check_covariance_factor,
+    check_normal_guide,
     compute_log_ratio,
     standardise_noise,
 )
@@ -64,6 +65,7 @@ class GuidedNoiseProposal(Proposal):
 
     def __post_init__(self) -> None:
         check_covariance_factor(self.covariance_factor)
+        check_normal_guide(self.guide_filter)
         if (
             self.guide_filter.noise_adaptations
             or self.guide_filter.gain_adaptations

@@ -21,6 +21,7 @@ from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.guided.guide_memory import (
     COVARIANCE,
     check_covariance_factor,
+    check_normal_guide,
     compute_log_ratio,
     pack_guide_belief,
     standardise_noise,
@@ -60,6 +61,7 @@ class ParticleGuideProposal(Proposal):
 
     def __post_init__(self) -> None:
         check_covariance_factor(self.covariance_factor)
+        check_normal_guide(self.guide_filter)
 
     @override
     def __call__(

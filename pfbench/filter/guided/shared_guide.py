@@ -26,6 +26,7 @@ from pfbench.filter.guided.guide_memory import (
     COVARIANCE,
     MEAN,
     check_covariance_factor,
+    check_normal_guide,
     compute_log_ratio,
     pack_guide_belief,
     unpack_guide_belief,
@@ -92,6 +93,7 @@ class SharedGuideProposal(Proposal):
                     f"proposal.{key} must be {first} or {second}, got {value}. Choose one."
                 )
         check_covariance_factor(self.covariance_factor)
+        check_normal_guide(self.guide_filter)
 
     @override
     def __call__(

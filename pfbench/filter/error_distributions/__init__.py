@@ -1,0 +1,1 @@
+"""Updates of Gaussian filters for observation distributions that are not normal."""
