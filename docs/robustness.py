@@ -31,8 +31,8 @@ from pfbench.results.statistics.intervals import order_statistic_interval
 
 TOP = Path(__file__).parents[1]
 PAGE = TOP / "docs" / "robustness.md"
-STUDIES = ("robust_flight", "robust_quad", "robust_canyon")
-RECORDED = ("robust_quad", "recorded_quad", "recorded_car", "robust_canyon")
+STUDIES = ("robust_flight", "robust_simulated", "robust_quad", "robust_car", "robust_canyon")
+RECORDED = ("robust_quad", "recorded_quad", "robust_car", "recorded_car", "robust_canyon")
 CONTROLS = (CONTROL, "ekf_scaled", "ekf")
 SAMPLED_HYPOTHESES = "rbpf_discrete"  # particles of noise hypotheses, a Kalman filter for each
 KALMAN = "kalman"
