@@ -23,8 +23,9 @@ from pfbench.report import read_page_data
 from pfbench.report.board.decided_parts import StudyFacts
 from pfbench.report.board.robust_word import (
     CONTROL,
+    NOMINAL_REGIME,
+    OUTLIER_REGIME,
     compare_with_control,
-    describe_robustness,
     find_robust_filters,
 )
 from pfbench.results.statistics.intervals import order_statistic_interval
@@ -130,32 +131,34 @@ def _describe_limit(world: str) -> str:
     return f"No limit holds: {stored['reason'].removeprefix('no bound: ').rstrip('.')}. {reached}"
 
 
-def find_strictly_robust(study: Study, world: str) -> tuple[str, ...]:
-    """Return the filters that fulfil the rule of the word "robust" against each of three controls.
+def find_robust(study: Study, world: str, controls: Sequence[str]) -> tuple[str, ...]:
+    """Return the filters that fulfil the rule of the word "robust" against each of several controls.
 
     The level is divided by the number of controls.
 
     Args:
         study: Files of a study.
         world: Scenario with outliers and nominal noise.
+        controls: Labels of the controls.
     """
     table = study.runs[study.runs["scenario"] == world]
     labels = tuple(study.facts.looks)
-    alpha = study.facts.options.alpha / len(CONTROLS)
-    evidence = (compare_with_control(table, labels, control=control) for control in CONTROLS)
+    alpha = study.facts.options.alpha / len(controls)
+    evidence = (compare_with_control(table, labels, control=control) for control in controls)
     sets = [find_robust_filters(pairs or {}, alpha) for pairs in evidence]
     return tuple(name for name in labels if all(name in names for names in sets))
 
 
-def _describe_robust(name: str) -> str:
-    """Describe the robust filters of each scenario of a study."""
-    study, lines = read_study(name), []
-    for world in study.facts.worlds:
-        table = study.runs[study.runs["scenario"] == world]
-        if text := describe_robustness(table, study.facts.looks, study.facts.options):
-            strict = ", ".join(f"`{name}`" for name in find_strictly_robust(study, world)) or "none"
-            plain = text.replace("[[", "").replace("]]", "")
-            lines.append(f"- `{world}`: {plain} Against all three controls: {strict}.")
+def robust() -> str:
+    """Table of the robust filters in each scenario with outliers and nominal noise."""
+    lines = markdown_head("world", f"against `{CONTROL}`", "against all three controls")
+    for study in map(read_study, STUDIES):
+        for world in study.facts.worlds:
+            regimes = set(study.runs.loc[study.runs["scenario"] == world, "regime"])
+            if {OUTLIER_REGIME, NOMINAL_REGIME} <= regimes:
+                names = (find_robust(study, world, c) for c in (CONTROLS[:1], CONTROLS))
+                cells = (", ".join(f"`{name}`" for name in group) or "none" for group in names)
+                lines.append(markdown_row(f"`{world}`", *cells))
     return "\n".join(lines)
 
 
@@ -218,11 +221,6 @@ def _study_tables(name: str) -> str:
         f"`{world}`: {look.words}.\n\n{_world_table(study, world)}"
         for world, look in study.facts.worlds.items()
     )
-
-
-def robust() -> str:
-    """Describe the robust filters of all studies."""
-    return "\n".join(filter(None, map(_describe_robust, STUDIES)))
 
 
 BLOCKS: dict[str, Callable[[], str]] = {"robust": robust, "recorded": recorded}
