@@ -22,7 +22,9 @@ SLOTS = 30
 
 TEXTS = {file.stem: file.read_text() for file in sorted((CONF / "filter").glob("*.yaml"))}
 
-NAMES = [name for name in TEXTS if not name.startswith("neural_")]  # these need a trained network
+NEEDS_TRAINING = ("neural_", "kalman_net")  # starts of the names of filters with a network
+
+NAMES = [name for name in TEXTS if not name.startswith(NEEDS_TRAINING)]
 
 NEEDS_ATTITUDE = "invariant_ekf"  # refuses a model without one
 

@@ -65,11 +65,14 @@ from pfbench.filter.learned.differentiable_resampling import (
     StopGradientResampler as StopGradientResampler,
 )
 from pfbench.filter.learned.features import Feature as Feature
+from pfbench.filter.learned.gain import LearnedGain as LearnedGain
+from pfbench.filter.learned.gain_filter import LearnedGainFilter as LearnedGainFilter
 from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk as LearnedRandomWalk
 from pfbench.filter.learned.networks import (
     DiagonalNormalHead as DiagonalNormalHead,
     LowRankNormalHead as LowRankNormalHead,
     NormalMixtureHead as NormalMixtureHead,
+    SkipMlp as SkipMlp,
     SplineFlowHead as SplineFlowHead,
     ZukoFlowHead as ZukoFlowHead,
 )

@@ -45,7 +45,7 @@ class GaussianBelief(NamedTuple):
 
     Attributes:
         mean: [R, D].
-        covariance: [R, d, d].
+        covariance: [R, d, d]; NaN if the filter states none.
         log_evidence: Log evidence so far, [R]; -inf if the run is lost.
         memory: Memory of the adaptations, [R, ...].
     """
@@ -61,7 +61,7 @@ class StepInfo(NamedTuple):
 
     Attributes:
         mean: Estimate, [R, D].
-        variance: [R, d].
+        variance: [R, d]; NaN if the filter states no covariance.
         covariance: Computes the covariance in the chart, [R, d, d]. For particles it costs a tenth
             of a step.
         trace: Numbers per run, {name: [R]}, such as `ess` or `resampled`.
@@ -71,6 +71,7 @@ class StepInfo(NamedTuple):
             of observed components, [R] each. None if the filter does not support it.
         group_covariance: Computes covariances of groups of components [R, G, s, s] from indices
             [G, s], where that is cheaper than the full covariance.
+        has_covariance: False if the filter states no covariance. Its moments are NaN.
     """
 
     mean: Tensor
@@ -80,6 +81,7 @@ class StepInfo(NamedTuple):
     cloud: Callable[[], tuple[Tensor, Tensor]] | None = None
     nis: Callable[[], tuple[Tensor, Tensor]] | None = None
     group_covariance: Callable[[Tensor], Tensor] | None = None
+    has_covariance: bool = True
 
     def covariance_of(self, groups: Tensor) -> Tensor:
         """Return covariances [R, G, s, s] of groups of components, indices [G, s]."""

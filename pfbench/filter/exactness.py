@@ -87,6 +87,15 @@ def has_evidence(method: object) -> bool:
     return all(getattr(stage, "has_evidence", True) for stage in (method, *stages))
 
 
+def has_covariance(method: object) -> bool:
+    """Return whether a filter states the covariance of its estimate.
+
+    Args:
+        method: Filter. It may define `has_covariance: bool`; nothing means True.
+    """
+    return bool(getattr(method, "has_covariance", True))
+
+
 def check_has_evidence(method: object, user: str) -> None:
     """Check that a filter may serve a parameter inference.
 

@@ -11,6 +11,8 @@ from pfbench.filter.gaussian.linearisation_rules import DifferenceSpace, TaylorL
 from pfbench.filter.particle.weight_update import WEIGHT_UPDATE_MEMORY
 from pfbench.model.base import StateSpaceModel
 
+LEARNED_GAIN_MEMORY = "learned_gain_"  # start of the names in the memory of a learned gain
+
 
 def apply_feedback(
     model: StateSpaceModel,
@@ -33,7 +35,8 @@ def apply_feedback(
         Belief about the correct_increment process, and the info with the uncorrected estimate.
 
     Raises:
-        ValueError: If particles carry their past, which refers to the uncorrected process.
+        ValueError: If particles or a learned gain carry a past, which refers to the uncorrected
+            process, or if the filter has several hypotheses.
     """
     valid = torch.isfinite(belief.log_evidence).unsqueeze(-1)
     uncorrected, correct = feedback.correct(torch.where(valid, info.mean, 0.0))
@@ -52,6 +55,12 @@ def apply_feedback(
         raise ValueError(
             "filter must not have several hypotheses in a scenario with feedback, which corrects one "
             "estimate. Choose another filter, or set scenario.closed_loop=false."
+        )
+    if any(name.startswith(LEARNED_GAIN_MEMORY) for name in belief.memory):
+        raise ValueError(
+            "filter must not have a learned gain in a scenario with feedback, got one: its memory "
+            "refers to the uncorrected process. Choose another filter, or set "
+            "scenario.closed_loop=false."
         )
     chart, centre = model.chart, belief.mean.unsqueeze(1)
 

@@ -14,7 +14,8 @@ The definitions need no truth:
 - **overconfident**: the normalised innovation squared (NIS) exceeds the 0.999 quantile of its
   distribution in more than half of the checked steps.
 
-Measurement outliers rarely reach these limits: with 10 % of outliers in 0.02 % of runs. They are ours. Where a
+A filter without a covariance is judged by its estimates: lost, diverged, or collapsed if they are
+not finite. Measurement outliers rarely reach these limits: with 10 % of outliers in 0.02 % of runs. They are ours. Where a
 truth exists, `pfbench.results.status` decides by the error instead.
 """
 
@@ -86,7 +87,7 @@ class HealthMonitor:
             device=record.y.device,
         )
         self._nis: dict[int, Tensor] = {}
-        self._has_particles = False
+        self._has_particles, self._has_covariance = False, True
         self._checks: HealthCheck | None = None
         self._collapsed = torch.zeros(len(record.y), dtype=torch.bool, device=record.y.device)
         self._first = observed[0] if observed else -1
@@ -101,12 +102,12 @@ class HealthMonitor:
             info: Estimate of the step.
         """
         if t in self.steps:
-            self._has_particles = info.cloud is not None
+            self._has_particles, self._has_covariance = info.cloud is not None, info.has_covariance
             with uncounted_observation(model):
                 nis = info.nis()[0] if info.nis is not None else None
             self._nis[t] = torch.full_like(info.mean[:, 0], torch.nan) if nis is None else nis
         # the prior is widest before the first measurement, so that this step is decisive
-        is_judged = info.cloud is None and info.mean.dtype != torch.float64
+        is_judged = info.cloud is None and info.has_covariance and info.mean.dtype != torch.float64
         if is_judged and (t in self.steps or t == self._first):
             self._collapsed |= is_ill_conditioned(info.covariance())
 
@@ -132,7 +133,7 @@ class HealthMonitor:
         """
         if self._nis:
             self._checks = self._check(model, record, mean, variance, ess)
-        at_floor = ~_has_spread(model, mean, variance)
+        at_floor = ~_has_spread(model, mean, variance) & self._has_covariance
         for t in (at_floor & torch.isfinite(mean).all(-1)).any(0).nonzero().flatten().tolist():
             misfit, observed = compute_misfit(model.at_step(t), record.at_step(t), mean[:, t])
             self._collapsed |= at_floor[:, t] & _is_far(misfit, observed)
@@ -183,11 +184,12 @@ class HealthMonitor:
         steps = list(self._nis)
         misfit, observed = compute_misfits(model, record, mean, steps)
         mean, variance = mean[:, steps].transpose(0, 1), variance[:, steps].transpose(0, 1)
-        has_spread = _has_spread(model, mean, variance)
+        has_spread = _has_spread(model, mean, variance) | (not self._has_covariance)
         if ess is not None:
             has_spread = has_spread & (ess[:, steps].T >= _MIN_ESS)
-        is_finite = torch.isfinite(mean).all(-1) & (variance >= 0.0).all(-1)
-        is_finite &= torch.isfinite(variance).all(-1)
+        is_finite = torch.isfinite(mean).all(-1)
+        if self._has_covariance:
+            is_finite &= (variance >= 0.0).all(-1) & torch.isfinite(variance).all(-1)
         coarse = torch.zeros_like(is_finite)
         if not self._has_particles:
             coarse = is_coarse(_distance(model, mean), variance).any(-1)

@@ -30,8 +30,10 @@ class FilterResult(NamedTuple):
     Attributes:
         mean: State estimate, [R, T, D]. NaN from the step at which a run is lost. With feedback,
             the estimate as it would read without any correction.
-        variance: Diagonal of the covariance in the chart, [R, T, d]. NaN as in `mean`.
-        log_evidence: log p(y_1:T), [R]. -inf where the run is lost.
+        variance: Diagonal of the covariance in the chart, [R, T, d]. NaN as in `mean`, and for a
+            filter without covariance.
+        log_evidence: log p(y_1:T), [R]. -inf where the run is lost. Not a density if the filter
+            states so, see `has_evidence`.
         trace: Diagnostics per run and step, {name: [R, T]}: `ess`, `resampled` and the results of
             `watch`.
         health: Health of each run as an index in `pfbench.filter.health.HEALTH`, int8 [R]: ok, lost,

@@ -84,5 +84,6 @@ def join_infos(infos: list[StepInfo]) -> StepInfo:
         return torch.cat([info.covariance_of(groups) for info in infos])
 
     return StepInfo(
-        mean, variance, covariance, trace, join_pairs("cloud"), join_pairs("nis"), group_covariance
-    )
+        mean, variance, covariance, trace, join_pairs("cloud"), join_pairs("nis"), group_covariance,
+        infos[0].has_covariance,
+    )  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import pfbench
-from pfbench.filter.exactness import has_evidence
+from pfbench.filter.exactness import has_covariance, has_evidence
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.job.plan import JobPlan
 from pfbench.model.base import StateSpaceModel
@@ -48,6 +48,7 @@ def make_metadata(
         "threads": values["threads"],
         "is_exact": method.is_exact or is_exact_kalman,
         "has_evidence": has_evidence(method),
+        "has_covariance": has_covariance(method),
         "oracle_noise": values["oracle_noise"],
         "modelling_choices": [*model.choices, *notes],
         "state": describe_state(model),

@@ -120,7 +120,8 @@ class ScoreRecorder:
     def __call__(self, t: int, info: StepInfo) -> dict[str, Tensor]:
         """Compute error and NEES of one step, and scores if the step is scored.
 
-        A filter without spread (all particles equal) has an infinite NEES, not an unknown one.
+        A filter without spread (all particles equal) has an infinite NEES, not an unknown one. For a
+        filter that states no covariance it is NaN, and nothing else is scored.
 
         Args:
             t: Time step.
@@ -134,9 +135,9 @@ class ScoreRecorder:
         for index, components in self._groups_by_size:
             e = error[:, components]
             value = squared_length(e, info.covariance_of(components))
-            has_truth = ~torch.isnan(e).any(-1)
+            has_truth = ~torch.isnan(e).any(-1) & info.has_covariance
             nees[:, index] = torch.where(has_truth & ~(value >= 0.0), torch.inf, value)
-        if t in self.at_step:
+        if t in self.at_step and info.has_covariance:
             start_time = self.clock()
             self.scores.append(self._score(t, error, info))
             if info.nis is not None:

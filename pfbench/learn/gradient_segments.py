@@ -12,10 +12,10 @@ from torch import Tensor
 from pfbench.core.derived_stream import relabel
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
-from pfbench.filter.learned.objectives import Objective, TrainingStep
+from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo
+from pfbench.filter.learned.gain_filter import LearnedGainFilter
+from pfbench.filter.learned.objectives import Objective, TrainableFilter, TrainingStep
 from pfbench.filter.loop import FilterPass
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.learn.training_data import TrainingData
 from pfbench.model.base import StateSpaceModel
 
@@ -23,7 +23,7 @@ from pfbench.model.base import StateSpaceModel
 def iterate_segments(
     objective: Objective,
     segment: int | None,
-    method: ParticleFilter,
+    method: TrainableFilter,
     model: StateSpaceModel,
     data: TrainingData,
     draws: RandomStream,
@@ -41,7 +41,7 @@ def iterate_segments(
         scale: Standard deviations of the initial distribution, [R or 1, d].
 
     Yields:
-        Losses and ESS / N of a segment's S steps, [S, R] each.
+        Losses and ESS / N of a segment's S steps, [S, R] each. ESS / N is NaN without particles.
     """
     steps = data.record.y.shape[1]
     recording = torch.is_grad_enabled() and objective.needs_filter_gradient
@@ -54,7 +54,7 @@ def iterate_segments(
             data.states[:, t], parent, noise, scale, relabel(step_draws, "lesson."),
         )  # fmt: skip
         losses.append(objective(training_step))
-        ess_fractions.append(info.trace["ess"].detach() / method.particles)
+        ess_fractions.append(_ess_fraction(method, info))
         if t + 1 == steps or (segment is not None and (t + 1) % segment == 0):
             yield torch.stack(losses), torch.stack(ess_fractions)
             losses, ess_fractions = [], []
@@ -83,11 +83,19 @@ class _GradientMode:
             return self.method.step(model, belief, record, draws)
 
 
-def _detach(belief: ParticleBelief) -> ParticleBelief:
-    """Return a belief without gradient history."""
-    window, memory = (
-        {name: a.detach() for name, a in tensors.items()}
-        for tensors in (belief.window, belief.memory)
-    )
-    x, log_w, log_z = belief.x.detach(), belief.log_w.detach(), belief.log_evidence.detach()
-    return belief._replace(x=x, log_w=log_w, log_evidence=log_z, window=window, memory=memory)
+def _ess_fraction(method: TrainableFilter, info: StepInfo) -> Tensor:
+    """Return ESS / N of a step, [R]; NaN for a filter without particles."""
+    if isinstance(method, LearnedGainFilter):
+        return torch.full_like(info.mean[:, 0], torch.nan).detach()
+    return info.trace["ess"].detach() / method.particles
+
+
+def _detach(value: Any) -> Any:
+    """Return a belief, or a part of one, without gradient history."""
+    if isinstance(value, Tensor):
+        return value.detach()
+    if isinstance(value, dict):
+        return {name: _detach(a) for name, a in value.items()}
+    if isinstance(value, ParticleBelief | GaussianBelief):
+        return value._replace(**{name: _detach(a) for name, a in value._asdict().items()})
+    return value

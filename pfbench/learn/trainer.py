@@ -10,7 +10,6 @@ import logging
 import time
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +21,14 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.learned import checkpoint
 from pfbench.filter.learned.checkpoint import flatten_parameters
-from pfbench.filter.learned.objectives import find_learned_parts, simulate_from_model
+from pfbench.filter.learned.objectives import (
+    TrainableFilter,
+    find_learned_parts,
+    simulate_from_model,
+)
 from pfbench.filter.learned.proposal import LearnedProposal
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.learn.gradient_segments import iterate_segments
-from pfbench.learn.training_config import Progress, Training
+from pfbench.learn.training_config import Progress, Training, set_up_filter
 from pfbench.learn.training_data import TrainingData
 from pfbench.model.base import StateSpaceModel, initial_law
 
@@ -53,7 +55,7 @@ class TrainingState:
         data: Training data. The first run gives the sizes of the networks.
 
     Attributes:
-        method: The filter with resampler and number of particles of the training.
+        method: The filter, with resampler and number of particles of the training if it has particles.
         parts: Trained parts by name.
         weights: Trained parameters.
     """
@@ -61,12 +63,12 @@ class TrainingState:
     def __init__(
         self,
         training: Training,
-        method: ParticleFilter,
+        method: TrainableFilter,
         model: StateSpaceModel,
         data: TrainingData,
     ) -> None:
         self.training, self.model = training, model
-        self.method = replace(method, particles=training.particles, resampler=training.resampler)
+        self.method = set_up_filter(training, method)
         self.parts = find_learned_parts(self.method)
         self._build_networks(data.select_runs(torch.arange(1)).record)
         self.weights = [p for module in self.parts.values() for p in module.parameters()]
@@ -173,7 +175,7 @@ class TrainingState:
     def _build_networks(self, record: Record) -> None:
         """Build the networks for the sizes of a record of one run."""
         draws = self._draws("sizes", torch.arange(1))
-        belief = self.method.init(self.model, 1, draws, record.start, record.spread)
+        belief: Any = self.method.init(self.model, 1, draws, record.start, record.spread)
         for module in self.parts.values():
             is_new = module.learnable.checkpoint is None
             if isinstance(module, LearnedProposal):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pfbench.filter.learned import checkpoint
-from pfbench.filter.learned.objectives import EvidenceLowerBound, Objective
+from pfbench.filter.learned.objectives import EvidenceLowerBound, Objective, TrainableFilter
+from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.resampling import EssResampler, Resampler
 from pfbench.filter.particle.resampling_schemes import Systematic
 
@@ -96,3 +97,23 @@ class Progress:
     seconds: float = 0.0
     losses: list[dict[str, float]] = field(default_factory=list)
     best_weights: dict[str, checkpoint.Weights] = field(default_factory=dict)
+
+
+def set_up_filter(training: Training, method: TrainableFilter) -> TrainableFilter:
+    """Return a filter with the resampler and the number of particles of a training.
+
+    Args:
+        training: Settings.
+        method: The filter. One without particles is returned unchanged.
+
+    Raises:
+        ValueError: If the objective needs particles and the filter has none.
+    """
+    if isinstance(method, ParticleFilter):
+        return replace(method, particles=training.particles, resampler=training.resampler)
+    if training.objective.needs_particles:
+        raise ValueError(
+            "train.objective must be defined without particles for a learned gain, got "
+            f"{type(training.objective).__name__}. Choose train=gain."
+        )
+    return method

@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from pfbench.filter.learned import checkpoint
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.learned.objectives import TrainableFilter
 from pfbench.learn.trainer import TrainingState
 from pfbench.learn.training_config import Progress, Training
 from pfbench.learn.training_data import TrainingData, draw_training_data
@@ -23,7 +23,7 @@ from pfbench.results.config_key import compute_config_key
 
 def train(
     training: Training,
-    method: ParticleFilter,
+    method: TrainableFilter,
     model: StateSpaceModel,
     data: TrainingData,
     validation: TrainingData,
@@ -39,7 +39,7 @@ def train(
 
     Args:
         training: Settings.
-        method: The filter. Resampler and number of particles are those of the settings.
+        method: The filter. Resampler and number of particles, if it has any, are those of the settings.
         model: State-space model, on its device and in its precision.
         data: Training data (`draw_training_data`).
         validation: Validation data.
@@ -156,7 +156,7 @@ def _checkpoint_content(
         "seconds": progress.seconds,
         "epochs": progress.epoch,
         "updates": progress.updates,
-        "particles": state.training.particles,
+        "particles": getattr(state.method, "particles", None),
         "device": str(state.model.anchor.device),
         "threads": torch.get_num_threads(),
     }

@@ -158,17 +158,21 @@ def compute_interval_coverage(data: MetricInput, level: int) -> ByComponent:
 
 
 def compute_mean_nees(data: MetricInput) -> ByComponent:
-    """Compute the mean NEES of a group."""
+    """Compute the mean NEES of a group; empty for a filter without a covariance."""
+    if not data.result.meta.get("has_covariance", True):
+        return {}
     return {"norm": mean_per_run(data.result.data["nees"][..., data.group_index], data.lost)}
 
 
 def compute_nees_ratio(data: MetricInput) -> ByComponent:
     """Compute the mean NEES of a group over its expectation, the number of components."""
-    return {"norm": compute_mean_nees(data)["norm"] / data.group_size}
+    return {name: mean / data.group_size for name, mean in compute_mean_nees(data).items()}
 
 
 def compute_overconfidence(data: MetricInput) -> ByComponent:
-    """Return 1 for an overconfident run, 0 for another one, NaN for a lost one."""
+    """Return 1 for an overconfident run, 0 for another, NaN for a lost one; empty without covariance."""
+    if not data.result.meta.get("has_covariance", True):
+        return {}
     nees = data.result.data["nees"][..., data.group_index]
     flags = is_overconfident(nees, data.group_size, data.lost)
     return {"norm": np.where(data.lost, np.nan, flags.astype(np.float64))}
@@ -233,12 +237,8 @@ def sum_trace(name: str) -> Callable[[MetricInput], ByComponent]:
 
 def compute_log_score(data: MetricInput) -> ByComponent:
     """Return the log evidence per step of the record; empty for a filter without evidence."""
-    return _job_value(data, lambda result: _log_score(result, data.lost))
-
-
-def _log_score(result: store.JobResult, lost: Flags) -> Array:
-    steps = result.meta.get("steps", len(result.data["time"]))
-    return np.where(lost, np.nan, result.data["log_evidence"] / steps)
+    steps = data.result.meta.get("steps", len(data.result.data["time"]))
+    return _job_value(data, lambda result: run_log_evidence(result) / steps)
 
 
 def compute_seconds_per_step(data: MetricInput) -> ByComponent:

@@ -14,7 +14,7 @@ from pfbench.model.base import StateSpaceModel
 
 SIZES = {
     "features": "number of features",
-    "noise": "components of the noise",
+    "noise": "components of the noise or of the gain",
     "memory": "hidden size of the recurrent network",
 }
 
@@ -24,7 +24,7 @@ class CheckpointSpec:
     """Source of the weights of a learned part of a filter.
 
     Attributes:
-        key: Name in the checkpoint: `proposal` or `kernel`.
+        key: Name in the checkpoint: `proposal`, `kernel` or `gain`.
         checkpoint: File, `untrained`, or None, which raises on use.
         seed: Seed of untrained weights.
         frame: Description of the distribution that the network corrects. The same weights give

@@ -7,7 +7,7 @@ resampling included. Others depend on one step, and the filter runs without a gr
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -17,12 +17,17 @@ from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state, simulate_steps
-from pfbench.filter.belief import ParticleBelief, StepInfo
+from pfbench.filter.belief import StepInfo
+from pfbench.filter.learned.gain import LearnedGain
+from pfbench.filter.learned.gain_filter import LearnedGainFilter
 from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
 from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.base import StateSpaceModel, StaticModel, initial_law
+
+TrainableFilter = ParticleFilter | LearnedGainFilter
+LearnedPart = LearnedProposal | LearnedRandomWalk | LearnedGain
 
 
 class TrainingStep(NamedTuple):
@@ -43,10 +48,10 @@ class TrainingStep(NamedTuple):
         draws: Random stream of the step.
     """
 
-    method: ParticleFilter
+    method: Any
     model: StateSpaceModel
-    before: ParticleBelief
-    after: ParticleBelief
+    before: Any
+    after: Any
     step_info: StepInfo
     record: Record
     truth: Tensor
@@ -70,6 +75,10 @@ class Objective(Protocol):
         Inputs and gaps are those of the training data.
         """
 
+    @property
+    def needs_particles(self) -> bool:
+        """True if the loss is defined for particle filters only."""
+
     def __call__(self, step: TrainingStep) -> Tensor:
         """Compute the loss of a step, [R]."""
 
@@ -87,6 +96,7 @@ class EvidenceLowerBound(Objective):
 
     needs_filter_gradient = True
     needs_simulated_data = False
+    needs_particles = True
 
     @override
     def __call__(self, step: TrainingStep) -> Tensor:
@@ -108,6 +118,7 @@ class StateErrorLoss(Objective):
 
     needs_filter_gradient = True
     needs_simulated_data = False
+    needs_particles = False
 
     @override
     def __call__(self, step: TrainingStep) -> Tensor:
@@ -128,6 +139,7 @@ class InferenceCompilation(Objective):
 
     needs_filter_gradient = False
     needs_simulated_data = True
+    needs_particles = True
 
     @override
     def __call__(self, step: TrainingStep) -> Tensor:
@@ -154,6 +166,7 @@ class ExpectedSquaredJump(Objective):
 
     needs_filter_gradient = False
     needs_simulated_data = False
+    needs_particles = True
 
     @override
     def __call__(self, step: TrainingStep) -> Tensor:
@@ -172,20 +185,25 @@ class ExpectedSquaredJump(Objective):
         return -(weighted * increment.square().mean(-1)).sum(-1)
 
 
-def find_learned_parts(method: ParticleFilter) -> dict[str, LearnedProposal | LearnedRandomWalk]:
+def find_learned_parts(method: TrainableFilter) -> dict[str, LearnedPart]:
     """Return the trainable parts of a filter, by their name in a checkpoint.
 
     Raises:
         ValueError: If the filter does not have a network.
     """
     stages = [
-        method.proposal,
-        *(move.kernel for move in method.moves if isinstance(move, MetropolisHastings)),
+        getattr(method, "gain", None),
+        getattr(method, "proposal", None),
+        *(
+            move.kernel
+            for move in getattr(method, "moves", ())
+            if isinstance(move, MetropolisHastings)
+        ),
     ]
     parts = {
         stage.checkpoint_key: stage
         for stage in stages
-        if isinstance(stage, LearnedProposal | LearnedRandomWalk)
+        if isinstance(stage, LearnedProposal | LearnedRandomWalk | LearnedGain)
     }
     if not parts:
         raise ValueError(

@@ -33,12 +33,13 @@ def write_training_figure(path: Path, losses: Losses) -> Path:
 
 
 def plot_training(losses: Losses) -> Figure:
-    """Plot the losses and the effective sample size over the epochs.
+    """Plot the losses and the effective sample size over the epochs, without the latter if it is NaN.
 
     Args:
         losses: Values as in `write_training_figure`.
     """
-    figure, (top, bottom) = stacked_axes(2, 1.5)
+    has_particles = np.isfinite(losses["ess"]).any()
+    figure, (top, *others) = stacked_axes(2 if has_particles else 1, 1.5)
     epoch, validation = np.asarray(losses["epoch"]), np.asarray(losses["validation"])
     top.plot(epoch, losses["loss"], color=PLAIN_COLOURS[5], lw=1.0, label="training runs")
     top.plot(epoch, validation, color=PLAIN_COLOURS[0], lw=1.3, label="validation runs")
@@ -49,8 +50,11 @@ def plot_training(losses: Losses) -> Figure:
             label="kept weights",
         )  # fmt: skip
     top.set_ylabel("loss")
-    bottom.plot(epoch, losses["ess"], color=PLAIN_COLOURS[0], lw=1.3)
-    bottom.set(xlabel="epoch", ylabel="ESS / N", ylim=(0, 1))
-    bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
+    for bottom in others:
+        bottom.plot(epoch, losses["ess"], color=PLAIN_COLOURS[0], lw=1.3)
+        bottom.set(ylabel="ESS / N", ylim=(0, 1))
+    last = [top, *others][-1]
+    last.set_xlabel("epoch")
+    last.xaxis.set_major_locator(MaxNLocator(integer=True))
     add_legend(figure, top, columns=3)
     return figure
