@@ -34,8 +34,10 @@ HEADLINES = {
     "claims": "figures/claims_printed_ratios",
     "learn_canyon_noise": "scores",
     "learn_data_efficiency": "data_efficiency",
+    "learn_gain": "ratios",
     "learn_noise_calibration": "calibration_location",
     "learn_quad_noise": "flights",
+    "learn_room": "rooms",
 }
 RESULTS = "results.json.gz"  # of a script in experiments/
 SUFFIXES = (".svg", ".png")  # of a headline figure, not of the copies that a folder keeps

@@ -1,4 +1,4 @@
-"""Write the numbers of README.md and of the pages of methods: `python docs/readme_numbers.py`.
+"""Write the numbers of README.md, of the pages of methods and of train_a_proposal.md: `python docs/readme_numbers.py`.
 
 Each block between `<!-- numbers:NAME -->` and `<!-- numbers:end -->` is generated from the published
 reports and the benchmark pages. A block without a function of its own is the table of the study of its
@@ -13,13 +13,20 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from pfbench.claims import read_claims
+from pfbench.files import markdown_bullets
 
 TOP = Path(__file__).parents[1]
-PAGES = (TOP / "README.md", *sorted((TOP / "docs" / "methods").glob("*.md")))
+PAGES = (
+    TOP / "README.md",
+    TOP / "docs" / "train_a_proposal.md",
+    *sorted((TOP / "docs" / "methods").glob("*.md")),
+)
 
 _BLOCK = re.compile(r"<!-- numbers:(\w+) -->\n.*?<!-- numbers:end -->", re.DOTALL)
 _MARKS = "[vacuous or circular](docs/glossary.md#results)"
@@ -231,8 +238,97 @@ def gpu() -> str:
     )
 
 
+def read_script_results(script: str) -> tuple[ModuleType, dict[str, Any]]:
+    """Read the stored results of a script in `experiments/`.
+
+    Args:
+        script: Name of the script.
+
+    Returns:
+        The script as a module, and its finished parts by name.
+    """
+    stored = gzip.decompress((TOP / "reports" / script / "results.json.gz").read_bytes())
+    return import_module(f"pfbench.experiments.{script}"), json.loads(stored)["done"]
+
+
+def _planned_equal_time(study: str) -> list[tuple[str, ...]]:
+    """Cells of the planned pairs of a learned proposal and a filter that takes less time."""
+    folder = TOP / "reports" / study
+    pack = json.loads(gzip.decompress((folder / "page.json.gz").read_bytes()))
+    with (folder / "verdicts.csv").open(encoding="utf-8", newline="") as file:
+        times = {row["filter"]: float(row["ms"]) for row in csv.DictReader(file) if row["ms"]}
+    words = {"better": "smaller", "worse": "larger"}
+    return [
+        (
+            pack["worlds"][0]["name"],
+            f"`{pair['a']}`",
+            f"`{pair['b']}`",
+            f"{_digits(pair['estimate'])} ({_digits(pair['low'])} to {_digits(pair['high'])})",
+            words.get(pair["word"], pair["word"]),
+        )
+        for pair in pack["planned"]
+        if pair["a"].startswith("neural_") and times[pair["b"]] <= times[pair["a"]]
+    ]
+
+
+def equal_time() -> str:
+    """Possible gain of learned proposals by world, and their errors at equal time."""
+    room, rooms = read_script_results("learn_room")
+    gain, done = read_script_results("learn_gain")
+    ratios = room.list_rooms(rooms)
+    left = [words.replace(",", ", ") for words, ratio in ratios.items() if ratio < room.OPEN]
+    rows = [
+        (
+            row["world"],
+            f"`{row['learned']}`",
+            f"`{row['rival']}`",
+            gain.format_ratio(row["mean"], row["half"]),
+            row["word"],
+        )
+        for row in gain.list_equal_time(done)
+    ]
+    rows += [
+        row
+        for study in ("learned_azimuth", "learned_passive")
+        for row in _planned_equal_time(study)
+    ]
+    head = (
+        "world",
+        "learned",
+        "filter that takes at most its time",
+        "RMSE, ratio",
+        "RMSE of the learned one",
+    )
+    winners = sorted({row[0] for row in rows if row[-1] == "smaller"})
+    answer = (
+        f"A learned proposal has the smaller error at equal time in: {', '.join(winners)}."
+        if winners
+        else "**A world in which a learned proposal has a smaller error at equal time was not found.**"
+    )
+    untested = [words for words in left if "oracle_noise" in words]
+    most = max(1.0 / ratios[words.replace(", ", ",")] - 1.0 for words in untested)
+    return (
+        f"In {len(ratios) - len(left)} of {len(ratios)} worlds the best proposal without a network has at least {room.OPEN:g} of the "
+        f"possible ESS, so a network has nothing to gain. The others are: {'; '.join(left)}.\n\n"
+        f"{format_table(head, rows)}\n\n{answer} Not compared at equal time: {'; '.join(untested)}. There the largest possible gain in "
+        f"ESS is {100 * most:.0f} %."
+    )
+
+
+def learned_gain() -> str:
+    """Errors of KalmanNet and its rivals relative to the EKF, and its comparisons with them."""
+    gain, done = read_script_results("learn_gain")
+    rows = [
+        (world, f"`{name}`", gain.format_ratio(mean, half), f"{p:.2g}")
+        for (world, name), (mean, half, p, _) in gain.list_ratios(done).items()
+    ]
+    head = ("world", "filter", "RMSE relative to `ekf`", "p, Holm")
+    pairs = "\n".join(markdown_bullets(*gain.describe_pairs(done))).rstrip()
+    return f"{format_table(head, rows)}\n\nKalmanNet with most training runs:\n\n{pairs}"
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
-    block.__name__: block for block in (claims, all_seven, speed, gpu)
+    block.__name__: block for block in (claims, all_seven, equal_time, learned_gain, speed, gpu)
 }
 
 

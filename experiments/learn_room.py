@@ -10,12 +10,11 @@ ratio that remains because the parents differ, the squared mean of a over the me
 
 The column `nats` is the information of a measurement about the noise of the step, by the rule of the extended Kalman filter at
 the predicted mean. Its formula is `log det (I + R^-1/2 H Q H' R^-1/2) / 2`. Steps without a measurement do not count. A scenario without its
-recorded data is omitted. The command resumes from the scenarios in its folder.
+recorded data is omitted. The command resumes from the scenarios in its folder and writes `report.md`.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Mapping
@@ -24,9 +23,11 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_module
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from pfbench.core import PhiloxStream, Record, map_inputs
+from pfbench.files import markdown_paragraph
 from pfbench.filter import (
     BootstrapProposal,
     CubaturePoints,
@@ -39,8 +40,9 @@ from pfbench.filter import (
     TaylorLinearisation,
     normalise_log_weights,
 )
-from pfbench.job import instantiate
+from pfbench.job import ResumableResults, instantiate
 from pfbench.model import StateSpaceModel, StaticModel
+from pfbench.report import COLUMN, add_legend, line_styles, render_palette_png
 from pfbench.scenario import RecordingRegime
 
 SCENARIOS: tuple[str, ...] = (
@@ -57,6 +59,7 @@ RULES = {
     "CKF": SigmaPointLinearisation(CubaturePoints()),
 }
 PARENTS, CHILDREN, RUNS, LOOKS = 40, 50, 4, 25
+OPEN = 0.99  # a best ratio below this leaves a network something to gain
 
 
 def proposals() -> dict[str, Proposal]:
@@ -181,23 +184,62 @@ def table(results: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return lines
 
 
+def list_rooms(done: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Largest ratio of a proposal without a network in each scenario; 1 leaves nothing to a network."""
+    return {words: max(columns[rule][0] for rule in RULES) for words, columns in done.items()}
+
+
+def plot_rooms(done: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """A row for each scenario, a mark for each proposal."""
+    style = line_styles(list(RULES))
+    figure = Figure(figsize=(2 * COLUMN, 0.6 + 0.15 * len(done)), layout="constrained")
+    axis = figure.subplots()
+    for marker, rule in zip(("o", "x", "+"), RULES, strict=True):
+        ratios = [columns[rule][0] for columns in done.values()]
+        rows = range(len(ratios))
+        axis.plot(ratios, rows, marker, ms=4, mfc="none", color=style[rule].colour, label=rule)
+    axis.set_yticks(range(len(done)), [words.replace(",", ", ") for words in done], fontsize=6)
+    axis.invert_yaxis()
+    axis.set_xlabel("ESS relative to the best proposal of one step")
+    add_legend(figure, axis, columns=3)
+    return figure
+
+
+def write_page(request: Mapping[str, Any], done: Mapping[str, Any]) -> str:
+    """The page of the study from its stored results."""
+    lines = ["# Possible gain of a learned proposal by scenario", ""]
+    lines += markdown_paragraph(
+        f"`python -m pfbench.experiments.learn_room` writes this page. Columns with the name of a proposal are its ESS relative to "
+        "the best proposal of one step, p(w | parent, y). At 1 no network can improve the ESS. `nats` is the information of a "
+        "measurement about the noise of its step, and `parents` the ratio that remains because the parents differ. Values are means "
+        f"over {request['runs']} runs and at most {LOOKS} steps of the first {request['steps']}, with {PARENTS} parents and "
+        f"{CHILDREN} children each. `oracle_noise` gives the filter the noise distribution of the data."
+    )
+    lines += [*table(done), ""]
+    open_ones = [words for words, ratio in list_rooms(done).items() if ratio < OPEN]
+    names = "; ".join(words.replace(",", ", ") for words in open_ones) or "none"
+    lines += markdown_paragraph(
+        f"Scenarios in which the best of these proposals has a ratio below {OPEN:g}: {names}."
+    )
+    lines += ["![ESS relative to the best proposal](rooms.png)", ""]
+    return "\n".join(lines)
+
+
 def main(folder: Path, *scenarios: str, steps: int = 400) -> None:
     torch.set_num_threads(1)
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "learn_room.json"
-    results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    request = {"runs": RUNS, "steps": steps}
+    results = ResumableResults(folder / "learn_room.json", request)
     for words in scenarios or SCENARIOS:
-        if words in results:
-            continue
         try:
             with torch.no_grad():
-                results[words] = room(*draw_record(words, RUNS, steps))
+                found = results(words, lambda words=words: room(*draw_record(words, RUNS, steps)))
         except ValueError as error:
             print(f"{words}: omitted, {error}", flush=True)
             continue
-        print(table({words: results[words]})[-1], flush=True)
-        path.write_text(json.dumps(results, indent=1))
-    (folder / "table.md").write_text("\n".join(table(results)) + "\n")
+        print(table({words: found})[-1], flush=True)
+    done = results.state["done"]
+    (folder / "report.md").write_text(write_page(request, done))
+    (folder / "rooms.png").write_bytes(render_palette_png(plot_rooms(done)))
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ COMMANDS = {
     "replay": ("replay_run", "compute one stored run again, with all its traces"),
     "judge": ("judge_trajectories", "compare trajectories of other programs with a reference"),
     "tune": ("tune_filters", "tune the baselines of a study of robustness alike"),
-    "train": ("train_network", "train the network of a neural_* filter"),
+    "train": ("train_network", "train the network of a neural_* filter or of kalman_net"),
     "list": ("list_options", "list what a configuration can choose"),
     "check": ("check_installation", "compose all configurations and print versions"),
 }

@@ -1,4 +1,4 @@
-"""Command `pfbench train`: training of a neural filter."""
+"""Command `pfbench train`: training of a filter with a network."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pfbench.config.composition import compose
 HELP = """\
 pfbench train key=value ...
 
-Train the network of a neural_* filter. The resulting file is the value of `checkpoint` of a job.
+Train the network of a neural_* filter or of kalman_net. The resulting file is the value of `checkpoint` of a job.
 An interrupted training resumes when the command is repeated.
 
   pfbench train filter=neural_sir scenario=passive_1 train=vsmc train.epochs=20
