@@ -19,6 +19,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import torch
 from hydra import compose, initialize_config_module
@@ -47,7 +48,7 @@ from pfbench.filter import (
 from pfbench.job import ResumableResults, instantiate
 from pfbench.learn import Training, draw_training_data, train
 from pfbench.model import StateSpaceModel
-from pfbench.report import COLUMN, line_styles, render_palette_png
+from pfbench.report import COLUMN, RC, line_styles, render_palette_png
 from pfbench.results import holm, wilcoxon_signed_rank
 
 WORLDS = ("linear_walk, nominal", "linear_walk, outliers")
@@ -168,6 +169,13 @@ def compare(parts: list[Any], others: list[Any]) -> tuple[float, float, float]:
     return *interval(each), wilcoxon_signed_rank(each.mean(0)).p
 
 
+def decide(mean: float, half: float, p: float) -> str:
+    """Decision on a log ratio: the interval, over runs and trainings, excludes 0, and so does the test."""
+    if p >= LEVEL or abs(mean) <= half:
+        return "inconclusive"
+    return "smaller" if mean < 0.0 else "larger"
+
+
 def list_ratios(done: Mapping[str, Any]) -> dict[tuple[str, str], list[Any]]:
     """Ratio to the EKF of each other filter in each world: mean, half interval, Holm's p, scores."""
     rows: dict[tuple[str, str], list[Any]] = {}
@@ -216,7 +224,7 @@ def describe_pairs(done: Mapping[str, Any]) -> list[str]:
     for (world, name, other, mean, half, _), p in zip(
         rows, holm([row[-1] for row in rows]), strict=True
     ):
-        word = "inconclusive" if p >= LEVEL else "smaller" if mean < 0.0 else "larger"
+        word = decide(mean, half, p)
         ratio = format_ratio(mean, half)
         texts.append(
             f"{world}, `{name}` against `{other}`: {word}, ratio {ratio}, corrected p {p:.2g}."
@@ -250,8 +258,7 @@ def list_equal_time(done: Mapping[str, Any]) -> list[dict[str, Any]]:
             )
     for row, p in zip(rows, holm([row["p"] for row in rows]), strict=True):
         row["p"] = p
-        wins = "smaller" if row["mean"] < 0.0 else "larger"
-        row["word"] = wins if p < LEVEL else "inconclusive"
+        row["word"] = decide(row["mean"], row["half"], p)
     return rows
 
 
@@ -287,7 +294,6 @@ def plot_ratios(done: Mapping[str, Any]) -> Figure:
             axis.plot([low, high], [row, row], color=style[name].colour, lw=1.2)
             axis.plot([middle], [row], "o", ms=3.5, color=style[name].colour)
         axis.axvline(1.0, color="0.6", lw=0.8, zorder=0)
-        axis.set_xscale("log")
         axis.set_title(world, fontsize=8)
         axis.set_xlabel("RMSE relative to EKF")
     axes[0].set_yticks(range(len(names)), names)
@@ -318,10 +324,10 @@ def write_page(request: Mapping[str, Any], done: Mapping[str, Any]) -> str:
     lines += ["## KalmanNet against its rivals on the same training runs", ""]
     lines += markdown_paragraph(
         f"{COUNTS[1]} training runs, RMSE of KalmanNet against the other, with Holm's correction over these lines. `gate` needs no "
-        "training runs:"
+        f"training runs. A decision needs a p-value below {LEVEL:g} and an interval without 1:"
     )
     lines += markdown_bullets(*describe_pairs(done))
-    lines += ["", "## Learned proposals at equal time", ""]
+    lines += ["## Learned proposals at equal time", ""]
     lines += markdown_paragraph(
         f"Learned proposals of {COUNTS[-1]} training runs with {PARTICLES} particles, against the filters without a network that take "
         f"at most their time, SIR with {' and '.join(map(str, DEARER))} particles included. The best of them has the smallest RMSE in "
@@ -360,7 +366,8 @@ def main(folder: Path, runs: int = 100, trainings: int = 3) -> None:
             results(f"{world}; sir, {particles} particles", partial(evaluate, world, method, runs))
     done = results.state["done"]
     (folder / "report.md").write_text(write_page(request, done))
-    (folder / "ratios.png").write_bytes(render_palette_png(plot_ratios(done)))
+    with matplotlib.rc_context(RC):
+        (folder / "ratios.png").write_bytes(render_palette_png(plot_ratios(done)))
 
 
 if __name__ == "__main__":

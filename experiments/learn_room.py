@@ -21,6 +21,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import torch
 from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
@@ -42,7 +43,7 @@ from pfbench.filter import (
 )
 from pfbench.job import ResumableResults, instantiate
 from pfbench.model import StateSpaceModel, StaticModel
-from pfbench.report import COLUMN, add_legend, line_styles, render_palette_png
+from pfbench.report import COLUMN, RC, add_legend, line_styles, render_palette_png
 from pfbench.scenario import RecordingRegime
 
 SCENARIOS: tuple[str, ...] = (
@@ -239,7 +240,8 @@ def main(folder: Path, *scenarios: str, steps: int = 400) -> None:
         print(table({words: found})[-1], flush=True)
     done = results.state["done"]
     (folder / "report.md").write_text(write_page(request, done))
-    (folder / "rooms.png").write_bytes(render_palette_png(plot_rooms(done)))
+    with matplotlib.rc_context(RC):
+        (folder / "rooms.png").write_bytes(render_palette_png(plot_rooms(done)))
 
 
 if __name__ == "__main__":

@@ -72,3 +72,18 @@ def test_the_page_of_possible_gains_names_the_scenarios_with_some() -> None:
     assert learn_room.list_rooms(done) == {"a,noise=x": 0.7, "b": 0.995}
     page = learn_room.write_page({"runs": 4, "steps": 400}, done)
     assert "ratio below 0.99: a, noise=x." in page
+
+
+@pytest.mark.parametrize(
+    ("mean", "half", "p", "word"),
+    [
+        (-0.2, 0.1, 0.01, "smaller"),
+        (0.2, 0.1, 0.01, "larger"),
+        (0.2, 0.3, 0.01, "inconclusive"),  # trainings differ
+        (0.2, 0.1, 0.06, "inconclusive"),
+    ],
+)
+def test_a_decision_holds_over_runs_and_over_trainings(
+    mean: float, half: float, p: float, word: str
+) -> None:
+    assert learn_gain.decide(mean, half, p) == word
