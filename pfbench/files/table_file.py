@@ -53,7 +53,7 @@ def _read_csv(file: Path) -> TableFile:
         problem = f"{', '.join(repeated)} twice" if repeated else "an empty name"
         raise ValueError(
             f"{file.name}: line 1 must have different names of columns, got {problem}. "
-            "Rename or remove a column."
+            "Rename or remove a column. In pandas, to_csv(index_label=NAME) names the index."
         )
     for number, line in enumerate(lines, 1):
         fields = line.count(",") + 1 if line.strip() else 0
@@ -110,9 +110,19 @@ def _whole_lines(file: Path) -> tuple[list[str], tuple[str, ...]]:
         )
     if not last:
         return lines, ()
-    return lines, (
-        f"{file.name}: line {len(lines) + 1} has no line end, so the file may be truncated. "
-        "This line was dropped",
+    return lines, (describe_cut(file, len(lines) + 1),)
+
+
+def describe_cut(file: Path, line: int) -> str:
+    """Describe a last line without a line end, which a reader drops.
+
+    Args:
+        file: File.
+        line: Number of the line.
+    """
+    return (
+        f"{file.name}: line {line} has no line end, so the file may be truncated. "
+        "This line was dropped"
     )
 
 

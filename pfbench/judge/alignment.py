@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from pfbench.judge.epoch_checks import check_scored_time, check_shared
+from pfbench.judge.epoch_holes import is_in_hole
 from pfbench.judge.judge_options import JudgeOptions
 from pfbench.judge.readers.local_frame import wrap_to_half_turn
 from pfbench.judge.readers.trajectory_table import (
@@ -17,7 +20,6 @@ from pfbench.judge.readers.trajectory_table import (
 from pfbench.judge.reference_track import ReferenceTrack
 from pfbench.results.error_measures import Array
 
-LEAST_EPOCHS = 10
 _CELL = 1.0  # s, coverage is a share of cells of this length
 
 
@@ -30,6 +32,8 @@ class CommonEpochs(NamedTuple):
         holes: Epochs that a valid trajectory leaves out although another one has them, [T] each.
         coverage: Share of the time that each trajectory covers.
         unused: Rows of each trajectory within the scored time that are not common.
+        share: Share of the epochs outside of holes that are common.
+        tolerance_needed: Tolerance that makes nearly all of them common, s.
     """
 
     time: Array
@@ -37,6 +41,8 @@ class CommonEpochs(NamedTuple):
     holes: tuple[np.ndarray | None, ...]
     coverage: tuple[float, ...]
     unused: tuple[int, ...]
+    share: float
+    tolerance_needed: float
 
 
 def find_common_epochs(
@@ -57,9 +63,10 @@ def find_common_epochs(
         The epochs.
 
     Raises:
-        ValueError: If fewer than 10 epochs are common.
+        ValueError: If fewer than 10 epochs are common, or if holes exist and many other epochs are not
+            common, so that the holes would have a larger weight than their time.
     """
-    _check_scored_time(reference, options)
+    check_scored_time(reference, options)
     masks = [_scored(table.time, reference, options) for table in tables]
     coverage = _shares_covered([t.time[m] for t, m in zip(tables, masks, strict=True)])
     valid = [k for k, share in enumerate(coverage) if share >= options.coverage]
@@ -67,18 +74,21 @@ def find_common_epochs(
     grid = _slowest(list(times.values()))
     nearest = {k: _nearest(times[k], grid) for k in valid}
     has_row = {k: _has_row(times[k], grid, options.tolerance) for k in valid}
-    common = np.ones(len(grid), dtype=bool)
-    for k in valid:  # a row that rounding puts outside the scored time is not a hole
-        is_absent = ~_has_row(tables[k].time, grid, options.tolerance)
-        common &= has_row[k] | (_is_in_hole(times[k], grid) & is_absent)
+    in_hole = {  # a row that rounding puts outside the scored time is not a hole
+        k: is_in_hole(times[k], grid) & ~_has_row(tables[k].time, grid, options.tolerance)
+        for k in valid
+    }
+    everywhere = np.ones(len(grid), dtype=bool)
+    shared = np.logical_and.reduce([everywhere, *has_row.values()])
+    is_hole = np.logical_or.reduce([~everywhere, *in_hole.values()])
+    common = np.logical_and.reduce([everywhere, *(has_row[k] | in_hole[k] for k in valid)])
+    share = float(shared.sum() / max((~is_hole).sum(), 1))
+    needed = _tolerance_needed([times[k] for k in valid], grid[~is_hole])
     common &= _thinned(grid, common, options.every)
-    if common.sum() < LEAST_EPOCHS:
-        raise ValueError(
-            f"trajectories of {reference.file} must share at least {LEAST_EPOCHS} epochs within "
-            f"{options.tolerance:g} s, got {int(common.sum())} of "
-            f"{', '.join(f'{len(times[k])} ({tables[k].file})' for k in valid) or 'none'}. Set "
-            f"{'a smaller every' if options.every else 'tolerance=SECONDS'}, or let the programs write the same epochs."
-        )
+    sizes = ", ".join(f"{len(times[k])} ({tables[k].file})" for k in valid) or "none"
+    remedy = "a smaller every" if options.every and share > 0.5 else f"tolerance={needed:g}"
+    text = f"within {options.tolerance:g} s, got {{}} of {sizes}. Set {remedy}"
+    check_shared(reference.file, common & shared, common & is_hole, share, text)
     rows = tuple(
         np.flatnonzero(masks[k])[nearest[k][common]] if k in times else None
         for k in range(len(tables))
@@ -86,27 +96,15 @@ def find_common_epochs(
     holes = tuple(~has_row[k][common] if k in times else None for k in range(len(tables)))
     used = [0 if h is None else int((~h).sum()) for h in holes]
     unused = tuple(int(m.sum()) - n for m, n in zip(masks, used, strict=True))
-    return CommonEpochs(grid[common], rows, holes, coverage, unused)
+    return CommonEpochs(grid[common], rows, holes, coverage, unused, share, needed)
 
 
-def _check_scored_time(reference: ReferenceTrack, options: JudgeOptions) -> None:
-    """Raise ValueError if the scored time is outside the reference, or blocks are too long for it."""
-    first, last = (float(t) for t in reference.table.time[[0, -1]])
-    span = f"{first:.10g} to {last:.10g} s"
-    for name, value, is_valid in (
-        ("from", options.start, options.start < last),
-        ("to", options.end, options.end > first),
-    ):
-        if not is_valid:
-            raise ValueError(
-                f"{name} must be within {reference.file} ({span}), got {value:.10g} s. Change {name}=..."
-            )
-    seconds = min(last, options.end) - max(first, options.start)
-    if options.block > seconds / 2:
-        raise ValueError(
-            f"block must be at most half of the scored time, {seconds / 2:.10g} s, got {options.block:.10g} s. "
-            "Set block=0 for the rule."
-        )
+def _tolerance_needed(times: Sequence[Array], grid: Array) -> float:
+    """Return the tolerance that makes 99 % of a grid common, rounded up to 1 ms."""
+    if not len(grid) or not times:
+        return 0.0
+    distances = np.max([np.abs(time[_nearest(time, grid)] - grid) for time in times], axis=0)
+    return math.ceil(1000 * float(np.quantile(distances, 0.99)) + 1e-6) / 1000
 
 
 def _slowest(times: Sequence[Array]) -> Array:
@@ -120,16 +118,6 @@ def _slowest(times: Sequence[Array]) -> Array:
 def _has_row(time: Array, grid: Array, tolerance: float) -> np.ndarray:
     """Return the epochs of a grid at which a trajectory has a row."""
     return np.asarray(np.abs(time[_nearest(time, grid)] - grid) <= tolerance)
-
-
-def _is_in_hole(time: Array, grid: Array) -> np.ndarray:
-    """Return the epochs of a grid that lie in a hole of a trajectory, before it or after it."""
-    if len(time) < 2:
-        return np.zeros(len(grid), dtype=bool)
-    limit = 1.5 * float(np.median(np.diff(time)))
-    padded = np.concatenate(([-np.inf], time, [np.inf]))
-    right = np.searchsorted(time, grid)
-    return np.asarray(padded[right + 1] - padded[right] > limit)
 
 
 def _scored(time: Array, reference: ReferenceTrack, options: JudgeOptions) -> np.ndarray:

@@ -26,6 +26,7 @@ from pfbench.results.statistics.world_effects import EffectEstimate
 
 MIN_BLOCKS = 6  # blocks from which a test is made
 _CORRELATION_TIMES = 8.0  # least mean length of a block
+_LEAST_MEANS, _RESOLVED = 50, 4.0  # means in a series, and lags that show a correlation time
 _LOST_CORRELATION = 1.5  # correlation times that the ends of a block lose
 _FREE_SHARE = 0.75  # degrees of freedom per block
 
@@ -70,9 +71,8 @@ def compare_along_run(square_a: Array, square_b: Array, length: float = 0.0) -> 
         return BlockEstimate(infinite, 1.0, square_a.size)
     ratio = 0.5 * math.log(mean_a / mean_b)
     influence = 0.5 * (square_a / mean_a - square_b / mean_b)  # of the log ratio; its mean is 0
-    covariance = _autocovariance(influence - influence.mean())
-    time = _correlation_time(covariance)
-    length = min(max(length or _choose_length(covariance), 1.0), influence.size / 2)
+    time = _correlation_time(influence)
+    length = min(max(length or choose_block_length(influence), 1.0), influence.size / 2)
     blocks = influence.size / length
     correction = (1 + 1 / blocks) / (1 - 1 / blocks) ** 2 * (1 + _LOST_CORRELATION * time / length)
     variance = correction * bootstrap_variance(influence, length)
@@ -107,19 +107,29 @@ def choose_block_length(values: Array) -> float:
     Returns:
         The larger of the length of Politis and White and of 8 correlation times.
     """
-    return _choose_length(_autocovariance(values - values.mean()))
-
-
-def _choose_length(covariance: Array) -> float:
-    """Return the block length of a series with an autocovariance [T], epochs."""
+    covariance = _autocovariance(values)
     if covariance[0] <= 0:
         return 1.0
-    time = _correlation_time(covariance)
-    return max(_politis_white_length(covariance), _CORRELATION_TIMES * time)
+    return max(_politis_white_length(covariance), _CORRELATION_TIMES * _correlation_time(values))
 
 
-def _correlation_time(covariance: Array) -> float:
-    """Return the first lag whose correlation is below 1/e, epochs."""
+def _correlation_time(values: Array) -> float:
+    """Return the first lag whose correlation is below 1/e, epochs, in the series or in means of it.
+
+    Errors that rise and fall with each measurement hide a slow correlation in the first lags. Means over
+    1, 2, 4, ... epochs show it, and count if their own correlation lasts for 4 means or more.
+    """
+    longest, width = _first_small_lag(values), 2
+    while values.size // width >= _LEAST_MEANS:
+        means = values[: values.size // width * width].reshape(-1, width).mean(axis=1)
+        lag = _first_small_lag(means)
+        longest = max(longest, width * lag) if lag >= _RESOLVED else longest
+        width *= 2
+    return longest
+
+
+def _first_small_lag(values: Array) -> float:
+    covariance = _autocovariance(values)
     below = covariance < math.exp(-1) * covariance[0]
     return float(below.argmax()) if below.any() else float(covariance.size)
 
@@ -142,5 +152,5 @@ def _politis_white_length(covariance: Array) -> float:
 
 def _autocovariance(values: Array) -> Array:
     n = values.size
-    spectrum = np.abs(np.fft.rfft(values, 2 * n)) ** 2
+    spectrum = np.abs(np.fft.rfft(values - values.mean(), 2 * n)) ** 2
     return np.asarray(np.fft.irfft(spectrum, 2 * n)[:n] / n)

@@ -61,11 +61,12 @@ class BlockDecision(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return values that JSON can store."""
-        numbers: dict[str, Any] = {
-            name: float(f"{getattr(self, name):.6g}") for name in ("seconds", "block_s", "blocks")
+        names = ("seconds", "block_s", "blocks", "seconds_needed")
+        values = {name: float(getattr(self, name)) for name in names}
+        numbers = {
+            name: float(f"{value:.6g}") if math.isfinite(value) else str(value)
+            for name, value in values.items()
         }
-        needed = self.seconds_needed
-        numbers["seconds_needed"] = float(f"{needed:.6g}") if math.isfinite(needed) else str(needed)
         return {"sequence": self.sequence, **numbers, **self.decision.to_dict()}
 
 
@@ -207,7 +208,7 @@ def _word(member: _Member, tests: FamilyTests, k: int, margin: float) -> tuple[s
     """Return word, statement on the margin, and reason of a missing test."""
     result = member.result
     if result is None:
-        reason = "no run in which both cover the time"
+        reason = "no run with the same name in which both cover the time"
         return NOT_TESTED, NO_SIZE, reason
     if result.estimate.value == 0 and result.estimate.standard_error == 0:
         return IDENTICAL, NO_SIZE, "all errors agree"

@@ -14,6 +14,31 @@ import numpy as np
 from pfbench.results.error_measures import Array
 from pfbench.results.store import JobResult
 
+_GAP_STEPS = 1.5
+
+
+def is_in_hole(time: Array, grid: Array) -> np.ndarray:
+    """Return the epochs of a grid that lie in a hole of a trajectory, before it or after it.
+
+    A gap of more than 1.5 steps between two rows is a hole. Half of it, 0.75 steps, counts before the
+    first row and after the last one, where the next row may still be due.
+
+    Args:
+        time: Times of the trajectory, [K], s.
+        grid: Epochs, [T], s.
+
+    Returns:
+        Mask, [T].
+    """
+    if len(time) < 2:
+        return np.zeros(len(grid), dtype=bool)
+    limit = _GAP_STEPS * float(np.median(np.diff(time)))
+    right = np.searchsorted(time, grid)
+    inner = np.clip(right, 1, len(time) - 1)
+    is_outside = (grid < time[0] - limit / 2) | (grid > time[-1] + limit / 2)
+    is_between = (right > 0) & (right < len(time))
+    return np.asarray(is_outside | (is_between & (time[inner] - time[inner - 1] > limit)))
+
 
 def fill_holes(results: Mapping[str, JobResult], holes: Mapping[str, np.ndarray]) -> None:
     """Set the errors in holes to the largest error of any program, in place.

@@ -1,4 +1,4 @@
-"""Checks of a trajectory against the reference: overlap, clock and units of each column."""
+"""Checks of a trajectory against the reference: place and units of each column."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from pfbench.judge.readers.trajectory_table import (
 from pfbench.judge.reference_track import ReferenceTrack
 from pfbench.results.error_measures import Array
 
-CLOCK_LIMIT = 0.5  # s, offset above which clocks are refused
 _FACTORS = {  # ratio of two units: the unit of the column, for positions, velocities and angles
     "m": {3.28084: "feet", 1e3: "mm", 1e-3: "km", 0.3048: "m while the reference is in feet"},
     "m/s": {3.28084: "feet/s", 3.6: "km/h", 1.943844: "knots", 0.277778: "m/s and the reference in km/h"},
@@ -25,37 +24,7 @@ _FACTORS = {  # ratio of two units: the unit of the column, for positions, veloc
 }  # fmt: skip
 _CLOSE = 0.045  # relative difference from a factor
 _USUAL = 0.97  # share of the increments of an angle that are compared
-_TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
-_EXPLAINED = 0.2  # share of the differences that remain at the offset of a wrong clock
 _NEAR = 1000.0  # m, smallest distance of a trajectory of the same place
-_SAMPLE = 1500  # epochs of the search for the clock
-
-
-def check_common_time(table: TrajectoryTable, reference: ReferenceTrack, name: str) -> None:
-    """Check that a trajectory and the reference share time.
-
-    Args:
-        table: Trajectory.
-        reference: Reference.
-        name: Name of the program, for the remedy.
-
-    Raises:
-        ValueError: If they do not overlap. The message proposes a unit or a shift.
-    """
-    (first, last), clock = (table.time[0], table.time[-1]), reference.table.time
-    if last > clock[0] and first < clock[-1]:
-        return
-    length, span = last - first, clock[-1] - clock[0]
-    unit = next((u for f, u in _TIME_UNITS.items() if 0.5 < length / f / span < 2), "")
-    remedy = (
-        f"The column is in {unit}: convert it to s."
-        if unit
-        else f"If both start together, set {name}.shift={clock[0] - first:.10g}."
-    )
-    raise ValueError(
-        f"{table.file}: column t must overlap {reference.file} ({clock[0]:.10g} to {clock[-1]:.10g} "
-        f"s), got {first:.10g} to {last:.10g} s. {remedy}"
-    )
 
 
 def check_distance(table: TrajectoryTable, reference: ReferenceTrack) -> None:
@@ -79,52 +48,6 @@ def check_distance(table: TrajectoryTable, reference: ReferenceTrack) -> None:
         )
 
 
-def check_clock(table: TrajectoryTable, reference: ReferenceTrack, name: str) -> float:
-    """Estimate the offset of the clock from the motion, and refuse a large one.
-
-    The offset minimises the median distance of the positions from the reference, after removal of
-    the median difference.
-
-    Args:
-        table: Trajectory.
-        reference: Reference.
-        name: Name of the program, for the remedy.
-
-    Returns:
-        Time to add to the clock of the trajectory, s; NaN if the motion does not show it.
-
-    Raises:
-        ValueError: If the offset exceeds 0.5 s and leaves less than 20 % of the
-            differences.
-    """
-    clock = reference.table.time
-    used = (table.time >= clock[0]) & (table.time <= clock[-1])
-    rows = np.flatnonzero(used)[:: max(1, int(used.sum()) // _SAMPLE)]
-    time, position = table.time[rows], reference.locate(table)[rows]
-    if len(time) < 20:
-        return np.nan
-
-    def spread(shift: float) -> float:
-        inside = (time + shift >= clock[0]) & (time + shift <= clock[-1])
-        if inside.sum() < max(20, len(time) // 2):
-            return np.inf
-        e = position[inside] - reference.interpolate_position(time[inside] + shift)
-        return float(np.median(np.linalg.norm(e - np.median(e, axis=0), axis=1)))
-
-    shift = 0.0
-    for half, step in ((25.0, 0.25), (0.5, 0.02), (0.03, 0.001)):
-        grid = shift + np.arange(-half, half + step / 2, step)
-        shift = float(grid[np.argmin([spread(s) for s in grid])])
-    at_zero, best = spread(0.0), spread(shift)
-    if abs(shift) > CLOCK_LIMIT and best < _EXPLAINED * at_zero:
-        raise ValueError(
-            f"{table.file}: column t must have the clock of {reference.file}, got an offset of "
-            f"{shift:.2f} s: with it the median difference falls from {at_zero:.3g} to {best:.3g} m. "
-            f"Set {name}.shift={shift:.2f}. GPS time is 18 s ahead of UTC since 2017."
-        )
-    return shift if best < 0.9 * at_zero or abs(shift) < 0.02 else np.nan
-
-
 def check_units(table: TrajectoryTable, reference: ReferenceTrack) -> None:
     """Compare each column with that of the reference, and refuse a ratio of two units.
 
@@ -143,6 +66,8 @@ def check_units(table: TrajectoryTable, reference: ReferenceTrack) -> None:
         ratio = _ratio(mine, theirs, unit, column)
         for factor, wrong in _FACTORS[unit].items():
             if abs(ratio / factor - 1) < _CLOSE:
+                if unit == "rad" and table.angle_unit == "deg":  # the reader has converted them
+                    unit, wrong = "deg", "radians, or degrees while the reference is in degrees"
                 raise ValueError(
                     f"{table.file}: column {column} must be in {unit}, got values {ratio:.4g} times "
                     f"those of {reference.file}: {wrong}. Multiply the column by {1 / factor:.6g}."
@@ -171,19 +96,31 @@ def _common_columns(
 
 
 def _ratio(mine: Array, theirs: Array, unit: str, column: str) -> float:
-    """Return the ratio of two columns: of medians, or the slope if they correlate; else 1.
-
-    Angles are compared by their increments without the largest, which pass half a turn.
-    """
+    """Return the ratio of two columns: of medians, or the slope if they correlate; else 1."""
     if unit == "deg" or column == "h_m":
         middle = float(np.median(theirs))
         return float(np.median(mine)) / middle if abs(middle) > 0.5 else 1.0
-    if unit == "rad":
+    slope, share = regress_column(mine, theirs, unit == "rad")
+    return slope if share >= 0.9 else 1.0
+
+
+def regress_column(mine: Array, theirs: Array, is_angle: bool = False) -> tuple[float, float]:
+    """Regress a column on one of the reference.
+
+    Args:
+        mine: Column of the program, [T].
+        theirs: Column of the reference at the same times, [T].
+        is_angle: Compare the increments without the largest, which pass half a turn.
+
+    Returns:
+        Slope, and share of the variance that it explains; 1 and 0 for a constant column.
+    """
+    if is_angle:
         mine, theirs = np.diff(mine), np.diff(theirs)
         used = np.abs(mine) <= np.quantile(np.abs(mine), _USUAL)
         used &= np.abs(theirs) <= np.quantile(np.abs(theirs), _USUAL)
         mine, theirs = mine[used], theirs[used]
     x, y = theirs - theirs.mean(), mine - mine.mean()
-    if not (x.any() and y.any()) or (x @ y) ** 2 < 0.9 * (x @ x) * (y @ y):
-        return 1.0
-    return float(x @ y / (x @ x))
+    if not (x.any() and y.any()):
+        return 1.0, 0.0
+    return float(x @ y / (x @ x)), float((x @ y) ** 2 / ((x @ x) * (y @ y)))

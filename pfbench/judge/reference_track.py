@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,8 @@ from pfbench.judge.readers.trajectory_table import (
 )
 from pfbench.results.error_measures import Array
 
+_SAME_TRUTH = 0.5  # m, largest difference of one truth that two files interpolate
+_MOVED = 1e-3  # m, smallest move
 _LEAST_GAP, _GAP_STEPS = 1.0, 2.5  # s, median steps
 
 
@@ -69,6 +71,27 @@ class ReferenceTrack:
             f"{table.file} must have positions in the frame of {self.file}, got {have} and no origin "
             "of the local frame. Set origin=LAT_DEG,LON_DEG,H_M of pn = pe = pd = 0."
         )
+
+    def place(self, table: TrajectoryTable) -> TrajectoryTable:
+        """Move a result of pfbench, whose positions start at 0, to its truth in the reference.
+
+        Args:
+            table: Trajectory of a program.
+
+        Returns:
+            The table with a note; unchanged without a truth, or if its truth is not the reference.
+        """
+        inside = self.is_bridged(table.time)
+        if table.truth is None or not self.is_local or not inside.any():
+            return table
+        move = self.interpolate_position(table.time[inside]) - table.truth[inside]
+        offset = np.median(move, axis=0)
+        if np.abs(move - offset).max() > _SAME_TRUTH or np.abs(offset).max() < _MOVED:
+            return table
+        columns = {n: table.values[n] + o for n, o in zip(LOCAL, offset, strict=True)}
+        note = "moved by {:.4g}, {:.4g}, {:.4g} m to its truth in the reference".format(*offset)
+        values = {**table.values, **columns}
+        return replace(table, values=values, truth=None, notes=(*table.notes, note))
 
     def interpolate_position(self, time: Array) -> Array:
         """Interpolate positions, [K, 3]: cubic with the velocities of the file, else linear.

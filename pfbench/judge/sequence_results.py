@@ -17,6 +17,8 @@ from pfbench.judge.alignment import (
     find_common_epochs,
     position_errors,
 )
+from pfbench.judge.axis_checks import check_axes
+from pfbench.judge.clock_checks import check_clock, check_common_time
 from pfbench.judge.epoch_holes import fill_holes
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.readers.trajectory_files import TrajectoryFile, read_trajectories
@@ -30,12 +32,7 @@ from pfbench.judge.readers.trajectory_table import (
     TrajectoryTable,
     covariance_matrices,
 )
-from pfbench.judge.reference_checks import (
-    check_clock,
-    check_common_time,
-    check_distance,
-    check_units,
-)
+from pfbench.judge.reference_checks import check_distance, check_units
 from pfbench.judge.reference_track import ReferenceTrack
 from pfbench.results.error_measures import Array
 from pfbench.results.store import JobResult
@@ -118,12 +115,15 @@ def read_runs(
         names = {"sequence": file.sequence, "run": file.run}
         sd = Path(source.sd.format(**names)) if source.sd else None
         tables = read_trajectories(file.path, source, sd)
-        for table in tables:
-            check_common_time(table, reference, program)
+        for table in map(reference.place, tables):
+            check_common_time(table, reference, program, source.shift)
             check_units(table, reference)
             if align == "none":
                 check_distance(table, reference)
-            offset = math.nan if align == "yaw" else check_clock(table, reference, program)
+            offset = math.nan
+            if align != "yaw":
+                offset = check_clock(table, reference, program, source.shift)
+                check_axes(table, reference)
             number = f"{table.run:09d}" if len(tables) > 1 else ""
             runs.append(JudgedRun(program, f"{file.run}{number}", file.path, table, offset))
     return runs

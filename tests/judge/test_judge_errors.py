@@ -33,7 +33,7 @@ BAD: dict[str, tuple[Change, str, str]] = {
     "degrees": (scale(["roll", "pitch", "yaw"], 180 / np.pi), "column pitch must be", "0.017453"),
     "negative deviation": (lambda d: d.assign(sd_pe=-1.0), "column sd_pe must be from", "Remove the uncertainty"),
     "another place": (lambda d: d.assign(pn=d.pn + 3e5), "positions must come within", "origin of the columns"),
-    "other epochs": (lambda d: d.assign(t=d.t + 0.2), "must share at least 10 epochs", "tolerance=SECONDS"),
+    "other epochs": (lambda d: d.assign(t=d.t + 0.2), "must share at least 10 epochs", "tolerance=0.201"),
 }  # fmt: skip
 
 

@@ -40,7 +40,8 @@ def read_result_trajectories(file: Path, options: SourceOptions) -> list[Traject
 def _run_table(file: Path, result: JobResult, places: list[int], run: int) -> TrajectoryTable:
     data = result.data
     error, sd = (data[name][run][:, places].astype(np.float64) for name in ("error", "sd"))
-    east, north, up = (data["track"][run].astype(np.float64) + error).T
+    track = data["track"][run].astype(np.float64)
+    east, north, up = (track + error).T
     values = dict(zip(LOCAL, (north, east, -up), strict=True))
     values |= dict(zip(POSITION_SD, sd[:, [1, 0, 2]].T, strict=True))
     number = int(data["run"][run]) if "run" in data else int(result.meta.get("first_run", 0)) + run
@@ -51,5 +52,6 @@ def _run_table(file: Path, result: JobResult, places: list[int], run: int) -> Tr
         if not used.all()
         else ()
     )
-    table = TrajectoryTable(file.name, time, values, np.arange(1, len(time) + 1), notes, number)
+    lines, truth = np.arange(1, len(time) + 1), track[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    table = TrajectoryTable(file.name, time, values, lines, notes, number, truth=truth)
     return table.keep_rows(used)

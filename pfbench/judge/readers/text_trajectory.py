@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pfbench.files.table_file import describe_cut
 from pfbench.judge.judge_options import SourceOptions
 from pfbench.judge.readers.local_frame import euler_angles, rotation_from_quaternion
 from pfbench.judge.readers.trajectory_table import (
@@ -49,7 +50,7 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
             f"NAME.frame must be ned or enu for {file.name}, got {options.frame or 'none'}: a .tum file "
             "does not state its axes. Set NAME.frame=enu if z points up."
         )
-    numbers, lines = _read_numbers(file, _TUM_COLUMNS)
+    numbers, lines, notes = _read_numbers(file, _TUM_COLUMNS)
     length = np.linalg.norm(numbers[:, 4:], axis=1)
     bad = np.abs(length - 1) > 0.01
     if bad.any():
@@ -62,7 +63,7 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     if options.frame == "enu":
         position, rotation = position @ _TO_NED.T, _TO_NED @ rotation @ _TO_FRD
     values = _by_name(LOCAL, position) | _by_name(ATTITUDE_COLUMNS, euler_angles(rotation))
-    return [TrajectoryTable(file.name, numbers[:, 0], values, lines)]
+    return [TrajectoryTable(file.name, numbers[:, 0], values, lines, notes)]
 
 
 def read_kf_gins_trajectory(
@@ -83,7 +84,7 @@ def read_kf_gins_trajectory(
     Raises:
         ValueError: If a line has other columns, or the times of both files differ.
     """
-    numbers, lines = _read_numbers(file, _KF_GINS_COLUMNS)
+    numbers, lines, notes = _read_numbers(file, _KF_GINS_COLUMNS)
     values = (
         _by_name(GEODETIC, numbers[:, 2:5])
         | _by_name(VELOCITY_COLUMNS, numbers[:, 5:8])
@@ -92,7 +93,9 @@ def read_kf_gins_trajectory(
     time = numbers[:, 1]
     if sd is not None:
         names = ("t", *(f"column {k}" for k in range(2, _KF_GINS_SD + 1)))
-        deviations, _ = _read_numbers(sd, names)
+        if not sd.is_file():
+            raise ValueError(f"sd must be a file, got {sd} for {file.name}. Check the path.")
+        deviations, _, _ = _read_numbers(sd, names)
         if deviations.shape[0] != len(time) or (np.abs(deviations[:, 0] - time) > 1e-4).any():
             raise ValueError(
                 f"{sd.name} must have the times of {file.name}, got {len(deviations)} rows from "
@@ -101,7 +104,7 @@ def read_kf_gins_trajectory(
         values |= _by_name(POSITION_SD, deviations[:, 1:4])
         values |= _by_name(VELOCITY_SD, deviations[:, 4:7])
         values |= _by_name(ATTITUDE_SD, np.radians(deviations[:, 7:10]))
-    return [TrajectoryTable(file.name, time, values, lines)]
+    return [TrajectoryTable(file.name, time, values, lines, notes, angle_unit="deg")]
 
 
 def count_fields(file: Path) -> int:
@@ -117,12 +120,14 @@ def _by_name(names: tuple[str, ...], columns: Array) -> dict[str, Array]:
     return {name: columns[:, k] for k, name in enumerate(names)}
 
 
-def _read_numbers(file: Path, names: tuple[str, ...]) -> tuple[Array, np.ndarray]:
-    """Return the numbers [T, K] and their lines [T]; comments start with # or %."""
+def _read_numbers(file: Path, names: tuple[str, ...]) -> tuple[Array, np.ndarray, tuple[str, ...]]:
+    """Return numbers [T, K], their lines [T], and notes; comments start with # or %.
+
+    A last line without an end may lack digits, so it is dropped with a note.
+    """
     rows, lines = [], []
-    for number, line in enumerate(
-        file.read_text(encoding="utf-8", errors="replace").split("\n"), 1
-    ):
+    *complete, last = file.read_text(encoding="utf-8", errors="replace").split("\n")
+    for number, line in enumerate(complete, 1):
         fields = line.split()
         if not fields or fields[0].startswith(("#", "%")):
             continue
@@ -137,4 +142,6 @@ def _read_numbers(file: Path, names: tuple[str, ...]) -> tuple[Array, np.ndarray
             )
         rows.append(row)
         lines.append(number)
-    return np.array(rows, dtype=np.float64).reshape(len(rows), len(names)), np.array(lines)
+    notes = (describe_cut(file, len(complete) + 1),) if last.strip() else ()
+    numbers = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+    return numbers, np.array(lines), notes

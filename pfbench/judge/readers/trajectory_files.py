@@ -113,8 +113,10 @@ def read_trajectories(
     elif suffix in _TEXT and count_fields(path) == 11:
         tables = read_kf_gins_trajectory(path, options, sd)
     else:
+        fields = f" and {count_fields(path)} columns" if suffix in _TEXT else ""
         raise ValueError(
             f"{path.name} must be .csv, .parquet, .tum, .nmea, .npz, or .nav or .txt with the 11 columns "
-            f"of KF-GINS, got the suffix {suffix or 'none'}. Rename or convert the file."
+            f"of KF-GINS, got the suffix {suffix or 'none'}{fields}. "
+            f"{'Use the navigation result of the program.' if fields else 'Rename or convert the file.'}"
         )
     return [replace(check_trajectory(t), time=t.time + options.shift) for t in tables]

@@ -53,6 +53,8 @@ class TrajectoryTable:
         notes: Notes of the reader.
         run: Number of the run within the file.
         origin: Latitude, longitude, height of the local frame if the file states it; deg, deg, m.
+        angle_unit: Unit of roll, pitch and yaw in the file, for messages.
+        truth: Truth of a result of pfbench in the frame of its positions, [T, 3], m.
     """
 
     file: str
@@ -62,6 +64,8 @@ class TrajectoryTable:
     notes: tuple[str, ...] = ()
     run: int = 0
     origin: tuple[float, ...] = ()
+    angle_unit: str = "rad"
+    truth: Array | None = None
 
     def select(self, group: tuple[str, ...]) -> Array:
         """Return the columns of a group, [T, K]."""
@@ -74,7 +78,10 @@ class TrajectoryTable:
     def keep_rows(self, mask: np.ndarray) -> TrajectoryTable:
         """Return the rows of a mask [T]."""
         values = {name: value[mask] for name, value in self.values.items()}
-        return replace(self, time=self.time[mask], values=values, lines=self.lines[mask])
+        truth = None if self.truth is None else self.truth[mask]
+        return replace(
+            self, time=self.time[mask], values=values, lines=self.lines[mask], truth=truth
+        )
 
 
 def check_trajectory(table: TrajectoryTable) -> TrajectoryTable:

@@ -1,0 +1,145 @@
+"""Checks of the clock of a trajectory: overlap with the reference, and the offset that the motion shows."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pfbench.judge.readers.trajectory_table import TrajectoryTable
+from pfbench.judge.reference_track import ReferenceTrack
+from pfbench.results.error_measures import Array
+
+CLOCK_LIMIT = 0.5  # s, offset above which clocks are refused
+_TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+_EXPLAINED = 0.2  # share of the differences that remain at the offset of a wrong clock
+_SAMPLE, _COARSE_SAMPLE = 1500, 300  # epochs of the search for the clock
+_NEAR_S = 25.0  # s, half of the first search
+_STEP_S, _LARGEST_GRID = 0.25, 4000
+_FAR = 0.05  # share of the extent of the reference above which the search is widened
+_WHOLE = 0.05  # s: time scales differ by whole seconds
+
+
+class _Offset(NamedTuple):
+    shift: float  # s
+    spread: float  # median difference of the positions at this shift, m
+
+
+class _Motion:
+    """Positions of a trajectory that are moved in time against the reference."""
+
+    def __init__(self, table: TrajectoryTable, reference: ReferenceTrack, rows: np.ndarray) -> None:
+        rows = rows[:: max(1, len(rows) // _SAMPLE)]
+        self.time, self.position = table.time[rows], reference.locate(table)[rows]
+        self.reference, self.clock = reference, reference.table.time
+        self.extent = _median_distance(reference.position)
+
+    def spread(self, shift: float, every: int = 1) -> float:
+        """Return the median distance from the reference after removal of the median difference, m."""
+        time = self.time[::every] + shift
+        inside = (time >= self.clock[0]) & (time <= self.clock[-1])
+        if inside.sum() < max(20, len(time) // 2):
+            return np.inf
+        truth = self.reference.interpolate_position(time[inside])
+        return _median_distance(self.position[::every][inside] - truth)
+
+    def search(self, first: float, last: float) -> _Offset:
+        """Return the best shift from first to last, s, to 1 ms."""
+        step = max(_STEP_S, (last - first) / _LARGEST_GRID)
+        every = max(1, len(self.time) // _COARSE_SAMPLE)
+        grid = np.arange(first, last + step / 2, step)
+        shift = float(grid[np.argmin([self.spread(s, every) for s in grid])])
+        for half, finer in ((2 * step, step / 5), (0.5, 0.02), (0.03, 0.001)):
+            grid = shift + np.arange(-half, half + finer / 2, finer)
+            shift = float(grid[np.argmin([self.spread(s) for s in grid])])
+        return _Offset(shift, self.spread(shift))
+
+    def search_all(self) -> _Offset:
+        """Return the best shift of those that leave half of the trajectory in the reference."""
+        middle = float(np.median(self.time))
+        return self.search(self.clock[0] - middle, self.clock[-1] - middle)
+
+
+def check_common_time(
+    table: TrajectoryTable, reference: ReferenceTrack, name: str, applied: float = 0.0
+) -> None:
+    """Check that a trajectory and the reference share time.
+
+    Args:
+        table: Trajectory.
+        reference: Reference.
+        name: Name of the program, for the remedy.
+        applied: Shift that its clock already has, s.
+
+    Raises:
+        ValueError: If they do not overlap. The message proposes a unit or a shift.
+    """
+    (first, last), clock = (table.time[0], table.time[-1]), reference.table.time
+    if last > clock[0] and first < clock[-1]:
+        return
+    length, span = last - first, clock[-1] - clock[0]
+    unit = next((u for f, u in _TIME_UNITS.items() if 0.5 < length / f / span < 2), "")
+    if unit:
+        remedy = f"The column is in {unit}: convert it to s."
+    else:
+        motion = _Motion(table, reference, np.arange(len(table.time)))
+        search_result = motion.search_all()
+        shift, remedy = clock[0] - first, "If both start together, set"
+        if search_result.spread < _EXPLAINED * motion.extent:
+            shift, remedy = _round_whole(search_result.shift), "The motion agrees at"
+        remedy = f"{remedy} {name}.shift={applied + shift:.10g}."
+    raise ValueError(
+        f"{table.file}: column t must overlap {reference.file} ({clock[0]:.10g} to {clock[-1]:.10g} "
+        f"s), got {first:.10g} to {last:.10g} s. {remedy}"
+    )
+
+
+def check_clock(
+    table: TrajectoryTable, reference: ReferenceTrack, name: str, applied: float = 0.0
+) -> float:
+    """Estimate the offset of the clock from the motion, and refuse a large one.
+
+    The offset minimises the median distance of the positions from the reference, after removal of
+    the median difference. Positions that are far from the reference widen the search from 25 s to all
+    offsets that leave half of the trajectory within the reference.
+
+    Args:
+        table: Trajectory.
+        reference: Reference.
+        name: Name of the program, for the remedy.
+        applied: Shift that its clock already has, s.
+
+    Returns:
+        Time to add to the clock of the trajectory, s; NaN if the motion does not show it.
+
+    Raises:
+        ValueError: If the offset exceeds 0.5 s and leaves less than 20 % of the
+            differences.
+    """
+    clock = reference.table.time
+    rows = np.flatnonzero((table.time >= clock[0]) & (table.time <= clock[-1]))
+    if len(rows) < 20:
+        return np.nan
+    motion = _Motion(table, reference, rows)
+    at_zero, best = motion.spread(0.0), motion.search(-_NEAR_S, _NEAR_S)
+    if best.spread >= _EXPLAINED * at_zero and at_zero > _FAR * motion.extent:
+        full_motion = _Motion(table, reference, np.arange(len(table.time)))
+        best = min(best, full_motion.search_all(), key=lambda offset: offset.spread)
+    shift = best.shift
+    if abs(shift) > CLOCK_LIMIT and best.spread < _EXPLAINED * at_zero:
+        raise ValueError(
+            f"{table.file}: column t must have the clock of {reference.file}, got an offset of "
+            f"{shift:.2f} s: with it the median difference falls from {at_zero:.3g} to {best.spread:.3g} m. "
+            f"Set {name}.shift={applied + _round_whole(shift):.10g}. GPS time is 18 s ahead of UTC since 2017."
+        )
+    return shift if best.spread < 0.9 * at_zero or abs(shift) < 0.02 else np.nan
+
+
+def _median_distance(points: Array) -> float:
+    """Return the median distance of points [K, 3] from their median."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+
+
+def _round_whole(shift: float) -> float:
+    """Return the whole number of seconds near a shift, else the shift to 10 ms."""
+    return float(round(shift)) if abs(shift - round(shift)) < _WHOLE else round(shift, 2)

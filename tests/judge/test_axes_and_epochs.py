@@ -1,0 +1,104 @@
+"""Wrong axes are refused, true ones are not; holes have the weight of their time; results find their place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import judge_cases as cases
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.signal import lfilter
+
+from pfbench.judge.axis_checks import check_axes
+from pfbench.judge.block_bootstrap import compare_along_run
+from pfbench.judge.epoch_holes import is_in_hole
+from pfbench.judge.judge_options import JudgeOptions, SourceOptions
+from pfbench.judge.judgement import judge_programs
+from pfbench.judge.readers.trajectory_files import read_trajectories
+from pfbench.judge.reference_track import read_reference
+
+WRONG = {
+    "swapped positions": ({"pn": "pe", "pe": "pn"}, [], "column pn .* times those of pe"),
+    "height for depth": ({}, ["pe"], "column pe .* times those of pe .* by -1"),
+    "swapped velocities": ({"vn": "ve", "ve": "vn"}, [], "column vn .* times those of ve"),
+    "upward velocity": ({}, ["vd"], "column vd .* by -1"),
+    "velocities for positions": ({"pn": "vn"}, [], "column pn .* times those of vn"),
+    "yaw from East": ({}, ["yaw"], "column yaw .* by -1"),
+}
+
+
+def drive_with_errors(seed: int, sd: float) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """A drive, and an estimate of all of its columns."""
+    truth = cases.drive(300.0)
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=(len(truth), 9)) * [sd, sd, sd, 0.1, 0.1, 0.1, 0.002, 0.002, 0.01]
+    return truth, truth.assign(**(truth.iloc[:, 1:10] + noise))
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_axes_are_refused(tmp_path: Path, case: str) -> None:
+    names, signs, message = WRONG[case]
+    truth, table = drive_with_errors(0, 1.0)
+    source = table.copy()
+    for name, other in names.items():
+        table[name] = source[other]
+    for name in signs:
+        table[name] = -table[name]
+    reference = read_reference(
+        cases.write(truth, tmp_path / "t.csv"), JudgeOptions(), SourceOptions()
+    )
+    (read,) = read_trajectories(cases.write(table, tmp_path / "m.csv"), SourceOptions())
+    with pytest.raises(ValueError, match=message):
+        check_axes(read, reference)
+
+
+@pytest.mark.parametrize("sd", [0.1, 1.0, 30.0, 100.0])
+def test_true_axes_are_accepted(tmp_path: Path, sd: float) -> None:
+    """Also with errors far above the motion, 20 drives each."""
+    for seed in range(20):
+        truth, table = drive_with_errors(seed, sd)
+        file = cases.write(truth, tmp_path / "t.csv")
+        reference = read_reference(file, JudgeOptions(), SourceOptions())
+        (read,) = read_trajectories(cases.write(table, tmp_path / "m.csv"), SourceOptions())
+        check_axes(read, reference)
+
+
+def test_the_end_of_a_program_within_its_step_is_no_hole() -> None:
+    time = np.arange(10.0)
+    grid = np.array([-1.0, -0.7, 0.0, 4.4, 9.0, 9.7, 10.0])
+    assert is_in_hole(time, grid).tolist() == [True, False, False, False, False, False, True]
+    assert is_in_hole(np.delete(time, 4), grid)[3]
+
+
+def test_holes_among_epochs_that_are_not_common_are_refused(tmp_path: Path) -> None:
+    """The clocks beat: few epochs agree to 10 ms, and all epochs of the hole would count."""
+    truth = cases.drive(120.0, 0.1)
+    reference = cases.write(truth, tmp_path / "truth.csv")
+    mine = cases.estimate(truth, 1.0, 1).assign(t=truth.t * 0.999 + 0.02)
+    mine = mine[(mine.t < 50) | (mine.t > 60)]
+    theirs = cases.write(cases.estimate(truth, 1.0, 2), tmp_path / "theirs.csv")
+    files = {"mine": str(cases.write(mine, tmp_path / "mine.csv")), "theirs": str(theirs)}
+    with pytest.raises(
+        ValueError, match=r"90 % of the epochs outside of holes .* Set tolerance=0\.0"
+    ):
+        judge_programs(str(reference), files)
+    (sequence,) = judge_programs(str(reference), files, JudgeOptions(tolerance=0.06)).sequences
+    share = sequence.epochs.holes[0].mean()
+    assert share == pytest.approx(10 / 120, abs=0.01)
+
+
+def spiked(rng: np.random.Generator, steps: int, correlation: float = 100.0) -> np.ndarray:
+    """Squared errors with a slow correlation, and 100 times the usual size at each eleventh epoch."""
+    a = np.exp(-1 / correlation)
+    white = rng.normal(size=(3, steps + 1000))
+    slow = lfilter([np.sqrt(1 - a * a)], [1, -a], white, axis=1)[:, -steps:]
+    return np.where(np.arange(steps) % 11 == 0, 100.0, 1.0) * (slow**2).sum(axis=0)
+
+
+def test_a_cycle_of_measurements_hides_no_slow_correlation() -> None:
+    """Equal programs: at most 5 % of 200 studies are decided, plus 3.1 standard errors."""
+    rng = np.random.default_rng(4)
+    p = [compare_along_run(spiked(rng, 6000), spiked(rng, 6000)).p for _ in range(200)]
+    assert np.mean(np.isfinite(p)) > 0.5
+    assert np.mean(np.array(p) < 0.05) <= 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 200)
