@@ -16,7 +16,7 @@ _GROUPS = ((*LOCAL, *VELOCITY_COLUMNS), ("roll", "pitch"), ("yaw",))
 _CLOSE = 0.045  # relative difference of a slope from 1
 _SIGN = 0.25  # the same for the opposite sign, which noise cannot cause
 _AGREES, _HALF = 0.9, 0.5  # shares of explained variance
-_WORSE = 5.0  # ratio of the variances that the own_share and the candidate column leave
+_WORSE = 5.0  # ratio of the variances that the own and the other column leave
 
 
 class _Fault(NamedTuple):
@@ -26,7 +26,7 @@ class _Fault(NamedTuple):
 
 
 def check_axes(table: TrajectoryTable, reference: ReferenceTrack) -> None:
-    """Compare each column with all columns of the reference, and refuse candidate signs and names.
+    """Compare each column with all columns of the reference, and refuse other signs and names.
 
     A column has the opposite sign if its slope on that of the reference is -1 and explains half of its
     variance. It has another name if another column explains 90 % with slope 1 or -1, and its own one

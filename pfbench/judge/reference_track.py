@@ -88,7 +88,9 @@ class ReferenceTrack:
         offset = np.median(move, axis=0)
         if np.abs(move - offset).max() > _SAME_TRUTH or np.abs(offset).max() < _MOVED:
             return table
-        columns = {n: table.values[n] + o for n, o in zip(LOCAL, offset, strict=True)}
+        columns = {
+            name: table.values[name] + shift for name, shift in zip(LOCAL, offset, strict=True)
+        }
         note = "moved by {:.4g}, {:.4g}, {:.4g} m to its truth in the reference".format(*offset)
         values = {**table.values, **columns}
         return replace(table, values=values, truth=None, notes=(*table.notes, note))

@@ -17,6 +17,7 @@ from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.judgement import judge_programs
 from pfbench.judge.readers.trajectory_files import read_trajectories
 from pfbench.judge.reference_track import read_reference
+from pfbench.results.store import write_result
 
 WRONG = {
     "swapped positions": ({"pn": "pe", "pe": "pn"}, [], "column pn .* times those of pe"),
@@ -102,3 +103,28 @@ def test_a_cycle_of_measurements_hides_no_slow_correlation() -> None:
     p = [compare_along_run(spiked(rng, 6000), spiked(rng, 6000)).p for _ in range(200)]
     assert np.mean(np.isfinite(p)) > 0.5
     assert np.mean(np.array(p) < 0.05) <= 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 200)
+
+
+@pytest.mark.parametrize(("scale", "is_placed"), [(1.0, True), (1.2, False)])
+def test_a_result_is_placed_at_its_truth(tmp_path: Path, scale: float, is_placed: bool) -> None:
+    """The track of a recorded drive starts at 0. The truth of another drive is not moved."""
+    truth = cases.drive(60.0)
+    track = scale * np.stack([truth.pe, truth.pn, -truth.pd], -1)
+    error = np.random.default_rng(0).normal(size=(1, len(truth), 3))
+    names = ["position_E", "position_N", "position_U"]
+    meta = {
+        "key": "k", "study": "s", "choices": {}, "config": {}, "label": "l", "seed": 1, "runs": 1,
+        "state": {"names": names, "units": ["m"] * 3, "groups": {"position": [0, 1, 2]}},
+    }  # fmt: skip
+    data = {
+        "time": truth.t.to_numpy(), "error": error, "sd": np.ones_like(error),
+        "nees": np.ones((1, len(truth), 1)), "log_evidence": np.zeros(1),
+        "lost": np.zeros(1, dtype=bool), "track": track[None] - track[0],
+    }  # fmt: skip
+    file = write_result(tmp_path / "k.npz", meta, data)
+    moved = truth.assign(pn=truth.pn + 12.0, pe=truth.pe - 5.0, pd=truth.pd + 1.0)
+    reference = cases.write(moved, tmp_path / "truth.csv")
+    (sequence,) = judge_programs(str(reference), {"mine": str(file)}).sequences
+    errors = sequence.results["mine"].data["error"][0, :, :3]
+    assert np.allclose(errors, error[0][:, [1, 0, 2]] * [1, 1, -1], atol=1e-4) == is_placed
+    assert any("moved by" in note for note in sequence.runs[0].table.notes) == is_placed
