@@ -52,7 +52,7 @@ def check_shared(
         text: Rest of the message, with braces for the number.
 
     Raises:
-        ValueError: If fewer than 10 epochs are shared, or fewer than 90 % beside holes.
+        ValueError: If fewer than 10 epochs are shared, or holes exist and fewer than 90 % are shared.
     """
     head = f"trajectories of {file} must share"
     if (count := int(shared.sum())) < LEAST_EPOCHS:
