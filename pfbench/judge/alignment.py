@@ -87,8 +87,8 @@ def find_common_epochs(
     common &= _thinned(grid, common, options.every)
     sizes = ", ".join(f"{len(times[k])} ({tables[k].file})" for k in valid) or "none"
     remedy = "a smaller every" if options.every and share > 0.5 else f"tolerance={needed:g}"
-    text = f"within {options.tolerance:g} s, got {{}} of {sizes}. Set {remedy}"
-    check_shared(reference.file, common & shared, common & is_hole, share, text)
+    counts = int((common & shared).sum()), int((common & is_hole).sum())
+    check_shared(counts, share, (reference.file, sizes, remedy), options.tolerance)
     rows = tuple(
         np.flatnonzero(masks[k])[nearest[k][common]] if k in times else None
         for k in range(len(tables))

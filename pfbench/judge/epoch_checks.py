@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from pfbench.judge.judge_options import JudgeOptions
 from pfbench.judge.reference_track import ReferenceTrack
 
@@ -40,28 +38,27 @@ def check_scored_time(reference: ReferenceTrack, options: JudgeOptions) -> None:
 
 
 def check_shared(
-    file: str, shared: np.ndarray, is_hole: np.ndarray, share: float, text: str
+    counts: tuple[int, int], share: float, texts: tuple[str, str, str], tolerance: float
 ) -> None:
     """Check that enough epochs are shared, for scores and for the weight of holes.
 
     Args:
-        file: Name of the reference.
-        shared: Scored epochs at which all trajectories have a row, [T].
-        is_hole: Scored epochs in holes, [T].
+        counts: Scored epochs at which all trajectories have a row, and scored epochs in holes.
         share: Share of the epochs outside of holes that are shared.
-        text: Rest of the message, with braces for the number.
+        texts: Name of the reference, number of epochs of each trajectory, and option that helps.
+        tolerance: Largest difference of common epochs, s.
 
     Raises:
         ValueError: If fewer than 10 epochs are shared, or holes exist and fewer than 90 % are shared.
     """
-    head = f"trajectories of {file} must share"
-    if (count := int(shared.sum())) < LEAST_EPOCHS:
+    (shared, in_holes), (file, sizes, remedy) = counts, texts
+    if shared < LEAST_EPOCHS:
         raise ValueError(
-            f"{head} at least {LEAST_EPOCHS} epochs {text.format(count)}, or let the programs write the "
-            "same epochs."
+            f"trajectories of {file} must share at least {LEAST_EPOCHS} epochs within {tolerance:g} s, "
+            f"got {shared} of {sizes}. Set {remedy}, or let the programs write the same epochs."
         )
-    if is_hole.any() and share < LEAST_SHARE:
-        percent = f"{100 * share:.3g} %"
+    if in_holes and share < LEAST_SHARE:
         raise ValueError(
-            f"{head} {100 * LEAST_SHARE:g} % of the epochs outside of holes {text.format(percent)}."
+            f"trajectories of {file} must share {100 * LEAST_SHARE:g} % of the epochs outside of holes "
+            f"within {tolerance:g} s, got {100 * share:.3g} % of {sizes}. Set {remedy}."
         )
