@@ -22,7 +22,7 @@ from pfbench.report.board.levels import (
     compute_condition_levels,
 )
 from pfbench.report.board.pack_entries import StudyNames, metric_entries
-from pfbench.report.board.planned import decide_planned, planned_entries
+from pfbench.report.board.planned import decide_planned, planned_entries, round_ratio
 from pfbench.report.board.sentence import describe_view
 from pfbench.report.board.study_views import build_views
 from pfbench.report.board.view import (
@@ -34,7 +34,7 @@ from pfbench.report.board.view import (
 )
 from pfbench.report.looks import PartName, find_looks
 from pfbench.report.options import ReportOptions
-from pfbench.report.study_page.opening import describe_pairs
+from pfbench.report.study_page.opening import describe_pairs, name_effects
 from pfbench.report.verdict_files import write_verdict_files
 
 ONE_CONDITION = pd.DataFrame({"family": ["w"], "scenario": ["w"], "regime": ["nominal"]})
@@ -227,7 +227,29 @@ def test_a_pair_that_track_decides_has_the_difference_of_shares() -> None:
         shown = re.search(shares, text)
         assert shown is not None, text
         assert [float(end) for end in shown.groups()] == pytest.approx([low, high], rel=3e-3)
-    assert re.match(r"runs won: [\d.]+ points \(.*; track kept: 98", entry["reason"])
+    won = re.match(
+        r"runs won: ([\d.]+) points \(([\d.]+) to ([\d.]+)\); track kept: 98", entry["reason"]
+    )
+    assert won is not None
+    shown = [entry["won"][name] for name in ("estimate", "low", "high")]
+    assert shown == pytest.approx(list(map(float, won.groups())), rel=5e-3)
+    assert entry["won"]["track"] == pytest.approx([59 / 60, 23 / 60], rel=1e-5)
+    pack = {"planned": [entry], "filters": [{"key": k, "name": k} for k in looks]}
+    assert name_effects(pack) == "Runs won"
+    (text,) = describe_pairs(pack)
+    assert text["effect"].endswith(" points")
+    assert float(text["effect"].split()[0]) == pytest.approx(float(won[1]), rel=5e-3)
+    assert (text["interval"][0], text["track"]) == ("[", "98.3 and 38.3 %")
+
+
+@pytest.mark.parametrize("percent", [-0.0783, 0.0859, 9.87, -12.34, 250.6, 1e-6])
+def test_a_ratio_near_one_keeps_the_digits_of_its_distance_from_one(percent: float) -> None:
+    """Four digits of the ratio itself would show 0.0783 % as 0.08."""
+    ratio = round_ratio(math.log1p(percent / 100))
+    assert ratio is not None
+    assert 100 * (ratio - 1) == pytest.approx(percent, rel=2e-3)
+    assert len(repr(ratio)) <= 14
+    assert round_ratio(math.nan) is None
 
 
 @pytest.mark.parametrize("runs", [1, 4, 30])

@@ -42,6 +42,13 @@ for view in PACKS["budget"]["views"].values():  # times of rounds make the wides
         row |= {"ms_low": 10.8 * row["ms"], "ms_high": 11.2 * row["ms"], "ms": 11.0 * row["ms"]}
 
 
+WON = {"estimate": -20.5, "low": -31.0, "high": -9.1, "track": [0.97, 0.98], "new_world": {"estimate": -20.5, "low": -90.0, "high": 40.0, "word": "open"}}  # fmt: skip
+PACKS["lost"]["planned"] = [
+    {**pair, "estimate": None, "low": None, "high": None, "cells": [], "won": WON}
+    for pair in PACKS["usual"]["planned"][:1]
+]
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("pages")
@@ -362,3 +369,21 @@ def test_axe_has_no_serious_finding(visit):
     assert page.evaluate(run, {}) == []
     page.locator("#theme").click()
     assert page.evaluate(run, {"runOnly": ["color-contrast"]}) == []
+
+
+def test_a_pair_that_runs_won_decide_is_drawn_and_legends_name_only_what_is_drawn(folder, chromium):
+    for has_script in (True, False):
+        page = chromium.new_context(java_script_enabled=has_script).new_page()
+        page.goto((folder / "lost" / "index.html").as_uri())
+        part = page.locator("#planned")
+        part.scroll_into_view_if_needed()
+        if has_script:
+            label = part.locator("svg g[role=img]").first.get_attribute("aria-label")
+            assert "−20.5 points [−31.0, −9.10]" in label
+        text = page.locator("main").inner_text()
+        assert ("Thick: these worlds" in text) == has_script
+        assert ("filled marks" in text) == has_script
+        assert "Hairline" not in text
+        table = part.locator("tbody tr").first.text_content()
+        assert "-20.5 points" in table
+        page.context.close()

@@ -29,6 +29,8 @@ from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.study_decisions.main_metrics import main_rule
 
 OPPOSITE = {"better": "worse", "worse": "better"}
+_ENDS = ("estimate", "low", "high")
+_NEAR = 0.1  # distance from 1 that is shown in percent with digits of its own
 
 
 def decide_planned(
@@ -99,21 +101,19 @@ def planned_entries(
         if question != "a":
             continue
         new = errors["b", a, b]
-        ratios = {k: _ratio(d, getattr(d, k)) for k in ("estimate", "low", "high")}
         records = [
             replace(record, a=f"[[{looks[a].name}]]", b=f"[[{looks[b].name}]]")
             for record in (tracks["a", a, b], d)
         ]
         entry = {
             "a": a, "b": b, "question": "Error in these worlds", "kind": _find_kind(looks[a], looks[b]),
-            "sentence": describe_pair(*records), **ratios, "p": d.p_corrected, "word": d.pair_word,
-            "reason": _describe_gap(d, tracks["a", a, b]), "cells": _list_cells(runs, levels, (a, b), worlds, options.alpha) if d.scale == "log ratio" else [],
-            "new_world": None if new.worlds < 2 else {
-                **{k: _ratio(new, getattr(new, k)) for k in ("estimate", "low", "high")}, "word": new.word,
-            },
+            "sentence": describe_pair(*records), **_list_ratios(d), "p": round_values(d.p_corrected), "word": d.pair_word,
+            "reason": _describe_gap(d, tracks["a", a, b]) or None, "cells": _list_cells(runs, levels, (a, b), worlds, options.alpha) if d.scale == "log ratio" else [],
+            "new_world": None if new.worlds < 2 else {**_list_ratios(new), "word": new.word},
             "prediction": None if new.worlds < 3 else [_ratio(new, new.new_low), _ratio(new, new.new_high)],
+            "won": _list_won(d, new, tracks["a", a, b]),
         }  # fmt: skip
-        entries.append(round_values(entry))
+        entries.append(entry)
     return entries
 
 
@@ -161,16 +161,55 @@ def _list_cells(
         estimate = average_levels(selected, runs.conditions[mask]).difference(i, j)
         if np.isfinite(estimate.value):
             ends = (estimate.value, *estimate.interval(alpha))
-            ratios = (float(np.exp(np.minimum(end, 700.0))) for end in ends)
             cells.append({
                 "world": scenario, "regime": "all", "name": worlds[scenario].name,
-                **dict(zip(("estimate", "low", "high"), ratios, strict=True)),
+                **dict(zip(_ENDS, (round_ratio(float(end)) for end in ends), strict=True)),
             })  # fmt: skip
     return cells
 
 
-def _ratio(decision: Decision, value: float) -> float:
-    """Return a log ratio as a ratio, NaN for an effect of another scale or an end that does not exist."""
-    if decision.scale != "log ratio" or not math.isfinite(value):
-        return math.nan
-    return math.exp(min(value, 700.0))
+def round_ratio(log_ratio: float) -> float | None:
+    """Return a ratio with four digits, and four of its distance from 1 if it is near; None without a number.
+
+    Args:
+        log_ratio: Log ratio.
+    """
+    if not math.isfinite(log_ratio):
+        return None
+    distance = math.expm1(min(log_ratio, 700.0))
+    if abs(distance) < _NEAR:
+        return round(1 + float(f"{distance:.4g}"), 12)
+    return float(f"{1 + distance:.4g}")
+
+
+def _ratio(decision: Decision, value: float) -> float | None:
+    """Return a log ratio as a ratio, None for an effect of another scale or an end that does not exist."""
+    return round_ratio(value) if decision.scale == "log ratio" else None
+
+
+def _list_ratios(decision: Decision) -> dict[str, float | None]:
+    """Return the ratio of a decision and its interval."""
+    return {name: _ratio(decision, getattr(decision, name)) for name in _ENDS}
+
+
+def _list_won(decision: Decision, new: Decision, track: Decision) -> dict[str, Any] | None:
+    """Return the difference of the shares of runs won in percentage points, and the shares of tracks kept.
+
+    None for a pair that is decided by its errors.
+    """
+    if decision.reason != RUNS_WON:
+        return None
+    points, new_points = (
+        dict(zip(_ENDS, (_round_points(v) for v in (d.estimate, d.high, d.low)), strict=True))
+        for d in (decision, new)
+    )
+    has_new = new.worlds > 1 and new.scale == decision.scale
+    return {
+        **points, "track": [float(f"{share:.6g}") for share in (track.share_a, track.share_b)],
+        "new_world": {**new_points, "word": new.word} if has_new else None,
+    }  # fmt: skip
+
+
+def _round_points(shares: float) -> float | None:
+    """Return percentage points for the first filter, of an effect that is negative for it; None without a number."""
+    return float(f"{-100 * shares:.6g}") if math.isfinite(shares) else None

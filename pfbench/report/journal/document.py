@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pfbench.files.escapes import escape_latex
 from pfbench.report.journal.page_format import PageFormat
 from pfbench.report.journal.references import SELF, cite, list_cited_keys
-from pfbench.report.journal.study_pack import Pack, find_rows, is_number
+from pfbench.report.journal.study_pack import Pack, find_rows, is_number, list_pairs
 
 _PACKAGES = (
     r"\usepackage[T1]{fontenc}",
@@ -25,7 +25,7 @@ CAPTIONS = {
     ),
     "over_time": "Median error over runs in time, {regime}. Filled and solid: proposed methods; hollow and dashed: others.",
     "planned": (
-        "Planned pairs. Diamonds: effect in these worlds with its simultaneous interval, filled if decided. Dots: single worlds. "
+        "Planned pairs{effects}. Diamonds: effect in these worlds with its simultaneous interval, filled if decided. {dots}"
         "Thin lines: a new world."
     ),
     "cost": (
@@ -60,7 +60,10 @@ def format_caption(name: str, pack: Pack) -> str:
     looks = {str(look["key"]): look for look in pack["filters"]}
     baseline = looks.get(str(pack["baselines"][0])) if pack["baselines"] else None
     regime = str(pack["regimes"][0]["name"]).lower()
+    has_ratio, has_won = (bool(list_pairs(pack, has_won=won)) for won in (False, True))
     words = {
+        "{effects}": " by the share of runs won where tracks are not kept" * has_won,
+        "{dots}": "Dots: single worlds. " * has_ratio,
         "{metric}": escape_latex(str(pack["metrics"][0]["name"])),
         "{level}": f"{100 * (1 - float(pack['alpha'])):g}",
         "{regime}": escape_latex(regime),

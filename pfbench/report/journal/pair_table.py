@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pfbench.files.escapes import escape_latex
@@ -15,6 +15,7 @@ from pfbench.report.journal.study_pack import (
     filters_by_key,
     find_rows,
     is_number,
+    list_pairs,
     name_with_star,
 )
 from pfbench.report.journal.table_layout import (
@@ -34,35 +35,67 @@ _ROUNDS = "Times: medians of rounds in which the filters took turns; ratio to th
 
 
 def make_planned_table(pack: Pack) -> LatexTable | None:
-    """Build the table of the planned pairs; None without a pair.
+    """Build the table of the planned pairs; None without a pair that has an effect.
 
     Args:
         pack: Data of the report.
     """
-    pairs = [pair for pair in pack["planned"] if is_number(pair["estimate"])]
-    if not pairs:
+    ratios, won = list_pairs(pack, has_won=False), list_pairs(pack, has_won=True)
+    if not (ratios or won):
         return None
     looks = filters_by_key(pack)
+    kinds = [name for name, pairs in (("ratio", ratios), ("points", won)) if pairs]
+    extra = ["track (%)"] if won else []
+    head = ["Method and baseline", *kinds, "interval", "p", *extra, "decision"]
+    specs = ["l", *["r"] * len(kinds), "l", "r", *["l"] * len(extra), "l"]
     groups: dict[str, list[list[LatexCell]]] = {}
-    for pair in pairs:
-        a, b = str(pair["a"]), str(pair["b"])
-        interval = f"[{_ratio(pair['low'])}, {_ratio(pair['high'])}]"
-        word = str(pair["word"])
-        name = f"{looks[a]['name']} against"
-        groups.setdefault(a, [[text_cell(name, span=5)._replace(alignment="@{}l")]]).append([
-            _indent(text_cell(str(looks[b]["name"]))), _ratio_cell(pair["estimate"], word),
-            text_cell(interval), text_cell(_p_value(pair.get("p"))), text_cell(word),
-        ])  # fmt: skip
-    head = ["Method and baseline", "ratio", "interval", "p", "decision"]
-    columns = [Column("l"), Column("r"), Column("l"), Column("r"), Column("l")]
-    worlds = len(pack["worlds"])
-    caption = (
-        r"Planned pairs: error of the method divided by that of the baseline, mean over "
-        rf"{'these ' + str(worlds) + ' worlds' if worlds > 1 else 'the runs of this world'} on a log scale, with "
-        r"simultaneous intervals and Holm's correction of \textit{p} over all pairs. Decisions are for these worlds."
-    )
+    for pair in pack["planned"]:
+        name = f"{looks[str(pair['a'])]['name']} against"
+        title = text_cell(name, span=len(head))._replace(alignment="@{}l")
+        baseline = _indent(text_cell(str(looks[str(pair["b"])]["name"])))
+        cells = _pair_cells(pair, kinds, has_track=bool(won))
+        groups.setdefault(str(pair["a"]), [[title]]).append([baseline, *cells])
+    caption = _describe_pairs(len(pack["worlds"]), bool(ratios), bool(won))
     heads = [[text_cell(text) for text in head]]
-    return LatexTable("planned", caption, columns, heads, list(groups.values()))
+    return LatexTable("planned", caption, list(map(Column, specs)), heads, list(groups.values()))
+
+
+def _pair_cells(pair: Pack, kinds: Sequence[str], *, has_track: bool) -> list[LatexCell]:
+    """Return the cells of a planned pair after its name."""
+    won, word = pair.get("won"), str(pair["word"])
+    values, write = (pair, _ratio) if won is None else (won, _points)
+    effect = text_cell("--")
+    if is_number(values["estimate"]):
+        effect = _effect_cell(write(values["estimate"]), word)
+    kind = kinds[0] if won is None else "points"
+    effects = [effect if name == kind else text_cell("") for name in kinds]
+    ends = [write(values[name]) for name in ("low", "high")]
+    interval = "--" if "--" in ends else f"[{', '.join(ends)}]"
+    shares = "/".join(f"{100 * share:.0f}" for share in won["track"]) if won else ""
+    return [
+        *effects, text_cell(interval), text_cell(_p_value(pair.get("p"))),
+        *[text_cell(shares)] * has_track, text_cell(word),
+    ]  # fmt: skip
+
+
+def _describe_pairs(worlds: int, has_ratio: bool, has_won: bool) -> str:
+    """Describe the effects of the planned pairs, for the caption of their table."""
+    ratio = (
+        "error of the method divided by that of the baseline, mean over "
+        rf"{'these ' + str(worlds) + ' worlds' if worlds > 1 else 'the runs of this world'} on a log scale"
+    )
+    points = (
+        "difference of the shares of runs won, in percentage points, positive if the method wins more, "
+        "with the shares of runs in which both keep track"
+    )
+    if has_ratio and has_won:
+        effects = f"{ratio}; where tracks are not kept, {points}"
+    else:
+        effects = ratio if has_ratio else f"{points}, since tracks are not kept"
+    return (
+        rf"Planned pairs: {effects}. "
+        r"Intervals are simultaneous, with Holm's correction of \textit{p} over all pairs. Decisions are for these worlds."
+    )
 
 
 def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
@@ -139,10 +172,15 @@ def _ratio(value: Any) -> str:
     return f"{value:.2f}" if 0.095 <= value < 9.995 else format_error_value(value, 2)
 
 
-def _ratio_cell(value: Any, word: str) -> LatexCell:
-    """Return the cell of a ratio: bold if better, with a dagger if worse."""
-    text = _ratio(value)
-    tex = rf"\textbf{{{text}}}" if word == "better" else text
+def _points(value: Any) -> str:
+    """Format percentage points with three digits and a sign."""
+    return f"{value:+#.3g}".rstrip(".").replace("-", "−") if is_number(value) else "--"
+
+
+def _effect_cell(text: str, word: str) -> LatexCell:
+    """Return the cell of an effect: bold if better, with a dagger if worse."""
+    tex = escape_latex(text)
+    tex = rf"\textbf{{{tex}}}" if word == "better" else tex
     tex += r"\rlap{\textsuperscript{\textdagger}}" if word == "worse" else ""
     return LatexCell(tex, text_width(text, SIZE, is_bold=word == "better"))
 

@@ -21,7 +21,7 @@ from pfbench.report.journal.ratio_figures import (
     plot_planned,
 )
 from pfbench.report.journal.references import renew_bibliography
-from pfbench.report.journal.study_pack import ALL, Pack, find_rows, is_number
+from pfbench.report.journal.study_pack import ALL, Pack, find_rows, is_number, list_pairs
 from pfbench.report.journal.table_layout import (
     LINE,
     LatexTable,
@@ -53,7 +53,7 @@ def select_figures(pack: Pack) -> dict[str, Plot]:
     plots: dict[str, tuple[Plot, bool]] = {
         "leaderboard": (plot_leaderboard, has_ratio),
         "over_time": (plot_over_time, any(key[1] == regime for key in pack["curves"])),
-        "planned": (plot_planned, any(is_number(pair["estimate"]) for pair in pack["planned"])),
+        "planned": (plot_planned, any(list_pairs(pack, has_won=won) for won in (False, True))),
         "cost": (plot_error_against_cost, has_cost),
         "calibration": (plot_calibration, bool(pack["calibration"].get((ALL, ALL)))),
     }
@@ -81,6 +81,10 @@ def write_paper(
     tables = _format_tables(pack, page)
     remarks = [f"{name}.tex has the intervals" for name in tables if "supplement" in name]
     plots = select_figures(pack)
+    if pack["planned"] and "planned" not in plots:
+        remarks.append(
+            "no planned pair has an effect, so that planned.pdf and table_planned.tex are left out"
+        )
     has_latex = shutil.which("pdflatex") is not None
     widths = {}
     for name, plot in plots.items():

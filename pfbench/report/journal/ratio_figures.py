@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -22,6 +24,7 @@ from pfbench.report.journal.study_pack import (
     filters_by_key,
     find_rows,
     is_number,
+    list_pairs,
 )
 from pfbench.report.plots.axis_ticks import set_plain_ticks
 from pfbench.report.plots.label_placement import place_labels
@@ -68,42 +71,49 @@ def plot_leaderboard(pack: Pack, setting: FigureSetting) -> Figure:
 def plot_planned(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot the planned pairs: effect in these worlds, each world, and a new world.
 
+    Ratios of errors have a logarithmic axis. Differences of runs won have a panel with a linear axis below.
+
     Args:
         pack: Data of the report.
         setting: Setting of the figures.
     """
-    looks = filters_by_key(pack)
-    pairs = [pair for pair in pack["planned"] if is_number(pair["estimate"])]
-    figure = setting.make_figure(MARGIN + 1.05 * ROW * max(len(pairs), 2))
-    axis = figure.subplots()
-    values = [
-        float(pair[name])
-        for pair in pairs
-        for name in ("estimate", "low", "high")
-        if is_number(pair[name])
-    ]
-    values += [
-        float(cell["estimate"])
-        for pair in pairs
-        for cell in pair["cells"]
-        if is_number(cell["estimate"])
-    ]
-    limits = ratio_limits(values)
-    use_ratio_scale(axis, *limits)
+    kinds = [(has_won, list_pairs(pack, has_won=has_won)) for has_won in (False, True)]
+    kinds = [(has_won, pairs) for has_won, pairs in kinds if pairs]
+    rows = [max(len(pairs), 2) for _, pairs in kinds]
+    figure = setting.make_figure(MARGIN * len(kinds) + 1.05 * ROW * sum(rows))
+    panels = figure.subplots(len(kinds), 1, squeeze=False, height_ratios=rows).ravel()
+    for axis, (has_won, pairs) in zip(panels, kinds, strict=True):
+        _plot_pairs(axis, pairs, filters_by_key(pack), setting, has_won=has_won)
+    return figure
+
+
+def _plot_pairs(
+    axis: Axes, pairs: Sequence[Pack], looks: Pack, setting: FigureSetting, *, has_won: bool
+) -> None:
+    """Plot pairs of one kind of effect: ratios, or percentage points of runs won."""
+    effects = [pair[name] for pair in pairs for name in ("estimate", "low", "high")]
+    effects += [cell["estimate"] for pair in pairs for cell in pair["cells"]]
+    values = [float(value) for value in effects if is_number(value)]
+    if has_won:
+        limits = min(-5.0, *values) * 1.08, max(5.0, *values) * 1.08
+        axis.set_xlim(limits)
+        axis.axvline(0.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
+        axis.set_xlabel("runs won, first minus second [percentage points]")
+    else:
+        limits = ratio_limits(values)
+        use_ratio_scale(axis, *limits)
+        axis.set_xlabel("ratio of errors, first / second")
     label_rows(axis, [f"{looks[p['a']]['name']} / {looks[p['b']]['name']}" for p in pairs], setting)
     for y, pair in enumerate(pairs):
         new, colour = pair.get("new_world"), str(looks[pair["a"]]["colour"])
         if new and is_number(new["low"]) and is_number(new["high"]):
-            axis.plot(
-                np.clip([new["low"], new["high"]], *limits), [y, y], color=_GREY, lw=0.5, zorder=1.5
-            )
+            ends = np.clip([new["low"], new["high"]], *limits)
+            axis.plot(ends, [y, y], color=_GREY, lw=0.5, zorder=1.5)
         for cell in pair["cells"]:
             if is_number(cell["estimate"]):
                 x = float(np.clip(cell["estimate"], *limits))
                 axis.plot([x], [y], ".", ms=2.5, color=_GREY, zorder=2)
         _draw_diamond(axis, y, pair, colour, limits)
-    axis.set_xlabel("ratio of errors, first / second")
-    return figure
 
 
 def plot_error_against_cost(pack: Pack, setting: FigureSetting) -> Figure:

@@ -79,3 +79,18 @@ def name_with_star(pack: Pack, key: str) -> str:
 def is_number(value: Any) -> bool:
     """Return whether a value of the data is a finite number."""
     return isinstance(value, int | float) and value == value and abs(value) != float("inf")
+
+
+def list_pairs(pack: Pack, *, has_won: bool) -> list[Pack]:
+    """List the planned pairs with a ratio of errors, or those with a difference of runs won.
+
+    Args:
+        pack: Data of the report.
+        has_won: Select pairs that are decided by runs won; their effect is in percentage points.
+
+    Returns:
+        Entries of the pairs, whose `estimate`, `low`, `high` and `new_world` are those of the effect.
+    """
+    if not has_won:
+        return [pair for pair in pack["planned"] if is_number(pair["estimate"])]
+    return [{**pair, **pair["won"], "cells": []} for pair in pack["planned"] if pair.get("won")]

@@ -165,13 +165,37 @@ def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
         {
             "pair": f"{names[pair['a']]} against {names[pair['b']]}",
             "question": pair["question"],
-            "ratio": format_short(pair["estimate"]),
-            "interval": format_interval(pair["low"], pair["high"]) or pair["reason"],
+            **_describe_effect(pair),
             "word": pair["word"],
             "sentence": _remove_marks(pair["sentence"]),
         }
         for pair in pack["planned"]
     ]
+
+
+def name_effects(pack: Mapping[str, Any]) -> str:
+    """Name the effects of the planned pairs, as the head of a column: ratio, runs won, or both.
+
+    Args:
+        pack: Data of the page.
+    """
+    has_won = [bool(pair.get("won")) for pair in pack["planned"]]
+    names = ("Ratio", *["runs won"] * any(has_won))
+    return "Runs won" if has_won and all(has_won) else " or ".join(names)
+
+
+def _describe_effect(pair: Mapping[str, Any]) -> dict[str, str]:
+    """Return effect, interval and shares of tracks kept of a planned pair."""
+    won = pair.get("won")
+    if won is None:
+        interval = format_interval(pair["low"], pair["high"]) or pair["reason"] or ""
+        return {"effect": format_short(pair["estimate"]), "interval": interval, "track": ""}
+    first, second = (format_short(100 * share) for share in won["track"])
+    return {
+        "effect": f"{format_short(won['estimate'])} points",
+        "interval": format_interval(won["low"], won["high"]),
+        "track": f"{first} and {second} %",
+    }
 
 
 def _name(items: Sequence[Mapping[str, Any]], key: str) -> str:

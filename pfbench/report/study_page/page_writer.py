@@ -13,7 +13,7 @@ from markupsafe import Markup
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.study_page.encoding import encode_pack
 from pfbench.report.study_page.equal_time import offer_budgets
-from pfbench.report.study_page.opening import describe_opening, describe_pairs
+from pfbench.report.study_page.opening import describe_opening, describe_pairs, name_effects
 from pfbench.report.writers import template_environment
 
 PAGE_BYTES = 1_500_000
@@ -56,6 +56,7 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
         "pack": pack,
         "opening": describe_opening(pack),
         "planned": describe_pairs(pack),
+        "effects": name_effects(pack),
         "level": _format_level(pack),
         "methods": [text for text in pack["methods_paragraph"].split("\n\n") if text.strip()],
         "notes": [{**note, "name": names[note["filter"]]} for note in pack["filter_notes"]],
@@ -97,6 +98,7 @@ def write_markdown(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
         "choices": pack.get("choices", ()),
         "opening": describe_opening(pack),
         "planned": describe_pairs(pack),
+        "effects": name_effects(pack),
         "level": _format_level(pack),
     }
     template = template_environment(_HERE, is_html=False).get_template("report.md.jinja")

@@ -2,9 +2,25 @@
 const verdictStyle = (word) =>
   /better/.test(word) ? "better" : /worse/.test(word) ? "worse" : /equal|equivalent/.test(word) ? "equal" : "open";
 
+// Ratios of errors, and points of runs won where tracks are not kept.
+const signed = (value) => `${value > 0 ? "+" : value < 0 ? "−" : ""}${short(Math.abs(value))}`;
+const ratioKind = { shown: (v) => v > 0, show: change, end: change, none: 1, less: "← smaller error", more: "larger error →" };
+const wonKind = {
+  shown: (v) => Number.isFinite(v),
+  show: (value) => `${signed(value)} points`,
+  end: signed,
+  none: 0,
+  less: "← second wins more",
+  more: "first wins more →",
+};
+
 function drawForest(part) {
-  const pairs = data.planned.filter((pair) => pair.estimate > 0);
-  if (!pairs.length) return void (part.innerHTML = "");
+  const ratios = data.planned.filter((pair) => pair.estimate > 0);
+  const won = data.planned.filter((pair) => pair.won).map((pair) => ({ ...pair, prediction: null, ...pair.won, cells: [] }));
+  part.innerHTML = (ratios.length ? forest(part, ratios, ratioKind) : "") + (won.length ? forest(part, won, wonKind) : "");
+}
+
+function forest(part, pairs, { shown, show, end, none, less, more }) {
   const width = widthOf(part);
   const narrow = width < 800;
   const [left, right] = narrow ? [8, 8] : [Math.min(310, width * 0.27), 290];
@@ -16,27 +32,29 @@ function drawForest(part) {
       ...pair.cells.map((cell) => cell.estimate),
       ...(pair.new_world ? [pair.new_world.low, pair.new_world.high] : []),
     ])
-    .filter((v) => v > 0);
-  const low = Math.min(0.9, Math.max(1 / 30, Math.min(...ends))) / 1.05;
-  const high = Math.max(1.1, Math.min(30, Math.max(...ends))) * 1.05;
-  const x = logarithmic(low, high, left, width - right);
-  const inside = (v) => Math.min(width - right, Math.max(left, x(Math.max(v, 1e-9))));
+    .filter(shown);
+  const [low, high] = none
+    ? [Math.min(0.9, Math.max(1 / 30, Math.min(...ends))) / 1.05, Math.max(1.1, Math.min(30, Math.max(...ends))) * 1.05]
+    : [Math.min(-5, ...ends) * 1.05, Math.max(5, ...ends) * 1.05];
+  const x = (none ? logarithmic : linear)(low, high, left, width - right);
+  const inside = (v) => Math.min(width - right, Math.max(left, x(none ? Math.max(v, 1e-9) : v)));
   let y = 18;
   let content = "";
   let question = null;
   for (const pair of pairs) {
-    const group = `${pair.question}${pair.kind === "tuned" ? ", against tuned baselines" : pair.kind === "paper" ? ", against the baselines of the paper" : ""}`;
+    const kind = { tuned: "against tuned baselines", paper: "against the baselines of the paper" }[pair.kind];
+    const group = narrow && kind ? `A${kind.slice(1)}` : [pair.question, ...(kind ? [kind] : [])].join(", ");
     if (group !== question) {
       content += label(0, y + 12, fit(group, width, 12, true), ' class="strong"');
       y += 22;
       question = group;
     }
     const [a, b] = [looks[pair.a], looks[pair.b]];
-    const names = `${a.name} against ${b.name}`;
+    const names = `${a.name}${narrow ? " / " : " against "}${b.name}`;
     const known = pair.low !== null && pair.high !== null;
-    const range = known ? `[${change(pair.low)}, ${change(pair.high)}]` : `(${pair.reason})`;
-    const words = `${change(pair.estimate)} ${range}`;
-    const small = pair.cells.filter((cell) => cell.estimate > 0);
+    const range = known ? `[${end(pair.low)}, ${end(pair.high)}]` : `(${pair.reason})`;
+    const words = `${show(pair.estimate)} ${range}`;
+    const small = pair.cells.filter((cell) => shown(cell.estimate));
     const rise = narrow ? 16 : 0;
     const step = Math.min(5, 40 / Math.max(1, small.length));
     const height = Math.max(30, 20 + step * small.length) + rise;
@@ -47,7 +65,7 @@ function drawForest(part) {
         label(
           width,
           y + 12,
-          `${change(pair.estimate)} ${pair.word}`,
+          `${show(pair.estimate)} ${pair.word}`,
           ` text-anchor="end" style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`,
         );
     else
@@ -56,11 +74,11 @@ function drawForest(part) {
         label(
           width - right + 12,
           middle + 4,
-          `${known ? words : change(pair.estimate)} ${pair.word}`,
+          `${known ? words : show(pair.estimate)} ${pair.word}`,
           ` style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`,
         );
     content += `<g${spoken(`${group}. ${names}: ${words}, ${pair.word}. ${plain(pair.sentence)}`)}><rect x="${left}" y="${px(y + rise)}" width="${px(width - left - right)}" height="${px(height - rise - 4)}" fill="transparent"/>`;
-    if (pair.prediction?.every((end) => end > 0))
+    if (pair.prediction?.every(shown))
       content += line(
         inside(pair.prediction[0]),
         middle,
@@ -68,22 +86,23 @@ function drawForest(part) {
         middle,
         ' stroke="var(--faint)" stroke-width="1"',
       );
-    if (pair.new_world?.low > 0 && pair.new_world.high > 0) content += bar(inside(pair.new_world.low), inside(pair.new_world.high), middle, 3, a, 0.45);
+    if (pair.new_world && shown(pair.new_world.low) && shown(pair.new_world.high)) content += bar(inside(pair.new_world.low), inside(pair.new_world.high), middle, 3, a, 0.45);
     content +=
       (known ? bar(inside(pair.low), inside(pair.high), middle, 6, a, 0.85) : "") + mark(a, inside(pair.estimate), middle, 6) + "</g>";
     small.forEach((cell, k) => {
       const level = middle + 10 + step * (k + 0.5);
-      const text = `${cell.name || cellName(cell)}: ${change(cell.estimate)} [${change(cell.low)}, ${change(cell.high)}]`;
+      const text = `${cell.name || cellName(cell)}: ${show(cell.estimate)} [${show(cell.low)}, ${show(cell.high)}]`;
       content += `<g${tip(text)}>${bar(inside(cell.low), inside(cell.high), level, 1.2, a, 0.7)}<circle class="c${a.index}" cx="${px(inside(cell.estimate))}" cy="${px(level)}" r="1.9" fill="var(--c)"/></g>`;
     });
     y += height;
   }
+  const ticks = (none ? logTicks : linearTicks)(low, high, narrow ? 5 : 9);
   const frame =
-    xAxis(logTicks(low, high, narrow ? 5 : 9), x, 10, y) +
-    line(x(1), 10, x(1), y, ' class="rule"') +
-    label(inside(low), y + 30, "← smaller error", ' class="axis"') +
-    label(width - right, y + 30, "larger error →", ' class="axis" text-anchor="end"');
-  part.innerHTML = svg(
+    xAxis(ticks, x, 10, y) +
+    line(x(none), 10, x(none), y, ' class="rule"') +
+    label(inside(low), y + 30, less, ' class="axis"') +
+    label(width - right, y + 30, more, ' class="axis" text-anchor="end"');
+  return svg(
     width,
     y + 36,
     frame + content,
