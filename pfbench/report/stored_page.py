@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.board.decided_parts import StudyFacts, decide_parts
+from pfbench.report.changing_sentences import renew_methods
 from pfbench.report.journal.references import renew_bibliography
 from pfbench.report.study_page import write_page
 from pfbench.report.verdict_files import format_verdicts
@@ -109,6 +110,7 @@ def rebuild_page(folder: Path) -> Path:
     if has_runs := runs.is_file():
         pack = decide_again(pack, runs)
     pack["bibtex"] = renew_bibliography(pack)
+    pack["methods_paragraph"] = renew_methods(pack)
     with RecordedFolder(folder, is_complete=False) as target:
         if has_runs:
             target.write("verdicts.csv", format_verdicts(pack))

@@ -16,6 +16,11 @@ from page_packs import build_pack
 from synthetic_results import study
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.changing_sentences import (
+    describe_equal_particles,
+    describe_particles,
+    renew_methods,
+)
 from pfbench.report.journal import paper_folder, references
 from pfbench.report.journal.error_columns import format_error_value
 from pfbench.report.journal.figure_style import FigureSetting
@@ -316,6 +321,43 @@ def test_methods_list_what_was_not_done(conditions: list[Condition]) -> None:
     assert "Times were measured once" not in limits
     for job in (job for condition in conditions for job in condition.jobs):
         del job.meta["step_time"]
+
+
+@pytest.mark.parametrize(("numbers", "text", "kind"), [
+    ({"A": [100], "B": [100]}, "100 particles", "equal"),
+    ({"A": [100], "B": [100], "C": [200]}, "100 particles, with these exceptions: 200 (C)", "different"),
+    ({"A": [150], "B": [200]}, "150 (A) and 200 (B) particles", "different"),
+    ({"A": [50, 100], "B": [100, 50]}, "50 or 100 particles", "equal"),
+    ({"A": [64]}, "64 particles", ""),
+])  # fmt: skip
+def test_the_methods_name_filters_with_other_numbers_of_particles(
+    numbers: dict[str, list[int]], text: str, kind: str
+) -> None:
+    """A stored paragraph gets the same sentences, and a second time no other ones."""
+    limit = describe_equal_particles(numbers)
+    end = f": particle filters have {kind} numbers of particles." if kind else "."
+    assert limit == f"The filters were not given equal time{end}"
+    assert describe_particles(numbers) == f"Particle filters used {text}"
+    pack = {
+        "filters": [{"key": name, "name": name} for name in numbers],
+        "filter_notes": [
+            {"filter": name, "particles": " or ".join(map(str, counts))}
+            for name, counts in numbers.items()
+        ],
+        "planned": [{"won": WON}, {}],
+        "methods_paragraph": "Before. Particle filters used 100 or 200 particles. The metric is x. 2 planned pairs are "
+        "decided from the differences of these trimmed means, paired by run.\n\nNot done: y. The filters were not given "
+        "equal time: particle filters have equal numbers of particles. End.",
+    }
+    for _ in range(2):
+        pack["methods_paragraph"] = renew_methods(pack)
+        assert pack["methods_paragraph"] == (
+            f"Before. Particle filters used {text}. The metric is x. 2 planned pairs are decided from "
+            "the differences of these trimmed means, or for 1 of them of the shares of runs won, "
+            f"since tracks are not kept, paired by run.\n\nNot done: y. {limit} End."
+        )
+    pack["planned"] = [{"won": WON}]
+    assert "from the differences of the shares of runs won, since" in renew_methods(pack)
 
 
 def test_each_reference_of_a_filter_has_an_entry_and_each_entry_a_filter() -> None:

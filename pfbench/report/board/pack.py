@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pfbench.report import provenance
@@ -69,7 +69,7 @@ def build_pack(
         "tracks": data.tracks,
         "replay": f"pfbench replay study={study} scenario={{world}} noise={{noise}}"
         f"{model} filter={{filter}} run={{run}}",
-        "methods_paragraph": _describe_methods(conditions, options, len(decided["planned"])),
+        "methods_paragraph": _describe_methods(conditions, options, decided["planned"]),
         **data.notes.to_entries(facts.looks),
         "provenance": [list(row) for row in provenance.list_shared_settings(conditions)],
         "facts": facts.to_entries(),
@@ -77,13 +77,16 @@ def build_pack(
     return pack | {"bibtex": format_bibliography(pack, conditions)}
 
 
-def _describe_methods(conditions: Sequence[Condition], options: ReportOptions, pairs: int) -> str:
+def _describe_methods(
+    conditions: Sequence[Condition], options: ReportOptions, planned: Sequence[Mapping[str, Any]]
+) -> str:
     """Describe what was done and what was not, in paragraphs."""
     paragraphs = describe_methods(
         conditions,
         alpha=options.alpha,
         margin=options.equivalence_margin,
-        pairs=pairs,
+        pairs=len(planned),
+        won=sum(pair["won"] is not None for pair in planned),
         metric=METRIC_NAMES[options.metric],
     )
     return "\n\n".join(paragraphs)

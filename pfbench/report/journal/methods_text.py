@@ -5,6 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pfbench.report.changing_sentences import (
+    describe_equal_particles,
+    describe_particles,
+    describe_units,
+    join_texts,
+)
 from pfbench.report.looks import describe_tuning, study_looks, study_part_names
 from pfbench.report.provenance import distinct_values
 from pfbench.results import store
@@ -21,6 +27,7 @@ def describe_methods(
     alpha: float = 0.05,
     margin: float = 0.05,
     pairs: int = 0,
+    won: int = 0,
     metric: str = "RMS error",
 ) -> list[str]:
     """Describe how the results of a study were made.
@@ -30,6 +37,7 @@ def describe_methods(
         alpha: Level of the families of tests.
         margin: Relative margin of equivalence.
         pairs: Number of planned pairs.
+        won: Number of these pairs that are decided by the shares of runs won.
         metric: Name of the metric that decides.
 
     Returns:
@@ -38,8 +46,8 @@ def describe_methods(
     jobs = [job.meta for condition in conditions for job in condition.jobs]
     done = [
         *_describe_design(conditions, jobs),
-        *_describe_particles(jobs),
-        *_describe_decisions(alpha, margin, pairs, metric),
+        *_describe_particles(conditions, jobs),
+        *_describe_decisions(alpha, margin, (pairs, won), metric),
         *_describe_times(jobs),
         *_describe_software(jobs),
     ]
@@ -70,9 +78,7 @@ def list_limits(conditions: Sequence[Condition]) -> list[str]:
             f"{runs} runs per condition are fewer than the {_FEW_RUNS} that tests require."
         )
     if {job["config"].get("budget", store.SAME_N) for job in jobs} == {store.SAME_N}:
-        limits.append(
-            "The filters were not given equal time: particle filters have equal numbers of particles."
-        )
+        limits.append(describe_equal_particles(_count_particles(conditions)))
     if all(divergence_threshold(job) is None for job in jobs):
         limits.append("No divergence threshold is stated, so only numerical failures count.")
     labels = [{job.label for job in condition.jobs} for condition in conditions]
@@ -105,29 +111,43 @@ def _describe_design(
         worlds = f"{_count(len(scenarios), 'scenario')} of {worlds}"
     return [
         f"This study compares {_count(filters, 'filter')} with pfbench in {worlds} ({'; '.join(scenarios)}) under {_count(len(regimes), 'noise regime')} ({'; '.join(regimes)}), with "
-        f"{_join(runs, 'and')} Monte Carlo runs of {_join(steps, 'and')} steps per condition.",
+        f"{join_texts(runs, 'and')} Monte Carlo runs of {join_texts(steps, 'and')} steps per condition.",
         "All filters of a condition receive the same truths, measurements and random numbers "
         f"(seed {', '.join(seeds)}), so that comparisons are paired by run.",
     ]
 
 
-def _describe_particles(jobs: Sequence[Mapping[str, Any]]) -> list[str]:
+def _describe_particles(
+    conditions: Sequence[Condition], jobs: Sequence[Mapping[str, Any]]
+) -> list[str]:
     """Describe the numbers of particles and the budget."""
-    numbers = distinct_values(str(job["particles"]) for job in jobs if job.get("particles"))
+    numbers = _count_particles(conditions)
     budgets = {str(job["config"].get("budget", store.SAME_N)) for job in jobs}
     if not numbers:
         return []
-    text = f"Particle filters used {_join(numbers, 'or')} particles"
+    names = {label: look.name for label, look in study_looks(conditions).items()}
+    text = describe_particles({names[label]: counts for label, counts in numbers.items()})
     if budgets != {store.SAME_N}:
         return [f"{text}, chosen for equal cost ({', '.join(sorted(budgets - {store.SAME_N}))})."]
     return [f"{text}."]
 
 
-def _describe_decisions(alpha: float, margin: float, pairs: int, metric: str) -> list[str]:
+def _count_particles(conditions: Sequence[Condition]) -> dict[str, list[int]]:
+    """Return the numbers of particles of each particle filter by label."""
+    numbers: dict[str, list[int]] = {}
+    for job in (job for condition in conditions for job in condition.jobs):
+        if job.meta.get("particles"):
+            numbers.setdefault(job.label, []).append(int(job.meta["particles"]))
+    return numbers
+
+
+def _describe_decisions(
+    alpha: float, margin: float, counts: tuple[int, int], metric: str
+) -> list[str]:
     """Describe metric, intervals, tests and lost runs."""
-    level = f"{100 * (1 - alpha):g} %"
+    level, (pairs, won) = f"{100 * (1 - alpha):g} %", counts
     tests = (
-        f"{_count(pairs, 'planned pair')} {'is' if pairs == 1 else 'are'} decided from the differences of these trimmed means, paired by run, "
+        f"{_count(pairs, 'planned pair')} {'is' if pairs == 1 else 'are'} decided from {describe_units(pairs, won)}, paired by run, "
         "with runs as units and Holm's correction over all pairs, separately for track and error; "
         if pairs
         else "No pair was planned; "
@@ -179,11 +199,6 @@ def _is_recorded(meta: Mapping[str, Any]) -> bool:
     """Return whether the scenario of a job reads recorded data."""
     node = meta["config"].get("scenario")
     return isinstance(node, Mapping) and "root" in node
-
-
-def _join(texts: Sequence[str], word: str) -> str:
-    """List texts with a word before the last one."""
-    return f" {word} ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
 
 
 def _count(number: int, noun: str) -> str:
