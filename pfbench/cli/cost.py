@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pfbench.cli.compose import split_words
-from pfbench.cli.report import check_study_exists
+from pfbench.cli.report import check_has_results
 from pfbench.config.composition import compose
 from pfbench.config.protected_keys import FOLDER_KEYS
 
@@ -49,7 +49,7 @@ def measure_cost(words: Sequence[str]) -> None:
     composed = [f"{key}={values[key]}" for key in _KEYS if key in values and key not in ("rounds", "seconds")]  # fmt: skip
     config = compose(composed).values
     study, results = config["study"], Path(config["results_dir"])
-    check_study_exists(study, results)
+    check_has_results(study, results)
     changes: dict[str, Any] = {
         key: config[key]
         for key in ("data", *FOLDER_KEYS, *_PLACES)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.compose import compose_study
-from pfbench.cli.report import check_study_exists, find_page_data, make_report_options
+from pfbench.cli.report import check_has_results, find_page_data, make_report_options
 from pfbench.config.composition import JobConfig
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def write_study_paper(words: Sequence[str]) -> None:
     study, reports = config.values["study"], Path(config.values["reports_dir"])
     stored = find_page_data(config, words)
     if stored is None:
-        check_study_exists(study, Path(config.values["results_dir"]))
+        check_has_results(study, Path(config.values["results_dir"]))
     with RecordedFolder(reports / study / "paper") as folder:
         pack = _decide_results(config, folder) if stored is None else _copy_data(stored, folder)
         remarks = write_paper(pack, page, folder)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pfbench.cli.compose import split_words
-from pfbench.cli.report import check_study_exists
+from pfbench.cli.report import check_has_results
 from pfbench.config.composition import compose
 from pfbench.config.protected_keys import FOLDER_KEYS
 
@@ -49,7 +49,7 @@ def replay_run(words: Sequence[str]) -> None:
         [f"{key}={values[key]}" for key in ("study", *_FOLDERS, *_PLACES) if key in values]
     )
     study, results = config.values["study"], Path(config.values["results_dir"])
-    check_study_exists(study, results)
+    check_has_results(study, results)
     from pfbench.replay import recomputation, replay_files
     from pfbench.replay.agreement import compare_runs, describe_agreement
     from pfbench.replay.run_selection import find_run

@@ -11,7 +11,7 @@ from pfbench.cli.claims import write_claims_page
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error, suggest_similar
 from pfbench.config.composition import JobConfig, compose
-from pfbench.config.folders import experiments_dir
+from pfbench.config.folders import experiments_dir, name_run_command
 
 HELP = """\
 pfbench report study=NAME [key=value ...]
@@ -58,31 +58,37 @@ def report_study(words: Sequence[str]) -> None:
             "study must be a study, got datasheets. Use: pfbench datasheet scenario=NAME"
         )
     if not find_page_data(config, words):
-        check_study_exists(study, Path(config.values["results_dir"]))
+        check_has_results(study, Path(config.values["results_dir"]))
     print(f"report: {_write_page(config).resolve()}")
 
 
-def check_study_exists(study: str, results: Path) -> None:
-    """Check that a study has a folder of results or an experiment.
+def check_has_results(study: str, results: Path) -> None:
+    """Check that a study has files of results.
 
     Args:
         study: Name of the study.
         results: Folder of all studies.
 
     Raises:
-        ValueError: If it has neither. The message names similar studies.
+        ValueError: If it has none. The message names failed jobs, similar studies, and the command that
+            makes the results.
     """
     from pfbench.results.conditions import list_stored_studies
+    from pfbench.results.store import list_failures
 
-    experiments = {path.stem for path in experiments_dir().glob("*.yaml")}
-    if study in experiments or (results / study).is_dir():
+    if any((results / study).glob("*.npz")):
         return
-    available = list_stored_studies(results)
-    similar = suggest_similar(study, sorted({*available, *experiments}))
+    experiments = {path.stem for path in experiments_dir().glob("*.yaml")}
+    available, failures = list_stored_studies(results), list_failures(results / study)
+    failed, similar = "", ""
+    if failures:
+        failed = f" {len(failures)} of its jobs failed, the first with {failures[0]['message']}"
+    elif study not in experiments:
+        similar = suggest_similar(study, sorted({*available, *experiments}))
     raise ValueError(
-        f"study must be a study with results, got {study}.{similar} "
+        f"study must be a study with results, got {study}.{similar}{failed} "
         f"Studies with results in {results}: {', '.join(available) or 'none'}. "
-        f"Run its jobs first: pfbench run study={study} ..."
+        f"Run its jobs first: {name_run_command(study)}"
     )
 
 
@@ -138,7 +144,7 @@ def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
     if options := [word for word in words if word.lstrip("+").startswith(("report.", "report="))]:
         raise ValueError(
             f"options of the report need results, got {', '.join(options)} and no results in {results}. "
-            f"Leave them out to use {data}, or run: pfbench run -m +experiment={study}"
+            f"Leave them out to use {data}, or run: {name_run_command(study)}"
         )
     return data
 
@@ -198,11 +204,7 @@ def _renew_published(study: str, folder: Path, results: Path) -> str:
     if (folder / PAGE_DATA).is_file():
         return f"{study}: {rebuild_page(folder).resolve()}, of the stored data"
     is_script = (experiments_dir() / f"{study}.py").is_file()
-    command = (
-        f"python -m pfbench.experiments.{study}"
-        if is_script
-        else f"pfbench run -m +experiment={study}"
-    )
+    command = f"python -m pfbench.experiments.{study}" if is_script else name_run_command(study)
     return (
         f"{study}: the published report is unchanged, since {results} holds no results. "
         f"Next: {command}"

@@ -17,6 +17,17 @@ def experiments_dir() -> Path:
     return _find_folder("experiments", "quickstart.yaml")
 
 
+def name_run_command(study: str) -> str:
+    """Return the command that runs the jobs of a study: its experiment, or words to complete.
+
+    Args:
+        study: Name of the study.
+    """
+    if (experiments_dir() / f"{study}.yaml").is_file():
+        return f"pfbench run -m +experiment={study}"
+    return f"pfbench run study={study} scenario=NAME noise=NAME filter=NAME"
+
+
 def _find_folder(name: str, marker: str) -> Path:
     """Return the folder inside or next to the package that contains the marker file."""
     package = Path(pfbench.__file__).resolve().parent

@@ -146,7 +146,7 @@ class PhiloxStream(BatchRandomStream):
 
     def __post_init__(self) -> None:
         if not isinstance(self.seed, Tensor) and not 0 <= self.seed < 2**32:
-            raise ValueError(f"seed must be from 0 to 2**32 - 1, got {self.seed}. Change the seed.")
+            raise ValueError(f"seed must be from 0 to 2**32 - 1, got {self.seed}. Set seed=1.")
         if isinstance(self.step, int) and self.step == 0:  # later steps have the same runs
             check_run_numbers(self.runs)
 

@@ -103,15 +103,17 @@ def _compute_or_note(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Compute a job, and write a note if it fails.
 
-    A job alone whose configuration is not valid is refused and leaves no note. The report of a
+    A job alone whose configuration or data are not valid is refused and leaves no note. The report of a
     sweep states all jobs that it lacks.
     """
-    plan = None
+    plan = episodes = None
     try:
         plan = build_plan(config)
-        return compute_job(plan, name)
+        episodes = EpisodeSource(plan)
+        return compute_job(plan, name, episodes)
     except Exception as error:
-        if plan is None and is_alone:
+        is_refused = plan is None or (episodes is None and isinstance(error, ValueError | OSError))
+        if is_alone and is_refused:
             raise
         choices = {group: config.choices[group] for group in CHOICES}
         note = store.write_failure(path, choices, error)
@@ -119,7 +121,9 @@ def _compute_or_note(
         raise
 
 
-def compute_job(plan: JobPlan, label: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def compute_job(
+    plan: JobPlan, label: str, episodes: EpisodeSource | None = None
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Compute a job without writing it.
 
     The episode is drawn once. Only if all runs do not fit into memory, they are computed in batches,
@@ -128,6 +132,7 @@ def compute_job(plan: JobPlan, label: str) -> tuple[dict[str, Any], dict[str, np
     Args:
         plan: Plan of the job, see `build_plan`.
         label: Title of the progress bar.
+        episodes: Episodes of the job, None to draw them.
 
     Returns:
         Metadata and arrays, see `store.Result`.
@@ -140,7 +145,7 @@ def compute_job(plan: JobPlan, label: str) -> tuple[dict[str, Any], dict[str, np
     trained = checkpoint_provenance(
         values["filter"], plan.config.choices["scenario"], values["seed"], plan.runs
     )
-    episodes = EpisodeSource(plan)
+    episodes = episodes or EpisodeSource(plan)
     plan, allocation = apply_budget(plan, episodes)
     size = max_runs_in_memory(plan, episodes)
     pcrb = _timed_pcrb(plan, episodes.joint, plan.runs) if episodes.joint else None

@@ -22,16 +22,6 @@ def check_settings(values: Mapping[str, Any]) -> None:
     Raises:
         ValueError: If a value is invalid. The message names key, requirement and value.
     """
-    requirements = {
-        **{key: f"a whole number of at least {least}" for key, least in _INTEGERS.items()},
-        "oracle_noise": "true (the filter receives the true noise regime) or false",
-        "pcrb": "auto (where the model's distributions are the simulated ones), true or false",
-        "memory_limit_gib": "the GiB that the job may use, or null for most of the free memory",
-        "dtype": "float64 (default) or float32",
-        "budget": f"one of {', '.join(store.BUDGETS)}",
-        "engine": "auto, eager, kernels or compiled",
-        "device": "cpu, cuda, or one of several GPUs such as cuda:1",
-    }
     valid = {
         **{key: type(values[key]) is int and values[key] >= _INTEGERS[key] for key in _INTEGERS},
         "oracle_noise": type(values["oracle_noise"]) is bool,
@@ -42,9 +32,10 @@ def check_settings(values: Mapping[str, Any]) -> None:
         "engine": values["engine"] in ("auto", "eager", "kernels", "compiled"),
         "device": re.fullmatch(r"cpu|cuda(:\d+)?", str(values["device"])) is not None,
     }
-    for key, requirement in requirements.items():
+    for key, (requirement, example) in _REQUIREMENTS.items():
         if not valid[key]:
-            raise ValueError(f"{key} must be {requirement}, got {values[key]}. Change this value.")
+            remedy = _advise_integer(key, values[key]) or f"Set {key}={example}."
+            raise ValueError(f"{key} must be {requirement}, got {values[key]}. {remedy}")
     if values["first_run"] + values["runs"] > RUN_NUMBERS:
         raise ValueError(
             f"first_run + runs must be at most 2**32 = {RUN_NUMBERS}, got {values['first_run']} + "
@@ -72,6 +63,27 @@ def apply_global_settings(values: Mapping[str, Any]) -> None:
 
 
 _INTEGERS = {"runs": 1, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}  # with minimum
+_EXAMPLES = {"runs": 100, "first_run": 0, "threads": 1, "seed": 1, "score_steps": 10}
+_REQUIREMENTS = {  # requirement and valid value by key
+    **{
+        key: (f"a whole number of at least {least}", str(_EXAMPLES[key]))
+        for key, least in _INTEGERS.items()
+    },
+    "oracle_noise": ("true (the filter receives the true noise regime) or false", "false"),
+    "pcrb": ("auto (where the model's distributions are the simulated ones), true or false", "auto"),
+    "memory_limit_gib": ("the GiB that the job may use, or null for most of the free memory", "null"),
+    "dtype": ("float64 (default) or float32", "float64"),
+    "budget": (f"one of {', '.join(store.BUDGETS)}", store.SAME_N),
+    "engine": ("auto, eager, kernels or compiled", "auto"),
+    "device": ("cpu, cuda, or one of several GPUs such as cuda:1", "cpu"),
+}  # fmt: skip
+
+
+def _advise_integer(key: str, value: Any) -> str:
+    """Return how a whole number is written that was given as 1e9 or 10.0; empty for other values."""
+    if key not in _INTEGERS or not isinstance(value, float) or not value.is_integer():
+        return ""
+    return f"Write it without exponent and without a decimal point: {key}={int(value)}."
 
 
 def _is_memory_limit(value: Any) -> bool:

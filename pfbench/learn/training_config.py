@@ -66,12 +66,14 @@ class Training:
             if type(value) is not int or value < minimum:
                 raise ValueError(
                     f"train.{name} must be an integer of at least {minimum}, got {value}. "
-                    "Change this value."
+                    f"Set train.{name}={minimum} or more."
                 )
         for name in ("learning_rate", "max_grad_norm"):
             value = getattr(self, name)
             if not value > 0.0:
-                raise ValueError(f"train.{name} must be positive, got {value}. Change this value.")
+                raise ValueError(
+                    f"train.{name} must be positive, got {value}. Set train.{name}=0.001."
+                )
 
 
 @dataclass

@@ -15,6 +15,7 @@ from typing import Any
 import pandas as pd
 import pyarrow as pa
 
+from pfbench.config.folders import name_run_command
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.board.decided_parts import StudyFacts, decide_parts
 from pfbench.report.changing_sentences import renew_methods
@@ -115,5 +116,6 @@ def rebuild_page(folder: Path) -> Path:
         if has_runs:
             target.write("verdicts.csv", format_verdicts(pack))
             write_page_data(pack, target)
+        pack["replay_first"] = name_run_command(str(pack["study"]))
         pack["downloads"] = [d for d in pack["downloads"] if (folder / d["href"]).is_file()]
         return write_page(pack, target)

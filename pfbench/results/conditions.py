@@ -237,11 +237,11 @@ def _list_files(files: Sequence[str]) -> str:
 
 
 def _no_results_message(study: str, results: Path) -> str:
-    """State which studies have results, and the command that makes these."""
+    """State which studies have results, and how the missing ones are made."""
     folder = results / study
     notes = store.list_failures(folder)
     failed = f" ({len(notes)} jobs failed, the first with {notes[0]['message']})" if notes else ""
     available = (
         f"Studies with results in {results}: {', '.join(list_stored_studies(results)) or 'none'}."
     )
-    return f"No results in {folder}{failed}. {available} Run: pfbench run -m +experiment={study}"
+    return f"{folder} must hold results, got none{failed}. {available} Run its jobs: pfbench run study={study} ..."

@@ -123,6 +123,25 @@ def test_a_misspelt_study_suggests_existing_ones(tmp_path: Path) -> None:
     assert "+experiment=quickstrat" not in said.err
 
 
+@pytest.mark.parametrize("command", ["report", "replay", "cost", "paper"])
+def test_a_study_without_results_is_told_the_command_that_exists(
+    command: str, tmp_path: Path
+) -> None:
+    more = {"replay": ("run=1", "filter=sir"), "paper": ("journal=ieee",)}.get(command, ())
+    said = pfbench(command, "study=quickstart", *more, home=tmp_path)
+    assert "got quickstart." in said.err
+    assert "Run its jobs first: pfbench run -m +experiment=quickstart\n" in said.err
+    store.write_failure(
+        tmp_path / "results" / "adhoc" / "0123456789abcdef.npz",
+        {"scenario": "growth", "noise": "nominal", "filter": "sir", "model": "growth"},
+        ValueError("bad"),
+    )
+    said = pfbench(command, "study=adhoc", *more, home=tmp_path)
+    assert "1 of its jobs failed, the first with ValueError: bad" in said.err
+    assert "pfbench run study=adhoc scenario=NAME noise=NAME filter=NAME" in said.err
+    assert "+experiment=adhoc" not in said.err
+
+
 def test_a_copied_result_is_refused(tmp_path: Path) -> None:
     assert pfbench("run", *WALK, "filter=ekf", home=tmp_path).code == 0
     (file,) = (tmp_path / "results" / "adhoc").glob("*.npz")

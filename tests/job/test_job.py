@@ -428,10 +428,13 @@ def test_a_failed_job_leaves_a_note_and_its_success_takes_it_away(tmp_path: Path
 
 
 REFUSED = {
-    "dtype=double": "dtype must be float64 (default) or float32, got double. Change this value.",
-    "runs=ten": "runs must be a whole number of at least 1, got ten. Change this value.",
-    "runs=0": "runs must be a whole number of at least 1, got 0. Change this value.",
-    "seed=-1": "seed must be a whole number of at least 0, got -1. Change this value.",
+    "dtype=double": "dtype must be float64 (default) or float32, got double. Set dtype=float64.",
+    "runs=ten": "runs must be a whole number of at least 1, got ten. Set runs=100.",
+    "runs=0": "runs must be a whole number of at least 1, got 0. Set runs=100.",
+    "runs=1e9": "runs must be a whole number of at least 1, got 1000000000.0. Write it without exponent and "
+    "without a decimal point: runs=1000000000.",
+    "seed=99999999999": "seed must be from 0 to 2**32 - 1, got 99999999999. Set seed=1.",
+    "seed=-1": "seed must be a whole number of at least 0, got -1. Set seed=1.",
     "filter.particles=0": "filter.particles must be at least 2, got 0. Choose more particles.",
     "particles=0": "filter.particles must be at least 2, got 0. Choose more particles.",
     "particles=many": "filter.particles must be a whole number, got 'many'. Write it without",
@@ -452,6 +455,14 @@ def test_a_value_that_is_not_valid_is_refused_once_and_leaves_nothing(
     with pytest.raises((ValueError, InstantiationException)) as caught:
         job.run(job.compose([*WALK, "filter=sir", "runs=2", word, f"results_dir={tmp_path}"]))
     assert REFUSED[word] in str(caught.value)
+    assert list(tmp_path.rglob("*.json")) == []
+
+
+def test_a_folder_of_data_that_is_missing_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    words = ("run", "scenario=recorded_quad_flights", "filter=ekf", "runs=1", "data.root=/nowhere")
+    said = pfbench(*words, home=tmp_path)
+    assert "data.root must contain the folder quad_rtk_mimu, got /nowhere" in said.err
+    assert "traceback:" not in said.err
     assert list(tmp_path.rglob("*.json")) == []
 
 

@@ -387,3 +387,19 @@ def test_a_pair_that_runs_won_decide_is_drawn_and_legends_name_only_what_is_draw
         table = part.locator("tbody tr").first.text_content()
         assert "-20.5 points" in table
         page.context.close()
+
+
+def test_a_page_made_without_results_says_that_the_command_needs_them(tmp_path, chromium):
+    pack = page_packs.build_pack(3, 1, 1, 4, carried=0)
+    texts = []
+    for name, more in (("with", {}), ("without", {"replay_first": "pfbench run -m +experiment=x"})):
+        with RecordedFolder(tmp_path / name) as target:
+            write_page({**pack, **more}, target)
+        page = chromium.new_context().new_page()
+        page.goto((tmp_path / name / "index.html").as_uri())
+        page.locator("#runs").scroll_into_view_if_needed()
+        page.wait_for_selector("#runwords code")
+        texts.append(page.locator("#runwords code").all_inner_texts())
+        page.context.close()
+    assert [text.split()[1] for text in texts[0]] == ["replay"]
+    assert texts[1] == [*texts[0], "pfbench run -m +experiment=x"]

@@ -97,8 +97,11 @@ function drawRun(focus) {
   const command = data.replay
     ? quoted(data.replay.replace(/\{(\w+)\}/g, (all, name) => (name in fill ? fill[name] : all)))
     : "";
+  const first = data.replay_first
+    ? `. The page was made without the results, which the command needs. They are made by <code>${esc(data.replay_first)}</code>.`
+    : "";
   find("#runwords").innerHTML =
-    `Run ${esc(number)} of ${esc(cellName(place))}: ${icon(look)}<b>${esc(look.name)}</b> ${esc(text)}, rank ${rank} of ${dots.filters.length} in this run.${command ? ` Repeat it: <code>${esc(command)}</code>` : ""}`;
+    `Run ${esc(number)} of ${esc(cellName(place))}: ${icon(look)}<b>${esc(look.name)}</b> ${esc(text)}, rank ${rank} of ${dots.filters.length} in this run.${command ? ` Repeat it: <code>${esc(command)}</code>${first}` : ""}`;
   drawTrack(look, number, cell);
 }
 
