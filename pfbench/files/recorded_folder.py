@@ -11,6 +11,7 @@ from typing import Any, Self
 
 from pfbench.files.atomic_write import set_aside, write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+from pfbench.files.git_files import list_unchanged_in_git
 
 MANIFEST = "manifest.json"
 _SHOWN = 3  # names in a warning at most
@@ -24,7 +25,7 @@ class RecordedFolder:
     Use it as a context. At the end, files of the previous manifest that were not written again are
     removed if their content is unchanged. After an error nothing is removed. A file that the manifest
     does not list, or that was changed since, is never removed: it stays, or is renamed to `NAME.kept`
-    if its name is needed.
+    if its name is needed. A file whose content git stores is replaced without a copy.
 
     Args:
         path: The folder. It is created with the first file.
@@ -38,6 +39,7 @@ class RecordedFolder:
         self._previous = _read_manifest(self.path / MANIFEST)
         self._written: dict[str, str] = {}
         self._renamed: list[str] = []
+        self._in_git = list_unchanged_in_git(self.path) - self._previous.keys()
 
     def __enter__(self) -> Self:
         """Return the folder."""
@@ -84,7 +86,8 @@ class RecordedFolder:
         plain = content.encode() if isinstance(content, str) else content
         digest = hash_content(plain)
         expected = (digest, self._previous.get(name), self._written.get(name))
-        if target.is_symlink() or (target.exists() and _hash_file(target) not in expected):
+        is_known = name in self._in_git or _hash_file(target) in expected
+        if target.is_symlink() or (target.exists() and not is_known):
             self._renamed.append(set_aside(target, "kept").relative_to(self.path).as_posix())
         write_atomically(target, lambda file: file.write(plain))
         self._written[name] = digest
@@ -118,7 +121,7 @@ class RecordedFolder:
             if (file.is_symlink() or file.is_file())
             and not any(file.is_relative_to(folder) for folder in nested)
             and (name := file.relative_to(self.path).as_posix())
-            not in (MANIFEST, *self._written, *self._previous)
+            not in (MANIFEST, *self._written, *self._previous, *self._in_git)
             and name not in self._renamed
         )
         if others and self._is_complete:

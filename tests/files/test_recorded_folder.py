@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -255,3 +257,24 @@ def test_no_other_module_removes_files() -> None:
         for path in (ROOT / "pfbench").rglob("*.py")
     }
     assert {name: n for name, n in counts.items() if n} == REMOVALS
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+def test_a_file_that_git_stores_is_replaced_without_copy_and_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As in a fresh clone, which has the published files without their manifest."""
+    for name in ("page.md", "figure.svg", "changed.md"):
+        (tmp_path / name).write_text("published")
+    for words in (("init", "-q"), ("add", ".")):
+        subprocess.run(["git", "-C", str(tmp_path), *words], check=True)
+    (tmp_path / "changed.md").write_text("by hand")
+    with RecordedFolder(tmp_path) as folder:
+        for name in ("page.md", "changed.md"):
+            folder.write(name, "new")
+    names = {path.name for path in tmp_path.iterdir() if path.is_file()} - {MANIFEST}
+    assert names == {"page.md", "figure.svg", "changed.md", "changed.md.kept"}
+    assert (tmp_path / "changed.md.kept").read_text() == "by hand"
+    assert "changed.md.kept" in caplog.text
+    assert "page.md" not in caplog.text.replace("changed", "")
+    assert "figure.svg" not in caplog.text

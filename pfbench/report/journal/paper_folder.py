@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from matplotlib.figure import Figure
 
@@ -79,12 +79,8 @@ def write_paper(
         ValueError: If a table does not fit the page. Nothing is written then.
     """
     tables = _format_tables(pack, page)
-    remarks = [f"{name}.tex has the intervals" for name in tables if "supplement" in name]
     plots = select_figures(pack)
-    if pack["planned"] and "planned" not in plots:
-        remarks.append(
-            "no planned pair has an effect, so that planned.pdf and table_planned.tex are left out"
-        )
+    remarks = _list_remarks(pack, tables, plots)
     has_latex = shutil.which("pdflatex") is not None
     widths = {}
     for name, plot in plots.items():
@@ -105,6 +101,16 @@ def write_paper(
     if len(main) < len(tables):
         supplement = [name for name in tables if "supplement" in name]
         folder.write("supplement.tex", format_document(pack, page, {}, supplement))
+    return remarks
+
+
+def _list_remarks(pack: Pack, tables: Iterable[str], plots: Iterable[str]) -> list[str]:
+    """List the tables of the supplement, and what is left out."""
+    remarks = [f"{name}.tex has the intervals" for name in tables if "supplement" in name]
+    if pack["planned"] and "planned" not in plots:
+        remarks.append(
+            "no planned pair has an effect, so that planned.pdf and table_planned.tex are left out"
+        )
     return remarks
 
 
