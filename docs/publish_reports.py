@@ -19,10 +19,9 @@ from typing import Any
 
 from pfbench.files import RecordedFolder
 from pfbench.report import (
-    HEADLINE,
     PAGE_DATA,
     read_page_data,
-    render_headline,
+    write_headline,
     write_markdown,
     write_page_data,
 )
@@ -43,8 +42,6 @@ RESULTS = "results.json.gz"  # of a script in experiments/
 SUFFIXES = (".svg", ".png")  # of a headline figure, not of the copies that a folder keeps
 CAPTION = "Error of each filter relative to the baseline"
 
-_NUMBER = re.compile(r"(?<![\w#.])-?\d+\.\d+(?!\w)")  # not in names
-_CLOSE = 1e-3  # units of the drawing
 _IMAGE = re.compile(r"^!\[([^\]]*)\]\(([^)]+)\)\n+(\*[^*\n].*\*\n+)?", re.MULTILINE)
 
 
@@ -55,36 +52,13 @@ def publish_study(folder: Path) -> None:
         folder: Folder of the report, with the data of its page.
     """
     pack = read_page_data(folder)
-    opening = next(iter(pack["views"].values()))
-    has_error = any(row["ratio"] is not None for row in opening["rows"])
-    pack["headline"] = CAPTION if has_error else ""
-    pack["headline_note"] = describe_absent(pack) if has_error else ""
     with RecordedFolder(folder, is_complete=False) as target:
         target.remove("headline.png")
-        if has_error:
-            drawing, stored = render_headline(pack), folder / HEADLINE
-            if not (stored.is_file() and is_equal_drawing(stored.read_bytes(), drawing)):
-                target.write(HEADLINE, drawing)
-        else:
-            target.remove(HEADLINE)
+        has_figure = write_headline(pack, target)
+        pack["headline"] = CAPTION if has_figure else ""
+        pack["headline_note"] = describe_absent(pack) if has_figure else ""
         write_page_data(pack, target)
         write_markdown(pack, target)
-
-
-def is_equal_drawing(first: bytes, second: bytes) -> bool:
-    """Return whether two SVG drawings differ in their numbers by less than 0.001 at most.
-
-    The last digit of a coordinate differs between processors.
-
-    Args:
-        first: SVG.
-        second: SVG.
-    """
-    texts = [_NUMBER.sub("#", drawing.decode()) for drawing in (first, second)]
-    if texts[0] != texts[1]:
-        return False
-    numbers = zip(*(_NUMBER.findall(drawing.decode()) for drawing in (first, second)), strict=True)
-    return all(abs(float(a) - float(b)) < _CLOSE for a, b in numbers)
 
 
 def describe_absent(pack: Mapping[str, Any]) -> str:

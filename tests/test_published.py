@@ -17,6 +17,7 @@ from checkout import ROOT
 from markupsafe import escape
 
 from pfbench.claims.page import write_claims
+from pfbench.report import is_equal_drawing
 from pfbench.report.stored_page import read_page_data, rebuild_page
 
 REPORT_FILE = re.compile(
@@ -62,7 +63,7 @@ def test_git_stores_only_the_published_files_of_a_report() -> None:
 
 def test_a_drawing_that_differs_in_the_last_digit_is_not_written_again() -> None:
     """As of two processors. A moved line, another text and another colour are differences."""
-    is_equal = load("publish_reports").is_equal_drawing
+    is_equal = is_equal_drawing
     drawing = (
         b'<path d="M 74.119688 51.399375" style="fill: #0b4f8a"/><text x="12.5">CPF 1.00</text>'
     )
@@ -138,7 +139,7 @@ def test_the_published_claims_are_decided_by_the_present_rules(tmp_path: Path) -
     for name in ("report.md", "verdicts.json", "jobs.json"):
         assert (copy / name).read_bytes() == (published / name).read_bytes(), name
     drawings = [(folder / "headline.svg").read_bytes() for folder in (copy, published)]
-    assert publish.is_equal_drawing(*drawings)
+    assert is_equal_drawing(*drawings)
 
 
 def test_the_stored_results_of_a_script_give_its_published_page() -> None:

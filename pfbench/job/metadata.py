@@ -18,6 +18,10 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.job.plan import JobPlan
 from pfbench.model.base import StateSpaceModel
 
+# parts of a checkout that decide results
+_DECIDING = ("pfbench", "conf", "experiments", "pyproject.toml", "setup.py")
+_TIMEOUT = 10  # s, of git
+
 
 def make_metadata(
     plan: JobPlan, model: StateSpaceModel, steps: int, notes: Sequence[str]
@@ -76,13 +80,7 @@ def read_versions() -> dict[str, str]:
 
     `commit` is empty outside a checkout.
     """
-    folder = Path(pfbench.__file__).resolve().parent
-    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude", "*"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=10)
-        commit = done.stdout.strip()
-    except (OSError, subprocess.TimeoutExpired):
-        commit = ""
+    commit = describe_commit(Path(pfbench.__file__).resolve().parents[1])
     return {
         "pfbench": pfbench.__version__,
         "commit": commit,
@@ -90,3 +88,34 @@ def read_versions() -> dict[str, str]:
         "torch": torch.__version__,
         "numpy": np.__version__,
     }
+
+
+def describe_commit(checkout: Path) -> str:
+    """Return the commit of a checkout, with "-dirty" if a tracked file that decides results is changed.
+
+    Pages, reports and tests do not count.
+
+    Args:
+        checkout: Top folder.
+
+    Returns:
+        Abbreviated commit, empty outside a checkout.
+    """
+    present = [name for name in _DECIDING if (checkout / name).exists()]
+    commands = (
+        ("rev-parse", "--short", "HEAD"),
+        ("diff", "--no-ext-diff", "--name-only", "HEAD", "--", *present),
+    )
+    try:
+        commit, changed = (_run_git(checkout, *command) for command in commands)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return f"{commit}-dirty" if commit and changed else commit
+
+
+def _run_git(folder: Path, *words: str) -> str:
+    """Run git in a folder and return its output, empty after an error of git."""
+    command = ["git", "-C", str(folder), *words]
+    return subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=_TIMEOUT
+    ).stdout.strip()

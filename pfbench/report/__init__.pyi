@@ -1,8 +1,8 @@
 """Public names of `pfbench.report` and the modules that define them."""
 
 from pfbench.report.journal.headline import (
-    HEADLINE as HEADLINE,
-    render_headline as render_headline,
+    is_equal_drawing as is_equal_drawing,
+    write_headline as write_headline,
 )
 from pfbench.report.journal.page_format import find_page_format as find_page_format
 from pfbench.report.journal.text_width import text_width as text_width

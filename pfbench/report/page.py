@@ -8,12 +8,13 @@ from pathlib import Path
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import cost, provenance, writers
 from pfbench.report.board import read_study
+from pfbench.report.journal.headline import write_headline
 from pfbench.report.looks import study_looks
 from pfbench.report.options import ReportOptions
 from pfbench.report.plots.paper import paper_figures
 from pfbench.report.plots.plotting import line_styles
 from pfbench.report.stored_page import write_page_data
-from pfbench.report.study_files import write_study_files
+from pfbench.report.study_files import list_figure_files, write_study_files
 from pfbench.report.study_page import write_page
 from pfbench.report.verdict_files import write_report_data
 from pfbench.results.conditions import (
@@ -34,7 +35,7 @@ def write_report(
     """Write the report of a study to `<out>/<study>/`.
 
     The folder contains the page (index.html, report.md) with its numbers (verdicts.csv, runs.parquet,
-    metrics.csv, page.json.gz), decisions.json, consistency.json, pfbench.bib, and the figures of the papers. Equal
+    metrics.csv, page.json.gz), decisions.json, consistency.json, pfbench.bib, headline.svg, and the figures of the papers. Equal
     results give equal bytes. Files that an earlier report wrote are removed if this one does not write
     them and they are unchanged (manifest.json). Other files stay.
 
@@ -71,6 +72,8 @@ def write_report(
             "definitions": [(metric.name, metric.caption) for metric in METRICS],
         }
         write_page_data(pack, folder)
+        write_headline(pack, folder)
+        pack["downloads"] += list_figure_files(folder.path)
         return write_page(pack, folder)
 
 

@@ -20,6 +20,7 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.board.decided_parts import StudyFacts, decide_parts
 from pfbench.report.changing_sentences import renew_methods
 from pfbench.report.journal.references import renew_bibliography
+from pfbench.report.study_files import list_figure_files
 from pfbench.report.study_page import write_page
 from pfbench.report.verdict_files import format_verdicts
 
@@ -117,5 +118,6 @@ def rebuild_page(folder: Path) -> Path:
             target.write("verdicts.csv", format_verdicts(pack))
             write_page_data(pack, target)
         pack["replay_first"] = name_run_command(str(pack["study"]))
-        pack["downloads"] = [d for d in pack["downloads"] if (folder / d["href"]).is_file()]
+        stored = [d for d in pack["downloads"] if (folder / d["href"]).is_file()]
+        pack["downloads"] = stored + list_figure_files(folder)
         return write_page(pack, target)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pandas as pd
 
 from pfbench.config.paper_files import plan_installed_pairs
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.journal.headline import HEADLINE
 from pfbench.report.options import ReportOptions
 from pfbench.report.table_formats import format_csv
 from pfbench.report.writers import write_json
@@ -74,6 +76,29 @@ def write_study_files(
         {"name": title, "href": file, "bytes": (folder.path / file).stat().st_size, "group": "Numbers"}
         for title, file in files.items()
     ]  # fmt: skip
+
+
+def list_figure_files(folder: Path) -> list[dict[str, Any]]:
+    """List the files of figures of a report as downloads: the leaderboard, and figures of the papers.
+
+    Args:
+        folder: Folder of the report.
+
+    Returns:
+        Entries of the downloads of the page.
+    """
+    files = [folder / HEADLINE, *sorted((folder / "figures").glob("paper_*.*"))]
+    names = {HEADLINE: "Error relative to the baseline"}
+    return [
+        {
+            "name": f"{names.get(file.name) or file.stem.removeprefix('paper_').replace('_', ' ')} ({file.suffix[1:].upper()})",
+            "href": file.relative_to(folder).as_posix(),
+            "bytes": file.stat().st_size,
+            "group": "Figures",
+        }
+        for file in files
+        if file.is_file()
+    ]
 
 
 def decide_study(

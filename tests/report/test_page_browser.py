@@ -403,3 +403,24 @@ def test_a_page_made_without_results_says_that_the_command_needs_them(tmp_path, 
         page.context.close()
     assert [text.split()[1] for text in texts[0]] == ["replay"]
     assert texts[1] == [*texts[0], "pfbench run -m +experiment=x"]
+
+
+LONG = {0: "COFM-AMSSRCPF", 1: "COFM-AMSSRCPF (printed)", 2: "Scaled EKF (tuned)"}
+
+
+def test_long_names_are_whole_on_a_telephone_and_labels_stay_in_the_window(tmp_path, chromium):
+    with RecordedFolder(tmp_path) as target:
+        write_page(page_packs.build_pack(9, 2, 2, 8, names=LONG), target)
+    page = chromium.new_context(viewport={"width": 390, "height": 844}).new_page()
+    page.goto((tmp_path / "index.html").as_uri())
+    page.wait_for_selector("#cost svg text")
+    cut = "nodes => nodes.filter(node => node.scrollWidth > node.clientWidth + 1).map(node => node.innerText)"
+    assert page.eval_on_selector_all("#rows .name, #rows th", cut) == []
+    names = page.locator("#rows .name").all_inner_texts()
+    assert {" ".join(name.split()) for name in names} >= set(LONG.values())
+    heads = " ".join(" ".join(page.locator("#heads").inner_text().split()).split())
+    assert "…" not in heads
+    right = "nodes => Math.max(...nodes.map(node => node.getBoundingClientRect().right))"
+    assert page.eval_on_selector_all("#cost svg text", right) <= 390
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.context.close()

@@ -85,6 +85,7 @@ def test_a_page_alone_is_published_too_and_a_first_ledger_is_written_of_what_the
 
 
 def test_a_study_is_shown_as_its_experiment_says(made: dict[str, Any], tmp_path: Path) -> None:
+    there(tmp_path, "results/recorded_car/a.npz")
     assert pfbench("report", "study=recorded_car", home=tmp_path).code == 0
     assert made["recorded_car"].start_time_s == 98.0
     assert (

@@ -54,10 +54,11 @@ def test_every_file_is_there_and_offered_by_the_page(report):
         "manifest.json",
         "page.json.gz",
         "pfbench.bib",
+        "headline.svg",
         *numbers,
     }
     html = (report / "index.html").read_text()
-    for name in sorted(numbers | {"pfbench.bib"}):
+    for name in sorted(numbers | {"pfbench.bib", "headline.svg"}):
         assert f'<a href="{name}" download>' in html
 
 

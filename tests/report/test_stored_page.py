@@ -52,6 +52,20 @@ def test_a_study_is_published_from_the_data_of_its_page(study: Path, tmp_path: P
     assert first == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def test_a_page_offers_its_figures_and_each_kind_of_file_once(study: Path, tmp_path: Path) -> None:
+    page = (study / "index.html").read_text()
+    links = re.findall(r'href="([^"#]+)" download', page)
+    assert {"runs.parquet", "verdicts.csv", "pfbench.bib", "headline.svg"} < set(links)
+    assert [link for link in links if not (study / link).is_file()] == []
+    heads = re.findall(r"<h3>(\w+)</h3><ul>", page)
+    assert heads == ["Numbers", "LaTeX", "Figures"]
+    assert "pfbench paper study=demo journal=ieee" in page
+    copy = Path(shutil.copytree(study, tmp_path / "demo"))
+    assert 'href="headline.svg" download' in rebuild_page(copy).read_text()
+    (copy / "headline.svg").unlink()
+    assert "headline.svg" not in rebuild_page(copy).read_text()
+
+
 def test_a_published_figure_names_the_filters_that_it_does_not_show(
     study: Path, tmp_path: Path
 ) -> None:

@@ -17,7 +17,7 @@ function heads() {
     },
     {
       key: "ratio",
-      text: `÷ ${cut(baseline, innerWidth <= 640 ? 9 : 18)}`,
+      text: `÷ ${innerWidth <= 640 ? baseline : cut(baseline, 18)}`,
       small: "with interval",
       value: (row) => row.ratio,
     },

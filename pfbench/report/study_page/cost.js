@@ -66,8 +66,8 @@ function drawCost(part) {
 // The name where it covers nothing, or not at all: the tooltip has it too.
 function nameBeside(row, x, y, wanted, boxes, [left, top, right, bottom]) {
   const look = looks[row.filter];
-  const text = cut(look.name, 18) + (Math.abs(y - wanted) > 1 ? ` ${short(row.ratio)} ${wanted < y ? "↑" : "↓"}` : "");
-  const length = text.length * (look.proposed ? 7 : 6.3);
+  const text = look.name + (Math.abs(y - wanted) > 1 ? ` ${short(row.ratio)} ${wanted < y ? "↑" : "↓"}` : "");
+  const length = textWidth(text, 11, look.proposed);
   const places = [
     [8, 4, 0],
     [-8 - length, 4, 0],

@@ -128,12 +128,15 @@ function yAxis(ticks, scale, left, right, format = tidy) {
 
 // Names cut to a width, with the whole name in the tooltip of the mark.
 const cut = (text, letters) => (text.length > letters ? `${text.slice(0, letters - 1)}…` : text);
-// A text cut to a width in px. Fonts differ between systems, so that the width is measured.
+// Width of a text, and a text cut to a width, in px. Fonts differ between systems, so that it is measured.
 const pen = document.createElement("canvas").getContext("2d");
-function fit(text, width, size = 12, bold = false) {
+function textWidth(text, size = 12, bold = false) {
   pen.font = `${bold ? 700 : 400} ${size}px system-ui, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-serif`;
+  return pen.measureText(text).width;
+}
+function fit(text, width, size = 12, bold = false) {
   let letters = text.length;
-  while (letters > 1 && pen.measureText(cut(text, letters)).width > width) letters--;
+  while (letters > 1 && textWidth(cut(text, letters), size, bold) > width) letters--;
   return cut(text, letters);
 }
 // Heights of labels, moved apart so that none covers another.

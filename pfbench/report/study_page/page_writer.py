@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -134,15 +133,8 @@ def _format_colours(filters: Sequence[Mapping[str, Any]]) -> str:
 
 def _group_files(downloads: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[dict[str, str]]]]:
     """Return the downloads by group, with sizes as text."""
-    return [
-        (
-            group,
-            [
-                {**file, "size": f"{max(1, round(file['bytes'] / 1000))} kB"}
-                if file.get("bytes")
-                else {**file, "size": ""}
-                for file in files
-            ],
-        )
-        for group, files in itertools.groupby(downloads, lambda file: str(file["group"]))
-    ]
+    groups: dict[str, list[dict[str, str]]] = {}
+    for file in downloads:
+        size = f"{max(1, round(file['bytes'] / 1000))} kB" if file.get("bytes") else ""
+        groups.setdefault(str(file["group"]), []).append({**file, "size": size})
+    return list(groups.items())
