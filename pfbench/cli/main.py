@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 import pfbench
-from pfbench.cli.messages import format_error, notes_of, suggest_similar
+from pfbench.cli.messages import format_error, is_refusal, notes_of, suggest_similar
 from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import ENVIRONMENT, split_trust
 
@@ -47,7 +47,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         argv: Words after `pfbench`. Default: those of the process.
 
     Raises:
-        SystemExit: With code 1 if the command failed, 2 if it does not exist, 130 if interrupted.
+        SystemExit: With code 1 if the command failed, 2 if it does not exist or its words or configuration
+            are not valid, 130 if interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -103,7 +104,7 @@ def _run_command(command: str, options: Sequence[str]) -> None:
         for note in notes_of(error):
             print(note, file=sys.stderr)
         print("(add --traceback to see the traceback)", file=sys.stderr)
-        raise SystemExit(1) from error
+        raise SystemExit(2 if is_refusal(error) else 1) from error
 
 
 def _usage() -> str:

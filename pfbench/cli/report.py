@@ -169,7 +169,7 @@ def _report_all(words: list[str]) -> None:
         print(_renew_published(study, reports / study, results))
     print(_write_claims(words, studies, published, failed))
     if failed:
-        raise ValueError(
+        raise RuntimeError(
             f"all {len(studies)} reports must be written, got {len(failed)} failures: "
             f"{', '.join(failed)}. The messages above give the reasons."
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import shlex
@@ -65,22 +66,27 @@ def run_jobs(words: Sequence[str]) -> None:
     overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
     first = check_words([*flags, *overrides])
     decorate = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
-    application = decorate(run_task)
     is_printed = any(word.partition("=")[0] in _PRINTING_FLAGS for word in words)
     plan = None if is_printed else plan_or_none(overrides, first)
     if plan and wants_until_decided(plan):
         check_has_sweep(flags)
         sweep = GrowingSweep.from_plan(plan)
         others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
-        sweep.run(lambda more: run_sweep(application, [*flags, *others, *more], plan, is_part=True))
+        task = decorate(run_task)
+        sweep.run(lambda more: run_sweep(task, [*flags, *others, *more], plan, is_part=True))
         return
-    print_study_size(plan)
     if flags:
-        run_sweep(application, [*flags, *overrides], plan)
+        print_study_size(plan)
+        run_sweep(decorate(run_task), [*flags, *overrides], plan)
         return
+
+    @functools.wraps(run_task)
+    def run_alone(cfg: Any) -> float:
+        return run_task(cfg, lambda: print_study_size(plan))
+
     sys.argv = ["pfbench run", *overrides]
     with hide_hydra_line():
-        application()
+        decorate(run_alone)()
 
 
 def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:
@@ -98,14 +104,19 @@ def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> St
 
 
 def print_study_size(plan: StudyPlan | None) -> None:
-    """Print what the chosen runs and worlds can show.
+    """Print what the chosen runs and worlds can show; nothing if the settings of the job are not valid.
 
     Args:
         plan: Plan of the study, None if it is not valid.
     """
+    from pfbench.job.settings import check_settings
+
+    if plan is None:
+        return
     try:
-        sentence = plan.describe_size() if plan else ""
-    except Exception:  # a scenario of the sweep is not valid: its job reports the error
+        check_settings(plan.first.values)
+        sentence = plan.describe_size()
+    except Exception:  # a setting or a scenario is not valid: the job reports the error
         return
     if sentence:
         print(sentence, flush=True)
@@ -161,11 +172,12 @@ def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
     ]
 
 
-def run_task(cfg: Any) -> float:
+def run_task(cfg: Any, announce: Callable[[], None] | None = None) -> float:
     """Run one job of a Hydra application.
 
     Args:
         cfg: Composed configuration.
+        announce: Function that is called when the data of the job are valid, before it is computed.
 
     Returns:
         The root mean square error of the main group, for sweepers that optimise.
@@ -182,7 +194,7 @@ def run_task(cfg: Any) -> float:
     total, choices = os.environ.get(SWEEP_JOBS), application.runtime.choices
     counter = "" if number is None else f"[{number + 1}{f'/{total}' if total else ''}] "
     try:
-        outcome = job.run(cfg, choices, counter)
+        outcome = job.run(cfg, choices, counter, announce)
     except Exception as error:
         note_outcome(number, "failed")
         if number is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -53,6 +53,7 @@ def run(
     config: JobConfig | DictConfig | Mapping[str, Any],
     choices: Mapping[str, str] | None = None,
     counter: str = "",
+    announce: Callable[[], None] | None = None,
 ) -> JobOutcome:
     """Run one job and write its result file, unless the file exists.
 
@@ -61,6 +62,7 @@ def run(
         choices: Names of scenario, noise, filter and model, if `config` does not contain them.
         counter: Start of the log line of a job in a sweep, for instance `"[3/40] "`. Empty for a
             job alone.
+        announce: Function that is called when the data of the job are valid, before it is computed.
 
     Returns:
         The outcome.
@@ -82,7 +84,7 @@ def run(
         repeat = "(overwrite=true to repeat)"
         log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
         return outcome
-    meta, outputs = _compute_or_note(config, name, path, is_alone=not counter)
+    meta, outputs = _compute_or_note(config, name, path, announce, is_alone=not counter)
     head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
     store.write_result(path, {**head, **meta}, outputs)
     outcome = JobOutcome(path, "finished", main_rmse(outputs, meta))
@@ -99,7 +101,12 @@ def run(
 
 
 def _compute_or_note(
-    config: JobConfig, name: str, path: Path, is_alone: bool
+    config: JobConfig,
+    name: str,
+    path: Path,
+    announce: Callable[[], None] | None,
+    *,
+    is_alone: bool,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Compute a job, and write a note if it fails.
 
@@ -110,6 +117,8 @@ def _compute_or_note(
     try:
         plan = build_plan(config)
         episodes = EpisodeSource(plan)
+        if announce is not None:
+            announce()
         return compute_job(plan, name, episodes)
     except Exception as error:
         is_refused = plan is None or (episodes is None and isinstance(error, ValueError | OSError))

@@ -31,7 +31,7 @@ WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=20")
 )
 def test_advice(tmp_path: Path, words: tuple[str, ...], advice: str) -> None:
     said = pfbench("run", "scenario=linear_walk", *words, home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert advice in said.err
     assert not list(tmp_path.rglob("*.npz"))
 
@@ -55,7 +55,7 @@ def test_a_file_of_another_form_is_named(tmp_path: Path, group: str, form: str) 
     file.write_bytes(content)
     words = (f"hydra.searchpath=[file://{tmp_path / 'mine'}]", f"{group}=other")
     said = pfbench("run", *WALK, *words, home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert f"{file} {message}" in said.err
 
 
@@ -79,7 +79,7 @@ def test_a_file_of_another_form_that_is_not_chosen_is_no_error(tmp_path: Path) -
 )
 def test_a_choice_of_another_kind_is_named(tmp_path: Path, word: str, advice: str) -> None:
     said = pfbench("run", *WALK, word, home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert advice in said.err
     assert not list(tmp_path.rglob("*.npz"))
 
@@ -98,7 +98,7 @@ def test_a_file_in_place_of_a_folder_is_named(tmp_path: Path, word: str, advice:
     word = word.replace("FILE", f"{file}").replace("FOLDER", f"{tmp_path}")
     words[word.partition("=")[0]] = word
     said = pfbench("judge", *words.values(), home=tmp_path)
-    assert said.code == 1
+    assert said.code == (1 if word.startswith("reports_dir") else 2)
     assert advice.replace("FILE", f"{file}").replace("FOLDER", f"{tmp_path}") in said.err
 
 
@@ -112,13 +112,13 @@ def test_a_key_of_swept_scenarios_is_set_in_all_jobs(tmp_path: Path) -> None:
 
 def test_a_sweep_that_did_not_start_skips_no_job(tmp_path: Path) -> None:
     said = pfbench("run", "-m", *WALK, "filter=ekf,ckff", home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert "skipped" not in said.out + said.err
 
 
 def test_a_misspelt_study_suggests_existing_ones(tmp_path: Path) -> None:
     said = pfbench("report", "study=quickstrat", home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert "got quickstrat. Similar: quickstart." in said.err
     assert "+experiment=quickstrat" not in said.err
 
@@ -127,7 +127,8 @@ def test_a_misspelt_study_suggests_existing_ones(tmp_path: Path) -> None:
 def test_a_study_without_results_is_told_the_command_that_exists(
     command: str, tmp_path: Path
 ) -> None:
-    more = {"replay": ("run=1", "filter=sir"), "paper": ("journal=ieee",)}.get(command, ())
+    more = {"replay": ["run=1", "filter=sir"], "paper": ["journal=ieee"]}.get(command, [])
+    more += [f"reports_dir={tmp_path}"] * (command != "cost")
     said = pfbench(command, "study=quickstart", *more, home=tmp_path)
     assert "got quickstart." in said.err
     assert "Run its jobs first: pfbench run -m +experiment=quickstart\n" in said.err
@@ -151,7 +152,7 @@ def test_a_copied_result_is_refused(tmp_path: Path) -> None:
         meta = json.loads(str(content["meta"]))
     store.write_result(copy, {**meta, "key": copy.stem}, arrays)
     said = pfbench("report", "study=adhoc", home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert f"{copy.name} and {file.name} hold the same runs of ekf" in said.err or (
         f"{file.name} and {copy.name} hold the same runs of ekf" in said.err
     )
@@ -213,3 +214,34 @@ def test_a_closed_pipe_gives_no_traceback() -> None:
     assert run.stderr.read() == ""
     run.stderr.close()
     assert run.wait() == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("report", "--flag"), 2),
+        (("replay", "study=quickstart"), 2),
+        (("run", *WALK, "filter=none_of_these"), 2),
+        (("run", *WALK, "filter=ekf", "runs=0"), 2),
+        (("run", *WALK, "filter=ekf", "seed=99999999999"), 2),
+        (("run", *WALK, "filter=ekf", "runs=2", "memory_limit_gib=1e-6"), 1),
+    ],
+)
+def test_refused_input_exits_with_two_and_prints_no_plan(
+    words: tuple[str, ...], code: int, tmp_path: Path
+) -> None:
+    said = pfbench(*words, home=tmp_path)
+    assert said.code == code, said.err
+    assert ("plan:" in said.out) == (code == 1)
+
+
+def test_a_sweep_without_a_result_has_no_next_report(tmp_path: Path) -> None:
+    words = ("run", "-m", *WALK, "filter=ekf", "study=mine")
+    said = pfbench(*words, "runs=0,-1", home=tmp_path)
+    assert said.code == 1
+    assert "2 failed" in said.out
+    assert "Next:" not in said.out
+    assert "plan:" not in said.out
+    said = pfbench(*words, "runs=0,2", home=tmp_path)
+    assert "1 finished, 0 skipped, 1 failed" in said.out
+    assert "Next: pfbench report study=mine" in said.out

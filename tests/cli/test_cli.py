@@ -162,7 +162,7 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 def test_a_mistake_is_reported_and_leaves_nothing_behind(tmp_path: Path, mistake: str) -> None:
     words, parts = MISTAKES[mistake]
     said = pfbench("run", "scenario=linear_walk", "runs=2", "particles=20", *words, home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert "error run: " in said.err
     message = said.err[said.err.index("error run: ") :]
     for part in parts:
@@ -190,7 +190,7 @@ def test_each_command_refuses_a_missing_folder_and_a_flag(
     words: tuple[str, ...], message: str, tmp_path: Path
 ) -> None:
     said = pfbench(*words, home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert f"\nerror {words[0]}: " in said.err
     assert said.err.count(message) == 1
     assert "usage:" not in said.err
@@ -217,7 +217,7 @@ def test_a_renamed_key_names_the_new_one(tmp_path: Path, word: str, message: str
     assert (f"{renamed[0]}: renamed to {renamed[1]}" if renamed else "") == message
     if message:
         said = pfbench("run", *WALK, word, home=tmp_path)
-        assert said.code == 1
+        assert said.code == 2
         assert message in said.err
 
 
@@ -266,7 +266,7 @@ def test_renamed_choices_lead_to_existing_ones() -> None:
 @pytest.mark.parametrize("device", ["cuda", "cuda:3"])
 def test_a_device_that_does_not_exist_is_reported(tmp_path: Path, device: str) -> None:
     said = pfbench("run", *WALK, f"device={device}", home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert f"device must be cpu or one of 0 CUDA devices, got {device}. Use device=cpu" in said.err
 
 
@@ -375,14 +375,14 @@ def test_list_of_a_group_says_what_each_one_is(tmp_path: Path) -> None:
 
 def test_list_of_no_group(tmp_path: Path) -> None:
     said = pfbench("list", "filters", home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert "error list: group must be one of filter, model" in said.err
     assert "got filters. Similar: filter." in said.err
 
 
 def test_report_of_a_study_that_does_not_exist(tmp_path: Path) -> None:
     said = pfbench("report", "study=nope", f"reports_dir={tmp_path / 'reports'}", home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert "error report: " in said.err
     assert "nope" in said.err
     assert "pfbench run" in said.err
@@ -391,7 +391,7 @@ def test_report_of_a_study_that_does_not_exist(tmp_path: Path) -> None:
 
 def test_report_with_a_misspelt_key(tmp_path: Path) -> None:
     said = pfbench("report", "stdy=nope", home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert "stdy=nope: key stdy does not exist. Similar: study." in said.err
 
 
@@ -430,5 +430,5 @@ def test_check_names_what_does_not_compose(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(check, "compose", broken)
     said = pfbench("check", home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert "configurations must compose, got errors:\n  filter=ukf: kappa is not there" in said.err

@@ -86,7 +86,7 @@ def test_the_metric_of_the_report_decides_and_is_fixed_at_the_first_look(
     found = table.runs.set_index(["filter", "run"])["value"]
     assert found.to_dict() == pytest.approx(expected)
     refused = pfbench(*GROWING, "report.metric=max_error", home=home)
-    assert refused.code == 1
+    assert refused.code == 2
     assert "report.metric must be rmse, as at the first look of this study" in refused.err
 
 
@@ -172,13 +172,13 @@ def test_copies_of_runs_are_not_counted(
 )
 def test_invalid_requests(home: Path, said: Said, words: tuple[str, ...], message: str) -> None:
     refused = pfbench(*GROWING, *words, home=home)
-    assert refused.code == 1
+    assert refused.code == 2
     assert message in refused.err
 
 
 def test_one_job_cannot_be_decided(tmp_path: Path) -> None:
     refused = pfbench("run", *STUDY, "filter=ekf", "runs=until-decided", home=tmp_path)
-    assert refused.code == 1
+    assert refused.code == 2
     assert "must be a sweep over at least two filters" in refused.err
 
 

@@ -447,7 +447,7 @@ def test_a_value_that_is_not_valid_is_refused_once_and_leaves_nothing(
     word: str, tmp_path: Path
 ) -> None:
     said = pfbench("run", *WALK, "filter=sir", "runs=2", word, home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert f"\nerror run: {REFUSED[word]}" in said.err
     assert (said.out + said.err).count(REFUSED[word]) == 1
     assert "Error executing job" not in said.err
@@ -471,7 +471,7 @@ def test_a_failure_does_not_touch_a_good_result(tmp_path: Path) -> None:
     assert pfbench(*words, home=tmp_path).code == 0
     (file,) = (tmp_path / "results" / "adhoc").iterdir()
     before = file.read_bytes()
-    assert pfbench(*words, "overwrite=true", "threads=0", home=tmp_path).code == 1
+    assert pfbench(*words, "overwrite=true", "threads=0", home=tmp_path).code == 2
     failed = pfbench(*words, "overwrite=true", "memory_limit_gib=1e-6", home=tmp_path)
     assert failed.code == 1
     assert f"previous result kept: {file}" in failed.err

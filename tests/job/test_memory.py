@@ -284,7 +284,7 @@ def test_a_limit_that_is_none_is_told(tmp_path: Path, value: str) -> None:
         said.code,
         f"got {value}." in said.err.partition("memory_limit_gib must be the GiB")[2],
     ) == (
-        1,
+        2,
         True,
     ), said.err
 

@@ -63,7 +63,7 @@ def test_bad_input_is_refused(home: Path, case: str) -> None:
     change, problem, remedy = BAD[case]
     cases.write(change(full(cases.drive())), home / "mine.csv")
     said = judge(home)
-    assert said.code == 1
+    assert said.code == 2
     assert problem in said.err
     assert remedy.replace("mine.columns", "NAME.columns") in said.err
     assert "mine.csv" in said.err or "truth.csv" in said.err
@@ -84,7 +84,7 @@ def test_radians_for_degrees(home: Path) -> None:
     cases.write(table.assign(t=truth.t), home / "truth.csv")
     cases.write(table.assign(t=truth.t, lat_deg=np.radians(table.lat_deg)), home / "mine.csv")
     said = judge(home, f"theirs={home / 'mine.csv'}")
-    assert said.code == 1
+    assert said.code == 2
     assert "column lat_deg must be in deg" in said.err
     assert "radians" in said.err
 
@@ -94,7 +94,7 @@ def test_a_hole_of_the_reference(home: Path) -> None:
     cases.write(full(truth), home / "mine.csv")
     cases.write(truth[(truth.t < 40) | (truth.t > 60)], home / "truth.csv")
     said = judge(home)
-    assert said.code == 1
+    assert said.code == 2
     assert "truth.csv: line 82, column t must follow the row before within 1.25 s" in said.err
     assert "holes=skip" in said.err
     said = judge(home, "holes=skip")
@@ -119,7 +119,7 @@ def test_a_hole_of_the_reference(home: Path) -> None:
 def test_bad_words(home: Path, words: tuple[str, ...], message: str) -> None:
     cases.write(full(cases.drive()), home / "mine.csv")
     said = judge(home, *words)
-    assert said.code == 1
+    assert said.code == 2
     assert message in said.err
     assert not (home / "reports").exists()
 
@@ -131,7 +131,7 @@ def test_a_frame_of_a_tum_file_is_required(home: Path) -> None:
         home / "mine.tum", np.column_stack([truth.t, truth[POSITION], zero, zero, zero, zero + 1])
     )
     said = judge(home, f"mine={home / 'mine.tum'}")
-    assert said.code == 1
+    assert said.code == 2
     assert "frame must be ned or enu for mine.tum" in said.err
 
 
@@ -150,6 +150,6 @@ def test_a_frame_of_a_tum_file_is_required(home: Path) -> None:
 def test_an_option_that_cannot_be_is_refused(home: Path, word: str, message: str) -> None:
     cases.write(full(cases.drive()), home / "mine.csv")
     said = judge(home, word)
-    assert said.code == 1
+    assert said.code == 2
     assert message in said.err
     assert not (home / "reports").exists()

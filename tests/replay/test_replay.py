@@ -98,7 +98,7 @@ def test_a_changed_number_is_found_with_its_time(home: Path, tmp_path: Path) -> 
 )
 def test_advice_of_replay(home: Path, words: tuple[str, ...], advice: str) -> None:
     said = pfbench("replay", *words, home=home)
-    assert said.code == 1
+    assert said.code == 2
     assert advice in said.err
 
 
@@ -135,7 +135,7 @@ def test_results_of_other_programs_are_refused(home: Path, tmp_path: Path) -> No
     store.write_result(tmp_path / "results/walks" / f"{meta['key']}.npz", meta, result.data)
     label = meta["label"]
     said = replay(tmp_path, "run=12", f"filter={label}")
-    assert said.code == 1
+    assert said.code == 2
     assert "study must have results of pfbench run" in said.err
 
 

@@ -73,5 +73,5 @@ def test_a_changed_job_is_measured_again_and_old_times_are_not_used(home: Path) 
 )
 def test_mistakes_have_advice(home: Path, words: tuple[str, ...], message: str) -> None:
     said = pfbench("cost", "study=walks", *words, home=home)
-    assert said.code == 1
+    assert said.code == 2
     assert message in said.err

@@ -124,7 +124,7 @@ MISTAKES = {
 def test_mistakes_are_told_as_elsewhere(tmp_path: Path, case: str) -> None:
     words, message = MISTAKES[case]
     said = pfbench("datasheet", *words, home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert message in said.err
     assert not list(tmp_path.rglob("*.npz"))
 
@@ -139,13 +139,13 @@ OLD_COMMANDS = {
 @pytest.mark.parametrize("words", OLD_COMMANDS)
 def test_an_old_command_names_the_new_one(tmp_path: Path, words: tuple[str, ...]) -> None:
     said = pfbench(*words, home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert f"se: {OLD_COMMANDS[words]}" in said.err
 
 
 def test_a_study_with_a_scenario_is_still_a_study(tmp_path: Path) -> None:
     said = pfbench("report", "study=none", *WALK, home=tmp_path)
-    assert said.code == 1
+    assert said.code == 2
     assert "study must be a study with results, got none" in said.err
 
 

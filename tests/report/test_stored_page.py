@@ -104,7 +104,7 @@ def test_a_page_is_made_again_without_results(study: Path, tmp_path: Path) -> No
     assert links == ["verdicts.csv", "runs.parquet"]
     (folder / "page.json.gz").write_bytes((study / "page.json.gz").read_bytes()[:-9])
     damaged = pfbench("report", "study=demo", f"reports_dir={tmp_path}/reports", home=tmp_path)
-    assert damaged.code == 1
+    assert damaged.code == 2
     assert "page.json.gz must be the data of a page" in damaged.err
 
 

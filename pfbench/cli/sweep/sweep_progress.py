@@ -51,7 +51,7 @@ class SweepProgress:
         return sweep
 
     def finish(self, is_complete: bool = True, is_part: bool = False) -> None:
-        """Print the counts and the next command.
+        """Print the counts, and the next command if the study has results.
 
         Args:
             is_complete: Whether the sweep ended without an error.
@@ -63,7 +63,10 @@ class SweepProgress:
             return
         counts = self._count_outcomes() or self._count_files(is_complete)
         elapsed = time.time() - self.start_time
-        command = "" if is_part else f"  Next: pfbench report study={self.study}"
+        has_results = any(self.folder.glob("*.npz"))
+        command = (
+            f"  Next: pfbench report study={self.study}" if has_results and not is_part else ""
+        )
         print(f"sweep: {counts} in {elapsed:.0f} s.{command}")
 
     @property

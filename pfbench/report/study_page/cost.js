@@ -77,6 +77,8 @@ function nameBeside(row, x, y, wanted, boxes, [left, top, right, bottom]) {
     [7, 15, 0],
     [-7 - length, -7, 0],
     [-7 - length, 15, 0],
+    [6 - length, 18, 0],
+    [6 - length, -9, 0],
   ];
   for (const [dx, dy] of places) {
     const box = [x + dx, y + dy - 10, x + dx + length, y + dy + 2];
