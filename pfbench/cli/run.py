@@ -79,14 +79,21 @@ def run_jobs(words: Sequence[str]) -> None:
         print_study_size(plan)
         run_sweep(decorate(run_task), [*flags, *overrides], plan)
         return
+    _run_alone(decorate, overrides, plan)
+
+
+def _run_alone(
+    decorate: Callable[[Any], Callable[[], Any]], overrides: Sequence[str], plan: StudyPlan | None
+) -> None:
+    """Run one job, and print what its runs can show once its data are valid."""
 
     @functools.wraps(run_task)
-    def run_alone(cfg: Any) -> float:
+    def run_with_plan(cfg: Any) -> float:
         return run_task(cfg, lambda: print_study_size(plan))
 
     sys.argv = ["pfbench run", *overrides]
     with hide_hydra_line():
-        decorate(run_alone)()
+        decorate(run_with_plan)()
 
 
 def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:
