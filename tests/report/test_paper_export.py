@@ -182,7 +182,8 @@ WON = {"estimate": -51.7, "low": -63.8, "high": -0.288, "track": [0.966, 0.9791]
 
 
 def test_pairs_that_runs_won_decide_are_in_the_table_and_in_the_figure(tmp_path: Path) -> None:
-    pack = build_pack(8, 1, 1, runs=3, instants=4, carried=0)
+    names = {k: f"COFM-AMSSRCPF (tuned) {k}" for k in range(8)}
+    pack = build_pack(8, 1, 1, runs=3, instants=4, carried=0, names=names)
     missing = {"estimate": None, "low": None, "high": None, "cells": [], "new_world": None}
     won, other, third = (pair | missing for pair in pack["planned"][:3])
     won |= {"won": WON, "word": "worse"}
@@ -207,6 +208,10 @@ def test_pairs_that_runs_won_decide_are_in_the_table_and_in_the_figure(tmp_path:
         shown = {**pack, "planned": planned}
         figure = draw_paper_figure(select_figures(shown)["planned"], shown, FigureSetting(page))
         assert len(figure.axes) == panels
+        figure.draw_without_rendering()
+        for axis in figure.axes:
+            box = axis.xaxis.label.get_window_extent()
+            assert 0 <= box.x0 <= box.x1 <= figure.bbox.width
     with RecordedFolder(tmp_path) as folder:
         remarks = paper_folder.write_paper({**pack, "planned": [other, third]}, page, folder)
     assert "no planned pair has an effect" in " ".join(remarks)

@@ -62,7 +62,7 @@ def format_caption(name: str, pack: Pack) -> str:
     regime = str(pack["regimes"][0]["name"]).lower()
     has_ratio, has_won = (bool(list_pairs(pack, has_won=won)) for won in (False, True))
     words = {
-        "{effects}": " by the share of runs won where tracks are not kept" * has_won,
+        "{effects}": ", by the share of runs won in percentage points where tracks are not kept" * has_won,
         "{dots}": "Dots: single worlds. " * has_ratio,
         "{metric}": escape_latex(str(pack["metrics"][0]["name"])),
         "{level}": f"{100 * (1 - float(pack['alpha'])):g}",

@@ -98,11 +98,11 @@ def _plot_pairs(
         limits = min(-5.0, *values) * 1.08, max(5.0, *values) * 1.08
         axis.set_xlim(limits)
         axis.axvline(0.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
-        axis.set_xlabel("runs won, first minus second [percentage points]")
+        axis.set_xlabel("runs won, first minus second [points]", loc="right")  # names are wide
     else:
         limits = ratio_limits(values)
         use_ratio_scale(axis, *limits)
-        axis.set_xlabel("ratio of errors, first / second")
+        axis.set_xlabel("ratio of errors, first / second", loc="right")
     label_rows(axis, [f"{looks[p['a']]['name']} / {looks[p['b']]['name']}" for p in pairs], setting)
     for y, pair in enumerate(pairs):
         new, colour = pair.get("new_world"), str(looks[pair["a"]]["colour"])

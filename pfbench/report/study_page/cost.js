@@ -79,6 +79,7 @@ function nameBeside(row, x, y, wanted, boxes, [left, top, right, bottom]) {
     [-7 - length, 15, 0],
     [6 - length, 18, 0],
     [6 - length, -9, 0],
+    [6 - length, 29, 0],
   ];
   for (const [dx, dy] of places) {
     const box = [x + dx, y + dy - 10, x + dx + length, y + dy + 2];
