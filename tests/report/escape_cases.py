@@ -16,6 +16,7 @@ _MARKDOWN = re.compile(
 _FILES = (
     "verdicts.csv",
     "metrics.csv",
+    "headline.svg",
     "runs.parquet",
     "decisions.json",
     "consistency.json",

@@ -256,7 +256,7 @@ def test_an_empty_study_says_where_to_go(results):
     message = str(refusal.value)
     assert str(results / "nothing") in message
     assert "demo" in message
-    assert "pfbench run -m +experiment=nothing" in message
+    assert "pfbench run study=nothing" in message
 
 
 def test_data_of_datasheets_are_no_study(tmp_path):
