@@ -80,8 +80,8 @@ def count_failing(number: int, total: int) -> str:
         number: Number of these filters.
         total: Number of all filters.
     """
-    verb = "is lost or diverges" if number == 1 else "are lost or diverge"
-    return f"{number} of {count_words(total, 'filter')} {verb}"
+    verb = "does" if number == 1 else "do"
+    return f"{number} of {count_words(total, 'filter')} {verb} not keep track"
 
 
 def _name(row: BoardRow, looks: Mapping[str, MethodLook]) -> str:
@@ -104,14 +104,14 @@ def _join(names: Sequence[str]) -> str:
 def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]) -> str:
     """Count the filters that do not keep track in many runs, or were not run."""
     off = [r for r in rows if r.verdict != MISSING and 1 - r.track > _LOST_SHARE]
-    missing = sum(row.verdict == MISSING for row in rows)
+    missing = [_name(row, looks) for row in rows if row.verdict == MISSING]
     without = sum(row.verdict == NOT_KEPT for row in rows)
     text = ""
     if off:
         worst = min(off, key=lambda row: row.track)
         share = f"{100 * (1 - worst.track):.0f} %"
         if len(off) == 1:
-            text = f"{_name(worst, looks)} is lost or diverges in {share} of runs."
+            text = f"{_name(worst, looks)} does not keep track in {share} of runs."
         else:
             text = (
                 f"{count_failing(len(off), len(rows))} in over a fifth of runs "
@@ -120,11 +120,11 @@ def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]
     if without > len(off):
         text += (
             f" {count_failing(without, len(rows))} in over a fifth of the runs "
-            f"of at least one condition: no error of {'its' if without == 1 else 'theirs'} is compared."
+            f"of at least one condition: {'its error is' if without == 1 else 'their errors are'} not compared."
         )
     if missing:
-        verb = "was" if missing == 1 else "were"
-        text += f" {count_words(missing, 'filter')} {verb} not run in all conditions."
+        verb = "was" if len(missing) == 1 else "were"
+        text += f" {_join(missing)} {verb} not run in all conditions."
     return text.strip()
 
 
@@ -142,10 +142,11 @@ def _describe_best(
     twins = [row for row in ranked if row.words == IDENTICAL]
     names = _join([_name(row, looks) for row in (best, *twins)])
     head = f"{names} {'have' if twins else 'has'} the smallest {where}"
+    head = f"Of the {len(ranked)} others, {head}" if 1 < len(ranked) < len(rows) else head
     if twins:
         head += " (identical results)"
     if baseline in (best.filter, *(row.filter for row in twins)):
-        return f"{head}. {_describe_next(ranked, looks, level)}".rstrip()
+        return f"{head}. {_describe_next(ranked, base, looks, level)}".rstrip()
     if math.isnan(best.ratio):
         state = "tracks not kept" if base.verdict == NOT_KEPT else "missing runs"
         return f"{head}. The baseline {_name(base, looks)} has no error because of {state}."
@@ -159,8 +160,8 @@ def _describe_best(
         return f"{head}, {size} ({interval}){cost}: equal to it {base.words}."
     if base.verdict == OPEN:
         return (
-            f"No difference to {_name(base, looks)} is decided jointly ({base.words}). "
-            f"{head}, {size} ({interval}){cost}."
+            f"{head}, {size} ({interval}){cost}. "
+            f"Jointly with all other pairs this is not decided: {_name(base, looks)} is {base.words} above it."
         )
     return f"{head}: {size} ({interval}){cost}."
 
@@ -193,8 +194,10 @@ def _describe_tracks(
     return f"{text} ({level} interval {_format_ends(*ends)})."
 
 
-def _describe_next(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook], level: str) -> str:
-    """State the distance of the first filter that is worse, or of the second, where the best is the baseline."""
+def _describe_next(
+    ranked: Sequence[BoardRow], base: BoardRow, looks: Mapping[str, MethodLook], level: str
+) -> str:
+    """State distance and cost of the first filter that is worse, or of the second, where the best is the baseline."""
     others = [row for row in ranked[1:] if row.words != IDENTICAL]
     if not others:
         return "No other filter has an error to compare." if len(ranked) == 1 else ""
@@ -204,7 +207,7 @@ def _describe_next(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook], 
     ends = [100 * (end - 1) for end in (row.ratio_low, row.ratio_high)]
     if not all(map(math.isfinite, ends)):
         return f"{size}, without an interval from so few runs."
-    return f"{size} ({level} interval {_format_ends(*ends)} %)."
+    return f"{size} ({level} interval {_format_ends(*ends)} %){_describe_cost(row, base)}."
 
 
 def _describe_cost(row: BoardRow, base: BoardRow) -> str:

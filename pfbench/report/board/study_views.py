@@ -68,11 +68,11 @@ def build_views(
                 unit="" if metric == LOG_SCORE or len(of_scope) > 1 else of_scope["unit"].iloc[0],
                 times=[(times or {}).get(key, {}) for key in of_scope.index],
             )
-            is_opening = (metric, world, regime) == (options.metric, ALL, ALL)
+            is_opening = metric == options.metric and in_scope.all()
             view_options = ViewOptions(  # planned words are of all conditions of a pair
                 options.alpha,
                 options.equivalence_margin,
-                words if is_opening and mask.sum() == in_scope.sum() else None,
+                words if is_opening and mask.all() else None,
             )
             where = _describe_scope(selected.conditions, names)
             notes = (
@@ -213,10 +213,17 @@ def _small_print(runs: StudyArrays, options: ReportOptions, names: StudyNames) -
         f"{count_words(filters, 'filter')}, "
         f"{_count_worlds(runs.conditions)}, "
         f"{count_words(runs.conditions['regime'].nunique(), 'noise regime')}, "
-        f"{count_words(int(runs.present.sum(axis=2).max()), 'paired run')} per condition, "
+        f"{_count_runs(runs)} per condition, "
         f"{count_words(len(seeds), 'seed')}. "
-        "Errors are trimmed means over runs on the logarithmic scale, averaged over conditions. "
+        "Errors are trimmed means over runs on the logarithmic scale, averaged over conditions, as are shares of runs. "
         f"Intervals of the ratio: {level} each. "
         f"Verdicts against the best hold for all pairs together at {level}. "
         f"They concern these worlds. {notes}"
     ).rstrip()
+
+
+def _count_runs(runs: StudyArrays) -> str:
+    """Count the paired runs of a condition, as a range where conditions differ."""
+    counts = runs.present.any(axis=0).sum(axis=1)
+    largest = count_words(int(counts.max()), "paired run")
+    return largest if counts.min() == counts.max() else f"{counts.min()} to {largest}"
