@@ -19,21 +19,14 @@ import pandas as pd
 from ceiling import STORE, largest_limit, root_mean
 
 from pfbench.files import markdown_head, markdown_row
-from pfbench.report import read_page_data
-from pfbench.report.board.decided_parts import StudyFacts
-from pfbench.report.board.robust_word import (
-    CONTROL,
-    NOMINAL_REGIME,
-    OUTLIER_REGIME,
-    compare_with_control,
-    find_robust_filters,
-)
-from pfbench.results.statistics.intervals import order_statistic_interval
+from pfbench.report import StudyFacts, compare_with_control, find_robust_filters, read_page_data
+from pfbench.results import order_statistic_interval
 
 TOP = Path(__file__).parents[1]
 PAGE = TOP / "docs" / "robustness.md"
 STUDIES = ("robust_flight", "robust_simulated", "robust_quad", "robust_car", "robust_canyon")
 RECORDED = ("robust_quad", "recorded_quad", "robust_car", "recorded_car", "robust_canyon")
+CONTROL, NOMINAL, OUTLIERS = "ekf_scaled_tuned", "nominal", "outliers"
 CONTROLS = (CONTROL, "ekf_scaled", "ekf")
 SAMPLED_HYPOTHESES = "rbpf_discrete"  # particles of noise hypotheses, a Kalman filter for each
 KALMAN = "kalman"
@@ -155,7 +148,7 @@ def robust() -> str:
     for study in map(read_study, STUDIES):
         for world in study.facts.worlds:
             regimes = set(study.runs.loc[study.runs["scenario"] == world, "regime"])
-            if {OUTLIER_REGIME, NOMINAL_REGIME} <= regimes:
+            if {OUTLIERS, NOMINAL} <= regimes:
                 names = (find_robust(study, world, c) for c in (CONTROLS[:1], CONTROLS))
                 cells = (", ".join(f"`{name}`" for name in group) or "none" for group in names)
                 lines.append(markdown_row(f"`{world}`", *cells))

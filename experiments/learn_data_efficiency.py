@@ -30,7 +30,6 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
-from scipy.stats import t as student
 
 from pfbench.core import PhiloxStream
 from pfbench.files import markdown_bullets, markdown_paragraph
@@ -57,7 +56,7 @@ from pfbench.learn import Training, draw_training_data, train
 from pfbench.model import StateSpaceModel, StochasticVolatility
 from pfbench.noise import NominalNoise
 from pfbench.report import COLUMN, RC, add_legend, line_styles, render_palette_png
-from pfbench.results import holm, wilcoxon_signed_rank
+from pfbench.results import crossed_mean_interval, holm, wilcoxon_signed_rank
 from pfbench.scenario import ModelSimulation, Scenario
 
 MEASURES = {
@@ -223,18 +222,6 @@ def against(scores: Mapping[str, Any], own: Mapping[str, Any], measure: str) -> 
     return a - b if measure == "evidence" else np.log(a / b)
 
 
-def interval(each: np.ndarray) -> tuple[float, float]:
-    """Mean over [trainings, runs] and half of its 95 % interval over both [Satterthwaite 1946]."""
-    parts = [
-        (each.mean(axis).var(ddof=1), n)
-        for axis, n in ((0, each.shape[1]), (1, each.shape[0]))
-        if n > 1
-    ]
-    variance = sum(part / n for part, n in parts)
-    freedom = variance**2 / sum((part / n) ** 2 / (n - 1) for part, n in parts) if variance else 1.0
-    return float(each.mean()), float(student.ppf(0.975, freedom) * math.sqrt(variance))
-
-
 def rows(results: Mapping[str, Any]) -> dict[str, list[Any]]:
     """Scores of each training by name: first without a network, then at about equal time, then learned."""
     found = {name: [scores] for name, scores in results["by hand"].items()}
@@ -263,7 +250,7 @@ def table(results: Mapping[str, Any], case: Case) -> list[str]:
         cells = []
         for measure in MEASURES:
             each = np.stack([against(scores, own, measure) for scores in parts])
-            mean, half = interval(each)
+            mean, half = crossed_mean_interval(each)
             ratio = (
                 f"{math.exp(mean):.3f} ({math.exp(mean - half):.3f} to {math.exp(mean + half):.3f})"
             )
@@ -309,7 +296,7 @@ def verdicts(results: Mapping[str, Any]) -> list[str]:
         each = {
             key: np.stack([against(*pair, key) for pair in pairs]) for key in ("evidence", "error")
         }
-        mean, half = interval(each["error"])
+        mean, half = crossed_mean_interval(each["error"])
         ratio = f"{math.exp(mean):.3f} ({math.exp(mean - half):.3f} to {math.exp(mean + half):.3f})"
         raw += [wilcoxon_signed_rank(values.mean(0)).p for values in each.values()]
         cells.append([name, other, ratio, f"{np.median(each['evidence'].mean(0)):.3f}"])
@@ -338,7 +325,7 @@ def plot_studies(studies: Mapping[str, Mapping[str, Any]]) -> Figure:
                 for part in results[BOUND].values()
             ]
             scale = np.exp if measure == "error" else np.asarray
-            means, halves = np.array([interval(values) for values in each]).T
+            means, halves = np.array([crossed_mean_interval(values) for values in each]).T
             colour = style[BOUND].colour
             axis.fill_between(
                 counts,

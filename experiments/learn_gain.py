@@ -24,7 +24,6 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
-from pfbench.experiments.learn_data_efficiency import interval
 
 from pfbench.core import PhiloxStream
 from pfbench.files import markdown_bullets, markdown_head, markdown_paragraph, markdown_row
@@ -49,7 +48,7 @@ from pfbench.job import ResumableResults, instantiate
 from pfbench.learn import Training, draw_training_data, train
 from pfbench.model import StateSpaceModel
 from pfbench.report import COLUMN, RC, line_styles, render_palette_png
-from pfbench.results import holm, wilcoxon_signed_rank
+from pfbench.results import crossed_mean_interval, holm, wilcoxon_signed_rank
 
 WORLDS = ("linear_walk, nominal", "linear_walk, outliers")
 OTHER_WORLDS = ("growth, nominal", "stochastic_volatility, nominal")  # of learned proposals only
@@ -166,7 +165,7 @@ def compare(parts: list[Any], others: list[Any]) -> tuple[float, float, float]:
         np.log(np.array(a["error"]) / np.array(others[i % len(others)]["error"]))
         for i, a in enumerate(parts)
     ])  # fmt: skip
-    return *interval(each), wilcoxon_signed_rank(each.mean(0)).p
+    return *crossed_mean_interval(each), wilcoxon_signed_rank(each.mean(0)).p
 
 
 def decide(mean: float, half: float, p: float) -> str:

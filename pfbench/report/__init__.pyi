@@ -1,5 +1,10 @@
 """Public names of `pfbench.report` and the modules that define them."""
 
+from pfbench.report.board.decided_parts import StudyFacts as StudyFacts
+from pfbench.report.board.robust_word import (
+    compare_with_control as compare_with_control,
+    find_robust_filters as find_robust_filters,
+)
 from pfbench.report.journal.headline import (
     is_equal_drawing as is_equal_drawing,
     write_headline as write_headline,

@@ -14,6 +14,10 @@ from pfbench.results.metrics import (
     Metric as Metric,
 )
 from pfbench.results.state_groups import main_component_group as main_component_group
+from pfbench.results.statistics.intervals import (
+    crossed_mean_interval as crossed_mean_interval,
+    order_statistic_interval as order_statistic_interval,
+)
 from pfbench.results.statistics.signed_rank import (
     holm as holm,
     wilcoxon_signed_rank as wilcoxon_signed_rank,
