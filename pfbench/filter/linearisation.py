@@ -117,7 +117,9 @@ def check_moments(model: StateSpaceModel, name: str, distribution: Any) -> None:
     if not has_finite_moments(distribution):
         kind = type(unwrap_independent(distribution)).__name__
         choice = (
-            "measurement_update=StudentObservationUpdate(), or " if name == "observation" else ""
+            "an EKF, UKF or CKF with measurement_update=StudentObservationUpdate(), or "
+            if name == "observation"
+            else ""
         )
         raise ValueError(
             f"{type(model).__name__}.{name} must have a finite mean and variance for a Gaussian "

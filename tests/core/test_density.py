@@ -211,7 +211,8 @@ def test_gaussian_filters_need_a_mean_and_a_variance(method: Any, name: str) -> 
         assert torch.isfinite(run_filter(method, observed(name), record, draws).mean).all()
         return
     with pytest.raises(
-        ValueError, match=r"Observed\.observation must have a finite mean.*Use a particle filter"
+        ValueError,
+        match=r"Observed\.observation must have a finite mean.*Use an EKF.* or a particle filter",
     ):
         run_filter(method, observed(name), record, draws)
 

@@ -112,7 +112,7 @@ def test_the_proposed_shift_is_the_whole_one(tmp_path: Path, applied: float, fou
     said = judge(
         tmp_path, f"reference={path}", f"kf.shift={applied - WEEK_S}" if applied else "kf.shift=0"
     )
-    assert said.code == 1
+    assert said.code == 2
     assert found in said.err
     assert f"kf.shift={-WEEK_S:.10g}" in said.err
     assert not (tmp_path / "judge").exists()
@@ -151,7 +151,7 @@ def test_radians_in_a_file_of_kf_gins(tmp_path: Path, column: slice, message: st
     nav[:, column] = np.radians(nav[:, column])
     np.savetxt(tmp_path / "x.nav", nav, fmt="%.9f")
     said = judge(tmp_path, nav=tmp_path / "x.nav")
-    assert said.code == 1
+    assert said.code == 2
     assert message in said.err
 
 
@@ -166,5 +166,5 @@ def test_other_files_of_kf_gins_are_refused(
     tmp_path: Path, words: tuple[str, ...], message: str
 ) -> None:
     said = judge(tmp_path, *words)
-    assert said.code == 1
+    assert said.code == 2
     assert message in said.err

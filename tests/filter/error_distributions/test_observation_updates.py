@@ -356,7 +356,11 @@ def laplace(h: Tensor) -> Any:
 @pytest.mark.parametrize(
     ("update", "family", "message"),
     [
-        (None, cauchy, "finite mean and variance .* got Cauchy. Use measurement_update=StudentObs"),
+        (
+            None,
+            cauchy,
+            "finite mean and variance .* got Cauchy. Use an EKF, UKF or CKF with measurement_update=StudentObs",
+        ),
         (STUDENT, laplace, "must return Student's t, Cauchy or normal .* got Laplace. Use another"),
         (STUDENT, skewed, "must return Student's t, .* got MixtureSameFamily. Use another"),
         (MIXTURE, laplace, "must return a mixture of normal distributions .* got Laplace. Use"),
