@@ -220,14 +220,18 @@ def page(stored: dict[str, Any]) -> str:
         settle = "never" if row["settle_s"] is None else f"{row['settle_s']:.1f}"
         lines.append(
             f"| {row['angle']} | {row['filter']} | {row['settled']} | {settle} | "
-            f"{_nees(row['nees_10_30'])} | {_nees(row['nees_half'])} | {row['position']:.2f} | "
+            f"{format_nees(row['nees_10_30'])} | {format_nees(row['nees_half'])} | {row['position']:.2f} | "
             f"{row['cpu_s'] / row.get('ekf_cpu_s', ekf['cpu_s']):.2g} |"
         )
     return "\n".join(lines) + "\n"
 
 
-def _nees(value: float) -> str:
-    """Format a NEES; a dash for a covariance that is singular to rounding."""
+def format_nees(value: float) -> str:
+    """Format a NEES; a dash for a covariance that is singular to rounding.
+
+    Args:
+        value: Squared error over variance.
+    """
     return f"{value:.3g}" if 0.0 <= value < 1e6 else "–"
 
 

@@ -110,7 +110,7 @@ class Scope:
     """Levels and shares of all filters in the conditions of a view, before a baseline is chosen."""
 
     def __init__(self, rows: pd.DataFrame, cells: Cells, world: str, regime: str) -> None:
-        filters = sorted(rows["filter"].unique())
+        filters, total = sorted(rows["filter"].unique()), len(rows)
         if world != "all":
             rows = rows[rows["scenario"] == world]
         if regime != "all":
@@ -118,6 +118,7 @@ class Scope:
         conditions = rows[["family", "scenario", "regime"]].drop_duplicates()
         self.levels = levels_of(conditions, cells, filters)
         self.is_single = len(conditions) == 1
+        self.has_all = len(rows) == total  # so that words of planned pairs decide
         parts = rows.groupby(["filter", "scenario", "regime"])
         names = {"keeps_track": "track", "coverage_90": "coverage", "nees_ratio": "nees"}
         shares = parts[list(names)].mean().groupby("filter").mean().rename(columns=names)
@@ -197,7 +198,7 @@ def find_differences(
     for key, view in stored.groupby(["metric", "world", "regime", "baseline"], sort=False):
         place = metric, world, regime = key[:3]
         scope = scopes.setdefault(place, scopes.get(place) or Scope(runs, cells[metric], world, regime))  # fmt: skip
-        is_opening = place == (stored["metric"][0], "all", "all")
+        is_opening = scope.has_all and metric == stored["metric"][0]
         rows = view_rows(scope, key[3], words if is_opening else {})
         own = pd.DataFrame(rows).set_index("filter")
         for _, row in view.iterrows():

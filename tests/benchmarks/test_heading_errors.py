@@ -1,4 +1,4 @@
-"""The pages of wrong headings and of the reach of sigma points state the stored results."""
+"""The pages of wrong headings, simulated and recorded, and of the reach of sigma points state the stored results."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from checkout import ROOT
 sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
 import heading_errors
 import point_reach
+import recorded_headings
+import torch
 
 from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, SigmaPointLinearisation
 
@@ -21,6 +23,31 @@ def test_the_page_is_written_from_the_stored_results() -> None:
     assert {(r["angle"], r["filter"]) for r in stored["rows"]} == {
         (angle, name) for angle in heading_errors.ANGLES for name in names
     }
+
+
+def test_the_page_of_recorded_headings_is_written_from_the_stored_results() -> None:
+    stored = json.loads(recorded_headings.STORE.read_text())
+    text = (ROOT / "benchmarks" / "recorded_headings.md").read_text()
+    assert text == recorded_headings.page(stored)
+    assert {(r["scenario"], r["angle"], r["filter"]) for r in stored["rows"]} == {
+        (scenario, angle, name)
+        for scenario in recorded_headings.SCENARIOS
+        for angle in heading_errors.ANGLES
+        for name in heading_errors.filters()
+    }
+
+
+def test_a_run_settles_from_its_first_window_within_the_bound() -> None:
+    """A window of 5 s that starts at 12 s, after a shorter one; steps without a reference are left out."""
+    seconds = torch.arange(1.0, 41.0)
+    error = torch.full((40,), 20.0)
+    error[3:7], error[12:] = 1.0, 2.0
+    position = torch.full((40,), 9.0)
+    position[30:] = torch.nan
+    at, final, ratio, distance = recorded_headings.settle(error, 0.5 * error, position, seconds)
+    assert (at, final, ratio, distance) == (12.0, 2.0, 1.0, 3.0)
+    never = recorded_headings.settle(error + 9.0, error, position, seconds)
+    assert never[0] == float("inf")
 
 
 def test_the_page_of_the_reach_is_written_from_the_stored_results() -> None:
