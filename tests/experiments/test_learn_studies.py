@@ -10,7 +10,7 @@ import torch
 from checkout import ROOT
 from matplotlib.figure import Figure
 from pfbench.experiments import learn_data_efficiency, learn_noise_calibration, learn_room
-from pfbench.experiments.learn_data_efficiency import Case, against, interval, volatility
+from pfbench.experiments.learn_data_efficiency import Case, against, volatility
 from scipy.stats import chi2, ncx2
 
 from pfbench.core.random_stream import PhiloxStream
@@ -21,6 +21,7 @@ from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.particle.proposals import BootstrapProposal
 from pfbench.model.linear_gaussian import local_level
+from pfbench.results import crossed_mean_interval
 
 
 def normal(r: torch.Tensor, variance: float) -> torch.Tensor:
@@ -81,11 +82,13 @@ def test_steps_without_a_measurement_are_not_selected() -> None:
 
 def test_an_interval_holds_what_differs_between_worlds_and_between_trainings() -> None:
     worlds = np.random.default_rng(0).normal(size=400)
-    assert interval(worlds[None])[1] == pytest.approx(1.96 / math.sqrt(400), rel=0.1)
+    assert crossed_mean_interval(worlds[None])[1] == pytest.approx(1.96 / math.sqrt(400), rel=0.1)
     same = np.stack([worlds] * 3)
     apart = same + np.array([-1.0, 0.0, 1.0])[:, None]
-    assert interval(same)[1] == pytest.approx(1.966 / math.sqrt(400), rel=0.1)
-    assert interval(apart)[1] == pytest.approx(4.303 * math.sqrt(1 / 3 + 1 / 400), rel=0.1)
+    assert crossed_mean_interval(same)[1] == pytest.approx(1.966 / math.sqrt(400), rel=0.1)
+    assert crossed_mean_interval(apart)[1] == pytest.approx(
+        4.303 * math.sqrt(1 / 3 + 1 / 400), rel=0.1
+    )
 
 
 def test_scores_are_told_against_the_own_noise_s() -> None:
