@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pandas as pd
 
@@ -18,8 +20,8 @@ LEVELS = {  # of each condition, logarithmic; None where all runs diverge
 CONDITIONS = (("w0", "nominal"), ("w0", "outliers"), ("w1", "nominal"), ("w1", "outliers"))
 
 
-def study(levels: dict[str, tuple[float | None, ...]]) -> dict[ViewKey, dict[str, str]]:
-    """Views of a study of 30 runs in each condition."""
+def make_table(levels: dict[str, tuple[float | None, ...]]) -> pd.DataFrame:
+    """Errors of a study of 30 runs in each condition."""
     rng = np.random.default_rng(3)
     rows = []
     for k, (world, regime) in enumerate(CONDITIONS):
@@ -33,13 +35,16 @@ def study(levels: dict[str, tuple[float | None, ...]]) -> dict[ViewKey, dict[str
                 "unit": "m", "group": "position", "rmse": error, "coverage_50": 0.5, "coverage_90": 0.9,
                 "nees_ratio": 1.0, "ms": 2.0,
             }))  # fmt: skip
-    looks = find_looks(list(levels))
+    return pd.concat(rows, ignore_index=True)
+
+
+def decide(data: pd.DataFrame) -> dict[ViewKey, dict[str, str]]:
+    """Views of a study."""
+    looks = find_looks(list(data["filter"].unique()))
     worlds = {key: PartName(key, key, key) for key in ("w0", "w1")}
     regimes = {key: PartName(key, key, key) for key in ("nominal", "outliers")}
     facts = StudyFacts(looks, worlds, regimes, ReportOptions(), {})
-    views: dict[ViewKey, dict[str, str]] = decide_parts(pd.concat(rows, ignore_index=True), facts)[
-        "views"
-    ]
+    views: dict[ViewKey, dict[str, str]] = decide_parts(data, facts)["views"]
     return views
 
 
@@ -48,7 +53,7 @@ def sentence(views: dict[ViewKey, dict[str, str]], world: str, regime: str) -> s
 
 
 def test_verdicts_of_single_conditions_are_counted() -> None:
-    views = study(LEVELS)
+    views = decide(make_table(LEVELS))
     name = find_looks(["cpso_escape"])["cpso_escape"].name
     text = (
         f"Best proposed method in single conditions, each decided alone: [[{name}]]. "
@@ -61,8 +66,25 @@ def test_verdicts_of_single_conditions_are_counted() -> None:
 
 
 def test_no_count_where_a_proposed_method_has_an_error_in_all_conditions() -> None:
-    views = study(LEVELS | {"mcmc_rpf": (0.4, 0.4, 0.4, 0.4)})
+    views = decide(make_table(LEVELS | {"mcmc_rpf": (0.4, 0.4, 0.4, 0.4)}))
     assert all("single conditions" not in view["sentence"] for view in views.values())
     assert "Best proposed method: " in sentence(views, "all", "all")
-    views = study({"ekf": LEVELS["ekf"], "ukf": LEVELS["mcmc_rpf"]})
+    views = decide(make_table({"ekf": LEVELS["ekf"], "ukf": LEVELS["mcmc_rpf"]}))
     assert all("single conditions" not in view["sentence"] for view in views.values())
+
+
+def test_runs_are_counted_by_condition_and_the_next_filter_has_a_cost() -> None:
+    """One condition has 30 runs and the others 12; the next filter takes twice the time of the baseline."""
+    data = make_table({"ekf": LEVELS["ekf"], "ukf": (0.3, 0.3, 0.3, 0.3)})
+    is_first = data["scenario"].eq("w0") & data["regime"].eq("nominal")
+    data = data[is_first | (data["run"] < 12)]
+    views = decide(data.assign(ms=np.where(data["filter"] == "ukf", 4.0, 2.0)))
+    assert (
+        "30 paired runs per condition"
+        in views[ViewKey("rmse", "w0", "nominal", "ekf")]["small_print"]
+    )
+    assert (
+        "12 to 30 paired runs per condition"
+        in views[ViewKey("rmse", "all", "all", "ekf")]["small_print"]
+    )
+    assert re.search(r"The next, \[\[UKF\]\], is .* above it \(.*\), at about 2 times its cost\.", sentence(views, "all", "all"))  # fmt: skip
