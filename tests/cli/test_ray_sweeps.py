@@ -24,7 +24,7 @@ SWEEP = (
     "run",
     "-m",
     "scenario=linear_walk",
-    "scenario.steps=150",
+    "scenario.steps=1000",  # a cell takes a second or so, many times the interval at which the tests look
     "runs=10",
     "particles=200",
     f"filter={','.join(FILTERS)}",
@@ -119,9 +119,12 @@ def test_a_killed_scheduler_of_ray_is_started_again(
     tmp_path: Path, alone: dict[str, dict[str, np.ndarray]]
 ) -> None:
     pytest.importorskip("ray", reason='needs Ray: pip install "pfbench[ray]"')
+    first = pfbench(*SWEEP[:-1], f"filter={FILTERS[0]}", home=tmp_path)
+    assert first.code == 0, first.err
     words = ("hydra/launcher=ray_local", "hydra.launcher.ray.init.num_cpus=2")
     with started(tmp_path, *words) as sweep:
-        wait(lambda: numbers(tmp_path), sweep)
+        # a worker in its first cell still has to import torch, so that the sweep cannot end before the kill
+        wait(lambda: processes_of(tmp_path, "ray::_run_job"), sweep)
         os.kill(wait(lambda: processes_of(tmp_path, "raylet/raylet"), sweep)[0], signal.SIGKILL)
         assert finish(sweep, tmp_path).count(LOST) == 1
     assert_same(numbers(tmp_path), alone)
