@@ -165,19 +165,6 @@ def plan_look_pairs(looks: Mapping[str, MethodLook]) -> list[tuple[str, str]]:
     return list_planned_pairs(looks, {key: look.baselines for key, look in methods.items()}, tuned)
 
 
-def describe_tuning(looks: Mapping[str, MethodLook]) -> str:
-    """Say how many filters have tuned parameters, and on which data; empty if none has.
-
-    Args:
-        looks: Looks of all filters of a study.
-    """
-    counts = Counter(look.tuning for look in looks.values() if look.tuning)
-    return " ".join(
-        f"Parameters of {number} of {len(looks)} filters were tuned on {tuning}."
-        for tuning, number in sorted(counts.items())
-    )
-
-
 def _parse_look(label: str, block: Mapping[str, Any]) -> MethodLook:
     """Build the look of a label from its node."""
     family = str(block.get("family", ""))

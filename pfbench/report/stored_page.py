@@ -18,8 +18,8 @@ import pyarrow as pa
 from pfbench.config.folders import name_run_command
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.board.decided_parts import StudyFacts, decide_parts
-from pfbench.report.changing_sentences import renew_methods
 from pfbench.report.journal.references import renew_bibliography
+from pfbench.report.methods_facts import MethodsFacts
 from pfbench.report.study_files import list_figure_files
 from pfbench.report.study_page import write_page
 from pfbench.report.verdict_files import format_verdicts
@@ -51,7 +51,7 @@ def read_page_data(folder: Path) -> dict[str, Any]:
         folder: Folder of the report.
 
     Raises:
-        ValueError: If the file is damaged.
+        ValueError: If the file is damaged, or lacks facts of the methods paragraph.
     """
     path = folder / PAGE_DATA
     try:
@@ -64,6 +64,7 @@ def read_page_data(folder: Path) -> dict[str, Any]:
         raise ValueError(
             f"{path} must be the data of a page, got {error}. Run the study and write its report again."
         ) from error
+    MethodsFacts.from_entries(pack.get("methods"), str(path))
     return pack
 
 
@@ -112,7 +113,6 @@ def rebuild_page(folder: Path) -> Path:
     if has_runs := runs.is_file():
         pack = decide_again(pack, runs)
     pack["bibtex"] = renew_bibliography(pack)
-    pack["methods_paragraph"] = renew_methods(pack)
     with RecordedFolder(folder, is_complete=False) as target:
         if has_runs:
             target.write("verdicts.csv", format_verdicts(pack))

@@ -109,7 +109,14 @@ def build_pack(
         "sweeps": [built.sweep()] if filters > 2 else [],
         "replay": "pfbench replay study=invented scenario={world} noise={noise} filter={filter} run={run}",
         "downloads": [{"name": "Verdicts (CSV)", "href": "verdicts.csv", "bytes": 1234, "group": "Numbers"}],
-        "methods_paragraph": "Filters were compared.\n\nOne seed was used.",
+        "methods": {
+            "filters": filters, "scenarios": [f"World {i}" for i in range(worlds)], "worlds": worlds,
+            "regimes": [f"Regime {i}" for i in range(regimes)], "runs": [runs], "steps": [60], "seeds": [1],
+            "particles": {}, "budgets": ["particles"], "metric": "RMS error", "alpha": 0.05, "margin": 0.05,
+            "rounds": 0, "is_recorded": False, "has_threshold": True, "is_complete": not missing, "tuned": {},
+            "software": {name: ["1"] for name in ("pfbench", "commit", "python", "torch", "numpy", "dtype",
+                                                  "device", "threads")},
+        },
         "bibtex": "@misc{a,\n title = {A},\n}",
         "filter_notes": [
             {"filter": key, "particles": "100", "is_exact": i % 2 == 0, "runs": runs, "lost": 0, "diverged": None,

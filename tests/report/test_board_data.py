@@ -12,6 +12,7 @@ from pfbench.report.board import build_pack
 from pfbench.report.board.decided_parts import select_baselines
 from pfbench.report.board.sweeps import read_settings
 from pfbench.report.board.tracks import select_telling_runs
+from pfbench.report.journal.methods_text import write_methods
 from pfbench.report.looks import find_looks
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import load_conditions
@@ -106,7 +107,7 @@ def test_the_level_of_a_report_is_that_of_its_option(results: Path, alpha: float
         assert f"together at {level}" in view["small_print"]
         if "interval" in view["sentence"]:
             assert f"{level} interval" in view["sentence"]
-    assert level in pack["methods_paragraph"]
+    assert level in write_methods(pack)[0]
 
 
 def test_one_baseline_measures_all_filters(results: Path) -> None:

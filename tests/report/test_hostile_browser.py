@@ -26,9 +26,8 @@ EVIL = "\"'><img src=x onerror=window.evil=1></text></svg><svg onload=window.evi
 CONTROLS = ("button", "summary", "[data-dot]", "[data-tip]", "[data-sort]")
 # texts that are shown; all others name a filter, a world or a form
 SHOWN = (
-    "bibtex", "caption", "commit", "direction", "group", "long", "methods_paragraph", "name", "note",
-    "provenance", "question", "reason_missing", "replay", "sentence", "small_print", "study", "title",
-    "unit", "value_unit", "version", "words",
+    "bibtex", "caption", "commit", "direction", "group", "long", "name", "note", "provenance", "question",
+    "reason_missing", "replay", "scenarios", "sentence", "small_print", "study", "title", "unit", "value_unit", "version", "words",
 )  # fmt: skip
 
 

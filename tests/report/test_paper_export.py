@@ -16,16 +16,10 @@ from page_packs import build_pack
 from synthetic_results import study
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report.changing_sentences import (
-    describe_equal_particles,
-    describe_particles,
-    renew_methods,
-)
 from pfbench.report.journal import paper_folder, references
 from pfbench.report.journal.error_columns import format_error_value
 from pfbench.report.journal.figure_style import FigureSetting
 from pfbench.report.journal.main_table import make_main_tables, make_supplement
-from pfbench.report.journal.methods_text import describe_methods
 from pfbench.report.journal.page_format import JOURNALS, SUPERSCRIPTS, find_page_format
 from pfbench.report.journal.pair_table import make_planned_table
 from pfbench.report.journal.paper_folder import (
@@ -43,6 +37,7 @@ from pfbench.report.journal.table_layout import (
     text_cell,
 )
 from pfbench.report.journal.text_width import text_width
+from pfbench.report.methods_facts import collect_methods_facts
 from pfbench.results.conditions import Condition, load_conditions
 
 HOSTILE = {0: r"A_b%$#&{}~^\x", 1: "Kürzel α [2]", 2: "$x^2$ <b>|"}
@@ -63,8 +58,7 @@ def write(
     folder: Path, pack: dict[str, Any], conditions: list[Condition], journal: str, width: str = ""
 ) -> list[str]:
     page = find_page_format(journal, width)
-    paragraphs = describe_methods(conditions, pairs=len(pack["planned"]))
-    pack["methods_paragraph"] = "\n\n".join(paragraphs)
+    pack["methods"] = collect_methods_facts(conditions).to_entries() | {"particles": {}}
     pack["bibtex"] = references.format_bibliography(pack, conditions)
     with RecordedFolder(folder) as target:
         return paper_folder.write_paper(pack, page, target)
@@ -304,65 +298,6 @@ def test_other_formats_compile(
         )  # fmt: skip
     log = (tmp_path / "paper.log").read_text(errors="replace")
     assert [line for line in log.splitlines() if line.startswith(("Overfull", "!"))] == []
-
-
-def test_methods_list_what_was_not_done(conditions: list[Condition]) -> None:
-    done, limits = describe_methods(conditions, pairs=2)
-    assert "4 filters with pfbench in 1 world (flight) under 1 noise regime (surge)" in done
-    assert "2 planned pairs are decided" in done
-    assert "The metric is the RMS error over the time of a run" in done
-    assert "4 Monte Carlo runs of 5 steps" in done
-    assert "commit 0123abc" in done
-    assert limits.startswith("Not done: one seed (5)")
-    assert "simulated" in limits
-    assert "4 runs per condition are fewer than the 10" in limits
-    assert "Times were measured once" in limits
-    for job in (job for condition in conditions for job in condition.jobs):
-        job.meta["step_time"] = {"rounds": [1.0] * 7}
-    done, limits = describe_methods(conditions, pairs=1, metric="CRPS")
-    assert "medians of 7 or more rounds" in done
-    assert "1 planned pair is decided" in done
-    assert "The metric is the CRPS over" in done
-    assert "Times were measured once" not in limits
-    for job in (job for condition in conditions for job in condition.jobs):
-        del job.meta["step_time"]
-
-
-@pytest.mark.parametrize(("numbers", "text", "kind"), [
-    ({"A": [100], "B": [100]}, "100 particles", "equal"),
-    ({"A": [100], "B": [100], "C": [200]}, "100 particles, with these exceptions: 200 (C)", "different"),
-    ({"A": [150], "B": [200]}, "150 (A) and 200 (B) particles", "different"),
-    ({"A": [50, 100], "B": [100, 50]}, "50 or 100 particles", "equal"),
-    ({"A": [64]}, "64 particles", ""),
-])  # fmt: skip
-def test_the_methods_name_filters_with_other_numbers_of_particles(
-    numbers: dict[str, list[int]], text: str, kind: str
-) -> None:
-    """A stored paragraph gets the same sentences, and a second time no other ones."""
-    limit = describe_equal_particles(numbers)
-    end = f": particle filters have {kind} numbers of particles." if kind else "."
-    assert limit == f"The filters were not given equal time{end}"
-    assert describe_particles(numbers) == f"Particle filters used {text}"
-    pack = {
-        "filters": [{"key": name, "name": name} for name in numbers],
-        "filter_notes": [
-            {"filter": name, "particles": " or ".join(map(str, counts))}
-            for name, counts in numbers.items()
-        ],
-        "planned": [{"won": WON}, {}],
-        "methods_paragraph": "Before. Particle filters used 100 or 200 particles. The metric is x. 2 planned pairs are "
-        "decided from the differences of these trimmed means, paired by run.\n\nNot done: y. The filters were not given "
-        "equal time: particle filters have equal numbers of particles. End.",
-    }
-    for _ in range(2):
-        pack["methods_paragraph"] = renew_methods(pack)
-        assert pack["methods_paragraph"] == (
-            f"Before. Particle filters used {text}. The metric is x. 2 planned pairs are decided from "
-            "the differences of these trimmed means, or for 1 of them of the shares of runs won, "
-            f"since tracks are not kept, paired by run.\n\nNot done: y. {limit} End."
-        )
-    pack["planned"] = [{"won": WON}]
-    assert "from the differences of the shares of runs won, since" in renew_methods(pack)
 
 
 def test_each_reference_of_a_filter_has_an_entry_and_each_entry_a_filter() -> None:

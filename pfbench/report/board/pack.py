@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from pfbench.report import provenance
@@ -15,9 +15,9 @@ from pfbench.report.board.pack_entries import (
 )
 from pfbench.report.board.run_table import METRIC_NAMES
 from pfbench.report.board.study_data import StudyData, read_study
-from pfbench.report.journal.methods_text import describe_methods
 from pfbench.report.journal.references import format_bibliography
 from pfbench.report.looks import study_looks, study_part_names
+from pfbench.report.methods_facts import collect_methods_facts
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import Condition, differing_settings
 from pfbench.results.store import list_failures
@@ -69,27 +69,17 @@ def build_pack(
         "tracks": data.tracks,
         "replay": f"pfbench replay study={study} scenario={{world}} noise={{noise}}"
         f"{model} filter={{filter}} run={{run}}",
-        "methods_paragraph": _describe_methods(conditions, options, decided["planned"]),
+        "methods": collect_methods_facts(
+            conditions,
+            alpha=options.alpha,
+            margin=options.equivalence_margin,
+            metric=METRIC_NAMES[options.metric],
+        ).to_entries(),
         **data.notes.to_entries(facts.looks),
         "provenance": [list(row) for row in provenance.list_shared_settings(conditions)],
         "facts": facts.to_entries(),
     }
     return pack | {"bibtex": format_bibliography(pack, conditions)}
-
-
-def _describe_methods(
-    conditions: Sequence[Condition], options: ReportOptions, planned: Sequence[Mapping[str, Any]]
-) -> str:
-    """Describe what was done and what was not, in paragraphs."""
-    paragraphs = describe_methods(
-        conditions,
-        alpha=options.alpha,
-        margin=options.equivalence_margin,
-        pairs=len(planned),
-        won=sum(pair["won"] is not None for pair in planned),
-        metric=METRIC_NAMES[options.metric],
-    )
-    return "\n\n".join(paragraphs)
 
 
 def _describe_differing(conditions: Sequence[Condition]) -> str:

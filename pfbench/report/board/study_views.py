@@ -29,9 +29,9 @@ from pfbench.report.board.run_table import LOG_SCORE, METRIC_NAMES
 from pfbench.report.board.sentence import count_failing, count_words, describe_view
 from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_filters
 from pfbench.report.journal.study_pack import ALL
-from pfbench.report.looks import describe_tuning
 from pfbench.report.options import ReportOptions
 from pfbench.report.setting_names import describe_data_settings, describe_settings
+from pfbench.report.tuning_words import count_tuned, describe_tuning
 from pfbench.results.error_measures import Flags
 from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.step_times import StepTimes
@@ -207,7 +207,11 @@ def _small_print(runs: StudyArrays, options: ReportOptions, names: StudyNames) -
     seeds = np.unique(runs.values["seed"][runs.present])
     level = format_interval_level(options.alpha)
     settings = describe_data_settings([*names.worlds, *names.regimes])
-    texts = (settings, describe_settings(list(names.looks)), describe_tuning(names.looks))
+    texts = (
+        settings,
+        describe_settings(list(names.looks)),
+        describe_tuning(count_tuned(names.looks), len(names.looks)),
+    )
     notes = " ".join(filter(None, texts))
     return (
         f"{count_words(filters, 'filter')}, "

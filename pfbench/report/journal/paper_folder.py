@@ -13,6 +13,7 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.journal.document import format_document, format_methods
 from pfbench.report.journal.figure_style import FigureSetting
 from pfbench.report.journal.main_table import make_main_tables, make_supplement
+from pfbench.report.journal.methods_text import write_methods
 from pfbench.report.journal.page_format import POINTS_PER_INCH, SUPERSCRIPTS, PageFormat
 from pfbench.report.journal.pair_table import make_cost_table, make_planned_table
 from pfbench.report.journal.ratio_figures import (
@@ -93,7 +94,7 @@ def write_paper(
         remarks.append("figures are PDF only: PGF needs pdflatex")
     for name, text in tables.items():
         folder.write(f"{name}.tex", text)
-    folder.write("methods.tex", format_methods(pack["methods_paragraph"].split("\n\n")))
+    folder.write("methods.tex", format_methods(write_methods(pack)))
     folder.write("pfbench.bib", renew_bibliography(pack))
     main = [name for name in tables if "supplement" not in name]
     main.sort(key=lambda name: "{table*}" in tables[name])  # wide floats hold up others

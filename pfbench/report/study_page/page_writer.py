@@ -10,6 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.journal.methods_text import write_methods
 from pfbench.report.study_page.encoding import encode_pack
 from pfbench.report.study_page.equal_time import offer_budgets
 from pfbench.report.study_page.opening import describe_opening, describe_pairs, name_effects
@@ -22,7 +23,7 @@ _OPTIONAL = ("paper_figures", "failures", "definitions", "filter_notes", "choice
 _STATIC = (
     *_OPTIONAL,
     "facts",
-    "methods_paragraph",
+    "methods",
     "bibtex",
     "provenance",
     "downloads",
@@ -31,7 +32,7 @@ _COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
 _SECTIONS = (
     ("planned", "planned", "Planned comparisons"), ("cells", "worlds", "Scenarios"), ("curves", "time", "Over time"),
     ("calibration", "calibration", "Calibration"), ("runs", "runs", "Single runs"), ("sweeps", "sweeps", "Dose and response"),
-    ("paper_figures", "figures", "Figures of the paper"), ("cells", "table", "Table"), ("methods_paragraph", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
+    ("paper_figures", "figures", "Figures of the paper"), ("cells", "table", "Table"), ("methods", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
 )  # fmt: skip
 
 
@@ -57,7 +58,7 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
         "planned": describe_pairs(pack),
         "effects": name_effects(pack),
         "level": _format_level(pack),
-        "methods": [text for text in pack["methods_paragraph"].split("\n\n") if text.strip()],
+        "methods": write_methods(pack),
         "notes": [{**note, "name": names[note["filter"]]} for note in pack["filter_notes"]],
         "choices": pack["choices"],
         "files": _group_files(pack["downloads"]),

@@ -18,7 +18,8 @@ from pfbench.config.paper_files import list_named_parts
 from pfbench.job.tuning import knobs
 from pfbench.job.tuning.candidate_search import SEED_SHIFT, Candidate, choose_candidate
 from pfbench.job.tuning.knobs import KNOBS, Knob, apply_candidate, list_candidates
-from pfbench.report.looks import describe_tuning, find_looks
+from pfbench.report.looks import find_looks
+from pfbench.report.tuning_words import count_tuned, describe_tuning
 from pfbench.results import store
 
 
@@ -91,12 +92,13 @@ def test_tuned_filters_were_not_tuned_on_scored_seeds() -> None:
 def test_reports_say_on_which_data_filters_were_tuned() -> None:
     world = json.loads((job.conf_dir() / "tuning" / "tuned.json").read_text())["world"]
     looks = find_looks(["ekf", "gate_tuned", "huber_tuned"])
-    said = describe_tuning(looks)
+    said = describe_tuning(count_tuned(looks), len(looks))
     assert said.startswith("Parameters of 2 of 3 filters were tuned on flight_500s (")
     for value in (world["model"], f"seed {world['seed']}", f"{world['runs']} runs"):
         assert str(value) in said
     assert ", ".join(world["regimes"]) in said
-    assert describe_tuning(find_looks(["ekf", "gate"])) == ""
+    assert count_tuned(find_looks(["ekf", "gate"])) == {}
+    assert describe_tuning({}, 2) == ""
 
 
 def test_a_search_finds_that_errors_are_larger_than_the_model_says(
