@@ -94,9 +94,13 @@ class ArgumentCheck {
         if (kind(a) == kind<int64_t>()) {  // without a branch, so that many are compared at a time
             const Packed<int64_t> values(a);
             const int64_t count = a.numel();
-            uint64_t largest = 0;
-            for (int64_t i = 0; i < count; ++i) largest = std::max(largest, static_cast<uint64_t>(values.data[i]));
-            valid = count == 0 || largest < static_cast<uint64_t>(size + !is_index);
+            const uint64_t largest = static_cast<uint64_t>(size) - is_index;
+            uint64_t outside = 0;  // its highest bit is that of a value below 0 or of a difference below 0
+            for (int64_t i = 0; i < count; ++i) {
+                const uint64_t value = static_cast<uint64_t>(values.data[i]);
+                outside |= value | (largest - value);
+            }
+            valid = count == 0 || outside >> 63 == 0;
         } else {
             for (const double value : few<double>(a, a.size(0), a.size(1)))
                 valid &= value >= 0 && value <= static_cast<double>(size);  // a comparison with NaN is false
