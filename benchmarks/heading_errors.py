@@ -26,6 +26,7 @@ from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     Filter,
     GaussianFilter,
+    GaussianSplitFilter,
     InvariantFilter,
     ParticleFilter,
     SigmaPointLinearisation,
@@ -41,7 +42,7 @@ STORE = HERE / "heading_errors.json"
 ANGLES = (10, 45, 90, 150)  # deg
 INTERVAL, SAMPLES = 0.5, 10  # s; IMU samples of an interval
 SETTLED = 5.0  # deg
-PARTICLES = 500
+PARTICLES, HEADINGS = 500, 32
 
 
 def tuning(heading_sd: float) -> StrapdownTuning:
@@ -127,6 +128,7 @@ def filters() -> dict[str, Filter]:
         "UKF, alpha 0.3": points[0.3],
         "invariant UKF, left, alpha 0.3": InvariantFilter(points[0.3], "left"),
         f"SIR, {PARTICLES} particles": ParticleFilter(PARTICLES),
+        f"heading RBPF, {HEADINGS} particles": GaussianSplitFilter(ekf, HEADINGS),
     }
 
 

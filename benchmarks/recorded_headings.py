@@ -4,7 +4,8 @@ The recorded start of each run is turned about the vertical by plus or minus the
 deviation of the heading in the filter. Fixes and runs are those of the scenario. Results are kept in
 recorded_headings.json.
 
-Run: python benchmarks/recorded_headings.py [--runs 20]; --page writes the page from the stored results alone.
+Run: python benchmarks/recorded_headings.py [--runs 20]; --page writes the page from the stored results alone, --filter
+NAME adds or replaces the rows of one filter.
 """
 
 from __future__ import annotations
@@ -145,21 +146,39 @@ def page(stored: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def measure_all(names: list[str], runs: int) -> list[dict[str, Any]]:
+    """Return the rows of filters in all scenarios and at all angles."""
+    rows = []
+    for scenario in SCENARIOS:
+        for angle in ANGLES:
+            for name in names:
+                values = measure(scenario, filters()[name], angle, runs)
+                rows.append({"scenario": scenario, "angle": angle, "filter": name, **values})
+                print(rows[-1], flush=True)
+    return rows
+
+
+def write_rows(rows: list[dict[str, Any]], runs: int) -> None:
+    """Store rows in the order of the table."""
+    stored = {(row["scenario"], row["angle"], row["filter"]): row for row in rows}
+    keys = [(s, a, f) for s in SCENARIOS for a in ANGLES for f in filters() if (s, a, f) in stored]
+    rows = [stored[key] for key in keys]
+    STORE.write_text(json.dumps({"runs": runs, "rows": rows}, indent=1) + "\n")
+
+
 def main() -> None:
     """Measure all filters and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--page", action="store_true")
+    parser.add_argument("--filter", choices=filters())
     options = parser.parse_args()
-    if not options.page:
-        rows = []
-        for scenario in SCENARIOS:
-            for angle in ANGLES:
-                for name, method in filters().items():
-                    values = measure(scenario, method, angle, options.runs)
-                    rows.append({"scenario": scenario, "angle": angle, "filter": name, **values})
-                    print(rows[-1], flush=True)
-        STORE.write_text(json.dumps({"runs": options.runs, "rows": rows}, indent=1) + "\n")
+    if options.filter:
+        stored = json.loads(STORE.read_text())
+        rows = [row for row in stored["rows"] if row["filter"] != options.filter]
+        write_rows(rows + measure_all([options.filter], stored["runs"]), stored["runs"])
+    elif not options.page:
+        write_rows(measure_all(list(filters()), options.runs), options.runs)
     (HERE / "recorded_headings.md").write_text(page(json.loads(STORE.read_text())))
 
 

@@ -26,9 +26,9 @@ NEEDS_TRAINING = ("neural_", "kalman_net")  # starts of the names of filters wit
 
 NAMES = [name for name in TEXTS if not name.startswith(NEEDS_TRAINING)]
 
-NEEDS_ATTITUDE = "invariant_ekf"  # refuses a model without one
+NEEDS_ATTITUDE = ("invariant_ekf", "rbpf_heading")  # refuse a model without one
 
-ON_ANY_MODEL = [name for name in NAMES if name != NEEDS_ATTITUDE]
+ON_ANY_MODEL = [name for name in NAMES if name not in NEEDS_ATTITUDE]
 
 
 @cache
@@ -56,13 +56,15 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
         return "at most 20000 points"
     if name == "invariant_ekf" and not hasattr(model, "group_chart"):
         return "filter.chart must be an invariant chart of the model"
+    if name == "rbpf_heading" and "attitude_yaw" not in model.names:
+        return "filter.sampled_states must be groups"
     if name == "dmc_density" and model.noise_gain(first.u) is None:
         return "additive noise"
     if name == "rbpf" and not (model.linear or model.linear_given):
         return "no component that is linear given the rest"
     if _has_far_points(method_of(name), model, record):
         return "must lie within 115 degrees"
-    is_single = not method_past(name) and name != "rbpf" and name not in BRANCHING
+    is_single = not method_past(name) and not name.startswith("rbpf") and name not in BRANCHING
     if record.feedback is not None and not is_single:
         return "scenario with feedback"
     return ""

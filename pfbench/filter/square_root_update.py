@@ -39,6 +39,33 @@ def condition_on(
     return columns, torch.linalg.qr(a[..., rest, :].mT, mode="r")[1].mT
 
 
+def split_root(a: Tensor, components: Sequence[int], sd: float) -> tuple[list[Tensor], Tensor]:
+    """Split the normal vector e = A xi, xi ~ N(0, I), into offsets to be drawn and a remainder.
+
+    e = sum_j c_j z_j + A' xi in distribution, with independent z_j ~ N(0, 1). In the remainder, the
+    standard deviation of each of the components is at most `sd`, and unchanged where it was smaller.
+    Each column c_j is a multiple of the regression of e on its component.
+
+    Args:
+        a: Root A, [..., d, m].
+        components: Components whose variance is split.
+        sd: Standard deviation that remains, positive.
+
+    Returns:
+        Columns c_j, [..., d], and the root A' [..., d, m].
+    """
+    columns = []
+    for i in components:
+        row = a[..., i, :]
+        length = row.norm(dim=-1, keepdim=True)
+        axis = row / length.clamp(min=sd)  # of unit length wherever something is drawn
+        share = (sd / length.clamp(min=sd)).square()
+        column = (a @ axis.unsqueeze(-1)).squeeze(-1)
+        columns.append(torch.sqrt(1.0 - share) * column)
+        a = a - (1.0 - share.sqrt()).unsqueeze(-1) * column.unsqueeze(-1) * axis.unsqueeze(-2)
+    return columns, a
+
+
 def kalman_update_root(root: Tensor, h: Tensor, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Apply the Kalman update of N(0, root root') by r = H l + v, v ~ N(0, I).
 
