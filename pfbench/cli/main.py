@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from importlib import import_module
 
 import pfbench
-from pfbench.cli.messages import format_error, is_refusal, notes_of, suggest_similar
+from pfbench.cli.messages import format_error, notes_of, suggest_similar
 from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import ENVIRONMENT, split_trust
+from pfbench.files.work_start import has_work_started, reset_work
 
 # command: function of the module of the same name, summary
 COMMANDS = {
@@ -36,6 +37,8 @@ pfbench {version}: benchmarks of particle filters in integrated navigation
   pfbench --version          version
   --traceback                print the traceback of an error (or set PFBENCH_TRACEBACK=1)
 
+Exit codes: 0 done, 1 failed after work had started, 2 refused before it, 130 interrupted
+
 First study: pfbench run -m +experiment=quickstart, then pfbench report study=quickstart
 """
 
@@ -47,8 +50,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         argv: Words after `pfbench`. Default: those of the process.
 
     Raises:
-        SystemExit: With code 1 if the command failed, 2 if it does not exist or its words or configuration
-            are not valid, 130 if interrupted.
+        SystemExit: With code 1 if the command failed, 2 if it was refused before its work started
+            (`pfbench.files.work_start`), 130 if interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -81,6 +84,7 @@ def _run_command(command: str, options: Sequence[str]) -> None:
     """Run a command and report its errors."""
     shows_traceback = "--traceback" in options or bool(os.environ.get("PFBENCH_TRACEBACK"))
     words = [word for word in options if word != "--traceback"]
+    reset_work()
     try:
         flag = next((w for w in words if w.startswith("--") and w != "--multirun"), None)
         if flag and command != "run":  # which has the flags of Hydra
@@ -104,7 +108,7 @@ def _run_command(command: str, options: Sequence[str]) -> None:
         for note in notes_of(error):
             print(note, file=sys.stderr)
         print("(add --traceback to see the traceback)", file=sys.stderr)
-        raise SystemExit(2 if is_refusal(error) else 1) from error
+        raise SystemExit(1 if has_work_started() else 2) from error
 
 
 def _usage() -> str:

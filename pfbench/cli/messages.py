@@ -77,17 +77,6 @@ def notes_of(error: BaseException) -> list[str]:
     return list(getattr(error, "__notes__", []))
 
 
-def is_refusal(error: BaseException) -> bool:
-    """Return whether an error is about the words or the configuration of a command, not of a job that ran.
-
-    Args:
-        error: Error of a command.
-    """
-    package = type(error).__module__.partition(".")[0]
-    is_input = isinstance(error, ValueError) or package in ("hydra", "omegaconf")
-    return is_input and not notes_of(error) and type(error).__name__ != "DamagedResultError"
-
-
 def suggest_similar(name: str, options: Sequence[str]) -> str:
     """Return a sentence with the options that are similar to a misspelt name.
 

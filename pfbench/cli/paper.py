@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pfbench.cli.compose import compose_study
 from pfbench.cli.report import check_has_results, find_page_data, make_report_options
@@ -12,6 +12,7 @@ from pfbench.config.composition import JobConfig
 
 if TYPE_CHECKING:
     from pfbench.files.recorded_folder import RecordedFolder
+    from pfbench.report.journal.page_format import PageFormat
 
 HELP = """\
 pfbench paper study=NAME journal=ieee|elsevier|springer [key=value ...]
@@ -45,14 +46,18 @@ def write_study_paper(words: Sequence[str]) -> None:
     config = compose_study([word for word in words if word.partition("=")[0] not in values])
     from pfbench.files.recorded_folder import RecordedFolder
     from pfbench.report.journal.paper_folder import write_paper
+    from pfbench.report.stored_page import read_page_data
 
     study, reports = config.values["study"], Path(config.values["reports_dir"])
     stored = find_page_data(config, words)
     if stored is None:
         check_has_results(study, Path(config.values["results_dir"]))
     with RecordedFolder(reports / study / "paper") as folder:
-        pack = _decide_results(config, folder) if stored is None else _copy_data(stored, folder)
-        remarks = write_paper(pack, page, folder)
+        if stored is None:
+            remarks = _write_of_results(config, page, folder)
+        else:
+            remarks = write_paper(read_page_data(stored.parent), page, folder)
+            _copy_data(stored.parent, folder)
     if stored is not None:
         print(f"note: without results, the paper is made of {stored}")
     for remark in remarks:
@@ -60,26 +65,28 @@ def write_study_paper(words: Sequence[str]) -> None:
     print(f"paper: {(folder.path / 'paper.tex').resolve()}")
 
 
-def _decide_results(config: JobConfig, folder: RecordedFolder) -> dict[str, Any]:
-    """Decide the results of a study, write the values of all views and runs, and return the data."""
-    from pfbench.report.verdict_files import write_report_data
+def _write_of_results(config: JobConfig, page: PageFormat, folder: RecordedFolder) -> list[str]:
+    """Write the paper of the results of a study with the values of all views and runs; return remarks."""
+    from pfbench.report.board import build_pack, read_study
+    from pfbench.report.journal.paper_folder import write_paper
+    from pfbench.report.verdict_files import write_verdict_files
     from pfbench.results.conditions import load_conditions
 
     study, results = config.values["study"], config.values["results_dir"]
     options = make_report_options(config)
     conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
-    return write_report_data(study, conditions, options, folder)
+    data = read_study(conditions, options)
+    pack = build_pack(study, conditions, options, data)
+    remarks = write_paper(pack, page, folder)
+    write_verdict_files(pack, data.table, folder)
+    return remarks
 
 
-def _copy_data(stored: Path, folder: RecordedFolder) -> dict[str, Any]:
-    """Copy the values of all views and runs that git stores with the data of a page, and return the data."""
-    from pfbench.report.stored_page import read_page_data
-
-    pack = read_page_data(stored.parent)
+def _copy_data(report: Path, folder: RecordedFolder) -> None:
+    """Copy the values of all views and runs that git stores with the data of a page."""
     for name in ("verdicts.csv", "runs.parquet"):
-        if (stored.parent / name).is_file():
-            folder.write(name, (stored.parent / name).read_bytes())
-    return pack
+        if (report / name).is_file():
+            folder.write(name, (report / name).read_bytes())
 
 
 def _value(words: Sequence[str], key: str) -> str:

@@ -12,6 +12,7 @@ from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error, suggest_similar
 from pfbench.config.composition import JobConfig, compose
 from pfbench.config.folders import experiments_dir, name_run_command
+from pfbench.files.work_start import start_work
 
 HELP = """\
 pfbench report study=NAME [key=value ...]
@@ -157,6 +158,7 @@ def _report_all(words: list[str]) -> None:
     pages = [path for name in _PAGES for path in reports.glob(f"*/{name}")]
     published = {path.parent.name for path in pages} - set(_NOT_STUDIES)
     failed = []
+    start_work()  # a report that is refused stops no other
     for study in sorted(studies):
         has_experiment = (experiments_dir() / f"{study}.yaml").exists()
         choice = f"+experiment={study}" if has_experiment else f"study={study}"

@@ -23,6 +23,7 @@ from pfbench.config.folders import conf_dir
 from pfbench.config.named_sets import expand_filter_sets
 from pfbench.config.sweep_check import check_words
 from pfbench.config.trust import ENVIRONMENT
+from pfbench.files.work_start import start_work
 
 HELP = """\
 pfbench run [-m] key=value ...
@@ -229,6 +230,7 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
         except Exception as error:
             if not _LOST_PROCESS & {parent.__name__ for parent in type(error).__mro__}:
                 raise
+            start_work()
             if not remaining:
                 packages = os.environ.get(ENVIRONMENT)
                 trusted = [f"trust=[{packages}]"] if packages else []

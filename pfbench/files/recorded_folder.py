@@ -12,6 +12,7 @@ from typing import Any, Self
 from pfbench.files.atomic_write import set_aside, write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
 from pfbench.files.git_files import list_unchanged_in_git
+from pfbench.files.work_start import start_work
 
 MANIFEST = "manifest.json"
 _SHOWN = 3  # names in a warning at most
@@ -83,6 +84,7 @@ class RecordedFolder:
             raise ValueError(
                 f"{target.parent} must be a folder, got a link. Remove the link, or choose another folder."
             )
+        start_work()
         plain = content.encode() if isinstance(content, str) else content
         digest = hash_content(plain)
         expected = (digest, self._previous.get(name), self._written.get(name))

@@ -14,6 +14,7 @@ from torch import Tensor
 from pfbench.config.composition import CHOICES, JobConfig, resolve_config
 from pfbench.core.record import Episode
 from pfbench.files.atomic_write import set_aside
+from pfbench.files.work_start import start_work
 from pfbench.filter.learned.checkpoint import checkpoint_provenance
 from pfbench.job.allocation import EpisodeSource, apply_budget, max_runs_in_memory
 from pfbench.job.filter_pass import TimedFilterPass, pass_filter
@@ -68,7 +69,7 @@ def run(
         The outcome.
 
     Raises:
-        ValueError: If a value of the configuration is invalid. Nothing is written for a job alone.
+        Exception: If the configuration or the data are not valid. Nothing is written for a job alone.
         Exception: If the job fails. The traceback is written to `<key>.failed.json` in the folder
             of the results, which a note of the error names.
     """
@@ -110,10 +111,10 @@ def _compute_or_note(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Compute a job, and write a note if it fails.
 
-    A job alone whose configuration or data are not valid is refused and leaves no note. The report of a
+    A job alone without a plan or data is refused and leaves no note, whatever the error. The report of a
     sweep states all jobs that it lacks.
     """
-    plan = episodes = None
+    episodes = None
     try:
         plan = build_plan(config)
         episodes = EpisodeSource(plan)
@@ -121,8 +122,7 @@ def _compute_or_note(
             announce()
         return compute_job(plan, name, episodes)
     except Exception as error:
-        is_refused = plan is None or (episodes is None and isinstance(error, ValueError | OSError))
-        if is_alone and is_refused:
+        if is_alone and episodes is None:
             raise
         choices = {group: config.choices[group] for group in CHOICES}
         note = store.write_failure(path, choices, error)
@@ -150,11 +150,12 @@ def compute_job(
         ValueError: If a single run does not fit into memory, or if runs that are drawn in batches
             have different durations.
     """
+    episodes = episodes or EpisodeSource(plan)
+    start_work()
     values, total = plan.values, len(plan.runs)
     trained = checkpoint_provenance(
         values["filter"], plan.config.choices["scenario"], values["seed"], plan.runs
     )
-    episodes = episodes or EpisodeSource(plan)
     plan, allocation = apply_budget(plan, episodes)
     size = max_runs_in_memory(plan, episodes)
     pcrb = _timed_pcrb(plan, episodes.joint, plan.runs) if episodes.joint else None

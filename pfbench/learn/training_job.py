@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from pfbench.files.work_start import start_work
 from pfbench.filter.learned import checkpoint
 from pfbench.filter.learned.objectives import TrainableFilter
 from pfbench.learn.trainer import TrainingState
@@ -59,6 +60,7 @@ def train(
     resume_file = path.with_name(path.name + ".part")
     state = TrainingState(training, method, model, data)
     progress = state.restore(resume_file)
+    start_work()
     write_board = open_tensorboard(path)
     with tqdm(
         total=training.epochs, initial=progress.epoch, desc="training", unit="epoch",

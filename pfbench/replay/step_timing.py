@@ -13,6 +13,7 @@ import torch
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.files.work_start import start_work
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
@@ -99,6 +100,7 @@ def time_condition(
     """
     steps = _count_steps(condition.jobs, seconds)
     tasks = _build_tasks(condition.jobs, changes, steps)
+    start_work()
     for task in tasks:
         task.measure()
     times: list[list[tuple[float, float]]] = [[] for _ in tasks]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import cost, provenance, writers
-from pfbench.report.board import read_study
+from pfbench.report.board import build_pack, read_study
 from pfbench.report.journal.headline import write_headline
 from pfbench.report.looks import study_looks
 from pfbench.report.options import ReportOptions
@@ -16,7 +16,7 @@ from pfbench.report.plots.plotting import line_styles
 from pfbench.report.stored_page import write_page_data
 from pfbench.report.study_files import list_figure_files, write_study_files
 from pfbench.report.study_page import write_page
-from pfbench.report.verdict_files import write_report_data
+from pfbench.report.verdict_files import write_verdict_files
 from pfbench.results.conditions import (
     Condition,
     load_conditions,
@@ -60,9 +60,10 @@ def write_report(
     drawings = paper_figures.paper_figures(
         study, conditions, style, options.paper_figures, options.start_time_s
     )
+    data = read_study(conditions, options, has_metrics=True)
+    pack = build_pack(study, conditions, options, data)
     with RecordedFolder(Path(out) / study) as folder:
-        data = read_study(conditions, options, has_metrics=True)
-        pack = write_report_data(study, conditions, options, folder, data)
+        pack["downloads"] = write_verdict_files(pack, data.table, folder)
         pack["downloads"] += write_study_files(data.metrics, conditions, options, folder)
         pack["provenance"] += list_job_settings(conditions, options.planned)
         pack |= {

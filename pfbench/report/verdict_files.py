@@ -3,42 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import pandas as pd
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report.board.pack import build_pack
 from pfbench.report.board.pack_entries import ViewKey
-from pfbench.report.board.study_data import StudyData, read_study
-from pfbench.report.options import ReportOptions
 from pfbench.report.table_formats import format_csv
-from pfbench.results.conditions import Condition
-
-
-def write_report_data(
-    study: str,
-    conditions: Sequence[Condition],
-    options: ReportOptions,
-    folder: RecordedFolder,
-    data: StudyData | None = None,
-) -> dict[str, Any]:
-    """Build the data of a report and write its files.
-
-    Args:
-        study: Name of the study.
-        conditions: Conditions of the study.
-        options: Options of the report.
-        folder: Target folder.
-        data: Data of the results, None to read them.
-
-    Returns:
-        Data for `study_page.write_page` and `journal.write_paper`.
-    """
-    data = data or read_study(conditions, options)
-    pack = build_pack(study, conditions, options, data)
-    return pack | {"downloads": write_verdict_files(pack, data.table, folder)}
 
 
 def write_verdict_files(

@@ -18,6 +18,7 @@ import numpy as np
 
 from pfbench.files.atomic_write import remove_temporary_files, write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+from pfbench.files.work_start import start_work
 from pfbench.results.result_format import FORMAT, check_arrays, check_metadata
 
 # values of the key `budget`
@@ -68,6 +69,7 @@ def write_result(path: str | Path, meta: Mapping[str, Any], data: Mapping[str, A
     # Unsorted, since the order of the groups is that of the last axis of nees.
     text = np.array(json.dumps(full))
     digest = np.array(hash_content({"meta": text, **plain}))
+    start_work()
     _write(path, lambda file: np.savez_compressed(file, meta=text, digest=digest, **plain))
     _note(path).unlink(missing_ok=True)
     remove_temporary_files(path)

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pfbench.cli.messages import format_error, notes_of
+from pfbench.files.work_start import start_work
 
 log = logging.getLogger("pfbench")
 
@@ -70,6 +71,8 @@ def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
         A reference to the lines of the jobs, if they were printed in the same terminal. Else the
         error itself.
     """
+    if isinstance(error, SweepJobError):
+        start_work()  # a job that cannot start fails in a sweep: the other jobs run
     launcher = next((w.partition("=")[2] for w in words if w.startswith("hydra/launcher=")), "")
     if not isinstance(error, SweepJobError) or launcher in _OTHER_TERMINAL:
         return error

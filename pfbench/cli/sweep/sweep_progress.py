@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pfbench.cli.sweep.study_plan import StudyPlan
+from pfbench.files.work_start import start_work
 
 SWEEP_JOBS = "PFBENCH_SWEEP_JOBS"  # environment variable: number of jobs, for the counter
 SWEEP_LOG = "PFBENCH_SWEEP_LOG"  # environment variable: file to which each job appends its outcome
@@ -59,6 +60,8 @@ class SweepProgress:
         """
         os.environ.pop(SWEEP_JOBS, None)
         os.environ.pop(SWEEP_LOG, None)
+        if is_complete or self._log.is_file():
+            start_work()  # in another process, for most launchers
         if self.study is None or self.jobs is None:
             return
         counts = self._count_outcomes() or self._count_files(is_complete)

@@ -81,9 +81,14 @@ class GrowingSweep:
                 f"number of particles at each look, got {values['budget']}. Use budget=particles."
             )
         check_main_metric(values["report"]["metric"])
-        schedule = LookSchedule(settings["mode"], settings["max_runs"])
+        schedule, jobs = LookSchedule(settings["mode"], settings["max_runs"]), plan.compose_jobs()
+        if all(config.values["filter"] == jobs[0].values["filter"] for config in jobs):
+            raise ValueError(
+                "filter must be at least two filters with runs=until-decided, got one per condition. "
+                "Add a filter (filter=ekf,sir), or set a number of runs."
+            )
         return cls(
-            str(values["study"]), Path(values["results_dir"]), tuple(plan.compose_jobs()),
+            str(values["study"]), Path(values["results_dir"]), tuple(jobs),
             schedule, hours, values["overwrite"] or values["pcrb"] is True, values["report"],
         )  # fmt: skip
 
@@ -200,11 +205,6 @@ class GrowingSweep:
         from pfbench.results.study_decisions.main_metrics import RULES
         from pfbench.results.until_decided.pair_states import decide_pairs
 
-        if not table.pairs:
-            raise ValueError(
-                "filter must be at least two filters with runs=until-decided, got one per condition. "
-                "Add a filter (filter=ekf,sir), or set a number of runs."
-            )
         runs, required = table.runs["run"].nunique(), self.schedule.runs[0]
         if runs < required:
             raise ValueError(
