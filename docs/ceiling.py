@@ -69,6 +69,8 @@ LEFT_OUT = {
     "steps, too long for this script. Their shorter or slower variants are in the table.",
     "`azimuth_constant_errors`, `sar_flight_constant_errors`": "all runs have the same initial errors, which are not "
     "drawn from the initial distribution of the model. The limits of a mean over runs do not hold then.",
+    "`terrain`, `terrain_fixed_wing`": "the smoothers have one mode. The exact filter is in "
+    "[robustness.md](robustness.md#terrain-referenced-navigation).",
     "`user_log`": "the data are of the user.",
 }
 

@@ -42,7 +42,7 @@ def method_of(name: str) -> Any:
 
 DENSE = ("mcmc_bridge", "mcmc_rpf_printed", "mcmc_tail")
 
-BRANCHING = ("gpb1", "imm", "gaussian_sum", "rbpf_discrete")
+BRANCHING = ("gpb1", "imm", "gaussian_sum", "rbpf_discrete", "ekf_bank", "ekf_bank_dense")
 
 REMEMBERING = ("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf")
 

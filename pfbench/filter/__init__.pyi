@@ -90,6 +90,7 @@ from pfbench.filter.loop import (
     run_filter as run_filter,
 )
 from pfbench.filter.manifold.chart_filter import InvariantFilter as InvariantFilter
+from pfbench.filter.marginal.filter_bank import FilterBank as FilterBank
 from pfbench.filter.marginal.gaussian_split import GaussianSplitFilter as GaussianSplitFilter
 from pfbench.filter.marginal.rao_blackwellised import (
     RaoBlackwellisedFilter as RaoBlackwellisedFilter,

@@ -53,6 +53,16 @@ from pfbench.model.strapdown.tuning import (
     StrapdownTuning as StrapdownTuning,
     TightTuning as TightTuning,
 )
+from pfbench.model.terrain.random_terrain import (
+    RandomTerrain as RandomTerrain,
+    TerrainWaves as TerrainWaves,
+    compute_elevation as compute_elevation,
+    compute_slope as compute_slope,
+)
+from pfbench.model.terrain.terrain_aided import (
+    TerrainAided as TerrainAided,
+    TerrainInputs as TerrainInputs,
+)
 from pfbench.model.textbook import (
     Benes as Benes,
     StochasticVolatility as StochasticVolatility,

@@ -38,3 +38,4 @@ from pfbench.scenario.recorded.urban_log import (
 )
 from pfbench.scenario.recording_regime import RecordingRegime as RecordingRegime
 from pfbench.scenario.simulated_flight import SimulatedFlight as SimulatedFlight
+from pfbench.scenario.terrain_flight import TerrainFlight as TerrainFlight

@@ -82,7 +82,13 @@ WORLDS = (
     *("linear_walk", "local_level", "benes", "growth", "lorenz63", "pendulum"),
     *("stochastic_volatility", "passive_1", "gps_ins", "flight_500s", "sar_flight", "anshun_fit"),
     *("anshun_nl", "azimuth", "azimuth_closed_loop", "azimuth_small", "flight_300s_closed_loop"),
-    *("recorded_berlin", "recorded_car_drive", "recorded_fixed_wing_aided", "recorded_walk"),
+    *(
+        "recorded_berlin",
+        "recorded_car_drive",
+        "recorded_fixed_wing_aided",
+        "recorded_walk",
+        "terrain",
+    ),
 )
 
 

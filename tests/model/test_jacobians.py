@@ -27,6 +27,7 @@ STATED = {
     "growth": BOTH, "stochastic_volatility": {"propagation_jacobian"}, "pendulum": BOTH, "lorenz63": BOTH,
     "linear_walk": BOTH, "passive_1": {"propagation_jacobian"}, "flight_300s": BOTH,
     "anshun_short": {"propagation_jacobian"}, "azimuth": {"observation_jacobian"},
+    "terrain": BOTH,
 }  # fmt: skip
 
 

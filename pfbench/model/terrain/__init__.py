@@ -1,0 +1,1 @@
+"""Navigation by the height of the terrain below a vehicle."""
