@@ -17,7 +17,7 @@ function heads() {
     },
     {
       key: "ratio",
-      text: `÷ ${innerWidth <= 640 ? baseline : cut(baseline, 18)}`,
+      text: `÷ ${baseline}`,
       small: "with interval",
       value: (row) => row.ratio,
     },

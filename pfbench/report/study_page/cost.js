@@ -12,7 +12,8 @@ function drawCost(part) {
   if (rows.length < 2) return;
   const width = widthOf(part);
   const height = Math.min(520, Math.max(340, 0.95 * width));
-  const [left, right, top, bottom] = [46, 10, 14, 40];
+  const axis = wrap(`error ÷ ${looks[state.baseline].name} (log) → worse`, height - 40, 11);
+  const [left, right, top, bottom] = [34 + 12 * axis.length, 10, 14, 40];
   const ratios = rows.map((row) => row.ratio).sort((a, b) => a - b);
   const ends = rows.flatMap((row) => [row.ratio, row.ratio_low, row.ratio_high]).filter((v) => v > 0);
   const usual = ratios[Math.floor(0.9 * (ratios.length - 1))];
@@ -32,7 +33,12 @@ function drawCost(part) {
     "ms per step (log) → dearer",
     ' class="axis" text-anchor="middle"',
   );
-  content += `<text class="axis" transform="translate(11 ${(top + height - bottom) / 2}) rotate(-90)" text-anchor="middle">${esc(`error ÷ ${cut(looks[state.baseline].name, 20)} (log) → worse`)}</text>`;
+  content += axis
+    .map(
+      (text, k) =>
+        `<text class="axis" transform="translate(${11 + 12 * k} ${height / 2}) rotate(-90)" text-anchor="middle">${esc(text)}</text>`,
+    )
+    .join("");
   const front = frontOf(rows);
   const path = front
     .map((row, k) => (k ? `H${px(x(row.ms))}V${px(inside(row.ratio))}` : `M${px(x(row.ms))} ${px(inside(row.ratio))}`))

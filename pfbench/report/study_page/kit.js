@@ -126,19 +126,47 @@ function yAxis(ticks, scale, left, right, format = tidy) {
     .join("");
 }
 
-// Names cut to a width, with the whole name in the tooltip of the mark.
-const cut = (text, letters) => (text.length > letters ? `${text.slice(0, letters - 1)}…` : text);
-// Width of a text, and a text cut to a width, in px. Fonts differ between systems, so that it is measured.
+// Width of a text in px. Fonts differ between systems, so that it is measured.
 const pen = document.createElement("canvas").getContext("2d");
 function textWidth(text, size = 12, bold = false) {
   pen.font = `${bold ? 700 : 400} ${size}px system-ui, "Segoe UI", Roboto, "DejaVu Sans", Arial, sans-serif`;
   return pen.measureText(text).width;
 }
-function fit(text, width, size = 12, bold = false) {
-  let letters = text.length;
-  while (letters > 1 && textWidth(cut(text, letters), size, bold) > width) letters--;
-  return cut(text, letters);
+// Lines of a text, none wider than the width, broken at blanks or, in a longer word, between letters. Nothing is left out.
+function wrap(text, width, size = 12, bold = false) {
+  const lines = [""];
+  const fits = (line) => textWidth(line, size, bold) <= width;
+  for (const word of String(text).split(" ")) {
+    const last = lines.length - 1;
+    const joined = lines[last] ? `${lines[last]} ${word}` : word;
+    if (fits(joined)) {
+      lines[last] = joined;
+      continue;
+    }
+    if (lines[last]) lines.push("");
+    for (const letter of word) {
+      if (lines[lines.length - 1] && !fits(lines[lines.length - 1] + letter)) lines.push("");
+      lines[lines.length - 1] += letter;
+    }
+  }
+  return lines;
 }
+// A label of some lines around a height.
+const block = (x, y, lines, size, more = "", bold = false) =>
+  lines
+    .map((text, k) =>
+      label(x, y + 4 + (size + 1) * (k - (lines.length - 1) / 2), text, ` style="font-size:${size}px"${bold ? ' class="strong"' : ""}${more}`),
+    )
+    .join("");
+// Column of the names of looks: its width, at most a share of the figure, and the height of a row.
+function nameColumn(shown, width, size, least) {
+  const widest = Math.max(...shown.map((look) => textWidth(look.name, size, look.proposed)));
+  const column = Math.ceil(Math.min(widest + 14, 0.45 * width));
+  const most = Math.max(...shown.map((look) => wrap(look.name, column - 12, size, look.proposed).length));
+  return [column, Math.max(least, most > 1 ? (size + 1) * most + 3 : 0)];
+}
+const nameLabel = (look, x, y, column, size, more = "") =>
+  block(x, y, wrap(look.name, column - 12, size, look.proposed), size, more, look.proposed);
 // Heights of labels, moved apart so that none covers another.
 function spread(heights, gap, low, high) {
   const order = heights.map((y, k) => [y, k]).sort((a, b) => a[0] - b[0]);

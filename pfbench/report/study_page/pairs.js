@@ -23,7 +23,12 @@ function drawForest(part) {
 function forest(part, pairs, { shown, show, end, none, less, more }) {
   const width = widthOf(part);
   const narrow = width < 800;
-  const [left, right] = narrow ? [8, 8] : [Math.min(310, width * 0.27), 290];
+  const wordsOf = (pair) => {
+    const range = pair.low !== null && pair.high !== null ? `[${end(pair.low)}, ${end(pair.high)}]` : "";
+    return [show(pair.estimate), range, pair.word].filter(Boolean).join(" ");
+  };
+  const widest = Math.max(...pairs.map((pair) => textWidth(wordsOf(pair), 11.5)));
+  const [left, right] = narrow ? [8, 8] : [Math.min(310, width * 0.27), Math.ceil(widest) + 16];
   const ends = pairs
     .flatMap((pair) => [
       pair.low,
@@ -45,8 +50,9 @@ function forest(part, pairs, { shown, show, end, none, less, more }) {
     const kind = { tuned: "against tuned baselines", paper: "against the baselines of the paper" }[pair.kind];
     const group = narrow && kind ? `A${kind.slice(1)}` : [pair.question, ...(kind ? [kind] : [])].join(", ");
     if (group !== question) {
-      content += label(0, y + 12, fit(group, width, 12, true), ' class="strong"');
-      y += 22;
+      const titles = wrap(group, width, 12, true);
+      content += block(0, y + 8 + 6.5 * (titles.length - 1), titles, 12, "", true);
+      y += 9 + 13 * titles.length;
       question = group;
     }
     const [a, b] = [looks[pair.a], looks[pair.b]];
@@ -55,26 +61,29 @@ function forest(part, pairs, { shown, show, end, none, less, more }) {
     const range = known ? `[${end(pair.low)}, ${end(pair.high)}]` : `(${pair.reason})`;
     const words = `${show(pair.estimate)} ${range}`;
     const small = pair.cells.filter((cell) => shown(cell.estimate));
-    const rise = narrow ? 16 : 0;
+    const verdict = `${show(pair.estimate)} ${pair.word}`;
+    const size = narrow ? 11.5 : 12;
+    const lines = wrap(names, narrow ? width - left - textWidth(verdict, 11.5) - 10 : left - 12, size);
+    const rise = narrow ? 3.5 + 12.5 * lines.length : 0;
     const step = Math.min(5, 40 / Math.max(1, small.length));
-    const height = Math.max(30, 20 + step * small.length) + rise;
-    const middle = y + rise + 11;
+    const height = Math.max(30, 20 + step * small.length, narrow ? 0 : 13 * lines.length + 6) + rise;
+    const middle = y + rise + (narrow ? 11 : Math.max(11, 6.5 * lines.length + 2));
     if (narrow)
       content +=
-        label(left, y + 12, fit(names, width - 150, 11.5), ' style="font-size:11.5px"') +
+        block(left, y + 8 + 6.25 * (lines.length - 1), lines, size) +
         label(
           width,
           y + 12,
-          `${show(pair.estimate)} ${pair.word}`,
+          verdict,
           ` text-anchor="end" style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`,
         );
     else
       content +=
-        label(left - 12, middle + 4, fit(names, left - 12), ' text-anchor="end"') +
+        block(left - 12, middle, lines, size, ' text-anchor="end"') +
         label(
           width - right + 12,
           middle + 4,
-          `${known ? words : show(pair.estimate)} ${pair.word}`,
+          wordsOf(pair),
           ` style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`,
         );
     content += `<g${spoken(`${group}. ${names}: ${words}, ${pair.word}. ${plain(pair.sentence)}`)}><rect x="${left}" y="${px(y + rise)}" width="${px(width - left - right)}" height="${px(height - rise - 4)}" fill="transparent"/>`;
@@ -118,7 +127,10 @@ function drawSweeps(part) {
 function drawSweep(panel, sweep) {
   const width = widthOf(panel);
   const height = 260;
-  const [left, right, top, bottom] = [48, 110, 24, 38];
+  const title = wrap(`${named(data.worlds, sweep.world)}${sweep.regime ? `, ${named(data.regimes, sweep.regime)}` : ""}`, width, 12, true);
+  const ends = sweep.lines.map((item) => ({ ...looks[item.filter], name: item.name }));
+  const [right, gap] = nameColumn(ends, width, 11, 13);
+  const [left, top, bottom] = [48, 11 + 13 * title.length, 38];
   const points = sweep.lines.flatMap((line) => line.points).filter((point) => point.value > 0);
   if (!points.length) return;
   const xs = points.map((point) => point.x);
@@ -129,15 +141,10 @@ function drawSweep(panel, sweep) {
   const x = (logX ? logarithmic : linear)(xLow, xHigh === xLow ? xLow + 1 : xHigh, left + 6, width - right);
   const y = logarithmic(yLow, yHigh, height - bottom, top);
   const ticks = [...new Set(xs)].length <= 7 ? [...new Set(xs)] : (logX ? logTicks : linearTicks)(xLow, xHigh, 6);
-  const format = sweep.ticks ? (v) => cut(sweep.ticks[v] ?? "", 14) : tidy;
+  const format = sweep.ticks ? (v) => sweep.ticks[v] ?? "" : tidy;
   let content =
     xAxis(sweep.ticks ? sweep.ticks.map((_, k) => k) : ticks, x, top, height - bottom, format) + yAxis(logTicks(yLow, yHigh, 6), y, left, width - right);
-  content += label(
-    0,
-    12,
-    fit(`${named(data.worlds, sweep.world)}${sweep.regime ? `, ${named(data.regimes, sweep.regime)}` : ""}`, width, 12, true),
-    ' class="strong"',
-  );
+  content += block(0, 8 + 6.5 * (title.length - 1), title, 12, "", true);
   content += label(
     (left + width - right) / 2,
     height - 6,
@@ -149,7 +156,7 @@ function drawSweep(panel, sweep) {
     .filter(([, values]) => values.length);
   const heights = spread(
     lines.map(([, values]) => y(values[values.length - 1].value)),
-    13,
+    gap,
     top,
     height - bottom,
   );
@@ -161,12 +168,7 @@ function drawSweep(panel, sweep) {
         content += `<line class="c${look.index}" x1="${px(x(point.x))}" x2="${px(x(point.x))}" y1="${px(y(point.low))}" y2="${px(y(point.high))}" stroke="var(--c)" stroke-opacity=".5"/>`;
       content += `<g${spoken(`${look.name}, ${sweep.name} ${format(point.x)}: ${short(point.value)} ${sweep.value_unit || ""} ${interval(point.low, point.high)}`)}>${mark(look, x(point.x), y(point.value), 4)}</g>`;
     }
-    content += label(
-      width - right + 8,
-      heights[k] + 4,
-      fit(look.name, right - 8, 11, look.proposed),
-      ` style="font-size:11px"${look.proposed ? ' class="strong"' : ""}`,
-    );
+    content += nameLabel(look, width - right + 8, heights[k], right, 11);
   });
   panel.innerHTML = `${svg(width, height, content, sweep.caption || `${sweep.name} and error`, "group")}<p class="note">${esc(sweep.caption || "")}</p>`;
 }

@@ -19,7 +19,8 @@ function drawRuns(part) {
     return;
   }
   const width = widthOf(part);
-  const [left, right, top, rowHeight] = [124, 46, 8, 19];
+  const [left, rowHeight] = nameColumn(filters, width, 11.5, 19);
+  const [right, top] = [46, 8];
   const bottom = top + rowHeight * filters.length;
   const values = filters
     .flatMap((look) => runValues(look.key))
@@ -45,12 +46,7 @@ function drawRuns(part) {
   if (filters.some((look) => runValues(look.key).includes(null)))
     content += label(width - right + 24, bottom + 14, "lost", ' class="axis" text-anchor="middle"');
   filters.forEach((look, k) => {
-    content += label(
-      left - 8,
-      level(k) + 4,
-      fit(look.name, left - 8, 11.5, look.proposed),
-      ` text-anchor="end" style="font-size:11.5px"${look.proposed ? ' class="strong"' : ""}`,
-    );
+    content += nameLabel(look, left - 8, level(k), left, 11.5, ' text-anchor="end"');
     const circles = runValues(look.key)
       .map((v, j) => `<circle cx="${px(place(v))}" cy="${px(level(k))}" r="3.4" data-dot="${k} ${j}"/>`)
       .join("");

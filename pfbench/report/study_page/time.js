@@ -1,10 +1,13 @@
 // Error over time: medians of all runs, or one run. The names stand at the end of the lines.
-function curveFigure(part, { t, lines, band = null, head, unit, height = 360, caption, isLog = true }) {
+function curveFigure(part, { t, lines, band = null, head, unit, height: least = 360, caption, isLog = true }) {
   const width = widthOf(part);
   const shown = lines.filter((item) => item.values.some((v) => v !== null && (!isLog || v > 0)));
   if (!shown.length) return void (part.innerHTML = '<p class="note">Select a filter.</p>');
   const narrow = width < 560;
-  const [left, right, top, bottom] = [50, narrow ? 96 : 150, 22, 36];
+  const hasNames = shown.length <= 40;
+  const [right, gap] = hasNames ? nameColumn(shown.map((item) => item.look), width, 11, 12.5) : [20, 0];
+  const [left, top, bottom] = [50, 22, 36];
+  const height = Math.max(least, top + bottom + gap * shown.length);
   const usable = (v) => v !== null && v !== undefined && (!isLog || v > 0);
   const all = [...shown.flatMap((item) => item.values), ...(band ? [...band.low, ...band.high] : [])].filter(usable);
   let [low, high] = [Math.min(...all), Math.max(...all)];
@@ -37,15 +40,14 @@ function curveFigure(part, { t, lines, band = null, head, unit, height = 360, ca
     content += `<path class="c${band.look.index}" d="${trace(band.high)}${back}Z" fill="var(--c)" fill-opacity=".14"/>`;
   }
   const last = shown.map((item) => [...item.values].reverse().find(usable));
-  const heights = spread(last.map(y), 12.5, top, height - bottom);
+  const heights = spread(last.map(y), gap, top, height - bottom);
   shown.forEach((item, k) => {
     const words = `${item.look.name}: at the end ${short(last[k], 2)} ${unit}`;
     const dash = item.look.proposed ? "" : ' stroke-dasharray="5 3"';
     content += `<path class="c${item.look.index}" d="${trace(item.values)}" fill="none" stroke="var(--c)" stroke-width="${item.bold ? 3 : 1.7}"${dash}${spoken(words)}/>`;
     const end = item.values.length - 1 - [...item.values].reverse().findIndex(usable);
     content += mark(item.look, x(t[end]), y(last[k]), 3.6);
-    if (shown.length <= 40)
-      content += `<text class="${item.look.proposed ? "strong" : ""}" x="${px(width - right + 12)}" y="${px(heights[k] + 4)}" style="font-size:11px">${esc(fit(item.look.name, right - 12, 11, item.look.proposed))}</text>`;
+    if (hasNames) content += nameLabel(item.look, width - right + 12, heights[k], right, 11);
   });
   content += `<line class="cross" y1="${top}" y2="${height - bottom}" stroke="var(--faint)" visibility="hidden"/>`;
   part.innerHTML = svg(

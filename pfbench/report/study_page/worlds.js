@@ -10,22 +10,23 @@ function drawWorlds(part) {
 function drawWorld(panel, world) {
   const cells = data.cells.filter((cell) => cell.world === world.key && single(cell));
   const width = widthOf(panel);
-  const [left, right, top] = [width < 340 ? 118 : 150, 10, 22];
   const step = cells.length > 1 ? 7 : 0;
-  const rowHeight = Math.max(17, 6 + step * cells.length);
   const filters = order();
+  const title = wrap(world.name, width, 12, true);
+  const [left, rowHeight] = nameColumn(filters, width, 11, Math.max(17, 6 + step * cells.length));
+  const [right, top] = [10, 9 + 13 * title.length];
   const bottom = top + rowHeight * filters.length;
   const rows = cells.map((cell) => single(cell).byFilter);
   const sorted = (list) => list.filter((v) => v > 0).sort((a, b) => a - b);
   const all = rows.flatMap((row) => Object.values(row));
   const values = sorted(all.map((row) => row.value));
   const ends = sorted(all.flatMap((row) => [row.value, row.low, row.high]));
-  let content = label(0, 12, fit(world.name, width, 12, true), ' class="strong"');
+  let content = block(0, 8 + 6.5 * (title.length - 1), title, 12, "", true);
   if (!values.length)
     return void (panel.innerHTML = svg(
       width,
-      40,
-      `${content}${label(0, 32, "No run has an error here.")}`,
+      top + 18,
+      `${content}${label(0, top + 10, "No run has an error here.")}`,
       `${world.name}: no errors`,
     ));
   const low = ends[0] / 1.05;
@@ -35,12 +36,7 @@ function drawWorld(panel, world) {
   content += xAxis(logTicks(low, high, 5), x, top - 4, bottom);
   filters.forEach((look, k) => {
     const y = top + rowHeight * (k + 0.5);
-    content += label(
-      left - 8,
-      y + 4,
-      fit(look.name, left - 8, 11, look.proposed),
-      ` text-anchor="end" style="font-size:11px"${look.proposed ? ' class="strong"' : ""}`,
-    );
+    content += nameLabel(look, left - 8, y, left, 11, ' text-anchor="end"');
     rows.forEach((row, r) => {
       const item = row[look.key];
       const level = y + step * (r - (rows.length - 1) / 2);
@@ -71,15 +67,16 @@ function drawCalibration(part) {
   const filters = order().filter((look) => shares[look.key]);
   const width = widthOf(part);
   const narrow = width < 640;
-  const [left, right, top, rowHeight] = [narrow ? 112 : 150, narrow ? 12 : 240, 24, 21];
-  const bottom = top + rowHeight * filters.length;
   if (!filters.length) return void (part.innerHTML = '<p class="note">This view has no regions.</p>');
+  const [left, rowHeight] = nameColumn(filters, width, 11.5, 21);
+  const [right, top] = [narrow ? 12 : 240, 24];
+  const bottom = top + rowHeight * filters.length;
   const x = linear(0, 1, left, width - right);
   let content = xAxis([0, 0.25, 0.5, 0.75, 0.9, 1], x, top, bottom, (v) => `${100 * v}`);
   for (const share of [0.5, 0.9])
     content +=
       line(x(share), top, x(share), bottom, ' class="rule"') +
-      label(x(share), top - 8, `${100 * share} % region`, ' class="axis" text-anchor="middle"');
+      label(Math.min(x(share), width - textWidth("90 % region", 11) / 2), top - 8, `${100 * share} % region`, ' class="axis" text-anchor="middle"');
   content += label(
     (left + width - right) / 2,
     bottom + 30,
@@ -92,12 +89,7 @@ function drawCalibration(part) {
     const { c50, c90, nees_ratio: nees } = shares[look.key];
     const word = rows[look.key].calibration ? `coverage ${rows[look.key].calibration}` : "";
     const words = `${look.name}: the 50 % regions contain ${percent(c50)}, the 90 % regions ${percent(c90)}; NEES per degree of freedom ${short(nees)}${word && `; ${word}`}`;
-    content += label(
-      left - 8,
-      y + 4,
-      fit(look.name, left - 8, 11.5, look.proposed),
-      ` text-anchor="end" style="font-size:11.5px"${look.proposed ? ' class="strong"' : ""}`,
-    );
+    content += nameLabel(look, left - 8, y, left, 11.5, ' text-anchor="end"');
     if (c50 === null || c90 === null) return;
     content += `<g${spoken(words)}>${bar(x(c50), x(c90), y, 2, look, 0.5)}<circle class="c${look.index}" cx="${px(x(c50))}" cy="${px(y)}" r="3.4" fill="var(--paper)" stroke="var(--c)" stroke-width="1.6"/>${mark(look, x(c90), y, 4.5)}</g>`;
     if (!narrow)
@@ -131,7 +123,7 @@ function drawTable(part) {
     const bold = (row, r) =>
       row.verdict === "best" ||
       short(row.value) === short(Math.min(...Object.values(rows[r]).map((item) => item.value ?? Infinity)));
-    html += `<tr><th scope="row"${look.proposed ? ' class="proposed"' : ""}>${icon(look)}${esc(look.name)}</th>${sequence
+    html += `<tr><th scope="row"${look.proposed ? ' class="proposed"' : ""}><span>${icon(look)}${esc(look.name)}</span></th>${sequence
       .map((r) => {
         const row = rows[r][look.key];
         if (!row || row.value === null) return `<td class="number faint">${row ? esc(row.words) : "–"}</td>`;
