@@ -2,11 +2,12 @@
 
     python benchmarks/judge_blocks.py
 
-It writes judge_blocks.json and a table of docs/judge.md, in about four minutes.
+It writes judge_blocks.json and a table of docs/judge.md, in about eight minutes.
 
 The errors of two programs are independent in three axes, at 2 Hz. Their correlation in time is
 exponential, or oscillates with a period of four correlation times. With varying size, the exponential
-errors of a program have a factor whose logarithm has the same correlation and SD 0.5.
+errors of a program have a factor whose logarithm has the same correlation and SD 0.5. With size over
+10 s, the logarithm has a correlation time of 10 s and SD 1, so that few bursts hold most of the error.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ STORE = Path(__file__).with_name("judge_blocks.json")
 PAGE = Path(__file__).parents[1] / "docs" / "judge.md"
 START = "<!-- numbers:judge_blocks -->"
 STUDIES, EPOCH_S, LEVEL, GAIN = 2000, 0.5, 0.05, 0.8
-CORRELATIONS = ("exponential", "oscillating", "varying size")
+CORRELATIONS = ("exponential", "oscillating", "varying size", "size over 10 s")
+BURST_S = 10.0
 TIMES_S, LENGTHS_S = (0.5, 2.0, 5.0, 20.0), (300, 1000, 3000)
 
 
@@ -35,6 +37,8 @@ def draw_errors(rng: np.random.Generator, kind: str, time_s: float, length_s: in
     errors = _filter_noise(rng, (2, 3), epochs, time, 0.25 if kind == "oscillating" else 0.0)
     if kind == "varying size":
         errors = errors * np.exp(0.5 * _filter_noise(rng, (2, 1), epochs, time, 0.0))
+    if kind == "size over 10 s":
+        errors = errors * np.exp(_filter_noise(rng, (2, 1), epochs, BURST_S / EPOCH_S, 0.0))
     return errors
 
 

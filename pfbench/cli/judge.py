@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -38,6 +39,7 @@ roll, pitch, yaw, sd_pn, ..., cov_nn, ...; .tum; .nmea; .nav and .txt of KF-GINS
   NAME.columns=t:time,pn:north,...   names of columns      NAME.sd=FILE   deviations of KF-GINS"""
 
 _RENAMED = {"from": "start", "to": "end"}  # words of the command line that Python reserves
+_LONGEST_NAME = 100
 _NAME = re.compile(r"[A-Za-z][\w+-]*")
 
 
@@ -52,18 +54,19 @@ def judge_trajectories(words: Sequence[str]) -> None:
     """
     values = _split(words)
     options, sources, programs = _sort_words(values)
+    from pfbench.judge.judge_notes import describe_notes
     from pfbench.judge.judge_page import describe_judgement, describe_material, write_judgement
     from pfbench.judge.judgement import judge_programs
 
     reference, study = programs.pop("reference"), str(values.get("study", "judge"))
-    if not re.fullmatch(r"[\w+.-]*\w[\w+.-]*", study):
+    if not re.fullmatch(r"[\w+.-]*\w[\w+.-]*", study) or len(study) > _LONGEST_NAME:
         raise ValueError(
-            f"study must be letters, digits, _, -, + or ., got {study}. Change study=NAME."
+            f"study must be letters, digits, _, -, + or ., at most {_LONGEST_NAME}, got {study[:150]}. Change study=NAME."
         )
     judgement = judge_programs(reference, programs, options, sources)
     page = write_judgement(judgement, values.get("reports_dir", "reports"), study, options)
     print(describe_material(judgement))
-    for sentence in describe_judgement(judgement):
+    for sentence in (*describe_notes(judgement, options), *describe_judgement(judgement)):
         print(f"- {sentence}")
     print(f"report: {page.resolve()}")
 
@@ -117,8 +120,13 @@ def _check_programs(
             "Use: pfbench judge reference=truth.csv mine=a.csv theirs=b.csv"
         )
     for name, pattern in programs.items():
-        is_path = "." in pattern or "/" in pattern
-        if not is_path or not _NAME.fullmatch(name):
+        is_path = "." in pattern or "/" in pattern or os.path.isfile(pattern)
+        if is_path and not _NAME.fullmatch(name):
+            raise ValueError(
+                f"names of programs must be letters, digits, _, + and -, with a letter first, got {name!r}. "
+                f"Rename the program: {re.sub(r'[^A-Za-z0-9_+-]+', '_', name).strip('_') or 'mine'}={pattern}"
+            )
+        if not is_path:
             raise ValueError(
                 f"{name} must be a program with a file, got {name}={pattern}."
                 f"{suggest_similar(name, option_keys)} See pfbench judge --help."

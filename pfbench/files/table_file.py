@@ -12,6 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]  # of columns
+_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 _CONTROL = frozenset(map(chr, range(32))) - {"\t"}
 
 
@@ -48,6 +49,7 @@ def read_table_file(file: Path) -> TableFile:
 def _read_csv(file: Path) -> TableFile:
     lines, notes = _whole_lines(file)
     names = [name.strip().strip('"') for name in lines[0].split(",")]
+    _check_names(file, lines[0], names)
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated or not all(names):
         problem = f"{', '.join(repeated)} twice" if repeated else "an empty name"
@@ -82,6 +84,36 @@ def _read_csv(file: Path) -> TableFile:
         )
     rows.columns = pd.Index(names)
     return TableFile(rows, {}, notes)
+
+
+def _check_names(file: Path, line: str, names: Sequence[str]) -> None:
+    """Raise ValueError if line 1 is a comment, has other separators, or has numbers instead of names."""
+    problem, remedy = "", ""
+    separator = next((s for s in _SEPARATORS if s in line), "")
+    if line.lstrip().startswith(("#", "%")):
+        problem, remedy = "a comment", "Remove it, or the sign of the comment before the names."
+    elif len(names) == 1 and (separator or len(line.split()) > 2):
+        pattern = separator or r"\s+"
+        problem = f"{_SEPARATORS.get(separator, 'blanks')} as separators"
+        remedy = (
+            f"In pandas, read_csv({file.name!r}, sep={pattern!r}).to_csv(..., index=False) writes commas. "
+            "Add decimal=',' if the numbers have decimal commas."
+        )
+    elif all(map(_is_number, names)):
+        problem, remedy = "numbers alone", "Insert a line with the names."
+    if problem:
+        raise ValueError(
+            f"{file.name}: line 1 must be names of columns separated by commas, got {problem} in "
+            f"{line[:80]!r}. {remedy}"
+        )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _whole_lines(file: Path) -> tuple[list[str], tuple[str, ...]]:

@@ -8,7 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pfbench.judge.epoch_checks import check_scored_time, check_shared
+from pfbench.judge.epoch_checks import (
+    check_coverage,
+    check_scored_time,
+    check_shared,
+    space_evenly,
+)
 from pfbench.judge.epoch_holes import is_in_hole
 from pfbench.judge.judge_options import JudgeOptions
 from pfbench.judge.readers.local_frame import wrap_to_half_turn
@@ -27,13 +32,14 @@ class CommonEpochs(NamedTuple):
     """Rows of each trajectory at the common epochs.
 
     Attributes:
-        time: Epochs of the trajectory with the longest steps, [T], s.
+        time: Epochs of the trajectory with the longest steps, [T], s; instants if its steps differ.
         rows: Rows of each valid trajectory, [T] each; None for a lost one. At a hole, the nearest row.
         holes: Epochs that a valid trajectory leaves out although another one has them, [T] each.
         coverage: Share of the time that each trajectory covers.
         unused: Rows of each trajectory within the scored time that are not common.
         share: Share of the epochs outside of holes that are common.
         tolerance_needed: Tolerance that makes nearly all of them common, s.
+        is_weighted: Whether epochs are repeated or left out by their time, since steps differ.
     """
 
     time: Array
@@ -43,6 +49,7 @@ class CommonEpochs(NamedTuple):
     unused: tuple[int, ...]
     share: float
     tolerance_needed: float
+    is_weighted: bool
 
 
 def find_common_epochs(
@@ -71,7 +78,8 @@ def find_common_epochs(
     coverage = _shares_covered([t.time[m] for t, m in zip(tables, masks, strict=True)])
     valid = [k for k, share in enumerate(coverage) if share >= options.coverage]
     times = {k: tables[k].time[masks[k]] for k in valid}
-    grid = _slowest(list(times.values()))
+    check_coverage([table.file for table in tables], coverage, options.coverage)
+    grid, instants, is_weighted = _weigh(_slowest(list(times.values())))
     nearest = {k: _nearest(times[k], grid) for k in valid}
     has_row = {k: _has_row(times[k], grid, options.tolerance) for k in valid}
     in_hole = {  # a row that rounding puts outside the scored time is not a hole
@@ -84,7 +92,7 @@ def find_common_epochs(
     common = np.logical_and.reduce([everywhere, *(has_row[k] | in_hole[k] for k in valid)])
     share = float(shared.sum() / max((~is_hole).sum(), 1))
     needed = _tolerance_needed([times[k] for k in valid], grid[~is_hole])
-    common &= _thinned(grid, common, options.every)
+    common &= _thinned(instants, common, options.every)
     sizes = ", ".join(f"{len(times[k])} ({tables[k].file})" for k in valid) or "none"
     remedy = "a smaller every" if options.every and share > 0.5 else f"tolerance={needed:g}"
     counts = int((common & shared).sum()), int((common & is_hole).sum())
@@ -94,9 +102,27 @@ def find_common_epochs(
         for k in range(len(tables))
     )
     holes = tuple(~has_row[k][common] if k in times else None for k in range(len(tables)))
-    used = [0 if h is None else int((~h).sum()) for h in holes]
-    unused = tuple(int(m.sum()) - n for m, n in zip(masks, used, strict=True))
-    return CommonEpochs(grid[common], rows, holes, coverage, unused, share, needed)
+    unused = _count_unused(masks, rows, holes)
+    return CommonEpochs(instants[common], rows, holes, coverage, unused, share, needed, is_weighted)
+
+
+def _weigh(grid: Array) -> tuple[Array, Array, bool]:
+    """Return the epoch of each instant, the instants, and whether they differ from the epochs."""
+    epochs, instants = space_evenly(grid)
+    return grid[epochs], instants, not np.array_equal(epochs, np.arange(len(grid)))
+
+
+def _count_unused(
+    masks: Sequence[np.ndarray],
+    rows: Sequence[np.ndarray | None],
+    holes: Sequence[np.ndarray | None],
+) -> tuple[int, ...]:
+    """Count the rows of each trajectory in the scored time that are at no common epoch."""
+    used = [
+        0 if hole is None or row is None else len(np.unique(row[~hole]))
+        for row, hole in zip(rows, holes, strict=True)
+    ]
+    return tuple(int(mask.sum()) - n for mask, n in zip(masks, used, strict=True))
 
 
 def _tolerance_needed(times: Sequence[Array], grid: Array) -> float:

@@ -16,7 +16,10 @@ _GROUPS = ((*LOCAL, *VELOCITY_COLUMNS), ("roll", "pitch"), ("yaw",))
 _CLOSE = 0.045  # relative difference of a slope from 1
 _SIGN = 0.25  # the same for the opposite sign, which noise cannot cause
 _AGREES, _HALF = 0.9, 0.5  # shares of explained variance
+_SAME_ZERO = 0.1  # rad
 _WORSE = 5.0  # ratio of the variances that the own and the other column leave
+
+_TUM_REMEDY = "Check NAME.frame, enu or ned, and the order t x y z qx qy qz qw."
 
 
 class _Fault(NamedTuple):
@@ -43,6 +46,7 @@ def check_axes(table: TrajectoryTable, reference: ReferenceTrack) -> None:
     if rows.sum() < 20:
         return
     time, clock = table.time[rows], reference.table.time
+    is_tum = table.file.lower().endswith(".tum")
     for group in _GROUPS:
         shared = [n for n in group if n in table.values and n in reference.table.values]
         theirs = {n: np.interp(time, clock, reference.table.values[n]) for n in shared}
@@ -51,16 +55,13 @@ def check_axes(table: TrajectoryTable, reference: ReferenceTrack) -> None:
             if fault:
                 raise ValueError(
                     f"{table.file}: column {fault.column} must be that of axes North, East, Down, got "
-                    f"{fault.problem} in {reference.file}. {fault.remedy}"
+                    f"{fault.problem} in {reference.file}. {fault.remedy if not is_tum else _TUM_REMEDY}"
                 )
 
 
 def _find_fault(column: str, mine: Array, theirs: Mapping[str, Array]) -> _Fault | None:
     """Return what is wrong with a column, or None."""
-    slope, own_share = regress_column(mine, theirs[column], column == "yaw")
-    if own_share >= _HALF and abs(slope + 1) < _SIGN:
-        problem = f"values {slope:.3f} times those of {column}"
-        return _Fault(column, problem, "Multiply the column by -1.")
+    own_slope, own_share = regress_column(mine, theirs[column], column == "yaw")
     for candidate in (n for n in theirs if n != column):
         slope, share = regress_column(mine, theirs[candidate])
         is_better = share >= _AGREES and 1 - own_share > _WORSE * (1 - share)
@@ -69,4 +70,17 @@ def _find_fault(column: str, mine: Array, theirs: Mapping[str, Array]) -> _Fault
             sign = "" if slope > 0 else ", and multiply the column by -1"
             remedy = f"Give it the name or the place of {candidate}{sign}."
             return _Fault(column, problem, remedy)
+    if own_share >= _HALF and abs(own_slope + 1) < _SIGN:
+        problem = f"values {own_slope:.3f} times those of {column}"
+        return _Fault(column, problem, _opposite_remedy(column, mine, theirs[column]))
     return None
+
+
+def _opposite_remedy(column: str, mine: Array, theirs: Array) -> str:
+    """Return the remedy of an opposite sign; yaw from East also has another zero."""
+    total = float(np.angle(np.exp(1j * (mine + theirs)).mean())) if column == "yaw" else 0.0
+    if abs(total) < _SAME_ZERO:
+        return "Multiply the column by -1."
+    return (
+        f"Subtract the column from {total:.4g} rad: it counts from another axis, the opposite way."
+    )

@@ -77,7 +77,8 @@ class _Member(NamedTuple):
     runs: int
     seconds: float
     epoch_s: float
-    result: BlockEstimate | None  # None without a run that both keep
+    result: BlockEstimate | None  # None without runs of the same name that both keep
+    reason: str = ""  # of a missing result
 
 
 def decide_along_runs(
@@ -123,9 +124,11 @@ def describe_blocks(result: BlockDecision) -> str:
     sample = f"{format_level(d)} simultaneous interval; {blocks}"
     if d.word == NOT_TESTED:
         size = format_effect(d, d.estimate, d.estimate, d.estimate).partition(" (")[0]
+        length = MIN_BLOCKS * result.block_s
+        needed = f" {_describe_length(length)}" if result.blocks < MIN_BLOCKS else ""
         return (
             f"{head}{d.a} and {d.b} are not tested: {d.reason}. The {d.metric} of {d.a} is {size} "
-            f"than that of {d.b} in this run. {_describe_length(MIN_BLOCKS * result.block_s)}"
+            f"than that of {d.b} in this run.{needed}"
         )
     if d.word in (BETTER, WORSE):
         return (
@@ -154,7 +157,8 @@ def _compare(sequence: SequenceResults, a: str, b: str, options: JudgeOptions) -
     epoch = seconds / (len(time) - 1)
     first, second = squares
     if first is None or second is None:
-        return _Member(sequence.name, a, b, len(shared), seconds, epoch, None)
+        reason = _missing_reason(sequence, a, b, shared)
+        return _Member(sequence.name, a, b, len(shared), seconds, epoch, None, reason)
     result = compare_along_run(first, second, options.block / epoch)
     return _Member(sequence.name, a, b, len(shared), seconds, epoch, result)
 
@@ -167,6 +171,21 @@ def _mean_square(sequence: SequenceResults, program: str, runs: Sequence[str]) -
         return None
     places = list(result.meta["state"]["groups"]["position"])
     return np.asarray((result.data["error"][rows][..., places] ** 2).sum(axis=-1).mean(axis=0))
+
+
+def _missing_reason(sequence: SequenceResults, a: str, b: str, shared: Sequence[str]) -> str:
+    """Name the cause of a missing comparison along the runs of two programs."""
+    names = sequence.run_names
+    if not shared:
+        runs = [", ".join(run or "without a name" for run in names[name][:3]) for name in (a, b)]
+        return f"no run has the same name ({a}: {runs[0]}; {b}: {runs[1]})"
+    counts = []
+    for name in (a, b):
+        rows = [names[name].index(run) for run in shared]
+        lost = int(sequence.results[name].data["lost"][rows].sum())
+        if lost:
+            counts.append(f"{name} is lost in {lost} of {format_count(len(shared), 'run')}")
+    return " and ".join(counts)
 
 
 def _effect(result: BlockEstimate | None) -> QuestionEffect:
@@ -208,14 +227,20 @@ def _word(member: _Member, tests: FamilyTests, k: int, margin: float) -> tuple[s
     """Return word, statement on the margin, and reason of a missing test."""
     result = member.result
     if result is None:
-        reason = "no run with the same name in which both cover the time"
-        return NOT_TESTED, NO_SIZE, reason
+        return NOT_TESTED, NO_SIZE, member.reason
     if result.estimate.value == 0 and result.estimate.standard_error == 0:
         return IDENTICAL, NO_SIZE, "all errors agree"
     if not np.isfinite(result.estimate.value):
         return NOT_TESTED, NO_SIZE, "one program has no error"
     if not np.isfinite(tests.p_corrected[k]):
-        count = format_count(int(result.blocks), "block")
-        return NOT_TESTED, NO_SIZE, f"{count} of time, {MIN_BLOCKS} are required"
+        if result.blocks >= MIN_BLOCKS:
+            equal = format_count(int(result.equal_blocks), "equal block")
+            count = (
+                f"few of {int(result.blocks)} blocks of time hold most of the difference, which "
+                f"count as {equal}"
+            )
+        else:
+            count = f"{format_count(int(result.blocks), 'block')} of time"
+        return NOT_TESTED, NO_SIZE, f"{count}, {MIN_BLOCKS} are required"
     ends = float(tests.low[k]), float(tests.high[k]), bool(tests.is_decided[k])
     return (*pair_word(*ends, margin), "")

@@ -9,6 +9,8 @@ from typing import Any
 
 FRAMES = ("", "ned", "enu")
 ALIGNMENTS = ("none", "offset", "yaw")
+_LARGEST_TIME = 1e10  # s, above the GPS and Unix times of this century
+_ORIGIN_LIMITS = (90.0, 360.0, 1e5)  # deg, deg, m
 HOLES = ("refuse", "skip")
 
 
@@ -27,6 +29,11 @@ class SourceOptions:
     shift: float = 0.0
     columns: Mapping[str, str] = field(default_factory=dict)
     sd: str = ""
+
+    def __post_init__(self) -> None:
+        _require(
+            "shift", abs(self.shift) <= _LARGEST_TIME, f"at most {_LARGEST_TIME:g} s", self.shift
+        )
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,8 @@ class JudgeOptions:
         _require(
             "origin", len(self.origin) in (0, 3), "lat_deg,lon_deg,h_m", list(self.origin) or "none"
         )
+        for value, limit in zip(self.origin, _ORIGIN_LIMITS, strict=False):
+            _require("origin", abs(value) <= limit, f"within {limit:g}", value)
 
 
 def _require(name: str, is_valid: bool, requirement: str, value: Any) -> None:

@@ -3,35 +3,22 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.judge.block_decisions import describe_blocks
-from pfbench.judge.epoch_checks import LEAST_SHARE
+from pfbench.judge.judge_notes import describe_notes
 from pfbench.judge.judge_options import JudgeOptions
 from pfbench.judge.judge_tables import blocks_table, error_figures, files_table, tabulate_accuracy
 from pfbench.judge.judgement import Judgement
-from pfbench.judge.sequence_results import SequenceResults
 from pfbench.report import writers
 from pfbench.results.decisions.decision import Decision
-from pfbench.results.decisions.sentence_formats import format_count
 from pfbench.results.decisions.sentences import describe_pair, describe_ranking, describe_total
 from pfbench.results.metrics import metric_definitions
 from pfbench.results.statistics.paired_effects import MIN_RUNS
-
-_ALIGNED = {
-    "offset": "The mean position error of each run is removed (align=offset): errors are relative.",
-    "yaw": "A shift and a turn about the vertical are removed from each run (align=yaw): errors are relative.",
-}
-_CLOCK_SHOWN = 0.05  # s
-_OFFSET_SHOWN = 5.0  # m
-_AXES = ("North", "East", "Down")
 
 
 def write_judgement(
@@ -62,7 +49,7 @@ def write_judgement(
         "name": name,
         "head": describe_material(judgement),
         "summary": list(describe_judgement(judgement)),
-        "notes": list(_describe_notes(judgement, options)),
+        "notes": list(describe_notes(judgement, options)),
         "limits": list(_describe_limits(judgement)),
         "definitions": [d for d in metric_definitions() if d.startswith(("CRPS", "coverage"))],
         "sensors": "CRPS [m]" in tables["accuracy"],
@@ -137,64 +124,6 @@ def _pairs_of(
     yield from zip(of_question[::2], of_question[1::2], strict=True)
 
 
-def _describe_notes(judgement: Judgement, options: JudgeOptions) -> Iterator[str]:
-    """Yield alignment, lost runs, clocks and epochs that are not common."""
-    if options.align in _ALIGNED:
-        yield _ALIGNED[options.align]
-    for sequence in judgement.sequences:
-        yield from _describe_epochs(sequence)
-        yield from _describe_offsets(sequence)
-        for k, run in enumerate(sequence.runs):
-            label = f"{run.program} {run.run}".strip() + f" in {sequence.name}"
-            if sequence.epochs.rows[k] is None:
-                share = 100 * sequence.epochs.coverage[k]
-                yield f"Lost: {label} covers {share:.3g} % of the time, {100 * options.coverage:g} % are required."
-            holes = sequence.epochs.holes[k]
-            if holes is not None and holes.any():
-                yield (
-                    f"Holes: {label} lacks {int(holes.sum())} of {len(holes)} epochs that another program "
-                    "has. The error there is the largest one of any program. Set `from` or `to` to leave out "
-                    "a time for all programs."
-                )
-            if math.isfinite(run.clock_offset) and abs(run.clock_offset) > _CLOCK_SHOWN:
-                yield (
-                    f"Clock: {label} agrees best with the reference at an offset of "
-                    f"{run.clock_offset:.3f} s. It is not removed."
-                )
-
-
-def _describe_epochs(sequence: SequenceResults) -> Iterator[str]:
-    """Yield a note if many epochs are not common, or if the reference has holes."""
-    epochs = sequence.epochs
-    if epochs.share < LEAST_SHARE:
-        yield (
-            f"Epochs: {100 * epochs.share:.3g} % of the epochs in {sequence.name} are common. "
-            f"tolerance={epochs.tolerance_needed:g} makes nearly all of them common; each program is "
-            "scored at its own time."
-        )
-    clock, first, last = sequence.reference.table.time, epochs.time[0], epochs.time[-1]
-    seconds = np.diff(np.clip(clock, first, last))[np.diff(clock) > sequence.reference.largest_gap]
-    if (seconds > 0).any():
-        holes = format_count(int((seconds > 0).sum()), "hole")
-        yield f"Reference: {seconds.sum():.4g} s in {holes} of {sequence.name} are left out."
-
-
-def _describe_offsets(sequence: SequenceResults) -> Iterator[str]:
-    """Yield a note on each constant position error, as of heights above the geoid."""
-    for program, result in sequence.results.items():
-        error = result.data["error"][~result.data["lost"]][..., :3].reshape(-1, 3)
-        if not len(error):
-            continue
-        median = np.median(error, axis=0)
-        spread = np.median(np.abs(error - median), axis=0)
-        for axis in np.flatnonzero(np.abs(median) > np.maximum(_OFFSET_SHOWN, 3 * spread)):
-            hint = "heights (ellipsoid or geoid)" if axis == 2 else "datum"
-            yield (
-                f"Offset: {program} in {sequence.name} has a median error of {median[axis]:.4g} m "
-                f"{_AXES[axis]}. It is not removed. Check {hint} and origin."
-            )
-
-
 def _describe_limits(judgement: Judgement) -> Iterator[str]:
     """Yield the reach of the conclusions."""
     count = len(judgement.sequences)
@@ -216,4 +145,8 @@ def _describe_limits(judgement: Judgement) -> Iterator[str]:
     yield (
         "Position errors are estimate minus reference at the epochs of the programs. The reference is "
         "interpolated, the estimates are not. Errors of the reference count as errors of all programs."
+    )
+    yield (
+        "RMSE: root mean square over the scored epochs. With several runs, RMSE, quantile and maximum are "
+        "means over the valid runs. Epochs in holes are scored, so more epochs than rows can be scored."
     )

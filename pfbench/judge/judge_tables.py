@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from pfbench.judge.block_decisions import BlockDecision
 from pfbench.judge.sequence_results import SequenceResults
+from pfbench.report.plots.axis_ticks import use_log_if_wide
 from pfbench.report.plots.figure_files import FigureSpec
 from pfbench.report.plots.plotting import INSTANTS, stacked_axes
 from pfbench.results.decisions.sentence_formats import format_effect
@@ -104,7 +105,7 @@ def files_table(sequences: Sequence[SequenceResults]) -> pd.DataFrame:
     for sequence in sequences:
         epochs = sequence.epochs
         for k, run in enumerate(sequence.runs):
-            used, table = epochs.rows[k], run.table
+            used, holes, table = epochs.rows[k], epochs.holes[k], run.table
             rows.append(
                 {
                     "sequence": sequence.name,
@@ -113,6 +114,7 @@ def files_table(sequences: Sequence[SequenceResults]) -> pd.DataFrame:
                     "file": table.file,
                     "rows": len(table.time),
                     "scored": 0 if used is None else len(used),
+                    "in holes": 0 if holes is None else int(holes.sum()),
                     "not common": epochs.unused[k],
                     "time covered [%]": 100 * epochs.coverage[k],
                     "clock offset [s]": run.clock_offset,
@@ -152,6 +154,8 @@ def _plot_errors(sequence: SequenceResults) -> Figure:
         square = (result.data["error"][valid][..., places] ** 2).sum(axis=-1).mean(axis=0)
         mean = np.add.reduceat(square, edges[:-1]) / np.diff(edges)
         axis.plot(time[edges[:-1]], np.sqrt(mean), label=program)
-    axis.set(xlabel="time [s]", ylabel="position error [m]", yscale="log")
+    curves = [np.asarray(line.get_ydata(), dtype=np.float64) for line in axis.get_lines()]
+    axis.set(xlabel="time [s]", ylabel="position error [m]")
+    use_log_if_wide(axis, axis.yaxis, curves)
     axis.legend()
     return figure

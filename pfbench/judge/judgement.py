@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from pfbench.judge.block_decisions import METRIC, BlockDecision, decide_along_runs
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.readers.trajectory_files import TrajectoryFile, list_trajectory_files
+from pfbench.judge.reference_checks import check_interpolation
 from pfbench.judge.reference_track import read_reference
 from pfbench.judge.sequence_results import JudgedRun, SequenceResults, read_runs, score_sequence
 from pfbench.report.options import ReportOptions
@@ -78,6 +81,8 @@ def judge_programs(
             runs += read_runs(program, of_sequence, track, source, options.align)
         if runs:
             sequences.append(score_sequence(name, track, runs, options))
+            if options.align == "none":
+                check_interpolation(track, sequences[-1].epochs.time, _position_rmse(sequences[-1]))
     pairs = plan_pairs(tuple(programs), options.baseline)
     return _decide(tuple(sequences), pairs, options)
 
@@ -120,6 +125,15 @@ def tabulate_runs(sequences: Sequence[SequenceResults]) -> pd.DataFrame:
                 rows.append((program, sequence.name, sequence.name, "recorded", run, value, keep))
     names = ["filter", "scenario", "family", "regime", "run", "value", "keeps_track"]
     return pd.DataFrame(rows, columns=names)
+
+
+def _position_rmse(sequence: SequenceResults) -> dict[str, float]:
+    """Return the position RMSE by program, m; NaN if all runs are lost."""
+    squares = {
+        program: (result.data["error"][~result.data["lost"]][..., :3] ** 2).sum(axis=-1)
+        for program, result in sequence.results.items()
+    }
+    return {name: float(np.sqrt(s.mean())) if s.size else math.nan for name, s in squares.items()}
 
 
 def _decide(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -25,6 +25,8 @@ _FACTORS = {  # ratio of two units: the unit of the column, for positions, veloc
 _CLOSE = 0.045  # relative difference from a factor
 _USUAL = 0.97  # share of the increments of an angle that are compared
 _NEAR = 1000.0  # m, smallest distance of a trajectory of the same place
+INTERPOLATED = 0.5  # share of an RMSE that interpolation may cause
+_SMALL = 1e-3  # m, error of interpolation that is of no account
 
 
 def check_distance(table: TrajectoryTable, reference: ReferenceTrack) -> None:
@@ -45,6 +47,35 @@ def check_distance(table: TrajectoryTable, reference: ReferenceTrack) -> None:
         raise ValueError(
             f"{table.file}: positions must come within {limit:.4g} m of {reference.file}, got a "
             f"distance of {least:.4g} m at least. Check order, unit and origin of the columns."
+        )
+
+
+def check_interpolation(
+    reference: ReferenceTrack, time: Array, errors: Mapping[str, float]
+) -> None:
+    """Check that steps of the reference are short enough to tell errors from interpolation.
+
+    Args:
+        reference: Reference.
+        time: Scored epochs, [T], s.
+        errors: Position RMSE by program, m; NaN for a lost one.
+
+    Raises:
+        ValueError: If interpolation causes half of the smallest RMSE.
+    """
+    size = float(np.sqrt(np.mean(reference.interpolation_error(time) ** 2)))
+    name, least = min(errors.items(), key=lambda item: item[1] if item[1] >= 0 else np.inf)
+    if size > max(INTERPOLATED * least, _SMALL):
+        step = float(np.median(np.diff(reference.table.time)))
+        about = (
+            f"about {size:.3g} m"
+            if np.isfinite(size)
+            else f"unknown with {len(reference.table.time)} rows"
+        )
+        raise ValueError(
+            f"{reference.file}: column t must have steps that can be interpolated, got {step:.4g} s: the "
+            f"error between the rows is {about}, and the position RMSE of {name} is {least:.3g} m. "
+            f"Use shorter steps, add vn, ve, vd, or set every={step:.4g} if the epochs agree with the rows."
         )
 
 

@@ -21,6 +21,7 @@ from pfbench.results.error_measures import Array
 
 _SAME_TRUTH = 0.5  # m, largest difference of one truth that two files interpolate
 _MOVED = 1e-3  # m, smallest move
+_LEAST_ROWS = 10  # rows that show a motion
 _LEAST_GAP, _GAP_STEPS = 1.0, 2.5  # s, median steps
 
 
@@ -112,6 +113,34 @@ class ReferenceTrack:
         slope = (position[k + 1] - position[k]) / step
         start, end = velocity[k] - slope, velocity[k + 1] - slope
         return linear + step * s * (1 - s) * ((1 - s) * start - s * end)
+
+    def interpolation_error(self, time: Array) -> Array:
+        """Estimate the error of interpolated positions, [K], m, from rows that are left out.
+
+        Each row is interpolated between its neighbours. The error grows with the square of the step, and
+        with velocities with its fourth power. It is 0 at the rows, and in the long gaps that a user
+        bridges. It is infinite between less than 10 rows, which cannot show a motion.
+
+        Args:
+            time: Times, [K], s.
+        """
+        clock, has_velocity = self.table.time, VELOCITY_COLUMNS[-1] in self.table.values
+        k = np.clip(np.searchsorted(clock, time, side="right") - 1, 0, len(clock) - 2)
+        step, power = np.diff(clock), 2 if has_velocity else 1
+        s = (time - clock[k]) / step[k]
+        size = (np.clip(s * (1 - s), 0.0, None) * step[k] ** 2) ** power
+        if len(clock) < _LEAST_ROWS:
+            return np.where(size > 1e-9, np.inf, 0.0)
+        bend = np.zeros(len(clock))
+        for first in (1, 2):
+            rows = np.arange(first, len(clock) - 1, 2)
+            rest = self.table.keep_rows(~np.isin(np.arange(len(clock)), rows))
+            left_out = replace(self, table=rest).interpolate_position(clock[rows])
+            distance = np.linalg.norm(self.position[rows] - left_out, axis=1)
+            bend[rows] = distance / (step[rows - 1] * step[rows]) ** power
+        bend[0], bend[-1] = bend[1], bend[-2]
+        is_long = step[k] > _GAP_STEPS * np.median(step)
+        return np.where(is_long, 0.0, size * (bend[k] + bend[k + 1]) / 2)
 
     def interpolate_columns(self, names: tuple[str, ...], time: Array) -> Array:
         """Interpolate velocities or angles linearly, [K, C]; angles along the shorter way.

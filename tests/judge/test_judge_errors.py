@@ -22,6 +22,8 @@ def scale(columns: list[str], factor: float) -> Change:
 BAD: dict[str, tuple[Change, str, str]] = {
     "no overlap": (lambda d: d.assign(t=d.t + 1e5), "column t must overlap truth.csv", "mine.shift=-100000"),
     "milliseconds": (lambda d: d.assign(t=d.t * 1e3 + 1e6), "column t must overlap", "in milliseconds"),
+    "milliseconds from 0": (lambda d: d.assign(t=d.t * 1e3), "column t must overlap", "in milliseconds"),
+    "minutes": (lambda d: d.assign(t=d.t / 60), "column t must overlap", "in minutes"),
     "leap seconds": (lambda d: d.assign(t=d.t + 18), "must have the clock of truth.csv", "mine.shift=-1"),
     "unknown column": (lambda d: d.rename(columns={"pe": "east"}), "without pe", "Add the missing columns"),
     "no time": (lambda d: d.rename(columns={"t": "time"}), "must have the column t", "mine.columns=t:"),
@@ -31,7 +33,9 @@ BAD: dict[str, tuple[Change, str, str]] = {
     "feet": (scale(POSITION, 3.28084), "column pn must be in m", "Multiply the column by 0.3048"),
     "km/h": (scale(["vn", "ve", "vd"], 3.6), "column vn must be in m/s", "0.277778"),
     "degrees": (scale(["roll", "pitch", "yaw"], 180 / np.pi), "column pitch must be", "0.017453"),
-    "negative deviation": (lambda d: d.assign(sd_pe=-1.0), "column sd_pe must be from", "Remove the uncertainty"),
+    "negative deviation": (lambda d: d.assign(sd_pe=-1.0), "column sd_pe must be above 0", "Remove the uncertainty"),
+    "yaw from East": (lambda d: d.assign(yaw=np.pi / 2 - d.yaw), "column yaw must be that of axes", "from 1.571 rad"),
+    "velocity in ENU": (lambda d: d.rename(columns={"vn": "ve", "ve": "vn"}), "times those of ve", "the name or the place of ve"),
     "another place": (lambda d: d.assign(pn=d.pn + 3e5), "positions must come within", "origin of the columns"),
     "other epochs": (lambda d: d.assign(t=d.t + 0.2), "must share at least 10 epochs", "tolerance=0.201"),
 }  # fmt: skip

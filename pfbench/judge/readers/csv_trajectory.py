@@ -11,7 +11,14 @@ import pandas as pd
 
 from pfbench.files.table_file import read_table_file
 from pfbench.judge.judge_options import SourceOptions
-from pfbench.judge.readers.trajectory_table import ALL_COLUMNS, GEODETIC, SD_GROUPS, TrajectoryTable
+from pfbench.judge.readers.trajectory_table import (
+    ALL_COLUMNS,
+    COVARIANCE_COLUMNS,
+    GEODETIC,
+    POSITION_SD,
+    SD_GROUPS,
+    TrajectoryTable,
+)
 
 
 def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
@@ -38,7 +45,8 @@ def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
                 f"{file.name}: columns must exist, got {wrong}. Choose from {', '.join(choices)}."
             )
     used = options.columns.items()
-    rows = rows.drop(columns=[name for name, in_file in used if name in rows and name != in_file])
+    hidden = [name for name in options.columns if name in rows]
+    rows = rows.drop(columns=[name for name in hidden if name not in options.columns.values()])
     rows = rows.rename(columns={in_file: name for name, in_file in used})
     if "t" not in rows:
         raise ValueError(
@@ -50,6 +58,8 @@ def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     values = {name: _numbers(file, rows[name], name, lines) for name in names}
     unused = [str(name) for name in rows if name not in names]
     notes = (f"columns not used: {', '.join(unused)}",) if unused else ()
+    if COVARIANCE_COLUMNS[0] in values and POSITION_SD[0] in values:
+        notes = (*notes, "the covariance is used in place of sd_pn, sd_pe and sd_pd")
     time = values.pop("t")
     origin = _stated_origin(content.stated)
     table_notes = (*content.notes, *notes)

@@ -8,7 +8,7 @@ import numpy as np
 
 from pfbench.judge.judge_options import SourceOptions
 from pfbench.judge.readers.trajectory_table import LOCAL, POSITION_SD, TrajectoryTable
-from pfbench.results.store import JobResult, read_result
+from pfbench.results.store import DamagedResultError, JobResult, read_result
 
 _AXES = ("position_E", "position_N", "position_U")
 
@@ -26,7 +26,13 @@ def read_result_trajectories(file: Path, options: SourceOptions) -> list[Traject
     Raises:
         ValueError: If the file is damaged, or states no track or no position in East, North, Up.
     """
-    result = read_result(file)
+    try:
+        result = read_result(file)
+    except DamagedResultError:
+        raise ValueError(
+            f"{file.name} must be a result of pfbench, got a file that is damaged or of another format. "
+            "Run the job again."
+        ) from None
     names = list(result.meta["state"]["names"])
     if "track" not in result.data or not set(_AXES) <= set(names):
         raise ValueError(

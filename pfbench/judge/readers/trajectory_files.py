@@ -101,6 +101,13 @@ def read_trajectories(
             f"sd must belong to a text file of KF-GINS, got {sd.name} for {path.name}. Remove the option, "
             "and add columns sd_pn, sd_pe and sd_pd to the file."
         )
+    for name, is_read in (("frame", suffix == ".tum"), ("columns", suffix in _TABLES)):
+        if getattr(options, name) and not is_read:
+            formats = ".tum file" if name == "frame" else "table with named columns"
+            raise ValueError(
+                f"{name} must belong to a {formats}, got {path.name}. Remove the option: the axes of "
+                "all other formats are North, East, Down or latitude, longitude, height."
+            )
     tables: Sequence[TrajectoryTable]
     if suffix in _TABLES:
         tables = read_csv_trajectory(path, options)

@@ -151,9 +151,12 @@ def _check_range(table: TrajectoryTable, name: str, value: Array) -> None:
         bad = (value < least) | (value > largest)
         if bad.any():
             row = int(bad.argmax())
+            limits = (
+                f"from {least:g} to {largest:g} {unit}" if unit else f"above 0, at most {largest:g}"
+            )
             raise ValueError(
-                f"{_place(table, row, name)} must be from {least:g} to {largest:g} {unit}, got "
-                f"{value[row]:g}. {hint or 'Check the unit and the order of the columns.'}"
+                f"{_place(table, row, name)} must be {limits}, got "
+                f"{value[row]:.10g}. {hint or 'Check the unit and the order of the columns.'}"
             )
 
 
