@@ -87,6 +87,7 @@ def test_the_main_metric_is_in_the_first_family_and_the_others_in_the_second(
     assert [d["href"] for d in downloads] == ["decisions.json", "consistency.json", "metrics.csv"]
     assert all((tmp_path / d["href"]).stat().st_size == d["bytes"] for d in downloads)
     records = json.loads((tmp_path / "decisions.json").read_text())
+    assert len({tuple(map(str, record.values())) for record in records}) == len(records)
     first = {r["metric"] for r in records if "track and error" in r["family"]}
     assert first == {"keeps track", f"position {RULES[metric].name}"}
     second = {r["metric"] for r in records if "secondary" in r["family"]}
