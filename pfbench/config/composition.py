@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
@@ -159,37 +159,38 @@ def list_groups() -> dict[str, list[Path]]:
     return groups | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
 
 
-class _SharedNodes(dict[str, Any]):
-    """Experiments in Hydra's store. Hydra copies the store for each composition and the chosen node once more."""
+class _ExperimentNodes(dict[str, Any]):
+    """Experiments in Hydra's store by file name, loaded when Hydra asks for one.
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> _SharedNodes:
+    Loading all of them takes as long as composing. Hydra copies the store for each composition and the
+    chosen node once more.
+    """
+
+    loaded: ClassVar[dict[tuple[Path, int], Any]] = {}  # by path and time of change
+
+    def __getitem__(self, name: str) -> Any:
+        from hydra.core.config_store import ConfigNode
+
+        path: Path = super().__getitem__(name)
+        version = path, path.stat().st_mtime_ns
+        if version not in self.loaded:
+            node = _load_experiment(path)
+            self.loaded[version] = ConfigNode(
+                name=name, node=node, group="experiment", package="_global_",
+                provider="pfbench.experiments",
+            )  # fmt: skip
+        return self.loaded[version]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _ExperimentNodes:
         return self
 
 
-_registered: dict[str, tuple[Path, int]] = {}  # experiments in Hydra's store, with the file's time
-
-
 def register_experiments() -> None:
-    """Register experiments/NAME.yaml with Hydra as the group `experiment`.
-
-    The folder lies outside conf/. Reading all files takes as long as composing, so files that did
-    not change since the last call are skipped.
-    """
+    """Register experiments/NAME.yaml with Hydra as the group `experiment`; the folder lies outside conf/."""
     from hydra.core.config_store import ConfigStore
 
-    store = ConfigStore.instance()
-    stored_names = store.repo.setdefault("experiment", _SharedNodes())
-    for path in experiments_dir().glob("*.yaml"):
-        version = path, path.stat().st_mtime_ns
-        if _registered.get(path.stem) != version or path.name not in stored_names:
-            store.store(
-                group="experiment",
-                name=path.stem,
-                node=_load_experiment(path),
-                package="_global_",
-                provider="pfbench.experiments",
-            )
-            _registered[path.stem] = version
+    paths = {path.name: path for path in experiments_dir().glob("*.yaml")}
+    ConfigStore.instance().repo["experiment"] = _ExperimentNodes(paths)
 
 
 def _load_experiment(path: Path) -> Any:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]  # of columns
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
@@ -47,6 +49,8 @@ def read_table_file(file: Path) -> TableFile:
 
 
 def _read_csv(file: Path) -> TableFile:
+    import pandas as pd  # half a second that a run without tables does not need
+
     lines, notes = _whole_lines(file)
     names = [name.strip().strip('"') for name in lines[0].split(",")]
     _check_names(file, lines[0], names)
