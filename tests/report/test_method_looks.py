@@ -121,9 +121,11 @@ def test_baselines_exist_and_give_the_planned_pairs() -> None:
     assert plan_installed_pairs(
         [f"{name}[particles={n}]" for name in ("mcmc_rpf", "sir") for n in (9, 99)]
     ) == [(f"mcmc_rpf[particles={n}]", f"sir[particles={n}]") for n in (9, 99)]
-    tuned = {pair for pair in pairs if pair[1].endswith("_tuned")}
+    tuned = {pair for pair in pairs if "tuning" in read_paper_block("filter", pair[1])}
     assert len(pairs) - len(tuned) == 17
-    assert len(tuned) == 4 * len({method for method, _ in pairs})
+    controls = {m for m in METHODS if "tuning" in read_paper_block("filter", m)}
+    assert len(controls) >= 4
+    assert tuned == {(m, control) for m in {method for method, _ in pairs} for control in controls}
     assert plan_installed_pairs(["mcmc_rpf", "sir"]) == [("mcmc_rpf", "sir")]  # rpf did not run
 
 
