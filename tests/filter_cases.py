@@ -104,5 +104,5 @@ def method_past(name: str) -> bool:
     return (
         bool(getattr(method_of(name), "moves", ()))
         or name.startswith(("cpso", "pso"))
-        or name in (*REMEMBERING, "guided_start")
+        or name in (*REMEMBERING, "guided_start", "interval_pf")
     )

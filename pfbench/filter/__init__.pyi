@@ -57,6 +57,9 @@ from pfbench.filter.gaussian.spherical_radial import (
     SphericalRule as SphericalRule,
 )
 from pfbench.filter.guided.initial_guide import GuidedInitialProposal as GuidedInitialProposal
+from pfbench.filter.guided.interval_guide import (
+    GuidedIntervalProposal as GuidedIntervalProposal,
+)
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal as GuidedNoiseProposal
 from pfbench.filter.guided.particle_guide import ParticleGuideProposal as ParticleGuideProposal
 from pfbench.filter.guided.shared_guide import SharedGuideProposal as SharedGuideProposal

@@ -49,7 +49,7 @@ PARTICLES = [
 FIXED_NUMBER = ("sqmc", "guided_start")  # refuse a number that changes, or have points for one
 EXACT = (
     *("sir", "sir_printed", "apf", "sqmc", "rbpf"), *("ckf_pf", "ekf_pf", "ukf_pf"), *("mcmc_tail", "mcmc_bridge", "mcmc_rpf_printed"),
-    *("dmc_density", "dmc_noise", "dmc_optimal"), "guided_start",
+    *("dmc_density", "dmc_noise", "dmc_optimal"), "guided_start", "interval_pf",
 )  # fmt: skip
 
 

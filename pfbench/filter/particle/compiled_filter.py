@@ -41,7 +41,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     not change a number that a stage stores between steps.
 
     Attributes:
-        method: The filter. With moves it runs uncompiled, because their path grows.
+        method: The filter. With moves, or a proposal that stores paths, it runs uncompiled.
         counter: Counter of likelihood evaluations, which compiled steps cannot increment.
         clock: Clock that measures the time of compilation, s.
         seconds: Time of compilation so far, s.
@@ -133,7 +133,8 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> CompiledStep | None:
         """Return the compiled step of this kind; None if the step must run uncompiled."""
-        if not isinstance(draws, PhiloxStream) or self.method.history is not None:
+        grows = self.method.history is not None or self.method.stores_path
+        if not isinstance(draws, PhiloxStream) or grows:
             return None
         key = id(model), belief.x.shape, len(tensors_in((belief, record)))
         if key not in self.graphs:

@@ -113,11 +113,18 @@ class ParticleFilter(Filter):
                 f"likelihood, got {len(self.moves)} with {type(self.weight_update).__name__}. "
                 "Remove the moves: they use the likelihood of the model."
             )
-        if self.history is not None and not isinstance(self.resampler, EssResampler):
+        if self.moves and self.stores_path:
+            raise ValueError(
+                "filter.moves must be empty with a proposal that stores the path of particles, got "
+                f"{len(self.moves)} with {type(self.proposal).__name__}. Remove the moves."
+            )
+        if (self.history is not None or self.stores_path) and not isinstance(
+            self.resampler, EssResampler
+        ):
             name = type(self.resampler).__name__
             raise ValueError(
-                f"filter.resampler must copy particles with their past for moves, got {name}. "
-                "Choose EssResampler."
+                "filter.resampler must copy particles with their past for moves or an interval, got "
+                f"{name}. Choose EssResampler."
             )
 
     @property
@@ -140,6 +147,11 @@ class ParticleFilter(Filter):
     def history(self) -> PathHistory | None:
         """History that the moves require."""
         return combine_histories([move.required_history for move in self.moves])
+
+    @property
+    def stores_path(self) -> bool:
+        """True if the proposal stores noise and states of past steps, so that its memory grows."""
+        return bool(getattr(self.proposal, "stores_path", False))
 
     @override
     def init(
