@@ -68,9 +68,10 @@ def pack_interval(memory: dict[str, Tensor], interval: NoiseInterval) -> dict[st
         interval: Interval after the step.
 
     Returns:
-        The memory. Without steps it holds no interval.
+        The memory. Without steps it holds the lengths alone.
     """
     rest = {name: a for name, a in memory.items() if not name.startswith(_PREFIX)}
+    rest[_LENGTH] = interval.length.to(interval.start)[:, None]  # always: closed loops refuse it
     length = int(interval.length.max())
     if not length:
         return rest
@@ -79,7 +80,7 @@ def pack_interval(memory: dict[str, Tensor], interval: NoiseInterval) -> dict[st
         map_inputs(inputs.append, u)
     stored = {f"{_INPUT}{i}": a.unsqueeze(1) for i, a in enumerate(inputs)}
     stored[_START], stored[_NOISE] = interval.start, interval.noise[:, :, -length:]
-    return rest | stored | {_LENGTH: interval.length.to(interval.start)[:, None]}
+    return rest | stored
 
 
 def unpack_interval(belief: ParticleBelief, record: Record) -> NoiseInterval:
