@@ -10,13 +10,14 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from ceiling import STORE, largest_limit, root_mean
+from terrain_wins import STUDIES as TERRAIN_STUDIES, describe_answer, terrain_table
 
 from pfbench.files import markdown_head, markdown_row
 from pfbench.report import StudyFacts, compare_with_control, find_robust_filters, read_page_data
@@ -216,7 +217,26 @@ def _study_tables(name: str) -> str:
     )
 
 
-BLOCKS: dict[str, Callable[[], str]] = {"robust": robust, "recorded": recorded}
+def _terrain(name: str) -> str:
+    """Table and sentences of a study of terrain navigation."""
+    study = read_study(name)
+    families = {label: look.family for label, look in study.facts.looks.items()}
+    return terrain_table(name, study.runs, families, format_median)
+
+
+def answer() -> str:
+    """State which observation makes a particle filter better than Kalman filters."""
+    studies = {name: read_study(name) for name in TERRAIN_STUDIES}
+    families = {a: look.family for a, look in studies["terrain_start"].facts.looks.items()}
+    return describe_answer({name: study.runs for name, study in studies.items()}, families)
+
+
+BLOCKS: dict[str, Callable[[], str]] = {
+    "robust": robust,
+    "recorded": recorded,
+    "answer": answer,
+    **{name: partial(_terrain, name) for name in TERRAIN_STUDIES},
+}
 
 
 def fill_page(text: str) -> str:

@@ -10,13 +10,13 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import yaml
 
 from pfbench import job
-from pfbench.model import TerrainWaves
+from pfbench.model import TerrainAided, TerrainWaves
 
 TOP = Path(__file__).parents[1]
 STORE = TOP / "docs" / "terrain_limit.json"
@@ -127,7 +127,7 @@ def measure(words: Sequence[str]) -> dict[str, Any]:
     plan = job.build_plan(job.compose([*words, "filter=ekf", f"runs={RUNS}"]))
     episode, model = plan.draw_episode(plan.runs), plan.model
     scene = plan.values["scenario"]
-    waves: TerrainWaves = model.waves
+    waves = cast(TerrainAided, model).waves
     cell = choose_cell(waves, scene["measurement_sd"])
     if (2.0 * REACH * scene["initial_sd"] / cell) ** 2 > LARGEST_GRID:
         return {"cell_m": cell, "rmse": [], "cpu_s": 0.0}
@@ -158,12 +158,14 @@ def list_conditions() -> Mapping[str, list[str]]:
 def main() -> None:
     """Measure the conditions that are not stored."""
     job.register_experiments()
-    store: dict[str, Any] = json.loads(STORE.read_text()) if STORE.exists() else {}
-    for name, words in list_conditions().items():
+    stored: dict[str, Any] = json.loads(STORE.read_text()) if STORE.exists() else {}
+    conditions = list_conditions()
+    store = {name: row for name, row in stored.items() if name in conditions}
+    for name, words in conditions.items():
         if name not in store:
             store[name] = measure(words)
             print(name, store[name], flush=True)
-            STORE.write_text(json.dumps(store, indent=1) + "\n")
+        STORE.write_text(json.dumps(store, indent=1) + "\n")
 
 
 if __name__ == "__main__":

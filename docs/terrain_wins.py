@@ -15,14 +15,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from pfbench.files import markdown_head, markdown_row
-from pfbench.results import holm, order_statistic_interval, wilcoxon_signed_rank
+from pfbench.results import holm, wilcoxon_signed_rank
 
 LIMITS = Path(__file__).parents[1] / "docs" / "terrain_limit.json"
 PARTICLES = "rpf"  # the particle filter that is compared
 BANKS = ("ekf_bank", "ekf_bank_dense")
 ALPHA = 0.05
+LOST = 1e12  # error of a lost run, so that two lost runs are equal
 STUDIES = {
     "terrain_start": "initial standard deviation per axis [m]",
     "terrain_rough": "shortest wavelength of the terrain [m]",
@@ -34,7 +36,7 @@ class Pair(NamedTuple):
     """Comparison of `PARTICLES` with a Kalman filter in a condition.
 
     Attributes:
-        ratio: Median over runs of the error of `PARTICLES` divided by that of the Kalman filter.
+        ratio: Centre over runs of the error of `PARTICLES` divided by that of the Kalman filter.
         low: Lower end of its 95 % interval.
         high: Upper end.
         p: p-value of Wilcoxon's test after Holm's correction.
@@ -75,13 +77,13 @@ def arrange_errors(runs: pd.DataFrame) -> dict[float, pd.DataFrame]:
         runs: Stored runs of the study.
 
     Returns:
-        Errors by dose, in the order of the study; a lost run is infinite.
+        Errors by dose, in the order of the study; NaN for a lost run.
     """
     tables = {}
     for scenario in runs["scenario"].unique():
         rows = runs[runs["scenario"] == scenario]
         table = rows.pivot_table(index="run", columns="filter", values="rmse", dropna=False)
-        tables[find_dose(scenario)] = table.fillna(np.inf)
+        tables[find_dose(scenario)] = table
     return tables
 
 
@@ -95,17 +97,34 @@ def compare_pairs(
         kalman: Labels of the Kalman filters.
     """
     keys = [(dose, label) for dose in errors for label in kalman]
-    logs = [
-        np.nan_to_num(np.log(errors[dose][PARTICLES] / errors[dose][label]).to_numpy(), posinf=99.0)
-        for dose, label in keys
-    ]  # a run that both lose counts as equal
+    filled = {dose: np.log(table.fillna(LOST)) for dose, table in errors.items()}
+    logs = [(filled[dose][PARTICLES] - filled[dose][label]).to_numpy() for dose, label in keys]
     adjusted = holm([wilcoxon_signed_rank(log).p for log in logs])
     pairs: dict[float, dict[str, Pair]] = {dose: {} for dose in errors}
     for (dose, label), log, p in zip(keys, logs, adjusted, strict=True):
-        interval = order_statistic_interval(log, 1.0 - ALPHA)
-        ends = (float(np.exp(value)) for value in (np.median(log), interval.low, interval.high))
-        pairs[dose][label] = Pair(*ends, float(p))
+        centre, low, high = (float(np.exp(value)) for value in signed_rank_interval(log))
+        pairs[dose][label] = Pair(centre, low, high, float(p))
     return pairs
+
+
+def signed_rank_interval(d: np.ndarray, level: float = 1.0 - ALPHA) -> tuple[float, float, float]:
+    """Compute the centre of paired differences and its interval, which belong to the signed-rank test.
+
+    The centre is the median of the means of all pairs of differences [Hodges and Lehmann 1963]. The
+    rank sum is taken as normal.
+
+    Args:
+        d: Differences, [n].
+        level: Coverage.
+
+    Returns:
+        Centre and ends of the interval.
+    """
+    n = d.size
+    means = np.sort([(d[i] + d[j]) / 2.0 for i in range(n) for j in range(i, n)])
+    spread = stats.norm.ppf(0.5 + 0.5 * level) * np.sqrt(n * (n + 1) * (2 * n + 1) / 24.0)
+    k = max(int(np.floor(n * (n + 1) / 4.0 - spread)), 1)
+    return float(np.median(means)), float(means[k - 1]), float(means[-k])
 
 
 def describe_wins(pairs: Mapping[float, Mapping[str, Pair]], labels: Sequence[str]) -> str:
@@ -121,7 +140,7 @@ def describe_wins(pairs: Mapping[float, Mapping[str, Pair]], labels: Sequence[st
     names = (
         " and ".join(f"`{label}`" for label in labels)
         if len(labels) < 3
-        else "every single Kalman filter"
+        else "every filter with one normal distribution"
     )
     if not won:
         return f"`{PARTICLES}` is not shown to be better than {names} at any dose."
@@ -145,7 +164,7 @@ def terrain_table(
     kept = runs.groupby(["scenario", "filter"])["keeps_track"].mean()
     scenes = {find_dose(scenario): scenario for scenario in runs["scenario"].unique()}
     ranks = {
-        label: np.mean([table.median().rank()[label] for table in errors.values()])
+        label: np.mean([table.fillna(LOST).median().rank()[label] for table in errors.values()])
         for label in families
     }
     times = runs.groupby("filter")["ms"].median()
@@ -159,30 +178,92 @@ def terrain_table(
             )
             cells.append(f"{format_median(table[label].to_numpy())}, {share}{mark}")
         lines.append(markdown_row(f"`{label}`", *cells, f"{times[label]:.3g}"))
-    limits = _read_limits(name)
-    if limits:
-        cells = [format_median(np.array(limits[dose])) if dose in limits else "" for dose in errors]
-        lines.append(markdown_row("exact mean", *cells, ""))
     single = [label for label in kalman if label not in BANKS]
     ends = [describe_wins(pairs, single), *(describe_wins(pairs, [bank]) for bank in BANKS)]
     return "\n".join(
-        [*lines, "", f"Dose: {STUDIES[name]}. " + " ".join(ends), *_list_ratios(pairs)]
+        [
+            *lines,
+            "",
+            f"Dose: {STUDIES[name]}. " + " ".join(ends),
+            *_list_ratios(pairs, compare_exact(name, errors)),
+        ]
     )
 
 
-def _list_ratios(pairs: Mapping[float, Mapping[str, Pair]]) -> list[str]:
-    """State the ratios to the best single Kalman filter and to both banks at each dose."""
-    lines = [
-        "",
-        *markdown_head("dose [m]", "closest single Kalman filter", *(f"`{b}`" for b in BANKS)),
+def describe_answer(runs: Mapping[str, pd.DataFrame], families: Mapping[str, str]) -> str:
+    """State which observation makes a particle filter better than Kalman filters, from all studies.
+
+    Args:
+        runs: Stored runs by study.
+        families: Family by label of the filter.
+    """
+    kalman = [label for label, family in families.items() if family == "kalman"]
+    single = [label for label in kalman if label not in BANKS]
+    lines = markdown_head(
+        "study", "dose", "all with one normal distribution", *(f"`{b}`" for b in BANKS)
+    )
+    all_won = []
+    for name, table in runs.items():
+        pairs = compare_pairs(arrange_errors(table), kalman)
+        cells = [find_won(pairs, labels) for labels in (single, *([bank] for bank in BANKS))]
+        kept = table.groupby(["scenario", "filter"])["keeps_track"].mean()
+        scenes = {f"{find_dose(scenario):g}": scenario for scenario in table["scenario"].unique()}
+        for dose in find_won(pairs, kalman):
+            shares = (f"`{a}` in {100 * kept[scenes[dose], a]:.0f} %" for a in (PARTICLES, *BANKS))
+            all_won.append(
+                f"`{PARTICLES}` is better than every Kalman filter, both banks included, in `{name}` at {dose} m. "
+                f"Track is kept there by {', '.join(shares)} of runs."
+            )
+        words = (", ".join(doses) + " m" if doses else "none" for doses in cells)
+        lines.append(markdown_row(f"`{name}`", STUDIES[name], *words))
+    none = f"`{PARTICLES}` is in no condition better than every Kalman filter, both banks included."
+    return "\n".join([*lines, "", *(all_won or [none])])
+
+
+def find_won(pairs: Mapping[float, Mapping[str, Pair]], labels: Sequence[str]) -> list[str]:
+    """Return the doses at which the particle filter is better than all of several filters.
+
+    Args:
+        pairs: Comparisons by dose and filter.
+        labels: Labels of the filters.
+    """
+    return [
+        f"{dose:g}" for dose, row in pairs.items() if all(row[a].word == "better" for a in labels)
     ]
+
+
+def compare_exact(name: str, errors: Mapping[float, pd.DataFrame]) -> dict[float, str]:
+    """Compare the particle filter with the exact mean on the runs of the point-mass filter, at each dose.
+
+    Args:
+        name: Name of the study.
+        errors: Errors by dose, see `arrange_errors`.
+
+    Returns:
+        Root of the ratio of mean squares by dose, where the exact mean is stored.
+    """
+    words = {}
+    for dose, exact in _read_limits(name).items():
+        runs = errors[dose][PARTICLES].reindex(range(len(exact))).to_numpy()
+        ratio = np.sqrt(np.square(runs).mean() / np.square(exact).mean())
+        words[dose] = f"{ratio:.2f}"
+    return words
+
+
+def _list_ratios(
+    pairs: Mapping[float, Mapping[str, Pair]], exact: Mapping[float, str]
+) -> list[str]:
+    """State the ratios to the closest filter with one normal distribution, banks and the exact mean."""
+    heads = ("dose [m]", "closest with one normal distribution", *(f"`{b}`" for b in BANKS))
+    lines = ["", *markdown_head(*heads, "exact mean")]
     for dose, row in pairs.items():
         closest = max((a for a in row if a not in BANKS), key=lambda a: row[a].ratio)
         words = [
             f"{row[a].ratio:.2f} [{row[a].low:.2f}, {row[a].high:.2f}], {row[a].word}"
             for a in (closest, *BANKS)
         ]
-        lines.append(markdown_row(f"{dose:g}", f"`{closest}`: {words[0]}", *words[1:]))
+        last = exact.get(dose, "–")
+        lines.append(markdown_row(f"{dose:g}", f"`{closest}`: {words[0]}", *words[1:], last))
     return lines
 
 
@@ -190,4 +271,6 @@ def _read_limits(name: str) -> dict[float, list[float]]:
     """Read the errors of the exact mean by dose."""
     stored: dict[str, Any] = json.loads(LIMITS.read_text()) if LIMITS.exists() else {}
     chosen = {key: row for key, row in stored.items() if key.split(" ")[0] == name}
-    return {float(key.rpartition("=")[2]): row["rmse"] for key, row in chosen.items()}
+    return {
+        float(key.rpartition("=")[2]): row["rmse"] for key, row in chosen.items() if row["rmse"]
+    }
