@@ -1,12 +1,12 @@
-"""What a user waits for: whole processes, from nothing to six campaigns of W4. Writes campaigns.md and campaigns.png.
+"""What a user waits for: whole processes, from their start to their end. Writes campaigns.json, campaigns.md and campaigns.png.
 
-    make bench      (or: python benchmarks/campaigns.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python --rounds 5)
+    make bench      (or: python benchmarks/campaigns.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python --rounds 3)
 
 Each contestant is a fresh process on one thread in each round: it imports, compiles or finds on disk what was compiled, filters
-W4's data by six seeds, and ends. Compared is the CPU time of the process and of those that it started and waited for. A pass that
-is not recorded fills the caches on disk first: those of torch, numba and the C++ compiler are where they always are, JAX's is a
-folder that lasts as long as this benchmark. A worker (worker.py) filters once before it listens, to be warm: that is the first
-campaign, and five more are asked for.
+the data by one seed or by six, and ends. Compared is the CPU time of the process and of those that it started and waited for. A
+pass that is not recorded fills the caches on disk first: those of torch, numba and the C++ compiler are where they always are,
+JAX's is a folder that lasts as long as this benchmark. `--only W1` times some studies again and takes the others from
+campaigns.json; `--only none` writes the page anew.
 """
 
 from __future__ import annotations
@@ -25,49 +25,100 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import problems
 import workload
-from compare import COLOURS, EAGER, FLOAT32, JAX, LOOPS, disagreements, fastest, own, ratio
-from matplotlib.figure import Figure
-from race import HERE, QUALITIES, THREADS, Contestant, Result, cpu_name
-
-CAMPAIGNS = 6
-PARTICLES = Contestant("particles float32", "numba", ("peer.py", "float32"))
-CONTESTANTS = (
+from compare import (
+    COLOURS,
+    COUNT,
+    DEFAULT,
+    DEFAULT32,
     FLOAT32,
-    LOOPS,
-    EAGER,
-    PARTICLES,
-    JAX,
-    Contestant("JAX, run by run", "jax", ("peer_jax.py", "loop", "count", "float32")),
+    NUMBA,
+    disagreements,
+    fastest,
+    own,
+    peer,
+    ratio,
+    starting,
 )
+from matplotlib.figure import Figure
+from race import (
+    HERE,
+    QUALITIES,
+    THREADS,
+    Contestant,
+    Result,
+    cpu_name,
+    load_results,
+    store_results,
+)
+
+PARTICLES = Contestant("particles float32", "numba", ("peer.py", "float32"))
+RUN_BY_RUN = Contestant("JAX, run by run", "jax", ("peer_jax.py", "loop", "count", "float32"))
 
 
 class Goal(NamedTuple):
-    """A library, and how many times as fast a process of pfbench must be, and should be."""
+    """Whose time counts, against the fastest of which libraries, and how many times as fast it must and should be."""
 
+    label: str
     library: str
     must: float
     aim: float
 
 
-GOALS = (Goal("particles", 1.5, 2.5), Goal("JAX", 2.5, 4.0))
+class Study(NamedTuple):
+    """What a process does: name, description, model, sizes, number of seeds, who takes part, and the goals."""
+
+    name: str
+    said: str
+    kind: str
+    steps: int
+    particles: int
+    seeds: int
+    contestants: tuple[Contestant, ...]
+    goals: tuple[Goal, ...]
+
+
+LARGE = (DEFAULT, DEFAULT32, FLOAT32, PARTICLES, COUNT, RUN_BY_RUN)
+ONE_JOB = (DEFAULT, DEFAULT32, NUMBA, COUNT, RUN_BY_RUN)
+GOALS = (Goal(DEFAULT.label, "particles", 3.0, 4.0), Goal(DEFAULT.label, "JAX", 4.0, 6.0))
+FASTEST = (Goal(DEFAULT.label, "", 2.0, 3.0),)
+STUDIES = (
+    Study("six campaigns of W4", "15-state INS error model", "ins", 200, 500, 6, LARGE, GOALS),
+    Study("W1, one job", "growth model", "growth", 100, 10_000, 1, ONE_JOB, FASTEST),
+    Study("W2, one job", "stochastic volatility", "volatility", 1000, 10_000, 1, ONE_JOB, FASTEST),
+    Study(
+        "W3, one job", "constant velocity, bearing and range", "radar", 100, 10_000, 1,
+        ONE_JOB, FASTEST,
+    ),
+)  # fmt: skip
+
+
+def make(study: Study, scale: float) -> Mapping[str, Any]:
+    """The data of a study; `scale` shortens it for a trial."""
+    runs, steps = max(4, round(100 * scale)), max(10, round(study.steps * scale))
+    if study.kind == "ins":
+        return {
+            **workload.make(runs, steps, study.particles)._asdict(),
+            "kind": np.array("ins"),
+        }
+    return problems.make(study.kind, steps, study.particles, runs=runs)._asdict()
 
 
 def one(
-    command: list[str], env: Mapping[str, str], turn: int
+    command: list[str], env: Mapping[str, str], seeds: int
 ) -> tuple[float, float, list[dict[str, Any]]] | None:
     """A process from its start to its end: CPU and wall milliseconds, and what it answered; None where it failed.
 
     Args:
         command: a worker and its workload.
         env: its environment.
-        turn: number of the round, which decides the seeds.
+        seeds: how many seeds it filters; the first is that by which a worker becomes warm.
     """
-    seeds = range(turn * CAMPAIGNS + 1, (turn + 1) * CAMPAIGNS)
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(
         command,
-        input="".join(f"go {seed}\n" for seed in seeds),
+        input="".join(f"go {seed}\n" for seed in range(1, seeds)),
         env=env,
         stdout=subprocess.PIPE,
         text=True,
@@ -80,11 +131,11 @@ def one(
 
 
 def race(
-    work: Mapping[str, Any], places: Mapping[str, str], rounds: int
+    study: Study, work: Mapping[str, Any], places: Mapping[str, str], rounds: int
 ) -> dict[Contestant, Result | None]:
     """One result for each contestant that has a place; None for one that failed, of which standard error has the reason.
 
-    Qualities are of the five campaigns of each round that answer, [5 rounds, R].
+    Qualities are of all seeds, [seeds, R]. A seed gives the same numbers in each round.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "work.npz"
@@ -94,7 +145,7 @@ def race(
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         }
         env = os.environ | dict.fromkeys(THREADS, "1") | kept
-        ready = (who for who in CONTESTANTS if who.place in places)
+        ready = (who for who in study.contestants if who.place in places)
         there = {
             who: [places[who.place], str(HERE / who.words[0]), *who.words[1:], str(path)]
             for who in ready
@@ -104,59 +155,67 @@ def race(
             for who, command in there.items():
                 if None in found[who]:
                     continue
-                found[who].append(one(command, env, turn))
+                found[who].append(one(command, env, study.seeds))
                 took = f"{found[who][-1][0] / 1e3:.2f} s" if found[who][-1] else "failed"
-                print(f"round {turn} of {rounds}, {who.label}: {took}", file=sys.stderr)
+                print(
+                    f"{study.name}, round {turn} of {rounds}, {who.label}: {took}", file=sys.stderr
+                )
     return {who: None if None in passes else _result(passes) for who, passes in found.items()}
 
 
 def _result(passes: list[tuple[float, float, list[dict[str, Any]]]]) -> Result:
-    (_, first, greeting), *rounds = passes  # the first pass filled the caches
-    answers = [answer for _, _, told in rounds for answer in told[1:]]
+    (_, first, answers), *rounds = passes  # the first pass filled the caches
     cpu, wall = (np.array([taken[clock] for taken in rounds]) for clock in (0, 1))
     qualities = {
         name: np.array([answer[name] for answer in answers], dtype=float) for name in QUALITIES
     }
-    return Result(cpu, wall, qualities, greeting[0]["versions"], first)
+    return Result(cpu, wall, qualities, answers[0]["versions"], first)
 
 
-def table(found: Mapping[Contestant, Result], bad: list[str]) -> list[str]:
-    """The goals and what became of them, and what each contestant took."""
-    ours = fastest(found, own)
-    of = {goal: [who for who in found if who.label.startswith(goal.library)] for goal in GOALS}
-    peers = {goal: fastest(found, there.__contains__) for goal, there in of.items()}
+def opponent(goal: Goal, found: Mapping[Contestant, Result]) -> Contestant | None:
+    """The fastest one of the libraries of a goal."""
+    return fastest(found, starting(goal.library) if goal.library else peer)
+
+
+def verdicts(study: Study, found: Mapping[Contestant, Result]) -> tuple[list[str], list[str]]:
+    """Rows of the table of goals, and the goals that are missed."""
+    rows, missed = [], []
+    for goal in study.goals:
+        ours, theirs = fastest(found, starting(goal.label)), opponent(goal, found)
+        if ours is None or theirs is None:
+            continue
+        low, middle, high = ratio(found[theirs], found[ours])
+        must, aim = (
+            f"{wanted:g}, {'met' if middle >= wanted else 'missed'}"
+            for wanted in (goal.must, goal.aim)
+        )
+        rows.append(
+            f"| {study.name} | {ours.label} | {theirs.label} | {middle:.2f} ({low:.2f}-{high:.2f}) | {must} | {aim} |"
+        )
+        if middle < goal.must:
+            missed.append(
+                f"{study.name}, {ours.label}: {middle:.2f} times {theirs.label}, must {goal.must:g}"
+            )
+    return rows, missed
+
+
+def section(study: Study, found: Mapping[Contestant, Result], bad: list[str]) -> list[str]:
+    """What each contestant of a study took."""
+    best = fastest(found, peer)
+    runs = next(iter(found.values())).qualities["evidence"].shape[1]
+    seeds = "one seed" if study.seeds == 1 else f"{study.seeds} seeds"
     lines = [
-        "| against | pfbench's best | times as fast (quartiles) | must | aim |",
-        "|---|---|---|---|---|",
-    ]
-    for goal, theirs in peers.items():
-        if ours is not None and theirs is not None:
-            low, middle, high = ratio(found[theirs], found[ours])
-            must, aim = (
-                f"{wanted:g}, {'met' if middle >= wanted else 'missed'}"
-                for wanted in (goal.must, goal.aim)
-            )
-            lines.append(
-                f"| {theirs.label} | {ours.label} | {middle:.2f} ({low:.2f}-{high:.2f}) | {must} | {aim} |"
-            )
-    heads = [
-        f"times as fast as {theirs.label if theirs else goal.library} (quartiles)"
-        for goal, theirs in peers.items()
-    ]
-    lines += [
-        "",
-        f"| | CPU s, median (quartiles) | wall s | {' | '.join(heads)} | log evidence minus exact |",
-        "|---" * 6 + "|",
-    ]
+        "", f"## {study.name}", "",
+        f"{study.said[0].upper()}{study.said[1:]}: {runs} runs, {study.steps} steps, {study.particles} particles, {seeds}.", "",
+        f"| | CPU s, median (quartiles) | wall s | times as fast as {best.label if best else '-'} (quartiles) | log evidence |",
+        "|---" * 5 + "|",
+    ]  # fmt: skip
     for who, result in found.items():
         low, middle, high = np.quantile(result.cpu, [0.25, 0.5, 0.75]) / 1e3
-        quick = [
-            "{1:.2f} ({0:.2f}-{2:.2f})".format(*ratio(found[peer], result)) if peer else "-"
-            for peer in peers.values()
-        ]
-        evidence = result.qualities["evidence"].mean(1)
+        quick = "{1:.2f} ({0:.2f}-{2:.2f})".format(*ratio(found[best], result)) if best else "-"
+        evidence = result.qualities["evidence"].mean(0)
         lines.append(
-            f"| {who.label} | {middle:.3g} ({low:.3g}-{high:.3g}) | {np.median(result.wall) / 1e3:.3g} | {' | '.join(quick)} "
+            f"| {who.label} | {middle:.3g} ({low:.3g}-{high:.3g}) | {np.median(result.wall) / 1e3:.3g} | {quick} "
             f"| {evidence.mean():.2f} ± {evidence.std(ddof=1) / len(evidence) ** 0.5:.2f} |"
         )
     return [
@@ -166,32 +225,34 @@ def table(found: Mapping[Contestant, Result], bad: list[str]) -> list[str]:
     ]
 
 
-def draw(found: Mapping[Contestant, Result], path: Path) -> None:
-    """Median CPU time of each contestant's process, quartiles as bars."""
-    figure = Figure(figsize=(6.5, 0.8 + 0.25 * len(found)), layout="constrained")
-    axis = figure.subplots()
-    for place, (who, result) in enumerate(found.items()):
-        low, middle, high = np.quantile(result.cpu, [0.25, 0.5, 0.75]) / 1e3
-        colour = COLOURS["pfbench"] if own(who) else "#777777"
-        axis.plot([low, high], [place, place], color=colour, lw=1.5)
-        axis.plot(middle, place, "o", color=colour, ms=5)
-        axis.annotate(
-            f"{middle:.3g}",
-            (high, place),
-            (6, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-        )
-    axis.set(xlim=(0, None), ylim=(len(found) - 0.4, -0.6))
-    axis.set_yticks(range(len(found)), [who.label for who in found], fontsize=8)
-    axis.margins(x=0.12)
-    axis.set_xlabel("CPU time in s of a whole process, one thread (median, quartiles)", fontsize=8)
-    axis.set_title(
-        "six campaigns of W4, with imports, and what was compiled on disk", fontsize=9, loc="left"
+def draw(found: Mapping[Study, Mapping[Contestant, Result]], path: Path) -> None:
+    """Median CPU time of each contestant's process, quartiles as bars; one panel for each study."""
+    sizes = [len(results) for results in found.values()]
+    figure = Figure(figsize=(6.5, 0.6 + 0.6 * len(sizes) + 0.22 * sum(sizes)), layout="constrained")
+    axes = figure.subplots(len(sizes), 1, height_ratios=sizes, squeeze=False)[:, 0]
+    for axis, (study, results) in zip(axes, found.items(), strict=True):
+        for place, (who, result) in enumerate(results.items()):
+            low, middle, high = np.quantile(result.cpu, [0.25, 0.5, 0.75]) / 1e3
+            colour = COLOURS["pfbench"] if own(who) else "#777777"
+            axis.plot([low, high], [place, place], color=colour, lw=1.5)
+            axis.plot(middle, place, "o", color=colour, ms=5)
+            axis.annotate(
+                f"{middle:.3g}",
+                (high, place),
+                (6, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8,
+            )
+        axis.set(xlim=(0, None), ylim=(len(results) - 0.4, -0.6))
+        axis.set_yticks(range(len(results)), [who.label for who in results], fontsize=8)
+        axis.margins(x=0.12)
+        axis.set_title(f"{study.name}: {study.said}", fontsize=9, loc="left")
+        axis.tick_params(axis="x", labelsize=8)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[-1].set_xlabel(
+        "CPU time in s of a whole process, one thread (median, quartiles)", fontsize=8
     )
-    axis.tick_params(axis="x", labelsize=8)
-    axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=150, metadata={"Software": None})
 
 
@@ -203,10 +264,11 @@ def main() -> None:
         help="Python that has the library particles; without, it takes no part",
     )
     parser.add_argument("--jax", default="", help="Python that has jax; likewise")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument(
         "--scale", type=float, default=1.0, help="below 1: fewer runs and steps, to try it out"
     )
+    parser.add_argument("--only", default="", help="studies whose names begin so")
     parser.add_argument(
         "--out", type=Path, default=HERE, help="folder for campaigns.md and campaigns.png"
     )
@@ -216,32 +278,42 @@ def main() -> None:
         for name, path in (("own", sys.executable), ("numba", chosen.numba), ("jax", chosen.jax))
         if path
     }
-    runs, steps = max(4, round(100 * chosen.scale)), max(10, round(200 * chosen.scale))
-    work = {**workload.make(runs, steps, 500)._asdict(), "kind": np.array("ins")}
-    told = race(work, places, chosen.rounds)
-    found = {who: result for who, result in told.items() if result is not None}
-    bad = disagreements(found, exact=False) + [
-        f"{who.label}: it did not run" for who, result in told.items() if result is None
-    ]
-    versions = {
-        name: value
-        for result in found.values()
-        for name, value in result.versions.items()
-        if name != "numpy"
-    }
+    store = chosen.out / "campaigns.json"
+    for study in (study for study in STUDIES if study.name.startswith(chosen.only)):
+        told = race(study, make(study, chosen.scale), places, chosen.rounds)
+        store_results(store, study.name, {who.label: result for who, result in told.items()})
+    found: dict[Study, dict[Contestant, Result]] = {}
+    rows, missed, lines, wrong, versions = [], [], [], [], {}
+    for study in STUDIES:
+        if not (stored := load_results(store, study.name)):
+            continue
+        results = {who: result for who in study.contestants if (result := stored.get(who.label))}
+        failed = [f"{label}: it did not run" for label, result in stored.items() if result is None]
+        bad = disagreements(results, exact=False) + failed
+        found[study] = results
+        new, late = verdicts(study, results)
+        rows, missed = rows + new, missed + late
+        wrong += [f"{study.name}, {text}" for text in bad]
+        lines += section(study, results, bad)
+        for result in results.values():
+            versions |= {name: value for name, value in result.versions.items() if name != "numpy"}
+    rounds = sorted({len(result.cpu) for results in found.values() for result in results.values()})
     page = [
-        "# Whole processes: six campaigns of W4", "",
-        f"SIR on the 15-state INS error model, {runs} Monte Carlo runs, {steps} steps, 500 particles, six times by six seeds. "
-        "Each contestant is a fresh process on one thread that imports, compiles or finds on disk what was compiled, filters and "
-        f"ends; {chosen.rounds} interleaved rounds after a pass that filled the caches; CPU time of the process. Ratios are "
-        "taken round by round. Written by `make bench`.", "",
-        *table(found, bad), "",
+        "# Whole processes", "",
+        f"Missed: {'; '.join(missed)}." if missed else "No goal is missed.", "",
+        "| study | pfbench | against | times as fast (quartiles) | must | aim |",
+        "|---" * 6 + "|", *rows, "",
+        "SIR. Each contestant is a fresh process on one thread that imports, compiles or finds on disk what was compiled, filters "
+        f"and ends; {' or '.join(map(str, rounds))} interleaved rounds after a pass that filled the caches; CPU time of the process. "
+        "Ratios are taken round by round, against the fastest form of a library. The default settings of pfbench are float64; "
+        "`particles float32` and JAX compute in float32, `particles` in float64. The log evidence of W4 is minus the exact one. "
+        "Written by `benchmarks/campaigns.py` from campaigns.json.", *lines, "",
         ", ".join([f"{cpu_name()}; Python {platform.python_version()}", *map(" ".join, versions.items())]) + ".", "",
     ]  # fmt: skip
     (chosen.out / "campaigns.md").write_text("\n".join(page))
     draw(found, chosen.out / "campaigns.png")
     print("\n".join(page))
-    sys.exit("; ".join(bad) if bad else 0)
+    sys.exit("; ".join(wrong) if wrong else 0)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python peer_particles.py WORKLOAD
 
 A Feynman-Kac model in plain NumPy, normals from a fast generator, resampling by the library's numba loop, its collector of
-moments.
+moments. The library has no axis of runs, so the runs follow each other.
 """
 
 from __future__ import annotations
@@ -44,12 +44,16 @@ def sir(work: Any) -> Filter:
     def run(seed: int) -> tuple[list[float], np.ndarray]:
         np.random.seed(seed)
         chance = np.random.Generator(np.random.SFC64(seed))
-        fk, collect = Bootstrap(problem, problem.y[0], chance), [Moments(mom_func=moments)]
-        smc = particles.SMC(
-            fk, int(work.particles), resampling="systematic", ESSrmin=1.0, collect=collect
-        )
-        smc.run()
-        return [smc.logLt], np.array([[mean for mean, _ in smc.summaries.moments]])
+        log_z, means = [], []
+        for y in problem.y:
+            fk, collect = Bootstrap(problem, y, chance), [Moments(mom_func=moments)]
+            smc = particles.SMC(
+                fk, int(work.particles), resampling="systematic", ESSrmin=1.0, collect=collect
+            )
+            smc.run()
+            log_z.append(smc.logLt)
+            means.append([mean for mean, _ in smc.summaries.moments])
+        return log_z, np.array(means)
 
     return run
 

@@ -25,8 +25,8 @@ class Workload(NamedTuple):
 
     Attributes:
         kind: growth, volatility, radar.
-        y: measurements [1, T, k].
-        truth: states [1, T, D].
+        y: measurements [R, T, k].
+        truth: states [R, T, D].
         particles: N [].
     """
 
@@ -36,23 +36,23 @@ class Workload(NamedTuple):
     particles: np.ndarray
 
 
-def make(kind: str, steps: int, particles: int, seed: int = 1) -> Workload:
-    """One world, drawn from the model itself."""
+def make(kind: str, steps: int, particles: int, seed: int = 1, runs: int = 1) -> Workload:
+    """One world for each run, drawn from the model itself."""
     chance = np.random.default_rng(seed)
     empty = Workload(
         np.array(kind),
-        np.zeros((1, steps, 2 if kind == "radar" else 1)),
-        np.zeros((1, steps, 1)),
+        np.zeros((runs, steps, 2 if kind == "radar" else 1)),
+        np.zeros((runs, steps, 1)),
         np.array(1),
     )
     problem = Problem(empty, np)
-    x = problem.initial(chance.standard_normal((1, problem.d)))
+    x = problem.initial(chance.standard_normal((runs, problem.d)))
     states, ys = [], []
     for t in range(steps):
-        x = problem.move(t, x, chance.standard_normal((1, problem.w)))
-        states.append(x[0])
-        ys.append(problem.see(x, chance.standard_normal((1, empty.y.shape[2])))[0])
-    return Workload(np.array(kind), np.stack(ys)[None], np.stack(states)[None], np.array(particles))
+        x = problem.move(t, x, chance.standard_normal((runs, problem.w)))
+        states.append(x)
+        ys.append(problem.see(x, chance.standard_normal((runs, empty.y.shape[2]))))
+    return Workload(np.array(kind), np.stack(ys, 1), np.stack(states, 1), np.array(particles))
 
 
 class Problem:

@@ -203,17 +203,15 @@ def speed() -> str:
         (f"{row['workload']}: {models[row['workload']]}", row["fastest peer"], row)
         for row in read_table(page)
     ]
-    studies = re.search(r"^# Whole processes: (\w+) ", (TOP / _STUDIES).read_text())
     entries += [
-        (f"{studies[1] if studies else ''} studies of W4, whole process", row["against"], row)
-        for row in read_table(_STUDIES)
+        (f"{row['study']}, whole process", row["against"], row) for row in read_table(_STUDIES)
     ]
     return format_table(
         ("workload", "pfbench", "compared with", "times as fast (quartiles)"),
         (
             (
                 workload,
-                row.get("pfbench", row.get("pfbench's best", "")),
+                row["pfbench"],
                 other,
                 row["times as fast (quartiles)"],
             )
