@@ -72,7 +72,7 @@ bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## spe
 	$(BIN)/python benchmarks/campaigns.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python
 	$(BIN)/python benchmarks/methods.py
 	$(BIN)/python benchmarks/scaling.py
-	$(BIN)/python benchmarks/pages.py
+	$(BIN)/python benchmarks/latency.py
 
 clean:
 	rm -rf $(VENV) .venv-bench .venv-peers build dist *.egg-info
