@@ -16,6 +16,7 @@ from board_estimates import page
 
 STORED = json.loads(judge_blocks.STORE.read_text())
 ALARMS = "equal programs called different"
+VARYING = ("varying size", "size over 10 s")
 
 
 def test_the_page_shows_the_stored_rates() -> None:
@@ -24,10 +25,12 @@ def test_the_page_shows_the_stored_rates() -> None:
     assert page(text, [{**STORED[0], ALARMS: 0.9}, *STORED[1:]], judge_blocks.START) != text
 
 
-@pytest.mark.parametrize("row", [r for r in STORED if r["correlation"] != "varying size"], ids=str)
+@pytest.mark.parametrize("row", STORED, ids=str)
 def test_equal_programs_are_rarely_called_different(row: dict[str, Any]) -> None:
+    """The level is kept, or exceeded by less than a third where the size of errors varies over time, as the page says."""
     error = math.sqrt(judge_blocks.LEVEL * (1 - judge_blocks.LEVEL) / judge_blocks.STUDIES)
-    assert row[ALARMS] <= judge_blocks.LEVEL + 2 * error
+    excess = 1 / 3 if row["correlation"] in VARYING else 0.0
+    assert row[ALARMS] <= judge_blocks.LEVEL * (1 + excess) + 2 * error * (not excess)
 
 
 def test_the_rates_are_those_of_the_code() -> None:

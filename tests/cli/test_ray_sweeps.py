@@ -102,7 +102,7 @@ def is_below(process: int, parent: int) -> bool:
 def finish(sweep: subprocess.Popen[str], home: Path) -> str:
     """Return what a sweep wrote to stderr, after results that it does not change any more."""
     done = {file: file.stat().st_mtime_ns for file in (home / "results" / "adhoc").glob("*.npz")}
-    _, err = sweep.communicate(timeout=180)
+    _, err = sweep.communicate(timeout=400)
     assert sweep.returncode == 0, err
     assert {file: file.stat().st_mtime_ns for file in done} == done
     return err
