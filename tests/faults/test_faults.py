@@ -11,6 +11,7 @@ import re
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -319,3 +320,18 @@ def test_outcomes_of_the_mutations_are_classes_of_the_table(text: str, outcome: 
     assert set(module.READERS) <= set(readers.READERS)
     remark = text if "every row" in text else text.split(":")[0]
     assert readers.class_of(module, text) == (outcome, remark)
+
+
+def test_a_class_that_could_not_run_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = [Tally("demo", skipped="no data"), Tally("demo", Counter({FINE: 3}))]
+    fault = main.FaultClass(lambda _size, _seed: answers.pop(0), 3, 3)
+    monkeypatch.setattr(main, "STORE", tmp_path)
+    monkeypatch.setitem(main.CLASSES, "demo", fault)
+    main.run_class("demo")
+    assert main.collect("demo")["skipped"] == "no data"
+    main.run_class("demo")
+    assert main.collect("demo")["skipped"] == ""
+    main.run_class("demo")  # nothing is left to do
+    assert answers == []
