@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.covariance import factor
 from pfbench.core.parameter_checks import check_whole_number
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import GaussianBelief
@@ -68,7 +69,8 @@ class FilterBank(HypothesisFilter):
         node, log_w, sd = split_normal(points, belief.covariance)
         grid = torch.cartesian_prod(*[node] * len(axes)).reshape(count, len(axes))
         weights = torch.cartesian_prod(*[log_w] * len(axes)).reshape(count, len(axes)).sum(-1)
-        root = torch.linalg.cholesky(belief.covariance)
+        root, is_valid = factor(belief.covariance)  # a run without a root is lost
+        root = torch.where(is_valid[:, None, None], root, torch.nan)
         scale = root.new_ones(root.shape[-1])
         scale[axes] = sd
         offset = root[..., axes] @ grid.mT  # [R, d, K]

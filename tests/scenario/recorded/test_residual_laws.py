@@ -57,7 +57,7 @@ def shortened(scene: DictConfig) -> DictConfig:
         elif "duration_s" in path:
             path.duration_s = 120.0
         elif "end_s" in path:
-            path.end_s = path.get("start_s", 1.0) + 60.0
+            path.end_s = (path.get("start_s") or 1.0) + 60.0
     return scene
 
 
