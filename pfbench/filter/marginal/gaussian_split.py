@@ -190,15 +190,15 @@ class GaussianSplitFilter:
         ancestors = Systematic()(w, torch.full_like(w[:, :1], n, dtype=torch.long), draws)[rows]
         z = self.points(draws).normal("split", n, len(sampled)).to(w)[rows]
         at = rows.unsqueeze(1)
-        x, root = belief.x[at, ancestors], factor(covariance[at, ancestors])[0]
+        x, (root, is_valid) = belief.x[at, ancestors], factor(covariance[at, ancestors])
+        root = torch.where(is_valid[..., None, None], root, torch.nan)  # the run is lost
         columns, root = split_root(root, sampled, 0.5 * self.largest_sd)
         shift = (torch.stack(columns, -1) @ z.unsqueeze(-1)).squeeze(-1)
         root = move_root(model.chart, *(a.flatten(0, 1) for a in (x, shift, root)))
         root = root.unflatten(0, (len(rows), n))
-        log_w = torch.full_like(w[rows], -math.log(n))
         return belief._replace(
             x=belief.x.index_copy(0, rows, model.chart.add(x, shift)),
-            log_w=belief.log_w.index_copy(0, rows, log_w),
+            log_w=belief.log_w.index_copy(0, rows, torch.full_like(w[rows], -math.log(n))),
             memory={_COVARIANCE: covariance.index_copy(0, rows, root @ root.mT)},
         )
 

@@ -111,6 +111,21 @@ def test_a_correlated_start_keeps_its_moments() -> None:
     torch.testing.assert_close(moments, spread[0] @ spread[0].mT)
 
 
+@pytest.mark.parametrize(("sd", "is_finite"), [(1.0, True), (0.0, True), (math.nan, False)])
+def test_a_singular_start_is_split_and_one_that_is_no_number_loses_the_run(
+    sd: float, is_finite: bool
+) -> None:
+    spread = torch.diag(torch.tensor([1.5, sd], dtype=torch.float64)).repeat(2, 1, 1)
+    draws, zero = PhiloxStream(1, torch.arange(2)), torch.zeros(2, 2, dtype=torch.float64)
+    covariance = (
+        FilterBank(branches=9).init(model(), 2, draws, zero, spread).memory["branch_covariance"]
+    )
+    assert torch.isfinite(covariance).all() == is_finite
+    if is_finite:
+        assert bool((covariance[..., 1, 1] > 0).all()) == (sd > 0)
+        assert bool((covariance[..., 0, 0] > 0).all())
+
+
 def test_a_bank_of_one_filter_is_that_filter() -> None:
     single, bank = run(GaussianFilter(TaylorLinearisation())), run(FilterBank(branches=1))
     torch.testing.assert_close(bank.mean, single.mean)
