@@ -210,7 +210,7 @@ def draw(stored: dict[str, Any]) -> None:
     axis.set(xscale="log")
     axis.margins(x=0.08)
     axis.set_xlabel(
-        "cost of a step, times that of SIR; circles: particles, squares: Gaussian filters and their mixtures",
+        "cost of a step, times that of SIR\ncircles: particles, squares: Gaussian filters and mixtures",
         fontsize=8,
     )
     axis.set_title(
