@@ -21,6 +21,7 @@ from pfbench.files import markdown_head, markdown_row
 from pfbench.results import holm, wilcoxon_signed_rank
 
 LIMITS = Path(__file__).parents[1] / "docs" / "terrain_limit.json"
+REPORTS = Path(__file__).parents[1] / "reports"
 PARTICLES = "rpf"  # the particle filter that is compared
 BANKS = ("ekf_bank", "ekf_bank_dense")
 ALPHA = 0.05
@@ -212,12 +213,36 @@ def describe_answer(runs: Mapping[str, pd.DataFrame], families: Mapping[str, str
             shares = (f"`{a}` in {100 * kept[scenes[dose], a]:.0f} %" for a in (PARTICLES, *BANKS))
             all_won.append(
                 f"`{PARTICLES}` is better than every Kalman filter, both banks included, in `{name}` at {dose} m. "
-                f"Track is kept there by {', '.join(shares)} of runs."
+                f"Track is kept there by {', '.join(shares)} of runs. {describe_joint(name, scenes[dose])}"
             )
         words = (", ".join(doses) + " m" if doses else "none" for doses in cells)
         lines.append(markdown_row(f"`{name}`", STUDIES[name], *words))
     none = f"`{PARTICLES}` is in no condition better than every Kalman filter, both banks included."
     return "\n".join([*lines, "", *(all_won or [none])])
+
+
+def describe_joint(name: str, scenario: str) -> str:
+    """State the verdicts of the report on both banks, which hold for all pairs of filters together.
+
+    Args:
+        name: Name of the study.
+        scenario: Name of the condition in the stored files.
+    """
+    table = pd.read_csv(REPORTS / name / "verdicts.csv")
+    is_view = (table["metric"] == "rmse") & (table["world"] == scenario)
+    rows = table[is_view & (table["baseline"] == PARTICLES)].drop_duplicates("filter")
+    found = rows.set_index("filter")
+    best = found.index[found["verdict"] == "best"]
+    words = {"open": "not decided", "equal": "equal"}
+    told = (
+        f"`{bank}` is {words.get(v := found.loc[bank, 'verdict'], v)} "
+        f"({str(found.loc[bank, 'words']).strip(chr(39))})"
+        for bank in BANKS
+    )
+    return (
+        f"The report decides all pairs of filters together, against the smallest error, that of `{best[0]}`: "
+        f"{', '.join(told)}."
+    )
 
 
 def find_won(pairs: Mapping[float, Mapping[str, Pair]], labels: Sequence[str]) -> list[str]:
