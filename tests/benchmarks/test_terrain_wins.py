@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -52,7 +53,19 @@ def test_a_win_is_a_decision_of_paired_runs() -> None:
     assert errors.shape == (RUNS, 4)
 
 
-def test_the_answer_names_the_doses() -> None:
+def test_the_answer_names_the_doses_and_the_joint_verdicts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terrain_wins, "REPORTS", tmp_path)
+    row = {"metric": "rmse", "world": "terrain[initial_sd=20.0]", "baseline": "rpf"}
+    verdicts = [
+        {**row, "filter": "gpf", "verdict": "best", "words": "smallest"},
+        {**row, "filter": "ekf_bank", "verdict": "worse", "words": "+88 %"},
+        {**row, "filter": "ekf_bank_dense", "verdict": "open", "words": "'-4.0 to +73 %"},
+        {**row, "metric": "crps", "filter": "ekf_bank", "verdict": "open", "words": "no"},
+    ]
+    (tmp_path / "terrain_rough").mkdir()
+    pd.DataFrame(verdicts).to_csv(tmp_path / "terrain_rough" / "verdicts.csv", index=False)
     start = make_runs({50.0: (1.0, 1.0, 1.0), 400.0: (2.0, 1.0, 0.8)})
     rough = make_runs({20.0: (2.0, 1.5, 1.4), 500.0: (1.5, 1.0, 1.0)})
     text = terrain_wins.describe_answer({"terrain_start": start, "terrain_rough": rough}, FAMILIES)
@@ -61,6 +74,9 @@ def test_the_answer_names_the_doses() -> None:
     assert (
         "both banks included, in `terrain_rough` at 20 m. Track is kept there by `rpf` in 100 %,"
         in text
+    )
+    assert (
+        "that of `gpf`: `ekf_bank` is worse (+88 %), `ekf_bank_dense` is not decided (-4.0" in text
     )
     text = terrain_wins.describe_answer({"terrain_start": start}, FAMILIES)
     assert "in no condition better than every Kalman filter" in text
