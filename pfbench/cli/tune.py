@@ -2,65 +2,109 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from pfbench.config.composition import compose
-from pfbench.config.named_sets import SUFFIX, TUNED_METHODS
+from pfbench.config.composition import JobConfig, compose
+from pfbench.config.named_sets import TUNED_METHODS
 
 HELP = """\
 pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
 
 Tune the baselines of a study of robustness: a factor on R and one knob of the method, 16 candidates
-each, in three noise regimes, with the seed of the study plus 1000. Write a configuration file per
-filter and the record of all candidates.
+each, in three noise regimes, with the seed of the study plus 1000. Write the chosen knobs and the
+record of all candidates into one file, FOLDER/tuned/NAME.yaml. In a study `tuned=NAME` gives the
+knobs to the filters that end in _tuned.
 
-  pfbench tune scenario=flight_500s model=ins_gnss_inflated
-  pfbench tune scenario=passive_1 filter=gate,huber runs=20 suffix=passive folder=conf
+  pfbench tune scenario=passive_1 folder=conf
+  pfbench run -m 'hydra.searchpath=[file://conf]' scenario=passive_1 tuned=passive_1 filter=tuned_baselines
 
   filter=...         filters to tune, default ekf_scaled,gate,huber,student
   runs=20 seed=1     runs of a candidate, and seed of the study
   noise=...          noise regimes, default nominal,outliers,student
-  suffix=tuned       end of the names of the tuned filters
-  folder=conf        folder of the files; use it with 'hydra.searchpath=[file://conf]'"""
+  r_factors=1,2,4,8  factors on R of the candidates, for all filters alike
+  report.start_time_s=0   time before which errors do not count, as in the report of the study
+  name=SCENARIO      name of the file
+  folder=conf        folder of the file; use it with 'hydra.searchpath=[file://conf]'"""
 
-_OPTIONS = {"filter": ",".join(TUNED_METHODS), "suffix": SUFFIX, "folder": "conf", "noise": ""}
+_OPTIONS = {
+    "filter": ",".join(TUNED_METHODS), "name": "", "folder": "conf", "noise": "nominal,outliers,student",
+    "r_factors": "1,2,4,8",
+}  # fmt: skip
+_OWN = ("seed", "runs", "study", "results_dir", "report.start_time_s")  # not settings of the world
 
 
 def tune_filters(words: Sequence[str]) -> None:
-    """Tune filters and write their files.
+    """Tune filters and write their knobs.
 
     Args:
         words: Words `key=value`.
 
     Raises:
-        ValueError: If a filter is without a knob, or a value is not valid.
+        ValueError: If a filter is without a knob, a list is empty, a value is not valid, or a study scores
+            the seed of the tuning.
     """
-    from pfbench.job.tuning.candidate_search import REGIMES, SEED_SHIFT, CandidateSearch
+    from pfbench.job.tuning.candidate_search import SEED_SHIFT, CandidateSearch
     from pfbench.job.tuning.knobs import list_candidates
-    from pfbench.job.tuning.tuned_files import write_filter_file, write_record
+    from pfbench.job.tuning.scored_seeds import check_seed
+    from pfbench.job.tuning.tuned_files import write_tuned_file
 
     options = _OPTIONS | {k: v for k, _, v in (w.partition("=") for w in words) if k in _OPTIONS}
+    lists = {key: _split_list(key, options[key]) for key in ("filter", "noise", "r_factors")}
     others = [word for word in words if word.partition("=")[0] not in _OPTIONS]
-    methods, folder = options["filter"].split(","), Path(options["folder"])
-    for method in methods:
-        list_candidates(method)  # refuses a filter without a knob before any run
-    regimes = tuple(options["noise"].split(",")) if options["noise"] else REGIMES
-    keys = {word.partition("=")[0] for word in others}
-    study = compose([*others, *([] if "runs" in keys else ["runs=20"])])
-    seed, runs = study.values["seed"] + SEED_SHIFT, study.values["runs"]
-    rest = [word for word in others if word.partition("=")[0] not in ("seed", "runs", "study")]
-    name = f"tuning_{study.choices['scenario']}_{study.choices['model']}"
-    fixed = [f"seed={seed}", f"runs={runs}", f"study={name}", "pcrb=false"]
-    search = CandidateSearch([*rest, *fixed], regimes, print)
+    grids = {method: list_candidates(method, _numbers(lists["r_factors"])) for method in lists["filter"]}  # fmt: skip
+    study = _compose_world(others)
+    seed, start_time_s = (
+        study.values["seed"] + SEED_SHIFT,
+        float(study.values["report"]["start_time_s"]),
+    )
+    check_seed(study, seed)
+    settings = [word for word in others if word.partition("=")[0] not in _OWN]
+    record = f"tuning_{study.choices['scenario']}_{study.choices['model']}"
+    fixed = [f"seed={seed}", f"runs={study.values['runs']}", f"study={record}", "pcrb=false"]
+    places = [word for word in others if word.startswith("results_dir=")]
+    search = CandidateSearch([*settings, *places, *fixed], lists["noise"], print, start_time_s)
     world = {
         **{key: study.choices[key] for key in ("scenario", "model")},
-        **{"seed": seed, "runs": runs, "regimes": list(regimes)},
+        "settings": [word for word in settings if re.match(r"(scenario|model|noise)\.", word)],
+        **{"seed": seed, "runs": study.values["runs"], "start_time_s": start_time_s},
+        "regimes": lists["noise"],
     }
-    results = [search.tune(method) for method in methods]
+    results = [search.tune(method, grid) for method, grid in grids.items()]
     for result in results:
-        path = write_filter_file(result, folder, options["suffix"], world)
         values = ", ".join(f"{key}={value:g}" for key, value in result.choice.values.items())
-        print(f"{result.method}: {values}. {path.resolve()}")
-    record = write_record(results, folder, options["suffix"], world)
-    print(f"record: {record.resolve()}")
+        print(f"{result.method}: {values}")
+    name = options["name"] or study.choices["scenario"]
+    path = write_tuned_file(results, Path(options["folder"]), name, world)
+    print(f"tuned={name}: {path.resolve()}")
+
+
+def _compose_world(words: Sequence[str]) -> JobConfig:
+    """Compose the world of a tuning, with 20 runs unless the words set them."""
+    keys = {word.partition("=")[0] for word in words}
+    return compose([*words, *([] if "runs" in keys else ["runs=20"])])
+
+
+def _split_list(key: str, text: str) -> list[str]:
+    """Split a list of the command line, which must have an entry."""
+    entries = [entry.strip() for entry in text.split(",")]
+    if not all(entries) or len(set(entries)) < len(entries):
+        raise ValueError(
+            f"{key} must be a list of distinct entries separated by commas, got {text!r}. "
+            f"Default: {key}={_OPTIONS[key]}"
+        )
+    return entries
+
+
+def _numbers(entries: Sequence[str]) -> tuple[float, ...]:
+    """Return factors on R, which must be positive numbers."""
+    try:
+        values = tuple(map(float, entries))
+    except ValueError:
+        values = (0.0,)
+    if not all(0.0 < value < float("inf") for value in values):
+        raise ValueError(
+            f"r_factors must be positive numbers, got {','.join(entries)}. Default: r_factors={_OPTIONS['r_factors']}"
+        )
+    return values

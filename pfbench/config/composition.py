@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 CHOICES = ("scenario", "noise", "filter", "model")  # groups that name a job
+TUNED = "tuned"  # group of the knobs that `pfbench tune` chose, which no job stores
 
 _HYDRA_STATE = threading.RLock()  # Hydra has one state for all threads of a process
 
@@ -149,6 +150,7 @@ def resolve_config(
     names = {str(group): str(name) for group, name in (choices or {}).items()}
     _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
     values = remove_nested_blocks(values)
+    values.pop(TUNED, None)  # the filter has its knobs now
     return JobConfig(values, names, is_shared, packages)
 
 

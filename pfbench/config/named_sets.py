@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-SUFFIX = "tuned"  # end of the names of the installed tuned filters
+SUFFIX = "tuned"  # end of the names of the tuned filters
 TUNED_METHODS = ("ekf_scaled", "gate", "huber", "student")
 FILTER_SETS = {"tuned_baselines": tuple(f"{method}_{SUFFIX}" for method in TUNED_METHODS)}
 

@@ -15,6 +15,7 @@ from pfbench.config.paper_block import PAPER
 from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.job_labels import parse_label
 
+_TUNED_DATA = "${tuned.data}"  # of a filter whose knobs are those of the group `tuned`
 _NAME = re.compile(r"\w+")
 _NODE = re.compile(rf"^{PAPER}:.*\n(?:[ \t]+.*\n?|[ \t]*\n)*", re.MULTILINE)
 
@@ -34,7 +35,18 @@ def read_paper_block(group: str, name: str) -> Mapping[str, Any]:
     if not _NAME.fullmatch(name) or not path.is_file():
         return {}
     node = _NODE.search(path.read_text(encoding="utf-8"))
-    return (yaml.safe_load(node.group())[PAPER] or {}) if node else {}
+    block = (yaml.safe_load(node.group())[PAPER] or {}) if node else {}
+    is_open = block.get("tuning") == _TUNED_DATA
+    return {**block, "tuning": _read_default_world()} if is_open else block
+
+
+@cache
+def _read_default_world() -> str:
+    """Read the data on which tuned filters were tuned unless a job chooses another world."""
+    main = yaml.safe_load((conf_dir() / "config.yaml").read_text(encoding="utf-8"))
+    (name,) = (entry["tuned"] for entry in main["defaults"] if "tuned" in entry)
+    knobs = yaml.safe_load((conf_dir() / "tuned" / f"{name}.yaml").read_text(encoding="utf-8"))
+    return str(knobs["data"])
 
 
 def list_named_parts(group: str) -> list[str]:

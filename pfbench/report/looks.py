@@ -116,8 +116,16 @@ def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
     Args:
         conditions: Conditions of the study.
     """
-    blocks = {job.label: _stored_block(job.meta, "filter") for c in conditions for job in c.jobs}
-    return find_looks(sorted(blocks), blocks)
+    blocks: dict[str, Mapping[str, Any]] = {}
+    worlds: dict[str, dict[str, None]] = {}  # distinct, in the order of the conditions
+    for job in (job for c in conditions for job in c.jobs):
+        blocks[job.label] = block = _stored_block(job.meta, "filter")
+        worlds.setdefault(job.label, {}).update({str(block["tuning"]): None} if block.get("tuning") else {})
+    looks = find_looks(sorted(blocks), blocks)
+    return {
+        label: replace(look, tuning=", ".join(worlds[label])) if worlds[label] else look
+        for label, look in looks.items()
+    }
 
 
 def study_part_names(conditions: Sequence[Condition], group: str) -> dict[str, PartName]:

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import copy
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pfbench.config.composition import JobConfig, compose
 from pfbench.job.run_job import run
-from pfbench.job.tuning.knobs import apply_candidate, list_candidates
+from pfbench.job.tuning.knobs import apply_candidate
 from pfbench.results import store
 from pfbench.results.error_measures import mean_per_run, rmse_per_run
+from pfbench.results.frame import drop_before
 from pfbench.results.state_groups import main_component_group
 
-REGIMES = ("nominal", "outliers", "student")
 SEED_SHIFT = 1000  # seed of a tuning minus seed of the study
 TIE = 0.01  # relative difference of two scores that calibration decides
+OBJECTIVE = (
+    "mean over regimes of log(median RMSE / median RMSE of the EKF), smallest; within 1 % the candidate whose "
+    "NEES divided by its dimension is closest to 1"
+)
+_PARTS = ("world", "scores", "filter")  # of the seconds of a job
 
 
 class JobScore(NamedTuple):
@@ -29,10 +33,12 @@ class JobScore(NamedTuple):
     Attributes:
         error: Median over runs of the RMSE of the main group; a lost run counts as infinite.
         nees_ratio: Median over runs of the mean NEES of the main group, divided by its dimension.
+        seconds: Computing time of the job.
     """
 
     error: float
     nees_ratio: float
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ class TuningResult:
         choice: Candidate of the choice.
         untuned: The filter as its file states it, without a factor on R.
         candidates: All candidates.
-        seconds: Time of the search.
+        seconds: Computing time of the jobs of all candidates.
     """
 
     method: str
@@ -69,10 +75,6 @@ class TuningResult:
     untuned: Candidate
     candidates: tuple[Candidate, ...]
     seconds: float
-
-    def to_record(self) -> dict[str, Any]:
-        """Return plain values for a file."""
-        return asdict(self)
 
 
 def choose_candidate(candidates: Sequence[Candidate]) -> Candidate:
@@ -101,33 +103,35 @@ class CandidateSearch:
         words: Overrides that name scenario, model, runs and seed of the tuning.
         regimes: Noise regimes of equal weight.
         progress: Function that is called with the name of each filter and candidate.
+        start_time_s: Time before which errors do not count [s].
     """
 
     def __init__(
         self,
         words: Sequence[str],
-        regimes: Sequence[str] = REGIMES,
+        regimes: Sequence[str],
         progress: Callable[[str], object] = lambda text: None,
+        start_time_s: float = 0.0,
     ) -> None:
         self.words, self.regimes, self.progress = tuple(words), tuple(regimes), progress
+        self.start_time_s, self.seconds = start_time_s, 0.0
         self.reference = {regime: self._score("ekf", regime, None) for regime in self.regimes}
 
-    def tune(self, method: str) -> TuningResult:
+    def tune(self, method: str, grid: Sequence[dict[str, float]]) -> TuningResult:
         """Search the knobs of a filter.
 
         Args:
             method: Name of the filter.
+            grid: Values of all candidates by knob.
 
         Returns:
             The result.
         """
-        start_time = time.perf_counter()
-        candidates = []
-        for values in list_candidates(method):
+        candidates, self.seconds = [], 0.0
+        for values in grid:
             self.progress(f"{method} {' '.join(f'{k}={v:g}' for k, v in values.items())}")
             candidates.append(self._try(method, values))
-        choice = choose_candidate(candidates)
-        seconds = time.perf_counter() - start_time
+        choice, seconds = choose_candidate(candidates), self.seconds
         return TuningResult(method, choice, self._try(method, {}), tuple(candidates), seconds)
 
     def _try(self, method: str, values: dict[str, float]) -> Candidate:
@@ -145,7 +149,9 @@ class CandidateSearch:
     def _score(self, method: str, regime: str, values: Mapping[str, float] | None) -> JobScore:
         """Run one job, or read its result."""
         config = compose([*self.words, f"filter={method}", f"noise={regime}"])
-        return score_job(run(_with_candidate(config, values)).path)
+        score = score_job(run(_with_candidate(config, values)).path, self.start_time_s)
+        self.seconds += score.seconds
+        return score
 
 
 def _with_candidate(config: JobConfig, values: Mapping[str, float] | None) -> JobConfig:
@@ -158,16 +164,17 @@ def _with_candidate(config: JobConfig, values: Mapping[str, float] | None) -> Jo
     return JobConfig(changed, config.choices, config.uses_shared_particles, config.trusted)
 
 
-def score_job(path: Any) -> JobScore:
+def score_job(path: Any, start_time_s: float = 0.0) -> JobScore:
     """Compute the score of a stored job.
 
     Args:
         path: File of the result.
+        start_time_s: Time before which errors do not count [s].
 
     Returns:
         The score.
     """
-    result = store.read_result(path)
+    result = drop_before(store.read_result(path), start_time_s)
     group = main_component_group(result.meta["state"])
     lost = np.asarray(result.data["lost"], dtype=bool)
     error = result.data["error"][..., group.places].astype(float) * group.scale
@@ -175,4 +182,5 @@ def score_job(path: Any) -> JobScore:
     number = list(result.meta["state"]["groups"]).index(group.state_group)
     nees = mean_per_run(result.data["nees"][..., number].astype(float), lost)
     size = len(result.meta["state"]["groups"][group.state_group])
-    return JobScore(float(np.median(rmse)), float(np.nanmedian(nees)) / size)
+    seconds = sum(result.meta["seconds"].get(part, 0.0) for part in _PARTS)
+    return JobScore(float(np.median(rmse)), float(np.nanmedian(nees)) / size, seconds)

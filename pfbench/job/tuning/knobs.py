@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -37,11 +37,14 @@ KNOBS: Mapping[str, Knob] = {
 }
 
 
-def list_candidates(method: str) -> list[dict[str, float]]:
+def list_candidates(
+    method: str, r_factors: Sequence[float] = R_FACTORS
+) -> list[dict[str, float]]:
     """List the candidates of a method.
 
     Args:
         method: Name of the filter.
+        r_factors: Factors on R.
 
     Returns:
         Values by knob, `r_factor` first.
@@ -55,7 +58,7 @@ def list_candidates(method: str) -> list[dict[str, float]]:
             "tuned alike."
         )
     knob = KNOBS[method]
-    return [{"r_factor": r, knob.name: v} for r, v in product(R_FACTORS, knob.values)]
+    return [{"r_factor": r, knob.name: v} for r, v in product(r_factors, knob.values)]
 
 
 def apply_candidate(adaptations: list[dict[str, Any]], values: Mapping[str, float]) -> list[Any]:

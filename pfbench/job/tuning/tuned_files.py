@@ -1,82 +1,97 @@
-"""Files of a tuning: a filter with the chosen knobs, and the record of the search."""
+"""File of a tuning: the knobs of each filter as the group `tuned`, and beside them all candidates with their scores."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pfbench.config.composition import compose
-from pfbench.config.paper_files import read_paper_block
 from pfbench.files.atomic_write import write_atomically
-from pfbench.job.tuning.candidate_search import TuningResult
-from pfbench.job.tuning.knobs import apply_candidate
+from pfbench.job.tuning.candidate_search import OBJECTIVE, Candidate, TuningResult
+
+_ERROR = "error_"  # start of the columns of a record with the error in a regime
+_DIGITS = 6
 
 
-def write_filter_file(
-    result: TuningResult, folder: Path, suffix: str, world: Mapping[str, Any]
+def write_tuned_file(
+    results: Sequence[TuningResult], folder: Path, name: str, world: Mapping[str, Any]
 ) -> Path:
-    """Write the configuration file of a tuned filter.
-
-    Args:
-        result: Result of the search.
-        folder: Folder of configuration files.
-        suffix: End of the filter's name, after `_`.
-        world: Scenario, model, seed, runs and regimes of the search.
-
-    Returns:
-        The file, `FOLDER/filter/METHOD_SUFFIX.yaml`.
-    """
-    nodes = compose([f"filter={result.method}"]).values["filter"]["noise_adaptations"]
-    lines = [
-        f"# {result.method} tuned on {world['scenario']}, model {world['model']}, seed {world['seed']}.",
-        "defaults:",
-        f"  - {result.method}",
-        "  - _self_",
-        "noise_adaptations:",
-    ]
-    for node in apply_candidate(nodes, result.choice.values):
-        pairs = [f"{key}: {json.dumps(value)}" for key, value in node.items()]
-        pairs[0] = f"_target_: {node['_target_']}"
-        lines += [f"  - {pairs[0]}", *(f"    {pair}" for pair in pairs[1:])]
-    block = read_paper_block("filter", result.method)
-    name = {key: f"{block.get(key, result.method)} (tuned)" for key in ("name", "long_name")}
-    lines += ["paper:", *(f"  {key}: {json.dumps(value)}" for key, value in name.items())]
-    lines += ["  family: kalman", "  proposed: false", '  cite: ""', "  baselines: []"]
-    lines.append(f"  tuning: {json.dumps(_describe_world(world))}")
-    path = folder / "filter" / f"{result.method}_{suffix}.yaml"
-    return _write(path, "\n".join(lines) + "\n")
-
-
-def write_record(
-    results: Sequence[TuningResult], folder: Path, suffix: str, world: Mapping[str, Any]
-) -> Path:
-    """Write all candidates with their scores.
+    """Write the knobs of tuned filters with the record of their search.
 
     Args:
         results: Results of the search by filter.
         folder: Folder of configuration files.
-        suffix: End of the filters' names.
-        world: Scenario, model, seed, runs and regimes of the search.
+        name: Name of the file, which `tuned=NAME` chooses.
+        world: Scenario, model, settings, seed, runs, start time and regimes of the search.
 
     Returns:
-        The file, `FOLDER/tuning/SUFFIX.json`.
+        The file, `FOLDER/tuned/NAME.yaml`.
     """
-    content = {"world": dict(world), "filters": [result.to_record() for result in results]}
-    text = json.dumps(content, indent=1) + "\n"
-    return _write(folder / "tuning" / f"{suffix}.json", text)
+    lines = [
+        f"# Knobs of tuned filters, chosen by `pfbench tune` in the world {name}.",
+        f"data: {json.dumps(describe_world(world))}",
+        f"objective: {json.dumps(OBJECTIVE)}",
+        "world:",
+        *(f"  {key}: {json.dumps(value)}" for key, value in world.items()),
+    ]
+    for result in results:
+        lines += [f"{result.method}:"]
+        lines += [f"  {key}: {json.dumps(value)}" for key, value in result.choice.values.items()]
+        lines += [f"  seconds: {result.seconds:.1f}", "  candidates: |"]
+        lines += [f"    {' '.join(row)}" for row in _list_rows(result)]
+    path = folder / "tuned" / f"{name}.yaml"
+    write_atomically(path, lambda file: file.write(("\n".join(lines) + "\n").encode()))
+    return path
 
 
-def _describe_world(world: Mapping[str, Any]) -> str:
-    """Describe the data of the search for reports."""
+def _list_rows(result: TuningResult) -> Iterator[list[str]]:
+    """Yield the rows of a record: the head, all candidates, and the filter without tuned knobs."""
+    knobs = list(result.choice.values)
+    yield [*knobs, "log_ratio", "nees_ratio", *(f"{_ERROR}{r}" for r in result.choice.errors)]
+    for candidate in (*result.candidates, result.untuned):
+        values = (candidate.values.get(knob) for knob in knobs)
+        words = ["-" if value is None else f"{value:g}" for value in values]
+        scores = (candidate.log_ratio, candidate.nees_ratio, *candidate.errors.values())
+        yield [*words, *(f"{score:.{_DIGITS}g}" for score in scores)]
+
+
+def read_candidates(node: Mapping[str, Any]) -> tuple[list[Candidate], Candidate]:
+    """Read the candidates of a filter from the file of a tuning.
+
+    Args:
+        node: Entry of the filter.
+
+    Returns:
+        All candidates, and the filter without tuned knobs.
+    """
+    head, *rows = (line.split() for line in node["candidates"].splitlines())
+    places = {name: k for k, name in enumerate(head)}
+    knobs, regimes = head[: places["log_ratio"]], head[places["nees_ratio"] + 1 :]
+    found = [
+        Candidate(
+            {knob: float(row[places[knob]]) for knob in knobs if row[places[knob]] != "-"},
+            float(row[places["log_ratio"]]),
+            float(row[places["nees_ratio"]]),
+            {r.removeprefix(_ERROR): float(row[places[r]]) for r in regimes},
+        )
+        for row in rows
+    ]
+    return found[:-1], found[-1]
+
+
+def describe_world(world: Mapping[str, Any]) -> str:
+    """Describe the data of a search for reports.
+
+    Args:
+        world: Scenario, model, settings, seed, runs, start time and regimes of the search.
+    """
+    settings = [re.sub(r"^scenario\.", "", word) for word in world.get("settings", ())]
+    parts = [f"model {world['model']}", *settings, f"seed {world['seed']}"]
+    if world.get("start_time_s"):
+        parts += [f"scored from {world['start_time_s']:g} s"]
     return (
-        f"{world['scenario']} (model {world['model']}, seed {world['seed']}, {world['runs']} runs; "
+        f"{world['scenario']} ({', '.join(parts)}, {world['runs']} runs; "
         f"noise: {', '.join(world['regimes'])})"
     )
-
-
-def _write(path: Path, text: str) -> Path:
-    """Write a text file as a whole."""
-    write_atomically(path, lambda file: file.write(text.encode()))
-    return path

@@ -78,7 +78,7 @@ def describe_robustness(
     names = {label: looks[label].name for label in evidence}
     text = describe_robust_filters(names, find_robust_filters(evidence, options.alpha))
     tuning = looks[CONTROL].tuning
-    is_foreign = tuning and not any(tuning.startswith(f"{key} ") for key in common)
+    is_foreign = tuning and not any(f", {key} (" in f", {tuning}" for key in common)
     return f"{text} The control was tuned in another world, {tuning}." if is_foreign else text
 
 
