@@ -61,10 +61,8 @@ def tune_filters(words: Sequence[str]) -> None:
     )
     check_seed(study, seed)
     settings = [word for word in others if word.partition("=")[0] not in _OWN]
-    record = f"tuning_{study.choices['scenario']}_{study.choices['model']}"
-    fixed = [f"seed={seed}", f"runs={study.values['runs']}", f"study={record}", "pcrb=false"]
-    places = [word for word in others if word.startswith("results_dir=")]
-    search = CandidateSearch([*settings, *places, *fixed], lists["noise"], print, start_time_s)
+    fixed = [f"seed={seed}", f"runs={study.values['runs']}", "pcrb=false", "score_steps=0"]
+    search = CandidateSearch([*settings, *fixed], lists["noise"], print, start_time_s)
     world = {
         **{key: study.choices[key] for key in ("scenario", "model")},
         "settings": [word for word in settings if re.match(r"(scenario|model|noise)\.", word)],

@@ -120,7 +120,9 @@ def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
     worlds: dict[str, dict[str, None]] = {}  # distinct, in the order of the conditions
     for job in (job for c in conditions for job in c.jobs):
         blocks[job.label] = block = _stored_block(job.meta, "filter")
-        worlds.setdefault(job.label, {}).update({str(block["tuning"]): None} if block.get("tuning") else {})
+        worlds.setdefault(job.label, {}).update(
+            {str(block["tuning"]): None} if block.get("tuning") else {}
+        )
     looks = find_looks(sorted(blocks), blocks)
     return {
         label: replace(look, tuning=", ".join(worlds[label])) if worlds[label] else look

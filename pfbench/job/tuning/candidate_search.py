@@ -6,16 +6,18 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from pfbench.config.composition import JobConfig, compose
-from pfbench.job.run_job import run
+from pfbench.files.work_start import start_work
+from pfbench.job.metadata import describe_state
+from pfbench.job.tuning.joint_regimes import draw_batches
 from pfbench.job.tuning.knobs import apply_candidate
-from pfbench.results import store
+from pfbench.model.base import StateSpaceModel
 from pfbench.results.error_measures import mean_per_run, rmse_per_run
-from pfbench.results.frame import drop_before
 from pfbench.results.state_groups import main_component_group
 
 SEED_SHIFT = 1000  # seed of a tuning minus seed of the study
@@ -24,21 +26,18 @@ OBJECTIVE = (
     "mean over regimes of log(median RMSE / median RMSE of the EKF), smallest; within 1 % the candidate whose "
     "NEES divided by its dimension is closest to 1"
 )
-_PARTS = ("world", "scores", "filter")  # of the seconds of a job
 
 
-class JobScore(NamedTuple):
-    """Score of a job.
+class RegimeScore(NamedTuple):
+    """Score of a filter in a noise regime.
 
     Attributes:
         error: Median over runs of the RMSE of the main group; a lost run counts as infinite.
         nees_ratio: Median over runs of the mean NEES of the main group, divided by its dimension.
-        seconds: Computing time of the job.
     """
 
     error: float
     nees_ratio: float
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class TuningResult:
         choice: Candidate of the choice.
         untuned: The filter as its file states it, without a factor on R.
         candidates: All candidates.
-        seconds: Computing time of the jobs of all candidates.
+        seconds: Computing time of all candidates.
     """
 
     method: str
@@ -115,7 +114,10 @@ class CandidateSearch:
     ) -> None:
         self.words, self.regimes, self.progress = tuple(words), tuple(regimes), progress
         self.start_time_s, self.seconds = start_time_s, 0.0
-        self.reference = {regime: self._score("ekf", regime, None) for regime in self.regimes}
+        self.batches = draw_batches({r: self._compose("ekf", r) for r in self.regimes})
+        _check_start(self.batches[0].episode.time, start_time_s)
+        start_work()
+        self.reference = self._score(self._compose("ekf", self.regimes[0]))
 
     def tune(self, method: str, grid: Sequence[dict[str, float]]) -> TuningResult:
         """Search the knobs of a filter.
@@ -128,15 +130,16 @@ class CandidateSearch:
             The result.
         """
         candidates, self.seconds = [], 0.0
+        config = self._compose(method, self.regimes[0])
         for values in grid:
             self.progress(f"{method} {' '.join(f'{k}={v:g}' for k, v in values.items())}")
-            candidates.append(self._try(method, values))
+            candidates.append(self._try(config, values))
         choice, seconds = choose_candidate(candidates), self.seconds
-        return TuningResult(method, choice, self._try(method, {}), tuple(candidates), seconds)
+        return TuningResult(method, choice, self._try(config, {}), tuple(candidates), seconds)
 
-    def _try(self, method: str, values: dict[str, float]) -> Candidate:
+    def _try(self, config: JobConfig, values: dict[str, float]) -> Candidate:
         """Run a candidate in all regimes."""
-        scores = {regime: self._score(method, regime, values) for regime in self.regimes}
+        scores = self._score(_with_candidate(config, values))
         logs = [math.log(s.error / self.reference[r].error) for r, s in scores.items()]
         ratios = [math.log(s.nees_ratio) for s in scores.values()]
         return Candidate(
@@ -146,15 +149,32 @@ class CandidateSearch:
             {regime: s.error for regime, s in scores.items()},
         )
 
-    def _score(self, method: str, regime: str, values: Mapping[str, float] | None) -> JobScore:
-        """Run one job, or read its result."""
-        config = compose([*self.words, f"filter={method}", f"noise={regime}"])
-        score = score_job(run(_with_candidate(config, values)).path, self.start_time_s)
-        self.seconds += score.seconds
-        return score
+    def _compose(self, method: str, regime: str) -> JobConfig:
+        """Compose the configuration of a filter."""
+        return compose([*self.words, f"filter={method}", f"noise={regime}"])
+
+    def _score(self, config: JobConfig) -> dict[str, RegimeScore]:
+        """Run a filter in all regimes and compute its scores by regime."""
+        scores = {}
+        for batch in self.batches:
+            result = batch.pass_filter(config)
+            self.seconds += sum(result.seconds.get(name, 0.0) for name in ("scores", "filter"))
+            data = result.arrays(batch.episode, None)
+            for regime, runs in batch.list_runs():
+                scores[regime] = score_runs(data, result.model, runs, self.start_time_s)
+        return scores
 
 
-def _with_candidate(config: JobConfig, values: Mapping[str, float] | None) -> JobConfig:
+def _check_start(time: Tensor, start_time_s: float) -> None:
+    """Check that a step remains after the start time."""
+    if not bool((time >= start_time_s).any()):
+        raise ValueError(
+            f"report.start_time_s must be at most {float(time[-1]):g} s, the end of the episode, "
+            f"got {start_time_s:g} s. Use a smaller value."
+        )
+
+
+def _with_candidate(config: JobConfig, values: Mapping[str, float]) -> JobConfig:
     """Return a configuration with the knobs of a candidate."""
     if not values:
         return config
@@ -164,23 +184,23 @@ def _with_candidate(config: JobConfig, values: Mapping[str, float] | None) -> Jo
     return JobConfig(changed, config.choices, config.uses_shared_particles, config.trusted)
 
 
-def score_job(path: Any, start_time_s: float = 0.0) -> JobScore:
-    """Compute the score of a stored job.
+def score_runs(
+    data: Mapping[str, np.ndarray], model: StateSpaceModel, runs: slice, start_time_s: float = 0.0
+) -> RegimeScore:
+    """Compute the score of some runs.
 
     Args:
-        path: File of the result.
+        data: Arrays of a job, see `store.JobResult`.
+        model: Model of the filter.
+        runs: Places of the runs.
         start_time_s: Time before which errors do not count [s].
-
-    Returns:
-        The score.
     """
-    result = drop_before(store.read_result(path), start_time_s)
-    group = main_component_group(result.meta["state"])
-    lost = np.asarray(result.data["lost"], dtype=bool)
-    error = result.data["error"][..., group.places].astype(float) * group.scale
+    state = describe_state(model)
+    group, steps = main_component_group(state), data["time"] >= start_time_s
+    lost = np.asarray(data["lost"][runs], dtype=bool)
+    error = data["error"][runs][:, steps][..., group.places].astype(float) * group.scale
     rmse = np.where(lost, np.inf, rmse_per_run(error, lost))
-    number = list(result.meta["state"]["groups"]).index(group.state_group)
-    nees = mean_per_run(result.data["nees"][..., number].astype(float), lost)
-    size = len(result.meta["state"]["groups"][group.state_group])
-    seconds = sum(result.meta["seconds"].get(part, 0.0) for part in _PARTS)
-    return JobScore(float(np.median(rmse)), float(np.nanmedian(nees)) / size, seconds)
+    number = list(state["groups"]).index(group.state_group)
+    nees = mean_per_run(data["nees"][runs][:, steps, number].astype(float), lost)
+    size = len(state["groups"][group.state_group])
+    return RegimeScore(float(np.median(rmse)), float(np.nanmedian(nees)) / size)

@@ -37,9 +37,7 @@ KNOBS: Mapping[str, Knob] = {
 }
 
 
-def list_candidates(
-    method: str, r_factors: Sequence[float] = R_FACTORS
-) -> list[dict[str, float]]:
+def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list[dict[str, float]]:
     """List the candidates of a method.
 
     Args:

@@ -46,8 +46,8 @@ def _list_experiments(scenario: str, seed: int) -> Iterator[str]:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
         sweep = tree.get("hydra", {}).get("sweeper", {}).get("params", {})
         choices = [entry for entry in tree.get("defaults", ()) if isinstance(entry, Mapping)]
-        chosen = [entry[_SCENARIO] for entry in choices if _SCENARIO in entry]
-        scenarios = str(sweep.get("scenario", ",".join(chosen))).split(",")
+        single = ",".join(entry[_SCENARIO] for entry in choices if _SCENARIO in entry)
+        scenarios = str(sweep.get("scenario", single)).split(",")
         seeds = str(sweep.get("seed", tree.get("seed", _DEFAULT_SEED))).split(",")
         if scenario in scenarios and str(seed) in seeds:
             yield path.stem

@@ -69,7 +69,7 @@ def read_candidates(node: Mapping[str, Any]) -> tuple[list[Candidate], Candidate
     head, *rows = (line.split() for line in node["candidates"].splitlines())
     places = {name: k for k, name in enumerate(head)}
     knobs, regimes = head[: places["log_ratio"]], head[places["nees_ratio"] + 1 :]
-    found = [
+    candidates = [
         Candidate(
             {knob: float(row[places[knob]]) for knob in knobs if row[places[knob]] != "-"},
             float(row[places["log_ratio"]]),
@@ -78,7 +78,7 @@ def read_candidates(node: Mapping[str, Any]) -> tuple[list[Candidate], Candidate
         )
         for row in rows
     ]
-    return found[:-1], found[-1]
+    return candidates[:-1], candidates[-1]
 
 
 def describe_world(world: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ A published study keeps its runs and these facts, so that its page is decided ag
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,7 +82,7 @@ class StudyFacts(NamedTuple):
 
     @classmethod
     def from_pack(cls, pack: Mapping[str, Any]) -> StudyFacts:
-        """Restore the facts of a stored page. Installed methods have their present looks.
+        """Restore the facts of a stored page. Installed methods have their present looks, and the stored data of their tuning.
 
         Args:
             pack: Data of a page.
@@ -92,8 +92,10 @@ class StudyFacts(NamedTuple):
         labels = [look.key for look in stored]
         methods = {parse_label(label)[0] for label in labels}
         is_installed = methods <= set(list_named_parts("filter"))
+        looks = {look.key: look for look in stored}
+        present = find_looks(labels) if is_installed else looks
         return cls(
-            find_looks(labels) if is_installed else {look.key: look for look in stored},
+            {key: replace(look, tuning=looks[key].tuning) for key, look in present.items()},
             {entry["key"]: PartName(**entry) for entry in pack["worlds"]},
             {entry["key"]: PartName(**entry) for entry in facts["regimes"]},
             ReportOptions(**facts["options"]),

@@ -17,7 +17,13 @@ from pfbench.cli.tune import tune_filters
 from pfbench.config.named_sets import FILTER_SETS, expand_filter_sets
 from pfbench.config.paper_files import list_named_parts
 from pfbench.job.tuning import knobs
-from pfbench.job.tuning.candidate_search import SEED_SHIFT, Candidate, choose_candidate
+from pfbench.job.tuning.candidate_search import (
+    SEED_SHIFT,
+    Candidate,
+    CandidateSearch,
+    choose_candidate,
+    score_runs,
+)
 from pfbench.job.tuning.knobs import KNOBS, Knob, apply_candidate, list_candidates
 from pfbench.job.tuning.scored_seeds import check_seed
 from pfbench.job.tuning.tuned_files import read_candidates
@@ -155,8 +161,7 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     monkeypatch.chdir(tmp_path)
     tune_filters([
         "scenario=linear_walk", "scenario.steps=60", "runs=20", "filter=ekf_scaled",
-        "noise=outliers", "name=walk", "folder=lab", f"results_dir={tmp_path / 'results'}",
-        "r_factors=1,4", "report.start_time_s=5",
+        "noise=outliers", "name=walk", "folder=lab", "r_factors=1,4", "report.start_time_s=5",
     ])  # fmt: skip
     written = yaml.safe_load((tmp_path / "lab/tuned/walk.yaml").read_text())
     assert written["ekf_scaled"]["r_factor"] == 4.0
@@ -170,15 +175,23 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     }  # fmt: skip
     words = [f"hydra.searchpath=[file://{tmp_path}/lab]", "tuned=walk", "filter=ekf_scaled_tuned"]
     assert stated_knobs(words)["r_factor"] == 4.0
-    # the errors once more, from the stored runs
-    medians = []
-    for result in store.list_results(tmp_path / "results/tuning_linear_walk_linear_walk"):
-        assert result.meta["seed"] == 1001
+    # the errors once more, from a job of its own for each filter
+    errors = []
+    for name in ("ekf", "ekf_scaled"):  # factors on R of 1 and 4
+        words = [
+            "scenario=linear_walk",
+            "scenario.steps=60",
+            "runs=20",
+            "seed=1001",
+            "noise=outliers",
+        ]
+        outcome = job.run(job.compose([*words, f"filter={name}", "study=check"]))
+        result = store.read_result(outcome.path)
         assert result.meta["state"]["units"][0] == "m"  # of position and velocity
-        error = result.data["error"][:, result.data["time"] >= 5.0, :1]
-        medians.append(float(np.median(np.sqrt((error.astype(float) ** 2).sum(-1).mean(1)))))
-    for c in (*candidates, untuned):
-        assert min(abs(m - c.errors["outliers"]) for m in medians) < 1e-5
+        error = result.data["error"][:, result.data["time"] >= 5.0, :1].astype(float)
+        errors.append(float(np.median(np.sqrt((error**2).sum(-1).mean(1)))))
+    assert [c.errors["outliers"] for c in candidates] == pytest.approx(errors, rel=1e-5)
+    assert untuned.errors["outliers"] == pytest.approx(errors[1], rel=1e-5)
     assert "ekf_scaled: r_factor=4, q_factor=1" in capsys.readouterr().out
 
 
@@ -205,6 +218,24 @@ def test_bad_input_is_refused_before_any_run(
         tune_filters(words)
     assert re.search(message, format_error(caught.value, words))
     assert list(tmp_path.rglob("*.npz")) == []
+
+
+@pytest.mark.parametrize("words", [[], ["oracle_noise=true"]])
+def test_regimes_in_one_batch_have_the_numbers_of_separate_jobs(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Shared inputs are repeated, and a model that knows the noise is passed alone."""
+    monkeypatch.chdir(tmp_path)
+    world = ["scenario=flight_300s", "scenario.imu_rate_hz=20", "runs=3", "seed=1001", *words]
+    regimes = ("nominal", "outliers", "variance_r")
+    search = CandidateSearch([*world, "episode_cache_dir=null"], regimes)
+    assert len(search.batches) == (3 if words else 1)
+    for regime in regimes:
+        path = job.run(job.compose([*world, f"noise={regime}", "filter=ekf", "study=check"])).path
+        result = store.read_result(path)
+        alone = score_runs(result.data, search.batches[0].plan.model, slice(None))
+        assert search.reference[regime] == pytest.approx(alone, rel=1e-5)
+    assert len({score.error for score in search.reference.values()}) == 3
 
 
 def test_a_seed_of_a_stored_study_is_refused(
