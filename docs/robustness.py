@@ -17,7 +17,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from ceiling import STORE, largest_limit, root_mean
+from second_seed import (
+    compare_rankings,
+    compare_robust,
+    rank_filters,
+    read_runs,
+    seed_table,
+    select_common,
+)
 from terrain_wins import STUDIES as TERRAIN_STUDIES, describe_answer, terrain_table
+from tuned_worlds import tuned_table
 
 from pfbench.files import markdown_head, markdown_row
 from pfbench.report import StudyFacts, compare_with_control, find_robust_filters, read_page_data
@@ -185,6 +194,36 @@ def _kind(family: str, label: str) -> str:
     return KALMAN if family == KALMAN else KINDS[0]
 
 
+def seeds() -> str:
+    """Compare the best filters and the verdict "robust" with those of another seed."""
+    studies = {name: read_study(name) for name in STUDIES}
+    tables = {name: select_common(study.runs, read_runs(name)) for name, study in studies.items()}
+    cells = {}
+    for name, pair in tables.items():
+        first, second = (rank_filters(runs, studies[name].facts) for runs in pair)
+        cells |= {(name, *key): compare_rankings(first[key], second[key]) for key in first}
+
+    def decide(name: str, runs: pd.DataFrame, world: str) -> tuple[str, ...]:
+        labels = set(runs["filter"])
+        facts = studies[name].facts
+        looks = {label: look for label, look in facts.looks.items() if label in labels}
+        study = studies[name]._replace(runs=runs, facts=facts._replace(looks=looks))
+        return find_robust(study, world, CONTROLS[:1])
+
+    verdicts = compare_robust(tables, decide, (NOMINAL, OUTLIERS))
+    return f"{seed_table(cells)}\n\n{verdicts}"
+
+
+def tuned() -> str:
+    """Table of the knobs of tier B by world."""
+    worlds = {
+        world: study.facts.looks[CONTROL].tuning
+        for study in map(read_study, STUDIES)
+        for world in study.facts.worlds
+    }
+    return tuned_table(worlds)
+
+
 def recorded() -> str:
     """Compare particle filters with the best Kalman filter in each condition of recorded data."""
     lines = markdown_head("study", "regime", *KINDS)
@@ -232,7 +271,9 @@ def answer() -> str:
 
 
 BLOCKS: dict[str, Callable[[], str]] = {
+    "tuned": tuned,
     "robust": robust,
+    "seeds": seeds,
     "recorded": recorded,
     "answer": answer,
     **{name: partial(_terrain, name) for name in TERRAIN_STUDIES},

@@ -1,6 +1,10 @@
 """Public names of `pfbench.report` and the modules that define them."""
 
-from pfbench.report.board.decided_parts import StudyFacts as StudyFacts
+from pfbench.report.board.decided_parts import (
+    StudyFacts as StudyFacts,
+    decide_parts as decide_parts,
+)
+from pfbench.report.board.pack_entries import cell_entries as cell_entries
 from pfbench.report.board.robust_word import (
     compare_with_control as compare_with_control,
     find_robust_filters as find_robust_filters,
@@ -32,6 +36,8 @@ from pfbench.report.plots.plotting import (
 from pfbench.report.stored_page import (
     PAGE_DATA as PAGE_DATA,
     read_page_data as read_page_data,
+    rebuild_page as rebuild_page,
     write_page_data as write_page_data,
 )
 from pfbench.report.study_page import write_markdown as write_markdown
+from pfbench.report.tuning_words import count_tuned as count_tuned

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from config_cases import CONF
 from pfbench.config.composition import compose
 from pfbench.config.paper_block import FAMILIES, check_paper_blocks, remove_nested_blocks
 from pfbench.config.paper_files import list_named_parts, plan_installed_pairs, read_paper_block
-from pfbench.report.looks import MethodLook, find_looks
+from pfbench.report.looks import MethodLook, find_looks, study_looks
 from pfbench.report.plots.plotting import line_styles
 from pfbench.report.setting_names import describe_settings
+from pfbench.results.conditions import Condition, JobFile
 
 METHODS = list_named_parts("filter")
 LOOKS = find_looks(METHODS)
@@ -85,6 +87,21 @@ def test_scenarios_and_regimes_state_their_names() -> None:
         blocks = {name: read_paper_block(group, name) for name in names}
         assert {name for name, block in blocks.items() if not keys <= set(block)} == set()
         assert len({block["name"] for block in blocks.values()}) == len(names)
+
+
+def test_a_study_of_several_worlds_names_the_data_of_all_tunings() -> None:
+    def condition(scenario: str, tuning: str) -> Condition:
+        paper = {"name": "Gated EKF (tuned)", **({"tuning": tuning} if tuning else {})}
+        meta = {"config": {"filter": {"paper": paper}}}
+        return Condition(scenario, "nominal", "", (JobFile(Path("a"), "gate_tuned", meta),))
+
+    worlds = [condition("a", "a (seed 1001)"), condition("b", "b (seed 1001)")]
+    tunings = {
+        study_looks(conditions)["gate_tuned"].tuning
+        for conditions in (worlds, [*worlds, *worlds], [*worlds, condition("c", "")])
+    }
+    assert tunings == {"a (seed 1001), b (seed 1001)"}
+    assert find_looks(["gate_tuned"])["gate_tuned"].tuning.startswith("flight_500s (model ")
 
 
 def test_no_two_methods_share_colour_and_marker() -> None:

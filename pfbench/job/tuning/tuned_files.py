@@ -1,4 +1,4 @@
-"""File of a tuning: the knobs of each filter as the group `tuned`, and beside them all candidates with their scores."""
+"""File of a tuning: the knobs of each filter as the group `tuned`, and all candidates with their scores."""
 
 from __future__ import annotations
 

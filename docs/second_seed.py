@@ -1,0 +1,166 @@
+"""Whether the verdicts of the studies `robust_*` hold for another seed: the block `seeds` of docs/robustness.md.
+
+`python docs/second_seed.py FOLDER` stores the runs of the second seed in docs/second_seed.parquet. FOLDER has a report of
+each study, written by `pfbench report reports_dir=FOLDER` from the jobs of the same experiment with another seed.
+Both seeds are decided by the same rules, each for the filters and the conditions that both have.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import pandas as pd
+from scipy import stats
+
+from pfbench.files import markdown_head, markdown_row
+from pfbench.report import StudyFacts, decide_parts
+
+RUNS = Path(__file__).parent / "second_seed.parquet"
+CONDITION = ["scenario", "regime"]
+_WORSE = ("worse", "not_kept")
+SAME, OPEN, CHANGED = "same", "not decided", "changes"
+
+Ranking = list[tuple[str, str]]  # filters with their verdicts, the best first
+
+
+class BestFilter(NamedTuple):
+    """Best filter of a condition with two seeds.
+
+    Attributes:
+        first: Best filter of the first seed.
+        second: Best filter of the second seed.
+        outcome: SAME; OPEN if neither is shown to be worse in the other seed; CHANGED.
+        agreement: Kendall's rank correlation of the orders of all filters.
+    """
+
+    first: str
+    second: str
+    outcome: str
+    agreement: float
+
+
+def store_runs(folder: Path, studies: Sequence[str]) -> None:
+    """Store the runs of the second seed of all studies in one file.
+
+    Args:
+        folder: Folder of the reports of the second seed.
+        studies: Names of the studies.
+    """
+    tables = [pd.read_parquet(folder / s / "runs.parquet").assign(study=s) for s in studies]
+    pd.concat(tables, ignore_index=True).to_parquet(RUNS, index=False, compression="zstd")
+
+
+@cache
+def read_runs(study: str) -> pd.DataFrame:
+    """Read the runs of the second seed of a study.
+
+    Args:
+        study: Name of the study.
+    """
+    table = pd.read_parquet(RUNS)
+    return table[table["study"] == study].drop(columns="study").reset_index(drop=True)
+
+
+def select_common(first: pd.DataFrame, second: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Select the filters and the conditions that both seeds have.
+
+    Args:
+        first: Runs of the first seed.
+        second: Runs of the second seed.
+    """
+    keys = [*CONDITION, "filter"]
+    common = first[keys].drop_duplicates().merge(second[keys].drop_duplicates(), on=keys)
+    return first.merge(common, on=keys), second.merge(common, on=keys)
+
+
+def rank_filters(runs: pd.DataFrame, facts: StudyFacts) -> dict[tuple[str, str], Ranking]:
+    """Rank the filters of each condition by the rules of the page of a study.
+
+    Args:
+        runs: Runs of a study.
+        facts: Other inputs of its decisions.
+    """
+    labels = set(runs["filter"])
+    looks = {label: look for label, look in facts.looks.items() if label in labels}
+    views = decide_parts(runs, facts._replace(looks=looks, times={}))["views"]
+    rankings: dict[tuple[str, str], Ranking] = {}
+    for key, view in views.items():
+        if "all" not in (key.world, key.regime) and key.metric == "rmse":
+            rows = sorted(view["rows"], key=lambda row: row["rank"])
+            rankings[key.world, key.regime] = [(row["filter"], row["verdict"]) for row in rows]
+    return rankings
+
+
+def compare_rankings(first: Ranking, second: Ranking) -> BestFilter:
+    """Compare the order of the filters of a condition with two seeds.
+
+    Args:
+        first: Ranking of the first seed.
+        second: Ranking of the second seed, of the same filters.
+    """
+    best, other = first[0][0], second[0][0]
+    is_worse = dict(second)[best] in _WORSE or dict(first)[other] in _WORSE
+    outcome = SAME if best == other else CHANGED if is_worse else OPEN
+    places = {label: k for k, (label, _) in enumerate(second)}
+    order = [places[label] for label, _ in first]
+    agreement = float(stats.kendalltau(range(len(order)), order).statistic)
+    return BestFilter(best, other, outcome, agreement)
+
+
+def seed_table(cells: Mapping[tuple[str, str, str], BestFilter]) -> str:
+    """Table and sentence on the best filter of each condition.
+
+    Args:
+        cells: Comparisons by study, scenario and regime.
+    """
+    lines = markdown_head("study", "world", "regime", "best, seed 1", "best, seed 2", "best filter", "rank correlation")  # fmt: skip
+    for (study, world, regime), cell in cells.items():
+        words = (f"`{study}`", f"`{world}`", regime, f"`{cell.first}`", f"`{cell.second}`")
+        lines.append(markdown_row(*words, cell.outcome, f"{cell.agreement:.2f}"))
+    counts = {o: sum(c.outcome == o for c in cells.values()) for o in (SAME, OPEN, CHANGED)}
+    return "\n".join([
+        *lines, "",
+        f"The best filter is the same in {counts[SAME]} of {len(cells)} conditions. In {counts[OPEN]} others the best filter of "
+        f"one seed is not decided to be worse in the other. In {counts[CHANGED]} it is.",
+    ])  # fmt: skip
+
+
+def compare_robust(
+    studies: Mapping[str, tuple[pd.DataFrame, pd.DataFrame]],
+    decide: Callable[[str, pd.DataFrame, str], Sequence[str]],
+    regimes: tuple[str, str],
+) -> str:
+    """Table and sentence on the verdict "robust" of each filter with two seeds.
+
+    Args:
+        studies: Runs of both seeds by study, of common filters and conditions.
+        decide: Returns the robust filters of a study by its runs in a scenario.
+        regimes: Regimes that the verdict needs.
+    """
+    lines = markdown_head("world", "robust with both seeds", "seed 1 only", "seed 2 only")
+    agreed = number = 0
+    for study, tables in studies.items():
+        for world, runs in tables[0].groupby("scenario", sort=False):
+            if not set(regimes) <= set(runs["regime"]):
+                continue
+            sets = [set(decide(study, t, str(world))) for t in tables]
+            labels = sorted(set(runs["filter"]))
+            groups = (sets[0] & sets[1], sets[0] - sets[1], sets[1] - sets[0])
+            agreed += len(labels) - len(sets[0] ^ sets[1])
+            number += len(labels)
+            cells = (", ".join(f"`{name}`" for name in sorted(group)) or "–" for group in groups)
+            lines.append(markdown_row(f"`{world}`", *cells))
+    return "\n".join([
+        *lines, "",
+        f"The verdict is the same for {agreed} of {number} pairs of a filter and a world, and differs for {number - agreed}.",
+    ])  # fmt: skip
+
+
+if __name__ == "__main__":
+    from robustness import STUDIES
+
+    store_runs(Path(sys.argv[1]), STUDIES)

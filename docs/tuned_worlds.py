@@ -1,0 +1,87 @@
+"""Parameters of tier B in each world: the block `tuned` of docs/robustness.md, from the files that `pfbench tune` wrote."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pfbench.config.named_sets import TUNED_METHODS
+from pfbench.files import markdown_head, markdown_row
+from pfbench.job.tuning.candidate_search import choose_candidate
+from pfbench.job.tuning.tuned_files import read_candidates
+
+TUNED = Path(__file__).parents[1] / "conf" / "tuned"
+NAMES = {"r_factor": "R", "q_factor": "Q"}
+
+
+def tuned_table(worlds: Mapping[str, str]) -> str:
+    """Table of the parameters of tier B, and a sentence on the ends of the grid.
+
+    Args:
+        worlds: Data on which a study says that its filters were tuned, by scenario.
+    """
+    lines = markdown_head("world", "tuned on", *(f"`{method}_tuned`" for method in TUNED_METHODS))
+    largest = 0
+    for world, data in worlds.items():
+        content = read_tuning(world, data)
+        lines.append(
+            markdown_row(
+                f"`{world}`",
+                content["data"]
+                if content["world"]["scenario"] == world
+                else f"not tuned here: {data}",
+                *(describe_choice(content[method]) for method in TUNED_METHODS),
+            )
+        )
+        largest += sum(has_largest_factor(content[method]) for method in TUNED_METHODS)
+    number = len(worlds) * len(TUNED_METHODS)
+    return "\n".join([
+        *lines, "",
+        f"In {largest} of {number} cells the factor on R is the largest of the grid, so that a larger one may be better still.",
+    ])  # fmt: skip
+
+
+def read_tuning(world: str, data: str) -> dict[str, Any]:
+    """Read the file of a tuning: that of a world, if a study says so, else the one that it names.
+
+    Args:
+        world: Scenario.
+        data: Data on which the study says that its filters were tuned.
+
+    Raises:
+        ValueError: If there is no such file.
+    """
+    contents = [yaml.safe_load(path.read_text()) for path in sorted(TUNED.glob("*.yaml"))]
+    named = [content for content in contents if content["data"] in data]
+    named.sort(key=lambda content: content["world"]["scenario"] != world)
+    if not named:
+        raise ValueError(
+            f"{TUNED} must have a file of the tuning on {data}, got none. Run pfbench tune."
+        )
+    return dict(named[0])
+
+
+def describe_choice(node: Mapping[str, Any]) -> str:
+    """State the parameters of a filter, and the change of its score from tier A in percent.
+
+    Args:
+        node: Entry of the filter in the file of a tuning.
+    """
+    candidates, untuned = read_candidates(node)
+    choice = choose_candidate(candidates)
+    values = ", ".join(f"{NAMES.get(key, key)} {value:g}" for key, value in choice.values.items())
+    return f"{values} ({100 * math.expm1(choice.log_ratio - untuned.log_ratio):+.0f} %)"
+
+
+def has_largest_factor(node: Mapping[str, Any]) -> bool:
+    """Return whether the chosen factor on R is the largest of its grid.
+
+    Args:
+        node: Entry of the filter in the file of a tuning.
+    """
+    candidates, _ = read_candidates(node)
+    return bool(node["r_factor"] == max(c.values["r_factor"] for c in candidates))
