@@ -12,6 +12,8 @@ import pytest
 from checkout import ROOT
 from scipy import stats
 
+from pfbench import job
+from pfbench.cli.compose import read_sweep
 from pfbench.report.board.decided_parts import StudyFacts
 from pfbench.report.looks import find_looks
 from pfbench.report.options import ReportOptions
@@ -100,3 +102,22 @@ def test_the_limit_of_a_scenario_is_that_of_the_page_of_limits() -> None:
     stated = robustness._describe_limit("flight_500s").partition(": ")[2].partition(" ")[0]
     assert math.isclose(float(stated), bound, rel_tol=5e-3)
     assert robustness._describe_limit("recorded_car_drive").startswith("No limit holds")
+
+
+def test_each_world_whose_model_has_an_invariant_chart_has_the_invariant_filter() -> None:
+    """Also the page, beside every other filter of the sweep and the limit."""
+    with_chart = set()
+    for name in robustness.STUDIES:
+        sweep = dict(word.split("=") for word in read_sweep(name))
+        scenarios = sweep["scenario"].split(",") if "scenario" in sweep else [""]
+        for scenario in scenarios:
+            words = [f"+experiment={name}", *([f"scenario={scenario}"] if scenario else [])]
+            config = job.compose(words)
+            has_chart = hasattr(job.instantiate(config.values["model"]), "group_chart")
+            assert has_chart == ("invariant_ekf" in sweep["filter"].split(","))
+            world = config.choices["scenario"]
+            text = robustness._world_table(robustness.read_study(name), world)
+            assert all(f"| `{label}`" in text for label in sweep["filter"].split(","))
+            assert "imit" in text.splitlines()[-1]
+            with_chart |= {world} if has_chart else set()
+    assert with_chart == {"recorded_quad_flights", "recorded_car_drive"}
