@@ -201,7 +201,7 @@ def seeds() -> str:
     cells = {}
     for name, pair in tables.items():
         first, second = (rank_filters(runs, studies[name].facts) for runs in pair)
-        cells |= {(name, *key): compare_rankings(first[key], second[key]) for key in first}
+        cells |= {key: compare_rankings(first[key], second[key]) for key in first}
 
     def decide(name: str, runs: pd.DataFrame, world: str) -> tuple[str, ...]:
         labels = set(runs["filter"])
@@ -211,7 +211,9 @@ def seeds() -> str:
         return find_robust(study, world, CONTROLS[:1])
 
     verdicts = compare_robust(tables, decide, (NOMINAL, OUTLIERS))
-    return f"{seed_table(cells)}\n\n{verdicts}"
+    lacking = [f"`{name}`" for name in STUDIES if name not in studies]
+    end = f"\n\nNot repeated with the second seed: {', '.join(lacking)}." if lacking else ""
+    return f"{seed_table(cells)}\n\n{verdicts}{end}"
 
 
 def tuned() -> str:

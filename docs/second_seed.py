@@ -50,7 +50,8 @@ def store_runs(folder: Path, studies: Sequence[str]) -> None:
         folder: Folder of the reports of the second seed.
         studies: Names of the studies.
     """
-    tables = [pd.read_parquet(folder / s / "runs.parquet").assign(study=s) for s in studies]
+    paths = {study: folder / study / "runs.parquet" for study in studies}
+    tables = [pd.read_parquet(p).assign(study=s) for s, p in paths.items() if p.is_file()]
     pd.concat(tables, ignore_index=True).to_parquet(RUNS, index=False, compression="zstd")
 
 
@@ -111,15 +112,15 @@ def compare_rankings(first: Ranking, second: Ranking) -> BestFilter:
     return BestFilter(best, other, outcome, agreement)
 
 
-def seed_table(cells: Mapping[tuple[str, str, str], BestFilter]) -> str:
+def seed_table(cells: Mapping[tuple[str, str], BestFilter]) -> str:
     """Table and sentence on the best filter of each condition.
 
     Args:
-        cells: Comparisons by study, scenario and regime.
+        cells: Comparisons by scenario and regime.
     """
-    lines = markdown_head("study", "world", "regime", "best, seed 1", "best, seed 2", "best filter", "rank correlation")  # fmt: skip
-    for (study, world, regime), cell in cells.items():
-        words = (f"`{study}`", f"`{world}`", regime, f"`{cell.first}`", f"`{cell.second}`")
+    lines = markdown_head("world", "regime", "best, seed 1", "best, seed 2", "best filter", "rank correlation")  # fmt: skip
+    for (world, regime), cell in cells.items():
+        words = (f"`{world}`", regime, f"`{cell.first}`", f"`{cell.second}`")
         lines.append(markdown_row(*words, cell.outcome, f"{cell.agreement:.2f}"))
     counts = {o: sum(c.outcome == o for c in cells.values()) for o in (SAME, OPEN, CHANGED)}
     return "\n".join([

@@ -61,7 +61,9 @@ def test_verdicts_that_differ_are_counted() -> None:
 
 
 def test_both_seeds_are_decided_for_the_same_filters_and_conditions() -> None:
-    for study in robustness.STUDIES:
+    studies = [study for study in robustness.STUDIES if len(second_seed.read_runs(study))]
+    assert len(studies) >= 3
+    for study in studies:
         first = robustness.read_study(study).runs
         pair = second_seed.select_common(first, second_seed.read_runs(study))
         keys = ["scenario", "regime", "filter", "run"]
