@@ -76,7 +76,17 @@ def merge_runs(published: pd.DataFrame, newer: pd.DataFrame, labels: Sequence[st
             f"the newer report must have all runs of {', '.join(labels)} that the published study has, got "
             f"{-lacking} missing. Run their jobs."
         )
-    return pd.concat([published[~is_old], newer[is_new]], ignore_index=True)
+    return pd.concat([published[~is_old], _keep_times(published, newer[is_new])], ignore_index=True)
+
+
+def _keep_times(published: pd.DataFrame, newer: pd.DataFrame) -> pd.DataFrame:
+    """Give runs the published time per step of their filter, whose operations do not depend on its parameters.
+
+    Timings of one study are then of one time and machine. A filter that the study lacks keeps its own.
+    """
+    keys = [*RUN, "filter"]
+    times = newer[keys].merge(published[[*keys, "ms"]], on=keys, how="left")["ms"]
+    return newer.assign(ms=times.fillna(pd.Series(newer["ms"].to_numpy())).to_numpy())
 
 
 def merge_packs(published: Pack, newer: Pack, labels: Sequence[str], runs: pd.DataFrame) -> Pack:
