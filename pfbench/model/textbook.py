@@ -72,12 +72,9 @@ class UnivariateGrowth(StateSpaceModel):
 
     @override
     def propagate(self, x: Tensor, u: TimeIndexInputs, w: Tensor) -> Tensor:
-        return (
-            0.5 * x
-            + 25.0 * x / (1.0 + x * x)
-            + 8.0 * torch.cos(1.2 * u.t)[:, None, None]
-            + self.q * w
-        )
+        shift = 8.0 * torch.cos(1.2 * u.t)[:, None, None]
+        drift = torch.addcdiv(0.5 * x, x, torch.addcmul(torch.ones_like(shift), x, x), value=25.0)
+        return drift + torch.addcmul(shift, self.q, w)  # few passes over the particles
 
     def propagation_jacobian(self, x: Tensor, u: TimeIndexInputs) -> Tensor:
         """Return the derivative of the mean, [R, N, 1, 1].

@@ -99,6 +99,7 @@ def eager_function(name: str) -> Callable[..., Any]:
         "propagate_affine": affine_map._affine,
         "count_unique": particle_moments.count_distinct_ancestors,
         "sum_and_squares": weight_update._totals,
+        "sum_log_weights": weight_update._summed,
         "normalise_weights": weight_update.normalise_updated_weights,
         "weighted_moments": particle_moments._flat_moments,
         "cholesky_factor": covariance.factor,
@@ -167,6 +168,24 @@ def test_normalised_weights_at_their_limits(dtype: torch.dtype) -> None:
     reference = torch.exp(x.double())
     ratio = w / (reference / reference.sum())
     assert float((ratio / ratio[0] - 1.0).abs().max()) < 8.0 * torch.finfo(dtype).eps
+
+
+@compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_sum_of_log_weights_has_no_nan(dtype: torch.dtype) -> None:
+    """NaN, and infinity minus infinity, become weight 0; a column holds for all particles of a run."""
+    values = torch.tensor([0.5, -torch.inf, torch.inf, torch.nan, -3.0], dtype=dtype)
+    grid = torch.cartesian_prod(values, values, values)
+    terms, log_w, log_ratio = (grid[:, k].repeat(3, 1) for k in range(3))
+    total = terms + log_w + log_ratio
+    expected = torch.where(torch.isnan(total), -torch.inf, total)
+    assert torch.equal(cpp.sum_log_weights(terms, log_w, log_ratio), expected)
+    assert torch.equal(weight_update._separate_sum(terms, log_w, log_ratio), expected)
+    column = torch.tensor([[0.25], [-torch.inf], [torch.nan]], dtype=dtype)
+    for a, b in ((column, column), (log_w, column), (column, log_ratio)):
+        full = cpp.sum_log_weights(terms, a.expand_as(terms), b.expand_as(terms))
+        assert torch.equal(cpp.sum_log_weights(terms, a, b), full)
+        assert torch.equal(weight_update._separate_sum(terms, a, b), full)
 
 
 def refusal(call: Callable[..., Any], arguments: list[Any]) -> str:

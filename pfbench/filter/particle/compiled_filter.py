@@ -136,6 +136,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         grows = self.method.history is not None or self.method.stores_path
         if not isinstance(draws, PhiloxStream) or grows:
             return None
+        belief = belief._replace(weights=None)  # a compiled step computes them
         key = id(model), belief.x.shape, len(tensors_in((belief, record)))
         if key not in self.graphs:
             if int(draws.step) == 1:

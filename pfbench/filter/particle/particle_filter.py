@@ -19,7 +19,7 @@ from pfbench.core.derived_stream import relabel
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
-from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
+from pfbench.filter.belief import Filter, KnownWeights, ParticleBelief, StepInfo
 from pfbench.filter.exactness import is_every_part_exact
 from pfbench.filter.moves.metropolis import Move
 from pfbench.filter.moves.path_history import PathHistory, combine_histories
@@ -48,6 +48,7 @@ from pfbench.filter.particle.weight_update import (
     WeightUpdate,
     compute_updated_weights,
     deactivate_invalid_particles,
+    is_equal_for_all,
     normalise_updated_weights,
 )
 from pfbench.model.base import StateSpaceModel, initial_law
@@ -232,7 +233,10 @@ class ParticleFilter(Filter):
             self.weight_update, model, parents.log_w, x, log_ratio, record, parents.memory
         )
         x, log_w = deactivate_invalid_particles(x, log_w, parents.x)
-        predicted_log_w = parents.log_w + log_ratio
+        # not normalised: a ratio that is equal for all particles changes nothing
+        predicted_log_w = (
+            parents.log_w if is_equal_for_all(log_ratio) else parents.log_w + log_ratio
+        )
         # a lost run keeps an evidence of -inf and continues with equal weights
         log_w, total, normalised_w, trace["ess"] = normalise_updated_weights(log_w)
         if not isinstance(self.particle_count, FixedCount):
@@ -240,6 +244,7 @@ class ParticleFilter(Filter):
         children = parents._replace(
             x=x,
             log_w=log_w,
+            weights=KnownWeights(log_w, normalised_w),
             log_evidence=belief.log_evidence + total,
             memory=memory | carried,
             ancestors=None,

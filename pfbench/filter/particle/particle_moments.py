@@ -131,7 +131,7 @@ def make_step_info(
 
     @compute_once
     def w() -> Tensor:  # once for all groups; the weights are normalised already
-        return torch.exp(belief.log_w)
+        return belief.compute_weights(belief.log_w)
 
     def group_covariance(groups: Tensor) -> Tensor:
         if model.chart.flat:

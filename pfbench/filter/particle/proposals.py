@@ -120,9 +120,8 @@ class BootstrapProposal(Proposal):
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
         w = draw_noise(model, belief.x.shape[1], draws)
-        return ProposalSample(
-            model.propagate(belief.x, record.u, w), torch.zeros_like(belief.log_w), belief.memory, w
-        )
+        log_ratio = torch.zeros_like(belief.log_w[:, :1]).expand_as(belief.log_w)
+        return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
 
 
 def hold_resampling(log_a: Tensor, belief: ParticleBelief) -> tuple[Tensor, ParticleBelief]:

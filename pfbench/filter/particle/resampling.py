@@ -104,7 +104,7 @@ class EssResampler(Resampler):
         n: Tensor,
         draws: RandomStream,
     ) -> tuple[ParticleBelief, Tensor]:
-        a = torch.exp(log_a)
+        a = belief.compute_weights(log_a)
         resampled_mask = torch.ones_like(belief.log_evidence, dtype=torch.bool)
         ancestors = self.scheme(a, n, draws)
         slots = torch.arange(a.shape[1], device=a.device)

@@ -123,8 +123,8 @@ class BayesWeightUpdate(WeightUpdate):
     def __call__(
         self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
     ) -> Tensor:
-        value = log_w + model.log_likelihood(record.y, x, record.u) + log_ratio
-        return torch.where(value == value, value, -torch.inf)  # isnan does not compile
+        log_likelihood = model.log_likelihood(record.y, x, record.u).expand_as(log_w).to(log_w)
+        return _summed(log_likelihood, _narrow(log_w), _narrow(log_ratio))
 
 
 @dataclass(frozen=True)
@@ -198,6 +198,22 @@ def deactivate_invalid_particles(
     return x, log_w
 
 
+def is_equal_for_all(a: Tensor) -> bool:
+    """Return whether numbers [R, N] are stored once for all particles of a run."""
+    return a.stride(1) == 0
+
+
+def _narrow(a: Tensor) -> Tensor:
+    """Return numbers [R, N] as [R, 1] if they are stored once for all particles of a run."""
+    return a[:, :1] if is_equal_for_all(a) else a
+
+
+def _separate_sum(log_likelihood: Tensor, log_w: Tensor, log_ratio: Tensor) -> Tensor:
+    """Return the sum [R, N] of terms [R, N] or [R, 1], -inf in place of NaN."""
+    value = log_likelihood + log_w + log_ratio
+    return torch.where(value == value, value, -torch.inf)  # isnan does not compile
+
+
 def _separate_normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Normalise the log weights of a step.
 
@@ -235,6 +251,9 @@ def has_long_rows(a: Tensor, *_: Tensor) -> bool:
     return a.shape[1] > 4096
 
 
+_summed = compilable(
+    _separate_sum, operator=cpp.sum_log_weights, keep_in_graph=False, use_torch_compiler=False
+)
 _totals = compilable(_separate_totals, operator=cpp.sum_and_squares, keep_in_graph=has_long_rows)
 normalise_updated_weights = compilable(
     _separate_normalise,

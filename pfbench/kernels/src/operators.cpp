@@ -88,6 +88,14 @@ std::tuple<Tensor, Tensor> sum_and_squares(const Tensor& terms) {
     return operators::sum_and_squares(terms);
 }
 
+Tensor sum_log_weights(const Tensor& log_likelihood, const Tensor& log_w, const Tensor& log_ratio) {
+    ArgumentCheck check("sum_log_weights");
+    check.real("log_likelihood", log_likelihood, "RN");
+    check.real("log_w", log_w, "Rn");
+    check.real("log_ratio", log_ratio, "Rn");
+    return operators::sum_log_weights(log_likelihood, log_w, log_ratio);
+}
+
 std::tuple<Tensor, Tensor, Tensor, Tensor> normalise_weights(const Tensor& log_w) {
     ArgumentCheck check("normalise_weights");
     check.real("log_w", log_w, "RN", "N");
@@ -164,6 +172,7 @@ const pfbench::Registration registration(
     pfbench::entry<&propagate_affine>("propagate_affine"),
     pfbench::entry<&count_unique>("count_unique"),
     pfbench::entry<&sum_and_squares>("sum_and_squares"),
+    pfbench::entry<&sum_log_weights>("sum_log_weights"),
     pfbench::entry<&normalise_weights>("normalise_weights"),
     pfbench::entry<&weighted_moments>("weighted_moments"),
     pfbench::entry<&cholesky_factor>("cholesky_factor"),
@@ -209,6 +218,10 @@ DIRECT_CALL aoti_torch_cpu_count_unique(AtenTensorHandle ancestors, AtenTensorHa
 
 DIRECT_CALL aoti_torch_cpu_sum_and_squares(AtenTensorHandle terms, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {
     return call_directly<&sum_and_squares>({result_0, result_1}, terms);
+}
+
+DIRECT_CALL aoti_torch_cpu_sum_log_weights(AtenTensorHandle log_likelihood, AtenTensorHandle log_w, AtenTensorHandle log_ratio, AtenTensorHandle* result_0) {
+    return call_directly<&sum_log_weights>({result_0}, log_likelihood, log_w, log_ratio);
 }
 
 DIRECT_CALL aoti_torch_cpu_normalise_weights(AtenTensorHandle log_w, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3) {

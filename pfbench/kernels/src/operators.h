@@ -13,6 +13,7 @@ Tensor log_normal(const Tensor& y, const Tensor& mean, const Tensor& scale, cons
 Tensor propagate_affine(const Tensor& phi, const Tensor& x, const Tensor& gain, const Tensor& w);
 Tensor count_unique(const Tensor& ancestors, const Tensor& log_w);
 std::tuple<Tensor, Tensor> sum_and_squares(const Tensor& terms);
+Tensor sum_log_weights(const Tensor& log_likelihood, const Tensor& log_w, const Tensor& log_ratio);
 std::tuple<Tensor, Tensor, Tensor, Tensor> normalise_weights(const Tensor& log_w);
 std::tuple<Tensor, Tensor> weighted_moments(const Tensor& x, const Tensor& w);
 std::tuple<Tensor, Tensor> cholesky_factor(const Tensor& covariance);

@@ -9,6 +9,17 @@
 #include "operators.h"
 
 namespace {
+// 1 / 0!, 1 / 1!, ..., 1 / (COUNT - 1)!
+template <class T, int COUNT>
+struct InverseFactorials {
+    T of[COUNT];
+    constexpr InverseFactorials() : of() {
+        double factorial = 1;  // exact up to 18!
+        for (int n = 0; n < COUNT; factorial *= ++n) of[n] = static_cast<T>(1 / factorial);
+    }
+    constexpr T operator[](int n) const { return of[n]; }
+};
+
 template <class T>
 struct Exponential;
 template <>
@@ -16,12 +27,14 @@ struct Exponential<double> {
     typedef int64_t Integer;
     static constexpr double LEAST = -800, HIGH = 0x1.62e42fefap-1, LOW = 0x1.cf79abc9e3b3ap-40;
     static constexpr int TERMS = 13, FRACTION = 52, BIAS = 1023;
+    static constexpr InverseFactorials<double, TERMS + 1> INVERSE_FACTORIAL{};
 };
 template <>
 struct Exponential<float> {
     typedef int32_t Integer;
     static constexpr float LEAST = -120, HIGH = 0x1.62ep-1f, LOW = 0x1.0bfbe8p-15f;
     static constexpr int TERMS = 7, FRACTION = 23, BIAS = 127;
+    static constexpr InverseFactorials<float, TERMS + 1> INVERSE_FACTORIAL{};
 };
 
 // 2^k of a k in the range of normal numbers.
@@ -41,8 +54,8 @@ inline T exponential(T x) {
     x = x > E::LEAST ? x : E::LEAST;  // e^x is 0 there
     const T k = std::rint(x * T(1.4426950408889634));
     const T r = (x - k * E::HIGH) - k * E::LOW;
-    T series = 1;
-    for (int n = E::TERMS; n > 0; --n) series = 1 + series * r * (T(1) / n);
+    T series = E::INVERSE_FACTORIAL[E::TERMS];
+    for (int n = E::TERMS - 1; n >= 0; --n) series = series * r + E::INVERSE_FACTORIAL[n];
     const int32_t whole = static_cast<int32_t>(k), half = whole / 2;  // 2^k may be subnormal, its two factors are not
     return series * power_of_two<T>(half) * power_of_two<T>(whole - half);
 }
@@ -93,7 +106,38 @@ void normalise(T* log_w, T* log_total, T* w, T* ess, const T* from, int64_t slot
         w[i] *= by;
     }
 }
+
+// A column [R, 1] that holds for all slots, or numbers [R, N], in rows.
+template <class T>
+struct Rows {
+    const Packed<T> packed;
+    const int64_t across, down;
+    explicit Rows(const Tensor& a) : packed(a), across(a.size(1) == 1 ? 0 : 1), down(a.size(1)) {}
+    const T* row(int64_t r) const { return packed.data + r * down; }
+};
+
+template <class T, int FIRST, int SECOND>  // strides, so that the compiler makes vector code of each case
+void add_row(T* out, const T* terms, const T* first, const T* second, int64_t slots) {
+    for (int64_t i = 0; i < slots; ++i) {
+        const T sum = terms[i] + first[i * FIRST] + second[i * SECOND];
+        out[i] = sum == sum ? sum : -std::numeric_limits<T>::infinity();
+    }
+}
 }  // namespace
+
+Tensor operators::sum_log_weights(const Tensor& log_likelihood, const Tensor& log_w, const Tensor& log_ratio) {
+    const int64_t runs = log_likelihood.size(0), slots = log_likelihood.size(1);
+    return by_type(log_likelihood, [&](auto like) {
+        using T = decltype(like);
+        const Tensor out = fresh<T>({runs, slots});
+        const Packed<T> terms(log_likelihood);
+        const Rows<T> first(log_w), second(log_ratio);
+        const auto add = first.across ? second.across ? add_row<T, 1, 1> : add_row<T, 1, 0> : second.across ? add_row<T, 0, 1> : add_row<T, 0, 0>;
+        for (int64_t r = 0; r < runs; ++r)
+            add(numbers<T>(out) + r * slots, terms.data + r * slots, first.row(r), second.row(r), slots);
+        return out;
+    });
+}
 
 std::tuple<Tensor, Tensor, Tensor, Tensor> operators::normalise_weights(const Tensor& log_w) {
     const int64_t runs = log_w.size(0), slots = log_w.size(1);
