@@ -110,7 +110,7 @@ def test_runs_may_be_stepped_in_blocks(
     )
 
 
-@pytest.mark.parametrize(("runs", "blocks"), [(1, 1), (100, 1), (300, 2), (1000, 8)])
+@pytest.mark.parametrize(("runs", "blocks"), [(1, 1), (100, 1), (300, 4), (1000, 12)])
 def test_blocks_of_runs_are_of_about_equal_size(runs: int, blocks: int) -> None:
     size = choose_run_batch(runs, 500, 15)
     assert -(-runs // size) == blocks
