@@ -12,21 +12,10 @@ from torch import Tensor
 from pfbench.core.chart import Chart
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
+from pfbench.filter.log_weights import ComputedWeights
 from pfbench.kernels import cpp
 from pfbench.kernels.compilation import compilable
 from pfbench.model.base import StateSpaceModel
-
-
-class KnownWeights(NamedTuple):
-    """Weights that were computed with their logarithms.
-
-    Attributes:
-        log_w: Log weights, [R, N].
-        w: Weights, [R, N].
-    """
-
-    log_w: Tensor
-    w: Tensor
 
 
 class ParticleBelief(NamedTuple):
@@ -41,7 +30,7 @@ class ParticleBelief(NamedTuple):
         past: Records of the steps in the window, oldest first, as `Record.at` returns them.
         ancestors: Slot that each particle copies within a step, [R, N]; N or more if a move changed
             it. None if the particles are not copies.
-        weights: Weights of earlier or present log weights, see `compute_weights`.
+        weights: Weights of earlier or present log weights, see `exponentiate`.
     """
 
     x: Tensor
@@ -51,12 +40,7 @@ class ParticleBelief(NamedTuple):
     memory: dict[str, Tensor] = {}  # noqa: RUF012
     past: tuple[Record, ...] = ()
     ancestors: Tensor | None = None
-    weights: KnownWeights | None = None
-
-    def compute_weights(self, log_w: Tensor) -> Tensor:
-        """Return e to the power of log weights [R, N], those at hand if they are of this tensor."""
-        known = self.weights
-        return known.w if known is not None and known.log_w is log_w else torch.exp(log_w)
+    weights: ComputedWeights | None = None
 
 
 class GaussianBelief(NamedTuple):

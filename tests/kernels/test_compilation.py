@@ -16,6 +16,7 @@ from torch import Tensor
 from pfbench.core import affine_map, covariance, density
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.filter import log_weights
 from pfbench.filter.belief import ParticleBelief, gather_ancestors
 from pfbench.filter.gaussian import gaussian_filter, kalman_update, linearisation_rules
 from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, UnscentedPoints
@@ -25,7 +26,7 @@ from pfbench.filter.gaussian.spherical_radial import (
     SphericalRadialPoints,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle import particle_moments, resampling_schemes, weight_update
+from pfbench.filter.particle import particle_moments, resampling_schemes
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import filter_pass, scoring
 from pfbench.kernels import compilation, cpp, cpp_library
@@ -84,7 +85,7 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
     )
     return [
         particle_moments._flat_moments(1e3 + x, torch.softmax(z, 1)),
-        weight_update.normalise_updated_weights(hidden),
+        log_weights.normalise_updated_weights(hidden),
         density.log_normal_density(
             0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen
         ),
@@ -292,7 +293,7 @@ def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(
     )
     w[2, 3] = torch.nan
     torch.testing.assert_close(
-        cpp.sum_and_squares(w), weight_update._separate_totals(w), equal_nan=True
+        cpp.sum_and_squares(w), log_weights._separate_totals(w), equal_nan=True
     )
 
 
@@ -422,7 +423,7 @@ def test_without_a_library_operators_run_in_torch_and_one_line_says_so(
     monkeypatch.setattr(cpp_library, "load_library", load)
     terms = torch.rand(3, 5)
     with compilation.use_compiled():
-        sums = [weight_update._totals(terms) for _ in range(2)]
+        sums = [log_weights._totals(terms) for _ in range(2)]
     cpp_library.is_library_loaded.cache_clear()
     for total, square in sums:
         torch.testing.assert_close(total, terms.sum(1, keepdim=True))

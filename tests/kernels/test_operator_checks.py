@@ -14,9 +14,9 @@ import random_calls
 import torch
 
 from pfbench.core import affine_map, covariance, density, random_stream
-from pfbench.filter import belief
+from pfbench.filter import belief, log_weights
 from pfbench.filter.gaussian import kalman_update, linearisation_rules
-from pfbench.filter.particle import particle_moments, resampling_schemes, weight_update
+from pfbench.filter.particle import particle_moments, resampling_schemes
 from pfbench.job import scoring
 from pfbench.kernels import (
     compilation,
@@ -98,9 +98,9 @@ def eager_function(name: str) -> Callable[..., Any]:
         "log_normal": density._quadratic,
         "propagate_affine": affine_map._affine,
         "count_unique": particle_moments.count_distinct_ancestors,
-        "sum_and_squares": weight_update._totals,
-        "sum_log_weights": weight_update._summed,
-        "normalise_weights": weight_update.normalise_updated_weights,
+        "sum_and_squares": log_weights._totals,
+        "sum_log_weights": log_weights._add_terms,
+        "normalise_weights": log_weights.normalise_updated_weights,
         "weighted_moments": particle_moments._flat_moments,
         "cholesky_factor": covariance.factor,
         "kalman_update": kalman_update._updated,
@@ -158,7 +158,7 @@ def test_normalised_weights_at_their_limits(dtype: torch.dtype) -> None:
     rows[8, 0] = torch.inf
     rows[9] -= 2.0 / torch.finfo(dtype).eps
     rows[10] = -3.0
-    expected, result = weight_update._separate_normalise(rows), cpp.normalise_weights(rows)
+    expected, result = log_weights._separate_normalise(rows), cpp.normalise_weights(rows)
     tolerance = 2e-6 if dtype == torch.float32 else 1e-13
     for a, b in zip(result, expected, strict=True):
         torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
@@ -180,12 +180,12 @@ def test_the_sum_of_log_weights_has_no_nan(dtype: torch.dtype) -> None:
     total = terms + log_w + log_ratio
     expected = torch.where(torch.isnan(total), -torch.inf, total)
     assert torch.equal(cpp.sum_log_weights(terms, log_w, log_ratio), expected)
-    assert torch.equal(weight_update._separate_sum(terms, log_w, log_ratio), expected)
+    assert torch.equal(log_weights._separate_sum(terms, log_w, log_ratio), expected)
     column = torch.tensor([[0.25], [-torch.inf], [torch.nan]], dtype=dtype)
     for a, b in ((column, column), (log_w, column), (column, log_ratio)):
         full = cpp.sum_log_weights(terms, a.expand_as(terms), b.expand_as(terms))
         assert torch.equal(cpp.sum_log_weights(terms, a, b), full)
-        assert torch.equal(weight_update._separate_sum(terms, a, b), full)
+        assert torch.equal(log_weights._separate_sum(terms, a, b), full)
 
 
 def refusal(call: Callable[..., Any], arguments: list[Any]) -> str:

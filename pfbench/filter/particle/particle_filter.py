@@ -19,8 +19,13 @@ from pfbench.core.derived_stream import relabel
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
-from pfbench.filter.belief import Filter, KnownWeights, ParticleBelief, StepInfo
+from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
 from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.log_weights import (
+    ComputedWeights,
+    is_equal_for_all,
+    normalise_updated_weights,
+)
 from pfbench.filter.moves.metropolis import Move
 from pfbench.filter.moves.path_history import PathHistory, combine_histories
 from pfbench.filter.particle.auxiliary_weights import AuxiliaryWeights, PosteriorWeights
@@ -48,8 +53,6 @@ from pfbench.filter.particle.weight_update import (
     WeightUpdate,
     compute_updated_weights,
     deactivate_invalid_particles,
-    is_equal_for_all,
-    normalise_updated_weights,
 )
 from pfbench.model.base import StateSpaceModel, initial_law
 
@@ -244,7 +247,7 @@ class ParticleFilter(Filter):
         children = parents._replace(
             x=x,
             log_w=log_w,
-            weights=KnownWeights(log_w, normalised_w),
+            weights=ComputedWeights(log_w, normalised_w),
             log_evidence=belief.log_evidence + total,
             memory=memory | carried,
             ancestors=None,

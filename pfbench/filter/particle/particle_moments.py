@@ -14,7 +14,7 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo, normalise_log_weights
 from pfbench.filter.gaussian.linearisation_rules import around_first
 from pfbench.filter.linearisation import mask_covariance
-from pfbench.filter.particle.weight_update import has_long_rows
+from pfbench.filter.log_weights import exponentiate, has_long_rows
 from pfbench.kernels import cpp
 from pfbench.kernels.compilation import compilable
 from pfbench.model.base import StateSpaceModel
@@ -131,7 +131,7 @@ def make_step_info(
 
     @compute_once
     def w() -> Tensor:  # once for all groups; the weights are normalised already
-        return belief.compute_weights(belief.log_w)
+        return exponentiate(belief.log_w, belief.weights)
 
     def group_covariance(groups: Tensor) -> Tensor:
         if model.chart.flat:

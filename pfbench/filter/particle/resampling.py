@@ -15,6 +15,7 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, gather_ancestors
 from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.log_weights import exponentiate
 from pfbench.model.base import StateSpaceModel
 
 
@@ -104,7 +105,7 @@ class EssResampler(Resampler):
         n: Tensor,
         draws: RandomStream,
     ) -> tuple[ParticleBelief, Tensor]:
-        a = belief.compute_weights(log_a)
+        a = exponentiate(log_a, belief.weights)
         resampled_mask = torch.ones_like(belief.log_evidence, dtype=torch.bool)
         ancestors = self.scheme(a, n, draws)
         slots = torch.arange(a.shape[1], device=a.device)

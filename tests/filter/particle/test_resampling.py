@@ -15,7 +15,8 @@ from torch import Tensor
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
 from pfbench.core.random_stream import PhiloxStream, RandomStream
-from pfbench.filter.belief import KnownWeights, ParticleBelief, ess, weighted_mean_cov
+from pfbench.filter.belief import ParticleBelief, ess, weighted_mean_cov
+from pfbench.filter.log_weights import ComputedWeights, exponentiate
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
 from pfbench.filter.particle.resampling import EssResampler, ResamplingScheme
 from pfbench.filter.particle.resampling_schemes import (
@@ -461,18 +462,19 @@ def test_a_bandwidth_that_is_not_positive_is_refused(scale: float) -> None:
 def test_only_weights_of_the_same_log_weights_are_used() -> None:
     """Weights of an earlier step would resample by the wrong probabilities."""
     log_w = torch.log_softmax(torch.randn(3, 40, dtype=torch.float64), 1)
-    earlier = KnownWeights(log_w.flip(1), log_w.flip(1).exp())
+    earlier = ComputedWeights(log_w.flip(1), log_w.flip(1).exp())
     x, evidence = torch.randn(3, 40, 2, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     belief = ParticleBelief(x, log_w, evidence, weights=earlier)
-    torch.testing.assert_close(belief.compute_weights(log_w), log_w.exp())
+    torch.testing.assert_close(exponentiate(log_w, belief.weights), log_w.exp())
     draws, n = PhiloxStream(2, torch.arange(3)), torch.full((3, 1), 40.0, dtype=torch.float64)
     resampler = EssResampler(Systematic(), ess_threshold=1.0)
     fresh, _ = resampler(MODEL, belief._replace(weights=None), log_w, n, draws)
     stale, _ = resampler(MODEL, belief, log_w, n, draws)
-    known = belief._replace(weights=KnownWeights(log_w, log_w.exp()))
-    own, _ = resampler(MODEL, known, log_w, n, draws)
+    at_hand = belief._replace(weights=ComputedWeights(log_w, log_w.exp()))
+    own, _ = resampler(MODEL, at_hand, log_w, n, draws)
     assert fresh.ancestors is not None
     for other in (stale, own):
         assert other.ancestors is not None
         assert torch.equal(fresh.ancestors, other.ancestors)
-    assert known.compute_weights(log_w) is known.weights.w  # type: ignore[union-attr]
+    assert at_hand.weights is not None
+    assert exponentiate(log_w, at_hand.weights) is at_hand.weights.w
