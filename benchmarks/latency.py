@@ -35,16 +35,22 @@ NOISES = (
     "bias_step",
     "gauss_markov",
 )
-# The command in a process that states the CPU time at which its filter draws the initial distribution.
+# The command in a process that states the CPU time at which its filter draws the initial distribution. It imports no more
+# than the command itself does, and nothing earlier.
 FIRST_STEP = """
-import sys, time
-from pfbench.cli import main
-from pfbench.filter import loop
-start = loop._start
-def say(*args):
-    print("cpu", time.process_time(), file=sys.stderr, flush=True)
-    return start(*args)
-loop._start = say
+import functools, sys, time
+from pfbench.cli import main, run
+run_task = run.run_task
+@functools.wraps(run_task)
+def run_and_say(*args):
+    from pfbench.filter import loop
+    start = loop._start
+    def say(*more):
+        print("cpu", time.process_time(), file=sys.stderr, flush=True)
+        return start(*more)
+    loop._start = say
+    return run_task(*args)
+run.run_task = run_and_say
 main(sys.argv[1:])
 """
 

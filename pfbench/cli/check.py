@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 from pfbench.cli.messages import format_error
 from pfbench.config.composition import compose, list_groups
+from pfbench.files.rare_collections import collect_rarely
 from pfbench.files.work_start import start_work
 
 HELP = """\
@@ -30,7 +31,7 @@ def check_installation(words: Sequence[str]) -> None:
     from pfbench import job
 
     start_work()  # to compose all files is the work
-
+    collect_rarely()  # it makes millions of objects, and no arrays
     rows = [(name, value or "unknown", "ok") for name, value in job.read_versions().items()]
     rows.append(("threads", f"{torch.get_num_threads()} of {os.cpu_count()} cores", "ok"))
     has_cuda = torch.cuda.is_available()

@@ -11,6 +11,7 @@ import pfbench
 from pfbench.cli.messages import format_error, notes_of, suggest_similar
 from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import ENVIRONMENT, split_trust
+from pfbench.files.rare_collections import collect_as_usual
 from pfbench.files.work_start import has_work_started, reset_work
 
 # command: function of the module of the same name, summary
@@ -109,6 +110,8 @@ def _run_command(command: str, options: Sequence[str]) -> None:
             print(note, file=sys.stderr)
         print("(add --traceback to see the traceback)", file=sys.stderr)
         raise SystemExit(1 if has_work_started() else 2) from error
+    finally:
+        collect_as_usual()
 
 
 def _usage() -> str:

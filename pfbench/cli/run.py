@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from pfbench.cli.sweep.application import make_application
 from pfbench.cli.sweep.job_errors import (
     hide_hydra_line,
     report_failed_job,
@@ -19,7 +20,6 @@ from pfbench.cli.sweep.study_plan import StudyPlan, plan_study
 from pfbench.cli.sweep.sweep_progress import SWEEP_JOBS, SweepProgress, note_outcome
 from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
 from pfbench.config.composition import JobConfig, register_experiments
-from pfbench.config.folders import conf_dir
 from pfbench.config.named_sets import expand_filter_sets
 from pfbench.config.sweep_check import check_words
 from pfbench.config.trust import ENVIRONMENT
@@ -57,8 +57,6 @@ def run_jobs(words: Sequence[str]) -> None:
     Args:
         words: Overrides and flags of Hydra.
     """
-    import hydra
-
     register_experiments()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -66,26 +64,23 @@ def run_jobs(words: Sequence[str]) -> None:
     overrides = expand_filter_sets([word for word in words if word not in flags])
     overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
     first = check_words([*flags, *overrides])
-    decorate = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
     is_printed = any(word.partition("=")[0] in _PRINTING_FLAGS for word in words)
     plan = None if is_printed else plan_or_none(overrides, first)
     if plan and wants_until_decided(plan):
         check_has_sweep(flags)
         sweep = GrowingSweep.from_plan(plan)
         others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
-        task = decorate(run_task)
-        sweep.run(lambda more: run_sweep(task, [*flags, *others, *more], plan, is_part=True))
+        application = make_application(run_task)
+        sweep.run(lambda more: run_sweep(application, [*flags, *others, *more], plan, is_part=True))
         return
     if flags:
         print_study_size(plan)
-        run_sweep(decorate(run_task), [*flags, *overrides], plan)
+        run_sweep(make_application(run_task), [*flags, *overrides], plan)
         return
-    _run_alone(decorate, overrides, plan)
+    _run_alone(overrides, plan)
 
 
-def _run_alone(
-    decorate: Callable[[Any], Callable[[], Any]], overrides: Sequence[str], plan: StudyPlan | None
-) -> None:
+def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
     """Run one job, and print what its runs can show once its data are valid."""
 
     @functools.wraps(run_task)
@@ -94,7 +89,7 @@ def _run_alone(
 
     sys.argv = ["pfbench run", *overrides]
     with hide_hydra_line():
-        decorate(run_with_plan)()
+        make_application(run_with_plan)()
 
 
 def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:

@@ -80,16 +80,11 @@ def compose(overrides: Sequence[str] = ()) -> JobConfig:
         ValueError: If a file sets a key that only the command line may set, or a value names what
             is not trusted.
     """
-    from hydra.core.hydra_config import HydraConfig
-    from omegaconf import open_dict
-
     words, trusted = split_trust(overrides)
     with _preserved_hydra_state():
         composed = compose_tree(words)
-        HydraConfig.instance().set_config(composed)  # an experiment may look up the choices
         choices = {str(k): str(v) for k, v in composed.hydra.runtime.choices.items()}
-        with open_dict(composed):
-            del composed["hydra"]
+        _move_hydra_node(composed)
         return resolve_config(composed, choices, trusted)
 
 
@@ -105,11 +100,19 @@ def compose_tree(words: Sequence[str]) -> DictConfig:
     Raises:
         UntrustedConfigError: If a file sets a key that only the command line may set.
     """
-    from hydra import compose as compose_config, initialize_config_dir
+    from hydra import version
+    from hydra._internal.hydra import Hydra
+    from hydra._internal.utils import create_config_search_path
+    from hydra.types import RunMode
+
+    from pfbench.config.shared_loader import SharedLoader
 
     def compose_words(some: Sequence[str]) -> DictConfig:
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            return compose_config("config", list(some), return_hydra_config=True)
+        version.setbase("1.3")
+        loader = SharedLoader(create_config_search_path(str(conf_dir())))
+        return Hydra("app", loader).compose_config(
+            "config", list(some), RunMode.RUN, from_shell=False
+        )
 
     register_experiments()
     check_files(words)
@@ -204,6 +207,22 @@ def _load_experiment(path: Path) -> Any:
     if params is not None and "filter" in params:
         params["filter"] = expand_filter_names(str(params["filter"]))
     return node
+
+
+def _move_hydra_node(composed: DictConfig) -> None:
+    """Move the node `hydra` to where an experiment may look up the choices, as Hydra does by a copy."""
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf, flag_override, open_dict
+
+    application: Any = HydraConfig.instance()
+    holder, node = OmegaConf.create(), composed._get_node("hydra")
+    with open_dict(composed):
+        del composed["hydra"]
+    with flag_override(holder, "no_deepcopy_set_nodes", True):
+        holder["hydra"] = node
+    holder.hydra._set_parent(composed)
+    OmegaConf.set_readonly(holder.hydra, True)
+    application.cfg = holder
 
 
 @contextmanager

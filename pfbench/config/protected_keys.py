@@ -49,8 +49,8 @@ def check_protected_keys(
         UntrustedConfigError: If a file set a protected key, or the study has an invalid name.
     """
     given_keys = {word.lstrip("+~").partition("=")[0] for word in words}
-    defaults = read_file(conf_dir() / "config.yaml")
-    allowed = {key: (defaults.get(key),) for key in FOLDER_KEYS} | dict(OTHER_KEYS)
+    defaults = _default_folders()
+    allowed = {key: (defaults[key],) for key in FOLDER_KEYS} | dict(OTHER_KEYS)
     values = to_plain(composed)
     for key, choices in allowed.items():
         value = _select(values, key)
@@ -171,6 +171,13 @@ def _hydra_sections(values: Mapping[str, Any]) -> dict[str, Any]:
     sections = {name: _select(values, f"hydra.{name}") for name in HYDRA_SECTIONS}
     sweeper = sections["sweeper"] or {}
     return sections | {"sweeper": {key: sweeper[key] for key in sweeper if key != "params"}}
+
+
+@cache
+def _default_folders() -> dict[str, Any]:
+    """Return the folders that pfbench's own main file gives."""
+    defaults = read_file(conf_dir() / "config.yaml")
+    return {key: defaults.get(key) for key in FOLDER_KEYS}
 
 
 @cache

@@ -6,17 +6,21 @@ written. Until then nothing is stored. Words, configurations, input files, plans
 
 from __future__ import annotations
 
+from pfbench.files.rare_collections import collect_as_usual, collect_rarely
+
 _state = {"has_started": False}
 
 
 def reset_work() -> None:
     """Note that no work has started: a command begins."""
     _state["has_started"] = False
+    collect_rarely()
 
 
 def start_work() -> None:
     """Note that work has started."""
     _state["has_started"] = True
+    collect_as_usual()
 
 
 def has_work_started() -> bool:

@@ -1,0 +1,195 @@
+"""A composition with kept files is Hydra's own, node by node, for all configurations and after each change of a file."""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, cast
+from unittest import mock
+
+import composed_once
+import pytest
+from hydra import version
+from hydra._internal import defaults_list
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from pfbench import job
+from pfbench.cli.check import _matching_scenario
+from pfbench.cli.sweep import application
+from pfbench.config import shared_loader
+from pfbench.config.composition import list_groups
+from pfbench.files import rare_collections
+from pfbench.files.work_start import reset_work, start_work
+
+GROUPS = list_groups()
+
+
+def composed_by(loader: type[ConfigLoaderImpl], words: Sequence[str], mode: RunMode) -> DictConfig:
+    """Compose by a loader, and by nothing that these tests or pfbench keep if it is Hydra's own."""
+    version.setbase("1.3")
+    job.register_experiments()
+    made = Hydra("app", loader(create_config_search_path(str(job.conf_dir()))))
+    own = shared_loader.collect_choices_by_hydra
+    is_shared = loader is shared_loader.SharedLoader
+    collect = shared_loader._collect_choices if is_shared else own
+    by_hydra = composed_once.compose_by_hydra
+    with (
+        mock.patch.object(ConfigLoaderImpl, "_load_configuration_impl", by_hydra),
+        mock.patch.object(defaults_list, "_create_interpolation_map", collect),
+    ):
+        return made.compose_config("config", list(words), mode, from_shell=False)
+
+
+def nodes(node: Any, path: str = "") -> Iterator[tuple[Any, ...]]:
+    """All nodes with their types, values and metadata; each must know its parent."""
+    metadata = {k: v for k, v in vars(node._metadata).items() if k != "resolver_cache"}
+    content = node._value()
+    children: dict[Any, Any] = {}
+    if isinstance(node, DictConfig) and isinstance(content, dict):
+        children, content = content, list(content)
+    elif isinstance(node, ListConfig) and isinstance(content, list):
+        children, content = dict(enumerate(content)), len(content)
+    yield path, type(node), metadata, content
+    for key, child in children.items():
+        assert child._get_parent() is node
+        yield from nodes(child, f"{path}.{key}")
+
+
+def is_same(words: Sequence[str], mode: RunMode = RunMode.RUN) -> bool:
+    shared, own = (
+        list(nodes(composed_by(loader, words, mode)))
+        for loader in (shared_loader.SharedLoader, ConfigLoaderImpl)
+    )
+    return shared == own
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_each_configuration_is_composed_as_by_hydra(group: str) -> None:
+    for path in GROUPS[group]:
+        plus = "+" if group == "experiment" else ""
+        words = [f"{plus}{group}={path.stem}", *_matching_scenario(group, path.stem)]
+        assert is_same(words), words
+
+
+@pytest.mark.parametrize("mode", RunMode)
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["hydra.mode=MULTIRUN"],
+        ["hydra/launcher=basic", "hydra.verbose=true", "runs=3"],
+        ["~train", "+mine={a: [1, {b: 2}]}"],
+        ["+experiment=quickstart", "filter=cofm_amssrcpf", "scenario=linear_walk"],
+    ],
+)
+def test_other_words_are_composed_as_by_hydra(words: list[str], mode: RunMode) -> None:
+    assert is_same(words, mode)
+    assert is_same(words, mode)  # now of kept files alone
+
+
+def test_a_composition_changes_no_kept_file() -> None:
+    words = ["scenario=linear_walk", "filter=sir"]
+    tree = composed_by(shared_loader.SharedLoader, words, RunMode.RUN)
+    OmegaConf.set_struct(tree, False)
+    tree.filter.resampler.scheme = "other"
+    tree.hydra.run.dir = "elsewhere"
+    tree.hydra.job.env_set["A"] = "b"
+    tree.runs = 1
+    assert is_same(words)
+
+
+def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
+    (tmp_path / "noise").mkdir()
+    file = tmp_path / "noise" / "mine.yaml"
+    words = [f"hydra.searchpath=[file://{tmp_path}]", "scenario=linear_walk", "noise=mine"]
+    target = "_target_: pfbench.noise.NominalNoise\n"
+    for text in ("paper: {name: first}\n", "paper: {name: other}\n", "defaults: [nominal]\n"):
+        file.write_text(target + text)
+        os.utime(file, ns=(0, hash(text) % 2**40))
+        assert is_same(words)
+    other = tmp_path / "second" / "noise" / "mine.yaml"
+    other.parent.mkdir(parents=True)
+    other.write_text(target + "paper: {name: second}\n")
+    words[0] = f"hydra.searchpath=[file://{tmp_path / 'second'}]"
+    assert is_same(words)
+    composed = composed_by(shared_loader.SharedLoader, words, RunMode.RUN)
+    assert composed.noise.paper.name == "second"
+
+
+def test_an_error_of_a_file_is_that_of_hydra(tmp_path: Path) -> None:
+    (tmp_path / "noise").mkdir()
+    file = tmp_path / "noise" / "mine.yaml"
+    words = [f"hydra.searchpath=[file://{tmp_path}]", "scenario=linear_walk", "noise=mine"]
+    texts = (
+        "a: [1\nb: }",
+        "a: 1\na: 2",
+        "defaults: [nothing_there]\na: 1",
+        "defaults: {a: 1}",
+        "defaults: ['/filter@x: ${nothing}']",
+        "# @package a b\nscenario: 3",
+    )
+    for text in texts:
+        file.write_text(text)
+        said = []
+        for loader in (shared_loader.SharedLoader, ConfigLoaderImpl):
+            with pytest.raises(Exception) as raised:  # noqa: PT011
+                composed_by(loader, words, RunMode.RUN)
+            said.append((raised.type, str(raised.value), str(raised.value.__cause__)))
+        assert said[0] == said[1], text
+
+
+def test_no_file_of_pfbench_sets_the_mode_of_hydra() -> None:
+    """So that words alone can."""
+    for path in GROUPS["experiment"]:
+        words = [f"+experiment={path.stem}"]
+        composed = composed_by(shared_loader.SharedLoader, words, RunMode.MULTIRUN)
+        assert composed.hydra.mode is None
+    for words in (["hydra.mode=RUN"], ["a=1", "++hydra.mode=RUN"], ["hydra={mode: RUN}"]):
+        assert application._can_set_mode(words)
+    assert not application._can_set_mode(["scenario=linear_walk", "hydrate=1", "filter=sir"])
+
+
+@pytest.mark.parametrize("words", [[], ["-m"], ["hydra.mode=MULTIRUN"], ["--multirun", "runs=2,3"]])
+def test_an_application_runs_as_that_of_hydra(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+
+    seen: list[list[Any]] = []
+
+    def task(cfg: Any) -> None:
+        own = cast(Any, HydraConfig.get())
+        settings = OmegaConf.to_container(own, resolve=False)
+        assert isinstance(settings, dict)
+        seen[-1].append((OmegaConf.to_container(cfg, resolve=True), settings))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["pfbench run", *words, "scenario=linear_walk"])
+    path = str(job.conf_dir())
+    decorated = hydra.main(version_base="1.3", config_path=path, config_name="config")(task)
+    for run in (decorated, application.make_application(task)):
+        seen.append([])
+        run()
+    assert seen[0] == seen[1]
+    assert len(seen[0]) == (2 if "runs=2,3" in words else 1)
+
+
+def test_garbage_is_collected_as_usual_once_work_starts() -> None:
+    usual = gc.get_threshold()
+    reset_work()
+    reset_work()
+    assert gc.get_threshold()[0] == rare_collections._YOUNG_OBJECTS > usual[0]
+    start_work()
+    assert gc.get_threshold() == usual
+    start_work()
+    assert gc.get_threshold() == usual
+    reset_work()
+    rare_collections.collect_as_usual()
+    assert gc.get_threshold() == usual
