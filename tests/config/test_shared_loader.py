@@ -83,7 +83,7 @@ def test_each_configuration_is_composed_as_by_hydra(group: str) -> None:
     "words",
     [
         ["hydra.mode=MULTIRUN"],
-        ["hydra/launcher=basic", "hydra.verbose=true", "runs=3"],
+        ["hydra/job_logging=none", "hydra.verbose=true", "runs=3"],
         ["~train", "+mine={a: [1, {b: 2}]}"],
         ["+experiment=quickstart", "filter=cofm_amssrcpf", "scenario=linear_walk"],
     ],
@@ -113,6 +113,9 @@ def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
         file.write_text(target + text)
         os.utime(file, ns=(0, hash(text) % 2**40))
         assert is_same(words)
+    file.write_text("defaults: [{/filter@x: '${filter}'}]\n")
+    assert is_same(words)
+    assert composed_by(shared_loader.SharedLoader, words, RunMode.RUN).noise.x.particles == 500
     other = tmp_path / "second" / "noise" / "mine.yaml"
     other.parent.mkdir(parents=True)
     other.write_text(target + "paper: {name: second}\n")
@@ -131,7 +134,7 @@ def test_an_error_of_a_file_is_that_of_hydra(tmp_path: Path) -> None:
         "a: 1\na: 2",
         "defaults: [nothing_there]\na: 1",
         "defaults: {a: 1}",
-        "defaults: ['/filter@x: ${nothing}']",
+        "defaults: [{/filter@x: '${nothing}'}]",
         "# @package a b\nscenario: 3",
     )
     for text in texts:
