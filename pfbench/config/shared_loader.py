@@ -26,26 +26,27 @@ from hydra.core.override_parser.types import Override
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig, OmegaConf, flag_override
 
-T = TypeVar("T")
+_Object = TypeVar("_Object")
 
 _OWN_PACKAGE = "pkg://hydra.conf"  # files of Hydra itself, which do not change in a process
 # objects of Hydra by their name, with the version of their files. A composition changes its copy, and pickle copies fastest
 _kept: dict[Hashable, tuple[Hashable, bytes]] = {}
 
 
-def _keep(key: Hashable, version: Hashable, make: Callable[[], T]) -> T:
+def _keep(key: Hashable, version: Hashable, make: Callable[[], _Object]) -> _Object:
     """Return a copy of an object that was made of the same files before, or make it."""
-    known = _kept.get(key)
-    if known is None or known[0] != version:
-        made = make()
+    kept_version, content = _kept.get(key, (None, b""))
+    if kept_version != version:
+        result = make()
         try:
-            known = _kept[key] = version, pickle.dumps(made, pickle.HIGHEST_PROTOCOL)
+            content = pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
         except (
             pickle.PicklingError
         ):  # in a process of a launcher, which has other classes of the same names
-            return made
-    result: T = pickle.loads(known[1])
-    return result
+            return result
+        _kept[key] = version, content
+    copied: _Object = pickle.loads(content)
+    return copied
 
 
 class SharedLoader(ConfigLoaderImpl):
@@ -100,7 +101,7 @@ class SharedLoader(ConfigLoaderImpl):
 
 
 class _MergedStart(ResultDefault):
-    """Entry of a defaults list that stands for the first ones, which are merged."""
+    """Entry of a defaults list with the merged result of its first entries."""
 
     def __init__(self, config: DictConfig) -> None:
         super().__init__()
@@ -143,8 +144,8 @@ class _StoredNode:
     def __init__(self, node: Any) -> None:
         self._node = node
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _StoredNode) and other._node is self._node
+    def __eq__(self, value: object) -> bool:
+        return isinstance(value, _StoredNode) and value._node is self._node
 
     def __hash__(self) -> int:
         return id(self._node)
@@ -164,7 +165,7 @@ def _has_own_file(config_path: str) -> bool:
 
 
 def _find_version(source: ConfigSource, config_path: str, schema: ConfigSource) -> Hashable | None:
-    """Return a value that differs if a file has changed, None if this cannot be told."""
+    """Return a value that differs if a file has changed, None for a file that is not kept."""
     name = ConfigSource._normalize_file_name(config_path)
     if source.scheme() == "structured":  # not by class: Hydra executes modules of sources twice
         return _StoredNode(ConfigStore.instance()._load(name))

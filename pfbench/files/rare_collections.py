@@ -1,7 +1,7 @@
 """Fewer garbage collections while a command starts.
 
-A command imports and composes before its work starts. Both make hundreds of thousands of objects, nearly all of which stay:
-to look through them again and again takes a fifth of the start.
+A command imports and composes before its work starts. Both make hundreds of thousands of objects, and most of them remain.
+Collections that visit them again and again take a fifth of the start.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def collect_rarely() -> None:
 def collect_as_usual() -> None:
     """Set the thresholds that the process had before `collect_rarely`.
 
-    No later collection looks through the objects of the start, unless the process has excluded others from collections before.
+    No later collection visits the objects of the start, unless the process has excluded others from collections before.
     """
     if not _usual:
         return
