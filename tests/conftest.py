@@ -7,6 +7,8 @@ import sys
 # Packages are installed without compiled modules. Else each process that a test starts compiles them again: seconds.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# torch's compiler starts processes for kernels of a GPU, and tries each set of vector instructions of the processor.
+os.environ |= {"TORCHINDUCTOR_COMPILE_THREADS": "1", "TORCHINDUCTOR_VEC_ISA_OK": "1"}
 
 import composed_once  # noqa: E402
 import torch  # noqa: E402
