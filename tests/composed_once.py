@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import itertools
 import os
 import pickle
 import re
@@ -25,6 +26,7 @@ from hydra._internal.config_repository import CachingConfigRepository
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
 from hydra.core.utils import JobRuntime
 from hydra.types import RunMode
 from omegaconf import _utils
@@ -122,12 +124,33 @@ def list_defaults_once(
 
 def merge_files_once(self: ConfigLoaderImpl, defaults: list[Any], repo: Any) -> Any:
     """Merge the files of a list."""
-    key = ("files", *(repr(dataclasses.astuple(default)) for default in defaults))
     if not is_own(repo):
         return _merge_files(self, defaults=defaults, repo=repo)
+    key = name_files(defaults)
     if key not in _composed:
-        _composed[key] = pickle.dumps(_merge_files(self, defaults=defaults, repo=repo))
+        _composed[key] = pickle.dumps(merge_after_hydra(self, defaults, repo))
     return pickle.loads(_composed[key])
+
+
+def merge_after_hydra(self: ConfigLoaderImpl, defaults: list[Any], repo: Any) -> Any:
+    """Merge the files of a list. Hydra's own come first, are mostly the same, and take half of the time."""
+    hydra = list(itertools.takewhile(lambda file: file.config_path.startswith("hydra/"), defaults))
+    key = name_files(hydra)
+    if key not in _composed:
+        _composed[key] = pickle.dumps(_merge_files(self, defaults=hydra, repo=repo))
+    begun = ConfigResult("", "", pickle.loads(_composed[key]), {})
+    first, load = object(), self._load_single_config
+
+    def load_single(default: Any, repo: Any) -> Any:
+        return begun if default is first else load(default=default, repo=repo)
+
+    with mock.patch.object(self, "_load_single_config", load_single):
+        return _merge_files(self, defaults=[first, *defaults[len(hydra) :]], repo=repo)
+
+
+def name_files(defaults: list[Any]) -> tuple[str, ...]:
+    """Return a name of the merged files of a list."""
+    return ("files", *(repr(dataclasses.astuple(file)) for file in defaults))
 
 
 def store_node(self: ConfigStore, *args: Any, **more: Any) -> None:
