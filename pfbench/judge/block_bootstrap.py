@@ -83,7 +83,7 @@ def compare_along_run(square_a: Array, square_b: Array, length: float = 0.0) -> 
     time = _correlation_time(influence)
     if not length:
         slow = _CORRELATION_TIMES * _correlation_time(_log_ratio(square_a, square_b))
-        length = max(choose_block_length(influence), slow)
+        length = max(_length_by_rules(influence, time), slow)
     length = min(max(length, 1.0), influence.size / 2)
     blocks = influence.size / length
     equal = min(blocks, count_equal_blocks(influence, length))
@@ -120,10 +120,7 @@ def choose_block_length(values: Array) -> float:
     Returns:
         The larger of the length of Politis and White and of 8 correlation times.
     """
-    covariance = _autocovariance(values)
-    if covariance[0] <= 0:
-        return 1.0
-    return max(_politis_white_length(covariance), _CORRELATION_TIMES * _correlation_time(values))
+    return _length_by_rules(values, _correlation_time(values))
 
 
 def count_equal_blocks(values: Array, length: float) -> float:
@@ -140,6 +137,13 @@ def count_equal_blocks(values: Array, length: float) -> float:
         square, fourth = float((sums**2).sum()), float((sums**4).sum())
         counts.append(_NORMAL_KURTOSIS * square**2 / fourth if fourth > 0 else float(sums.size))
     return float(np.mean(counts))
+
+
+def _length_by_rules(values: Array, correlation_time: float) -> float:
+    covariance = _autocovariance(values)
+    if covariance[0] <= 0:
+        return 1.0
+    return max(_politis_white_length(covariance), _CORRELATION_TIMES * correlation_time)
 
 
 def _log_ratio(square_a: Array, square_b: Array) -> Array:

@@ -121,7 +121,7 @@ def test_what_disagrees_with_the_grid_is_seen() -> None:
 
 @pytest.mark.slow
 def test_particle_marginal_chains_find_the_grid_s_posterior() -> None:
-    posterior = pmmh(NILE, ParticleFilter(60), nile(YEARS), draws=60, warmup=40, chains=24, seed=1)
+    posterior = pmmh(NILE, ParticleFilter(60), nile(YEARS), draws=30, warmup=40, chains=48, seed=1)
     assert posterior.accepted is not None
     assert 0.1 < float(posterior.accepted.mean()) < 0.6
     agrees(posterior.table(), YEARS)
@@ -132,7 +132,7 @@ def test_particle_marginal_chains_find_the_grid_s_posterior() -> None:
 def test_metropolis_on_a_kalman_likelihood_finds_it_too(leaps: int) -> None:
     settings = PmmhSettings(leaps=leaps)
     posterior = pmmh(
-        NILE, EKF, nile(YEARS), draws=60, warmup=40, chains=24, seed=2, settings=settings
+        NILE, EKF, nile(YEARS), draws=30, warmup=40, chains=48, seed=2, settings=settings
     )
     agrees(posterior.table(), YEARS)
     assert posterior.accepted is not None
