@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -77,7 +76,7 @@ def read_study(name: str) -> Study:
     folder = TOP / "reports" / name
     rows = pd.read_csv(folder / "verdicts.csv")
     rows = rows[(rows["metric"] == "rmse") & (rows["world"] != "all") & (rows["regime"] != "all")]
-    rows = rows.drop_duplicates(["world", "regime", "filter"])
+    rows = rows[rows["verdict"] != "missing"].drop_duplicates(["world", "regime", "filter"])
     facts = StudyFacts.from_pack(read_page_data(folder))
     return Study(pd.read_parquet(folder / "runs.parquet"), rows, facts)
 
@@ -107,17 +106,19 @@ def _world_table(study: Study, world: str) -> str:
     errors = {key: part["rmse"].to_numpy() for key, part in runs.groupby(["regime", "filter"])}
     regimes = list(dict.fromkeys(regime for regime, _ in rows))
     lines = markdown_head("filter", *(f"{r} [{runs['unit'].iloc[0]}]" for r in regimes), "ms/step")
-    ranks: Counter[str] = Counter()
+    ranks: dict[str, list[float]] = {}
     for row in rows.values():
-        ranks[row["filter"]] += row["rank"]
-    for label in sorted(ranks, key=lambda label: ranks[label]):
+        place = len(rows) if np.isnan(row["rank"]) else row["rank"]  # after all that keep track
+        ranks.setdefault(row["filter"], []).append(place)
+    missing = "failed" if study.facts.failures else "not run"
+    for label in sorted(ranks, key=lambda label: float(np.mean(ranks[label]))):
         present = [(regime, label) for regime in regimes if (regime, label) in errors]
         cells = {
             key: f"{format_median(errors[key])}, {100 * rows[key]['track']:.0f} / {100 * rows[key]['coverage']:.0f} %"
             for key in present
         }
         times = float(np.median([rows[key]["ms"] for key in present]))
-        words = (cells.get((regime, label), "failed") for regime in regimes)
+        words = (cells.get((regime, label), missing) for regime in regimes)
         tier = " (B)" if study.facts.looks[label].tuning else ""
         lines.append(markdown_row(f"`{label}`{tier}", *words, _digits(times)))
     return "\n".join([*lines, "", _describe_limit(world)])

@@ -7,6 +7,7 @@ Both seeds are decided by the same rules, each for the filters and the condition
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
@@ -91,7 +92,7 @@ def rank_filters(runs: pd.DataFrame, facts: StudyFacts) -> dict[tuple[str, str],
     rankings: dict[tuple[str, str], Ranking] = {}
     for key, view in views.items():
         if "all" not in (key.world, key.regime) and key.metric == "rmse":
-            rows = sorted(view["rows"], key=lambda row: row["rank"])
+            rows = sorted(view["rows"], key=lambda row: row["rank"] or math.inf)  # None: not kept
             rankings[key.world, key.regime] = [(row["filter"], row["verdict"]) for row in rows]
     return rankings
 

@@ -48,6 +48,28 @@ def test_the_rank_correlation_is_that_of_the_orders() -> None:
     assert second_seed.compare_rankings(ranking, swapped).agreement == pytest.approx(1 - 2 / 6)
 
 
+@pytest.mark.parametrize("study", ["robust_quad", "robust_canyon"])
+def test_rankings_are_those_of_the_report(study: str) -> None:
+    stored = robustness.read_study(study)
+    rankings = second_seed.rank_filters(stored.runs, stored.facts)
+    for (world, regime), ranking in rankings.items():
+        rows = [row for row in stored.list_rows(world) if row["regime"] == regime]
+        assert ranking == [(row["filter"], row["verdict"]) for row in rows]
+    assert len(rankings) == len(stored.runs[["scenario", "regime"]].drop_duplicates())
+
+
+def test_filters_that_lose_the_track_are_the_last_of_a_table() -> None:
+    study, world = robustness.read_study("robust_quad"), "recorded_quad_flights"
+    verdicts: dict[str, set[str]] = {}
+    for row in study.list_rows(world):
+        verdicts.setdefault(row["filter"], set()).add(row["verdict"])
+    lost = {label for label, words in verdicts.items() if words == {"not_kept"}}
+    table = robustness._world_table(study, world).splitlines()
+    order = [line.split("`")[1] for line in table if line.startswith("| `")]
+    assert lost
+    assert set(order[-len(lost) :]) == lost
+
+
 def test_verdicts_that_differ_are_counted() -> None:
     runs = pd.DataFrame({
         "scenario": "w", "regime": ["nominal", "outliers"] * 3, "filter": ["a", "a", "b", "b", "c", "c"],
@@ -61,8 +83,6 @@ def test_verdicts_that_differ_are_counted() -> None:
 
 
 def test_both_seeds_are_decided_for_the_same_filters_and_conditions() -> None:
-    if not second_seed.RUNS.is_file():
-        pytest.skip("no runs of a second seed are stored")
     studies = [study for study in robustness.STUDIES if len(second_seed.read_runs(study))]
     assert len(studies) >= 3
     for study in studies:
