@@ -111,7 +111,8 @@ def _world_table(study: Study, world: str) -> str:
         place = len(rows) if np.isnan(row["rank"]) else row["rank"]  # after all that keep track
         ranks.setdefault(row["filter"], []).append(place)
     missing = "failed" if study.facts.failures else "not run"
-    for label in sorted(ranks, key=lambda label: float(np.mean(ranks[label]))):
+    order = {label: (len(regimes) - len(r), float(np.mean(r))) for label, r in ranks.items()}
+    for label in sorted(order, key=lambda label: order[label]):
         present = [(regime, label) for regime in regimes if (regime, label) in errors]
         cells = {
             key: f"{format_median(errors[key])}, {100 * rows[key]['track']:.0f} / {100 * rows[key]['coverage']:.0f} %"
@@ -197,7 +198,7 @@ def _kind(family: str, label: str) -> str:
 
 def seeds() -> str:
     """Compare the best filters and the verdict "robust" with those of another seed."""
-    studies = {name: read_study(name) for name in STUDIES}
+    studies = {name: read_study(name) for name in STUDIES if len(read_runs(name))}
     tables = {name: select_common(study.runs, read_runs(name)) for name, study in studies.items()}
     cells = {}
     for name, pair in tables.items():
@@ -212,9 +213,26 @@ def seeds() -> str:
         return find_robust(study, world, CONTROLS[:1])
 
     verdicts = compare_robust(tables, decide, (NOMINAL, OUTLIERS))
-    lacking = [f"`{name}`" for name in STUDIES if name not in studies]
-    end = f"\n\nNot repeated with the second seed: {', '.join(lacking)}." if lacking else ""
-    return f"{seed_table(cells)}\n\n{verdicts}{end}"
+    lacking = [describe_lacking(name, pair) for name, pair in tables.items()]
+    lacking += [f"`{name}`" for name in STUDIES if name not in studies]
+    end = f"\n\nNot repeated with the second seed: {'; '.join(filter(None, lacking))}."
+    return f"{seed_table(cells)}\n\n{verdicts}{end if any(lacking) else ''}"
+
+
+def describe_lacking(name: str, pair: tuple[pd.DataFrame, pd.DataFrame]) -> str:
+    """Name the filters and regimes of a study that a second seed lacks; empty if it lacks none.
+
+    Args:
+        name: Name of the study.
+        pair: Runs of both seeds, of common filters and conditions.
+    """
+    runs = read_study(name).runs
+    words = []
+    for column in ("filter", "regime"):
+        values = sorted(set(runs[column]) - set(pair[1][column]))
+        listed = ", ".join(f"`{value}`" for value in values)
+        words += [f"the {column}{'s' if len(values) > 1 else ''} {listed}"] if values else []
+    return f"in `{name}` {' and '.join(words)}" if words else ""
 
 
 def tuned() -> str:
