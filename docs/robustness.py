@@ -214,9 +214,10 @@ def seeds() -> str:
 
     verdicts = compare_robust(tables, decide, (NOMINAL, OUTLIERS))
     lacking = [describe_lacking(name, pair) for name, pair in tables.items()]
-    lacking += [f"`{name}`" for name in STUDIES if name not in studies]
-    end = f"\n\nNot repeated with the second seed: {'; '.join(filter(None, lacking))}."
-    return f"{seed_table(cells)}\n\n{verdicts}{end if any(lacking) else ''}"
+    lacking += [f"- `{name}`" for name in STUDIES if name not in studies]
+    rows = "\n".join(filter(None, lacking))
+    end = f"\n\nNot repeated with the second seed:\n\n{rows}"
+    return f"{seed_table(cells)}\n\n{verdicts}{end if rows else ''}"
 
 
 def describe_lacking(name: str, pair: tuple[pd.DataFrame, pd.DataFrame]) -> str:
@@ -232,7 +233,7 @@ def describe_lacking(name: str, pair: tuple[pd.DataFrame, pd.DataFrame]) -> str:
         values = sorted(set(runs[column]) - set(pair[1][column]))
         listed = ", ".join(f"`{value}`" for value in values)
         words += [f"the {column}{'s' if len(values) > 1 else ''} {listed}"] if values else []
-    return f"in `{name}` {' and '.join(words)}" if words else ""
+    return f"- in `{name}` {' and '.join(words)}" if words else ""
 
 
 def tuned() -> str:
