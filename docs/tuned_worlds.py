@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import yaml
 
-from pfbench.config.named_sets import TUNED_METHODS
 from pfbench.files import markdown_head, markdown_row
-from pfbench.job.tuning.candidate_search import choose_candidate
-from pfbench.job.tuning.tuned_files import read_candidates
 
+METHODS = ("ekf_scaled", "gate", "huber", "student")
 TUNED = Path(__file__).parents[1] / "conf" / "tuned"
 NAMES = {"r_factor": "R", "q_factor": "Q"}
 
@@ -24,7 +24,7 @@ def tuned_table(worlds: Mapping[str, str]) -> str:
     Args:
         worlds: Data on which a study says that its filters were tuned, by scenario.
     """
-    lines = markdown_head("world", "tuned on", *(f"`{method}_tuned`" for method in TUNED_METHODS))
+    lines = markdown_head("world", "tuned on", *(f"`{method}_tuned`" for method in METHODS))
     largest = 0
     for world, data in worlds.items():
         content = read_tuning(world, data)
@@ -34,11 +34,11 @@ def tuned_table(worlds: Mapping[str, str]) -> str:
                 content["data"]
                 if content["world"]["scenario"] == world
                 else f"not tuned here: {data}",
-                *(describe_choice(content[method]) for method in TUNED_METHODS),
+                *(describe_choice(content[method]) for method in METHODS),
             )
         )
-        largest += sum(has_largest_factor(content[method]) for method in TUNED_METHODS)
-    number = len(worlds) * len(TUNED_METHODS)
+        largest += sum(has_largest_factor(content[method]) for method in METHODS)
+    number = len(worlds) * len(METHODS)
     return "\n".join([
         *lines, "",
         f"In {largest} of {number} cells the factor on R is the largest of the grid, so that a larger one may be better still.",
@@ -71,10 +71,12 @@ def describe_choice(node: Mapping[str, Any]) -> str:
     Args:
         node: Entry of the filter in the file of a tuning.
     """
-    candidates, untuned = read_candidates(node)
-    choice = choose_candidate(candidates)
-    values = ", ".join(f"{NAMES.get(key, key)} {value:g}" for key, value in choice.values.items())
-    return f"{values} ({100 * math.expm1(choice.log_ratio - untuned.log_ratio):+.0f} %)"
+    candidates = read_candidates(node)
+    knobs = list(candidates.columns[: candidates.columns.get_loc("log_ratio")])
+    chosen = (candidates[knobs] == [node[knob] for knob in knobs]).all(axis=1)
+    (log_ratio,), untuned = candidates["log_ratio"][chosen], candidates["log_ratio"].iloc[-1]
+    values = ", ".join(f"{NAMES.get(knob, knob)} {node[knob]:g}" for knob in knobs)
+    return f"{values} ({100 * math.expm1(log_ratio - untuned):+.0f} %)"
 
 
 def has_largest_factor(node: Mapping[str, Any]) -> bool:
@@ -83,5 +85,13 @@ def has_largest_factor(node: Mapping[str, Any]) -> bool:
     Args:
         node: Entry of the filter in the file of a tuning.
     """
-    candidates, _ = read_candidates(node)
-    return bool(node["r_factor"] == max(c.values["r_factor"] for c in candidates))
+    return bool(node["r_factor"] == read_candidates(node)["r_factor"].max())
+
+
+def read_candidates(node: Mapping[str, Any]) -> pd.DataFrame:
+    """Read the candidates of a filter; the last row is the filter of tier A, without parameters.
+
+    Args:
+        node: Entry of the filter in the file of a tuning.
+    """
+    return pd.read_csv(StringIO(node["candidates"]), sep=" ", na_values="-")
