@@ -32,11 +32,11 @@ log = logging.getLogger("pfbench")
 
 # normal numbers of a job: on a CUDA device compiling costs seconds and saves 15 ms per million [measured]
 _CUDA_NUMBERS = 5e8
-# a compiled step saves this in place of C++ operators [measured in float64: growth model 3e-4 and 0.8e-8,
-# stochastic volatility 1.5e-8, constant velocity in the plane 1.4e-8, 15 states nothing]
+# a compiled step saves this in place of C++ operators [measured in float64: growth model 3e-4 and 0.3e-8,
+# stochastic volatility 0.5e-8, constant velocity in the plane 1.1e-8, 15 states nothing]
 _SAVED_PER_STEP = 3e-4  # s
-_SAVED_PER_PARTICLE = 1.2e-8  # s per particle and step
-_COMPILATION = 10.0  # s; 4 to 5 s of a step that is cached, 10 to 14 s of another one
+_SAVED_PER_PARTICLE = 0.6e-8  # s per particle and step
+_COMPILATION = 10.0  # s; 4 to 8 s of a step that is cached, 10 to 14 s of another one
 
 
 class TimedFilterPass(NamedTuple):

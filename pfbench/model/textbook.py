@@ -150,7 +150,8 @@ class StochasticVolatility(StateSpaceModel):
 
     @override
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        return self.mu + self.rho * (x - self.mu) + self.sigma * w
+        mean = torch.addcmul((1.0 - self.rho) * self.mu, self.rho, x)
+        return torch.addcmul(mean, self.sigma, w)  # few passes over the particles
 
     def propagation_jacobian(self, x: Tensor, u: Any) -> Tensor:
         """Return rho, [1, 1, 1, 1].
@@ -183,12 +184,10 @@ class StochasticVolatility(StateSpaceModel):
         Returns:
             Log likelihood, [R, N]. A missing measurement gives 0.
         """
-        square, log_variance = y.nan_to_num().square(), x[..., 0]
-        return torch.where(
-            torch.isnan(y),
-            0.0,
-            -0.5 * (square * torch.exp(-log_variance) + log_variance) - _HALF_LOG_2PI,
-        )
+        present = torch.where(torch.isnan(y), 0.0, 1.0).to(x)
+        half_square = -0.5 * y.nan_to_num().square()
+        log_density = torch.addcmul(-_HALF_LOG_2PI * present, -0.5 * present, x[..., 0])
+        return torch.addcmul(log_density, half_square, torch.exp(-x[..., 0]))  # few passes
 
     @override
     def transition(self, x: Tensor, u: Any) -> Distribution:
