@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from ceiling import STORE, largest_limit, root_mean
+from recorded_wins import KALMAN, KINDS, Condition, recorded_table
 from second_seed import (
     compare_rankings,
     compare_robust,
@@ -38,11 +39,8 @@ RECORDED = ("robust_quad", "recorded_quad", "robust_car", "recorded_car", "robus
 CONTROL, NOMINAL, OUTLIERS = "ekf_scaled_tuned", "nominal", "outliers"
 CONTROLS = (CONTROL, "ekf_scaled", "ekf")
 SAMPLED_HYPOTHESES = "rbpf_discrete"  # particles of noise hypotheses, a Kalman filter for each
-KALMAN = "kalman"
-KINDS = ("particles of the state", "particles of hypotheses")
 LEVEL = 0.95
 _BLOCK = re.compile(r"<!-- numbers:(\w+) -->\n.*?<!-- numbers:end -->", re.DOTALL)
-_WORSE = ("worse", "not_kept")
 
 Row = dict[Any, Any]
 
@@ -162,31 +160,13 @@ def robust() -> str:
             regimes = set(study.runs.loc[study.runs["scenario"] == world, "regime"])
             if {OUTLIERS, NOMINAL} <= regimes:
                 names = (find_robust(study, world, c) for c in (CONTROLS[:1], CONTROLS))
-                cells = (", ".join(f"`{name}`" for name in group) or "none" for group in names)
+                gains = compare_outliers(study, world)
+                cells = (
+                    ", ".join(f"`{name}` ({gains[name]:+.2g} %)" for name in group) or "none"
+                    for group in names
+                )
                 lines.append(markdown_row(f"`{world}`", *cells))
     return "\n".join(lines)
-
-
-def compare_sampled(study: Study, rows: Sequence[Row], kind: str) -> tuple[str, bool]:
-    """Compare particle filters with the best Kalman filter of a condition, by the verdicts of the board.
-
-    Args:
-        study: Files of a study.
-        rows: Rows of a condition, the best filter first.
-        kind: One of `KINDS`.
-
-    Returns:
-        Words on the comparison, and whether the particle filter is shown to be better.
-    """
-    kinds = {label: _kind(look.family, label) for label, look in study.facts.looks.items()}
-    kalman = next(row for row in rows if kinds[row["filter"]] == KALMAN)
-    first = next((row for row in rows if kinds[row["filter"]] == kind), None)
-    if first is None:
-        return "not in the study", False
-    is_ahead = first["rank"] < kalman["rank"]
-    is_better = is_ahead and first["verdict"] == "best" and kalman["verdict"] in _WORSE
-    word = "better than" if is_better else "not decided against" if is_ahead else "not better than"
-    return f"`{first['filter']}` {word} `{kalman['filter']}`", is_better
 
 
 def _kind(family: str, label: str) -> str:
@@ -205,23 +185,35 @@ def seeds() -> str:
         first, second = (rank_filters(runs, studies[name].facts) for runs in pair)
         cells |= {key: compare_rankings(first[key], second[key]) for key in first}
 
-    def decide(name: str, runs: pd.DataFrame, world: str) -> tuple[str, ...]:
+    def decide(
+        name: str, runs: pd.DataFrame, world: str, controls: Sequence[str]
+    ) -> tuple[str, ...]:
         labels = set(runs["filter"])
         facts = studies[name].facts
         looks = {label: look for label, look in facts.looks.items() if label in labels}
         study = studies[name]._replace(runs=runs, facts=facts._replace(looks=looks))
-        return find_robust(study, world, CONTROLS[:1])
+        return find_robust(study, world, controls)
 
-    verdicts = compare_robust(tables, decide, (NOMINAL, OUTLIERS))
+    verdicts = "\n\n".join(
+        f"{title}:\n\n{compare_robust(tables, decide, (NOMINAL, OUTLIERS), controls)}"
+        for title, controls in (
+            (f"Against `{CONTROL}`", CONTROLS[:1]),
+            ("Against all three controls", CONTROLS),
+        )
+    )
     lacking = [describe_lacking(name, pair) for name, pair in tables.items()]
     lacking += [f"- `{name}`" for name in STUDIES if name not in studies]
+    for name in TERRAIN_STUDIES:
+        runs = read_runs(name)
+        pair = select_common(read_study(name).runs, runs)
+        lacking.append(describe_lacking(name, pair) if len(runs) else f"- `{name}`")
     rows = "\n".join(filter(None, lacking))
     end = f"\n\nNot repeated with the second seed:\n\n{rows}"
     return f"{seed_table(cells)}\n\n{verdicts}{end if rows else ''}"
 
 
 def describe_lacking(name: str, pair: tuple[pd.DataFrame, pd.DataFrame]) -> str:
-    """Name the filters and regimes of a study that a second seed lacks; empty if it lacks none.
+    """Name the scenarios, filters and regimes of a study that a second seed lacks; empty if it lacks none.
 
     Args:
         name: Name of the study.
@@ -229,7 +221,7 @@ def describe_lacking(name: str, pair: tuple[pd.DataFrame, pd.DataFrame]) -> str:
     """
     runs = read_study(name).runs
     words = []
-    for column in ("filter", "regime"):
+    for column in ("scenario", "filter", "regime"):
         values = sorted(set(runs[column]) - set(pair[1][column]))
         listed = ", ".join(f"`{value}`" for value in values)
         words += [f"the {column}{'s' if len(values) > 1 else ''} {listed}"] if values else []
@@ -247,26 +239,40 @@ def tuned() -> str:
 
 
 def recorded() -> str:
-    """Compare particle filters with the best Kalman filter in each condition of recorded data."""
-    lines = markdown_head("study", "regime", *KINDS)
-    wins: dict[str, list[str]] = {kind: [] for kind in KINDS}
-    for name in RECORDED:
-        study = read_study(name)
-        for world, regime in dict.fromkeys((r["world"], r["regime"]) for r in study.list_rows()):
-            rows = [r for r in study.list_rows(world) if r["regime"] == regime]
-            outcomes = {kind: compare_sampled(study, rows, kind) for kind in KINDS}
-            lines.append(
-                markdown_row(f"`{name}`", regime, *(words for words, _ in outcomes.values()))
-            )
-            for kind, (_, is_better) in outcomes.items():
-                wins[kind] += [f"`{name}`, {regime}"] * is_better
-    ends = [
-        f"Filters with {kind} are better than the best Kalman filter in {len(won)} conditions: {'; '.join(won)}."
-        if won
-        else f"No filter with {kind} is shown to be better than the best Kalman filter in any recorded condition."
-        for kind, won in wins.items()
-    ]
-    return "\n".join([*lines, "", *ends])
+    """Compare particle filters with all Kalman filters in each condition of recorded data."""
+    conditions = [c for name in RECORDED for c in list_conditions(name, read_study(name).runs)]
+    second = [c for name in STUDIES for c in list_conditions(name, read_runs(name))]
+    return recorded_table(conditions, {f"{c.study} {c.regime}": c for c in second})
+
+
+def compare_outliers(study: Study, world: str) -> dict[str, float]:
+    """Compare the errors in outliers with those of the control: change of the median in percent, by filter.
+
+    Args:
+        study: Files of a study.
+        world: Scenario with outliers.
+    """
+    runs = study.runs[(study.runs["scenario"] == world) & (study.runs["regime"] == OUTLIERS)]
+    medians = runs.assign(rmse=runs["rmse"].fillna(np.inf)).groupby("filter")["rmse"].median()
+    return {str(label): 100 * (value / medians[CONTROL] - 1) for label, value in medians.items()}
+
+
+def list_conditions(name: str, runs: pd.DataFrame) -> list[Condition]:
+    """List the conditions of a study with the errors of their filters.
+
+    Args:
+        name: Name of the study.
+        runs: Its runs.
+    """
+    study = read_study(name)
+    kinds = {label: _kind(look.family, label) for label, look in study.facts.looks.items()}
+    coverage = {(r["world"], r["regime"], r["filter"]): r["coverage"] for r in study.list_rows()}
+    conditions = []
+    for (world, regime), part in runs.groupby(["scenario", "regime"], sort=False):
+        errors = part.pivot_table(index="run", columns="filter", values="rmse", dropna=False)
+        shares = {label: coverage[world, regime, label] for label in errors}
+        conditions.append(Condition(name, str(regime), errors, kinds, shares))
+    return conditions
 
 
 def _study_tables(name: str) -> str:

@@ -45,15 +45,19 @@ class BestFilter(NamedTuple):
 
 
 def store_runs(folder: Path, studies: Sequence[str]) -> None:
-    """Store the runs of the second seed of all studies in one file.
+    """Store the runs of the second seed of all studies in one file. Studies without a new report are kept.
 
     Args:
         folder: Folder of the reports of the second seed.
         studies: Names of the studies.
     """
     paths = {study: folder / study / "runs.parquet" for study in studies}
-    tables = [pd.read_parquet(p).assign(study=s) for s, p in paths.items() if p.is_file()]
-    pd.concat(tables, ignore_index=True).to_parquet(RUNS, index=False, compression="zstd")
+    new = {s: pd.read_parquet(p).assign(study=s) for s, p in paths.items() if p.is_file()}
+    stored = pd.read_parquet(RUNS) if RUNS.is_file() else pd.DataFrame({"study": []})
+    kept = stored[~stored["study"].isin(list(new))]
+    pd.concat([kept, *new.values()], ignore_index=True).to_parquet(
+        RUNS, index=False, compression="zstd"
+    )
 
 
 @cache
@@ -133,36 +137,40 @@ def seed_table(cells: Mapping[tuple[str, str], BestFilter]) -> str:
 
 def compare_robust(
     studies: Mapping[str, tuple[pd.DataFrame, pd.DataFrame]],
-    decide: Callable[[str, pd.DataFrame, str], Sequence[str]],
+    decide: Callable[[str, pd.DataFrame, str, Sequence[str]], Sequence[str]],
     regimes: tuple[str, str],
+    controls: Sequence[str],
 ) -> str:
     """Table and sentence on the verdict "robust" of each filter with two seeds.
 
     Args:
         studies: Runs of both seeds by study, of common filters and conditions.
-        decide: Returns the robust filters of a study by its runs in a scenario.
+        decide: Returns the robust filters of a study by its runs in a scenario, against the controls.
         regimes: Regimes that the verdict needs.
+        controls: Controls, which are not counted.
     """
     lines = markdown_head("world", "robust with both seeds", "seed 1 only", "seed 2 only")
-    agreed = number = 0
+    number = both = one = 0
     for study, tables in studies.items():
         for world, runs in tables[0].groupby("scenario", sort=False):
             if not set(regimes) <= set(runs["regime"]):
                 continue
-            sets = [set(decide(study, t, str(world))) for t in tables]
-            labels = sorted(set(runs["filter"]))
+            sets = [set(decide(study, t, str(world), controls)) - set(controls) for t in tables]
             groups = (sets[0] & sets[1], sets[0] - sets[1], sets[1] - sets[0])
-            agreed += len(labels) - len(sets[0] ^ sets[1])
-            number += len(labels)
+            number += len(set(runs["filter"]) - set(controls))
+            both += len(groups[0])
+            one += len(groups[1]) + len(groups[2])
             cells = (", ".join(f"`{name}`" for name in sorted(group)) or "–" for group in groups)
             lines.append(markdown_row(f"`{world}`", *cells))
     return "\n".join([
         *lines, "",
-        f"The verdict is the same for {agreed} of {number} pairs of a filter and a world, and differs for {number - agreed}.",
+        f"Of {number} pairs of a filter and a world, without the controls, {both} are robust with both seeds, {one} with one of them "
+        f"and {number - both - one} with none.",
     ])  # fmt: skip
 
 
 if __name__ == "__main__":
     from robustness import STUDIES
+    from terrain_wins import STUDIES as TERRAIN_STUDIES
 
-    store_runs(Path(sys.argv[1]), STUDIES)
+    store_runs(Path(sys.argv[1]), (*STUDIES, *TERRAIN_STUDIES))

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from paired_errors import ALPHA, LOST, compare_with_all, describe_comparison, signed_rank_interval
+from second_seed import read_runs
 
 from pfbench.files import markdown_head, markdown_row
 from pfbench.results import holm, wilcoxon_signed_rank
@@ -24,8 +25,6 @@ LIMITS = Path(__file__).parents[1] / "docs" / "terrain_limit.json"
 REPORTS = Path(__file__).parents[1] / "reports"
 PARTICLES = "rpf"  # the particle filter that is compared
 BANKS = ("ekf_bank", "ekf_bank_dense")
-ALPHA = 0.05
-LOST = 1e12  # error of a lost run, so that two lost runs are equal
 STUDIES = {
     "terrain_start": "initial standard deviation per axis [m]",
     "terrain_rough": "shortest wavelength of the terrain [m]",
@@ -108,26 +107,6 @@ def compare_pairs(
     return pairs
 
 
-def signed_rank_interval(d: np.ndarray, level: float = 1.0 - ALPHA) -> tuple[float, float, float]:
-    """Compute the centre of paired differences and its interval, which belong to the signed-rank test.
-
-    The centre is the median of the means of all pairs of differences [Hodges and Lehmann 1963]. The
-    rank sum is taken as normal.
-
-    Args:
-        d: Differences, [n].
-        level: Coverage.
-
-    Returns:
-        Centre and ends of the interval.
-    """
-    n = d.size
-    means = np.sort([(d[i] + d[j]) / 2.0 for i in range(n) for j in range(i, n)])
-    spread = stats.norm.ppf(0.5 + 0.5 * level) * np.sqrt(n * (n + 1) * (2 * n + 1) / 24.0)
-    k = max(int(np.floor(n * (n + 1) / 4.0 - spread)), 1)
-    return float(np.median(means)), float(means[k - 1]), float(means[-k])
-
-
 def describe_wins(pairs: Mapping[float, Mapping[str, Pair]], labels: Sequence[str]) -> str:
     """State the doses at which the particle filter is better than all of several filters.
 
@@ -186,7 +165,7 @@ def terrain_table(
             *lines,
             "",
             f"Dose: {STUDIES[name]}. " + " ".join(ends),
-            *_list_ratios(pairs, compare_exact(name, errors)),
+            *_list_ratios(pairs, {a: compare_exact(name, errors, a) for a in (PARTICLES, *BANKS)}),
         ]
     )
 
@@ -213,7 +192,8 @@ def describe_answer(runs: Mapping[str, pd.DataFrame], families: Mapping[str, str
             shares = (f"`{a}` in {100 * kept[scenes[dose], a]:.0f} %" for a in (PARTICLES, *BANKS))
             all_won.append(
                 f"`{PARTICLES}` is better than every Kalman filter, both banks included, in `{name}` at {dose} m. "
-                f"Track is kept there by {', '.join(shares)} of runs. {describe_joint(name, scenes[dose])}"
+                f"Track is kept there by {', '.join(shares)} of runs. {describe_joint(name, scenes[dose])} "
+                f"{describe_all_studies(runs, kalman, name, dose)} {describe_second_seed(name, scenes[dose], kalman)}"
             )
         words = (", ".join(doses) + " m" if doses else "none" for doses in cells)
         lines.append(markdown_row(f"`{name}`", STUDIES[name], *words))
@@ -245,6 +225,52 @@ def describe_joint(name: str, scenario: str) -> str:
     )
 
 
+def describe_all_studies(
+    runs: Mapping[str, pd.DataFrame], kalman: Sequence[str], name: str, dose: str
+) -> str:
+    """State the largest p-value of a condition if the pairs of all studies are counted together.
+
+    Args:
+        runs: Stored runs by study.
+        kalman: Labels of the Kalman filters.
+        name: Name of the study.
+        dose: Dose of the condition.
+    """
+    keys, p = [], []
+    for study, table in runs.items():
+        for value, errors in arrange_errors(table).items():
+            logs = np.log(errors.fillna(LOST))
+            keys += [(study, f"{value:g}")] * len(kalman)
+            p += [wilcoxon_signed_rank((logs[PARTICLES] - logs[a]).to_numpy()).p for a in kalman]
+    largest = max(v for key, v in zip(keys, holm(p), strict=True) if key == (name, dose))
+    return f"With the pairs of all {len(runs)} studies counted together, its largest p-value is {largest:.2g}."
+
+
+def describe_second_seed(name: str, scenario: str, kalman: Sequence[str]) -> str:
+    """State what the runs of a second seed say on one condition, in the median run and in root mean square.
+
+    Args:
+        name: Name of the study.
+        scenario: Name of the condition in the stored files.
+        kalman: Labels of the Kalman filters.
+    """
+    runs = read_runs(name)
+    if runs.empty:
+        return "The condition was not repeated with a second seed."
+    errors = arrange_errors(runs)[find_dose(scenario)]
+    found = compare_with_all(errors, PARTICLES, kalman)
+    here = runs[runs["scenario"] == scenario]
+    kept = 100 * here.groupby("filter")["keeps_track"].mean()
+    shown = "shown" if found.p <= ALPHA else "not shown"
+    ratio = root_mean_ratio(errors[PARTICLES].to_numpy(), errors[found.closest].to_numpy())
+    return (
+        f"With a second seed and {len(errors)} runs, which decide this one statement, it is {shown} to be better "
+        f"than every Kalman filter (p = {found.p:.2g}): {describe_comparison(PARTICLES, found)}. In root mean square over "
+        f"runs its error is {ratio:.2f} times as large; it keeps track in {kept[PARTICLES]:.1f} %, "
+        f"`{found.closest}` in {kept[found.closest]:.1f} % of these runs."
+    )
+
+
 def find_won(pairs: Mapping[float, Mapping[str, Pair]], labels: Sequence[str]) -> list[str]:
     """Return the doses at which the particle filter is better than all of several filters.
 
@@ -257,38 +283,48 @@ def find_won(pairs: Mapping[float, Mapping[str, Pair]], labels: Sequence[str]) -
     ]
 
 
-def compare_exact(name: str, errors: Mapping[float, pd.DataFrame]) -> dict[float, str]:
-    """Compare the particle filter with the exact mean on the runs of the point-mass filter, at each dose.
+def compare_exact(name: str, errors: Mapping[float, pd.DataFrame], label: str) -> dict[float, str]:
+    """Compare a filter with the exact mean on the runs of the point-mass filter, at each dose.
 
     Args:
         name: Name of the study.
         errors: Errors by dose, see `arrange_errors`.
+        label: Filter.
 
     Returns:
         Root of the ratio of mean squares by dose, where the exact mean is stored.
     """
     words = {}
     for dose, exact in _read_limits(name).items():
-        runs = errors[dose][PARTICLES].reindex(range(len(exact))).to_numpy()
-        ratio = np.sqrt(np.square(runs).mean() / np.square(exact).mean())
-        words[dose] = f"{ratio:.2f}"
+        runs = errors[dose][label].reindex(range(len(exact))).to_numpy()
+        words[dose] = f"{root_mean_ratio(runs, np.array(exact)):.2f}"
     return words
 
 
+def root_mean_ratio(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the root mean square of errors divided by that of others.
+
+    Args:
+        a: Errors, [R].
+        b: Other errors, [R].
+    """
+    return float(np.sqrt(np.square(a).mean() / np.square(b).mean()))
+
+
 def _list_ratios(
-    pairs: Mapping[float, Mapping[str, Pair]], exact: Mapping[float, str]
+    pairs: Mapping[float, Mapping[str, Pair]], exact: Mapping[str, Mapping[float, str]]
 ) -> list[str]:
     """State the ratios to the closest filter with one normal distribution, banks and the exact mean."""
     heads = ("dose [m]", "closest with one normal distribution", *(f"`{b}`" for b in BANKS))
-    lines = ["", *markdown_head(*heads, "exact mean")]
+    lines = ["", *markdown_head(*heads, *(f"`{label}` to exact mean" for label in exact))]
     for dose, row in pairs.items():
         closest = max((a for a in row if a not in BANKS), key=lambda a: row[a].ratio)
         words = [
             f"{row[a].ratio:.2f} [{row[a].low:.2f}, {row[a].high:.2f}], {row[a].word}"
             for a in (closest, *BANKS)
         ]
-        last = exact.get(dose, "–")
-        lines.append(markdown_row(f"{dose:g}", f"`{closest}`: {words[0]}", *words[1:], last))
+        last = [found.get(dose, "–") for found in exact.values()]
+        lines.append(markdown_row(f"{dose:g}", f"`{closest}`: {words[0]}", *words[1:], *last))
     return lines
 
 

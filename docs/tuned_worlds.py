@@ -25,7 +25,7 @@ def tuned_table(worlds: Mapping[str, str]) -> str:
         worlds: Data on which a study says that its filters were tuned, by scenario.
     """
     lines = markdown_head("world", "tuned on", *(f"`{method}_tuned`" for method in METHODS))
-    largest = 0
+    largest = at_end = 0
     for world, data in worlds.items():
         content = read_tuning(world, data)
         lines.append(
@@ -38,10 +38,12 @@ def tuned_table(worlds: Mapping[str, str]) -> str:
             )
         )
         largest += sum(has_largest_factor(content[method]) for method in METHODS)
+        at_end += sum(is_at_end(content[method]) for method in METHODS)
     number = len(worlds) * len(METHODS)
     return "\n".join([
         *lines, "",
-        f"In {largest} of {number} cells the factor on R is the largest of the grid, so that a larger one may be better still.",
+        f"In {largest} of {number} cells the factor on R is the largest of the grid, and in {at_end} the second parameter is at an end of "
+        "its grid, so that a value beyond it may be better still. The control and the other filters have the same number of candidates.",
     ])  # fmt: skip
 
 
@@ -86,6 +88,17 @@ def has_largest_factor(node: Mapping[str, Any]) -> bool:
         node: Entry of the filter in the file of a tuning.
     """
     return bool(node["r_factor"] == read_candidates(node)["r_factor"].max())
+
+
+def is_at_end(node: Mapping[str, Any]) -> bool:
+    """Return whether the second parameter of the choice is the smallest or the largest of its grid.
+
+    Args:
+        node: Entry of the filter in the file of a tuning.
+    """
+    candidates = read_candidates(node)
+    knob = candidates.columns[1]
+    return bool(node[knob] in (candidates[knob].min(), candidates[knob].max()))
 
 
 def read_candidates(node: Mapping[str, Any]) -> pd.DataFrame:

@@ -25,13 +25,14 @@ knobs to the filters that end in _tuned.
   noise=...          noise regimes, default nominal,outliers,student
   r_factors=1,2,4,8  factors on R of the candidates, for all filters alike
   report.start_time_s=0   time before which errors do not count, as in the report of the study
-  name=SCENARIO      name of the file
+  name=SCENARIO      name of the file; a file of this name is replaced
   folder=conf        folder of the file; use it with 'hydra.searchpath=[file://conf]'"""
 
 _OPTIONS = {
     "filter": ",".join(TUNED_METHODS), "name": "", "folder": "conf", "noise": "nominal,outliers,student",
     "r_factors": "1,2,4,8",
 }  # fmt: skip
+_FEWEST_RUNS = 2  # of which the median is not a run by chance
 _OWN = ("seed", "runs", "study", "results_dir", "report.start_time_s")  # not settings of the world
 
 
@@ -55,6 +56,8 @@ def tune_filters(words: Sequence[str]) -> None:
     others = [word for word in words if word.partition("=")[0] not in _OPTIONS]
     grids = {method: list_candidates(method, _numbers(lists["r_factors"])) for method in lists["filter"]}  # fmt: skip
     study = _compose_world(others)
+    name = options["name"] or study.choices["scenario"]
+    _check_choices(name, study.values["runs"])
     seed, start_time_s = (
         study.values["seed"] + SEED_SHIFT,
         float(study.values["report"]["start_time_s"]),
@@ -73,9 +76,20 @@ def tune_filters(words: Sequence[str]) -> None:
     for result in results:
         values = ", ".join(f"{key}={value:g}" for key, value in result.choice.values.items())
         print(f"{result.method}: {values}")
-    name = options["name"] or study.choices["scenario"]
     path = write_tuned_file(results, Path(options["folder"]), name, world)
     print(f"tuned={name}: {path.resolve()}")
+
+
+def _check_choices(name: str, runs: int) -> None:
+    """Check the name of the file, and that there are runs for a median."""
+    if not re.fullmatch(r"\w+", name):
+        raise ValueError(
+            f"name must consist of letters, digits and underscores, got {name!r}. It is a file of folder=."
+        )
+    if runs < _FEWEST_RUNS:
+        raise ValueError(
+            f"runs must be at least {_FEWEST_RUNS} for a tuning, got {runs}. Default: runs=20."
+        )
 
 
 def _compose_world(words: Sequence[str]) -> JobConfig:

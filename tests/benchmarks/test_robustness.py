@@ -19,6 +19,7 @@ from pfbench.report.looks import find_looks
 from pfbench.report.options import ReportOptions
 
 sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
+import recorded_wins
 import robustness
 
 WORLD, RUNS = "flight_300s", 40
@@ -71,28 +72,43 @@ def test_a_filter_that_beats_a_weak_control_only_is_not_strictly_robust() -> Non
     assert {"huber", "gate"} <= set(robustness.find_robust(study, WORLD, robustness.CONTROLS[:1]))
 
 
+def make_condition(ratios: dict[str, float], seed: int = 5) -> recorded_wins.Condition:
+    """Runs of filters whose errors are those of the EKF times a ratio."""
+    random = np.random.default_rng(seed)
+    level = 5.0 * np.exp(0.3 * random.standard_normal(RUNS))
+    errors = pd.DataFrame({
+        label: ratio * level * np.exp(0.05 * random.standard_normal(RUNS)) for label, ratio in ratios.items()
+    })  # fmt: skip
+    kinds = {label: recorded_wins.KALMAN for label in ratios}
+    kinds |= {"rpf": recorded_wins.KINDS[0], robustness.SAMPLED_HYPOTHESES: recorded_wins.KINDS[1]}
+    return recorded_wins.Condition("s", "nominal", errors, kinds, dict.fromkeys(ratios, 0.9))
+
+
 @pytest.mark.parametrize(
-    ("verdicts", "words", "is_better"),
+    ("ratios", "words"),
     [
-        ((("rpf", "best"), ("ekf", "worse")), "`rpf` better than `ekf`", True),
-        ((("rpf", "best"), ("ekf", "not_kept")), "`rpf` better than `ekf`", True),
-        ((("rpf", "best"), ("ekf", "open")), "`rpf` not decided against `ekf`", False),
-        ((("ekf", "best"), ("rpf", "equal")), "`rpf` not better than `ekf`", False),
-        ((("rbpf_discrete", "best"), ("rpf", "open"), ("ekf", "worse")), "`rpf` not decided against `ekf`", False),
-        ((("rbpf_discrete", "best"), ("ekf", "worse")), "not in the study", False),
+        ({"rpf": 0.8, "ekf": 1.0, "gate": 0.9}, "`rpf` is better than every Kalman filter in `s`, nominal: `rpf` 0.8"),
+        ({"rpf": 0.8, "ekf": 1.0, "gate": 0.7}, "No filter with particles of the state"),
+        ({"rpf": 0.8, "ekf": 1.0, "gate": 0.8}, "No filter with particles of the state"),
+        ({"rbpf_discrete": 0.8, "rpf": 1.2, "ekf": 1.0}, "`rbpf_discrete` is better than every Kalman filter"),
     ],
 )  # fmt: skip
-def test_a_particle_filter_is_better_only_by_a_verdict(
-    verdicts: tuple[tuple[str, str], ...], words: str, is_better: bool
+def test_a_particle_filter_is_better_than_every_kalman_filter_only_by_a_test(
+    ratios: dict[str, float], words: str
 ) -> None:
-    study = make_study({label: (1.0, 1.0) for label, _ in verdicts})
-    rows = [
-        {"filter": label, "verdict": verdict, "rank": k + 1}
-        for k, (label, verdict) in enumerate(verdicts)
-    ]
-    assert robustness.compare_sampled(study, rows, robustness.KINDS[0]) == (words, is_better)
-    if rows[0]["filter"] == robustness.SAMPLED_HYPOTHESES:
-        assert robustness.compare_sampled(study, rows, robustness.KINDS[1])[1]
+    condition = make_condition(ratios)
+    assert words in recorded_wins.recorded_table([condition], {})
+    repeated = {"s nominal": make_condition({**ratios, "ekf": 0.5}, seed=6)}
+    text = recorded_wins.recorded_table([condition], repeated)
+    assert ("With a second seed it is not shown to be better" in text) == ("is better" in words)
+
+
+def test_conditions_are_counted_together() -> None:
+    """Thirty equal filters: one alone is decided wrongly more often than all together."""
+    equal = [make_condition({"rpf": 1.0, "ekf": 1.0}, seed) for seed in range(30)]
+    alone = sum("is better" in recorded_wins.recorded_table([c], {}) for c in equal)
+    assert alone > 0
+    assert "is better" not in recorded_wins.recorded_table(equal, {})
 
 
 def test_the_limit_of_a_scenario_is_that_of_the_page_of_limits() -> None:

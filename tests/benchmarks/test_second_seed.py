@@ -76,10 +76,32 @@ def test_verdicts_that_differ_are_counted() -> None:
     })  # fmt: skip
     sets = iter([("a", "b"), ("b", "c")])
     text = second_seed.compare_robust(
-        {"study": (runs, runs)}, lambda *_: next(sets), ("nominal", "outliers")
+        {"study": (runs, runs)}, lambda *_: next(sets), ("nominal", "outliers"), ("d",)
     )
     assert "| `w` | `b` | `a` | `c` |" in text
-    assert "the same for 1 of 3 pairs of a filter and a world, and differs for 2." in text
+    assert (
+        "Of 3 pairs of a filter and a world, without the controls, 1 are robust with both" in text
+    )
+    assert "2 with one of them and 0 with none." in text
+    sets = iter([("a", "b"), ("b", "c")])
+    text = second_seed.compare_robust(
+        {"study": (runs, runs)}, lambda *_: next(sets), ("nominal", "outliers"), ("b",)
+    )
+    assert "| `w` | – | `a` | `c` |" in text  # the control is not compared with itself
+    assert "Of 2 pairs" in text
+
+
+def test_a_study_without_a_new_report_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(second_seed, "RUNS", tmp_path / "runs.parquet")
+    for study, values in (("a", [1.0]), ("b", [2.0]), ("b", [3.0])):
+        folder = tmp_path / f"{study}{values[0]}" / study
+        folder.mkdir(parents=True)
+        pd.DataFrame({"rmse": values}).to_parquet(folder / "runs.parquet")
+        second_seed.store_runs(folder.parent, ("a", "b"))
+    stored = pd.read_parquet(second_seed.RUNS)
+    assert dict(zip(stored["study"], stored["rmse"], strict=True)) == {"a": 1.0, "b": 3.0}
 
 
 def test_both_seeds_are_decided_for_the_same_filters_and_conditions() -> None:

@@ -12,6 +12,7 @@ from checkout import ROOT
 from scipy import stats
 
 sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
+import paired_errors
 import terrain_wins
 
 RUNS = 40
@@ -57,6 +58,8 @@ def test_the_answer_names_the_doses_and_the_joint_verdicts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(terrain_wins, "REPORTS", tmp_path)
+    seeds = {"terrain_rough": make_runs({20.0: (2.0, 1.5, 1.4), 500.0: (1.5, 1.0, 0.5)})}
+    monkeypatch.setattr(terrain_wins, "read_runs", lambda name: seeds.get(name, pd.DataFrame()))
     row = {"metric": "rmse", "world": "terrain[initial_sd=20.0]", "baseline": "rpf"}
     verdicts = [
         {**row, "filter": "gpf", "verdict": "best", "words": "smallest"},
@@ -78,6 +81,16 @@ def test_the_answer_names_the_doses_and_the_joint_verdicts(
     assert (
         "that of `gpf`: `ekf_bank` is worse (+88 %), `ekf_bank_dense` is not decided (-4.0" in text
     )
+    assert (
+        "With a second seed and 40 runs, which decide this one statement, it is shown to be" in text
+    )
+    assert "of `ekf_bank_dense`. In root mean square over runs its error is 0.6" in text
+    seeds["terrain_rough"] = make_runs({20.0: (2.0, 1.5, 1.0), 500.0: (1.5, 1.0, 0.5)})
+    text = terrain_wins.describe_answer({"terrain_rough": rough}, FAMILIES)
+    assert "which decide this one statement, it is not shown to be better" in text
+    seeds.clear()
+    text = terrain_wins.describe_answer({"terrain_rough": rough}, FAMILIES)
+    assert "The condition was not repeated with a second seed." in text
     text = terrain_wins.describe_answer({"terrain_start": start}, FAMILIES)
     assert "in no condition better than every Kalman filter" in text
 
@@ -99,7 +112,7 @@ def test_the_interval_covers_the_centre_and_agrees_with_the_test() -> None:
     random, covered, agreed = np.random.default_rng(2), 0, 0
     for _ in range(2000):
         d = 0.3 + random.standard_normal(25)
-        _, low, high = terrain_wins.signed_rank_interval(d)
+        _, low, high = paired_errors.signed_rank_interval(d)
         covered += low <= 0.3 <= high
         agreed += (stats.wilcoxon(d).pvalue < 0.05) == (not low <= 0.0 <= high)
     assert covered / 2000 == pytest.approx(0.95, abs=4.0 * np.sqrt(0.05 * 0.95 / 2000))

@@ -166,7 +166,7 @@ class UnscentedPoints:
         kappa: Secondary spread.
 
     Raises:
-        ValueError: If alpha or, on use, alpha^2 (d + kappa) is not positive.
+        ValueError: If alpha or, on use, alpha^2 (d + kappa) is not positive, or beta is negative.
     """
 
     alpha: float = 1.0
@@ -177,6 +177,10 @@ class UnscentedPoints:
         if not self.alpha > 0.0:
             raise ValueError(
                 f"linearisation.points.alpha must be positive, got {self.alpha}. Set a spread."
+            )
+        if not self.beta >= 0.0:  # the covariance of a curved function could be indefinite
+            raise ValueError(
+                f"linearisation.points.beta must be at least 0, got {self.beta}. Use 2 for normal states."
             )
 
     def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:

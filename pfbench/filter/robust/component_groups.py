@@ -44,6 +44,11 @@ class ComponentGrouping:
                 f"grouping must be {', '.join(GROUPINGS[:-1])} or {GROUPINGS[-1]}, got "
                 f"{self.kind}. Choose one of them."
             )
+        if not all(isinstance(number, int) for number in self.groups or ()):
+            raise ValueError(
+                f"groups must be a whole number for each component, got {list(self.groups or ())}. "
+                "Give components of one group the same number."
+            )
 
     def numbers(self, components: int) -> Sequence[int] | None:
         """Return the group number of each component, None for groups of equal variance.
@@ -52,9 +57,15 @@ class ComponentGrouping:
             components: Number of measured components k.
 
         Raises:
-            ValueError: If satellites need as many ranges as rates, and k is odd.
+            ValueError: If satellites need as many ranges as rates, and k is odd, or if `groups` has
+                another number of entries.
         """
         if self.groups is not None:
+            if len(self.groups) != components:
+                raise ValueError(
+                    f"groups must be one number for each of the {components} components of the measurement, got "
+                    f"{list(self.groups)}. Give as many numbers."
+                )
             return self.groups
         if self.kind == "satellite":
             if components % 2:

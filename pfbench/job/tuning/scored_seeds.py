@@ -1,9 +1,11 @@
-"""Check that no study scores the seed of a tuning: installed experiments, and stored results."""
+"""Check that no study scores the seed of a tuning: installed experiments, stored results, and a new job."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -36,6 +38,25 @@ def check_seed(world: JobConfig, seed: int) -> None:
     for study in scored:
         raise ValueError(
             f"seed + 1000 must be a seed that no study scores in {scenario}, got {seed}, which {study} scores. "
+            "Set another seed."
+        )
+
+
+def check_tuned_seed(values: Mapping[str, Any], scenario: str) -> None:
+    """Check that a job does not score the seed by which its filter was tuned in the same scenario.
+
+    Args:
+        values: Configuration of the job.
+        scenario: Name of its scenario.
+
+    Raises:
+        ValueError: If it does.
+    """
+    paper = values["filter"].get("paper") or {}
+    found = re.match(r"(\w+) \(.*\bseed (\d+)", str(paper.get("tuning", "")))
+    if found and found[1] == scenario and int(found[2]) == values["seed"]:
+        raise ValueError(
+            f"seed must not be that by which the filter was tuned in {scenario}, got {values['seed']}. "
             "Set another seed."
         )
 

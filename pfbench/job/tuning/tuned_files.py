@@ -30,7 +30,7 @@ def write_tuned_file(
         The file, `FOLDER/tuned/NAME.yaml`.
     """
     lines = [
-        f"# Knobs of tuned filters, chosen by `pfbench tune` in the world {name}.",
+        f"# Knobs of tuned filters, chosen by `pfbench tune` in the world {world['scenario']}.",
         f"data: {json.dumps(describe_world(world))}",
         f"objective: {json.dumps(OBJECTIVE)}",
         "world:",

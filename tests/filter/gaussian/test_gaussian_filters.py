@@ -633,6 +633,8 @@ def test_the_unscented_kappa_of_three_less_d_matches_the_kurtosis(d: int) -> Non
 
 
 def test_unscented_parameters_without_points_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"beta must be at least 0, got -1\.0\. Use 2"):
+        UnscentedPoints(beta=-1.0)
     with pytest.raises(ValueError, match=r"alpha must be positive, got 0\.0"):
         UnscentedPoints(0.0)
     with pytest.raises(ValueError, match=r"kappa must be greater than -d = -2, got -2\.0"):

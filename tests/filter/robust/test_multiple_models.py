@@ -246,9 +246,10 @@ def test_impossible_hypotheses_are_refused() -> None:
         NoiseHypotheses(measurement_factors=(1.0, 0.0))
     with pytest.raises(ValueError, match=r"measurement_factors must be as many"):
         NoiseHypotheses(measurement_factors=(1.0, 2.0, 3.0))
-    for rows in ([[0.9, 0.2], [0.5, 0.5]], [[1.1, -0.1], [0.5, 0.5]], [[1.0, 0.0]], [0.9, 0.1]):
+    wrong = ([[0.9, 0.2], [0.5, 0.5]], [[1.1, -0.1], [0.5, 0.5]], [[1.0, 0.0]], [0.9, 0.1], 0.5)
+    for rows in wrong:
         with pytest.raises(ValueError, match=r"transition must be 2 rows of 2 probabilities"):
-            NoiseHypotheses(transition=rows)
+            NoiseHypotheses(transition=rows)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="one stationary distribution"):
         NoiseHypotheses(transition=[[1.0, 0.0], [0.0, 1.0]])
     with pytest.raises(ValueError, match="branches must be a whole number"):

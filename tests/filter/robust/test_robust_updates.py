@@ -496,6 +496,12 @@ BAD: dict[str, Any] = {
     r"grouping must be component for a measurement .*satellite with 3": lambda: filtered(
         HuberUpdate(grouping="satellite"), measurements(steps=1)
     ),
+    r"groups must be one number for each of the 3 components .*got \[0, 1\]": lambda: filtered(
+        InnovationGate(groups=[0, 1]), measurements(steps=1)
+    ),
+    r"groups must be a whole number for each component, got \[\[0, 5\]\]": lambda: InnovationGate(
+        groups=[[0, 5]]
+    ),
 }
 
 

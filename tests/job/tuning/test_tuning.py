@@ -205,6 +205,8 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
         (["scenario=linear_walk", "r_factors=1,1"], r"r_factors must be a list of distinct.*got '1,1'"),
         (["scenario=linear_walk", "r_factors=1,-2"], r"r_factors must be positive numbers, got 1,-2"),
         (["scenario=linear_walk", "r_factors=1,many"], r"r_factors must be positive numbers, got 1,many"),
+        (["scenario=linear_walk", "name=../x"], r"name must consist of letters.*got '../x'\. It"),
+        (["scenario=linear_walk", "runs=1"], r"runs must be at least 2 for a tuning, got 1\. Default"),
         (["scenario=passiv_1"], r"scenario=passiv_1 does not exist. Similar: passive_1"),
         (["scenario=flight_500s", "seed=-999"], r"a seed that no study scores in flight_500s, got 1, which \w+ scores"),
         (["scenario=flight_500s", "seed=-1001"], r"seed must be at least -1000, got -1001"),
@@ -236,6 +238,15 @@ def test_regimes_in_one_batch_have_the_numbers_of_separate_jobs(
         alone = score_runs(result.data, search.batches[0].plan.model, slice(None))
         assert search.reference[regime] == pytest.approx(alone, rel=1e-5)
     assert len({score.error for score in search.reference.values()}) == 3
+
+
+def test_a_job_does_not_score_the_seed_of_its_tuning() -> None:
+    """In the same world; another seed and another world are scored."""
+    words = ["scenario=passive_1", "tuned=passive_1", "filter=gate_tuned", "runs=2"]
+    with pytest.raises(ValueError, match=r"seed must not be .* tuned in passive_1, got 1001\. Set"):
+        job.build_plan(job.compose([*words, "seed=1001"]))
+    for free in ([*words, "seed=1"], [*words, "seed=1001", "filter=gate"], ["scenario=passive_2", *words[1:], "seed=1001"]):  # fmt: skip
+        assert job.build_plan(job.compose(free)).values["runs"] == 2
 
 
 def test_a_seed_of_a_stored_study_is_refused(
