@@ -13,6 +13,7 @@ from checkout import ROOT
 sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
 import campaigns
 import problems
+import race
 import workload
 from compare import EAGER, LOOPS
 from race import Result
@@ -47,6 +48,18 @@ def test_goals_are_judged_by_default_settings_and_the_faster_form_of_each_librar
     assert lines[-1] == "All contestants agree."
     campaigns.draw({STUDY: found}, tmp_path / "campaigns.png")
     assert (tmp_path / "campaigns.png").stat().st_size > 1000
+
+
+def test_the_least_time_is_the_start_and_the_fused_loop(tmp_path: Path) -> None:
+    """Median start 2 s and 100 runs of 30 ms make 5 s; half of 7 s is asked for."""
+    (tmp_path / "latency.json").write_text('{"first_step": [[1.0, 9.0], [2.0, 9.0], [4.0, 9.0]]}')
+    assert campaigns.least_time(tmp_path, 7.0, 2.0) == ""
+    race.store_results(
+        tmp_path / "compare.json", "W1, N = 1e4", {"fused C": result([20.0, 30.0, 40.0])}
+    )
+    text = campaigns.least_time(tmp_path, 7.0, 2.0)
+    assert "(2.00 s, latency.md)" in text
+    assert "(3.00 s, compare.md) take 5.00 s together; the must is 3.50 s." in text
 
 
 def test_a_peer_that_took_no_part_leaves_its_column_empty() -> None:

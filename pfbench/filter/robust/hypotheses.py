@@ -56,8 +56,8 @@ class NoiseHypotheses:
                 "hypotheses.measurement_factors must be as many as process_factors, got "
                 f"{len(self.measurement_factors)} and {m}. Give both for each hypothesis."
             )
-        given: Any = self.transition  # of a configuration: anything
-        rows = [list(r) if _is_row(r) else r for r in given] if _is_row(given) else [given]
+        matrix: Any = self.transition  # of a configuration: anything
+        rows = [list(r) if _is_row(r) else r for r in matrix] if _is_row(matrix) else [matrix]
         is_square = len(rows) == m and all(_is_row(row) and len(row) == m for row in rows)
         if not is_square or not all(_is_distribution(row) for row in rows):
             raise ValueError(

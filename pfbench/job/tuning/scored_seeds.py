@@ -53,8 +53,8 @@ def check_tuned_seed(values: Mapping[str, Any], scenario: str) -> None:
         ValueError: If it does.
     """
     paper = values["filter"].get("paper") or {}
-    found = re.match(r"(\w+) \(.*\bseed (\d+)", str(paper.get("tuning", "")))
-    if found and found[1] == scenario and int(found[2]) == values["seed"]:
+    match = re.match(r"(\w+) \(.*\bseed (\d+)", str(paper.get("tuning", "")))
+    if match and match[1] == scenario and int(match[2]) == values["seed"]:
         raise ValueError(
             f"seed must not be that by which the filter was tuned in {scenario}, got {values['seed']}. "
             "Set another seed."
