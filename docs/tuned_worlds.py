@@ -42,8 +42,8 @@ def tuned_table(worlds: Mapping[str, str]) -> str:
     number = len(worlds) * len(METHODS)
     return "\n".join([
         *lines, "",
-        f"In {largest} of {number} cells the factor on R is the largest of the grid, and in {at_end} the second parameter is at an end of "
-        "its grid, so that a value beyond it may be better still. The control and the other filters have the same number of candidates.",
+        f"In {largest} of {number} cells the factor on R is the largest of the grid. In {at_end} cells the second parameter is at an end of "
+        "its grid. A value beyond may be better still. The control and the other filters have the same number of candidates.",
     ])  # fmt: skip
 
 

@@ -32,7 +32,7 @@ _OPTIONS = {
     "filter": ",".join(TUNED_METHODS), "name": "", "folder": "conf", "noise": "nominal,outliers,student",
     "r_factors": "1,2,4,8",
 }  # fmt: skip
-_FEWEST_RUNS = 2  # of which the median is not a run by chance
+_FEWEST_RUNS = 2  # a median of one run is that run
 _OWN = ("seed", "runs", "study", "results_dir", "report.start_time_s")  # not settings of the world
 
 

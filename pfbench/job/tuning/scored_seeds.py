@@ -43,7 +43,7 @@ def check_seed(world: JobConfig, seed: int) -> None:
 
 
 def check_tuned_seed(values: Mapping[str, Any], scenario: str) -> None:
-    """Check that a job does not score the seed by which its filter was tuned in the same scenario.
+    """Check that a job does not score the seed of the tuning of its filter in the same scenario.
 
     Args:
         values: Configuration of the job.
@@ -56,7 +56,7 @@ def check_tuned_seed(values: Mapping[str, Any], scenario: str) -> None:
     match = re.match(r"(\w+) \(.*\bseed (\d+)", str(paper.get("tuning", "")))
     if match and match[1] == scenario and int(match[2]) == values["seed"]:
         raise ValueError(
-            f"seed must not be that by which the filter was tuned in {scenario}, got {values['seed']}. "
+            f"seed must not be that of the tuning of the filter in {scenario}, got {values['seed']}. "
             "Set another seed."
         )
 
