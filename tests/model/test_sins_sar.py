@@ -119,16 +119,17 @@ def test_the_model_follows_the_mechanisation_through_every_manoeuvre(
 
 
 @pytest.mark.slow
-def test_the_model_follows_the_mechanisation_for_a_thousand_seconds() -> None:
-    """To 0.15 m of a hundred kilometres, with misalignments of degrees, at steps of 0.04 s."""
-    path = job.instantiate(composed("scenario=sar_flight").scenario).trajectory
+def test_the_model_follows_the_mechanisation_for_five_hundred_seconds() -> None:
+    """To 0.06 m of fifty kilometres, with misalignments of degrees, at steps of 0.04 s."""
+    words = ("scenario=sar_flight", "scenario.trajectory.duration_s=500")
+    path = job.instantiate(composed(*words).scenario).trajectory
     missed, grown = followed(
         SimulatedFlight(path, SILENT, SarSensor(), MISALIGNED, imu_rate_hz=50.0), torch.arange(4)
     )
     assert missed[:3].max() < 1e-4 * ARCMIN
-    assert missed[3:6].max() < 3e-4
-    assert missed[6:9].max() < 0.15
-    assert grown[6:8].max() > 1e5
+    assert missed[3:6].max() < 1e-4
+    assert missed[6:9].max() < 0.06
+    assert grown[6:8].max() > 4e4
 
 
 def test_an_ins_without_errors_stays_on_the_path() -> None:
@@ -538,9 +539,14 @@ def test_a_cloud_runs_and_stays_a_cloud_of_rotations(flight: Episode, model: Sin
 
 @pytest.mark.slow
 def test_the_extended_kalman_filter_is_consistent_on_the_flight() -> None:
-    """NEES of every group in its band through the flight, and errors of the last half of the size of the prototype's."""
+    """NEES of every group in its band through 400 s, and errors of the last half of the size of the filter's own sd.
+
+    The errors of a run last for minutes: the RMS of 24 runs has a standard error of 14 %, and four of them are allowed.
+    """
     runs, level = torch.arange(24), 1e-4
-    cfg = composed("scenario=sar_flight", "scenario.imu_rate_hz=20")
+    cfg = composed(
+        "scenario=sar_flight", "scenario.imu_rate_hz=20", "scenario.trajectory.duration_s=400"
+    )
     model, episode = (
         job.instantiate(cfg.model),
         job.instantiate(cfg.scenario).draw(NominalNoise(), runs, 21),
@@ -548,13 +554,12 @@ def test_the_extended_kalman_filter_is_consistent_on_the_flight() -> None:
     estimate = filtered(TaylorLinearisation(), model, episode)
     assert not estimate.lost.any()
     low, high = stats.chi2.ppf([level, 1 - level], 3 * len(runs))
-    nees = estimate.trace["nees"][:, 99::100].sum(0)  # [10, groups]
+    nees = estimate.trace["nees"][:, 99::100].sum(0)  # [4, groups]
     assert (nees > low).all(), nees / (3 * len(runs))
     assert (nees < high).all(), nees / (3 * len(runs))
-    rms = estimate.trace["error"][:, 500:].square().mean((0, 1)).sqrt()
-    assert (rms[:3] < 0.45 * ARCMIN).all()
-    assert (rms[3:6] < torch.tensor([0.075, 0.075, 0.02], dtype=torch.float64)).all()
-    assert (rms[6:9] < torch.tensor([5.0, 5.0, 2.0], dtype=torch.float64)).all()
+    rms = estimate.trace["error"][:, 200:].square().mean((0, 1)).sqrt()
+    sd = [0.43 * ARCMIN, 0.43 * ARCMIN, 0.27 * ARCMIN, 0.072, 0.072, 0.029, 3.7, 3.7, 1.75]
+    assert (rms[:9] < 1.56 * torch.tensor(sd, dtype=torch.float64)).all()
 
 
 # what is refused

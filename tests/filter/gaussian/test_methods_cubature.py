@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from rule_cases import RULES
+from scipy import stats
 from tight_cases import composed, flight, kalman, linear
 from torch import Tensor
 
@@ -98,10 +99,19 @@ def test_ten_metres_beside_the_ins_ranges_are_linear(flight: Episode) -> None:
 @pytest.mark.slow
 def test_the_whole_flight_gives_the_prototype_s_numbers() -> None:
     """30 runs, from 200 s on: rmse 0.66, 0.58, 1.40 m and mean of the largest error 1.66, 1.47, 3.43 m, each to 10 %; NIS
-    16.0 +- 0.4; tr(R^-1 C_zz) / m = 0.09 and largest eigenvalue 1.28 once it is steady."""
-    model, episode = drawn("nominal", 30)
-    mean, _, nis = kalman(model, model.prepare(episode.record))  # which all rules are there
-    error = model.error(mean, model.assemble(episode.truth))[:, 200:, 6:9]
+    16.0 +- 0.4; tr(R^-1 C_zz) / m = 0.09 and largest eigenvalue 1.28 once it is steady. NEES of every state in its band."""
+    runs, level = 30, 1e-4
+    model, episode = drawn("nominal", runs)
+    truth = model.assemble(episode.truth)
+    assert (truth[:, -1, 6:8].square().mean(0).sqrt() > 1000.0).all()  # open loop
+    mean, variance, nis = kalman(model, model.prepare(episode.record))  # which all rules are there
+    errors = model.error(mean, truth)
+    low, high = stats.chi2.ppf([level, 1 - level], runs)
+    for t in (100, 500, 900, 1399):
+        z = (errors[:, t].square() / variance[:, t]).sum(0)
+        assert (z > low).all()
+        assert (z < high).all(), (t, torch.sqrt(z / runs))
+    error = errors[:, 200:, 6:9]
     for found, expected in (
         (error.square().mean((0, 1)).sqrt(), [0.66, 0.58, 1.40]),
         (error.abs().amax(1).mean(0), [1.66, 1.47, 3.43]),
