@@ -7,8 +7,10 @@ import sys
 # Packages are installed without compiled modules. Else each process that a test starts compiles them again: seconds.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-# torch's compiler starts processes for kernels of a GPU, and tries each set of vector instructions of the processor.
+# torch's compiler starts processes for kernels of a GPU, tries each set of vector instructions of the processor, and compiles
+# all headers in advance, which takes longer than the few kernels of the tests save.
 os.environ |= {"TORCHINDUCTOR_COMPILE_THREADS": "1", "TORCHINDUCTOR_VEC_ISA_OK": "1"}
+os.environ["TORCHINDUCTOR_CPP_CACHE_PRECOMPILE_HEADERS"] = "0"
 
 import composed_once  # noqa: E402
 import torch  # noqa: E402

@@ -313,7 +313,7 @@ def test_a_process_never_holds_the_clouds_of_all_steps(tmp_path: Path) -> None:
         "pcrb=false",
     )
     env = os.environ | environment(tmp_path)
-    command = [sys.executable, "-c", MEASURED, *words, "engine=eager"]
+    command = [sys.executable, "-c", MEASURED, *words, "engine=kernels"]
     done = subprocess.run(
         command, capture_output=True, text=True, env=env, cwd=tmp_path, check=False, timeout=500
     )
