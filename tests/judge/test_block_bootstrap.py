@@ -68,9 +68,8 @@ def test_false_alarms(steps: int, correlation: float) -> None:
     ("steps", "correlation"), [(400, 10.0), (400, 40.0), (1600, 10.0), (1600, 40.0), (6400, 40.0)]
 )
 def test_false_alarms_of_the_design(steps: int, correlation: float) -> None:
-    studies = 2000 if steps < 1600 else 1000
-    by_blocks, _ = alarms(steps, correlation, studies)
-    assert by_blocks <= 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / studies)
+    by_blocks, _ = alarms(steps, correlation, 2000)
+    assert by_blocks <= 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 2000)
 
 
 @pytest.mark.parametrize("time", [10.0, 40.0])

@@ -228,7 +228,9 @@ def test_regimes_in_one_batch_have_the_numbers_of_separate_jobs(
 ) -> None:
     """Shared inputs are repeated, and a model that knows the noise is passed alone."""
     monkeypatch.chdir(tmp_path)
-    world = ["scenario=flight_300s", "scenario.imu_rate_hz=20", "runs=3", "seed=1001", *words]
+    cruise = "scenario.trajectory.segments=[{_target_:pfbench.nav.cruise,duration_s:60}]"
+    world = ["scenario=flight_300s", "scenario.imu_rate_hz=20", cruise, "runs=3", "seed=1001"]
+    world += words
     regimes = ("nominal", "outliers", "variance_r")
     search = CandidateSearch([*world, "episode_cache_dir=null"], regimes)
     assert len(search.batches) == (3 if words else 1)
