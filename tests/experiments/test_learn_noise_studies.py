@@ -247,9 +247,10 @@ def test_the_canyon_is_learned_and_scored_on_a_few_seconds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        learn_canyon_noise, "STRETCHES", {"first": (0.0, 15.0), "second": (15.0, 30.0)}
+        learn_canyon_noise, "STRETCHES", {"first": (0.0, 10.0), "second": (10.0, 20.0)}
     )
     monkeypatch.setattr(learn_canyon_noise, "PARTICLES", 50)
+    monkeypatch.setattr(learn_canyon_noise, "CHAINS", 4)
     monkeypatch.setattr(
         learn_canyon_noise,
         "positions",

@@ -137,7 +137,7 @@ def test_unbiased_on_models_with_an_answer(case: str, preference: str) -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_unbiased_with_narrow_error_bars(case: str) -> None:
     model, y, exact = CASES[case]()
-    check_evidence(ParticleFilter(400, EssResampler(Ssp(), 0.5)), model, y, exact, runs=8000)
+    check_evidence(ParticleFilter(400, EssResampler(Ssp(), 0.5)), model, y, exact, runs=4000)
 
 
 @dataclasses.dataclass(frozen=True)

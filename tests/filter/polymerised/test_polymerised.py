@@ -742,7 +742,11 @@ def test_no_filter_beats_the_bound_and_the_repair_beats_the_print(scenario: str)
         * (torch.sqrt(bound[:, 0, 0] + bound[:, 1, 1]) / episode.datasheet["range"])[-20:].mean()
     )
     error = {}
-    for name in ("sir", "gpf", "qmc_gpf", "qmc_polymerised", "qmc_polymerised_printed", "sqmc"):
+    others = {"passive_1": ("gpf", "sqmc"), "passive_2": ("gpf",), "passive_3": ()}
+    for name in (
+        *("sir", "qmc_gpf", "qmc_polymerised", "qmc_polymerised_printed"),
+        *others[scenario],
+    ):
         with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
             method = job.instantiate(
                 compose("config", [f"filter={name}", "particles=200"])["filter"]
