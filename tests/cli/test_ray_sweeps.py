@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,12 +20,12 @@ from command_line import GONE, environment, pfbench, processes_of
 
 from pfbench.results import store
 
-FILTERS = ("sir", "rpf", "apf", "gpf")
+FILTERS = ("sir", "apf", "gpf")
 SWEEP = (
     "run",
     "-m",
     "scenario=linear_walk",
-    "scenario.steps=1000",  # a cell takes a second or so, many times the interval at which the tests look
+    "scenario.steps=600",  # a cell takes half a second or so, many times the interval at which the tests look
     "runs=10",
     "particles=200",
     f"filter={','.join(FILTERS)}",
@@ -55,12 +56,12 @@ def assert_same(
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, np.ndarray]]:
-    """The sweep in one process."""
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The home of the sweep in one process."""
     home = tmp_path_factory.mktemp("alone")
     said = pfbench(*SWEEP, home=home)
     assert said.code == 0, said.err
-    return numbers(home)
+    return home
 
 
 @contextmanager
@@ -115,25 +116,25 @@ needs_proc = pytest.mark.skipif(
 
 @pytest.mark.slow
 @needs_proc
-def test_a_killed_scheduler_of_ray_is_started_again(
-    tmp_path: Path, alone: dict[str, dict[str, np.ndarray]]
-) -> None:
+def test_a_killed_scheduler_of_ray_is_started_again(tmp_path: Path, alone: Path) -> None:
+    """One worker, since each starts in seconds. A cell that is done already is left as it is."""
     pytest.importorskip("ray", reason='needs Ray: pip install "pfbench[ray]"')
-    first = pfbench(*SWEEP[:-1], f"filter={FILTERS[0]}", home=tmp_path)
-    assert first.code == 0, first.err
-    words = ("hydra/launcher=ray_local", "hydra.launcher.ray.init.num_cpus=2")
+    folder = tmp_path / "results" / "adhoc"
+    folder.mkdir(parents=True)
+    shutil.copy(next((alone / "results" / "adhoc").glob("*.npz")), folder)
+    words = ("hydra/launcher=ray_local", "hydra.launcher.ray.init.num_cpus=1")
     with started(tmp_path, *words) as sweep:
         # a worker in its first cell still has to import torch, so that the sweep cannot end before the kill
         wait(lambda: processes_of(tmp_path, "ray::_run_job"), sweep)
         os.kill(wait(lambda: processes_of(tmp_path, "raylet/raylet"), sweep)[0], signal.SIGKILL)
         assert finish(sweep, tmp_path).count(LOST) == 1
-    assert_same(numbers(tmp_path), alone)
+    assert_same(numbers(tmp_path), numbers(alone))
 
 
 @pytest.mark.slow
 @needs_proc
 def test_a_lost_node_and_a_killed_worker_cost_their_own_cells_which_are_done_again(
-    tmp_path: Path, alone: dict[str, dict[str, np.ndarray]]
+    tmp_path: Path, alone: Path
 ) -> None:
     """A node dies in its first cell, then the only other worker dies in a later one; Ray repeats these cells alone."""
     pytest.importorskip("ray", reason='needs Ray: pip install "pfbench[ray]"')
@@ -144,7 +145,9 @@ def test_a_lost_node_and_a_killed_worker_cost_their_own_cells_which_are_done_aga
         return [p for p in processes_of(tmp_path, "ray::_run_job") if is_below(p, raylet)]
 
     with mock.patch.dict(os.environ, QUIET):
-        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+        cluster = Cluster(
+            initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
+        )
         node = cluster.add_node(num_cpus=1)
         try:
             with started(
@@ -158,4 +161,4 @@ def test_a_lost_node_and_a_killed_worker_cost_their_own_cells_which_are_done_aga
                 assert LOST not in finish(sweep, tmp_path)
         finally:
             cluster.shutdown()
-    assert_same(numbers(tmp_path), alone)
+    assert_same(numbers(tmp_path), numbers(alone))

@@ -121,7 +121,7 @@ def test_what_disagrees_with_the_grid_is_seen() -> None:
 
 @pytest.mark.slow
 def test_particle_marginal_chains_find_the_grid_s_posterior() -> None:
-    posterior = pmmh(NILE, ParticleFilter(60), nile(YEARS), draws=30, warmup=40, chains=48, seed=1)
+    posterior = pmmh(NILE, ParticleFilter(60), nile(YEARS), draws=20, warmup=30, chains=48, seed=1)
     assert posterior.accepted is not None
     assert 0.1 < float(posterior.accepted.mean()) < 0.6
     agrees(posterior.table(), YEARS)
@@ -132,7 +132,7 @@ def test_particle_marginal_chains_find_the_grid_s_posterior() -> None:
 def test_metropolis_on_a_kalman_likelihood_finds_it_too(leaps: int) -> None:
     settings = PmmhSettings(leaps=leaps)
     posterior = pmmh(
-        NILE, EKF, nile(YEARS), draws=30, warmup=40, chains=48, seed=2, settings=settings
+        NILE, EKF, nile(YEARS), draws=20, warmup=30, chains=48, seed=2, settings=settings
     )
     agrees(posterior.table(), YEARS)
     assert posterior.accepted is not None
@@ -215,7 +215,7 @@ def test_ranks_on_a_toy_are_uniform_and_a_wrong_likelihood_shows() -> None:
     right = {
         "PMMH": simulation_based_calibration(toy, shape, by_pmmh(toy, 40, 57, 30), DRAWS, seed=7),
         "SVI": simulation_based_calibration(
-            toy, shape, by_svi(toy, GaussianHmmLikelihood(), 100), DRAWS, seed=7
+            toy, shape, by_svi(toy, GaussianHmmLikelihood(), 60), DRAWS, seed=7
         ),
     }
     wrong = simulation_based_calibration(toy, shape, by_pmmh(believed, 40, 57, 30), DRAWS, seed=7)
@@ -235,11 +235,11 @@ def test_ranks_on_passive_location_are_uniform_and_a_wrong_likelihood_shows() ->
     )
     likelihood = FilterLikelihood(EKF)
     assert uniform(
-        simulation_based_calibration(far, shape, by_svi(far, likelihood, 50), DRAWS, seed=8),
+        simulation_based_calibration(far, shape, by_svi(far, likelihood, 30), DRAWS, seed=8),
         far.names,
     )
     assert not uniform(
-        simulation_based_calibration(far, shape, by_svi(believed, likelihood, 50), DRAWS, seed=8),
+        simulation_based_calibration(far, shape, by_svi(believed, likelihood, 30), DRAWS, seed=8),
         far.names,
     )
 
