@@ -9,6 +9,7 @@ interval of a difference uses that filters share their runs.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -110,14 +111,12 @@ def arrange_runs(table: pd.DataFrame, filters: tuple[str, ...]) -> StudyArrays:
         filters: Labels of all filters of the study.
     """
     conditions = table[_CONDITION].drop_duplicates().sort_values(_CONDITION).reset_index(drop=True)
-    c = pd.MultiIndex.from_frame(conditions).get_indexer(
-        pd.MultiIndex.from_frame(table[_CONDITION])
+    c, n = (
+        table.groupby(columns, dropna=False, observed=True).ngroup().to_numpy()
+        for columns in (_CONDITION, ["seed", "run"])
     )
-    run_names = table[["seed", "run"]].drop_duplicates().sort_values(["seed", "run"])
-    runs = pd.MultiIndex.from_frame(run_names)
-    n = runs.get_indexer(pd.MultiIndex.from_frame(table[["seed", "run"]]))
     f = pd.Index(filters).get_indexer(pd.Index(table["filter"]))
-    shape = (len(filters), len(conditions), len(runs))
+    shape = (len(filters), len(conditions), int(n.max(initial=-1)) + 1)
 
     def arrange(name: str) -> Array:
         values = np.full(shape, np.nan)
@@ -173,10 +172,11 @@ def average_levels(levels: ConditionEffects, conditions: pd.DataFrame) -> Filter
         levels: Levels of the conditions, [F, C].
         conditions: Family, scenario and regime of the conditions, C rows.
     """
-    scenarios = conditions.groupby("family")["scenario"].transform("nunique")
-    regimes = conditions.groupby(["family", "scenario"])["regime"].transform("size")
-    families = conditions["family"].nunique()
-    weights = (1 / (families * scenarios * regimes)).to_numpy(dtype=np.float64)
+    keys = list(zip(conditions["family"], conditions["scenario"], strict=True))
+    regimes = Counter(keys)
+    scenarios = Counter(family for family, _ in regimes)
+    each = (len(scenarios) * scenarios[key[0]] * regimes[key] for key in keys)
+    weights = 1 / np.fromiter(each, np.float64)
     count = levels.runs.min(axis=1)
     with np.errstate(invalid="ignore"):
         level = np.where(count > 0, (weights * levels.location).sum(axis=1), np.nan)

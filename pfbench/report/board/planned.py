@@ -44,12 +44,9 @@ def decide_planned(
         options: Options of the report.
     """
     keys = ["family", "scenario", "regime", "seed", "run"]
-    by_filter = {label: pd.MultiIndex.from_frame(rows[keys]) for label, rows in table.groupby("filter")}  # fmt: skip
-    pairs = [
-        pair
-        for pair in plan_look_pairs(looks)
-        if len(by_filter[pair[0]].intersection(by_filter[pair[1]]))
-    ]
+    number = table.groupby(keys, sort=False, dropna=False, observed=True).ngroup()
+    by_filter = {label: set(numbers) for label, numbers in number.groupby(table["filter"])}
+    pairs = [(a, b) for a, b in plan_look_pairs(looks) if not by_filter[a].isdisjoint(by_filter[b])]
     if not pairs:
         return []
     groups = table["group"].unique()

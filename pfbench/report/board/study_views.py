@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -37,6 +36,8 @@ from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.step_times import StepTimes
 from pfbench.results.study_decisions.common_conditions import select_conditions
 
+Descriptions = Mapping[str, Mapping[str, Any]]
+
 
 def build_views(
     table: pd.DataFrame,
@@ -55,16 +56,13 @@ def build_views(
         times: Times in rounds by label, of each scenario and regime; None without any.
     """
     runs = arrange_runs(table, tuple(names.looks))
-    groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
+    selections = _list_selections(runs, table, names, options)
     views: dict[ViewKey, dict[str, Any]] = {}
     baselines: list[str] = []
     for metric in list_metrics(table, options.metric):
         levels = compute_condition_levels(runs, metric)
-        for world, regime, in_scope in _list_scopes(runs.conditions):
-            mask = _select_common(runs, in_scope)
-            selected = runs.select(mask)
-            of_scope = groups.loc[list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))]  # fmt: skip
-            scope = _assess_scope(selected, levels, mask, options)._replace(
+        for world, regime, in_scope, mask, selected, of_scope, described, where, note in selections:
+            scope = _assess_scope(selected, levels, mask, described)._replace(
                 unit="" if metric == LOG_SCORE or len(of_scope) > 1 else of_scope["unit"].iloc[0],
                 times=[(times or {}).get(key, {}) for key in of_scope.index],
             )
@@ -74,9 +72,8 @@ def build_views(
                 options.equivalence_margin,
                 words if is_opening and mask.all() else None,
             )
-            where = _describe_scope(selected.conditions, names)
             notes = (
-                _small_print(selected, options, names),
+                note,
                 _describe_hard_condition(scope, selected.conditions, names),
                 _describe_timing(scope, options),
             )
@@ -96,7 +93,7 @@ def build_views(
                         partial(compare_track_shares, selected, alpha=options.alpha),
                     ),
                     "small_print": " ".join(filter(None, notes)),
-                    "rows": [round_values(asdict(row)) for row in rows],
+                    "rows": [round_values(vars(row)) for row in rows],
                 }
     return views
 
@@ -143,15 +140,30 @@ def _describe_common(mask: Flags, in_scope: Flags, filters: int) -> str:
     return f"{count} {verb} compared: not all {filters} filters were run in the others. "
 
 
+def _list_selections(
+    runs: StudyArrays, table: pd.DataFrame, names: StudyNames, options: ReportOptions
+) -> list[tuple[str, str, Flags, Flags, StudyArrays, pd.DataFrame, Descriptions, str, str]]:
+    """List the scopes, their runs and what is said of them whatever the metric."""
+    groups, found = table.groupby(["scenario", "regime"])[["unit", "group"]].first(), []
+    for world, regime, in_scope in _list_scopes(runs.conditions):
+        mask = _select_common(runs, in_scope)
+        own = runs.select(mask)
+        keys = list(own.conditions[["scenario", "regime"]].itertuples(index=False, name=None))
+        texts = _describe_scope(own.conditions, names), _small_print(own, options, names)
+        described = describe_filters(own, options.alpha)
+        found.append((world, regime, in_scope, mask, own, groups.loc[keys], described, *texts))
+    return found
+
+
 def _assess_scope(
-    runs: StudyArrays, levels: ConditionEffects, mask: Flags, options: ReportOptions
+    runs: StudyArrays, levels: ConditionEffects, mask: Flags, described: Descriptions
 ) -> Scope:
-    """Average the levels of the conditions of a scope, and describe the filters there."""
+    """Average the levels of the conditions of a scope."""
     selected = ConditionEffects(*(array[:, mask] for array in levels))
     return Scope(
         runs.filters,
         average_levels(selected, runs.conditions),
-        describe_filters(runs, options.alpha),
+        described,
         "",
         len(runs.conditions) == 1,
     )
