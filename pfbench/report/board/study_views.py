@@ -37,6 +37,7 @@ from pfbench.results.step_times import StepTimes
 from pfbench.results.study_decisions.common_conditions import select_conditions
 
 Descriptions = Mapping[str, Mapping[str, Any]]
+Selection = tuple[str, str, Flags, Flags, StudyArrays, pd.DataFrame, Descriptions, str, str]
 
 
 def build_views(
@@ -142,9 +143,10 @@ def _describe_common(mask: Flags, in_scope: Flags, filters: int) -> str:
 
 def _list_selections(
     runs: StudyArrays, table: pd.DataFrame, names: StudyNames, options: ReportOptions
-) -> list[tuple[str, str, Flags, Flags, StudyArrays, pd.DataFrame, Descriptions, str, str]]:
+) -> list[Selection]:
     """List the scopes, their runs and what is said of them whatever the metric."""
-    groups, found = table.groupby(["scenario", "regime"])[["unit", "group"]].first(), []
+    groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
+    found: list[Selection] = []
     for world, regime, in_scope in _list_scopes(runs.conditions):
         mask = _select_common(runs, in_scope)
         own = runs.select(mask)
