@@ -175,8 +175,8 @@ def average_levels(levels: ConditionEffects, conditions: pd.DataFrame) -> Filter
     keys = list(zip(conditions["family"], conditions["scenario"], strict=True))
     regimes = Counter(keys)
     scenarios = Counter(family for family, _ in regimes)
-    each = (len(scenarios) * scenarios[key[0]] * regimes[key] for key in keys)
-    weights = 1 / np.fromiter(each, np.float64)
+    counts = (len(scenarios) * scenarios[key[0]] * regimes[key] for key in keys)
+    weights = 1 / np.fromiter(counts, np.float64)
     count = levels.runs.min(axis=1)
     with np.errstate(invalid="ignore"):
         level = np.where(count > 0, (weights * levels.location).sum(axis=1), np.nan)

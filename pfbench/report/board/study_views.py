@@ -146,15 +146,17 @@ def _list_selections(
 ) -> list[Selection]:
     """List the scopes, their runs and what is said of them whatever the metric."""
     groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
-    found: list[Selection] = []
+    selections: list[Selection] = []
     for world, regime, in_scope in _list_scopes(runs.conditions):
         mask = _select_common(runs, in_scope)
-        own = runs.select(mask)
-        keys = list(own.conditions[["scenario", "regime"]].itertuples(index=False, name=None))
-        texts = _describe_scope(own.conditions, names), _small_print(own, options, names)
-        described = describe_filters(own, options.alpha)
-        found.append((world, regime, in_scope, mask, own, groups.loc[keys], described, *texts))
-    return found
+        selected = runs.select(mask)
+        keys = list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))
+        texts = _describe_scope(selected.conditions, names), _small_print(selected, options, names)
+        described = describe_filters(selected, options.alpha)
+        selections.append(
+            (world, regime, in_scope, mask, selected, groups.loc[keys], described, *texts)
+        )
+    return selections
 
 
 def _assess_scope(
