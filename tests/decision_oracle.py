@@ -253,6 +253,7 @@ def decide(estimates: list[dict[str, Any]], question: str) -> list[dict[str, Any
 def recompute(runs: pd.DataFrame, records: list[dict[str, Any]]) -> pd.DataFrame:
     """Decide the same pairs, metrics and questions as the records, family by family."""
     rows = []
+    known: dict[tuple[str, str, str], dict[str, Any]] = {}  # both questions are of the same runs
     records = sorted(records, key=lambda r: (r["family"], r["question"]))
     for (_, question), family in groupby(records, key=lambda r: (r["family"], r["question"])):
         members = list(family)
@@ -260,9 +261,10 @@ def recompute(runs: pd.DataFrame, records: list[dict[str, Any]]) -> pd.DataFrame
         for r in members:
             is_known = r["metric"] in METRICS or r["metric"] in runs
             metric = r["metric"] if is_known else "error"  # "main group error"
-            worlds = pair_cells(runs, r["a"], r["b"], metric)
-            kind = METRICS.get(metric, "ratio")
-            estimates.append(estimate(worlds, kind) | {
+            key = r["a"], r["b"], metric
+            if key not in known:
+                known[key] = estimate(pair_cells(runs, *key), METRICS.get(metric, "ratio"))
+            estimates.append(known[key] | {
                 "margin": r["margin"], "is_ratio": r["scale"] == "log ratio",
             })  # fmt: skip
         for r, row in zip(members, decide(estimates, question), strict=True):
