@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.stats import binomtest
 from torch import Tensor
 
 from pfbench.core import PhiloxStream, Record
@@ -36,6 +37,7 @@ from pfbench.filter import (
 )
 from pfbench.model import StrapdownTotal, StrapdownTuning
 from pfbench.nav.preintegration import PreintegratedImu, preintegrate
+from pfbench.results import order_statistic_interval
 
 HERE = Path(__file__).parent
 STORE = HERE / "heading_errors.json"
@@ -161,15 +163,16 @@ def measure(
         chart = model.group_chart(method.chart)
     nees: list[Tensor] = []
 
-    def watch(t: int, info: Any) -> dict[str, Tensor]:
-        error = model.chart.subtract(truth[:, t], info.mean)
+    def watch(t: int, step: Any) -> dict[str, Tensor]:
+        error = model.chart.subtract(truth[:, t], step.mean)
         slope = None
         if chart is not model.chart:
-            slope, error = change(model, chart, info.mean), chart.subtract(truth[:, t], info.mean)
-        covariance = info.covariance()
+            slope, error = change(model, chart, step.mean), chart.subtract(truth[:, t], step.mean)
+        covariance = step.covariance()
         covariance = covariance if slope is None else slope @ covariance @ slope.mT
-        white = torch.linalg.solve(covariance, error.unsqueeze(-1)).squeeze(-1)
-        nees.append((error * white).sum(-1) / error.shape[-1])
+        white, info = torch.linalg.solve_ex(covariance, error.unsqueeze(-1))
+        ratio = (error * white.squeeze(-1)).sum(-1) / error.shape[-1]
+        nees.append(torch.where(info == 0, ratio, torch.nan))  # a collapsed cloud is singular
         return {}
 
     started = time.process_time()
@@ -178,19 +181,48 @@ def measure(
     heading = model.error(result.mean, truth)[..., 2].abs().rad2deg()
     wrong = ~(heading < SETTLED)
     after = torch.where(wrong, torch.arange(1, wrong.shape[1] + 1), 0).amax(1) * INTERVAL
-    settle_s = float(np.median(torch.where(after < seconds, after, torch.inf)))
+    times = describe_times(torch.where(after < seconds, after, torch.inf).numpy())
     position = (result.mean - truth)[..., 7:10].square().sum(-1).mean(1).sqrt()
     values, half = torch.stack(nees, 1), len(nees) // 2
     early = values[:, round(10 / INTERVAL) : round(30 / INTERVAL)]
     return {
         "settled": int((after < seconds).sum()),
-        "settle_s": settle_s if math.isfinite(settle_s) else None,
+        **times,
         "lost": int(result.lost.sum()),
         "nees_10_30": float(early.nanmean()),
         "nees_half": float(values[:, half:].nanmean()),
         "position": float(position.nanmedian()),
         "cpu_s": time.process_time() - started,
     }
+
+
+def describe_times(times: np.ndarray) -> dict[str, float | None]:
+    """Return the median of the times of runs with its 95 % interval; None for never.
+
+    Args:
+        times: Seconds until a run settles, inf for never, [R].
+    """
+    interval = order_statistic_interval(times, 0.95)
+    found = {"settle_s": np.median(times), "settle_low": interval.low, "settle_high": interval.high}
+    return {key: float(value) if math.isfinite(value) else None for key, value in found.items()}
+
+
+def format_settled(row: dict[str, Any], runs: int) -> str:
+    """Format the share of runs that settle and their median time, two cells with 95 % intervals.
+
+    Args:
+        row: Stored row.
+        runs: Number of runs.
+    """
+    share = binomtest(row["settled"], runs).proportion_ci(method="wilson")
+    middle, low, high = (
+        "never" if (value := row[key]) is None else f"{value:.1f}"
+        for key in ("settle_s", "settle_low", "settle_high")
+    )
+    return (
+        f"{100 * row['settled'] / runs:.0f} [{100 * share.low:.0f}, {100 * share.high:.0f}] | "
+        f"{middle} [{low}, {high}]"
+    )
 
 
 def change(model: StrapdownTotal, chart: Any, mean: Tensor) -> Tensor:
@@ -209,19 +241,19 @@ def page(stored: dict[str, Any]) -> str:
         " ".join(__doc__.split("\n\n")[1].split()[:-5]),
         "Written by `benchmarks/heading_errors.py`.",
         "",
-        f"{stored['runs']} runs of 60 s. A run settles when its heading stays within 5 degrees; the time is the",
+        f"{stored['runs']} runs of 60 s with one seed; in brackets are 95 % intervals, Wilson's for the share and that of",
+        "order statistics for the time. A run settles when its heading stays within 5 degrees; the time is the",
         "median. NEES is in the chart of the filter, divided by its 15 components; 1 is consistent. The position",
         "error is the median RMSE of the runs. CPU times are relative to the EKF of the same angle. The covariance of",
         "collapsed particles is singular to rounding and has no NEES.",
         "",
-        "| heading error [deg] | filter | settled | time [s] | NEES, 10 to 30 s | NEES, second half | position [m] | CPU time |",
+        "| heading error [deg] | filter | settled [%] | time [s] | NEES, 10 to 30 s | NEES, second half | position [m] | CPU time |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in stored["rows"]:
         ekf = next(r for r in stored["rows"] if r["angle"] == row["angle"] and r["filter"] == "EKF")
-        settle = "never" if row["settle_s"] is None else f"{row['settle_s']:.1f}"
         lines.append(
-            f"| {row['angle']} | {row['filter']} | {row['settled']} | {settle} | "
+            f"| {row['angle']} | {row['filter']} | {format_settled(row, stored['runs'])} | "
             f"{format_nees(row['nees_10_30'])} | {format_nees(row['nees_half'])} | {row['position']:.2f} | "
             f"{row['cpu_s'] / row.get('ekf_cpu_s', ekf['cpu_s']):.2g} |"
         )
@@ -254,7 +286,7 @@ def add_rows(name: str) -> None:
 def main() -> None:
     """Measure all filters and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=24)
+    parser.add_argument("--runs", type=int, default=96)
     parser.add_argument("--page", action="store_true")
     parser.add_argument("--filter", choices=filters())
     options = parser.parse_args()

@@ -9,6 +9,7 @@ from checkout import ROOT
 
 sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
 import heading_errors
+import numpy as np
 import point_reach
 import recorded_headings
 import torch
@@ -23,6 +24,16 @@ def test_the_page_is_written_from_the_stored_results() -> None:
     assert {(r["angle"], r["filter"]) for r in stored["rows"]} == {
         (angle, name) for angle in heading_errors.ANGLES for name in names
     }
+
+
+def test_settled_runs_have_intervals() -> None:
+    """Wilson's interval of 19 of 20, and ranks 6 and 15 of 20 for the median; later ranks may never settle."""
+    times = np.r_[np.arange(1.0, 15.0), np.full(6, np.inf)]
+    row = heading_errors.describe_times(times) | {"settled": 19}
+    assert row["settle_s"] == 10.5
+    assert heading_errors.format_settled(row, 20) == "95 [76, 99] | 10.5 [6.0, never]"
+    for heading in ("settled [%]", "95 % interval"):
+        assert heading in heading_errors.page({"runs": 20, "rows": []})
 
 
 def test_the_page_of_recorded_headings_is_written_from_the_stored_results() -> None:
