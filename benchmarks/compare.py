@@ -52,6 +52,7 @@ BATCH = (
     Contestant("particles float64", "numba", ("peer.py", "float64")), CUTHBERT,
     Contestant("naive torch float32", "own", ("naive.py", "float32")),
 )  # fmt: skip
+FEW = tuple(who for who in BATCH if who not in (EAGER, JAX, CUTHBERT, BATCH[-1]))  # the fast ones
 GAUSSIAN = (
     DEFAULT._replace(words=("house.py", "float64", "auto", "ckf")),
     DEFAULT32._replace(words=("house.py", "float32", "auto", "ckf")),
@@ -74,6 +75,7 @@ class Case(NamedTuple):
     steps: int
     particles: int
     contestants: tuple[Contestant, ...]
+    zeros: str = "model"  # of the coefficients of W4, see workload.make
 
 
 class Goal(NamedTuple):
@@ -95,6 +97,19 @@ CASES = (
     Case("W2, N = 1e4", "stochastic volatility", "volatility", 1, 1000, 10_000, LARGE),
     Case("W3, N = 1e4", "constant velocity, bearing and range", "radar", 1, 100, 10_000, SMALL),
     Case("W4, N = 500", "15-state INS error model", "ins", 100, 200, 500, BATCH),
+    Case(
+        "W4 dense, N = 500", "15-state model, no coefficient 0", "ins", 100, 200, 500, FEW, "none"
+    ),
+    Case(
+        "W4 sparse, N = 500",
+        "15-state model, 8 of 10 coefficients 0",
+        "ins",
+        100,
+        200,
+        500,
+        FEW,
+        "small",
+    ),
     Case("W5", "cubature filter on W4's model", "ins", 100, 200, 500, GAUSSIAN),
 )
 GOALS = (
@@ -106,6 +121,9 @@ GOALS = (
     Goal("W1, N = 1e5", None, 3.0, 2.0), Goal("W2, N = 1e4", None, 2.5),
     Goal("W3, N = 1e4", None, 2.5), Goal("W4, N = 500", None, 5.0, 2.6),
     Goal("W4, N = 500", FLOAT64.label, 3.0), Goal("W5", None, 2.0),
+    Goal("W4 dense, N = 500", DEFAULT.label, 2.5), Goal("W4 dense, N = 500", DEFAULT32.label, 4.0),
+    Goal("W4 dense, N = 500", None, 5.0, 2.6), Goal("W4 dense, N = 500", FLOAT64.label, 3.0),
+    Goal("W4 sparse, N = 500", DEFAULT.label, 2.5), Goal("W4 sparse, N = 500", DEFAULT32.label, 4.0),
 )  # fmt: skip
 
 
@@ -114,7 +132,9 @@ def work(case: Case, scale: float) -> Mapping[str, Any]:
     steps = max(10, round(case.steps * scale))
     if case.kind == "ins":
         return {
-            **workload.make(max(4, round(case.runs * scale)), steps, case.particles)._asdict(),
+            **workload.make(
+                max(4, round(case.runs * scale)), steps, case.particles, zeros=case.zeros
+            )._asdict(),
             "kind": np.array("ins"),
         }
     return problems.make(case.kind, steps, case.particles)._asdict()

@@ -66,14 +66,19 @@ def ins_model() -> InsGnss:
     return job.instantiate(_configured().model)
 
 
-def make(runs: int, steps: int, particles: int, seed: int = 1) -> Workload:
+def make(runs: int, steps: int, particles: int, seed: int = 1, zeros: str = "model") -> Workload:
     """The workload, drawn from the model over the first `steps` seconds of flight flight_300s.
+
+    `zeros` says which coefficients of [Phi | L] are 0: those of the `model` (6 in 10), `none` (each 0 becomes 1e-9), or `small` ones
+    (below 1e-4: 8 in 10). Data and exact posterior are those of the coefficients.
 
     Raises:
         ValueError: more steps than the flight has.
     """
     model = ins_model()
-    phi, gain = (a[:, :steps] for a in model.discretise(_nominal(steps, seed)))
+    phi, gain = (
+        _change_zeros(a[:, :steps], zeros) for a in model.discretise(_nominal(steps, seed))
+    )
     draws = PhiloxStream(seed, torch.arange(runs))
     x = model.p0 * draws.normal("world.state", 1, len(model.p0))
     states = []
@@ -101,6 +106,13 @@ def make(runs: int, steps: int, particles: int, seed: int = 1) -> Workload:
     return Workload(
         step0, p0, r, seen, seen_y, truth.numpy(), log_evidence, mean, sd, np.array(particles)
     )
+
+
+def _change_zeros(a: torch.Tensor, zeros: str) -> torch.Tensor:
+    """Coefficients without zeros, or with more."""
+    if zeros == "none":
+        return torch.where(a == 0.0, 1e-9, a)
+    return torch.where(a.abs() < 1e-4, 0.0, a) if zeros == "small" else a
 
 
 def _nominal(steps: int, seed: int) -> InsIntervals:

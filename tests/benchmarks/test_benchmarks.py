@@ -61,6 +61,20 @@ def test_the_exact_answer_is_the_kalman_filters() -> None:
         np.testing.assert_allclose(work.mean[run, -1] / work.sd[-1], m / work.sd[-1], atol=1e-8)
 
 
+def test_a_dense_and_a_sparse_workload_have_their_zeros_and_their_exact_answer() -> None:
+    shares, evidence = {}, {}
+    for zeros in ("none", "model", "small"):
+        work = workload.make(runs=2, steps=10, particles=200, zeros=zeros)
+        shares[zeros] = float((work.step == 0.0).mean())
+        evidence[zeros] = work.log_evidence
+        again = workload.kalman(work.step, work.p0, work.r, work.seen, work.y)[0]
+        assert np.allclose(again, work.log_evidence)
+    assert shares["none"] == 0.0 < 0.55 < shares["model"] < 0.65 < 0.75 < shares["small"] < 0.85
+    assert np.allclose(
+        evidence["none"], evidence["model"], atol=1e-2
+    )  # tiny coefficients change little
+
+
 def test_longer_than_the_flight_is_refused() -> None:
     with pytest.raises(ValueError, match="steps=301"):
         workload.make(runs=1, steps=301, particles=2)
