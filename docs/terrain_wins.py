@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -30,6 +30,8 @@ STUDIES = {
     "terrain_rough": "shortest wavelength of the terrain [m]",
     "terrain_recorded": "initial standard deviation per axis [m]",
 }
+
+Key = TypeVar("Key", bound=Hashable)
 
 
 class Pair(NamedTuple):
@@ -88,19 +90,19 @@ def arrange_errors(runs: pd.DataFrame) -> dict[float, pd.DataFrame]:
 
 
 def compare_pairs(
-    errors: Mapping[float, pd.DataFrame], kalman: Sequence[str]
-) -> dict[float, dict[str, Pair]]:
+    errors: Mapping[Key, pd.DataFrame], kalman: Sequence[str]
+) -> dict[Key, dict[str, Pair]]:
     """Compare the particle filter with each Kalman filter at each dose.
 
     Args:
-        errors: Errors by dose, see `arrange_errors`.
+        errors: Errors by dose, or by study and dose, see `arrange_errors`.
         kalman: Labels of the Kalman filters.
     """
     keys = [(dose, label) for dose in errors for label in kalman]
     filled = {dose: np.log(table.fillna(LOST)) for dose, table in errors.items()}
     logs = [(filled[dose][PARTICLES] - filled[dose][label]).to_numpy() for dose, label in keys]
     adjusted = holm([wilcoxon_signed_rank(log).p for log in logs])
-    pairs: dict[float, dict[str, Pair]] = {dose: {} for dose in errors}
+    pairs: dict[Key, dict[str, Pair]] = {dose: {} for dose in errors}
     for (dose, label), log, p in zip(keys, logs, adjusted, strict=True):
         centre, low, high = (float(np.exp(value)) for value in signed_rank_interval(log))
         pairs[dose][label] = Pair(centre, low, high, float(p))
@@ -236,13 +238,12 @@ def describe_all_studies(
         name: Name of the study.
         dose: Dose of the condition.
     """
-    keys, p = [], []
-    for study, table in runs.items():
-        for value, errors in arrange_errors(table).items():
-            logs = np.log(errors.fillna(LOST))
-            keys += [(study, f"{value:g}")] * len(kalman)
-            p += [wilcoxon_signed_rank((logs[PARTICLES] - logs[a]).to_numpy()).p for a in kalman]
-    largest = max(v for key, v in zip(keys, holm(p), strict=True) if key == (name, dose))
+    errors = {
+        (study, f"{value:g}"): errors
+        for study, table in runs.items()
+        for value, errors in arrange_errors(table).items()
+    }
+    largest = max(pair.p for pair in compare_pairs(errors, kalman)[name, dose].values())
     return f"With the pairs of all {len(runs)} studies counted together, its largest p-value is {largest:.2g}."
 
 

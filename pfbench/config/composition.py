@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.group_checks import check_groups, resolve_values
-from pfbench.config.named_sets import expand_filter_names
+from pfbench.config.named_sets import check_tuned_seed, expand_filter_names
 from pfbench.config.paper_block import check_paper_blocks, remove_nested_blocks
 from pfbench.config.protected_keys import check_protected_keys
 from pfbench.config.trust import check_configuration, check_study, split_trust
@@ -153,7 +153,9 @@ def resolve_config(
     names = {str(group): str(name) for group, name in (choices or {}).items()}
     _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
     values = remove_nested_blocks(values)
-    values.pop(TUNED, None)  # the filter has its knobs now
+    check_tuned_seed(
+        values, names.get("scenario"), values.pop(TUNED, {})
+    )  # the filter has its knobs
     return JobConfig(values, names, is_shared, packages)
 
 

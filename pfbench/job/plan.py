@@ -22,7 +22,6 @@ from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.settings import apply_global_settings
-from pfbench.job.tuning.scored_seeds import check_tuned_seed
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
@@ -131,7 +130,6 @@ def build_plan(config: JobConfig) -> JobPlan:
     """
     values = config.values
     apply_global_settings(values)
-    check_tuned_seed(values, config.choices["scenario"])
     # The model first: a scenario may contain it, and an error then names the key of the model.
     model, scenario, noise, method = instantiate_parts(
         values, ("model", "scenario", "noise", "filter"), config.trusted

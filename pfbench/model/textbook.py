@@ -185,9 +185,9 @@ class StochasticVolatility(StateSpaceModel):
             Log likelihood, [R, N]. A missing measurement gives 0.
         """
         present = torch.where(torch.isnan(y), 0.0, 1.0).to(x)
-        half_square = -0.5 * y.nan_to_num().square()
+        log_square = torch.log(y.nan_to_num().square())  # -inf for y = 0: no product of 0 and inf
         log_density = torch.addcmul(-_HALF_LOG_2PI * present, -0.5 * present, x[..., 0])
-        return torch.addcmul(log_density, half_square, torch.exp(-x[..., 0]))  # few passes
+        return torch.add(log_density, torch.exp(log_square - x[..., 0]), alpha=-0.5)  # few passes
 
     @override
     def transition(self, x: Tensor, u: Any) -> Distribution:

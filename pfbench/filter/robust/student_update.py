@@ -31,8 +31,8 @@ class StudentUpdate(ResidualLoss):
 
     y ~ N(H x, R / lambda), lambda ~ Gamma(nu / 2, nu / 2), and q(x) q(lambda) is optimised in
     turn: lambda = (nu + k) / (nu + tr R^-1 (e e' + H P+ H')), with e the residual after the update.
-    R is the scale of the distribution; its covariance would be R nu / (nu - 2), which nu <= 2 does not have. The belief is too
-    narrow: in one dimension with nu = 3, P+ is 0.76 of the true variance.
+    R is the scale of the distribution; its covariance R nu / (nu - 2) exists for nu > 2. The belief
+    is too narrow: in one dimension with nu = 3, P+ is 0.76 of the true variance.
 
     Attributes:
         dof: nu. Infinity gives the plain update.

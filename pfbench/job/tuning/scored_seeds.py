@@ -1,11 +1,9 @@
-"""Check that no study scores the seed of a tuning: installed experiments, stored results, and a new job."""
+"""Check that no study scores the seed of a tuning: installed experiments, and stored results."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -38,25 +36,6 @@ def check_seed(world: JobConfig, seed: int) -> None:
     for study in scored:
         raise ValueError(
             f"seed + 1000 must be a seed that no study scores in {scenario}, got {seed}, which {study} scores. "
-            "Set another seed."
-        )
-
-
-def check_tuned_seed(values: Mapping[str, Any], scenario: str) -> None:
-    """Check that a job does not score the seed of the tuning of its filter in the same scenario.
-
-    Args:
-        values: Configuration of the job.
-        scenario: Name of its scenario.
-
-    Raises:
-        ValueError: If it does.
-    """
-    paper = values["filter"].get("paper") or {}
-    match = re.match(r"(\w+) \(.*\bseed (\d+)", str(paper.get("tuning", "")))
-    if match and match[1] == scenario and int(match[2]) == values["seed"]:
-        raise ValueError(
-            f"seed must not be that of the tuning of the filter in {scenario}, got {values['seed']}. "
             "Set another seed."
         )
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -101,6 +101,35 @@ class FilterLevels(NamedTuple):
         factor = middle / (middle - 1) if middle > 1 else np.nan
         error = np.sqrt(factor * (parts**2).sum())
         return EffectEstimate(np.asarray(value), np.asarray(error), np.asarray(middle - 1.0))
+
+
+Descriptions = Mapping[str, Mapping[str, Any]]
+
+
+class Selection(NamedTuple):
+    """Runs of a scope, and what is said of them whatever the metric.
+
+    Attributes:
+        world: Scenario, or "all".
+        regime: Noise regime, or "all".
+        in_scope: Whether a condition is in the scope, [C].
+        mask: Whether all filters were run in it too, [C].
+        runs: Runs of these conditions.
+        groups: Unit and main group of these conditions.
+        filters: Description of each filter.
+        where: Words on the scope.
+        small_print: Note below the view.
+    """
+
+    world: str
+    regime: str
+    in_scope: Flags
+    mask: Flags
+    runs: StudyArrays
+    groups: pd.DataFrame
+    filters: Descriptions
+    where: str
+    small_print: str
 
 
 def arrange_runs(table: pd.DataFrame, filters: tuple[str, ...]) -> StudyArrays:

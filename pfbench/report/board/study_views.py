@@ -11,6 +11,7 @@ import pandas as pd
 
 from pfbench.report.board.curves import CellKey
 from pfbench.report.board.levels import (
+    Selection,
     StudyArrays,
     arrange_runs,
     average_levels,
@@ -36,9 +37,6 @@ from pfbench.results.statistics.paired_effects import ConditionEffects
 from pfbench.results.step_times import StepTimes
 from pfbench.results.study_decisions.common_conditions import select_conditions
 
-Descriptions = Mapping[str, Mapping[str, Any]]
-Selection = tuple[str, str, Flags, Flags, StudyArrays, pd.DataFrame, Descriptions, str, str]
-
 
 def build_views(
     table: pd.DataFrame,
@@ -62,36 +60,38 @@ def build_views(
     baselines: list[str] = []
     for metric in list_metrics(table, options.metric):
         levels = compute_condition_levels(runs, metric)
-        for world, regime, in_scope, mask, selected, of_scope, described, where, note in selections:
-            scope = _assess_scope(selected, levels, mask, described)._replace(
-                unit="" if metric == LOG_SCORE or len(of_scope) > 1 else of_scope["unit"].iloc[0],
-                times=[(times or {}).get(key, {}) for key in of_scope.index],
+        for selection in selections:
+            scope = _assess_scope(selection, levels)._replace(
+                unit=""
+                if metric == LOG_SCORE or len(selection.groups) > 1
+                else selection.groups["unit"].iloc[0],
+                times=[(times or {}).get(key, {}) for key in selection.groups.index],
             )
-            is_opening = metric == options.metric and in_scope.all()
+            is_opening = metric == options.metric and selection.in_scope.all()
             view_options = ViewOptions(  # planned words are of all conditions of a pair
                 options.alpha,
                 options.equivalence_margin,
-                words if is_opening and mask.all() else None,
+                words if is_opening and selection.mask.all() else None,
             )
             notes = (
-                note,
-                _describe_hard_condition(scope, selected.conditions, names),
+                selection.small_print,
+                _describe_hard_condition(scope, selection.runs.conditions, names),
                 _describe_timing(scope, options),
             )
             if not views:  # the page opens with a baseline that has an error
                 baselines = _order_baselines(scope, names.baselines)
             for baseline in baselines:
                 rows = build_rows(scope, baseline, view_options)
-                views[ViewKey(metric, world, regime, baseline)] = {
-                    "sentence": _describe_common(mask, in_scope, len(rows))
+                views[ViewKey(metric, selection.world, selection.regime, baseline)] = {
+                    "sentence": _describe_common(selection.mask, selection.in_scope, len(rows))
                     + describe_view(
                         rows,
                         names.looks,
                         baseline,
-                        where,
-                        _name_metric(metric, of_scope["group"]),
+                        selection.where,
+                        _name_metric(metric, selection.groups["group"]),
                         format_interval_level(options.alpha),
-                        partial(compare_track_shares, selected, alpha=options.alpha),
+                        partial(compare_track_shares, selection.runs, alpha=options.alpha),
                     ),
                     "small_print": " ".join(filter(None, notes)),
                     "rows": [round_values(vars(row)) for row in rows],
@@ -133,7 +133,7 @@ def _select_common(runs: StudyArrays, mask: Flags) -> Flags:
 
 
 def _describe_common(mask: Flags, in_scope: Flags, filters: int) -> str:
-    """State that filters are compared in a part of the conditions; empty if in all."""
+    """State that filters are compared in a selection of the conditions; empty if in all."""
     if mask.sum() == in_scope.sum():
         return ""
     count = f"{mask.sum()} of {count_words(int(in_scope.sum()), 'condition')}"
@@ -146,30 +146,28 @@ def _list_selections(
 ) -> list[Selection]:
     """List the scopes, their runs and what is said of them whatever the metric."""
     groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
-    selections: list[Selection] = []
+    selections = []
     for world, regime, in_scope in _list_scopes(runs.conditions):
         mask = _select_common(runs, in_scope)
         selected = runs.select(mask)
         keys = list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))
-        texts = _describe_scope(selected.conditions, names), _small_print(selected, options, names)
         described = describe_filters(selected, options.alpha)
+        texts = _describe_scope(selected.conditions, names), _small_print(selected, options, names)
         selections.append(
-            (world, regime, in_scope, mask, selected, groups.loc[keys], described, *texts)
+            Selection(world, regime, in_scope, mask, selected, groups.loc[keys], described, *texts)
         )
     return selections
 
 
-def _assess_scope(
-    runs: StudyArrays, levels: ConditionEffects, mask: Flags, described: Descriptions
-) -> Scope:
+def _assess_scope(selection: Selection, levels: ConditionEffects) -> Scope:
     """Average the levels of the conditions of a scope."""
-    selected = ConditionEffects(*(array[:, mask] for array in levels))
+    selected = ConditionEffects(*(array[:, selection.mask] for array in levels))
     return Scope(
-        runs.filters,
-        average_levels(selected, runs.conditions),
-        described,
+        selection.runs.filters,
+        average_levels(selected, selection.runs.conditions),
+        selection.filters,
         "",
-        len(runs.conditions) == 1,
+        len(selection.runs.conditions) == 1,
     )
 
 
