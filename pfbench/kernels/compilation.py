@@ -48,9 +48,9 @@ def use_compiled(enabled: bool = True) -> Iterator[None]:
 
 
 @contextmanager
-def capture_graph() -> Iterator[None]:
-    """Mark that a step is recorded in this context: code must not branch on numbers."""
-    token = _graph.set(True)
+def capture_graph(enabled: bool = True) -> Iterator[None]:
+    """Mark that a step is recorded in this context, unless `enabled` is False: code must not branch on numbers."""
+    token = _graph.set(enabled)
     try:
         yield
     finally:
@@ -133,7 +133,10 @@ def compilable(
         if _on_cuda(args):
             return (_find_cuda_kernel(operator, args) or function)(*args)
         _check(operator, args)
-        return (function if in_graph is None or not fits_graph(*args) else in_graph)(*args)
+        # tangents do not pass an operator: a derivative through it would be zero
+        if in_graph is None or not _plain(args) or not fits_graph(*args):
+            return function(*args)
+        return in_graph(*args)
 
     return cast(F, call)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import sys
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -25,12 +26,15 @@ def code_folder() -> Path:
 def use_private_cache() -> None:
     """Make torch's compiler keep its code in `code_folder`, unless the user chose another folder.
 
-    Its default is a folder of a predictable name in the system's temporary folder.
+    Its default is a folder of a predictable name in the system's temporary folder. An import of the
+    compiler writes this default into the environment, so that it looks like the user's choice.
 
     Raises:
         OSError: If the folder cannot be made, or if others can write there.
     """
-    if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
+    compiler = sys.modules.get("torch._inductor.runtime.cache_dir_utils")
+    default = os.path.abspath(compiler.default_cache_dir()) if compiler else None
+    if os.environ.get("TORCHINDUCTOR_CACHE_DIR") in (None, default):
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(code_folder() / "torch")
 
 

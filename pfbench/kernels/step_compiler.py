@@ -76,6 +76,7 @@ def compile_function(
     Returns:
         The compiled function, and its C++ entry if torch generated one.
     """
+    use_private_cache()  # before the imports, which choose a folder
     from torch._functorch.config import patch as patch_functorch
     from torch._guards import TracingContext, tracing
     from torch._inductor.compile_fx import compile_fx, compile_fx_inner  # takes seconds to import
@@ -83,7 +84,6 @@ def compile_function(
     from torch.fx.experimental.proxy_tensor import make_fx
     from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
-    use_private_cache()
     decompositions = {torch.ops.aten.stack.default: _stack_by_component}
     graph = make_fx(function, decomposition_table=decompositions)(*example)
     on_cpu = not any(a.is_cuda for a in example)

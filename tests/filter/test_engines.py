@@ -1,4 +1,4 @@
-"""Every particle filter of conf/ computes the same in every engine and in any batch, in double precision."""
+"""Every filter of conf/ computes the same in every engine and in any batch, in double precision."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from typing import Any
 
 import pytest
 import torch
-from filter_cases import ON_ANY_MODEL, method_of
+from config_cases import composed, truncated, world
+from filter_cases import NAMES, ON_ANY_MODEL, TEXTS, method_of, refusal
 from torch import Tensor
 
+from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.particle import compiled_step
+from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.swarm.swarm_proposal import SwarmProposal
 from pfbench.kernels import compilation
@@ -76,3 +80,102 @@ def test_engines_and_batches_agree_to_rounding(name: str) -> None:
             torch.testing.assert_close(
                 other.trace[key].double(), value.double(), rtol=1e-8, atol=1e-11
             )
+
+
+# recorded steps
+
+
+def small_method_of(name: str) -> Any:
+    """Return a filter with few iterations of a swarm, which would take most of the time.
+
+    A network takes its dimensions from the first model that it sees, so it is made anew.
+    """
+    method = method_of(name) if name in NAMES else method_of.__wrapped__(name)
+    if isinstance(swarm := getattr(method, "proposal", None), SwarmProposal):
+        return replace(method, proposal=replace(swarm, iterations=2))
+    return method
+
+
+def assert_results_agree(one: FilterResult, other: FilterResult) -> None:
+    for field in ("mean", "variance", "log_evidence"):
+        a, b = getattr(one, field), getattr(other, field)
+        scale = 1.0 if one.mean.dtype == torch.float64 else 1e4
+        torch.testing.assert_close(a, b, rtol=1e-7 * scale, atol=1e-9 * scale, equal_nan=True)
+
+
+MODELS = {
+    "growth": ("scenario=growth", "model=growth"),
+    "ins": ("scenario=flight_500s", "model=ins_gnss_inflated"),
+}
+
+
+@compiler
+@pytest.mark.parametrize("name", TEXTS)
+@pytest.mark.parametrize("words", MODELS.values(), ids=MODELS)
+def test_a_recorded_step_computes_what_the_step_as_it_is_computes(
+    name: str, words: tuple[str, str]
+) -> None:
+    """Recording takes other branches: once, every Jacobian through an operator was zero there."""
+    model = job.instantiate(composed(*words).model)
+    record = truncated(world(words[0].removeprefix("scenario=")), 3).record
+    if name in NAMES and refusal(name, model, record):
+        pytest.skip("refuses this model")
+    method, draws = small_method_of(name), PhiloxStream(5, torch.arange(len(record.y)))
+    with compilation.use_compiled(), torch.no_grad():
+        expected = run_filter(method, model, record, draws)
+        with compilation.capture_graph():
+            recorded = run_filter(method, model, record, draws)
+    assert_results_agree(recorded, expected)
+
+
+@pytest.mark.slow
+@compiler
+@pytest.mark.filterwarnings("ignore")  # the compiler's own
+@pytest.mark.parametrize("name", ["sir", "apf", "rpf", "gpf", "ekf_pf", "ckf_pf"])
+def test_a_compiled_step_computes_what_the_step_as_it_is_computes(name: str) -> None:
+    """By the real compiler, on an INS."""
+    words = MODELS["ins"]
+    model, record = (
+        job.instantiate(composed(*words).model),
+        truncated(world("flight_500s"), 4).record,
+    )
+    draws = PhiloxStream(5, torch.arange(len(record.y)))
+    step = CompiledParticleFilter(method_of(name))
+    with compilation.use_compiled(), torch.no_grad():
+        assert_results_agree(
+            run_filter(step, model, record, draws), run_filter(step.method, model, record, draws)
+        )
+    assert step.is_active
+
+
+@compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("fault", ["particles", "weights", "none"])
+def test_a_compiled_step_with_other_numbers_is_not_used(
+    fault: str,
+    dtype: torch.dtype,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The first compiled step is compared with the step as it is. Here each particle moves by half an sd."""
+
+    def compile_wrongly(step: Any, example: list[Tensor]) -> Any:
+        def run_step(given: list[Tensor]) -> list[Tensor]:
+            out = list(step(*given))
+            if fault == "particles":
+                out[0] = out[0] + 0.5 * out[0].std()
+            elif fault == "weights":
+                out[1] = 0.5 * out[1]
+            return out
+
+        return run_step, None
+
+    monkeypatch.setattr(compiled_step, "compile_function", compile_wrongly)
+    model, step = tracker().to(dtype), CompiledParticleFilter(method_of("sir"))
+    draws = PhiloxStream(5, torch.arange(RUNS), dtype)
+    with compilation.use_compiled(), torch.no_grad():
+        result = run_filter(step, model, Record(Y.to(dtype)), draws)
+        expected = run_filter(step.method, model, Record(Y.to(dtype)), draws)
+    assert step.is_active == (fault == "none")
+    assert ("differ from those of the uncompiled step" in caplog.text) == (fault != "none")
+    assert_results_agree(result, expected)

@@ -131,10 +131,12 @@ def compile_step(
         The compiled step.
 
     Raises:
-        Exception: If the step cannot be recorded or compiled. torch raises many kinds.
+        Exception: If the step cannot be recorded or compiled, or if its numbers are not those of
+            the step as it is. torch raises many kinds.
     """
     names: list[list[str]] = []
     step = _make_tensor_function(method, model, belief, record, draws, names)
+    plain_step = _make_tensor_function(method, model, belief, record, draws, [], record_step=False)
     state, inputs = _belief_to_storage(belief), [to_storage(a) for a in tensors_in(record)]
     shared = [torch.as_tensor(draws.seed), draws.runs]
     example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
@@ -143,10 +145,12 @@ def compile_step(
         run, entry = compile_function(step, example)
         evaluations = counter.count - count if counter else 0
         out = run(example)
+        expected = plain_step(*example)
     finally:
         if counter:
             counter.count = count
     memory, trace = names
+    _check_agreement(out, expected, len(state))
     carried_shapes = [a.shape for a in out[: len(state)]]
     keeps_shapes = len(memory) + 3 == len(state) and carried_shapes == [a.shape for a in state]
     max_steps = _choose_max_steps(out) if keeps_shapes else 1
@@ -160,8 +164,9 @@ def _make_tensor_function(
     record: Record,
     draws: PhiloxStream,
     names: list[list[str]],
+    record_step: bool = True,
 ) -> Callable[..., list[Tensor]]:
-    """Return a step as a function of tensors. It writes its memory and trace names."""
+    """Return a step as a function of tensors, to be recorded or as it is. It writes its memory and trace names."""
     carried_count = len(_belief_to_storage(belief))
 
     def step(*flat: Tensor) -> list[Tensor]:
@@ -172,13 +177,41 @@ def _make_tensor_function(
         step_record = replace_tensors(record, remaining)
         before = belief._replace(x=x, log_w=log_w, log_evidence=log_z, memory=memory)
         stream = PhiloxStream(seed, runs, draws.dtype, number)
-        with torch.no_grad(), compilation.capture_graph():
+        with torch.no_grad(), compilation.capture_graph(record_step):
             after, summary = method.compute_step(model, before, step_record, stream)
         names[:] = [list(after.memory), list(summary.trace)]
         carried = [after.x, after.log_w, after.log_evidence, *after.memory.values()]
         return [to_storage(a) for a in (*carried, *summary[:3], *summary.trace.values())]
 
     return step
+
+
+def _check_agreement(out: Sequence[Tensor], expected: Sequence[Tensor], carried: int) -> None:
+    """Raise ArithmeticError unless a compiled step gives the numbers of the step as it is.
+
+    The tensors that the step carries are compared, component by component over all particles, with
+    their spread as the scale. Sums that are rounded in another order may choose other ancestors, so a
+    few particles may differ: almost none in double precision.
+
+    Args:
+        out: Results of the compiled step, in storage layout [..., R, N].
+        expected: Those of the step as it is.
+        carried: Number of tensors that the step carries.
+    """
+    for place, (a, b) in enumerate(zip(out[:carried], expected[:carried], strict=True)):
+        if a.shape != b.shape:
+            raise ArithmeticError(f"the shape of tensor {place} is {a.shape}, uncompiled {b.shape}")
+        is_double = b.dtype == torch.float64
+        a, b, axes = a.double(), b.double(), tuple(range(max(b.dim() - 2, 0), b.dim()))
+        finite = torch.where(torch.isfinite(b), b, torch.zeros_like(b))
+        spread = finite.amax(axes, keepdim=True) - finite.amin(axes, keepdim=True)
+        limit = (1e-5 * spread + 1e-8 * b.abs()) if is_double else (1e-2 * spread + 1e-4 * b.abs())
+        agrees = ((a - b).abs() <= limit + 1e-12) | (a == b) | (torch.isnan(a) & torch.isnan(b))
+        share = float(agrees.double().mean())
+        if share < (0.999 if is_double else 0.8):
+            raise ArithmeticError(
+                f"its numbers differ from those of the uncompiled step in {1 - share:.1%} of tensor {place}"
+            )
 
 
 def tensors_in(tree: Any) -> list[Tensor]:
