@@ -30,10 +30,9 @@ LEARNED = "neural_ckf"  # the filter whose network a study named learned_* train
 
 
 def list_studies() -> list[str]:
-    """List the published studies that are experiments in YAML."""
-    studies = {path.parent.name for path in (TOP / "reports").glob("*/report.md")}
+    """List the published studies that are experiments in YAML: those whose cost is stored."""
     names = {path.stem for path in (TOP / "experiments").glob("*.yaml")}
-    return sorted(names & (studies | set(read_costs())))
+    return sorted(names & set(read_costs()))
 
 
 def read_costs() -> dict[str, float]:

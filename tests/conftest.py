@@ -1,4 +1,4 @@
-"""Compiled modules are kept, one thread for each test process, and less work for the garbage collector."""
+"""Compiled modules are kept, results of a user are not seen, one thread for each test process, and less work for the garbage collector."""
 
 import gc
 import os
@@ -12,6 +12,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ |= {"TORCHINDUCTOR_COMPILE_THREADS": "1", "TORCHINDUCTOR_VEC_ISA_OK": "1"}
 os.environ["TORCHINDUCTOR_CPP_CACHE_PRECOMPILE_HEADERS"] = "0"
 
+import checkout  # noqa: E402
 import composed_once  # noqa: E402
 import torch  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
@@ -19,6 +20,7 @@ from hypothesis import HealthCheck, settings  # noqa: E402
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")  # a machine with other work is no fault of a test
 composed_once.install()
+sys.addaudithook(checkout.refuse_own_files)
 torch.set_num_threads(1)  # with xdist, more threads than cores make everything slower
 
 

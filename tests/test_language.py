@@ -13,14 +13,14 @@ from functools import cache
 from pathlib import Path
 
 import yaml
-from checkout import ROOT
+from checkout import ROOT, list_published
 
 PACKAGE = ROOT / "pfbench"
 RENAMED = ROOT / "docs" / "renamed.md"
 PAGES = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
-    *sorted((ROOT / "reports").glob("learn_*/report.md")),  # written by scripts without a template
+    *(f / "report.md" for f in list_published() if f.name.startswith("learn_")),  # no template
 ]
 TEMPLATES = sorted(PACKAGE.rglob("*.jinja"))
 SCRIPTS = [*sorted((ROOT / "experiments").glob("*.py")), ROOT / "docs" / "methods" / "pictures.py"]

@@ -13,17 +13,12 @@ from types import ModuleType
 
 import pandas as pd
 import pytest
-from checkout import ROOT
+from checkout import PUBLISHED_FILE, ROOT, list_published
 from markupsafe import escape
 
 from pfbench.claims.page import write_claims
 from pfbench.report import is_equal_drawing
 from pfbench.report.stored_page import read_page_data, rebuild_page
-
-REPORT_FILE = re.compile(
-    r"reports/(README\.md|\w+/(report\.md|verdicts\.(json(\.gz)?|csv)|runs\.parquet|page\.json\.gz|results\.json\.gz"
-    r"|headline\.(png|svg))|claims/(measurements\.parquet|jobs\.json))"
-)
 
 
 def load(name: str) -> ModuleType:
@@ -50,7 +45,7 @@ def test_no_file_in_git_is_ignored() -> None:
 
 def test_git_stores_only_the_published_files_of_a_report() -> None:
     stored = [name for name in list_git_files() if name.startswith("reports/")]
-    assert [name for name in stored if not REPORT_FILE.fullmatch(name)] == []
+    assert [name for name in stored if not PUBLISHED_FILE.fullmatch(name)] == []
     studies = {name.split("/")[1] for name in stored} - {"README.md"}
     assert studies > set(load("publish_reports").HEADLINES)
     for study in studies:
@@ -108,9 +103,7 @@ def check_published_page(folder: Path, copy: Path) -> None:
 
 
 def test_published_pages_are_decided_by_the_present_rules(tmp_path: Path) -> None:
-    listed = (ROOT / "reports" / "README.md").read_text()  # a user's own reports are not
-    folders = [data.parent for data in (ROOT / "reports").glob("*/page.json.gz")]
-    folders = [folder for folder in folders if f"({folder.name}/report.md)" in listed]
+    folders = [folder for folder in list_published() if (folder / "page.json.gz").is_file()]
     assert len(folders) > 20
     for folder in folders:
         if folder.name != LARGE:
@@ -122,12 +115,20 @@ def test_the_largest_published_page_is_decided_by_the_present_rules(tmp_path: Pa
     check_published_page(ROOT / "reports" / LARGE, tmp_path / LARGE)
 
 
+def split_numbers(file: Path) -> tuple[object, list[float]]:
+    """Content of a JSON file without its floating-point numbers, and these."""
+    numbers: list[float] = []
+    return json.loads(
+        file.read_text(), parse_float=lambda text: numbers.append(float(text))
+    ), numbers
+
+
 def test_the_published_claims_are_decided_by_the_present_rules(tmp_path: Path) -> None:
     """From the measurements in git, without results of a study, as `make report` does in a fresh clone."""
     published, publish = ROOT / "reports" / "claims", load("publish_reports")
-    for page in (ROOT / "reports").glob("*/report.md"):  # the page links to those that are there
-        (tmp_path / page.parent.name).mkdir()
-        (tmp_path / page.parent.name / "index.html").touch()
+    for folder in list_published():  # the page links to those that are there
+        (tmp_path / folder.name).mkdir()
+        (tmp_path / folder.name / "index.html").touch()
     copy = tmp_path / "claims"
     for name in ("measurements.parquet", "jobs.json"):
         shutil.copy(published / name, copy)
@@ -136,15 +137,18 @@ def test_the_published_claims_are_decided_by_the_present_rules(tmp_path: Path) -
     publish.publish_report(copy)
     tables = [pd.read_parquet(folder / "measurements.parquet") for folder in (copy, published)]
     pd.testing.assert_frame_equal(*tables)  # bytes differ between versions of pyarrow
-    for name in ("report.md", "verdicts.json", "jobs.json"):
+    for name in ("report.md", "jobs.json"):
         assert (copy / name).read_bytes() == (published / name).read_bytes(), name
+    contents = [split_numbers(folder / "verdicts.json") for folder in (copy, published)]
+    assert contents[0][0] == contents[1][0]
+    assert contents[0][1] == pytest.approx(contents[1][1], rel=1e-12)  # digits of the processor
     drawings = [(folder / "headline.svg").read_bytes() for folder in (copy, published)]
     assert is_equal_drawing(*drawings)
 
 
 def test_the_stored_results_of_a_script_give_its_published_page() -> None:
     publish = load("publish_reports")
-    folders = [data.parent for data in (ROOT / "reports").glob(f"*/{publish.RESULTS}")]
+    folders = [folder for folder in list_published() if (folder / publish.RESULTS).is_file()]
     assert folders
     for folder in folders:
         page = publish.write_script_page(folder)
@@ -240,9 +244,20 @@ def test_studies_run_cheapest_first_and_within_a_limit() -> None:
     costs = {"a": 3600.0, "b": 60.0, "c": 7200.0}
     assert studies.plan_studies(["c", "a", "unknown", "b"], costs) == ["b", "a", "c", "unknown"]
     assert studies.plan_studies(["c", "a", "b"], costs, hours=1.5) == ["b", "a"]
-    published = set(load("publish_reports").HEADLINES) - {"claims"}
-    learned = {name for name in published if name.startswith("learn_")}  # scripts of their own
-    assert published - learned <= set(studies.list_studies()) <= set(studies.read_costs())
+    scripts = set(load("publish_reports").HEADLINES)  # which are no experiments
+    assert set(studies.list_studies()) == {folder.name for folder in list_published()} - scripts
+
+
+@pytest.mark.parametrize("name", ["reports/quickstart/report.md", "results/quickstart/a.npz"])
+def test_a_test_that_reads_what_a_user_may_have_written_fails(name: str) -> None:
+    """`make demo` and then `make test` pass in one clone. The files need not exist."""
+    with pytest.raises(AssertionError, match="a clone in use"):
+        (ROOT / name).open()
+    for folder in (ROOT / name).parents[:2]:
+        with pytest.raises(AssertionError, match="a clone in use"):
+            list(folder.iterdir())
+    with pytest.raises(AssertionError, match="a clone in use"):
+        list((ROOT / name).parents[1].glob("*/report.md"))
 
 
 def test_the_cost_of_a_study_is_the_computing_time_of_its_jobs(
