@@ -248,6 +248,7 @@ def test_studies_run_cheapest_first_and_within_a_limit() -> None:
     assert set(studies.list_studies()) == {folder.name for folder in list_published()} - scripts
 
 
+@pytest.mark.filterwarnings("ignore:Exception ignored in. <posix.Scandir")  # refused before use
 @pytest.mark.parametrize("name", ["reports/quickstart/report.md", "results/quickstart/a.npz"])
 def test_a_test_that_reads_what_a_user_may_have_written_fails(name: str) -> None:
     """`make demo` and then `make test` pass in one clone. The files need not exist."""
