@@ -30,6 +30,7 @@ def train_network(words: Sequence[str]) -> None:
         ValueError: If a sweep or oracle noise is requested, or a value is invalid.
     """
     from pfbench import job
+    from pfbench.job.inputs import find_inputs
     from pfbench.learn.training_job import fit
 
     if {"-m", "--multirun"} & set(words):
@@ -49,7 +50,7 @@ def train_network(words: Sequence[str]) -> None:
     regimes = {
         name: job.instantiate(compose([*words, f"noise={name}"]).values["noise"]) for name in names
     }
-    about = {"versions": job.read_versions()}
+    about = {"versions": job.read_versions(), "inputs": find_inputs(values, config.trusted)}
     path = fit(values, choices, regimes, job.instantiate, about, print)
     shared = [word for word in words if not word.startswith(_NOT_OF_A_JOB)]
     command = shlex.join(["pfbench", "run", *shared, f"checkpoint={path}"])  # brackets for zsh

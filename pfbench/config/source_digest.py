@@ -1,6 +1,6 @@
-"""Digest of the source code of a user's classes, for the key of a job.
+"""Digests of the source code of a user's classes, for the key of a job, and of that of pfbench.
 
-Classes of pfbench are not part of it: a report refuses results of several versions or commits.
+The code of pfbench is not part of a key: a report refuses results of several builds.
 """
 
 from __future__ import annotations
@@ -8,34 +8,62 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
+import sys
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pfbench
+from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.trust import BROAD
 
+PACKAGE = Path(pfbench.__file__).resolve().parent
+_COMPILED = (".pyc", ".so", ".pyd")
+_LIBRARIES = ("site-packages", "dist-packages")
 
-def hash_user_code(values: Any) -> str:
-    """Compute a digest of the source files that the classes of a configuration consist of.
 
-    The files are those of the modules that `_target_` names, and of all modules of the same package
-    that they import, directly or through others. Libraries and pfbench are left out.
+def hash_user_code(values: Any) -> dict[str, str]:
+    """Compute digests of the source files that the classes of a configuration consist of.
+
+    The files are those of the modules that `_target_` names, and of all modules that they import,
+    directly or through others, from the same package or from the folder that contains it. Installed
+    libraries and pfbench are left out.
 
     Args:
         values: Resolved configuration.
 
     Returns:
-        Hexadecimal digits, or an empty text if the configuration names no class of a user.
+        Hexadecimal digits by the name of the module. Empty if the configuration names no class of a user.
     """
     files: dict[str, bytes] = {}
     for target in sorted(set(_user_targets(values))):
         _collect(_module_of(target), files)
-    if not files:
-        return ""
+    return {name: hashlib.sha256(source).hexdigest()[:16] for name, source in sorted(files.items())}
+
+
+@cache
+def hash_package() -> str:
+    """Compute a digest of the sources and the configuration files of the installed pfbench.
+
+    It depends on the names and contents of the files only, not on times or compiled files, and not on
+    whether the package is installed or a checkout.
+
+    Returns:
+        Hexadecimal digits.
+    """
     sha256 = hashlib.sha256()
-    for name, source in sorted(files.items()):
-        sha256.update(f"{name} {len(source)};".encode() + source)
-    return sha256.hexdigest()[:16]
+    folders = {"pfbench": PACKAGE, "conf": conf_dir(), "experiments": experiments_dir()}
+    for name, folder in folders.items():
+        inside = [other for other in folders.values() if other != folder]
+        for file in sorted(folder.rglob("*")):
+            is_other = any(file.is_relative_to(other) for other in inside if other != PACKAGE)
+            if file.suffix in _COMPILED or is_other or not file.is_file():
+                continue
+            content = file.read_bytes()
+            sha256.update(f"{name}/{file.relative_to(folder).as_posix()} {len(content)};".encode())
+            sha256.update(content)
+    return sha256.hexdigest()[:12]
 
 
 def _user_targets(node: Any) -> Iterator[str]:
@@ -81,8 +109,27 @@ def _collect(module: str, files: dict[str, bytes]) -> None:
     if file.suffix == ".py":
         package = module if file.name == "__init__.py" else parent
         for name in _imports(ast.parse(source), package):
-            if name.split(".")[0] == module.split(".")[0]:
+            if _is_beside(name.split(".")[0], module.split(".")[0]):
                 _collect(name, files)
+
+
+def _is_beside(name: str, own: str) -> bool:
+    """Return whether a top-level module is a user's own one or a helper in the same folder."""
+    if name == own:
+        return True
+    if name in sys.stdlib_module_names or name in ("pfbench", *BROAD):
+        return False
+    home = _find_home(own)
+    return home is not None and home == _find_home(name)
+
+
+def _find_home(name: str) -> Path | None:
+    """Return the folder of a top-level module, or None for an installed library."""
+    file = _find_file(name)
+    if file is None:
+        return None
+    home = (file.parent if file.name == "__init__.py" else file).parent
+    return None if home.name in _LIBRARIES else home
 
 
 def _imports(tree: ast.AST, package: str) -> Iterator[str]:

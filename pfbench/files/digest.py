@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,28 @@ def hash_content(content: Any) -> str:
     sha256 = hashlib.sha256()
     _add(sha256, content)
     return sha256.hexdigest()
+
+
+def hash_file(path: Path) -> str:
+    """Compute the SHA-256 of the bytes of a file, once in a process while the file is unchanged.
+
+    Args:
+        path: File.
+
+    Returns:
+        16 hexadecimal digits.
+
+    Raises:
+        OSError: If the file cannot be read.
+    """
+    state = path.stat()
+    return _hash_bytes(path, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+
+
+@lru_cache(maxsize=4096)
+def _hash_bytes(path: Path, *_: int) -> str:
+    with path.open("rb") as file:  # in pieces: a log may be larger than the memory
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
 def has_valid_digest(content: Mapping[str, Any]) -> bool:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pfbench.config.composition import JobConfig
 from pfbench.core.record import Episode, iterate_steps
+from pfbench.job.inputs import find_inputs
 from pfbench.job.metadata import describe_state, make_provenance
 from pfbench.job.pcrb_cache import compute_pcrb
 from pfbench.job.plan import IGNORED_IN_KEY, instantiate_parts
@@ -22,6 +23,7 @@ from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.conditions import DATASHEETS
 from pfbench.results.config_key import compute_config_key
+from pfbench.results.inputs import extend_key
 from pfbench.results.state_groups import main_component_group
 from pfbench.scenario.recording_regime import RecordingRegime
 
@@ -47,13 +49,20 @@ def build_datasheet(config: JobConfig, about: str = "") -> Path:
     """
     values, choices = config.values, config.choices
     selected = {name: values[name] for name in _CONFIG_KEYS}
-    key = compute_config_key(selected, IGNORED_IN_KEY)
+    inputs = find_inputs(selected)
+    key = extend_key(compute_config_key(selected, IGNORED_IN_KEY), inputs)
     path = Path(values["results_dir"]) / DATASHEETS / f"{key}.npz"
     if path.exists() and not values["overwrite"]:
         return path
     meta, outputs = compute_datasheet(values)
     names = {group: choices[group] for group in ("scenario", "noise", "model")} | {"filter": "none"}
-    head = {"key": key, "study": DATASHEETS, "label": "datasheet", "choices": names}
+    head = {
+        "key": key,
+        "study": DATASHEETS,
+        "label": "datasheet",
+        "choices": names,
+        "inputs": inputs,
+    }
     return store.write_result(path, {**head, "config": selected, "about": about, **meta}, outputs)
 
 
@@ -85,7 +94,8 @@ def compute_datasheet(
     with torch.no_grad():
         episode: Episode = scenario.draw(recording_regime, runs, values["seed"])
         drawn_time = time.perf_counter()
-        pcrb, pcrb_text = compute_pcrb(values, model, recording_regime, episode, runs)
+        inputs = find_inputs(values)
+        pcrb, pcrb_text = compute_pcrb(values, model, recording_regime, episode, runs, inputs)
         truth = model.assemble(episode.truth)
         group = main_component_group(describe_state(model))
         raw = compute_raw_estimate(model, truth, episode.record, group.places)

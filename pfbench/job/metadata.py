@@ -6,6 +6,7 @@ import platform
 import subprocess
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ import numpy as np
 import torch
 
 import pfbench
+from pfbench.config.source_digest import hash_package
 from pfbench.filter.exactness import has_covariance, has_evidence
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.job.inputs import describe_unnamed_files
 from pfbench.job.plan import JobPlan
 from pfbench.model.base import StateSpaceModel
 
@@ -39,6 +42,7 @@ def make_metadata(
     """
     values, method = plan.values, plan.method
     device = values["device"]
+    unnamed = describe_unnamed_files(values["scenario"], plan.config.trusted)
     is_exact_kalman = model.linear and isinstance(method, GaussianFilter) and method.plain
     return {
         "label": plan.config.choices["filter"],
@@ -54,7 +58,7 @@ def make_metadata(
         "has_evidence": has_evidence(method),
         "has_covariance": has_covariance(method),
         "oracle_noise": values["oracle_noise"],
-        "modelling_choices": [*model.choices, *notes],
+        "modelling_choices": [*model.choices, *notes, *unnamed],
         "state": describe_state(model),
         **make_provenance(),
     }
@@ -78,16 +82,26 @@ def make_provenance() -> dict[str, Any]:
 def read_versions() -> dict[str, str]:
     """Return the versions that affect the numbers.
 
-    `commit` is empty outside a checkout.
+    `commit` is empty outside a checkout. `build` is the commit of an unchanged checkout, else a digest of
+    the sources. Both are those of the first call in the process: later changes are not loaded.
     """
-    commit = describe_commit(Path(pfbench.__file__).resolve().parents[1])
+    commit, build = _read_build()
     return {
         "pfbench": pfbench.__version__,
         "commit": commit,
+        "build": build,
         "python": platform.python_version(),
         "torch": torch.__version__,
         "numpy": np.__version__,
     }
+
+
+@cache
+def _read_build() -> tuple[str, str]:
+    """Return the commit and the build of this process."""
+    commit = describe_commit(Path(pfbench.__file__).resolve().parents[1])
+    is_clean = commit and not commit.endswith("-dirty")
+    return commit, commit if is_clean else f"sources {hash_package()}"
 
 
 def describe_commit(checkout: Path) -> str:
@@ -99,16 +113,19 @@ def describe_commit(checkout: Path) -> str:
         checkout: Top folder.
 
     Returns:
-        Abbreviated commit, empty outside a checkout.
+        Abbreviated commit, empty outside a checkout. The repository of a project in whose folder pfbench
+        is installed does not count.
     """
     present = [name for name in _DECIDING if (checkout / name).exists()]
     commands = (
-        ("rev-parse", "--short", "HEAD"),
+        ("rev-parse", "--show-cdup", "--short", "HEAD"),  # the first is empty at the top
         ("diff", "--no-ext-diff", "--name-only", "HEAD", "--", *present),
     )
     try:
         commit, changed = (_run_git(checkout, *command) for command in commands)
     except (OSError, subprocess.SubprocessError):
+        return ""
+    if "/" in commit:
         return ""
     return f"{commit}-dirty" if commit and changed else commit
 

@@ -15,6 +15,7 @@ from pfbench.core.record import Episode
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.white import NominalNoise
+from pfbench.results.inputs import Inputs
 from pfbench.scenario.episode_cache import load_or_build
 from pfbench.scenario.recording_regime import RecordingRegime
 
@@ -25,6 +26,7 @@ def compute_pcrb(
     recording_regime: RecordingRegime,
     episode: Episode,
     runs: Tensor,
+    inputs: Inputs | None = None,
 ) -> tuple[Tensor | None, str]:
     """Compute the posterior Cramér-Rao bound on the error of all filters.
 
@@ -40,6 +42,7 @@ def compute_pcrb(
         recording_regime: Noise regime, after the episode was drawn.
         episode: Episode of the runs.
         runs: Numbers of the runs, [R].
+        inputs: Inputs of the job, see `find_inputs`.
 
     Returns:
         Standard deviations [T, d], in the units of the state, and a description. Otherwise None
@@ -69,7 +72,9 @@ def compute_pcrb(
         return {"pcrb": sd.contiguous(), "is_separate": torch.tensor(is_separate)}
 
     try:
-        result = load_or_build(values["episode_cache_dir"], _recipe(values, model, runs), compute)
+        result = load_or_build(
+            values["episode_cache_dir"], _recipe(values, model, runs, inputs or {}), compute
+        )
     except ValueError as error:
         wrapper = "" if is_nominal else f"{type(oracle).__name__}: "
         return None, "no bound: " + f"{error}".removeprefix(wrapper)
@@ -79,13 +84,16 @@ def compute_pcrb(
     return result["pcrb"], f"posterior Cramer-Rao bound of the model{oracle_text}, {method}{start}"
 
 
-def _recipe(values: Mapping[str, Any], model: StateSpaceModel, runs: Tensor) -> tuple[object, ...]:
+def _recipe(
+    values: Mapping[str, Any], model: StateSpaceModel, runs: Tensor, inputs: Inputs
+) -> tuple[object, ...]:
     """Return all that decides the bound."""
     scenario = {**values["scenario"], "root": None, "cache_dir": None}
     source = Path(inspect.getfile(type(model))).read_bytes()
     source_hash = hashlib.sha256(source).hexdigest()
     episodes = values["noise"], values["seed"], int(runs[0]), len(runs)
-    return ("bound 1", source_hash, values["model"], scenario, *episodes)
+    read = {group: inputs[group] for group in ("scenario", "noise", "model") if group in inputs}
+    return ("bound 1", source_hash, values["model"], scenario, *episodes, *([read] if read else []))
 
 
 def lacks_bound(values: Mapping[str, Any], meta: Mapping[str, Any], names: Container[str]) -> bool:

@@ -13,18 +13,19 @@ import torch
 from omegaconf import OmegaConf, open_dict
 from torch import Tensor
 
-from pfbench.config.composition import CHOICES, JobConfig
+from pfbench.config.composition import JobConfig
 from pfbench.config.paper_block import PAPER, PARTS, remove_all_blocks
-from pfbench.config.source_digest import hash_user_code
 from pfbench.config.trust import check_configuration, trusted_packages
 from pfbench.core.record import Episode
 from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.run_batches import choose_run_batch
+from pfbench.job.inputs import find_inputs
 from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
+from pfbench.results.inputs import Inputs, extend_key
 from pfbench.scenario.base import Scenario
 from pfbench.scenario.recording_regime import RecordingRegime
 
@@ -138,17 +139,23 @@ def build_plan(config: JobConfig) -> JobPlan:
     return JobPlan(config, model, scenario, RecordingRegime(noise), method, runs)
 
 
-def job_key(values: Mapping[str, Any]) -> str:
-    """Compute the key of a job from all settings that affect its results.
+def job_key(values: Mapping[str, Any], inputs: Inputs | None = None) -> str:
+    """Compute the key of a job from all that affects its results.
 
-    The source code of a user's classes is part of it. That of pfbench is not: reports refuse results
-    of several versions or commits.
+    That is its settings and the content of all files that it reads, a user's classes included. The source
+    code of pfbench is not part of it: reports refuse results of several builds.
+
+    Args:
+        values: Resolved configuration.
+        inputs: Inputs of the job, see `find_inputs`. None to find them.
+
+    Returns:
+        16 hexadecimal digits. The first half depends on the settings alone.
     """
-    code = hash_user_code({name: values.get(name) for name in CHOICES})
+    inputs = find_inputs(values) if inputs is None else inputs
     values = {**values, "filter": replace_checkpoint_by_hash(values.get("filter"))}
-    values |= {"user_code": code} if code else {}
     defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
-    return compute_config_key(values, (*IGNORED_IN_KEY, *defaults))
+    return extend_key(compute_config_key(values, (*IGNORED_IN_KEY, *defaults)), inputs)
 
 
 def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:

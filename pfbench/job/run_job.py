@@ -18,6 +18,7 @@ from pfbench.files.work_start import start_work
 from pfbench.filter.learned.checkpoint import checkpoint_provenance
 from pfbench.job.allocation import EpisodeSource, apply_budget, max_runs_in_memory
 from pfbench.job.filter_pass import TimedFilterPass, pass_filter
+from pfbench.job.inputs import check_unchanged, find_inputs
 from pfbench.job.metadata import make_metadata
 from pfbench.job.pcrb_cache import compute_pcrb, lacks_bound
 from pfbench.job.plan import JobPlan, build_plan, job_key
@@ -25,6 +26,7 @@ from pfbench.job.settings import check_settings
 from pfbench.results import store
 from pfbench.results.conditions import DATASHEETS
 from pfbench.results.headline import describe_runs, main_rmse
+from pfbench.results.inputs import Inputs, find_same_configuration, list_changed
 from pfbench.results.joined_runs import join_arrays, join_metadata
 
 if TYPE_CHECKING:
@@ -75,7 +77,8 @@ def run(
     """
     config = resolve_config(config, choices)
     values = config.values
-    path = _result_path(values)
+    inputs = find_inputs(values, config.trusted)
+    path = _result_path(values, inputs)
     job_choices = {group: config.choices[group] for group in CHOICES}
     name = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
     result = None if values["overwrite"] else _read_finished(path, values)
@@ -85,8 +88,12 @@ def run(
         repeat = "(overwrite=true to repeat)"
         log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
         return outcome
+    if inputs and not path.exists():
+        _announce_change(path, inputs)
     meta, outputs = _compute_or_note(config, name, path, announce, is_alone=not counter)
+    check_unchanged(inputs, values, config.trusted)
     head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
+    head["inputs"] = inputs
     store.write_result(path, {**head, **meta}, outputs)
     outcome = JobOutcome(path, "finished", main_rmse(outputs, meta))
     seconds = meta["seconds"]
@@ -195,7 +202,30 @@ def _read_finished(path: Path, values: Mapping[str, Any]) -> store.JobResult | N
     return result
 
 
-def _result_path(values: Mapping[str, Any]) -> Path:
+def _announce_change(path: Path, inputs: Inputs) -> None:
+    """State which inputs have changed since the latest result of the same configuration."""
+    earlier = [meta for file in find_same_configuration(path) if (meta := _read_meta(file))]
+    if not earlier:
+        return
+    latest = max(earlier, key=lambda meta: str(meta.get("created", "")))
+    changed = list_changed(latest.get("inputs", {}), inputs)
+    log.info(
+        "%s %s changed since the result of %s: new job",
+        " and ".join(changed),
+        "has" if len(changed) == 1 else "have",
+        str(latest.get("created", ""))[:19].replace("T", " "),
+    )
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    """Read the metadata of another result, empty if it is damaged or not one of this version."""
+    try:
+        return store.read_metadata(path)
+    except (ValueError, OSError):
+        return {}
+
+
+def _result_path(values: Mapping[str, Any], inputs: Inputs) -> Path:
     """Return the file of a job."""
     study = values["study"]
     if study in _RESERVED:
@@ -203,13 +233,14 @@ def _result_path(values: Mapping[str, Any]) -> Path:
             f"study must not be {' or '.join(_RESERVED)}, got {study}. These folders hold other "
             "reports. Choose another name."
         )
-    return Path(values["results_dir"]) / study / f"{job_key(values)}.npz"
+    return Path(values["results_dir"]) / study / f"{job_key(values, inputs)}.npz"
 
 
 def _timed_pcrb(plan: JobPlan, episode: Episode, runs: Tensor) -> tuple[Tensor | None, str, float]:
     """Compute the bound, its description and the seconds."""
     start_time = time.perf_counter()
-    sd, text = compute_pcrb(plan.values, plan.model, plan.recording_regime, episode, runs)
+    inputs = find_inputs(plan.values, plan.config.trusted)
+    sd, text = compute_pcrb(plan.values, plan.model, plan.recording_regime, episode, runs, inputs)
     return sd, text, time.perf_counter() - start_time
 
 

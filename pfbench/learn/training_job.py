@@ -20,6 +20,7 @@ from pfbench.learn.training_log import open_tensorboard, write_losses
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.base import NoiseRegime
 from pfbench.results.config_key import compute_config_key
+from pfbench.results.inputs import Inputs, extend_key
 
 
 def train(
@@ -99,7 +100,7 @@ def fit(
         choices: Name chosen in each configuration group.
         regimes: Noise regimes of the mixture, by name.
         build: Function that instantiates a node of the configuration.
-        metadata: Further content of the checkpoint.
+        metadata: Further content of the checkpoint, such as `inputs`, see `pfbench.job.inputs`.
         tell: Function that prints the log line of an epoch.
 
     Returns:
@@ -111,7 +112,8 @@ def fit(
     model, training, method = (build(cfg[group]) for group in ("model", "train", "filter"))
     model = model.to(cfg["device"], getattr(torch, cfg["dtype"]))
     scenario = build(cfg["scenario"])
-    path = _checkpoint_path(cfg, choices, regimes, training.checkpoint_path)
+    inputs = metadata.get("inputs", {})
+    path = _checkpoint_path(cfg, choices, regimes, training.checkpoint_path, inputs)
     if path.exists() and not cfg["overwrite"]:
         tell(f"skipped  checkpoint exists: {path}   (overwrite=true to repeat)")
         return path
@@ -138,14 +140,16 @@ def _checkpoint_path(
     choices: Mapping[str, str],
     regimes: Mapping[str, NoiseRegime],
     path: str | None,
+    inputs: Inputs,
 ) -> Path:
-    """Return the given path, or one that depends on all settings of the training."""
+    """Return the given path, or one that depends on all settings and inputs of the training."""
     if path:
         return Path(path)
     groups = ("model", "scenario", "filter", "train", "noise", "dtype")
     settings = {group: cfg[group] for group in groups} | {"noises": [*regimes]}
     ignored = ("scenario.root", "scenario.cache_dir", "train.checkpoint_path")
     key = compute_config_key(checkpoint.replace_checkpoint_by_hash(settings), ignored)
+    key = extend_key(key, inputs)
     name = f"{choices['filter']}_{choices['scenario']}_{key}.pt"
     return Path(cfg["results_dir"]) / cfg["study"] / "checkpoints" / name
 

@@ -60,6 +60,10 @@ class ErrorReplay(NoiseRegime):
                 f"got {self.block_length_s}. Give longer blocks."
             )
 
+    def input_files(self) -> list[Path]:
+        """List the file of the record."""
+        return [] if self.root is None else [Path(self.root) / self.folder / self.file]
+
     @override
     def draw_errors(
         self, draws: RandomStream, channels: MeasurementChannels, time: Tensor

@@ -11,6 +11,7 @@ from pfbench.results.conditions import Condition, natural_sort_key
 _SHARED = (
     ("pfbench", "versions.pfbench"),
     ("commit", "versions.commit"),
+    ("build", "versions.build"),
     ("python", "versions.python"),
     ("torch", "versions.torch"),
     ("numpy", "versions.numpy"),

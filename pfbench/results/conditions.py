@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from pfbench.files.atomic_write import set_aside
 from pfbench.results import store
+from pfbench.results.inputs import describe_older, select_newest_inputs
 from pfbench.results.job_labels import (
     flatten_settings,
     list_data_settings,
@@ -24,6 +25,7 @@ from pfbench.results.step_times import STEP_TIME, add_step_times
 log = logging.getLogger("pfbench")
 
 DATASHEETS = "datasheets"  # folder of the results that holds the scenarios' datasheets
+_BUILD = ("versions.pfbench", "versions.commit", "versions.build")
 _SHARED_SETTINGS = ("scenario", "noise", "dtype")  # settings that decide the data of a filter
 _Described = tuple[Path, dict[str, Any]]
 
@@ -58,12 +60,14 @@ class Condition(NamedTuple):
         noise: Noise regime.
         model: Model.
         jobs: Result files.
+        older: Sentence on the results of the study that are not compared, since their inputs have changed.
     """
 
     scenario: str
     noise: str
     model: str
     jobs: tuple[JobFile, ...]
+    older: str = ""
 
     @property
     def name(self) -> str:
@@ -100,9 +104,12 @@ def load_conditions(
     items = [item for path in paths if (item := _read_undamaged(path)) is not None]
     if not items:
         raise FileNotFoundError(_no_results_message(study, Path(results)))
+    items, older = select_newest_inputs(items)
+    if sentence := describe_older([*older.values()]):
+        log.warning("warning  study %s: %s", study, sentence)
     _check_distinct(items)
     if not allow_mixed_versions:
-        _check_equal(items, ("versions.pfbench", "versions.commit"), "the study")
+        _check_equal(items, _BUILD, "the study")
     groups = {group[0][0]: group for group in find_consecutive_parts(items)}
     items = [(path, join_metadata([meta for _, meta in group])) for path, group in groups.items()]
     items.sort(key=lambda item: (_condition_key(item[1]), *_job_order(item[1])))
@@ -118,7 +125,7 @@ def load_conditions(
                 job._replace(parts=tuple(path for path, _ in groups[job.path]))
                 for job in _label_jobs(items_of_data)
             ]
-            conditions.append(Condition(*names, key[2], tuple(jobs)))
+            conditions.append(Condition(*names, key[2], tuple(jobs), sentence))
     return conditions
 
 

@@ -22,7 +22,10 @@ PLACE_SETTINGS = (
     "memory_limit_gib",
     "overwrite",
     "report",
-    "scenario.root",
+    "scenario.root",  # like those below, of files whose content is part of the key, see `pfbench.job.inputs`
+    "scenario.trajectory.root",
+    "scenario.receiver.constellation.root",
+    "noise.root",
     "scenario.cache_dir",
     "pcrb",  # does not change the filter's results; a job without the bound runs again where it is requested
     "runs_in",  # an experiment's table from which `runs` is taken

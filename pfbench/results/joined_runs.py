@@ -13,7 +13,17 @@ from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
 
 _SHARED = ("time", "pcrb", "range", "score_steps")  # arrays without an axis of runs
 _EQUAL = ("time", "range", "score_steps")  # of all parts
-_SAME_JOB = ("choices", "label", "seed", "steps", "particles", "trained", "state", "versions")
+_SAME_JOB = (
+    "choices",
+    "label",
+    "seed",
+    "steps",
+    "particles",
+    "trained",
+    "state",
+    "versions",
+    "inputs",
+)
 Part = tuple[Path, dict[str, Any]]
 
 

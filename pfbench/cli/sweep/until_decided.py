@@ -98,14 +98,18 @@ class GrowingSweep:
         Args:
             number: Number of the look, from 1.
         """
+        from pfbench.job.inputs import find_inputs
         from pfbench.job.plan import job_key
 
         keys = set()
         for config in self.jobs:
-            values = copy.deepcopy(config.values)
+            values, inputs = (
+                copy.deepcopy(config.values),
+                find_inputs(config.values, config.trusted),
+            )
             for first, runs in self.schedule.parts(number):
                 numbers = {"first_run": config.values["first_run"] + first, "runs": runs}
-                keys.add(job_key({**values, **numbers}))
+                keys.add(job_key({**values, **numbers}, inputs))
         return keys
 
     def has_results(self, number: int) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
+from pathlib import Path
 
 import pandas as pd
 import torch
@@ -46,6 +47,10 @@ class BroadcastConstellation(Constellation):
         _ = self.epoch
         if not self.validity > 0.0:
             raise ValueError(f"validity must be positive, got {self.validity}. Give seconds.")
+
+    def input_files(self) -> list[Path]:
+        """List the file of the ephemerides."""
+        return [] if self.root is None else [Path(self.root) / self.path]
 
     @cached_property
     def epoch(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -93,6 +94,10 @@ class RecordedAidedFlight(Scenario):
     flight: RecordedDrive
     tuning: AidedTuning
     instruments: BaroMagSensors
+
+    def input_files(self) -> list[Path]:
+        """List the files that `draw` reads."""
+        return replace(self.flight, root=self.root).input_files()
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:

@@ -6,7 +6,8 @@ All runs of a drive have the same motion. They differ in receiver errors and ini
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from pfbench.scenario.base import Scenario, check_duration
 from pfbench.scenario.recorded.assembly import FixReceiver, assemble
 from pfbench.scenario.recorded.fix_holdout import FixHoldout
 from pfbench.scenario.recorded.log_reader import read_log
-from pfbench.scenario.recorded.log_tables import find_dataset
+from pfbench.scenario.recorded.log_tables import find_dataset, list_tables
 from pfbench.scenario.recorded.navigation_log import LogFiles
 from pfbench.scenario.recorded.time_grid import TIME_TOLERANCE, ResampledLog, resample_log
 
@@ -71,6 +72,10 @@ class RecordedDrive(Scenario):
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         return self.over(self.read(), noise, runs, seed)
+
+    def input_files(self) -> list[Path]:
+        """List the files that `draw` reads."""
+        return list_tables(self.root, self.folder, astuple(self.files))
 
     def read(self) -> ResampledLog:
         """Read the log and resample it to filter steps."""
@@ -146,6 +151,10 @@ class RecordedFlights(Scenario):
         check_duration("scenario.filter_step_s", self.filter_step_s)
         if not self.flights:
             raise ValueError("scenario.flights must not be empty, got []. Select a flight.")
+
+    def input_files(self) -> list[Path]:
+        """List the files that `draw` reads."""
+        return list_tables(self.root, self.folder, astuple(self.files))
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:

@@ -5,7 +5,7 @@ Error messages name the file, the column and the row. The file is long because o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,8 @@ from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_range
 from pfbench.scenario.plausibility.log_table import LogTable
+
+_SUFFIXES = (".parquet", ".csv")
 
 
 def find_dataset(root: str | None, folder: str) -> Path:
@@ -45,6 +47,46 @@ def find_dataset(root: str | None, folder: str) -> Path:
 _LARGEST_NUMBERS = {"G": 63, "R": 32, "E": 36, "C": 63, "J": 202, "I": 14, "S": 158}
 
 
+def list_tables(root: str | None, folder: str, names: Iterable[str]) -> list[Path]:
+    """List the files of tables, which `read_table` would read.
+
+    Args:
+        root: Folder of all data sets. None gives no files.
+        folder: Name of the data set.
+        names: File names without .parquet or .csv.
+
+    Returns:
+        The files that exist.
+    """
+    paths = (
+        Path(root or "") / folder / f"{name}{suffix}" for name in names for suffix in _SUFFIXES
+    )
+    return [path for path in dict.fromkeys(paths) if root is not None and path.is_file()]
+
+
+def find_table(folder: Path, name: str) -> Path:
+    """Return the file of a table.
+
+    Args:
+        folder: Folder of the table.
+        name: File name without .parquet or .csv.
+
+    Raises:
+        ValueError: If the file does not exist, or there is one of each kind.
+    """
+    files = list_tables(str(folder), "", (name,))
+    if not files:
+        raise ValueError(
+            f"{folder} must contain {name}.parquet or {name}.csv. "
+            "Store a log as a folder with imu, gnss and reference."
+        )
+    if len(files) > 1:
+        raise ValueError(
+            f"{folder} must not contain both {name}.parquet and {name}.csv. Delete one of them."
+        )
+    return files[0]
+
+
 def read_table(
     folder: Path,
     name: str,
@@ -66,19 +108,7 @@ def read_table(
         ValueError: If the file does not exist, is ambiguous or damaged, a selection is missing or not in the
             file, or the table has fewer than two rows.
     """
-    files = [
-        file for suffix in (".parquet", ".csv") if (file := folder / f"{name}{suffix}").is_file()
-    ]
-    if not files:
-        raise ValueError(
-            f"{folder} must contain {name}.parquet or {name}.csv. "
-            "Store a log as a folder with imu, gnss and reference."
-        )
-    if len(files) > 1:
-        raise ValueError(
-            f"{folder} must not contain both {name}.parquet and {name}.csv. Delete one of them."
-        )
-    file = files[0]
+    file = find_table(folder, name)
     content = read_table_file(file)
     table = LogTable(
         content.rows,

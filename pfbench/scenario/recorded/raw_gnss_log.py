@@ -37,6 +37,7 @@ _MEASURED = (
     "az",
     "el",
 )
+SKY = "pseudorange"  # table of the raw measurements
 _COLUMNS = (*_MEASURED, "sx", "sy", "sz", "svx", "svy", "svz")
 
 
@@ -90,7 +91,7 @@ def read_sky(
         ValueError: If a column or the origin is missing, an epoch contains a satellite twice, or
             the times do not match any epoch.
     """
-    table = read_table(folder, "pseudorange", {})
+    table = read_table(folder, SKY, {})
     value = dict(zip(_COLUMNS, parse_numbers(table, _COLUMNS).T, strict=True))
     after = np.searchsorted(time, value["t"]).clip(1, len(time) - 1)
     row = np.where(value["t"] - time[after - 1] < time[after] - value["t"], after - 1, after)

@@ -7,7 +7,8 @@ differ in initial errors and in the errors that a noise regime adds to each sate
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -28,9 +29,10 @@ from pfbench.scenario.base import (
 from pfbench.scenario.plausibility.sky_checks import check_sky
 from pfbench.scenario.recorded.assembly import FixReceiver, assemble, encode_names
 from pfbench.scenario.recorded.log_reader import read_log
-from pfbench.scenario.recorded.log_tables import find_dataset
+from pfbench.scenario.recorded.log_tables import find_dataset, list_tables
 from pfbench.scenario.recorded.navigation_log import LogFiles
 from pfbench.scenario.recorded.raw_gnss_log import (
+    SKY,
     RawGnssLog,
     make_step_inputs,
     read_sky,
@@ -166,6 +168,10 @@ class RecordedWalk(Scenario):
             (*motion.notes, *notes),
             motion.datasheet | datasheet,
         )
+
+    def input_files(self) -> list[Path]:
+        """List the files that `draw` reads."""
+        return list_tables(self.root, self.folder, (*astuple(self.files), SKY))
 
     def _draw_start(self, motion: Tensor | None, draws: PhiloxStream) -> Tensor:
         """Draw starts [R, 19], about which the true state has the assumed distribution."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from pfbench.files.digest import hash_file
 from pfbench.nav import attitude, earth
 from pfbench.nav.motion_spline import MotionSpline, RecordedMotion
 from pfbench.nav.trajectory import TrajectoryData
@@ -19,6 +19,8 @@ from pfbench.scenario.plausibility.log_agreement import compare_reference
 from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.recorded.log_tables import (
     find_dataset,
+    find_table,
+    list_tables,
     parse_numbers,
     read_table,
     read_times,
@@ -66,9 +68,12 @@ class RecordedTrajectory:
                 f"scenario.trajectory.end_s must be later than start_s = {self.start_s}, "
                 f"got {self.end_s}. Change start_s or end_s."
             )
-        content = read_table(find_dataset(self.root, self.folder), self.file, {}).rows
-        digest = hashlib.sha256(content.to_csv(index=False).encode()).hexdigest()
-        object.__setattr__(self, "checksum", digest[:16])
+        table = find_table(find_dataset(self.root, self.folder), self.file)
+        object.__setattr__(self, "checksum", hash_file(table))
+
+    def input_files(self) -> list[Path]:
+        """List the file of the trajectory."""
+        return list_tables(self.root, self.folder, (self.file,))
 
     def generate(self, rate: float) -> TrajectoryData:
         """Generate truth and ideal sensors at `rate` samples per second."""

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,8 +24,9 @@ from pfbench.scenario.base import (
     check_added_sd,
     check_duration,
 )
-from pfbench.scenario.recorded.log_tables import find_dataset
+from pfbench.scenario.recorded.log_tables import find_dataset, list_tables
 from pfbench.scenario.recorded.urban_log import (
+    TABLES,
     UrbanLog,
     interpolate_reference,
     line_of_sight_directions,
@@ -90,6 +92,10 @@ class UrbanDrive(Scenario):
     start_s: float | None = None
     end_s: float | None = None
     limits: PlausibleLimits | None = None
+
+    def input_files(self) -> list[Path]:
+        """List the files that `draw` reads."""
+        return list_tables(self.root, self.folder, TABLES)
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:

@@ -35,6 +35,7 @@ from pfbench.scenario.recorded.log_tables import (
 from pfbench.scenario.recorded.navigation_log import ReferenceLog
 
 MIN_HEADING_SPEED = 1.0  # m/s; smallest speed at which the velocity determines the heading
+TABLES = ("pseudorange", "odometry", "truth")
 _SAME_TIME = 1e-3  # s
 
 
@@ -82,9 +83,7 @@ def read_drive(folder: Path, limits: PlausibleLimits | None = None) -> UrbanLog:
         ValueError: If a table or column is missing, the tables have different epochs, or a check
             fails.
     """
-    pseudoranges, wheels, truth = (
-        read_table(folder, name, {}, limits) for name in ("pseudorange", "odometry", "truth")
-    )
+    pseudoranges, wheels, truth = (read_table(folder, name, {}, limits) for name in TABLES)
     time = read_times(wheels, 1.0)
     reference = parse_numbers(truth, ("t", "lat_deg", "lon_deg", "h_m", "ve_d", "vn_d"))
     if not np.array_equal(time, reference[:, 0]):

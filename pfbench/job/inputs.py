@@ -1,0 +1,139 @@
+"""Inputs of a job: every file that its objects read, by a digest of its content.
+
+A class that reads files has a method `input_files`, which returns their paths. It answers for all objects
+inside of it. Files that a job reads and that no object names do not make a new job when they change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import hydra
+
+from pfbench.config.composition import CHOICES
+from pfbench.config.paper_block import remove_all_blocks
+from pfbench.config.source_digest import hash_user_code
+from pfbench.config.trust import check_configuration, trusted_packages
+from pfbench.files.digest import hash_file
+from pfbench.filter.learned.checkpoint import hash_checkpoints
+from pfbench.results.inputs import Inputs, list_changed
+
+_MISSING = "missing"
+
+
+def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Inputs:
+    """Find all that a job reads besides its configuration and pfbench.
+
+    Args:
+        values: Resolved configuration of the job, or the groups of it that are built.
+        trusted: Packages that it may name besides pfbench and those of PFBENCH_TRUST.
+
+    Returns:
+        Digests by name, for each of `scenario`, `noise`, `filter` and `model` that has inputs. A file
+        is named by its folder and its name, as in "my_log/imu.csv", wherever the folder is.
+
+    Raises:
+        ValueError: If an object names a folder or a device as a file, or a checkpoint is damaged.
+    """
+    trusted = (*trusted, *trusted_packages())
+    found = {}
+    for group in CHOICES:
+        node = values.get(group)
+        entries = _hash_files(_list_files(node, trusted), values.get("data", {}).get("root"))
+        entries |= {f"code of {name}": value for name, value in hash_user_code(node).items()}
+        if group == "filter":
+            weights = hash_checkpoints(node)
+            entries |= {f"weights of {name}": value for name, value in weights.items()}
+        if entries:
+            found[group] = entries
+    return found
+
+
+def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence[str] = ()) -> None:
+    """Raise ValueError if a file was written while a job read it.
+
+    Args:
+        before: Inputs before the job.
+        values: Resolved configuration of the job.
+        trusted: Packages that it may name.
+    """
+    changed = list_changed(before, find_inputs(values, trusted))
+    files = [name for name in changed if not name.startswith("code of ")]  # loaded before
+    if files:
+        raise ValueError(
+            f"{' and '.join(files)} must not change while a job reads it, got other content at its end. "
+            "Run the job again."
+        )
+
+
+def describe_unnamed_files(scenario: Any, trusted: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return a note if nothing in a user's scenario says which files it reads.
+
+    Args:
+        scenario: Node of the configuration.
+        trusted: Packages that it may name.
+    """
+    target = str(scenario.get("_target_", ""))
+    trusted = (*trusted, *trusted_packages())
+    if target.startswith("pfbench.") or any(True for _ in _list_readers(scenario, trusted)):
+        return ()
+    return (
+        f"{target} has no method input_files, so a file that it reads can change without a new job",
+    )
+
+
+def _list_files(node: Any, trusted: Sequence[str]) -> Iterator[Path]:
+    """Yield the files that the objects of a node read."""
+    for reader in _list_readers(node, trusted):
+        try:
+            check_configuration(reader, trusted)
+            built = hydra.utils.instantiate(remove_all_blocks(reader), _convert_="all")
+        except Exception:
+            continue
+        for entry in built.input_files():
+            path = Path(entry)
+            if path.exists() and not path.is_file():
+                raise ValueError(
+                    f"input_files of {reader['_target_']} must return files, got {path}. "
+                    "Return the path of each file that is read."
+                )
+            yield path
+
+
+def _list_readers(node: Any, trusted: Sequence[str]) -> Iterator[Mapping[str, Any]]:
+    """Yield the outermost nodes of a configuration whose classes have a method `input_files`."""
+    if isinstance(node, Mapping):
+        if hasattr(_find_class(node.get("_target_"), trusted), "input_files"):
+            yield node
+            return
+        node = list(node.values())
+    if isinstance(node, list | tuple):
+        for value in node:
+            yield from _list_readers(value, trusted)
+
+
+def _find_class(target: Any, trusted: Sequence[str]) -> Any:
+    """Return a class of pfbench or of a trusted package, or None. Nothing else is imported."""
+    packages = [f"{package}." for package in ("pfbench", *trusted)]
+    if not isinstance(target, str) or not target.startswith(tuple(packages)):
+        return None
+    module, _, name = target.rpartition(".")
+    try:
+        return getattr(import_module(module), name, None)
+    except ImportError:  # the plan of the job imports it again, and raises with its key
+        return None
+
+
+def _hash_files(paths: Iterator[Path], root: str | None) -> dict[str, str]:
+    """Return the digest of each file by a name that does not depend on where the data are."""
+    found: dict[str, str] = {}
+    for path in dict.fromkeys(paths):
+        is_at_root = root is not None and path.parent == Path(root)
+        name = path.name if is_at_root else f"{path.parent.name}/{path.name}"
+        while name in found:  # folders of one name in two places
+            name += "'"
+        found[name] = hash_file(path) if path.exists() else _MISSING
+    return found

@@ -1,0 +1,158 @@
+"""Inputs of results: which results of a condition were computed from other content than the newest one.
+
+The metadata of a job has `inputs`: digests by name for scenario, noise, filter and model, see
+`pfbench.job.inputs`. Results of other data are never compared: those of the newest content are, and
+the others are named.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
+
+Inputs = dict[str, dict[str, str]]  # digests by name, by group of the configuration
+Item = tuple[Path, dict[str, Any]]  # file and metadata of a job
+_OF_DATA = ("scenario", "noise", "model")  # groups whose inputs all filters of a condition share
+_HALF = 8  # digits of a key that depend on the configuration alone
+
+
+class OlderResult(NamedTuple):
+    """Result that is not compared.
+
+    Attributes:
+        label: Name of the filter.
+        changed: Inputs that have other content now, for people.
+    """
+
+    label: str
+    changed: tuple[str, ...]
+
+
+def extend_key(key: str, inputs: Inputs) -> str:
+    """Return the key of a job with inputs. Its first half stays that of the configuration.
+
+    Args:
+        key: Key of the configuration.
+        inputs: Inputs. Without any the key is unchanged.
+    """
+    if not inputs:
+        return key
+    text = json.dumps([key, inputs], sort_keys=True)
+    return key[:_HALF] + hashlib.sha256(text.encode()).hexdigest()[: len(key) - _HALF]
+
+
+def find_same_configuration(path: Path) -> list[Path]:
+    """List the other results of the folder of a result that may be of its configuration.
+
+    Args:
+        path: File of the result.
+    """
+    return [file for file in path.parent.glob(f"{path.stem[:_HALF]}*.npz") if file != path]
+
+
+def list_changed(before: Inputs, after: Inputs, groups: Sequence[str] = ()) -> list[str]:
+    """List the inputs of two jobs whose content differs, or that one of them lacks, for people.
+
+    Args:
+        before: Inputs of one job.
+        after: Inputs of the other job.
+        groups: Groups of the configuration. Empty for all.
+    """
+    groups = groups or tuple({**before, **after})
+    old, new = _flatten(before, groups), _flatten(after, groups)
+    differing = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    return list(dict.fromkeys(_format_name(name) for _, name in differing))
+
+
+def select_newest_inputs(items: Sequence[Item]) -> tuple[list[Item], dict[Path, OlderResult]]:
+    """Separate the results of the newest inputs of each condition from the others.
+
+    For each name the digest of the result that was computed last counts. Of two results of one job
+    with other inputs of the filter, such as its code, the later one counts.
+
+    Args:
+        items: Files and metadata of the results of a study.
+
+    Returns:
+        The results that are compared, and the others by their files.
+    """
+    if not any(meta.get("inputs") for _, meta in items):
+        return list(items), {}
+    ordered = sorted(items, key=_computed_at)
+    newest: dict[tuple[str, ...], dict[tuple[str, str], str]] = {}
+    last: dict[str, Inputs] = {}
+    for _, meta in ordered:
+        inputs = meta.get("inputs", {})
+        newest.setdefault(_condition(meta), {}).update(_flatten(inputs, _OF_DATA))
+        last |= dict.fromkeys((_describe_data(meta), _describe_job(meta)), inputs)
+    older = {}
+    for path, meta in ordered:
+        inputs, of_condition = meta.get("inputs", {}), newest[_condition(meta)]
+        own = _flatten(inputs, _OF_DATA)
+        changed = [
+            _format_name(key[1]) for key, digest in own.items() if of_condition[key] != digest
+        ]
+        # files that came or went with equal settings of the data, or another code of the same filter
+        changed += list_changed(inputs, last[_describe_data(meta)], _OF_DATA[:2])
+        changed += list_changed(inputs, last[_describe_job(meta)])
+        if changed:
+            older[path] = OlderResult(str(meta["label"]), tuple(dict.fromkeys(changed)))
+    return [item for item in items if item[0] not in older], older
+
+
+def describe_older(older: Sequence[OlderResult]) -> str:
+    """State in one line which results are not compared, and why; empty if there are none.
+
+    Args:
+        older: Results that are not compared.
+    """
+    if not older:
+        return ""
+    changed = " and ".join(dict.fromkeys(name for result in older for name in result.changed))
+    labels = ", ".join(dict.fromkeys(result.label for result in older))
+    return (
+        f"{len(older)} {'result' if len(older) == 1 else 'results'} of earlier content of {changed} "
+        f"not compared: {labels}. To compare, run again; with overwrite=true what is skipped"
+    )
+
+
+def _flatten(inputs: Inputs, groups: Sequence[str]) -> dict[tuple[str, str], str]:
+    """Return digests by group and name."""
+    return {
+        (group, name): digest for group in groups for name, digest in inputs.get(group, {}).items()
+    }
+
+
+def _format_name(name: str) -> str:
+    """Write "my_log/imu.csv" as "imu.csv of my_log"."""
+    folder, slash, file = name.rpartition("/")
+    return f"{file} of {folder}" if slash else name
+
+
+def _computed_at(item: Item) -> tuple[str, int]:
+    """Return the time of a result. Within a second that of its file decides."""
+    path, meta = item
+    return str(meta.get("created", "")), path.stat().st_mtime_ns if path.exists() else 0
+
+
+def _condition(meta: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return scenario, noise and model of a result."""
+    return tuple(str(meta["choices"].get(group, "")) for group in _OF_DATA)
+
+
+def _describe_data(meta: Mapping[str, Any]) -> str:
+    """Return a key of the settings that decide the data of a result, whatever the inputs are."""
+    settings = {group: meta["config"].get(group) for group in _OF_DATA[:2]}
+    return repr([*_condition(meta)[:2], compute_config_key(settings, PLACE_SETTINGS)])
+
+
+def _describe_job(meta: Mapping[str, Any]) -> str:
+    """Return a key of the job and the runs of a result, whatever the inputs are."""
+    runs = [meta["seed"], meta.get("first_run"), meta["runs"]]
+    config = compute_config_key(meta["config"], PLACE_SETTINGS)
+    return repr([meta["choices"], meta["label"], *runs, config])
