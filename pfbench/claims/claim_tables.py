@@ -38,7 +38,9 @@ def jobs_table(jobs: Jobs) -> pd.DataFrame:
 def list_commits(jobs_metadata: Iterable[Mapping[str, Any]]) -> list[str]:
     """List the distinct commits of jobs."""
     versions = (meta.get("versions", {}) for meta in jobs_metadata)
-    return distinct_values(str(version.get("commit") or "not stated") for version in versions)
+    return distinct_values(
+        str(version.get("commit") or version.get("build") or "not stated") for version in versions
+    )
 
 
 def describe_jobs(claim: Claim, jobs: Jobs) -> list[str]:

@@ -121,5 +121,5 @@ def _shorten(meta: Mapping[str, Any]) -> dict[str, Any]:
         **budget,
         **{name: meta[name] for name in _JOB_KEYS if meta.get(name) is not None},
         "seconds": {name: seconds[name] for name in ("per_step",) if name in seconds},
-        "versions": {name: versions[name] for name in ("commit",) if name in versions},
+        "versions": {name: versions[name] for name in ("commit", "build") if name in versions},
     }

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
+import os
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -46,24 +47,35 @@ def hash_user_code(values: Any) -> dict[str, str]:
 def hash_package() -> str:
     """Compute a digest of the sources and the configuration files of the installed pfbench.
 
-    It depends on the names and contents of the files only, not on times or compiled files, and not on
-    whether the package is installed or a checkout.
+    It depends on the names and contents of the files only, not on times or compiled files.
 
     Returns:
         Hexadecimal digits.
     """
     sha256 = hashlib.sha256()
-    folders = {"pfbench": PACKAGE, "conf": conf_dir(), "experiments": experiments_dir()}
-    for name, folder in folders.items():
-        inside = [other for other in folders.values() if other != folder]
-        for file in sorted(folder.rglob("*")):
-            is_other = any(file.is_relative_to(other) for other in inside if other != PACKAGE)
-            if file.suffix in _COMPILED or is_other or not file.is_file():
-                continue
-            content = file.read_bytes()
-            sha256.update(f"{name}/{file.relative_to(folder).as_posix()} {len(content)};".encode())
-            sha256.update(content)
+    homes = {
+        str(PACKAGE): "pfbench",
+        str(conf_dir()): "conf",
+        str(experiments_dir()): "experiments",
+    }
+    for home, name in homes.items():
+        for folder, below, files in os.walk(home):  # an order of its own for each file system
+            below[:] = sorted(
+                {*below} - {"__pycache__"} - {b for b in below if f"{folder}/{b}" in homes}
+            )
+            for file in sorted(files):
+                if not file.endswith(_COMPILED):
+                    content = _read(f"{folder}/{file}")
+                    sha256.update(
+                        f"{name}{folder.removeprefix(home)}/{file} {len(content)};".encode()
+                    )
+                    sha256.update(content)
     return sha256.hexdigest()[:12]
+
+
+def _read(path: str) -> bytes:
+    with open(path, "rb", buffering=0) as file:
+        return file.read()
 
 
 def _user_targets(node: Any) -> Iterator[str]:

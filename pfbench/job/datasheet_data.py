@@ -22,8 +22,7 @@ from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.conditions import DATASHEETS
-from pfbench.results.config_key import compute_config_key
-from pfbench.results.inputs import extend_key
+from pfbench.results.config_key import compute_config_key, extend_key
 from pfbench.results.state_groups import main_component_group
 from pfbench.scenario.recording_regime import RecordingRegime
 

@@ -6,7 +6,9 @@ inside of it. Files that a job reads and that no object names do not make a new 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,8 @@ from pfbench.config.source_digest import hash_user_code
 from pfbench.config.trust import check_configuration, trusted_packages
 from pfbench.files.digest import hash_file
 from pfbench.filter.learned.checkpoint import hash_checkpoints
-from pfbench.results.inputs import Inputs, list_changed
+from pfbench.results.config_key import Inputs
+from pfbench.results.inputs import list_changed
 
 _MISSING = "missing"
 
@@ -89,8 +92,7 @@ def _list_files(node: Any, trusted: Sequence[str]) -> Iterator[Path]:
     """Yield the files that the objects of a node read."""
     for reader in _list_readers(node, trusted):
         try:
-            check_configuration(reader, trusted)
-            built = hydra.utils.instantiate(remove_all_blocks(reader), _convert_="all")
+            built = _build(json.dumps(reader, sort_keys=True, default=str), tuple(trusted))
         except Exception:
             continue
         for entry in built.input_files():
@@ -101,6 +103,14 @@ def _list_files(node: Any, trusted: Sequence[str]) -> Iterator[Path]:
                     "Return the path of each file that is read."
                 )
             yield path
+
+
+@lru_cache(maxsize=64)
+def _build(reader: str, trusted: tuple[str, ...]) -> Any:
+    """Build the object of a node, written as JSON, once for the many jobs of a sweep."""
+    node = json.loads(reader)
+    check_configuration(node, trusted)
+    return hydra.utils.instantiate(remove_all_blocks(node), _convert_="all")
 
 
 def _list_readers(node: Any, trusted: Sequence[str]) -> Iterator[Mapping[str, Any]]:

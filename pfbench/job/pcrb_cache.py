@@ -15,7 +15,7 @@ from pfbench.core.record import Episode
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.white import NominalNoise
-from pfbench.results.inputs import Inputs
+from pfbench.results.config_key import Inputs
 from pfbench.scenario.episode_cache import load_or_build
 from pfbench.scenario.recording_regime import RecordingRegime
 

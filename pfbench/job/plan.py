@@ -24,8 +24,7 @@ from pfbench.job.inputs import find_inputs
 from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
-from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
-from pfbench.results.inputs import Inputs, extend_key
+from pfbench.results.config_key import PLACE_SETTINGS, Inputs, compute_config_key, extend_key
 from pfbench.scenario.base import Scenario
 from pfbench.scenario.recording_regime import RecordingRegime
 

@@ -25,8 +25,9 @@ from pfbench.job.plan import JobPlan, build_plan, job_key
 from pfbench.job.settings import check_settings
 from pfbench.results import store
 from pfbench.results.conditions import DATASHEETS
+from pfbench.results.config_key import Inputs, list_same_configuration
 from pfbench.results.headline import describe_runs, main_rmse
-from pfbench.results.inputs import Inputs, find_same_configuration, list_changed
+from pfbench.results.inputs import list_changed
 from pfbench.results.joined_runs import join_arrays, join_metadata
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def run(
         log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
         return outcome
     if inputs and not path.exists():
-        _announce_change(path, inputs)
+        _announce_change(path, job_choices, inputs)
     meta, outputs = _compute_or_note(config, name, path, announce, is_alone=not counter)
     check_unchanged(inputs, values, config.trusted)
     head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
@@ -202,9 +203,10 @@ def _read_finished(path: Path, values: Mapping[str, Any]) -> store.JobResult | N
     return result
 
 
-def _announce_change(path: Path, inputs: Inputs) -> None:
+def _announce_change(path: Path, choices: Mapping[str, str], inputs: Inputs) -> None:
     """State which inputs have changed since the latest result of the same configuration."""
-    earlier = [meta for file in find_same_configuration(path) if (meta := _read_meta(file))]
+    others = map(_read_meta, list_same_configuration(path, ".npz"))
+    earlier = [meta for meta in others if meta.get("choices") == choices]
     if not earlier:
         return
     latest = max(earlier, key=lambda meta: str(meta.get("created", "")))

@@ -19,8 +19,7 @@ from pfbench.learn.training_data import TrainingData, draw_training_data
 from pfbench.learn.training_log import open_tensorboard, write_losses
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.base import NoiseRegime
-from pfbench.results.config_key import compute_config_key
-from pfbench.results.inputs import Inputs, extend_key
+from pfbench.results.config_key import Inputs, compute_config_key, extend_key
 
 
 def train(

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pfbench.config.composition import CHOICES, JobConfig
+from pfbench.job.inputs import find_inputs
 from pfbench.job.plan import build_plan
 from pfbench.job.run_job import compute_job
 from pfbench.replay.run_selection import StoredRun
 from pfbench.results import store
+from pfbench.results.config_key import DATA_FOLDERS, Inputs
+from pfbench.results.inputs import list_changed
 
 _ENGINES = ("kernels", "compiled")  # engines that a job may have used; the others are eager
 
@@ -70,10 +73,18 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
     }
     if meta.get("budget_allocation"):
         values["filter"]["particles"] = meta["particles"]
-    if "root" in values["scenario"] and values["scenario"]["root"] is not None:
-        values["scenario"]["root"] = values["data"]["root"]
+    for key in DATA_FOLDERS:
+        _replace_folder(values, key.split("."), values["data"]["root"])
     _replace_cache_folders(values["scenario"], values["episode_cache_dir"])
     return JobConfig(values, {group: str(meta["choices"][group]) for group in CHOICES})
+
+
+def _replace_folder(node: Any, path: Sequence[str], folder: str | None) -> None:
+    """Set a folder of data at a path of a stored configuration, if it has one."""
+    for name in path[:-1]:
+        node = node.get(name) if isinstance(node, dict) else None
+    if isinstance(node, dict) and node.get(path[-1]) is not None:
+        node[path[-1]] = folder
 
 
 def _replace_cache_folders(node: Any, folder: str | None) -> None:
@@ -96,12 +107,23 @@ def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobRes
         Result with one run, and scores at all steps.
     """
     config = replay_config(stored, changes)
+    _check_inputs(stored.result.meta, find_inputs(config.values, config.trusted))
     choices = {group: config.choices[group] for group in CHOICES}
     title = " / ".join(choices[group] for group in ("scenario", "noise", "filter"))
     meta, outputs = compute_job(build_plan(config), f"{title}, run {stored.run}")
     head = {"key": stored.job.path.stem, "study": stored.job.path.parent.name}
     full = {**head, "choices": choices, "config": config.values, **meta}
     return store.JobResult(full, outputs)
+
+
+def _check_inputs(meta: Mapping[str, Any], present: Inputs) -> None:
+    """Raise ValueError if a job cannot be computed again, since what it read has changed."""
+    changed = list_changed(meta["inputs"], present) if present and "inputs" in meta else []
+    if changed:
+        raise ValueError(
+            f"{' and '.join(changed)} must be as it was when the result was computed, got other content. "
+            "Run the job again, and replay the new result."
+        )
 
 
 def select_stored_scores(result: store.JobResult, stored: store.JobResult) -> store.JobResult:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from pfbench.report.looks import study_looks, study_part_names
-from pfbench.report.provenance import distinct_values
+from pfbench.report.provenance import distinct_values, list_builds
 from pfbench.report.tuning_words import count_tuned
 from pfbench.results import store
 from pfbench.results.conditions import Condition
@@ -152,6 +152,7 @@ def _list_software(jobs: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
     """List versions, commit, number type, device and threads of the jobs."""
     versions = [job.get("versions", {}) for job in jobs]
     software = {name: [node[name] for node in versions if node.get(name)] for name in _VERSIONS}
+    software["commit"] = list_builds(jobs)
     software |= {name: [job[name] for job in jobs if name in job] for name in _PLACES}
     return {name: distinct_values(map(str, values)) for name, values in software.items()}
 

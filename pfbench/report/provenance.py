@@ -34,6 +34,29 @@ _PHASES = {
 }
 
 
+def is_uncommitted(meta: Mapping[str, Any]) -> bool:
+    """Return whether a job was computed in a checkout with changes that no commit has."""
+    return str(_value_at(meta, "versions.commit") or "").endswith("-dirty")
+
+
+def list_builds(metadata: Iterable[Mapping[str, Any]]) -> list[str]:
+    """List the builds of jobs, for people: commits, or digests of the sources without git.
+
+    Args:
+        metadata: Metadata of the jobs.
+    """
+    builds = (
+        _value_at(meta, "versions.commit") or _value_at(meta, "versions.build") for meta in metadata
+    )
+    texts = (str(build).replace("-dirty", " with uncommitted changes") for build in builds if build)
+    return distinct_values(texts)
+
+
+def name_build(builds: str) -> str:
+    """Write "commit" before builds of `list_builds` that begin with one."""
+    return builds if builds.startswith("sources") else f"commit {builds}"
+
+
 def list_shared_settings(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
     """List the settings of all jobs; a mixed report has several values."""
     rows = []
@@ -101,15 +124,10 @@ def format_bibtex(conditions: Sequence[Condition]) -> str:
     version = ", ".join(
         distinct_values(str(_value_at(meta, "versions.pfbench")) for meta in metadata)
     )
-    commit = ", ".join(
-        distinct_values(
-            str(_value_at(meta, "versions.commit"))
-            for meta in metadata
-            if _value_at(meta, "versions.commit")
-        )
-    )
+    commit = ", ".join(list_builds(metadata))
     years = [str(meta["created"])[:4] for meta in metadata if meta.get("created")]
-    note = f"  note    = {{Commit {commit}}},\n" if commit else ""
+    build = name_build(commit)
+    note = f"  note    = {{{build[0].upper()}{build[1:]}}},\n" if commit else ""
     return (
         "@misc{pfbench,\n"
         "  author  = {{The pfbench authors}},\n"

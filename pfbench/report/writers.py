@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from pfbench.files.escapes import escape_code_block, escape_markdown
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report import table_formats
+from pfbench.report import provenance, table_formats
 from pfbench.report.plots.figure_files import FigureSpec, draw_figure
 from pfbench.report.plots.plotting import format_slug
 
@@ -166,6 +166,7 @@ def template_environment(home: Path, *, is_html: bool) -> jinja2.Environment:
         "pipe": lambda table: Markup(table_formats.format_markdown(table)),
         "code": lambda text: Markup(escape_code_block(text)),
         "number": table_formats.format_number,
+        "name_build": provenance.name_build,
     }
     return environment
 

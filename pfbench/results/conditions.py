@@ -105,7 +105,7 @@ def load_conditions(
     if not items:
         raise FileNotFoundError(_no_results_message(study, Path(results)))
     items, older = select_newest_inputs(items)
-    if sentence := describe_older([*older.values()]):
+    if sentence := describe_older(older):
         log.warning("warning  study %s: %s", study, sentence)
     _check_distinct(items)
     if not allow_mixed_versions:

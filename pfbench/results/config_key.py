@@ -1,4 +1,4 @@
-"""Key of a job: a hash of its configuration."""
+"""Key of a job: a hash of its configuration and of the content of the files that it reads."""
 
 from __future__ import annotations
 
@@ -6,10 +6,23 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from pfbench.kernels.generator_version import GENERATOR_VERSION
 
+Inputs = dict[
+    str, dict[str, str]
+]  # digests by name, for the groups of a configuration, see `pfbench.job.inputs`
+_HALF = 8  # digits of a key that depend on the configuration alone
+# folders of files whose content is part of the key, see `pfbench.job.inputs`
+DATA_FOLDERS = (
+    "scenario.root",
+    "scenario.trajectory.root",
+    "scenario.receiver.constellation.root",
+    "model.receiver.constellation.root",
+    "noise.root",
+)
 # paths of a configuration that decide where, when and how fast a job runs, not what it computes
 PLACE_SETTINGS = (
     "results_dir",
@@ -22,10 +35,7 @@ PLACE_SETTINGS = (
     "memory_limit_gib",
     "overwrite",
     "report",
-    "scenario.root",  # like those below, of files whose content is part of the key, see `pfbench.job.inputs`
-    "scenario.trajectory.root",
-    "scenario.receiver.constellation.root",
-    "noise.root",
+    *DATA_FOLDERS,
     "scenario.cache_dir",
     "pcrb",  # does not change the filter's results; a job without the bound runs again where it is requested
     "runs_in",  # an experiment's table from which `runs` is taken
@@ -66,6 +76,29 @@ def compute_config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) 
             f"configuration must be numbers, texts, lists and dicts, got {error}."
         ) from error
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def extend_key(key: str, inputs: Inputs) -> str:
+    """Return the key of a job with inputs. Its first half stays that of the configuration.
+
+    Args:
+        key: Key of the configuration.
+        inputs: Inputs. Without any the key is unchanged.
+    """
+    if not inputs:
+        return key
+    text = json.dumps([key, inputs], sort_keys=True)
+    return key[:_HALF] + hashlib.sha256(text.encode()).hexdigest()[: len(key) - _HALF]
+
+
+def list_same_configuration(path: Path, suffix: str) -> list[Path]:
+    """List the files of other inputs next to a result, whose keys have the same first half.
+
+    Args:
+        path: File of the result.
+        suffix: End of their names.
+    """
+    return [f for f in path.parent.glob(f"{path.stem[:_HALF]}*{suffix}") if f != path]
 
 
 def list_not_finite(node: Any, key: str) -> Iterator[tuple[str, float]]:

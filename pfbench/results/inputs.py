@@ -7,18 +7,14 @@ the others are named.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
+from pfbench.results.config_key import PLACE_SETTINGS, Inputs, compute_config_key
 
-Inputs = dict[str, dict[str, str]]  # digests by name, by group of the configuration
 Item = tuple[Path, dict[str, Any]]  # file and metadata of a job
 _OF_DATA = ("scenario", "noise", "model")  # groups whose inputs all filters of a condition share
-_HALF = 8  # digits of a key that depend on the configuration alone
 
 
 class OlderResult(NamedTuple):
@@ -31,28 +27,6 @@ class OlderResult(NamedTuple):
 
     label: str
     changed: tuple[str, ...]
-
-
-def extend_key(key: str, inputs: Inputs) -> str:
-    """Return the key of a job with inputs. Its first half stays that of the configuration.
-
-    Args:
-        key: Key of the configuration.
-        inputs: Inputs. Without any the key is unchanged.
-    """
-    if not inputs:
-        return key
-    text = json.dumps([key, inputs], sort_keys=True)
-    return key[:_HALF] + hashlib.sha256(text.encode()).hexdigest()[: len(key) - _HALF]
-
-
-def find_same_configuration(path: Path) -> list[Path]:
-    """List the other results of the folder of a result that may be of its configuration.
-
-    Args:
-        path: File of the result.
-    """
-    return [file for file in path.parent.glob(f"{path.stem[:_HALF]}*.npz") if file != path]
 
 
 def list_changed(before: Inputs, after: Inputs, groups: Sequence[str] = ()) -> list[str]:
@@ -69,7 +43,7 @@ def list_changed(before: Inputs, after: Inputs, groups: Sequence[str] = ()) -> l
     return list(dict.fromkeys(_format_name(name) for _, name in differing))
 
 
-def select_newest_inputs(items: Sequence[Item]) -> tuple[list[Item], dict[Path, OlderResult]]:
+def select_newest_inputs(items: Sequence[Item]) -> tuple[list[Item], list[OlderResult]]:
     """Separate the results of the newest inputs of each condition from the others.
 
     For each name the digest of the result that was computed last counts. Of two results of one job
@@ -79,18 +53,18 @@ def select_newest_inputs(items: Sequence[Item]) -> tuple[list[Item], dict[Path, 
         items: Files and metadata of the results of a study.
 
     Returns:
-        The results that are compared, and the others by their files.
+        The results that are compared, and the others of jobs that were not run again since.
     """
     if not any(meta.get("inputs") for _, meta in items):
-        return list(items), {}
+        return list(items), []
     ordered = sorted(items, key=_computed_at)
     newest: dict[tuple[str, ...], dict[tuple[str, str], str]] = {}
     last: dict[str, Inputs] = {}
     for _, meta in ordered:
         inputs = meta.get("inputs", {})
         newest.setdefault(_condition(meta), {}).update(_flatten(inputs, _OF_DATA))
-        last |= dict.fromkeys((_describe_data(meta), _describe_job(meta)), inputs)
-    older = {}
+        last[_describe_data(meta)] = last[_describe_job(meta)] = inputs
+    kept, older = [], {}
     for path, meta in ordered:
         inputs, of_condition = meta.get("inputs", {}), newest[_condition(meta)]
         own = _flatten(inputs, _OF_DATA)
@@ -102,7 +76,15 @@ def select_newest_inputs(items: Sequence[Item]) -> tuple[list[Item], dict[Path, 
         changed += list_changed(inputs, last[_describe_job(meta)])
         if changed:
             older[path] = OlderResult(str(meta["label"]), tuple(dict.fromkeys(changed)))
-    return [item for item in items if item[0] not in older], older
+        else:
+            kept.append((path, meta))
+    replaced = {_describe_job(meta) for _, meta in kept}
+    lacking = [
+        older[path]
+        for path, meta in ordered
+        if path in older and _describe_job(meta) not in replaced
+    ]
+    return kept, lacking
 
 
 def describe_older(older: Sequence[OlderResult]) -> str:
@@ -113,11 +95,12 @@ def describe_older(older: Sequence[OlderResult]) -> str:
     """
     if not older:
         return ""
-    changed = " and ".join(dict.fromkeys(name for result in older for name in result.changed))
+    changed = list(dict.fromkeys(name for result in older for name in result.changed))
     labels = ", ".join(dict.fromkeys(result.label for result in older))
     return (
-        f"{len(older)} {'result' if len(older) == 1 else 'results'} of earlier content of {changed} "
-        f"not compared: {labels}. To compare, run again; with overwrite=true what is skipped"
+        f"{len(older)} {'result is' if len(older) == 1 else 'results are'} not compared, since "
+        f"{' and '.join(changed)} {'has' if len(changed) == 1 else 'have'} changed: {labels}. "
+        "Run the jobs again, with overwrite=true if they are skipped."
     )
 
 

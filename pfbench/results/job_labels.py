@@ -6,9 +6,11 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pfbench.results.config_key import DATA_FOLDERS
+
 _DATA_SETTINGS = ("scenario", "noise")  # settings that decide the data of a filter
 _NOT_DATA = "scenario.paper."  # names and thresholds
-_LOCATION_SETTINGS = ("scenario.cache_dir", "scenario.root")  # settings that do not
+_LOCATION_SETTINGS = ("scenario.cache_dir", *DATA_FOLDERS)  # settings that do not
 
 
 def parse_label(label: str) -> tuple[str, dict[str, str]]:

@@ -117,12 +117,13 @@ def measurement_key(jobs: Sequence[tuple[str, str]]) -> str:
 
 
 def read_commit(meta: Mapping[str, Any]) -> str:
-    """Return the commit of a job, empty if it is not known.
+    """Return the commit of a job, or the digest of its sources without one; empty if not known.
 
     Args:
         meta: Metadata of the job.
     """
-    return str(meta.get("versions", {}).get("commit", ""))
+    versions = meta.get("versions", {})
+    return str(versions.get("commit") or versions.get("build") or "")
 
 
 def select_job_times(conditions: Conditions) -> dict[tuple[str, str], StepTimes]:

@@ -19,6 +19,7 @@ import numpy as np
 from pfbench.files.atomic_write import remove_temporary_files, write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
 from pfbench.files.work_start import start_work
+from pfbench.results.config_key import list_same_configuration
 from pfbench.results.result_format import FORMAT, check_arrays, check_metadata
 
 # values of the key `budget`
@@ -72,6 +73,9 @@ def write_result(path: str | Path, meta: Mapping[str, Any], data: Mapping[str, A
     start_work()
     _write(path, lambda file: np.savez_compressed(file, meta=text, digest=digest, **plain))
     _note(path).unlink(missing_ok=True)
+    for note in list_same_configuration(path, ".failed.json"):  # of inputs that have changed
+        if _read_note(note)["choices"] == full["choices"]:
+            note.unlink(missing_ok=True)
     remove_temporary_files(path)
     return path
 

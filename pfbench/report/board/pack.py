@@ -10,6 +10,7 @@ from pfbench.report.board.decided_parts import StudyFacts, decide_parts
 from pfbench.report.board.pack_entries import (
     budget_entries,
     cell_entries,
+    describe_uncommitted,
     describe_versions,
     regime_entries,
 )
@@ -51,8 +52,8 @@ def build_pack(
         options,
         data.times,
         list_failures(conditions[0].jobs[0].path.parent),
-        data.warning,
-        _describe_differing(conditions),
+        " ".join(filter(None, (conditions[0].older, data.warning))),
+        " ".join(filter(None, (describe_uncommitted(conditions), _describe_differing(conditions)))),
     )
     decided = decide_parts(table, facts)
     cells = cell_entries(table)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from pfbench.report import provenance
 from pfbench.report.board.run_table import LOG_SCORE, METRIC_NAMES
 from pfbench.report.looks import MethodLook, PartName
 from pfbench.results.conditions import Condition
@@ -81,14 +82,21 @@ def round_values(values: Any) -> Any:
 
 
 def describe_versions(conditions: Sequence[Condition]) -> dict[str, str]:
-    """Return commit, date and version of the results."""
+    """Return builds, date and version of the results. The build of uncommitted code is not its commit."""
     metadata = [job.meta for c in conditions for job in c.jobs]
     versions = metadata[0].get("versions", {})
     return {
-        "commit": str(versions.get("commit") or "")[:7],
+        "commit": ", ".join(provenance.list_builds(metadata)),
         "date": max(str(meta.get("created", ""))[:10] for meta in metadata),
         "version": str(versions.get("pfbench", "")),
     }
+
+
+def describe_uncommitted(conditions: Sequence[Condition]) -> str:
+    """State how many jobs were computed by code that no commit has; empty if none was."""
+    metadata = [job.meta for c in conditions for job in c.jobs]
+    number = sum(provenance.is_uncommitted(meta) for meta in metadata)
+    return f"{number} of {len(metadata)} jobs are of uncommitted code." if number else ""
 
 
 def filter_entry(look: MethodLook) -> dict[str, Any]:

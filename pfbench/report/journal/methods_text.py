@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from pfbench.report.journal.study_pack import Pack
 from pfbench.report.methods_facts import MethodsFacts
+from pfbench.report.provenance import name_build
 from pfbench.report.tuning_words import describe_tuning
 from pfbench.results import store
 
@@ -147,7 +148,7 @@ def _describe_software(facts: MethodsFacts) -> list[str]:
     value = {name: ", ".join(values) or "unknown" for name, values in facts.software.items()}
     threads = f"{value['threads']} thread{'' if value['threads'] == '1' else 's'}"
     return [
-        f"Software: pfbench {value['pfbench']} (commit {value['commit']}), Python {value['python']}, torch "
+        f"Software: pfbench {value['pfbench']} ({name_build(value['commit'])}), Python {value['python']}, torch "
         f"{value['torch']}, numpy {value['numpy']}; {value['dtype']} on {value['device']} ({threads}).",
     ]
 

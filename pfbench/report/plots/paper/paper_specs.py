@@ -40,7 +40,7 @@ class PaperFigureData(NamedTuple):
     @property
     def prefix(self) -> str:
         """Prefix of the file names."""
-        scenario, noise, model, _ = self.condition
+        scenario, noise, model = self.condition[:3]
         return format_slug(f"{scenario}_{noise}_{model}")
 
     def select_group(self, group: str) -> dict[str, tuple[store.JobResult, ComponentGroup]]:
