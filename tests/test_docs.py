@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from checkout import ROOT
+from checkout import ROOT, list_published
 
 # use_your_data.md and write_a_scenario.md also run shell commands: their own tests run all blocks
 # glossary.md and renamed.md contain tables only
@@ -15,8 +15,12 @@ METHODS = (
     if "```python" in page.read_text()
 )
 PAGES = [*(page for page in ALL_PAGES if page.name not in TABLES | {"use_your_data.md"}), *METHODS]
-FOLDERS = ("docs", "reports", "benchmarks")
-LINKING_PAGES = (ROOT / "README.md", *(page for f in FOLDERS for page in (ROOT / f).rglob("*.md")))
+LINKING_PAGES = (
+    ROOT / "README.md",
+    ROOT / "reports" / "README.md",
+    *(folder / "report.md" for folder in list_published()),
+    *(page for name in ("docs", "benchmarks") for page in (ROOT / name).rglob("*.md")),
+)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

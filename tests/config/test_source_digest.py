@@ -17,7 +17,8 @@ FILES = {
         "from codelab.constants import SCALE\n\n\nclass Walk:\n"
         "    def __init__(self, noise=0.3):\n        self.noise = noise * SCALE\n"
     ),
-    "codelab/constants.py": "from . import units\nSCALE = 2.0 * units.METRE\n",
+    "codehelpers.py": "OFFSET = 0\n",
+    "codelab/constants.py": "import json, codehelpers\nfrom . import units\nSCALE = 2.0 * units.METRE\n",
     "codelab/units.py": "METRE = 1.0\n",
     "codelab/plots.py": "COLOUR = 'red'\n",
 }
@@ -30,7 +31,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in [name for name in sys.modules if name.startswith("codelab")]:
+    for name in [name for name in sys.modules if name.startswith(("codelab", "codehelpers"))]:
         monkeypatch.delitem(sys.modules, name)
     importlib.invalidate_caches()
     return tmp_path
@@ -44,6 +45,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("codelab/units.py", "1.0", "1.5", False),  # one that this module imports
         ("codelab/__init__.py", "", "x = 1\n", False),
         ("codelab/plots.py", "red", "blue", True),  # one that the class does not need
+        ("codehelpers.py", "0", "0.5", False),  # one beside the package
     ],
 )
 def test_the_key_follows_the_source_that_a_class_needs(
@@ -57,6 +59,6 @@ def test_the_key_follows_the_source_that_a_class_needs(
 
 def test_a_configuration_of_pfbench_alone_keeps_its_key(lab: Path) -> None:
     own = {"model": {"_target_": "pfbench.model.LinearGaussian"}, "filter": {"x": [1.0]}}
-    assert hash_user_code(own) == ""
-    assert hash_user_code({"filter": [own, {"a": CONFIG["model"]}]}) != ""
-    assert hash_user_code({"a": {"_target_": "torch.nn.Linear"}}) == ""
+    assert hash_user_code(own) == {}
+    assert hash_user_code({"filter": [own, {"a": CONFIG["model"]}]}) != {}
+    assert hash_user_code({"a": {"_target_": "torch.nn.Linear"}}) == {}

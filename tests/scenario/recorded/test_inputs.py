@@ -1,0 +1,202 @@
+"""A job's key and its result name every byte that the job reads: a changed file is another job."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+from recorded_data import DATA, recorded
+from synthetic_log import tables, write
+
+from pfbench import job
+from pfbench.files.digest import hash_file
+from pfbench.job.inputs import check_unchanged, describe_unnamed_files, find_inputs
+from pfbench.job.plan import build_plan
+from pfbench.replay.recomputation import recompute_run
+from pfbench.replay.run_selection import StoredRun
+from pfbench.report.page import write_report
+from pfbench.results.conditions import load_conditions
+from pfbench.results.store import list_failures, read_result
+
+OF_FILES = (
+    "recorded_berlin", "recorded_boreas", "recorded_car_drive", "recorded_fixed_wing", "recorded_fixed_wing_aided",
+    "recorded_quad_flights", "recorded_walk", "terrain_fixed_wing", "anshun_real_orbits",
+)  # fmt: skip
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """A user's log in `data`."""
+    return write(tmp_path / "data" / "my_log", tables(5.0))
+
+
+def compose(folder: Path, *words: str) -> job.JobConfig:
+    """A job of the log, with results in the folder."""
+    origin = "scenario.origin=[40.0,-105.0,1500.0]"
+    places = (f"data.root={folder}/data", f"results_dir={folder}/results", f"reports_dir={folder}")
+    named = ("scenario=user_log", "scenario.folder=my_log", "study=mine", "runs=3", origin)
+    return job.compose([*named, "filter=ekf", *places, *words])
+
+
+def mend(file: Path) -> None:
+    """Change a number that leaves the log valid."""
+    table = pd.read_csv(file)
+    table.iloc[-1, -1] += 1e-6
+    table.to_csv(file, index=False)
+
+
+def spoil(source: Path, target: Path, named: set[Path]) -> None:
+    """Copy data sets with nonsense in all files that are not named."""
+    for file in source.glob("*/*"):
+        copy = target / file.relative_to(source)
+        copy.parent.mkdir(exist_ok=True)
+        if file in named:
+            copy.symlink_to(file)
+        else:
+            copy.write_text("not a table")
+
+
+@recorded
+@pytest.mark.parametrize(
+    "words", [*((f"scenario={name}",) for name in OF_FILES), ("noise=replay",)]
+)
+def test_a_shipped_job_reads_no_file_that_it_does_not_name(
+    words: tuple[str, ...], tmp_path: Path
+) -> None:
+    """With nonsense in every other file of all data sets the episode is the same."""
+    assert DATA is not None
+    base = (*words, "runs=1", "filter=ekf", "episode_cache_dir=null")
+    plans = [build_plan(job.compose([*base, f"data.root={DATA}"]))]
+    found = find_inputs(plans[0].values)
+    names = {name for group in found.values() for name in group}
+    assert names
+    spoil(Path(DATA), tmp_path, {Path(DATA) / name for name in names})
+    plans += [build_plan(job.compose([*base, f"data.root={tmp_path}"]))]
+    assert find_inputs(plans[1].values) == found
+    assert job.job_key(plans[1].values) == job.job_key(plans[0].values)  # wherever the data are
+    first, second = (plan.draw_episode(torch.arange(1)).record.y for plan in plans)
+    torch.testing.assert_close(first, second, rtol=0, atol=0, equal_nan=True)
+
+
+def test_every_shipped_scenario_with_a_data_folder_is_among_them() -> None:
+    listed = {*OF_FILES, "user_log"}
+    for file in (job.conf_dir() / "scenario").glob("*.yaml"):
+        assert ("${data.root}" in file.read_text()) == (file.stem in listed), file.stem
+
+
+@pytest.mark.parametrize("name", ["imu", "gnss", "reference"])
+def test_a_changed_table_is_another_job_of_the_same_settings(log: Path, name: str) -> None:
+    home = log.parents[1]
+    key = job.job_key(compose(home).values)
+    os.utime(log / f"{name}.csv")
+    assert job.job_key(compose(home).values) == key
+    mend(log / f"{name}.csv")
+    changed = job.job_key(compose(home).values)
+    assert changed != key
+    assert changed[:8] == key[:8]
+    simulated = job.compose(["scenario=growth", "filter=ekf"])
+    assert find_inputs(simulated.values) == {}
+
+
+def test_a_digest_sees_a_change_that_keeps_size_and_time(tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    file.write_text("t,x\n1,2\n")
+    before, state = hash_file(file), file.stat()
+    file.write_text("t,x\n1,3\n")
+    os.utime(file, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert hash_file(file) != before
+
+
+def test_results_of_a_mended_log_are_not_compared_with_those_before(
+    log: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    home = log.parents[1]
+    caplog.set_level(logging.INFO, "pfbench")
+    ekf = compose(home)
+    first = job.run(ekf).path
+    assert read_result(first).meta["inputs"]["scenario"].keys() == {
+        f"my_log/{name}.csv" for name in ("imu", "gnss", "reference")
+    }
+    assert job.run(ekf).status == "skipped"
+    mend(log / "imu.csv")
+    job.run(compose(home, "filter=ckf"))
+    page = write_report("mine", home / "results", home / "reports")
+    said = "1 result is not compared, since imu.csv of my_log has changed: ekf. Run the jobs again"
+    assert said in caplog.text
+    text = (page.parent / "report.md").read_text().replace("\\", "")
+    assert said in text
+    assert "| EKF |" not in text
+    caplog.clear()
+    assert job.run(ekf).status == "finished"
+    assert "imu.csv of my_log has changed since the result of 2" in caplog.text
+    (condition,) = load_conditions("mine", home / "results")
+    assert [one.label for one in condition.jobs] == ["ckf", "ekf"]
+    assert condition.older == ""
+    assert first.exists()
+    (stored,) = (one for one in condition.jobs if one.label == "ekf")
+    mend(log / "gnss.csv")
+    run = StoredRun(condition, stored, 0, stored.load())
+    with pytest.raises(ValueError, match=r"gnss.csv of my_log must be as it was when the result"):
+        recompute_run(run, {})
+
+
+def test_a_failure_of_earlier_inputs_is_forgotten_when_the_job_finishes(log: Path) -> None:
+    home, whole = log.parents[1], (log / "gnss.csv").read_text()
+    (log / "gnss.csv").write_text("t\n1\n")
+    with pytest.raises(ValueError, match=r"gnss.csv"):
+        job.run(compose(home), counter="[1/2] ")
+    assert len(list_failures(home / "results" / "mine")) == 1
+    (log / "gnss.csv").write_text(whole)
+    job.run(compose(home), counter="[1/2] ")
+    assert list_failures(home / "results" / "mine") == []
+
+
+def test_a_file_that_changes_while_the_job_reads_it_is_refused(log: Path) -> None:
+    config = compose(log.parents[1])
+    before = find_inputs(config.values)
+    check_unchanged(before, config.values)
+    mend(log / "imu.csv")
+    with pytest.raises(ValueError, match=r"imu.csv of my_log must not change while a job reads it"):
+        check_unchanged(before, config.values)
+
+
+# a user's own classes
+
+OWN = """
+class World:
+    def __init__(self, file):
+        self.file = file
+{method}
+"""
+METHOD = """
+    def input_files(self):
+        return [self.file]
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A module of a user, and a file that it reads."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "map.txt").write_text("a map")
+    (tmp_path / "inputlab.py").write_text(OWN.format(method=METHOD))
+    (tmp_path / "inputlab_bare.py").write_text(OWN.format(method=""))
+    return tmp_path
+
+
+def test_a_users_class_names_its_files_and_its_code_is_an_input(own: Path) -> None:
+    node: dict[str, Any] = {"_target_": "inputlab.World", "file": str(own / "map.txt")}
+    assert find_inputs({"scenario": node}).keys() == {"scenario"}  # its code, which is not run
+    found = find_inputs({"scenario": node}, ["inputlab"])["scenario"]
+    assert found.keys() == {f"{own.name}/map.txt", "code of inputlab"}
+    assert describe_unnamed_files(node, ["inputlab"]) == ()
+    bare = {**node, "_target_": "inputlab_bare.World"}
+    (note,) = describe_unnamed_files(bare, ["inputlab_bare"])
+    assert note.startswith("inputlab_bare.World has no method input_files")
+    with pytest.raises(ValueError, match=r"input_files of inputlab.World must return files, got"):
+        find_inputs({"scenario": {**node, "file": str(own)}}, ["inputlab"])
