@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pfbench.config import source_digest
 from pfbench.job.metadata import describe_commit
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
@@ -39,3 +40,46 @@ def test_only_files_that_decide_results_mark_a_commit(tmp_path: Path) -> None:
         git(tmp_path, "add", name)
         assert describe_commit(tmp_path) == f"{commit}-dirty", name
         git(tmp_path, "reset", "-q", "--hard")
+
+
+def test_the_repository_of_another_project_is_not_that_of_pfbench(tmp_path: Path) -> None:
+    """As of an environment in the folder of a user's project."""
+    inside = tmp_path / "env" / "site-packages"
+    inside.mkdir(parents=True)
+    (tmp_path / "a.txt").write_text("theirs")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-qm", "first")
+    assert describe_commit(tmp_path) != ""
+    assert describe_commit(inside) == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "is_same"),
+    [
+        ("a.py", "x = 1\n", True),  # written again
+        ("__pycache__/a.pyc", "other", True),
+        ("kernels/operators_avx2.so", "other", True),
+        ("a.py", "x = 2\n", False),
+        ("kernels/b.cpp", "int x;", False),
+        ("conf/noise/n.yaml", "sd: 2", False),
+        ("experiments/e.yaml", "runs: 2", False),
+    ],
+)
+def test_two_wheels_of_other_sources_are_other_builds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str, is_same: bool
+) -> None:
+    """Without git, whatever the times and the compiled files are."""
+    files = {"a.py": "x = 1\n", "conf/noise/n.yaml": "sd: 1", "experiments/e.yaml": "runs: 1"}
+
+    def build(folder: Path, files: dict[str, str]) -> str:
+        for file, content in files.items():
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            (folder / file).write_text(content)
+        monkeypatch.setattr(source_digest, "PACKAGE", folder)
+        monkeypatch.setattr(source_digest, "conf_dir", lambda: folder / "conf")
+        monkeypatch.setattr(source_digest, "experiments_dir", lambda: folder / "experiments")
+        return source_digest.hash_package.__wrapped__()
+
+    first = build(tmp_path / "one", files)
+    assert (build(tmp_path / "two", {**files, name: text}) == first) == is_same

@@ -141,3 +141,16 @@ def test_a_baseline_without_an_error_is_replaced_in_words(tmp_path: Path) -> Non
         assert [words in view["sentence"] for view in pack["views"].values()] == [is_said] * len(
             pack["views"]
         )
+
+
+def test_a_page_says_that_jobs_are_of_uncommitted_code() -> None:
+    metadata = [{"versions": {"commit": commit}} for commit in ("0123abc", "0123abc-dirty", "")]
+    metadata[2]["versions"]["build"] = "sources 89ef"
+    builds = provenance.list_builds(metadata)
+    assert builds == ["0123abc", "0123abc with uncommitted changes", "sources 89ef"]
+    assert provenance.name_build(builds[0]) == "commit 0123abc"
+    assert provenance.name_build(builds[2]) == "sources 89ef"
+    jobs = tuple(JobFile(Path("a"), "a", meta) for meta in metadata)
+    condition = Condition("s", "n", "m", jobs)
+    assert describe_uncommitted([condition]) == "1 of 3 jobs are of uncommitted code."
+    assert describe_uncommitted([condition._replace(jobs=jobs[:1])]) == ""
