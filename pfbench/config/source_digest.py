@@ -125,13 +125,13 @@ def _collect(module: str, files: dict[str, bytes]) -> None:
                 _collect(name, files)
 
 
-def _is_beside(name: str, own: str) -> bool:
+def _is_beside(name: str, module: str) -> bool:
     """Return whether a top-level module is a user's own one or a helper in the same folder."""
-    if name == own:
+    if name == module:
         return True
     if name in sys.stdlib_module_names or name in ("pfbench", *BROAD):
         return False
-    home = _find_home(own)
+    home = _find_home(module)
     return home is not None and home == _find_home(name)
 
 

@@ -42,7 +42,7 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
         ValueError: If an object names a folder or a device as a file, or a checkpoint is damaged.
     """
     trusted = (*trusted, *trusted_packages())
-    found = {}
+    digests = {}
     for group in CHOICES:
         node = values.get(group)
         entries = _hash_files(_list_files(node, trusted), values.get("data", {}).get("root"))
@@ -51,8 +51,8 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
             weights = hash_checkpoints(node)
             entries |= {f"weights of {name}": value for name, value in weights.items()}
         if entries:
-            found[group] = entries
-    return found
+            digests[group] = entries
+    return digests
 
 
 def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence[str] = ()) -> None:
@@ -139,11 +139,11 @@ def _find_class(target: Any, trusted: Sequence[str]) -> Any:
 
 def _hash_files(paths: Iterator[Path], root: str | None) -> dict[str, str]:
     """Return the digest of each file by a name that does not depend on where the data are."""
-    found: dict[str, str] = {}
+    digests: dict[str, str] = {}
     for path in dict.fromkeys(paths):
         is_at_root = root is not None and path.parent == Path(root)
         name = path.name if is_at_root else f"{path.parent.name}/{path.name}"
-        while name in found:  # folders of one name in two places
+        while name in digests:  # folders of one name in two places
             name += "'"
-        found[name] = hash_file(path) if path.exists() else _MISSING
-    return found
+        digests[name] = hash_file(path) if path.exists() else _MISSING
+    return digests

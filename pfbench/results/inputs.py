@@ -64,27 +64,22 @@ def select_newest_inputs(items: Sequence[Item]) -> tuple[list[Item], list[OlderR
         inputs = meta.get("inputs", {})
         newest.setdefault(_condition(meta), {}).update(_flatten(inputs, _OF_DATA))
         last[_describe_data(meta)] = last[_describe_job(meta)] = inputs
-    kept, older = [], {}
+    compared: list[Item] = []
+    older: list[tuple[str, OlderResult]] = []
     for path, meta in ordered:
         inputs, of_condition = meta.get("inputs", {}), newest[_condition(meta)]
-        own = _flatten(inputs, _OF_DATA)
-        changed = [
-            _format_name(key[1]) for key, digest in own.items() if of_condition[key] != digest
-        ]
+        of_data = _flatten(inputs, _OF_DATA)
+        changed = [_format_name(key[1]) for key in of_data if of_data[key] != of_condition[key]]
         # files that came or went with equal settings of the data, or another code of the same filter
         changed += list_changed(inputs, last[_describe_data(meta)], _OF_DATA[:2])
         changed += list_changed(inputs, last[_describe_job(meta)])
         if changed:
-            older[path] = OlderResult(str(meta["label"]), tuple(dict.fromkeys(changed)))
+            names = tuple(dict.fromkeys(changed))
+            older.append((_describe_job(meta), OlderResult(str(meta["label"]), names)))
         else:
-            kept.append((path, meta))
-    replaced = {_describe_job(meta) for _, meta in kept}
-    lacking = [
-        older[path]
-        for path, meta in ordered
-        if path in older and _describe_job(meta) not in replaced
-    ]
-    return kept, lacking
+            compared.append((path, meta))
+    replaced = {_describe_job(meta) for _, meta in compared}
+    return compared, [result for job, result in older if job not in replaced]
 
 
 def describe_older(older: Sequence[OlderResult]) -> str:
