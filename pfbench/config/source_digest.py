@@ -27,9 +27,8 @@ _LIBRARIES = ("site-packages", "dist-packages")
 def hash_user_code(values: Any) -> dict[str, str]:
     """Compute digests of the source files that the classes of a configuration consist of.
 
-    The files are those of the modules that `_target_` names, and of all modules that they import,
-    directly or through others, from the same package or from the folder that contains it. Installed
-    libraries and pfbench are left out.
+    The files are those of the modules that `_target_` names, and of all modules that these import,
+    directly or through others. Installed libraries and pfbench are left out.
 
     Args:
         values: Resolved configuration.
