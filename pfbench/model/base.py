@@ -39,6 +39,9 @@ class StateSpaceModel(nn.Module, ABC):
             measurement are linear given all others, with normal distributions. A Kalman filter of
             each particle can estimate them. A linear model need not set it.
         choices: Modelling choices that a report must list.
+        channel_names: Quantity, frame and unit of each component of y, as `position North [m]`. Empty if the
+            model does not state them: a scenario is then compared by its number of components only.
+        input_type: NamedTuple of the inputs u. None if the model reads none or does not state them.
     """
 
     names: tuple[str, ...]
@@ -49,6 +52,8 @@ class StateSpaceModel(nn.Module, ABC):
     linear: bool = False
     linear_given: tuple[int, ...] = ()
     choices: tuple[str, ...] = ()
+    channel_names: tuple[str, ...] = ()
+    input_type: type | None = None
 
     @property
     def chart(self) -> Chart:
@@ -147,7 +152,17 @@ class StateSpaceModel(nn.Module, ABC):
         return y - y_hat
 
     def prepare(self, record: Record) -> Record:
-        """Return the record with inputs that are computed once for all steps."""
+        """Return the record with inputs that are computed once for all steps.
+
+        Raises:
+            ValueError: If the inputs are not those of `input_type`.
+        """
+        if self.input_type is not None and not isinstance(record.u, self.input_type):
+            kind = type(record.u).__name__ if record.u else "no inputs"
+            raise ValueError(
+                f"record.u must be {self.input_type.__name__} for {type(self).__name__}, got {kind}. "
+                "Choose a scenario with these inputs: pfbench list scenario model=NAME"
+            )
         return record
 
     def at_step(self, t: int) -> StateSpaceModel:

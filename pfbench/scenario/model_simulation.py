@@ -49,6 +49,12 @@ class ModelSimulation(Scenario):
     model: StateSpaceModel
     steps: int
     interval_s: float = 1.0
+    input_type = tuple  # no inputs
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Measured channels: those of the model."""
+        return self.model.channel_names
 
     def __post_init__(self) -> None:
         if not isinstance(self.steps, int) or self.steps < 1:

@@ -90,6 +90,7 @@ class UrbanDrive(Scenario):
     start_s: float | None = None
     end_s: float | None = None
     limits: PlausibleLimits | None = None
+    channel_names, input_type = UrbanGnss.channel_names, UrbanGnss.input_type
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
