@@ -11,6 +11,7 @@ from typing import Any
 
 from pfbench.config.composition import compose_tree, list_groups
 from pfbench.config.instantiation import instantiate
+from pfbench.config.trust import UntrustedConfigError
 
 _PARTS = ("model", "scenario")
 
@@ -101,6 +102,8 @@ def is_fitting(tree: Mapping[str, Any], trusted: Sequence[str] = ()) -> bool:
     try:
         resolved = (OmegaConf.to_container(nodes[part], resolve=True) for part in _PARTS)
         model, scenario = (instantiate(_without_data(node), trusted) for node in resolved)
+    except UntrustedConfigError:
+        raise
     except Exception:  # a key that the scenario does not have, or values of another sensor
         return False
     return not describe_misfit(model, scenario)
@@ -125,7 +128,7 @@ def _without_data(node: Any) -> Any:
 def _refusal(difference: str, fitting: Mapping[str, str]) -> ValueError:
     """Return the error of a model that does not fit."""
     advice = (
-        f"Models that fit: {', '.join(fitting)}."
+        f"Models that fit: {', '.join(fitting)}. Scenarios of a model: pfbench list scenario model=NAME"
         if fitting
         else "No shipped model fits. Give both the same sensors, for instance velocity_sd."
     )

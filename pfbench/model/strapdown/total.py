@@ -20,7 +20,7 @@ from pfbench.core.manifold.group_block import LieGroupBlock
 from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive, check_tuning
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import StateSpaceModel, check_truth_sizes
 from pfbench.model.ins_errors import name_components
 from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.nav.preintegration import PreintegratedImu, rotate
@@ -164,6 +164,8 @@ class StrapdownTotal(StateSpaceModel):
 
     @override
     def assemble(self, truth: dict[str, Tensor]) -> Tensor:
+        sizes = dict(zip(self.groups, _SIZES, strict=True))
+        check_truth_sizes(truth, sizes)
         values = [truth[name] for name in self.groups if name in truth]
         if not values:
             raise ValueError(
@@ -173,6 +175,6 @@ class StrapdownTotal(StateSpaceModel):
         missing = values[0].new_full((*values[0].shape[:-1], 1), torch.nan)
         blocks = [
             truth.get(name, missing.expand(*missing.shape[:-1], size))
-            for name, size in zip(self.groups, _SIZES, strict=True)
+            for name, size in sizes.items()
         ]
         return torch.cat(blocks, -1)
