@@ -54,9 +54,9 @@ def _list_fitting(group: str, words: Sequence[str]) -> Collection[str]:
     from pfbench.config.composition import compose_tree
     from pfbench.config.model_fit import list_fitting_models, list_fitting_scenarios
 
-    other = _OTHER.get(group)
-    if other is None or other not in given_keys(words):
-        example = f"pfbench list {group} {other}=NAME" if other else f"pfbench list {group}"
+    needed = _OTHER.get(group)
+    if needed is None or needed not in given_keys(words):
+        example = f"pfbench list {group} {needed}=NAME" if needed else f"pfbench list {group}"
         raise ValueError(f"words must be {example}, got {' '.join(words)}. See pfbench list --help")
     if group == "scenario":
         return list_fitting_scenarios(words)

@@ -100,7 +100,7 @@ def is_fitting(tree: Mapping[str, Any], trusted: Sequence[str] = ()) -> bool:
 
     nodes = OmegaConf.create(_plain_values(tree))
     try:
-        resolved = (OmegaConf.to_container(nodes[part], resolve=True) for part in _PARTS)
+        resolved = (OmegaConf.to_container(nodes[key], resolve=True) for key in _PARTS)
         model, scenario = (instantiate(_without_data(node), trusted) for node in resolved)
     except UntrustedConfigError:
         raise

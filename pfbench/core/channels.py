@@ -17,7 +17,16 @@ EACH_SATELLITE = (
 
 
 def name_channels(quantity: str, frame: Sequence[str], unit: str) -> tuple[str, ...]:
-    """Name the channels of a vector, one per axis of its frame."""
+    """Name the channels of a vector.
+
+    Args:
+        quantity: Measured quantity.
+        frame: Axes.
+        unit: SI unit.
+
+    Returns:
+        A name per axis.
+    """
     return tuple(f"{quantity} {axis} [{unit}]" for axis in frame)
 
 

@@ -376,7 +376,10 @@ def test_list_of_a_group_says_what_each_one_is(tmp_path: Path) -> None:
 def test_list_of_the_models_that_fit_a_recorded_scenario(tmp_path: Path) -> None:
     said = pfbench("list", "model", "scenario=recorded_berlin", home=tmp_path)
     assert said.code == 0, said.err
-    assert [line.split()[0] for line in said.out.splitlines()] == ["urban_gnss", "urban_gnss_mixture"]
+    assert [line.split()[0] for line in said.out.splitlines()] == [
+        "urban_gnss",
+        "urban_gnss_mixture",
+    ]
 
 
 def test_list_of_what_fits_needs_the_other_part(tmp_path: Path) -> None:
