@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -56,9 +57,16 @@ KINDS = {
     "recorded_walk": {"strapdown_tight"},
     "recorded_berlin": {"urban_gnss", "urban_gnss_mixture"},
 }
-OTHERS = [
-    pytest.param(name, marks=pytest.mark.slow) for name in GROUPS["scenario"] if name not in KINDS
-]
+# another scenario of the same kind, or one of the models of another
+ALIKE = {
+    "azimuth_closed_loop", "recorded_boreas", "flight_500s", "anshun_real_orbits", "recorded_quad_flights",
+}  # fmt: skip
+
+
+def slow_if(is_slow: Callable[[str], bool], names: Iterable[str]) -> list[Any]:
+    return [pytest.param(name, marks=[pytest.mark.slow] if is_slow(name) else []) for name in names]
+
+
 UKF = GaussianFilter(SigmaPointLinearisation(CubaturePoints()))
 
 
@@ -68,12 +76,14 @@ def fitting(scenario: str) -> set[str]:
     return set(list_fitting_models(compose_tree([f"scenario={scenario}", "data.root=null"])))
 
 
-@pytest.mark.parametrize("scenario", KINDS)
+@pytest.mark.parametrize("scenario", slow_if(ALIKE.__contains__, KINDS))
 def test_models_that_fit_each_kind_of_scenario(scenario: str) -> None:
     assert fitting(scenario) == KINDS[scenario]
 
 
-@pytest.mark.parametrize("scenario", [*KINDS, *OTHERS])
+@pytest.mark.parametrize(
+    "scenario", slow_if(lambda name: name in ALIKE or name not in KINDS, GROUPS["scenario"])
+)
 def test_each_pair_that_fits_runs(scenario: str) -> None:
     if scenario == "user_log" or (scenario in RECORDED and DATA is None):
         pytest.skip("needs recorded data")
@@ -213,6 +223,20 @@ def test_order_and_frame_count() -> None:
     assert not describe_misfit(model, source)
     object.__setattr__(source, "channel_names", model.channel_names[::-1])
     assert "'position East [m]' as channel 1" in describe_misfit(model, source)
+
+
+def test_inputs_are_compared() -> None:
+    """Channels that agree do not help: a scenario without inputs, or with others, cannot move the model."""
+    model, source = room(), Draft()
+    model.input_type = Inputs
+    for kind, got in ((tuple, "none"), (Wind, "Wind")):
+        object.__setattr__(source, "input_type", kind)
+        assert (
+            describe_misfit(model, source)
+            == f"Room reads the inputs Inputs, and Draft provides {got}"
+        )
+    object.__setattr__(source, "input_type", Inputs)
+    assert not describe_misfit(model, source)
 
 
 def test_an_input_that_nothing_states_is_named_when_it_lacks() -> None:
