@@ -160,7 +160,7 @@ def test_what_does_not_fit_is_refused() -> None:
     ):
         MODEL.prepare(Record(torch.zeros(1, 2, 6), u))
     with pytest.raises(
-        ValueError, match=r"record must be .*got tuple .*scenario=recorded_fixed_wing_aided"
+        ValueError, match=r"record\.u must be PreintegratedImu for StrapdownAided, got no inputs"
     ):
         MODEL.prepare(Record(torch.zeros(1, 2, 10)))
     for changes, words in (
