@@ -58,7 +58,7 @@ KINDS = {
     "recorded_walk": {"strapdown_tight"},
     "recorded_berlin": {"urban_gnss", "urban_gnss_mixture"},
 }
-# another scenario of the same kind, or one of the models of another
+# of a kind with another one of the list: among the slow tests
 ALIKE = {
     "azimuth_closed_loop", "recorded_boreas", "flight_500s", "anshun_real_orbits", "recorded_quad_flights",
 }  # fmt: skip
