@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
-from pfbench.cli.compose import read_description
+from pfbench.cli.compose import given_keys, read_description
 from pfbench.cli.messages import suggest_similar
 from pfbench.config.composition import list_groups
 
 HELP = """\
-pfbench list [GROUP]
+pfbench list [GROUP] [key=value ...]
 
 List the configuration groups with their files, or the files of a group with their descriptions.
 
   pfbench list
-  pfbench list filter"""
+  pfbench list filter
+  pfbench list model scenario=sar_flight     the models that fit a scenario
+  pfbench list scenario model=ins_gnss       the scenarios that fit a model"""
+
+_OTHER = {"model": "scenario", "scenario": "model"}
 
 
 def list_options(words: Sequence[str]) -> None:
     """Print the configuration groups, or the files of one group.
 
     Args:
-        words: Name of a group, or nothing.
+        words: Name of a group, or nothing. For a model or a scenario, overrides with the other one.
 
     Raises:
-        ValueError: If the group does not exist.
+        ValueError: If the group does not exist, or the overrides do not name the other one.
     """
     groups = list_groups()
     if not words:
@@ -35,5 +39,25 @@ def list_options(words: Sequence[str]) -> None:
     if words[0] not in groups:
         similar = suggest_similar(words[0], list(groups))
         raise ValueError(f"group must be one of {', '.join(groups)}, got {words[0]}.{similar}")
-    for path in sorted(groups[words[0]]):
+    files = sorted(groups[words[0]])
+    if len(words) > 1:
+        names = _list_fitting(words[0], words[1:])
+        files = [path for path in files if path.stem in names]
+    for path in files:
         print(f"{path.stem:24} {read_description(path)}")
+    if not files:
+        print(f"No shipped {words[0]} fits.")
+
+
+def _list_fitting(group: str, words: Sequence[str]) -> Collection[str]:
+    """List the models or scenarios that fit overrides, which name the other one."""
+    from pfbench.config.composition import compose_tree
+    from pfbench.config.model_fit import list_fitting_models, list_fitting_scenarios
+
+    needed = _OTHER.get(group)
+    if needed is None or needed not in given_keys(words):
+        example = f"pfbench list {group} {needed}=NAME" if needed else f"pfbench list {group}"
+        raise ValueError(f"words must be {example}, got {' '.join(words)}. See pfbench list --help")
+    if group == "scenario":
+        return list_fitting_scenarios(words)
+    return list_fitting_models(compose_tree(words))

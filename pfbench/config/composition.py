@@ -142,6 +142,7 @@ def resolve_config(
             valid, a value refers to itself, or one names what is not trusted.
     """
     from omegaconf import OmegaConf
+    from omegaconf.errors import InterpolationKeyError
 
     if isinstance(config, JobConfig):
         return config
@@ -149,7 +150,14 @@ def resolve_config(
     is_shared = "particles" in tree["filter"] and OmegaConf.is_interpolation(
         tree["filter"], "particles"
     )
-    values = resolve_values(tree)
+    try:
+        values = resolve_values(tree)
+    except InterpolationKeyError as error:
+        if not str(error.full_key).startswith("model."):
+            raise
+        from pfbench.config.model_fit import explain_error
+
+        raise explain_error(error, tree, trusted) from error
     names = {str(group): str(name) for group, name in (choices or {}).items()}
     _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
     values = remove_nested_blocks(values)

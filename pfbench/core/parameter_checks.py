@@ -47,6 +47,23 @@ def check_positive(name: str, values: Any) -> Tensor:
     return tensor
 
 
+def check_tuning(tuning: Any, kind: type) -> None:
+    """Check that a model has the tuning of its own kind, not that of another recorded scenario.
+
+    Args:
+        tuning: Value of the key `model.tuning`.
+        kind: Class that the model needs.
+
+    Raises:
+        ValueError: If it is another class.
+    """
+    if not isinstance(tuning, kind):
+        raise ValueError(
+            f"model.tuning must be a {kind.__name__}, got {type(tuning).__name__}. Choose another model: "
+            "pfbench list model scenario=NAME"
+        )
+
+
 def check_whole_number(name: str, value: Any, least: int, remedy: str) -> None:
     """Check a whole number.
 

@@ -15,7 +15,7 @@ from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
 from pfbench.filter.model_jacobians import check_noise_gain
 from pfbench.filter.resolution import check_measurement_resolution
-from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law
+from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law, named_inputs
 
 _STATES = 4  # of each run that the model is tried with
 
@@ -107,7 +107,7 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
     first, step_model = record.at_step(0), model.at_step(0)
     runs, width = first.y.shape
     name = type(model).__name__
-    with torch.no_grad():
+    with torch.no_grad(), named_inputs(model):
         distribution: Any = initial_law(model, runs, record.spread)
         # a stream of its own, in the precision of the model
         stream = PhiloxStream(0, torch.arange(runs, device=model.anchor.device), model.anchor.dtype)

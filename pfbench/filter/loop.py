@@ -19,7 +19,7 @@ from pfbench.filter.health import HealthMonitor, with_cached_nis
 from pfbench.filter.input_check import check_is_filter, check_model, check_record
 from pfbench.filter.particle.proposals import RecordStartedFilter
 from pfbench.filter.run_batches import join_infos, join_runs, split_runs
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import StateSpaceModel, named_inputs
 
 Watch = Callable[[int, StepInfo], dict[str, Tensor]]
 
@@ -187,7 +187,9 @@ def prepare_record(model: StateSpaceModel, record: Record) -> Record:
     start, spread = (
         None if a is None else a.to(model.anchor) for a in (record.start, record.spread)
     )
-    return model.prepare(record).to(model.anchor)._replace(start=start, spread=spread)
+    with named_inputs(model):
+        prepared = model.prepare(record)
+    return prepared.to(model.anchor)._replace(start=start, spread=spread)
 
 
 def run_filter(

@@ -11,6 +11,7 @@ from pfbench.config.folders import (
     conf_dir as conf_dir,
     experiments_dir as experiments_dir,
 )
+from pfbench.config.instantiation import instantiate as instantiate
 from pfbench.job.datasheet_data import build_datasheet as build_datasheet
 from pfbench.job.metadata import read_versions as read_versions
 from pfbench.job.pcrb_cache import compute_pcrb as compute_pcrb
@@ -18,7 +19,6 @@ from pfbench.job.plan import (
     IGNORED_IN_KEY as IGNORED_IN_KEY,
     JobPlan as JobPlan,
     build_plan as build_plan,
-    instantiate as instantiate,
     job_key as job_key,
 )
 from pfbench.job.resumable import ResumableResults as ResumableResults

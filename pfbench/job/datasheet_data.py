@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from pfbench.config.composition import JobConfig
+from pfbench.config.instantiation import instantiate_parts
 from pfbench.core.record import Episode, iterate_steps
 from pfbench.job.inputs import find_inputs
 from pfbench.job.metadata import describe_state, make_provenance
 from pfbench.job.pcrb_cache import compute_pcrb
-from pfbench.job.plan import IGNORED_IN_KEY, instantiate_parts
+from pfbench.job.plan import IGNORED_IN_KEY
 from pfbench.job.raw_estimate import compute_raw_estimate
 from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import hydra
 import torch
-from omegaconf import OmegaConf, open_dict
 from torch import Tensor
 
 from pfbench.config.composition import JobConfig
-from pfbench.config.paper_block import PAPER, PARTS, remove_all_blocks
-from pfbench.config.trust import check_configuration, trusted_packages
+from pfbench.config.instantiation import instantiate_parts
+from pfbench.config.paper_block import PAPER, PARTS
 from pfbench.core.record import Episode
 from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
 from pfbench.filter.particle.particle_filter import ParticleFilter
@@ -126,7 +124,7 @@ def build_plan(config: JobConfig) -> JobPlan:
         The plan. Nothing is drawn yet.
 
     Raises:
-        ValueError: If a value of the configuration is invalid.
+        ValueError: If a value of the configuration is invalid, or the model does not fit the scenario.
     """
     values = config.values
     apply_global_settings(values)
@@ -155,48 +153,3 @@ def job_key(values: Mapping[str, Any], inputs: Inputs | None = None) -> str:
     values = {**values, "filter": replace_checkpoint_by_hash(values.get("filter"))}
     defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
     return extend_key(compute_config_key(values, (*IGNORED_IN_KEY, *defaults)), inputs)
-
-
-def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:
-    """Build the object that a node names by `_target_`. Lists and dicts become plain ones.
-
-    Args:
-        node: Node of a configuration.
-        trusted: Packages that it may name besides pfbench and those of PFBENCH_TRUST.
-
-    Returns:
-        The object.
-
-    Raises:
-        ValueError: If a name in the node is not public or not trusted.
-    """
-    if OmegaConf.is_dict(node) and PAPER in node:
-        node = copy.deepcopy(node)  # which keeps the full key for errors
-        with open_dict(node):  # of a composed configuration, whose keys are fixed
-            node.pop(PAPER)
-    is_config = OmegaConf.is_config(node)
-    values = OmegaConf.to_container(node, resolve=True) if is_config else node
-    bare = remove_all_blocks(values)
-    if bare != values:
-        node, values, is_config = bare, bare, False
-    check_configuration(values, (*trusted, *trusted_packages()))
-    if is_config and OmegaConf.to_container(node, resolve=False) != values:
-        node = values  # what was checked: a resolver may give another value next time
-    return hydra.utils.instantiate(node, _convert_="all")
-
-
-def instantiate_parts(
-    values: Mapping[str, Any], names: Sequence[str], trusted: Sequence[str] = ()
-) -> tuple[Any, ...]:
-    """Build several parts of a configuration.
-
-    Args:
-        values: Resolved configuration. Errors name the full key of a part in it.
-        names: Top-level keys of the parts, in the order of their construction.
-        trusted: Packages that the parts may name besides pfbench.
-
-    Returns:
-        The objects.
-    """
-    tree = OmegaConf.create({name: values[name] for name in names})
-    return tuple(instantiate(tree[name], trusted) for name in names)

@@ -6,6 +6,8 @@ The file is long, since the wrappers are part of it: the first step of a model m
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -18,6 +20,25 @@ from pfbench.core.covariance import gaussian_log_density
 from pfbench.core.density import log_density, log_normal_density
 from pfbench.core.normal import StandardNormal, dense_normal
 from pfbench.core.record import Record
+
+
+@contextmanager
+def named_inputs(model: StateSpaceModel) -> Iterator[None]:
+    """Name the input that a model reads from u and that u does not have.
+
+    Raises:
+        ValueError: If the model reads a field that its inputs do not have.
+    """
+    try:
+        yield
+    except AttributeError as error:
+        if not isinstance(error.obj, tuple):
+            raise
+        fields = ", ".join(getattr(error.obj, "_fields", ())) or "no inputs"
+        raise ValueError(
+            f"record.u must have the input {error.name}, which {type(model).__name__} reads, got {fields}. "
+            "Choose a scenario that provides it, or add the field to its inputs."
+        ) from error
 
 
 class StateSpaceModel(nn.Module, ABC):
@@ -39,6 +60,9 @@ class StateSpaceModel(nn.Module, ABC):
             measurement are linear given all others, with normal distributions. A Kalman filter of
             each particle can estimate them. A linear model need not set it.
         choices: Modelling choices that a report must list.
+        channel_names: Quantity, frame and unit of each component of y, as `position North [m]`. Empty if the
+            model does not state them: a scenario is then compared by its number of components only.
+        input_type: NamedTuple of the inputs u. None if the model reads none or does not state them.
     """
 
     names: tuple[str, ...]
@@ -49,6 +73,8 @@ class StateSpaceModel(nn.Module, ABC):
     linear: bool = False
     linear_given: tuple[int, ...] = ()
     choices: tuple[str, ...] = ()
+    channel_names: tuple[str, ...] = ()
+    input_type: type | None = None
 
     @property
     def chart(self) -> Chart:
@@ -147,7 +173,17 @@ class StateSpaceModel(nn.Module, ABC):
         return y - y_hat
 
     def prepare(self, record: Record) -> Record:
-        """Return the record with inputs that are computed once for all steps."""
+        """Return the record with inputs that are computed once for all steps.
+
+        Raises:
+            ValueError: If the inputs are not those of `input_type`.
+        """
+        if self.input_type is not None and not isinstance(record.u, self.input_type):
+            kind = type(record.u).__name__ if record.u else "no inputs"
+            raise ValueError(
+                f"record.u must be {self.input_type.__name__} for {type(self).__name__}, got {kind}. "
+                "Choose a scenario with these inputs: pfbench list scenario model=NAME"
+            )
         return record
 
     def at_step(self, t: int) -> StateSpaceModel:
@@ -171,7 +207,7 @@ class StateSpaceModel(nn.Module, ABC):
             States, [R, T, D]; NaN where the truth of a group is unknown.
 
         Raises:
-            ValueError: If no group of this model has a truth.
+            ValueError: If no group of this model has a truth, or a truth has other components.
         """
         available = [name for name in self.groups if name in truth]
         if not available:
@@ -179,6 +215,7 @@ class StateSpaceModel(nn.Module, ABC):
                 f"truth must have at least one group of {list(self.groups)}, got {sorted(truth)}. "
                 "Choose a scenario that fits the model."
             )
+        check_truth_sizes(truth, {name: len(places) for name, places in self.groups.items()})
         first = truth[available[0]]
         state = first.new_full((*first.shape[:-1], self.chart.size), torch.nan)
         for name in available:
@@ -312,6 +349,24 @@ class StaticModel(ModelWrapper):
     @override
     def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
         return self.model.log_likelihood(y, x, u)
+
+
+def check_truth_sizes(truth: Mapping[str, Tensor], sizes: Mapping[str, int]) -> None:
+    """Check that true values have the components of their groups: one number would fill a vector.
+
+    Args:
+        truth: True values by group, [R, T, k].
+        sizes: Number of components k of each group of the model.
+
+    Raises:
+        ValueError: If a group has another number of components.
+    """
+    for name in sizes.keys() & truth.keys():
+        if truth[name].shape[-1] != sizes[name]:
+            raise ValueError(
+                f"truth of {name} must have {sizes[name]} components, as the model, got "
+                f"{truth[name].shape[-1]}. Choose a scenario that fits the model."
+            )
 
 
 def _mean_of(distribution: Any, name: str) -> Tensor:

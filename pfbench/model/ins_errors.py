@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from pfbench.core.channels import describe_misfit
 from pfbench.core.covariance import factor
 from pfbench.core.normal import dense_normal, normal_batch
 from pfbench.model.base import StateSpaceModel
@@ -73,6 +74,21 @@ class InsErrorModel(StateSpaceModel):
     """
 
     p0: Tensor
+
+    def check_receiver(self, receiver: Any) -> None:
+        """Check that a sensor measures what the model reads.
+
+        Args:
+            receiver: Sensor whose noise the model assumes.
+
+        Raises:
+            ValueError: If it measures other channels.
+        """
+        if difference := describe_misfit(self, receiver):
+            raise ValueError(
+                f"model.receiver must measure what the model reads, but {difference}. Choose another model: "
+                "pfbench list model scenario=NAME"
+            )
 
     @property
     @override

@@ -20,7 +20,12 @@ from pfbench.model.ins_errors import (
     name_ins_components,
 )
 from pfbench.nav import error_dynamics
-from pfbench.nav.aiding import AlignmentErrors, GnssReceiver, ProcessNoiseInflation
+from pfbench.nav.aiding import (
+    LOOSE_CHANNELS,
+    AlignmentErrors,
+    GnssReceiver,
+    ProcessNoiseInflation,
+)
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.strapdown import InsIntervals
 
@@ -64,10 +69,12 @@ class InsGnss(InsErrorModel):
         inflation: Additional process noise, or None.
 
     Raises:
-        ValueError: If a sensor bias is 0, which makes the initial distribution improper.
+        ValueError: If a sensor bias is 0, which makes the initial distribution improper, or the receiver
+            measures other channels.
     """
 
     linear = True
+    input_type = InsIntervals
     r: Tensor
     observed_indices: Tensor
 
@@ -80,6 +87,8 @@ class InsGnss(InsErrorModel):
         inflation: ProcessNoiseInflation | None = None,
     ) -> None:
         super().__init__()
+        self.channel_names = LOOSE_CHANNELS[: len(receiver.sd)]
+        self.check_receiver(receiver)
         drift = ("gyro_constant", "gyro_markov") if markov else ("gyro_bias",)
         self.names, self.units, self.groups = name_ins_components(
             (*NAVIGATION, *drift, "accelerometer_bias")
@@ -116,7 +125,7 @@ class InsGnss(InsErrorModel):
     def prepare(self, record: Record) -> Record:
         if isinstance(record.u, LooseStep):
             return record
-        return record._replace(u=self.discretise(record.u))
+        return record._replace(u=self.discretise(super().prepare(record).u))
 
     def discretise(self, u: InsIntervals) -> LooseStep:
         """Compute transition [..., D, D] and noise gain [..., D, W] of intervals, float64."""

@@ -152,10 +152,12 @@ def local_level(
         Durbin and Koopman 2012, ch. 2 (Nile data).
     """
     check_positive("level_sd", level_sd)
-    return LinearGaussian(
+    model = LinearGaussian(
         [[1.0]], [[level_sd]], [[1.0]], [measurement_sd], [initial_mean], [initial_sd],
         names=("level",), observes_initial=observes_initial,
     )  # fmt: skip
+    model.channel_names = ("level",)
+    return model
 
 
 def linear_walk(
@@ -182,7 +184,9 @@ def linear_walk(
     q = noise**2 * torch.tensor(
         [[step**3 / 3, step**2 / 2], [step**2 / 2, step]], dtype=torch.float64
     )
-    return LinearGaussian(
+    model = LinearGaussian(
         [[1.0, step], [0.0, 1.0]], torch.linalg.cholesky(q), [[1.0, 0.0]], [measurement_sd],
         [0.0, 0.0], list(initial_sd), names=("position", "velocity"), units=("m", "m/s"),
     )  # fmt: skip
+    model.channel_names = ("position on a line [m]",)
+    return model

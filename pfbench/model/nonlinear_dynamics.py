@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from pfbench.core.channels import name_channels
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
 from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive
@@ -31,6 +32,7 @@ class Pendulum(StateSpaceModel):
         ValueError: If an argument is not positive.
     """
 
+    channel_names = ("horizontal deflection of the pendulum, by its length",)
     noise_root: Tensor
     r: Tensor
     p0: Tensor
@@ -121,6 +123,7 @@ class Lorenz63(StateSpaceModel):
         ValueError: If an argument is not positive.
     """
 
+    channel_names = name_channels("state of the Lorenz attractor", ("x", "y", "z"), "1")
     q: Tensor
     r: Tensor
     p0: Tensor

@@ -60,6 +60,14 @@ class PassiveLocation(StateSpaceModel):
             the stated length.
     """
 
+    channel_names = (
+        "bearing of the emitter in body axes [rad]",
+        "elevation of the emitter in body axes [rad]",
+        "bearing rate [rad/s]",
+        "elevation rate [rad/s]",
+        "Doppler rate [Hz/s]",
+    )
+    input_type = PlatformInputs
     phi: Tensor
     gain: Tensor
     r: Tensor

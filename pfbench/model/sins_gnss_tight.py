@@ -18,7 +18,7 @@ from pfbench.model.tight_coupling import (
     NAMES,
     TIGHT_GROUPS,
     UNITS,
-    check_ranging_inputs,
+    check_satellites,
     compute_initial_sd,
     predict_measurement,
 )
@@ -81,6 +81,7 @@ class SinsGnssTight(InsErrorModel):
             sensor has a Markov part.
     """
 
+    channel_names, input_type = RangingReceiver.channel_names, RangingReceiver.input_type
     r: Tensor
     names, units, groups = NAMES, UNITS, TIGHT_GROUPS
 
@@ -92,6 +93,7 @@ class SinsGnssTight(InsErrorModel):
         inflation: ProcessNoiseInflation | None = None,
     ) -> None:
         super().__init__()
+        self.check_receiver(receiver)
         self.imu, self.clock, self.inflation = imu, receiver.clock, inflation
         self.register_buffer("p0", compute_initial_sd(imu, receiver.clock, initial))
         self.register_buffer("r", receiver.sd)
@@ -104,7 +106,7 @@ class SinsGnssTight(InsErrorModel):
     def prepare(self, record: Record) -> Record:
         if isinstance(record.u, TightStep):
             return record
-        u = check_ranging_inputs(record, len(self.r))
+        u = check_satellites(super().prepare(record), len(self.r))
         steps = u.duration.shape[-1]
         blocks = [
             self.discretise(map_inputs(lambda a, i=i: a[:, i : i + _EPOCHS], u))

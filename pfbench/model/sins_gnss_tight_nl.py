@@ -19,7 +19,7 @@ from pfbench.model.tight_coupling import (
     NAMES,
     TIGHT_GROUPS,
     UNITS,
-    check_ranging_inputs,
+    check_satellites,
     compute_initial_sd,
     predict_measurement,
 )
@@ -92,6 +92,7 @@ class SinsGnssTightNl(InsErrorModel):
             sensor has a Markov part.
     """
 
+    channel_names, input_type = RangingReceiver.channel_names, RangingReceiver.input_type
     r: Tensor
     names, units, groups = NAMES, UNITS, TIGHT_GROUPS
     noise_dim = 11
@@ -99,6 +100,7 @@ class SinsGnssTightNl(InsErrorModel):
 
     def __init__(self, imu: ImuErrors, receiver: RangingReceiver, initial: AlignmentErrors) -> None:
         super().__init__()
+        self.check_receiver(receiver)
         self.imu, self.clock = imu, receiver.clock
         self.register_buffer("p0", compute_initial_sd(imu, receiver.clock, initial))
         self.register_buffer("r", receiver.sd)
@@ -117,7 +119,7 @@ class SinsGnssTightNl(InsErrorModel):
     def prepare(self, record: Record) -> Record:
         if isinstance(record.u, NonlinearTightStep):
             return record
-        u = check_ranging_inputs(record, len(self.r))
+        u = check_satellites(super().prepare(record), len(self.r))
         dcm = error_dynamics.mid_interval(u.intervals).dcm
         interval = (dcm, u.pos, u.pos_start, u.pos_end, u.vel, u.w_in, u.f, u.duration)
         return record._replace(u=NonlinearTightStep(*interval, *u.sight))

@@ -17,7 +17,7 @@ from pfbench.core.record import Record
 from pfbench.model.azimuth_errors import AzimuthStep, ErrorEquations
 from pfbench.model.ins_errors import BIASES, NAVIGATION, InsErrorModel, name_ins_components
 from pfbench.nav import earth, error_dynamics
-from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
+from pfbench.nav.aiding import LOOSE_CHANNELS, AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.strapdown import InsIntervals
 
@@ -75,9 +75,11 @@ class SinsGpsAzimuth(InsErrorModel):
         biases: Whether to use 15 states instead of 9.
 
     Raises:
-        ValueError: If the factor is not positive, or with `biases` a sensor bias is 0.
+        ValueError: If the factor is not positive, with `biases` a sensor bias is 0, or the receiver
+            measures other channels.
     """
 
+    input_type = InsIntervals
     r: Tensor
     observed_indices: Tensor
 
@@ -92,6 +94,8 @@ class SinsGpsAzimuth(InsErrorModel):
         biases: bool = False,
     ) -> None:
         super().__init__()
+        self.channel_names = LOOSE_CHANNELS[: len(receiver.sd)]
+        self.check_receiver(receiver)
         if not process_noise_factor > 0.0:
             raise ValueError(
                 f"model.process_noise_factor must be positive, got {process_noise_factor}. "
@@ -133,12 +137,8 @@ class SinsGpsAzimuth(InsErrorModel):
     def prepare(self, record: Record) -> Record:
         if isinstance(record.u, AzimuthStep):
             return record
-        if not isinstance(record.u, InsIntervals):
-            raise ValueError(
-                f"record.u must be InsIntervals for SinsGpsAzimuth, "
-                f"got {type(record.u).__name__}. Choose a simulated flight."
-            )
-        u, middle = record.u, error_dynamics.mid_interval(record.u)
+        u = super().prepare(record).u
+        middle = error_dynamics.mid_interval(u)
         matrix = error_dynamics.coupling_matrix(u.pos, u.vel)
         ends = earth.metre_scale(u.pos_start), earth.metre_scale(u.pos_end)
         step = AzimuthStep(

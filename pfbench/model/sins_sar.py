@@ -101,10 +101,11 @@ class SinsSar(InsErrorModel):
         inflation: Additional process noise, or None.
 
     Raises:
-        ValueError: If a sensor is without a constant bias or has a Markov part, or
-            `rotate_noise_by_error` is combined with `inflation`.
+        ValueError: If a sensor is without a constant bias or has a Markov part, the receiver measures
+            other channels, or `rotate_noise_by_error` is combined with `inflation`.
     """
 
+    channel_names, input_type = SarSensor.channel_names, SarSensor.input_type
     r: Tensor
     density: Tensor
 
@@ -117,6 +118,7 @@ class SinsSar(InsErrorModel):
         inflation: ProcessNoiseInflation | None = None,
     ) -> None:
         super().__init__()
+        self.check_receiver(receiver)
         if imu.gyro_markov > 0 or imu.accelerometer_markov > 0:
             raise ValueError(
                 f"model.imu must have constant biases, got gyro_markov_deg_h={imu.gyro_markov_deg_h}, "
@@ -162,7 +164,7 @@ class SinsSar(InsErrorModel):
     def prepare(self, record: Record) -> Record:
         if isinstance(record.u, SarStep):
             return record
-        return record._replace(u=self.discretise(record.u))
+        return record._replace(u=self.discretise(super().prepare(record).u))
 
     def discretise(self, u: InsIntervals) -> SarStep:
         """Compute mean inputs over intervals, with the gain at the identity quaternion."""

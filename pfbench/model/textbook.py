@@ -45,6 +45,7 @@ class UnivariateGrowth(StateSpaceModel):
         ValueError: If a standard deviation is not positive.
     """
 
+    channel_names = ("square of the growth state, by 20",)
     q: Tensor
     r: Tensor
     p0: Tensor
@@ -123,6 +124,7 @@ class StochasticVolatility(StateSpaceModel):
         ValueError: If |rho| is 1 or more, or sigma is not positive.
     """
 
+    channel_names = ("return of a volatile price",)
     sigma: Tensor
     mu: Tensor
     rho: Tensor
@@ -210,6 +212,7 @@ class Benes(StateSpaceModel):
         ValueError: If an argument is not positive.
     """
 
+    channel_names = ("state of the Benes diffusion",)
     d: Tensor
     r: Tensor
 

@@ -63,28 +63,23 @@ def compute_initial_sd(imu: ImuErrors, clock: ReceiverClock, initial: AlignmentE
     return torch.cat([initial.sd, torch.tensor(sizes, dtype=torch.float64)])
 
 
-def check_ranging_inputs(record: Record, components: int) -> RangingInputs:
-    """Check the inputs of a tightly coupled model.
+def check_satellites(record: Record, components: int) -> RangingInputs:
+    """Check that the measurements are of the satellites of a tightly coupled model.
 
     Args:
-        record: Measurements and inputs.
+        record: Measurements, and inputs of the type that the model reads.
         components: Number of measurement components of the model.
 
     Returns:
         Inputs.
 
     Raises:
-        ValueError: If the inputs are of another kind, or the measurements do not fit the receiver
-            of the model.
+        ValueError: If the measurements do not fit the receiver of the model.
     """
-    if not isinstance(record.u, RangingInputs):
-        raise ValueError(
-            f"record.u must be RangingInputs (ranges), got {type(record.u).__name__}. "
-            "Choose a scenario with a RangingReceiver."
-        )
     if record.y.shape[-1] != components:
         raise ValueError(
             f"the scenario must measure the {components} components of model.receiver, "
             f"got {record.y.shape[-1]}. Give both the same satellites."
         )
-    return record.u
+    u: RangingInputs = record.u
+    return u

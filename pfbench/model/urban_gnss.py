@@ -17,10 +17,10 @@ from torch.distributions import Distribution
 from torch.nn.functional import normalize
 from typing_extensions import override
 
+from pfbench.core.channels import EACH_SATELLITE
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
 from pfbench.core.normal import normal_batch
-from pfbench.core.parameter_checks import check_positive, check_three_positive
-from pfbench.core.record import Record
+from pfbench.core.parameter_checks import check_positive, check_three_positive, check_tuning
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.pseudorange_errors import PseudorangeError, UrbanInputs
 
@@ -133,6 +133,8 @@ class UrbanGnss(StateSpaceModel):
         ValueError: If a density or standard deviation is not positive.
     """
 
+    channel_names = (f"range {EACH_SATELLITE} minus that from the local origin [m]",)
+    input_type = UrbanInputs
     density: Tensor
     p0: Tensor
     noise_dim = 8
@@ -148,6 +150,7 @@ class UrbanGnss(StateSpaceModel):
 
     def __init__(self, tuning: UrbanTuning, range_error: PseudorangeError) -> None:
         super().__init__()
+        check_tuning(tuning, UrbanTuning)
         self.register_buffer("density", tuning.density)
         self.register_buffer("p0", tuning.initial_sd)
         self.range_error = range_error
@@ -163,20 +166,6 @@ class UrbanGnss(StateSpaceModel):
     @override
     def chart(self) -> Chart:
         return _CHART
-
-    @override
-    def prepare(self, record: Record) -> Record:
-        """Return the record after a check of its inputs.
-
-        Raises:
-            ValueError: If the inputs are not `UrbanInputs`.
-        """
-        if not isinstance(record.u, UrbanInputs):
-            raise ValueError(
-                "The inputs of UrbanGnss must be UrbanInputs, "
-                f"got {type(record.u).__name__}. Choose scenario=recorded_berlin."
-            )
-        return record
 
     @override
     def initial(self, runs: int) -> Distribution:

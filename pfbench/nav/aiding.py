@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.channels import name_channels
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels, fix_channels
 from pfbench.nav import earth
@@ -18,6 +19,9 @@ from pfbench.nav.imu_errors import DEG_H, UG
 from pfbench.nav.strapdown import InsIntervals
 
 ARCMIN = math.pi / 180.0 / 60.0
+POSITION_DIFFERENCES = name_channels("INS minus measured position", ("North", "East", "Up"), "m")
+VELOCITY_DIFFERENCES = name_channels("INS minus measured velocity", ("East", "North", "Up"), "m/s")
+LOOSE_CHANNELS = (*POSITION_DIFFERENCES, *VELOCITY_DIFFERENCES)
 
 
 class FlightSolution(NamedTuple):
@@ -56,7 +60,10 @@ class AidingData:
 
 
 class AidingSensor(Protocol):
-    """Instruments that aid an INS."""
+    """Instruments that aid an INS.
+
+    One that states `channel_names` and `input_type` (`pfbench.core.channels`) is compared with the model.
+    """
 
     @property
     def channels(self) -> MeasurementChannels:
@@ -98,9 +105,15 @@ class GnssReceiver(AidingSensor):
 
     position_sd: Sequence[float]
     velocity_sd: Sequence[float] | None = None
+    input_type = InsIntervals
 
     def __post_init__(self) -> None:
         _ = self.sd
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the measured differences, [3] or [6]."""
+        return LOOSE_CHANNELS[: len(self.sd)]
 
     @property
     def sd(self) -> Tensor:

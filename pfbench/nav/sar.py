@@ -12,8 +12,9 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.nav import earth
-from pfbench.nav.aiding import AidingData, AidingSensor, FlightSolution
+from pfbench.nav.aiding import POSITION_DIFFERENCES, AidingData, AidingSensor, FlightSolution
 from pfbench.nav.imu_errors import DEG_H
+from pfbench.nav.strapdown import InsIntervals
 
 _DEG = DEG_H * 3600.0
 _KINDS = ("angle", "position", "position", "position")
@@ -41,6 +42,8 @@ class SarSensor(AidingSensor):
     heading_sd_deg: float = 0.05
     position_sd: Sequence[float] = (20.0, 20.0)
     height_sd: float = 10.0
+    channel_names = ("INS minus measured heading [rad]", *POSITION_DIFFERENCES)
+    input_type = InsIntervals
 
     def __post_init__(self) -> None:
         if len(self.position_sd) != 2:

@@ -102,7 +102,7 @@ def check_unit_process(noise: NoiseRegime, time: Tensor) -> None:
     if bool((noise.process_factors(time) != 1.0).any()):
         raise ValueError(
             "noise must not change the process noise of a scenario with recorded sensors. "
-            "Set noise.process_variance_factors to 1, or choose a simulated scenario."
+            "Set noise.process_variance_factors=[1.0,1.0], or choose a simulated scenario."
         )
 
 

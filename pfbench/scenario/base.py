@@ -11,7 +11,12 @@ from pfbench.noise.base import NoiseRegime
 
 
 class Scenario(Protocol):
-    """Generator of episodes, independent of the filters."""
+    """Generator of episodes, independent of the filters.
+
+    It may state what it provides, which is then compared with the model (`pfbench.core.channels`):
+    `channel_names`, the quantity, frame and unit of each component of y, and `input_type`, the NamedTuple
+    of the inputs u.
+    """
 
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         """Draw the episode of some runs.

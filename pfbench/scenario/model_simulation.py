@@ -21,7 +21,7 @@ from pfbench.core.simulate import (
     is_independent_normal,
     simulate_steps,
 )
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import StateSpaceModel, named_inputs
 from pfbench.noise.base import NoiseRegime, process_variance_factors
 from pfbench.noise.white import NominalNoise
 from pfbench.scenario.base import Scenario
@@ -49,6 +49,12 @@ class ModelSimulation(Scenario):
     model: StateSpaceModel
     steps: int
     interval_s: float = 1.0
+    input_type = tuple  # no inputs
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Measured channels: those of the model."""
+        return self.model.channel_names
 
     def __post_init__(self) -> None:
         if not isinstance(self.steps, int) or self.steps < 1:
@@ -66,9 +72,11 @@ class ModelSimulation(Scenario):
         model, stream = self.model, PhiloxStream(seed, runs)
         time = self.interval_s * torch.arange(1, self.steps + 1, dtype=torch.float64)
         blank = torch.full((len(runs), self.steps, 1), torch.nan, dtype=torch.float64)
-        inputs, scale = model.prepare(Record(blank)), process_variance_factors(noise, time).sqrt()
         x = draw_initial_state(model, model.initial(len(runs)), stream, "world.state")
-        steps = list(simulate_steps(model, inputs, stream, x, "world.state", scale))
+        with named_inputs(model):
+            inputs = model.prepare(Record(blank))
+            scale = process_variance_factors(noise, time).sqrt()
+            steps = list(simulate_steps(model, inputs, stream, x, "world.state", scale))
         y = _measurements(self.model, [step.distribution for step in steps], noise, stream, time)
         states = torch.cat([step.x for step in steps], 1)
         truth = {name: states[..., list(indices)] for name, indices in model.groups.items()}

@@ -14,6 +14,7 @@ from pfbench.core.chart import wrap_angle
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.passive_location import (
+    PassiveLocation,
     PlatformInputs,
     compute_level_attitude,
     predict_bearing,
@@ -86,6 +87,7 @@ class PassiveLocationScenario(Scenario):
     doppler_includes_acceleration: bool = False
     emitter_prior: EmitterPrior = field(default_factory=LinearisedEmitterPrior)
     randomise_emitter: bool = False
+    channel_names, input_type = PassiveLocation.channel_names, PlatformInputs
 
     def __post_init__(self) -> None:
         sizes = {

@@ -56,6 +56,18 @@ class SimulatedFlight(Scenario):
     cache_dir: str | None = None
     closed_loop: bool = False
 
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Measured channels: those of the receiver. Empty if it does not state them."""
+        names: tuple[str, ...] = getattr(self.receiver, "channel_names", ())
+        return names
+
+    @property
+    def input_type(self) -> type | None:
+        """Type of the inputs that the receiver passes on. None if it does not state them."""
+        kind: type | None = getattr(self.receiver, "input_type", None)
+        return kind
+
     def __post_init__(self) -> None:
         samples = self.imu_rate_hz * self.filter_interval_s
         if samples < 2 or abs(samples / 2 - round(samples / 2)) > 1e-9:

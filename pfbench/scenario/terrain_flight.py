@@ -12,7 +12,7 @@ from pfbench.core.parameter_checks import check_positive
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.terrain.random_terrain import RandomTerrain, compute_elevation
-from pfbench.model.terrain.terrain_aided import TerrainInputs
+from pfbench.model.terrain.terrain_aided import TerrainAided, TerrainInputs
 from pfbench.nav import earth
 from pfbench.nav.trajectory import TrajectorySource
 from pfbench.noise.base import NoiseRegime, process_variance_factors
@@ -52,6 +52,7 @@ class TerrainFlight(Scenario):
     measurement_sd: float
     interval_s: float = 1.0
     cache_dir: str | None = None
+    channel_names, input_type = TerrainAided.channel_names, TerrainInputs
 
     def __post_init__(self) -> None:
         for name in ("initial_sd", "drift", "measurement_sd", "interval_s"):

@@ -126,8 +126,8 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "a model without its scenario": (
         ("model=ins_gnss",),
         (
-            "model.imu must be set, since scenario.imu does not exist",
-            "model.imu=... or choose a scenario that defines imu",
+            "model.imu is read from scenario.imu, which this scenario does not have",
+            "Scenarios of a model: pfbench list scenario model=NAME",
         ),
     ),
     "a key through another": (
@@ -371,6 +371,21 @@ def test_list_of_a_group_says_what_each_one_is(tmp_path: Path) -> None:
     assert said.code == 0
     assert "sir                      SIR: bootstrap particle filter" in said.out
     assert len(said.out.splitlines()) == len(list((job.conf_dir() / "filter").glob("*.yaml")))
+
+
+def test_list_of_the_models_that_fit_a_recorded_scenario(tmp_path: Path) -> None:
+    said = pfbench("list", "model", "scenario=recorded_berlin", home=tmp_path)
+    assert said.code == 0, said.err
+    assert [line.split()[0] for line in said.out.splitlines()] == [
+        "urban_gnss",
+        "urban_gnss_mixture",
+    ]
+
+
+def test_list_of_what_fits_needs_the_other_part(tmp_path: Path) -> None:
+    said = pfbench("list", "filter", "scenario=growth", home=tmp_path)
+    assert said.code == 2
+    assert "words must be pfbench list filter, got scenario=growth" in said.err
 
 
 def test_list_of_no_group(tmp_path: Path) -> None:

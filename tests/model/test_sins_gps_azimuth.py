@@ -500,7 +500,7 @@ def test_error_is_corrected_minus_true(worlds: Episode) -> None:
         ),
         (
             lambda: model_of().prepare(Record(torch.zeros(1, 1, 6))),
-            r"record\.u must be .*got tuple.*Choose a simulated flight",
+            r"record\.u must be InsIntervals .*got no inputs\. Choose a scenario",
         ),
     ],
 )

@@ -156,11 +156,11 @@ def test_what_does_not_fit_is_refused() -> None:
     u = inputs(2)
     with pytest.raises(
         ValueError,
-        match=r"must be PreintegratedImu with 10 measured components .*got PreintegratedImu with 6",
+        match=r"must measure the 10 components of StrapdownAided .*got 6",
     ):
         MODEL.prepare(Record(torch.zeros(1, 2, 6), u))
     with pytest.raises(
-        ValueError, match=r"record must be .*got tuple .*scenario=recorded_fixed_wing_aided"
+        ValueError, match=r"record\.u must be PreintegratedImu for StrapdownAided, got no inputs"
     ):
         MODEL.prepare(Record(torch.zeros(1, 2, 10)))
     for changes, words in (

@@ -347,7 +347,7 @@ def test_impossible_settings_name_their_key(make: Callable[[], object], message:
 
 def test_inputs_of_another_scenario_are_refused() -> None:
     with pytest.raises(
-        ValueError, match=r"must be UrbanInputs, got tuple. Choose scenario=recorded_berlin"
+        ValueError, match=r"must be UrbanInputs for UrbanGnss, got no inputs\. Choose a scenario"
     ):
         model().prepare(Record(torch.zeros(1, 1, 3)))
 

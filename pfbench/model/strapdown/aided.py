@@ -15,10 +15,11 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from pfbench.core.channels import name_channels
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
 from pfbench.core.manifold.group_block import LieGroupBlock
 from pfbench.core.normal import independent_normal, normal_batch
-from pfbench.core.parameter_checks import check_positive
+from pfbench.core.parameter_checks import check_positive, check_tuning
 from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.strapdown.total import StrapdownTotal
@@ -26,6 +27,10 @@ from pfbench.model.strapdown.tuning import AidedTuning
 from pfbench.nav.preintegration import PreintegratedImu, rotate
 
 _MOTION, _BIASES = 16, 4
+INSTRUMENT_CHANNELS = (
+    "pressure height above the start [m]",
+    *name_channels("magnetic field in body axes", ("right", "forward", "up"), "gauss"),
+)
 _DRIVEN = StrapdownTotal.noise_dim
 _CHART = Chart((QuaternionBlock(), EuclideanBlock(_MOTION - 4 + _BIASES)))
 
@@ -51,6 +56,7 @@ class StrapdownAided(StateSpaceModel):
             numbers or is zero.
     """
 
+    input_type = PreintegratedImu
     p0: Tensor
     r: Tensor
     magnetic_field_gauss: Tensor
@@ -59,8 +65,10 @@ class StrapdownAided(StateSpaceModel):
 
     def __init__(self, tuning: AidedTuning) -> None:
         super().__init__()
+        check_tuning(tuning, AidedTuning)
         north, east, down = _field(tuning.magnetic_field_gauss)
         self.motion = StrapdownTotal(tuning.motion)
+        self.channel_names = (*self.motion.channel_names, *INSTRUMENT_CHANNELS)
         self.register_buffer("p0", torch.cat([tuning.motion.initial_sd, tuning.bias_sd]))
         self.register_buffer("r", tuning.measurement_sd)
         self.register_buffer("magnetic_field_gauss", self.p0.new_tensor([east, north, -down]))
@@ -110,12 +118,12 @@ class StrapdownAided(StateSpaceModel):
 
     @override
     def prepare(self, record: Record) -> Record:
-        if not isinstance(record.u, PreintegratedImu) or record.y.shape[-1] != len(self.r):
+        record = super().prepare(record)
+        if record.y.shape[-1] != len(self.r):
             raise ValueError(
-                f"record must be PreintegratedImu with {len(self.r)} measured components "
-                f"(a fix, a height, a field) for StrapdownAided, got {type(record.u).__name__} with "
-                f"{record.y.shape[-1]}. Choose scenario=recorded_fixed_wing_aided, and set velocity_sd of "
-                "tuning.motion and of the receiver both to three numbers or both to null."
+                f"the scenario must measure the {len(self.r)} components of StrapdownAided (a fix, a height, "
+                f"a field), got {record.y.shape[-1]}. Choose scenario=recorded_fixed_wing_aided, and set "
+                "velocity_sd of tuning.motion and of the receiver both to three numbers or both to null."
             )
         return record
 

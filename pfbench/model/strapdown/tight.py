@@ -15,11 +15,11 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from pfbench.core.channels import EACH_SATELLITE
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
 from pfbench.core.manifold.group_block import LieGroupBlock
 from pfbench.core.normal import independent_normal, normal_batch
-from pfbench.core.parameter_checks import check_positive
-from pfbench.core.record import Record
+from pfbench.core.parameter_checks import check_positive, check_tuning
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.strapdown.total import StrapdownTotal
 from pfbench.model.strapdown.tuning import TightTuning
@@ -83,12 +83,18 @@ class StrapdownTight(StateSpaceModel):
         ValueError: If a density or standard deviation is not positive.
     """
 
+    channel_names = (
+        f"range {EACH_SATELLITE} minus that from the local origin [m]",
+        f"range rate {EACH_SATELLITE} minus that from the local origin [m/s]",
+    )
+    input_type = TightMemsInputs
     p0: Tensor
     other_walk: Tensor
     noise_dim = _DRIVEN + _CLOCK
 
     def __init__(self, tuning: TightTuning) -> None:
         super().__init__()
+        check_tuning(tuning, TightTuning)
         self.motion = StrapdownTotal(tuning.motion)
         self.clock, self.range, self.rate = tuning.clock, tuning.range, tuning.rate
         self.register_buffer("p0", torch.cat([tuning.motion.initial_sd, tuning.clock_sd]))
@@ -128,16 +134,6 @@ class StrapdownTight(StateSpaceModel):
     @override
     def origin(self) -> Tensor:
         return torch.cat([self.motion.origin, self.p0.new_zeros(_CLOCK)])
-
-    @override
-    def prepare(self, record: Record) -> Record:
-        if not isinstance(record.u, TightMemsInputs):
-            kind = type(record.u).__name__
-            raise ValueError(
-                f"record.u must be TightMemsInputs for StrapdownTight, got {kind}. "
-                "Choose a scenario with raw ranges (walk)."
-            )
-        return record
 
     @override
     def initial(self, runs: int) -> Distribution:

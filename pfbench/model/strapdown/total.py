@@ -14,18 +14,21 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core import quaternion
+from pfbench.core.channels import name_channels
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
 from pfbench.core.manifold.group_block import LieGroupBlock
 from pfbench.core.normal import independent_normal, normal_batch
-from pfbench.core.parameter_checks import check_positive
+from pfbench.core.parameter_checks import check_positive, check_tuning
 from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import StateSpaceModel, check_truth_sizes
 from pfbench.model.ins_errors import name_components
 from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.nav.preintegration import PreintegratedImu, rotate
 
 _SIZES = (4, 3, 3, 3, 3)  # quaternion, velocity, position, gyro bias, accelerometer bias
 _CHART = Chart((QuaternionBlock(), EuclideanBlock(12)))
+_AXES = ("East", "North", "Up")
+FIX_CHANNELS = (*name_channels("position", _AXES, "m"), *name_channels("velocity", _AXES, "m/s"))
 
 
 class StrapdownTotal(StateSpaceModel):
@@ -53,6 +56,7 @@ class StrapdownTotal(StateSpaceModel):
         ValueError: If a density or standard deviation is not positive.
     """
 
+    input_type = PreintegratedImu
     density: Tensor
     r: Tensor
     p0: Tensor
@@ -66,6 +70,7 @@ class StrapdownTotal(StateSpaceModel):
 
     def __init__(self, tuning: StrapdownTuning) -> None:
         super().__init__()
+        check_tuning(tuning, StrapdownTuning)
         density = {
             "gyro_density": tuning.gyro_density,
             "accelerometer_density": tuning.accelerometer_density,
@@ -75,6 +80,7 @@ class StrapdownTotal(StateSpaceModel):
         roots = [check_positive(f"tuning.{name}", [value] * 3) for name, value in density.items()]
         self.register_buffer("density", torch.cat(roots))
         self.register_buffer("r", tuning.measurement_sd)
+        self.channel_names = FIX_CHANNELS[: len(self.r)]
         self.register_buffer("p0", tuning.initial_sd)
         axes = {
             "attitude": (("pitch", "roll", "yaw"), "rad"),
@@ -113,12 +119,7 @@ class StrapdownTotal(StateSpaceModel):
 
     @override
     def prepare(self, record: Record) -> Record:
-        if not isinstance(record.u, PreintegratedImu):
-            kind = type(record.u).__name__
-            raise ValueError(
-                f"record.u must be PreintegratedImu for StrapdownTotal, got {kind}. "
-                "Choose a recorded scenario."
-            )
+        record = super().prepare(record)
         if record.y.shape[-1] != len(self.r):
             raise ValueError(
                 f"the scenario must measure the {len(self.r)} components of tuning.position_sd "
@@ -163,6 +164,8 @@ class StrapdownTotal(StateSpaceModel):
 
     @override
     def assemble(self, truth: dict[str, Tensor]) -> Tensor:
+        sizes = dict(zip(self.groups, _SIZES, strict=True))
+        check_truth_sizes(truth, sizes)
         values = [truth[name] for name in self.groups if name in truth]
         if not values:
             raise ValueError(
@@ -172,6 +175,6 @@ class StrapdownTotal(StateSpaceModel):
         missing = values[0].new_full((*values[0].shape[:-1], 1), torch.nan)
         blocks = [
             truth.get(name, missing.expand(*missing.shape[:-1], size))
-            for name, size in zip(self.groups, _SIZES, strict=True)
+            for name, size in sizes.items()
         ]
         return torch.cat(blocks, -1)

@@ -53,6 +53,8 @@ class TerrainAided(StateSpaceModel):
             IEEE Control Systems Magazine.
     """
 
+    channel_names = ("height of the terrain below [m]",)
+    input_type = TerrainInputs
     wave_vector: Tensor
     amplitude: Tensor
     phase: Tensor

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.channels import EACH_SATELLITE
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.nav.aiding import AidingData, AidingSensor, FlightSolution
@@ -89,6 +90,11 @@ class RangingReceiver(AidingSensor):
     mask_deg: float = 10.0
     satellites: Sequence[str] | None = None
     sagnac: bool = False
+    channel_names = (
+        f"INS minus measured range {EACH_SATELLITE} [m]",
+        f"INS minus measured range rate {EACH_SATELLITE} [m/s]",
+    )
+    input_type = RangingInputs
 
     def __post_init__(self) -> None:
         for name, size in (("pseudorange_sd", self.pseudorange_sd), ("rate_sd", self.rate_sd)):

@@ -13,7 +13,9 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels
+from pfbench.model.strapdown.aided import INSTRUMENT_CHANNELS
 from pfbench.model.strapdown.tuning import AidedTuning
+from pfbench.nav.preintegration import PreintegratedImu
 from pfbench.noise.base import NoiseRegime, check_unit_process
 from pfbench.noise.white import NominalNoise
 from pfbench.scenario.base import Scenario, check_added_sd
@@ -94,6 +96,12 @@ class RecordedAidedFlight(Scenario):
     flight: RecordedDrive
     tuning: AidedTuning
     instruments: BaroMagSensors
+    input_type = PreintegratedImu
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Measured channels: those of the fixes, then those of the instruments."""
+        return (*self.flight.channel_names, *INSTRUMENT_CHANNELS)
 
     def input_files(self) -> list[Path]:
         """List the files that `draw` reads."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record, fix_channels
-from pfbench.model.strapdown.total import StrapdownTotal
+from pfbench.model.strapdown.total import FIX_CHANNELS, StrapdownTotal
 from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.nav.preintegration import PreintegratedImu, preintegrate
 from pfbench.noise.base import NoiseRegime, check_unit_process
@@ -48,6 +48,11 @@ class FixReceiver:
                     f"scenario.receiver.{name} must be 3 numbers of at least 0, got {list(sd)}. "
                     "Set East, North and Up, with 0 for no added errors."
                 )
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the measured components, [3] or [6]."""
+        return FIX_CHANNELS[: len(self.sd)]
 
     @property
     def channels(self) -> MeasurementChannels:

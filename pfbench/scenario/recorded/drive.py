@@ -18,6 +18,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
 from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.nav.preintegration import PreintegratedImu
 from pfbench.noise.base import NoiseRegime
 from pfbench.scenario.base import Scenario, check_duration
 from pfbench.scenario.recorded.assembly import FixReceiver, assemble
@@ -65,6 +66,12 @@ class RecordedDrive(Scenario):
     origin: Sequence[float] | None = None
     limits: PlausibleLimits | None = None
     holdout: FixHoldout | None = None
+    input_type = PreintegratedImu
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Measured channels: those of the fixes."""
+        return self.receiver.channel_names
 
     def __post_init__(self) -> None:
         check_duration("scenario.filter_step_s", self.filter_step_s)
@@ -146,6 +153,12 @@ class RecordedFlights(Scenario):
     files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
     origin: Sequence[float] | None = None
     limits: PlausibleLimits | None = None
+    input_type = PreintegratedImu
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Measured channels: those of the fixes."""
+        return self.receiver.channel_names
 
     def __post_init__(self) -> None:
         check_duration("scenario.filter_step_s", self.filter_step_s)

@@ -17,6 +17,7 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
+from pfbench.model.strapdown.tight import StrapdownTight
 from pfbench.model.strapdown.tuning import TightTuning
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.noise.base import NoiseRegime, check_unit_process
@@ -120,6 +121,7 @@ class RecordedWalk(Scenario):
     files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
     origin: Sequence[float] | None = None
     limits: PlausibleLimits | None = None
+    channel_names, input_type = StrapdownTight.channel_names, StrapdownTight.input_type
 
     def __post_init__(self) -> None:
         check_duration("scenario.filter_step_s", self.filter_step_s)

@@ -92,6 +92,7 @@ class UrbanDrive(Scenario):
     start_s: float | None = None
     end_s: float | None = None
     limits: PlausibleLimits | None = None
+    channel_names, input_type = UrbanGnss.channel_names, UrbanGnss.input_type
 
     def input_files(self) -> list[Path]:
         """List the files that `draw` reads."""

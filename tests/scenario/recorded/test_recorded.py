@@ -24,7 +24,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     TaylorLinearisation,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.job.plan import instantiate
+from pfbench.job import instantiate
 from pfbench.model.strapdown.total import StrapdownTotal
 from pfbench.nav.preintegration import PreintegratedImu
 from pfbench.noise.outage import MeasurementOutage

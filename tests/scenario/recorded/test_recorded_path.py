@@ -18,7 +18,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
-from pfbench.job.plan import instantiate
+from pfbench.job import instantiate
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.nav import attitude, earth
 from pfbench.noise.white import NominalNoise
