@@ -1,0 +1,154 @@
+"""What surrounds a command: outputs that may close while it works, and signals that end it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from pfbench.files.work_start import has_work_started
+
+_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+_PARENT_CHECK = 1.0  # s, between two looks whether the process of the sweep lives
+
+
+class SignalStop(BaseException):
+    """A signal ends the command. It passes all handlers of errors, as KeyboardInterrupt does.
+
+    Attributes:
+        number: Number of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class LastingOutput:
+    """Output stream that a command can write to after its reader is gone or its disk is full.
+
+    Attributes:
+        error: First error of the stream, None while it works. What is written after it is lost.
+    """
+
+    def __init__(self, stream: Any, *, is_quiet: bool = False) -> None:
+        self._stream, self._is_quiet = stream, is_quiet
+        self.error: OSError | None = None
+
+    def write(self, text: str) -> int:
+        """Write a text."""
+        if self.error is None:
+            try:
+                return int(self._stream.write(text))
+            except OSError as error:
+                self._leave(error)
+        return len(text)
+
+    def flush(self) -> None:
+        """Write what is buffered."""
+        if self.error is None:
+            try:
+                self._stream.flush()
+            except OSError as error:
+                self._leave(error)
+
+    def _leave(self, error: OSError) -> None:
+        """Send all that follows to nowhere, what Python flushes at its end included."""
+        self.error = error
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+        if has_work_started() and not self._is_quiet:
+            print(
+                f"note: the output cannot be written any longer ({error.strerror}). The command goes on without it",
+                file=sys.stderr,
+            )
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def lasting_outputs() -> Iterator[LastingOutput]:
+    """Replace the outputs of the process by lasting ones, and restore them and the handlers of the log.
+
+    Yields:
+        The standard output.
+    """
+    streams, root = (sys.stdout, sys.stderr), logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    out = LastingOutput(_opened(sys.stdout))
+    sys.stdout, sys.stderr = out, LastingOutput(_opened(sys.stderr), is_quiet=True)  # type: ignore[assignment]
+    try:
+        yield out
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        sys.stdout, sys.stderr = streams
+        root.handlers[:], root.level = handlers, level  # Hydra's write to streams that may close
+
+
+def _opened(stream: Any) -> Any:
+    """Return a stream that can write each character; one to nowhere if the process has none."""
+    if stream is None:
+        return open(os.devnull, "w")
+    with contextlib.suppress(AttributeError, OSError):  # a word may have bytes that are no text
+        stream.reconfigure(errors="backslashreplace")
+    return stream
+
+
+@contextlib.contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """Raise SignalStop for the signals that end a process, unless the program around handles or ignores them."""
+
+    def stop(number: int, frame: object) -> None:
+        for each in taken:
+            signal.signal(each, signal.SIG_IGN)  # a second one must not interrupt the tidying
+        raise SignalStop(number)
+
+    taken: list[int] = []
+    if threading.current_thread() is threading.main_thread():
+        taken += [each for each in _SIGNALS if signal.getsignal(each) == signal.SIG_DFL]
+    for each in taken:
+        signal.signal(each, stop)
+    try:
+        yield
+    finally:
+        for each in taken:
+            signal.signal(each, signal.SIG_DFL)
+
+
+def stop_workers() -> None:
+    """End the processes of the launchers joblib and Ray, which would go on without the sweep."""
+    if "joblib" in sys.modules:
+        from joblib.externals.loky import reusable_executor
+
+        if (executor := reusable_executor._executor) is not None:
+            executor.shutdown(wait=True, kill_workers=True)
+    if "ray" in sys.modules:
+        sys.modules["ray"].shutdown()
+
+
+def end_with_parent() -> None:
+    """End this process when the process of its sweep is gone, if it is a worker of joblib.
+
+    The sweep may be killed without a word: a worker would go on for the rest of its job.
+    """
+    parent = os.getppid()
+    name = f"watch of {parent}"
+    is_watched = any(thread.name == name for thread in threading.enumerate())
+    if multiprocessing.current_process().name == "MainProcess" or is_watched:
+        return
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_PARENT_CHECK)
+        os._exit(1)
+
+    threading.Thread(target=watch, name=name, daemon=True).start()
