@@ -49,7 +49,9 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
     if isinstance(error, MemoryError):
         return "memory must be enough for the command, got an array that is too large. Reduce runs, particles or steps."
     text = f"{error}".strip() or type(error).__name__
-    if match := re.search(r"Could not override '([^']+)'", text):
+    if match := re.search(r"Could not override '([^']*)'", text):
+        if not match[1]:
+            return "each word must be key=value, got one without a key. Write the key before the equals sign."
         if match[1] == "experiment":
             name = next((w.partition("=")[2] for w in words if w.startswith("experiment=")), "NAME")
             return f"experiment={name} must be added with a plus sign. Use +experiment={name}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,17 @@ def hash_user_code(values: Any) -> str:
     for name, source in sorted(files.items()):
         sha256.update(f"{name} {len(source)};".encode() + source)
     return sha256.hexdigest()[:16]
+
+
+def list_user_packages(values: Any, trusted: Sequence[str]) -> list[str]:
+    """List the trusted packages that define a class of a configuration.
+
+    Args:
+        values: Resolved configuration.
+        trusted: Packages that the user trusts.
+    """
+    targets = list(_user_targets(values))
+    return [name for name in trusted if any(t.startswith(f"{name}.") for t in targets)]
 
 
 def _user_targets(node: Any) -> Iterator[str]:

@@ -12,6 +12,8 @@ import numpy as np
 from torch import Tensor
 
 from pfbench.config.composition import CHOICES, JobConfig, resolve_config
+from pfbench.config.source_digest import hash_user_code, list_user_packages
+from pfbench.config.trust import trusted_packages
 from pfbench.core.record import Episode
 from pfbench.files.atomic_write import set_aside
 from pfbench.files.work_start import start_work
@@ -87,7 +89,7 @@ def run(
         return outcome
     meta, outputs = _compute_or_note(config, name, path, announce, is_alone=not counter)
     head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
-    store.write_result(path, {**head, **meta}, outputs)
+    store.write_result(path, {**head, **describe_user_code(config), **meta}, outputs)
     outcome = JobOutcome(path, "finished", main_rmse(outputs, meta))
     seconds = meta["seconds"]
     log.info(
@@ -99,6 +101,20 @@ def run(
         1e3 * seconds["per_step"],
     )
     return outcome
+
+
+def describe_user_code(config: JobConfig) -> dict[str, Any]:
+    """Return the metadata `trusted`: packages of a user that a job needs, and a digest of their source.
+
+    Empty if all classes are of pfbench.
+
+    Args:
+        config: Configuration of the job.
+    """
+    values = {name: config.values.get(name) for name in CHOICES}
+    packages = list_user_packages(values, (*config.trusted, *trusted_packages()))
+    names = list(dict.fromkeys(packages))
+    return {"trusted": {"packages": names, "code": hash_user_code(values)}} if names else {}
 
 
 def _compute_or_note(

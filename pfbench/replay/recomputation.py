@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from pfbench.config.composition import CHOICES, JobConfig
+from pfbench.config.source_digest import hash_user_code
+from pfbench.config.trust import UntrustedConfigError, trusted_packages
 from pfbench.job.plan import build_plan
 from pfbench.job.run_job import compute_job
 from pfbench.replay.run_selection import StoredRun
@@ -52,7 +54,7 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
         The configuration.
 
     Raises:
-        ValueError: If the result was not computed by a job.
+        ValueError: If the result was not computed by a job, or the packages of its classes are not trusted.
     """
     parts = ("scenario", "noise", "filter", "model")
     values = copy.deepcopy(meta["config"])
@@ -73,7 +75,30 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
     if "root" in values["scenario"] and values["scenario"]["root"] is not None:
         values["scenario"]["root"] = values["data"]["root"]
     _replace_cache_folders(values["scenario"], values["episode_cache_dir"])
-    return JobConfig(values, {group: str(meta["choices"][group]) for group in CHOICES})
+    trusted = trusted_packages()
+    packages = (meta.get("trusted") or {}).get("packages", [])
+    if not set(packages) <= set(trusted):
+        given = f"trust=[{','.join(trusted)}]" if trusted else "none of them"
+        raise UntrustedConfigError(
+            f"trust must name the packages whose classes the run used, {', '.join(packages)}, got {given}. Nothing was "
+            f"run. If you still trust them, add trust=[{','.join(packages)}] to the command."
+        )
+    return JobConfig(
+        values, {group: str(meta["choices"][group]) for group in CHOICES}, trusted=trusted
+    )
+
+
+def describe_changed_code(meta: Mapping[str, Any]) -> str:
+    """Describe that the classes of a user are no longer those of a stored job; empty if they are.
+
+    Args:
+        meta: Metadata of the job, whose packages are trusted.
+    """
+    stored = meta.get("trusted")
+    if not stored or stored["code"] == hash_user_code({k: meta["config"].get(k) for k in CHOICES}):
+        return ""
+    names = ", ".join(stored["packages"])
+    return f"the code of {names} has changed since {meta['label']} was run: its numbers may differ"
 
 
 def _replace_cache_folders(node: Any, folder: str | None) -> None:
