@@ -93,7 +93,9 @@ def _time_study(
             rest -= estimate_time(condition, rounds, seconds)
             measured[key] = time_condition(condition, changes, rounds, seconds)
             changed = {describe_changed_code(job.meta) for job in condition.jobs} - {""}
-            print(*(f"note: {text}" for text in sorted(changed)), sep="\n", end="\n" * bool(changed))
+            print(
+                *(f"note: {text}" for text in sorted(changed)), sep="\n", end="\n" * bool(changed)
+            )
             write_step_times(folder, measured)
         jobs, steps = measured[key]["jobs"], measured[key]["steps"]
         used = len(next(iter(jobs.values()))["cpu"])

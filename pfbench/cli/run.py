@@ -67,6 +67,8 @@ def run_jobs(words: Sequence[str]) -> None:
     first = check_words([*flags, *overrides])
     is_printed = any(word.partition("=")[0] in _PRINTING_FLAGS for word in words)
     plan = None if is_printed else plan_or_none(overrides, first)
+    if plan and flags:
+        plan.check_comparable()
     if plan and wants_until_decided(plan):
         check_has_sweep(flags)
         sweep = GrowingSweep.from_plan(plan)

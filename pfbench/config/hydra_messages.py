@@ -7,7 +7,12 @@ from collections.abc import Sequence
 
 
 # how Hydra's parser begins its errors
-_GRAMMAR = ("mismatched input", "extraneous input", "no viable alternative", "token recognition error")
+_GRAMMAR = (
+    "mismatched input",
+    "extraneous input",
+    "no viable alternative",
+    "token recognition error",
+)
 
 
 def format_value_error(text: str) -> str:
