@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-
 # how Hydra's parser begins its errors
 _GRAMMAR = (
     "mismatched input",

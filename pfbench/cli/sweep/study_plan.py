@@ -13,7 +13,6 @@ from pfbench.config.composition import JobConfig, compose
 from pfbench.config.paper_block import PAPER
 from pfbench.config.sweep_check import expand_sweep
 
-
 # keys that are equal in all jobs of a condition, and how several values are run
 _EQUAL_KEYS = {
     "seed": "Use more runs of one seed (runs=200), or one study for each seed: study=mine_1 seed=1, then study=mine_2 seed=2.",
