@@ -11,7 +11,7 @@ from importlib import import_module
 import pfbench
 from pfbench.cli.messages import format_error, notes_of, suggest_similar
 from pfbench.cli.terminal import SignalStop, lasting_outputs, stop_workers, stopped_by_signals
-from pfbench.cli.unknown_errors import is_named, keep_trace
+from pfbench.cli.unknown_errors import describe_unknown, keep_trace
 from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import ENVIRONMENT, split_trust
 from pfbench.files.rare_collections import collect_as_usual
@@ -131,9 +131,10 @@ def _run_command(command: str, options: Sequence[str]) -> None:
 
 def _report(command: str, words: Sequence[str], error: Exception) -> None:
     """Print the sentence of an error, its notes, and where its trace is."""
-    print(f"\nerror {command}: {format_error(error, words)}", file=sys.stderr)
-    notes = notes_of(error)
-    if not is_named(error) and not any(note.startswith("traceback: ") for note in notes):
+    message, notes = format_error(error, words), notes_of(error)
+    print(f"\nerror {command}: {message}", file=sys.stderr)
+    is_unknown = message.startswith(describe_unknown(error))
+    if is_unknown and not any(note.startswith("traceback: ") for note in notes):
         trace = keep_trace(error, [command, *words])
         notes += [f"traceback: {trace}"] if trace else []
     for note in notes:

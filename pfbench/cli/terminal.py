@@ -16,6 +16,7 @@ from typing import Any
 from pfbench.files.work_start import has_work_started
 
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+_WATCH = "watch of the sweep"  # name of a thread
 _PARENT_CHECK = 1.0  # s, between two looks whether the process of the sweep lives
 
 
@@ -140,15 +141,13 @@ def end_with_parent() -> None:
 
     The sweep may be killed without a word: a worker would go on for the rest of its job.
     """
-    parent = os.getppid()
-    name = f"watch of {parent}"
-    is_watched = any(thread.name == name for thread in threading.enumerate())
-    if multiprocessing.current_process().name == "MainProcess" or is_watched:
+    parent = multiprocessing.parent_process()
+    if parent is None or any(thread.name == _WATCH for thread in threading.enumerate()):
         return
 
     def watch() -> None:
-        while os.getppid() == parent:
+        while os.getppid() == parent.pid:
             time.sleep(_PARENT_CHECK)
         os._exit(1)
 
-    threading.Thread(target=watch, name=name, daemon=True).start()
+    threading.Thread(target=watch, name=_WATCH, daemon=True).start()
