@@ -63,7 +63,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         try:
             _dispatch(words)
         except (KeyboardInterrupt, SignalStop) as stop:
-            stop_workers()
             number = stop.number if isinstance(stop, SignalStop) else signal.SIGINT
             print(
                 f"\nEnded by {signal.Signals(number).name}. Finished jobs are kept. Repeat the command to resume.",
@@ -71,6 +70,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             )
             raise SystemExit(128 + number) from None
         finally:
+            stop_workers()  # they keep the environment of this command
             _restore(*before)
         output.flush()
         if output.error and not isinstance(output.error, BrokenPipeError):

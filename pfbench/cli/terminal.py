@@ -127,10 +127,8 @@ def stopped_by_signals() -> Iterator[None]:
 
 def stop_workers() -> None:
     """End the processes of the launchers joblib and Ray, which would go on without the sweep."""
-    if "joblib" in sys.modules:
-        from joblib.externals.loky import reusable_executor
-
-        if (executor := reusable_executor._executor) is not None:
+    if reusable := sys.modules.get("joblib.externals.loky.reusable_executor"):
+        if (executor := reusable._executor) is not None:
             executor.shutdown(wait=True, kill_workers=True)
     if "ray" in sys.modules:
         sys.modules["ray"].shutdown()

@@ -75,7 +75,7 @@ _MOST = {"threads": max(256, os.cpu_count() or 1)}
 _REQUIREMENTS = {  # requirement and valid value by key
     **{
         key: (
-            f"a whole number of at least {least}" + f" and at most {_MOST.get(key)}" * (key in _MOST),
+            f"a whole number of at least {least}" + f", at most {_MOST.get(key)}" * (key in _MOST),
             str(_EXAMPLES[key]),
         )
         for key, least in _INTEGERS.items()
