@@ -49,6 +49,10 @@ def measure_cost(words: Sequence[str]) -> None:
     rounds, seconds = _read_numbers(values)
     composed = [f"{key}={values[key]}" for key in _KEYS if key in values and key not in ("rounds", "seconds")]  # fmt: skip
     config = compose(composed).values
+    if type(config["overwrite"]) is not bool:
+        raise ValueError(
+            f"overwrite must be true or false, got {config['overwrite']}. Set overwrite=true."
+        )
     study, results = config["study"], Path(config["results_dir"])
     check_has_results(study, results)
     changes: dict[str, Any] = {

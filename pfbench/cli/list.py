@@ -32,8 +32,10 @@ def list_options(words: Sequence[str]) -> None:
             print(f"{group:12} {', '.join(sorted(path.stem for path in files))}")
         print("\nNext: pfbench list GROUP")
         return
-    if words[0] not in groups:
+    if len(words) > 1 or words[0] not in groups:
         similar = suggest_similar(words[0], list(groups))
-        raise ValueError(f"group must be one of {', '.join(groups)}, got {words[0]}.{similar}")
+        raise ValueError(
+            f"group must be one of {', '.join(groups)}, got {' '.join(words) or 'an empty word'}.{similar}"
+        )
     for path in sorted(groups[words[0]]):
         print(f"{path.stem:24} {read_description(path)}")

@@ -25,6 +25,7 @@ _STORAGE = {
     errno.EPERM: "Change its permissions or set another folder",
     errno.ENOTDIR: "Set a folder instead of a file",
     errno.EISDIR: "Set a file instead of a folder",
+    errno.EEXIST: "Set a folder instead of a file",
     errno.ENOENT: "Make it, or correct its name",
     errno.ENAMETOOLONG: "Use a shorter name",
 }

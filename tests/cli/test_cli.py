@@ -99,23 +99,50 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "negative seed": (("seed=-1",), (f"seed {NUMBER} 0, got -1",)),
     "huge seed": (("seed=4294967296",), ("seed", "4294967296", "2**32 - 1")),
     "no threads": (("threads=0",), (f"threads {NUMBER} 1, at most ", "got 0")),
-    "threads that end the process": (("threads=100000",), ("at most ", "got 100000. Set threads=1.")),
-    "a repeat that is no truth": (("overwrite=maybe",), ("overwrite must be true (repeat", "got maybe")),
-    "a folder that is a number": (("results_dir=5",), ("results_dir must be a folder, got 5. Set results_dir=results",)),
+    "threads that end the process": (
+        ("threads=100000",),
+        ("at most ", "got 100000. Set threads=1."),
+    ),
+    "a repeat that is no truth": (
+        ("overwrite=maybe",),
+        ("overwrite must be true (repeat", "got maybe"),
+    ),
+    "a folder that is a number": (
+        ("results_dir=5",),
+        ("results_dir must be a folder, got 5. Set results_dir=results",),
+    ),
     "no folder": (("results_dir=null",), ("results_dir must be a folder, got None",)),
     "a study that is a truth": (("study=true",), ("study must be a name of letters", "got True")),
     "endless memory": (("memory_limit_gib=inf",), ("memory_limit_gib must be the GiB", "got inf")),
-    "a device beyond all": (("device=cuda:99999999999999999999",), ("device must be cpu, cuda", "Set device=cpu")),
+    "a device beyond all": (
+        ("device=cuda:99999999999999999999",),
+        ("device must be cpu, cuda", "Set device=cpu"),
+    ),
     "seeds of one study": (
         ("-m", "seed=1,2"),
-        ("seed must be one value in a study, since its report compares filters on equal data, got 1, 2.", "study=mine_1 seed=1"),
+        (
+            "seed must be one value in a study, since its report compares filters on equal data, got 1, 2.",
+            "study=mine_1 seed=1",
+        ),
     ),
     "runs of one study": (("-m", "runs=2,3"), ("runs must be one value in a study",)),
-    "runs that leave a gap": (("-m", "runs=2", "first_run=0,5"), ("first_run must be one value in a study",)),
-    "a sweep without a job": (("-m", "seed=range(1,1)"), ("seed must have 1 to 100000 values, got none of",)),
-    "an endless sweep": (("-m", "seed=range(1,inf)"), ("seed must have 1 to 100000 values, got more of",)),
+    "runs that leave a gap": (
+        ("-m", "runs=2", "first_run=0,5"),
+        ("first_run must be one value in a study",),
+    ),
+    "a sweep without a job": (
+        ("-m", "seed=range(1,1)"),
+        ("seed must have 1 to 100000 values, got none of",),
+    ),
+    "an endless sweep": (
+        ("-m", "seed=range(1,inf)"),
+        ("seed must have 1 to 100000 values, got more of",),
+    ),
     "a word without a key": (("=x",), ("each word must be key=value, got one without a key",)),
-    "a key that exists": (("+seed=1",), ("seed exists already. Leave out the plus sign: seed=VALUE",)),
+    "a key that exists": (
+        ("+seed=1",),
+        ("seed exists already. Leave out the plus sign: seed=VALUE",),
+    ),
     "a launcher of words": (
         ("-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=x"),
         ("hydra.launcher.n_jobs must have a value of its type, got x",),
