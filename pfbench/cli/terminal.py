@@ -127,9 +127,9 @@ def stopped_by_signals() -> Iterator[None]:
 
 def stop_workers() -> None:
     """End the processes of the launchers joblib and Ray, which would go on without the sweep."""
-    if reusable := sys.modules.get("joblib.externals.loky.reusable_executor"):
-        if (executor := reusable._executor) is not None:
-            executor.shutdown(wait=True, kill_workers=True)
+    loky = sys.modules.get("joblib.externals.loky.reusable_executor")
+    if loky is not None and loky._executor is not None:
+        loky._executor.shutdown(wait=True, kill_workers=True)
     if "ray" in sys.modules:
         sys.modules["ray"].shutdown()
 

@@ -19,7 +19,6 @@ from pfbench.cli.messages import format_error
 from pfbench.cli.unknown_errors import describe_unknown, is_named
 from pfbench.config.trust import check_study
 from pfbench.results.conditions import natural_sort_key
-from pfbench.results.store import read_metadata
 
 SENTENCE = re.compile(r"error (\w+): \S.* (must|is not|does not|exists already)\b.*[^\s:]$")
 DEMO = ("study=demo", "report.figure_formats=[svg]")
@@ -36,7 +35,7 @@ MISTAKES: dict[tuple[str, ...], str] = {
     ("report", *DEMO, "report.convergence_threshold=5"): "report.convergence_threshold must be numbers by group",
     ("report", *DEMO, "report.equivalence_margin=null"): "report.equivalence_margin must be a number, got None",
     ("report", *DEMO, "report.allow_mixed_versions=maybe"): "report.allow_mixed_versions must be true or false",
-    ("report", *DEMO, "~report"): "report must have keys of alpha,",
+    ("report", "study=demo", "~report"): "report must have keys of alpha,",
     ("report", *DEMO, "+report.nope=1"): "report must have keys of alpha,",
     ("report", *DEMO, "reports_dir=null"): "reports_dir must be a folder, got None",
     ("report", *DEMO, "reports_dir=/dev/full"): "must be accessible, got 'Not a directory'. Set a folder",
@@ -57,7 +56,7 @@ MISTAKES: dict[tuple[str, ...], str] = {
     ("judge", "reference=a.csv", "mine=b.csv", "tolerance=inf"): "tolerance must be positive, got inf",
     ("judge", "reference=a.csv", "mine=b.csv", "margin=1e-300"): "margin must be from 1e-6 to 1e6",
     ("judge", "reference=a.csv", "mine=b.csv", "study=claims"): "study must not be claims or datasheets",
-    ("train", "filter=\udcff"): "must",
+    ("train", "filter=nobody"): "filter=nobody does not exist",
 }  # fmt: skip
 
 
@@ -100,7 +99,7 @@ def test_a_mistake_is_a_sentence_that_pfbench_wrote(
     assert not list(traces.iterdir())  # nothing that nobody foresaw
 
 
-def test_only_what_pfbench_raises_itself_counts_as_a_sentence(tmp_path: Path) -> None:
+def test_only_what_pfbench_raises_itself_counts_as_a_sentence() -> None:
     def error_of(call: Any, *arguments: Any) -> BaseException:
         try:
             call(*arguments)
@@ -115,9 +114,6 @@ def test_only_what_pfbench_raises_itself_counts_as_a_sentence(tmp_path: Path) ->
     text = describe_unknown(error_of(natural_sort_key, 3))
     assert text.startswith("reading the results must succeed, got TypeError: expected string or")
     assert text.endswith(". Check the words of the command and the files that they name.")
-    text = describe_unknown(error_of(read_metadata, tmp_path / "a\0b"))
-    assert text.startswith("reading the results (")
-    assert "a\\x00b" not in text or "must succeed" in text
 
 
 def test_the_trace_of_an_unforeseen_error_is_kept_in_a_file(
