@@ -60,16 +60,22 @@ class LastingOutput:
             except OSError as error:
                 self._leave(error)
 
+    def tell(self) -> None:
+        """Print once that the output is closed, if the command has work that goes on."""
+        if self.error is not None and has_work_started() and not self._is_quiet:
+            self._is_quiet = True
+            print(
+                f"note: the output cannot be written any longer ({self.error.strerror}). "
+                "The command goes on without it",
+                file=sys.stderr,
+            )
+
     def _leave(self, error: OSError) -> None:
         """Send all that follows to nowhere, what Python flushes at its end included."""
         self.error = error
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
-        if has_work_started() and not self._is_quiet:
-            print(
-                f"note: the output cannot be written any longer ({error.strerror}). The command goes on without it",
-                file=sys.stderr,
-            )
+        with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), self._stream.fileno())
+        self.tell()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -84,14 +90,18 @@ def lasting_outputs() -> Iterator[LastingOutput]:
     """
     streams, root = (sys.stdout, sys.stderr), logging.getLogger()
     handlers, level = list(root.handlers), root.level
-    out = LastingOutput(_opened(sys.stdout))
-    sys.stdout, sys.stderr = out, LastingOutput(_opened(sys.stderr), is_quiet=True)  # type: ignore[assignment]
+    opened = [_opened(stream) for stream in streams]
+    out, err = LastingOutput(opened[0]), LastingOutput(opened[1], is_quiet=True)
+    sys.stdout, sys.stderr = out, err  # type: ignore[assignment]
     try:
         yield out
     finally:
+        out.tell()
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         sys.stdout, sys.stderr = streams
+        for stream in set(opened) - set(streams):
+            stream.close()
         root.handlers[:], root.level = handlers, level  # Hydra's write to streams that may close
 
 

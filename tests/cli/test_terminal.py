@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import logging
 import os
 import signal
@@ -38,6 +39,9 @@ class Closed:
 
     def flush(self) -> None:
         pass
+
+    def fileno(self) -> int:
+        raise io.UnsupportedOperation
 
 
 @pytest.mark.parametrize(("number", "code"), [(errno.EPIPE, 0), (errno.ENOSPC, 1)])
