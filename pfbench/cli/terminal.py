@@ -92,7 +92,7 @@ def lasting_outputs() -> Iterator[LastingOutput]:
     handlers, level = list(root.handlers), root.level
     opened = [_opened(stream) for stream in streams]
     out, err = LastingOutput(opened[0]), LastingOutput(opened[1], is_quiet=True)
-    sys.stdout, sys.stderr = out, err  # type: ignore[assignment]
+    sys.stdout, sys.stderr = out, err
     try:
         yield out
     finally:
