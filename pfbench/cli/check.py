@@ -21,11 +21,13 @@ def check_installation(words: Sequence[str]) -> None:
     """Print the state of the installation as a table of item, value and status.
 
     Args:
-        words: Ignored.
+        words: None.
 
     Raises:
-        ValueError: If a configuration does not compose.
+        ValueError: If there are words, or a configuration does not compose.
     """
+    if words:
+        raise ValueError(f"check must have no words, got {' '.join(words)}. Use: pfbench check")
     import torch
 
     from pfbench import job

@@ -56,6 +56,8 @@ def split_words(
     advice = f"See {' '.join(usage.split()[:2])} --help."
     for word in words:
         key, equals, value = word.partition("=")
+        if key == "hydra.searchpath":  # a word of the run: a result stores the configuration itself
+            continue
         if not equals or not value or key in values:
             raise ValueError(f"words must be key=value, each key once, got {word}. {advice}")
         if key not in keys:

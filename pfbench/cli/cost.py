@@ -27,6 +27,7 @@ one timing per job. Finished conditions are skipped: repeat an interrupted comma
   seconds=0.05               mean time of a filter in a round; at least 20 steps are taken
   overwrite=true             measure finished conditions again
   device=cpu threads=1       where to measure; by default as stored
+  trust=[mylab]              packages of filters of your own, as in their runs
   results_dir=FOLDER         the file is RESULTS/STUDY/step_times.json
 
 See also: pfbench report study=NAME"""
@@ -48,6 +49,10 @@ def measure_cost(words: Sequence[str]) -> None:
     rounds, seconds = _read_numbers(values)
     composed = [f"{key}={values[key]}" for key in _KEYS if key in values and key not in ("rounds", "seconds")]  # fmt: skip
     config = compose(composed).values
+    if type(config["overwrite"]) is not bool:
+        raise ValueError(
+            f"overwrite must be true or false, got {config['overwrite']}. Set overwrite=true."
+        )
     study, results = config["study"], Path(config["results_dir"])
     check_has_results(study, results)
     changes: dict[str, Any] = {
@@ -65,6 +70,7 @@ def _time_study(
     folder: Path, changes: dict[str, Any], numbers: tuple[int, float], overwrite: bool
 ) -> int:
     """Time the conditions of a study that are not yet in its file, and return their number."""
+    from pfbench.replay.recomputation import describe_changed_code
     from pfbench.replay.step_timing import estimate_time, time_condition
     from pfbench.results.conditions import load_conditions
     from pfbench.results.step_times import (
@@ -90,6 +96,10 @@ def _time_study(
         if key not in measured:
             rest -= estimate_time(condition, rounds, seconds)
             measured[key] = time_condition(condition, changes, rounds, seconds)
+            changed = {describe_changed_code(job.meta) for job in condition.jobs} - {""}
+            print(
+                *(f"note: {text}" for text in sorted(changed)), sep="\n", end="\n" * bool(changed)
+            )
             write_step_times(folder, measured)
         jobs, steps = measured[key]["jobs"], measured[key]["steps"]
         used = len(next(iter(jobs.values()))["cpu"])

@@ -39,6 +39,7 @@ roll, pitch, yaw, sd_pn, ..., cov_nn, ...; .tum; .nmea; .nav and .txt of KF-GINS
   NAME.columns=t:time,pn:north,...   names of columns      NAME.sd=FILE   deviations of KF-GINS"""
 
 _RENAMED = {"from": "start", "to": "end"}  # words of the command line that Python reserves
+_OTHER_PAGES = ("claims", "datasheets")  # folders of reports
 _LONGEST_NAME = 100
 _NAME = re.compile(r"[A-Za-z][\w+-]*")
 
@@ -62,6 +63,10 @@ def judge_trajectories(words: Sequence[str]) -> None:
     if not re.fullmatch(r"[\w+.-]*\w[\w+.-]*", study) or len(study) > _LONGEST_NAME:
         raise ValueError(
             f"study must be letters, digits, _, -, + or ., at most {_LONGEST_NAME}, got {study[:150]}. Change study=NAME."
+        )
+    if study in _OTHER_PAGES:
+        raise ValueError(
+            f"study must not be {' or '.join(_OTHER_PAGES)}, got {study}. These folders hold other pages. Change study=NAME."
         )
     judgement = judge_programs(reference, programs, options, sources)
     page = write_judgement(judgement, values.get("reports_dir", "reports"), study, options)

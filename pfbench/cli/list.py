@@ -38,7 +38,9 @@ def list_options(words: Sequence[str]) -> None:
         return
     if words[0] not in groups:
         similar = suggest_similar(words[0], list(groups))
-        raise ValueError(f"group must be one of {', '.join(groups)}, got {words[0]}.{similar}")
+        raise ValueError(
+            f"group must be one of {', '.join(groups)}, got {words[0] or 'an empty word'}.{similar}"
+        )
     files = sorted(groups[words[0]])
     if len(words) > 1:
         names = _list_fitting(words[0], words[1:])

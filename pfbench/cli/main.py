@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 
 import pfbench
 from pfbench.cli.messages import format_error, notes_of, suggest_similar
+from pfbench.cli.terminal import SignalStop, lasting_outputs, stop_workers, stopped_by_signals
+from pfbench.cli.unknown_errors import describe_unknown, keep_trace
 from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import ENVIRONMENT, split_trust
 from pfbench.files.rare_collections import collect_as_usual
@@ -38,7 +41,7 @@ pfbench {version}: benchmarks of particle filters in integrated navigation
   pfbench --version          version
   --traceback                print the traceback of an error (or set PFBENCH_TRACEBACK=1)
 
-Exit codes: 0 done, 1 failed after work had started, 2 refused before it, 130 interrupted
+Exit codes: 0 done, 1 failed after work had started, 2 refused before it, 128 + number of a signal that ended it (130 interrupted)
 
 First study: pfbench run -m +experiment=quickstart, then pfbench report study=quickstart
 """
@@ -52,14 +55,36 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     Raises:
         SystemExit: With code 1 if the command failed, 2 if it was refused before its work started
-            (`pfbench.files.work_start`), 130 if interrupted.
+            (`pfbench.files.work_start`), 128 and its number if a signal ended it, such as 130 of an interruption.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    try:
-        _dispatch(words)
-        sys.stdout.flush()  # here, since Python reports an error of its last flush with a traceback
-    except BrokenPipeError:  # the reader closed the pipe, as in `pfbench list | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    before = os.environ.get(ENVIRONMENT), sys.argv
+    with lasting_outputs() as output, stopped_by_signals():
+        try:
+            _dispatch(words)
+        except (KeyboardInterrupt, SignalStop) as stop:
+            number = stop.number if isinstance(stop, SignalStop) else signal.SIGINT
+            print(
+                f"\nEnded by {signal.Signals(number).name}. Finished jobs are kept. Repeat the command to resume.",
+                file=sys.stderr,
+            )
+            raise SystemExit(128 + number) from None
+        finally:
+            stop_workers()  # they keep the environment of this command
+            _restore(*before)
+        output.flush()
+        if output.error and not isinstance(output.error, BrokenPipeError):
+            reason = f"{output.error.strerror}. Direct it to another file"
+            print(f"\nerror: the output must be writable, got {reason}", file=sys.stderr)
+            raise SystemExit(1)
+
+
+def _restore(packages: str | None, arguments: list[str]) -> None:
+    """Restore what a command sets for its processes: the next one of this process trusts nothing by it."""
+    sys.argv = arguments
+    os.environ.pop(ENVIRONMENT, None)
+    if packages is not None:
+        os.environ[ENVIRONMENT] = packages
 
 
 def _dispatch(words: Sequence[str]) -> None:
@@ -95,23 +120,26 @@ def _run_command(command: str, options: Sequence[str]) -> None:
             packages
         )  # for all parts, and the processes of a launcher
         getattr(import_module(f"pfbench.cli.{command}"), COMMANDS[command][0])(words)
-    except KeyboardInterrupt:
-        print(
-            "\nInterrupted. Finished jobs are kept. Repeat the command to resume.", file=sys.stderr
-        )
-        raise SystemExit(130) from None
-    except BrokenPipeError:
-        raise
     except Exception as error:
         if shows_traceback:
             raise
-        print(f"\nerror {command}: {format_error(error, words)}", file=sys.stderr)
-        for note in notes_of(error):
-            print(note, file=sys.stderr)
-        print("(add --traceback to see the traceback)", file=sys.stderr)
+        _report(command, words, error)
         raise SystemExit(1 if has_work_started() else 2) from error
     finally:
         collect_as_usual()
+
+
+def _report(command: str, words: Sequence[str], error: Exception) -> None:
+    """Print the sentence of an error, its notes, and where its trace is."""
+    message, notes = format_error(error, words), notes_of(error)
+    print(f"\nerror {command}: {message}", file=sys.stderr)
+    is_unknown = message.startswith(describe_unknown(error))
+    if is_unknown and not any(note.startswith("traceback: ") for note in notes):
+        trace = keep_trace(error, [command, *words])
+        notes += [f"traceback: {trace}"] if trace else []
+    for note in notes:
+        print(note, file=sys.stderr)
+    print("(add --traceback to see the traceback)", file=sys.stderr)
 
 
 def _usage() -> str:

@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pfbench.cli.unknown_errors import describe_unknown, is_named
 from pfbench.config.hydra_messages import format_choice_error, format_value_error
 
 # extra of the package that installs a launcher
@@ -24,8 +25,11 @@ _STORAGE = {
     errno.EPERM: "Change its permissions or set another folder",
     errno.ENOTDIR: "Set a folder instead of a file",
     errno.EISDIR: "Set a file instead of a folder",
+    errno.EEXIST: "Set a folder instead of a file",
+    errno.ENOENT: "Make it, or correct its name",
     errno.ENAMETOOLONG: "Use a shorter name",
 }
+_OTHER_STORAGE = "Check the file and its folder, or set another one"
 _ALL_KEYS = " List all: pfbench run --cfg job"
 
 
@@ -41,10 +45,14 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
     """
     if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
         return _format_refusal(f"{error}", error.__cause__, words)
-    if isinstance(error, OSError) and error.errno in _STORAGE:
+    if isinstance(error, OSError) and error.errno is not None:
         return _format_storage(error)
+    if isinstance(error, MemoryError):
+        return "memory must be enough for the command, got an array that is too large. Reduce runs, particles or steps."
     text = f"{error}".strip() or type(error).__name__
-    if match := re.search(r"Could not override '([^']+)'", text):
+    if match := re.search(r"Could not override '([^']*)'", text):
+        if not match[1]:
+            return "each word must be key=value, got one without a key. Write the key before the equals sign."
         if match[1] == "experiment":
             name = next((w.partition("=")[2] for w in words if w.startswith("experiment=")), "NAME")
             return f"experiment={name} must be added with a plus sign. Use +experiment={name}"
@@ -59,6 +67,8 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
         return _format_unknown_choice(match[1], match[2], re.findall(r"^\t(\w+)$", text, re.M))
     if message := format_value_error(text):
         return message
+    if not is_named(error):
+        text = describe_unknown(error)
     renamed = next((find_renamed(word) for word in words if find_renamed(word)), None)
     return f"{text} {renamed[0]}: renamed to {renamed[1]}" if renamed else text
 
@@ -67,7 +77,7 @@ def _format_storage(error: OSError) -> str:
     """Format an error of the file system with its remedy."""
     name = error.filename or "files of the command"
     return (
-        f"{name} must be accessible, got '{error.strerror}'. {_STORAGE[error.errno or 0]}, then "
+        f"{name} must be accessible, got '{error.strerror}'. {_STORAGE.get(error.errno or 0, _OTHER_STORAGE)}, then "
         "repeat the command. Finished jobs are kept."
     )
 

@@ -25,6 +25,7 @@ a figure.
 
   scenario, noise, model     needed where the filter has results in several conditions
   device=cpu threads=1       where to compute; by default as stored
+  trust=[mylab]              packages of a filter of your own, as in its run
   results_dir, reports_dir   folders; files go to REPORTS/STUDY/replay/"""
 
 _CHOICES = ("scenario", "noise", "model")
@@ -68,6 +69,8 @@ def replay_run(words: Sequence[str]) -> None:
     print(f"status: {replay_files.describe_status(comparable)}")
     print(describe_agreement(compare_runs(stored.result, comparable)))
     _print_versions(meta["versions"], result.meta["versions"])
+    if changed := recomputation.describe_changed_code(meta):
+        print(changed)
     for name, old, new, unit in replay_files.tabulate_metrics(stored, comparable):
         print(f"  {name:28} {_format(new):>12} {unit:8} stored {_format(old)}")
     for path in replay_files.write_replay(stored, result, config.values["reports_dir"]):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -104,8 +105,14 @@ def make_report_options(config: JobConfig) -> Any:
     """
     from pfbench.report.options import ReportOptions
 
-    values = config.values["report"].items()
-    options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values}
+    values = config.values.get("report")
+    known = [field.name for field in fields(ReportOptions)]
+    if not isinstance(values, Mapping) or not set(values) <= {*known}:
+        given = ", ".join(map(str, values)) if isinstance(values, Mapping) else str(values)
+        raise ValueError(
+            f"report must have keys of {', '.join(known)}, got {given}. Choose a file: pfbench list report"
+        )
+    options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     return ReportOptions(**options, planned=count_planned_jobs(config.values["study"]))
 
 

@@ -19,6 +19,7 @@ from pfbench.cli.sweep.job_errors import (
 from pfbench.cli.sweep.study_plan import StudyPlan, plan_study
 from pfbench.cli.sweep.sweep_progress import SWEEP_JOBS, SweepProgress, note_outcome
 from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
+from pfbench.cli.terminal import end_with_parent
 from pfbench.config.composition import JobConfig, register_experiments
 from pfbench.config.named_sets import expand_filter_sets
 from pfbench.config.sweep_check import check_words
@@ -66,6 +67,8 @@ def run_jobs(words: Sequence[str]) -> None:
     first = check_words([*flags, *overrides])
     is_printed = any(word.partition("=")[0] in _PRINTING_FLAGS for word in words)
     plan = None if is_printed else plan_or_none(overrides, first)
+    if plan and flags:
+        plan.check_comparable()
     if plan and wants_until_decided(plan):
         check_has_sweep(flags)
         sweep = GrowingSweep.from_plan(plan)
@@ -195,6 +198,7 @@ def run_task(cfg: Any, announce: Callable[[], None] | None = None) -> float:
         application, "job.num", throw_on_missing=False
     )  # None outside a sweep
     total, choices = os.environ.get(SWEEP_JOBS), application.runtime.choices
+    end_with_parent()
     counter = "" if number is None else f"[{number + 1}{f'/{total}' if total else ''}] "
     try:
         outcome = job.run(cfg, choices, counter, announce)

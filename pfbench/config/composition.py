@@ -18,7 +18,7 @@ from pfbench.config.group_checks import check_groups, resolve_values
 from pfbench.config.named_sets import check_tuned_seed, expand_filter_names
 from pfbench.config.paper_block import check_paper_blocks, remove_nested_blocks
 from pfbench.config.protected_keys import check_protected_keys
-from pfbench.config.trust import check_configuration, check_study, split_trust
+from pfbench.config.trust import check_configuration, check_places, check_study, split_trust
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -60,8 +60,9 @@ class JobConfig:
         check_groups(self.values, CHOICES)
         check_configuration(self.values, self.trusted)
         check_paper_blocks(self.values)
+        check_places(self.values)
         if "study" in self.values:
-            check_study(self.values["study"])
+            self.values["study"] = check_study(self.values["study"])
 
 
 def compose(overrides: Sequence[str] = ()) -> JobConfig:

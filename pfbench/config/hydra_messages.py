@@ -5,6 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+# how Hydra's parser begins its errors
+_GRAMMAR = (
+    "mismatched input",
+    "extraneous input",
+    "no viable alternative",
+    "token recognition error",
+)
+
 
 def format_value_error(text: str) -> str:
     """Format an error of Hydra about a single value.
@@ -25,13 +33,18 @@ def format_value_error(text: str) -> str:
         )
     if match := re.search(r"Missing mandatory value: (\S+)", text):
         return f"{match[1]} must be set. Set {match[1]}=..."
-    if "LexerNoViableAlt" in text or text.startswith(("mismatched input", "extraneous input")):
+    if "LexerNoViableAlt" in text or text.startswith(_GRAMMAR):
         return "each word must be key=value. Quote a value with spaces or signs."
     if match := re.search(r"tried to allocate (\d+) bytes", text):
         size = int(match[1]) / 2**30
         return f"memory must hold an array of {size:.3g} GiB. Reduce runs, particles or steps."
     if match := re.search(r"Error parsing override '([^']*)'", text):
         return f"'{match[1]}' must be key=value. Quote it if the shell reads brackets or spaces."
+    if match := re.search(r"Error merging override (\S+)=(\S*)", text):
+        key = match[1].lstrip("+~")
+        return f"{key} must have a value of its type, got {match[2]}. See its default: pfbench run --cfg all"
+    if match := re.search(r"An item is already at '([^']+)'", text):
+        return f"{match[1]} exists already. Leave out the plus sign: {match[1]}=VALUE"
     return ""
 
 

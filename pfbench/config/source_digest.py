@@ -10,7 +10,7 @@ import hashlib
 import importlib.util
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -75,6 +75,17 @@ def hash_package() -> str:
 def _read(path: str) -> bytes:
     with open(path, "rb", buffering=0) as file:
         return file.read()
+
+
+def list_user_packages(values: Any, trusted: Sequence[str]) -> list[str]:
+    """List the trusted packages that define a class of a configuration.
+
+    Args:
+        values: Resolved configuration.
+        trusted: Packages that the user trusts.
+    """
+    targets = list(_user_targets(values))
+    return [name for name in trusted if any(t.startswith(f"{name}.") for t in targets)]
 
 
 def _user_targets(node: Any) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from typing import Any, NoReturn
 
 from pfbench.config.composition import JobConfig, compose, compose_tree
@@ -10,6 +11,8 @@ from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import UntrustedConfigError, check_study
+
+_MOST_VALUES = 100_000  # of one key of a sweep
 
 
 def check_words(words: Sequence[str]) -> JobConfig | None:
@@ -72,7 +75,13 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
         if override.is_sweep_override():
-            values = [f"{key}={value}" for value in override.sweep_string_iterator()]
+            texts = list(islice(override.sweep_string_iterator(), _MOST_VALUES + 1))
+            if not 0 < len(texts) <= _MOST_VALUES:
+                raise UntrustedConfigError(
+                    f"{key} must have 1 to {_MOST_VALUES} values, got {'more' if texts else 'none'} of "
+                    f"{override.input_line}. Write them as {key}=A,B."
+                )
+            values = [f"{key}={value}" for value in texts]
         else:
             values = [override.input_line or f"{key}={override.get_value_element_as_str()}"]
         alternatives[key] = values

@@ -102,21 +102,42 @@ def check_configuration(values: Any, trusted: Sequence[str] = (), path: str = ""
             _check_node(key, node, trusted)
 
 
-def check_study(name: Any) -> None:
+def check_study(name: Any) -> str:
     """Check the name of a study, which is also the name of its folder.
 
     Args:
-        name: Value of the key `study`.
+        name: Value of the key `study`. YAML reads 2024 as a number.
+
+    Returns:
+        The name as a text.
 
     Raises:
         UntrustedConfigError: If it is not a plain name.
     """
-    name = str(name) if isinstance(name, int | float) else name  # study=2024
+    name = str(name) if type(name) in (int, float) else name
     if not isinstance(name, str) or not STUDY.fullmatch(name) or set(name) == {"."}:
         raise UntrustedConfigError(
             f"study must be a name of letters, digits, '_', '-', '+' and '.', got {name!r}. "
             "Use results_dir=... and reports_dir=... for other folders."
         )
+    return name
+
+
+def check_places(values: Mapping[str, Any]) -> None:
+    """Check the folders of results and reports: Hydra makes them before a job begins.
+
+    Args:
+        values: Resolved configuration.
+
+    Raises:
+        UntrustedConfigError: If one is not a text, or is empty.
+    """
+    for key in ("results_dir", "reports_dir"):
+        if not isinstance(values.get(key, key), str) or values.get(key) == "":
+            raise UntrustedConfigError(
+                f"{key} must be a folder, got {values[key]!r}. Set {key}={key.partition('_')[0]}, or {key}=./5 for a "
+                "name that YAML reads as a number."
+            )
 
 
 def _walk(node: Any, path: str, depth: int = 0) -> Iterator[tuple[str, Any]]:

@@ -12,6 +12,8 @@ import numpy as np
 from torch import Tensor
 
 from pfbench.config.composition import CHOICES, JobConfig, resolve_config
+from pfbench.config.source_digest import list_user_packages
+from pfbench.config.trust import trusted_packages
 from pfbench.core.record import Episode
 from pfbench.files.atomic_write import set_aside
 from pfbench.files.work_start import start_work
@@ -94,7 +96,7 @@ def run(
     meta, outputs = _compute_or_note(config, name, path, announce, is_alone=not counter)
     check_unchanged(inputs, values, config.trusted)
     head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
-    head["inputs"] = inputs
+    head |= {"inputs": inputs, "trusted": list_used_packages(config)}
     store.write_result(path, {**head, **meta}, outputs)
     outcome = JobOutcome(path, "finished", main_rmse(outputs, meta))
     seconds = meta["seconds"]
@@ -107,6 +109,17 @@ def run(
         1e3 * seconds["per_step"],
     )
     return outcome
+
+
+def list_used_packages(config: JobConfig) -> list[str]:
+    """List the packages of a user that define classes of a job; empty if all are of pfbench.
+
+    Args:
+        config: Configuration of the job.
+    """
+    values = {name: config.values.get(name) for name in CHOICES}
+    packages = list_user_packages(values, (*config.trusted, *trusted_packages()))
+    return list(dict.fromkeys(packages))
 
 
 def _compute_or_note(

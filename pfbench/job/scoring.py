@@ -110,9 +110,8 @@ class ScoreRecorder:
             )
             for index in by_size
         ]
-        self.at_step = sorted(
-            {(k + 1) * steps // score_steps - 1 for k in range(score_steps)} - {-1}
-        )
+        count = min(score_steps, steps)
+        self.at_step = [(k + 1) * steps // count - 1 for k in range(count)]
         self.scores: list[ProperScores] = []
         self.innovations: list[tuple[Tensor, Tensor]] = []
         self.seconds = 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -23,19 +25,23 @@ def check_settings(values: Mapping[str, Any]) -> None:
         ValueError: If a value is invalid. The message names key, requirement and value.
     """
     valid = {
-        **{key: type(values[key]) is int and values[key] >= _INTEGERS[key] for key in _INTEGERS},
+        **{
+            key: type(values[key]) is int and least <= values[key] <= _MOST.get(key, math.inf)
+            for key, least in _INTEGERS.items()
+        },
+        "overwrite": type(values.get("overwrite", False)) is bool,
         "oracle_noise": type(values["oracle_noise"]) is bool,
         "pcrb": values["pcrb"] in (True, False, "auto"),
         "memory_limit_gib": _is_memory_limit(values["memory_limit_gib"]),
         "dtype": values["dtype"] in ("float32", "float64"),
         "budget": values["budget"] in store.BUDGETS,
         "engine": values["engine"] in ("auto", "eager", "kernels", "compiled"),
-        "device": re.fullmatch(r"cpu|cuda(:\d+)?", str(values["device"])) is not None,
+        "device": re.fullmatch(r"cpu|cuda(:\d{1,3})?", str(values["device"])) is not None,
     }
     for key, (requirement, example) in _REQUIREMENTS.items():
         if not valid[key]:
             remedy = _advise_integer(key, values[key]) or f"Set {key}={example}."
-            raise ValueError(f"{key} must be {requirement}, got {values[key]}. {remedy}")
+            raise ValueError(f"{key} must be {requirement}, got {values.get(key)}. {remedy}")
     if values["first_run"] + values["runs"] > RUN_NUMBERS:
         raise ValueError(
             f"first_run + runs must be at most 2**32 = {RUN_NUMBERS}, got {values['first_run']} + "
@@ -64,12 +70,18 @@ def apply_global_settings(values: Mapping[str, Any]) -> None:
 
 _INTEGERS = {"runs": 1, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}  # with minimum
 _EXAMPLES = {"runs": 100, "first_run": 0, "threads": 1, "seed": 1, "score_steps": 10}
+# threads beyond the cores only wait, and OpenMP ends the process with a fault if there are many
+_MOST = {"threads": max(256, os.cpu_count() or 1)}
 _REQUIREMENTS = {  # requirement and valid value by key
     **{
-        key: (f"a whole number of at least {least}", str(_EXAMPLES[key]))
+        key: (
+            f"a whole number of at least {least}" + f", at most {_MOST.get(key)}" * (key in _MOST),
+            str(_EXAMPLES[key]),
+        )
         for key, least in _INTEGERS.items()
     },
     "oracle_noise": ("true (the filter receives the true noise regime) or false", "false"),
+    "overwrite": ("true (repeat finished jobs) or false", "false"),
     "pcrb": ("auto (where the model's distributions are the simulated ones), true or false", "auto"),
     "memory_limit_gib": ("the GiB that the job may use, or null for most of the free memory", "null"),
     "dtype": ("float64 (default) or float32", "float64"),
@@ -88,4 +100,4 @@ def _advise_integer(key: str, value: Any) -> str:
 
 def _is_memory_limit(value: Any) -> bool:
     """Return whether a value is a memory limit: a positive number, or None."""
-    return value is None or (isinstance(value, int | float) and value > 0)
+    return value is None or (type(value) in (int, float) and 0 < value < math.inf)

@@ -80,9 +80,9 @@ class JudgeOptions:
     def __post_init__(self) -> None:
         for name in ("every", "largest_gap", "limit", "block"):
             _require(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))
-        _require("tolerance", self.tolerance > 0, "positive", self.tolerance)
-        _require("margin", 0 < self.margin < math.inf, "positive", self.margin)
-        _require("alpha", 0 < self.alpha < 1, "between 0 and 1", self.alpha)
+        _require("tolerance", 0 < self.tolerance < math.inf, "positive", self.tolerance)
+        _require("margin", 1e-6 <= self.margin <= 1e6, "from 1e-6 to 1e6", self.margin)
+        _require("alpha", 1e-9 <= self.alpha < 1, "from 1e-9 to below 1", self.alpha)
         _require("coverage", 0 < self.coverage <= 1, "above 0 and at most 1", self.coverage)
         _require("from", self.start < self.end, "before to", f"{self.start} and {self.end}")
         _require("holes", self.holes in HOLES, " or ".join(HOLES), self.holes)

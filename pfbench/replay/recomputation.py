@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from pfbench.config.composition import CHOICES, JobConfig
-from pfbench.job.inputs import find_inputs
+from pfbench.config.trust import UntrustedConfigError, trusted_packages
+from pfbench.job.inputs import CODE, find_inputs
 from pfbench.job.plan import build_plan
 from pfbench.job.run_job import compute_job
 from pfbench.replay.run_selection import StoredRun
@@ -55,7 +56,7 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
         The configuration.
 
     Raises:
-        ValueError: If the result was not computed by a job.
+        ValueError: If the result was not computed by a job, or the packages of its classes are not trusted.
     """
     parts = ("scenario", "noise", "filter", "model")
     values = copy.deepcopy(meta["config"])
@@ -76,7 +77,37 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
     for key in DATA_FOLDERS:
         _replace_folder(values, key.split("."), values["data"]["root"])
     _replace_cache_folders(values["scenario"], values["episode_cache_dir"])
-    return JobConfig(values, {group: str(meta["choices"][group]) for group in CHOICES})
+    trusted = trusted_packages()
+    packages = meta.get("trusted", [])
+    if not set(packages) <= set(trusted):
+        given = f"trust=[{','.join(trusted)}]" if trusted else "none of them"
+        raise UntrustedConfigError(
+            f"trust must name the packages whose classes the run used, {', '.join(packages)}, got {given}. Nothing was "
+            f"run. If you still trust them, add trust=[{','.join(packages)}] to the command."
+        )
+    return JobConfig(
+        values, {group: str(meta["choices"][group]) for group in CHOICES}, trusted=trusted
+    )
+
+
+def describe_changed_code(meta: Mapping[str, Any]) -> str:
+    """Describe that the classes of a user are no longer those of a stored job; empty if they are.
+
+    Args:
+        meta: Metadata of the job, whose packages are trusted.
+    """
+    if not meta.get("trusted"):
+        return ""
+    changed = _list_changed_inputs(meta, find_inputs(meta["config"], trusted_packages()))
+    code = [name for name in changed if name.startswith(CODE)]
+    if not code:
+        return ""
+    return f"the {' and the '.join(code)} has changed since {meta['label']} was run: its numbers may differ"
+
+
+def _list_changed_inputs(meta: Mapping[str, Any], present: Inputs) -> list[str]:
+    """List the inputs of a job that have other content now, for people."""
+    return list_changed(meta["inputs"], present) if present and "inputs" in meta else []
 
 
 def _replace_folder(node: Any, path: Sequence[str], folder: str | None) -> None:
@@ -117,8 +148,11 @@ def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobRes
 
 
 def _check_inputs(meta: Mapping[str, Any], present: Inputs) -> None:
-    """Raise ValueError if a job cannot be computed again, since what it read has changed."""
-    changed = list_changed(meta["inputs"], present) if present and "inputs" in meta else []
+    """Raise ValueError if a job cannot be computed again, since a file that it read has changed.
+
+    Another code of a user's classes is told, since it may be a mended message.
+    """
+    changed = [name for name in _list_changed_inputs(meta, present) if not name.startswith(CODE)]
     if changed:
         raise ValueError(
             f"{' and '.join(changed)} must be as it was when the result was computed, got other content. "

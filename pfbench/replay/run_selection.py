@@ -122,10 +122,10 @@ def _matching_keys(folder: Path, choices: Mapping[str, str]) -> list[str] | None
 
 
 def _read_choices(path: Path) -> dict[str, str]:
-    """Return the choices of a job by group; empty for a damaged file."""
+    """Return the choices of a job by group; empty for a file that is damaged or no result."""
     try:
         choices = store.read_metadata(path)["choices"]
-    except store.DamagedResultError:
+    except (ValueError, OSError):
         return {}
     return {group: str(choices.get(group, "")) for group in _GROUPS}
 

@@ -2,13 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from pfbench.results.decisions.options import DecisionOptions
 from pfbench.results.study_decisions.main_metrics import check_main_metric
 
 _FORMATS = ("svg", "png")
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, tuple | list) and all(isinstance(text, str) for text in value)
+
+
+# kinds of options that a command line or a file sets: requirement and test
+_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    **dict.fromkeys(("alpha", "start_time_s", "equivalence_margin"), ("a number", _is_number)),
+    "figure_formats": ("a list of names such as [svg,png]", _are_texts),
+    "paper_figures": ("a list of names, or null", lambda value: value is None or _are_texts(value)),
+    "allow_mixed_versions": ("true or false", lambda value: type(value) is bool),
+    "convergence_threshold": (
+        "numbers by group, such as {position: 10}",
+        lambda value: isinstance(value, Mapping) and all(map(_is_number, value.values())),
+    ),
+    "metric": ("a name", lambda value: isinstance(value, str)),
+    "baseline": ("the label of a filter", lambda value: isinstance(value, str)),
+}
 
 
 @dataclass(frozen=True)
@@ -48,6 +73,11 @@ class ReportOptions:
     baseline: str = ""
 
     def __post_init__(self) -> None:
+        for key, (requirement, is_valid) in _KINDS.items():
+            if not is_valid(getattr(self, key)):
+                raise ValueError(
+                    f"report.{key} must be {requirement}, got {getattr(self, key)!r}. Leave it out for the default."
+                )
         check_main_metric(self.metric)
         if not 0 < self.alpha < 1:
             raise ValueError(f"report.alpha must be between 0 and 1, got {self.alpha}. Use 0.05.")

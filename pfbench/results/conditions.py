@@ -158,12 +158,14 @@ def list_stored_studies(results: Path) -> list[str]:
 
 
 def _read_undamaged(path: Path) -> tuple[Path, dict[str, Any]] | None:
-    """Read the metadata of a result. A damaged file is set aside and left out."""
+    """Read the metadata of a result. A damaged file is set aside and left out, one that is no result is left out."""
     try:
         return path, store.read_result(path).meta
     except store.DamagedResultError as error:
         log.warning("warning  %s   renamed to %s", error, set_aside(path).name)
-        return None
+    except (ValueError, OSError) as error:  # of another program or format, or not readable
+        log.warning("warning  %s   left out: %s", path, error)
+    return None
 
 
 def differing_settings(jobs: Sequence[JobFile]) -> list[str]:

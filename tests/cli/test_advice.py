@@ -237,11 +237,11 @@ def test_refused_input_exits_with_two_and_prints_no_plan(
 
 def test_a_sweep_without_a_result_has_no_next_report(tmp_path: Path) -> None:
     words = ("run", "-m", *WALK, "filter=ekf", "study=mine")
-    said = pfbench(*words, "runs=0,-1", home=tmp_path)
+    said = pfbench(*words, "dtype=one,two", home=tmp_path)
     assert said.code == 1
     assert "2 failed" in said.out
     assert "Next:" not in said.out
     assert "plan:" not in said.out
-    said = pfbench(*words, "runs=0,2", home=tmp_path)
+    said = pfbench(*words, "dtype=one,float64", home=tmp_path)
     assert "1 finished, 0 skipped, 1 failed" in said.out
     assert "Next: pfbench report study=mine" in said.out

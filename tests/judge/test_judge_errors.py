@@ -147,8 +147,8 @@ def test_a_frame_of_a_tum_file_is_required(home: Path) -> None:
         ("block=1e9", "block must be at most half of the scored time"),
         ("every=1e9", "Set a smaller every"),
         ("mine.sd=sd.txt", "sd must belong to a text file of KF-GINS, got sd.txt for mine.csv"),
-        ("margin=0", "error judge: margin must be positive"),
-        ("alpha=1", "error judge: alpha must be between 0 and 1"),
+        ("margin=0", "error judge: margin must be from 1e-6 to 1e6"),
+        ("alpha=1", "error judge: alpha must be from 1e-9 to below 1"),
     ],
 )
 def test_an_option_that_cannot_be_is_refused(home: Path, word: str, message: str) -> None:

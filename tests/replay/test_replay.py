@@ -157,3 +157,48 @@ def test_a_replay_writes_nowhere_else_whatever_a_result_says(home: Path) -> None
     assert "outside" not in json.dumps(values)
     assert values["scenario"]["cache_dir"] == values["scenario"]["nested"][0]["cache_dir"] == "mine"
     assert recompute_run(disguise(), changes).meta["study"] == "walks"
+
+
+OWN = """
+from pfbench.filter import GaussianFilter
+
+class Mine(GaussianFilter):
+    pass
+"""
+
+
+def test_a_filter_of_the_user_is_replayed_and_timed_with_the_trust_of_its_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The packages of a run must be trusted again: a result may be of another person."""
+    (tmp_path / "replaylab").mkdir()
+    (tmp_path / "replaylab" / "filters.py").write_text(OWN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    words = ("filter=ekf", "filter._target_=replaylab.filters.Mine", "trust=[replaylab]")
+    assert pfbench("run", *WALK, "study=walks", *words, home=tmp_path).code == 0
+    (result,) = store.list_results(tmp_path / "results/walks")
+    assert result.meta["trusted"]["packages"] == ["replaylab"]
+    again = ("run=12", "filter=ekf")
+    said = replay(tmp_path, *again)
+    assert said.code == 2
+    assert "trust must name the packages whose classes the run used, replaylab, got none of them" in said.err  # fmt: skip
+    remedy = said.err.partition("add ")[2].split()[0]
+    assert remedy == "trust=[replaylab]"
+    said = replay(
+        tmp_path, *again, remedy, "hydra.searchpath=[file://conf]"
+    )  # the words of the run
+    assert said.code == 0, said.err
+    assert "equal in every digit" in said.out
+    assert "has changed" not in said.out
+    (tmp_path / "replaylab" / "filters.py").write_text(f"{OWN}\n# another\n")
+    changed = "the code of replaylab has changed since ekf was run: its numbers may differ"
+    assert changed in replay(tmp_path, *again, remedy).out
+    cost = ("cost", "study=walks", "rounds=5", "seconds=0.001")
+    assert f"add {remedy} to the command" in pfbench(*cost, home=tmp_path).err
+    said = pfbench(*cost, remedy, home=tmp_path)
+    assert said.code == 0, said.err
+    assert changed in said.out
+
+
+def test_a_filter_of_pfbench_needs_no_trust(home: Path) -> None:
+    assert all("trusted" not in r.meta for r in store.list_results(home / "results/walks"))

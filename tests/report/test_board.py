@@ -179,6 +179,28 @@ def test_filters_are_compared_where_all_of_them_were_run() -> None:
     assert "No filter has an error to compare" in split["sentence"]
 
 
+def test_without_a_divergence_threshold_no_share_of_tracks_is_shown() -> None:
+    """A run that is not lost may be anywhere: only lost runs are known."""
+    data = table()
+    data.loc[(data["filter"] == "mcmc_rpf") & (data["run"] < 12), "keeps_track"] = False
+    for limit in (5.0, None):
+        worlds = {w: PartName(w, w, "", "m", limit, w) for w in ("w0", "w1")}
+        worlds["w0"] = PartName("w0", "w0", "", "m", 5.0, "w0")  # one world without it suffices
+        names = StudyNames(find_looks(list(EFFECTS)), worlds, {}, ["mcmc_rpf"])
+        views = build_views(data, names, ReportOptions(), {})
+        opening = next(iter(views.values()))
+        rows = {row["filter"]: row for row in opening["rows"]}
+        text = " ".join(f"{view['sentence']} {view['small_print']}" for view in views.values())
+        assert (rows["sir"]["track"] is None) == (limit is None)
+        assert rows["mcmc_rpf"]["words"] == ("runs lost" if limit is None else "track not kept") + ", 4/4"  # fmt: skip
+        assert ("[[MCMC-RPF]] is lost in 40 % of runs." in text) == (limit is None)
+        alone = next(view for key, view in views.items() if key.world == "w0" and key.baseline == "mcmc_rpf")  # fmt: skip
+        assert "does not keep track in 40 % of runs." in alone["sentence"]
+        sentences = [view["sentence"] for key, view in views.items() if key.world == "w1"]
+        assert any("Runs that are not lost: [[" in s for s in sentences) == (limit is None)
+        assert any("Track is kept by" in s for s in sentences) == (limit is not None)
+
+
 def test_the_log_score_orders_a_board() -> None:
     """A difference of 0.3 per step is a ratio of predictive densities."""
     data = table({"ekf": 0.0, "sir": 0.0}, worlds=1).drop(columns="rmse")

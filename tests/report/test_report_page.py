@@ -188,7 +188,7 @@ def test_a_filter_that_lost_every_run_is_worse_and_has_no_number(tmp_path):
     records = json.loads((made.parent / "decisions.json").read_text())
     track = [r for r in records if r["metric"] == "keeps track" and r["question"] == "a"]
     assert [(r["a"], r["b"], r["word"]) for r in track] == [("doomed", "ekf", "worse")]
-    assert "does not keep track in 100 % of runs" in (made.parent / "report.md").read_text()
+    assert "is lost in 100 % of runs" in (made.parent / "report.md").read_text()
     row = pd.read_csv(made.parent / "metrics.csv").query(
         "filter == 'doomed' and metric == 'rmse' and component == 'norm' and group == 'position'"
     )

@@ -12,9 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import synthetic_results as synthetic
 
 from pfbench.files.digest import hash_content
+from pfbench.replay.run_selection import find_run
 from pfbench.results import store
+from pfbench.results.conditions import load_conditions
 
 KEY = "0123456789abcdef"
 Change = Callable[[dict[str, Any]], object]
@@ -159,3 +162,24 @@ def test_a_failure_note_of_another_kind_is_a_failure_without_text(
     (failure,) = store.list_failures(tmp_path)
     assert failure["key"] == KEY
     assert failure["message"] == f"{KEY}.failed.json is damaged. Run the job again"
+
+
+def test_a_file_that_is_no_result_stops_no_report(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is named in a line and stays where it is; the rest is reported."""
+    folder = tmp_path / "demo"
+    synthetic.study(folder, runs=4, steps=5)
+    good = len(list(folder.glob("*.npz")))
+    np.savez(folder / "foreign.npz", x=np.zeros(3))
+    np.save(folder / "single.npy", np.zeros(3))
+    (folder / "single.npy").rename(folder / "single.npz")
+    forge(folder, meta() | {"format": 3}, arrays())
+    (condition,) = load_conditions("demo", tmp_path)
+    assert len(condition.jobs) == good
+    for name in ("foreign", "single", KEY):
+        (line,) = [text for text in caplog.messages if f"{folder / name}.npz   left out: " in text]
+        assert "must" in line
+        assert (folder / f"{name}.npz").is_file()
+    run = find_run("demo", tmp_path, 1, "ekf", {"scenario": "flight", "noise": "surge"})
+    assert run.job.meta["label"] == "ekf"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -12,6 +12,13 @@ from pfbench.cli.compose import given_keys, read_sweep
 from pfbench.config.composition import JobConfig, compose
 from pfbench.config.paper_block import PAPER
 from pfbench.config.sweep_check import expand_sweep
+
+# keys that are equal in all jobs of a condition, and how several values are run
+_EQUAL_KEYS = {
+    "seed": "Use more runs of one seed (runs=200), or one study for each seed: study=mine_1 seed=1, then study=mine_2 seed=2.",
+    "runs": "Use the largest number, or one study for each number.",
+    "first_run": "Use first runs that continue each other, such as first_run=0,100 with runs=100.",
+}
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,33 @@ class StudyPlan:
     def has_one_study(self) -> bool:
         """Return whether all jobs belong to one study."""
         return "study" not in self._swept_options() and len(self.experiments) < 2
+
+    def check_comparable(self) -> None:
+        """Check that the report of the study can compare the jobs, which needs equal data in each condition.
+
+        Raises:
+            ValueError: If the jobs of a condition differ in their seed or their runs.
+        """
+        report = self.first.values.get("report")
+        if isinstance(report, Mapping) and report.get("allow_mixed_versions"):
+            return
+        for key, remedy in _EQUAL_KEYS.items():
+            values = [option.partition("=")[2] for option in self._swept_options().get(key, ())]
+            if len(set(values)) > 1 and not (key == "first_run" and self._continue_runs(values)):
+                raise ValueError(
+                    f"{key} must be one value in a study, since its report compares filters on equal data, got "
+                    f"{', '.join(values[:5])}. {remedy} To run them all the same, and to report them, add "
+                    "report.allow_mixed_versions=true to both commands."
+                )
+
+    def _continue_runs(self, first_runs: Sequence[str]) -> bool:
+        """Return whether jobs with these first runs continue each other, so that a report joins them."""
+        runs = self.first.values["runs"]
+        numbers = [int(text) for text in first_runs if text.isdecimal()]
+        is_whole = type(runs) is int and len(numbers) == len(first_runs)
+        return is_whole and sorted(numbers) == [
+            min(numbers) + k * runs for k in range(len(numbers))
+        ]
 
     def list_families(self) -> dict[str, str]:
         """Return the family of each scenario of the sweep."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,8 +69,12 @@ class GrowingSweep:
 
         values = plan.first.values
         settings = values["until_decided"]
+        if not isinstance(settings, Mapping):
+            raise ValueError(
+                f"until_decided must have the keys mode, max_runs and max_hours, got {settings}. Leave it out."
+            )
         hours = settings["max_hours"]
-        if hours is not None and (type(hours) not in (int, float) or hours <= 0):
+        if hours is not None and (type(hours) not in (int, float) or not 0 < hours < math.inf):
             raise ValueError(
                 f"until_decided.max_hours must be positive or null, got {hours}. Use null for no limit."
             )

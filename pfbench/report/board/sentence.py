@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 
 from pfbench.report.board.view import EQUAL, MISSING, NOT_KEPT, OPEN, BoardRow
@@ -13,6 +14,12 @@ from pfbench.results.decisions.words import IDENTICAL, WORSE
 TrackInterval = Callable[[str, str], tuple[float, float]]  # of two labels
 
 _MOST_NAMES = 3  # in a sentence
+# words where no divergence threshold says whether a track is kept
+_LOST_WORDS = {
+    "does not keep track in": "is lost in",
+    "do not keep track in": "are lost in",
+    r"Track is kept by (.*?) in (\d+ %) and by (.*?) in (\d+ %) of runs": r"Runs that are not lost: \1 \2, \3 \4",
+}
 _LOST_SHARE = 0.2  # share of runs off track from which a filter is counted
 
 
@@ -24,6 +31,8 @@ def describe_view(
     metric: str,
     level: str = "95 %",
     track_interval: TrackInterval | None = None,
+    *,
+    has_limit: bool = True,
 ) -> str:
     """Describe a view: failures, the best filter, the best proposed method, ties.
 
@@ -36,6 +45,7 @@ def describe_view(
         level: Level of an interval, as text.
         track_interval: Interval of the difference of the shares of runs in which two filters keep track;
             None for sentences without it.
+        has_limit: Whether all scenarios state a divergence threshold. Otherwise only lost runs are known.
 
     Returns:
         Sentences. Names of filters are enclosed in double square brackets.
@@ -43,6 +53,8 @@ def describe_view(
     ranked = [row for row in rows if row.rank is not None]
     failures = _describe_failures(rows, looks)
     tracks = _describe_tracks(rows, looks, baseline, level, track_interval)
+    if not has_limit:
+        failures, tracks = map(name_lost_runs, (failures, tracks))
     if not ranked:
         return f"{failures} No filter has an error to compare {scope}. {tracks}".strip()
     if len(rows) == 1:
@@ -82,6 +94,17 @@ def count_failing(number: int, total: int) -> str:
     """
     verb = "does" if number == 1 else "do"
     return f"{number} of {count_words(total, 'filter')} {verb} not keep track"
+
+
+def name_lost_runs(text: str) -> str:
+    """Replace the words on tracks in a sentence on conditions without a divergence threshold.
+
+    Args:
+        text: Sentence of this module.
+    """
+    for words, lost in _LOST_WORDS.items():
+        text = re.sub(words, lost, text)
+    return text
 
 
 def _name(row: BoardRow, looks: Mapping[str, MethodLook]) -> str:

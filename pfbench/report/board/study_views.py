@@ -26,8 +26,8 @@ from pfbench.report.board.pack_entries import (
     round_values,
 )
 from pfbench.report.board.run_table import LOG_SCORE, METRIC_NAMES
-from pfbench.report.board.sentence import count_failing, count_words, describe_view
-from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_filters
+from pfbench.report.board.sentence import count_failing, count_words, describe_view, name_lost_runs
+from pfbench.report.board.view import Scope, ViewOptions, build_rows, describe_filters, show_row
 from pfbench.report.journal.study_pack import ALL
 from pfbench.report.options import ReportOptions
 from pfbench.report.setting_names import describe_data_settings, describe_settings
@@ -82,6 +82,7 @@ def build_views(
                 baselines = _order_baselines(scope, names.baselines)
             for baseline in baselines:
                 rows = build_rows(scope, baseline, view_options)
+                has_limit = _has_limits(selection.runs.conditions, names)
                 views[ViewKey(metric, selection.world, selection.regime, baseline)] = {
                     "sentence": _describe_common(selection.mask, selection.in_scope, len(rows))
                     + describe_view(
@@ -92,11 +93,18 @@ def build_views(
                         _name_metric(metric, selection.groups["group"]),
                         format_interval_level(options.alpha),
                         partial(compare_track_shares, selection.runs, alpha=options.alpha),
+                        has_limit=has_limit,
                     ),
                     "small_print": " ".join(filter(None, notes)),
-                    "rows": [round_values(vars(row)) for row in rows],
+                    "rows": [round_values(show_row(row, has_limit=has_limit)) for row in rows],
                 }
     return views
+
+
+def _has_limits(conditions: pd.DataFrame, names: StudyNames) -> bool:
+    """Return whether all scenarios of a view state a divergence threshold."""
+    worlds = (names.worlds.get(name) for name in conditions["scenario"].unique())
+    return all(world is None or world.limit is not None for world in worlds)
 
 
 def _order_baselines(scope: Scope, baselines: Sequence[str]) -> list[str]:
@@ -195,10 +203,11 @@ def _describe_hard_condition(scope: Scope, conditions: pd.DataFrame, names: Stud
     if len(counts) == 1 or not counts.any():
         return ""
     hardest = conditions.iloc[[int(counts.argmax())]]
-    return (
+    text = (
         f"{count_failing(int(counts.max()), len(scope.filters))} in over a fifth of runs "
         f"{_describe_scope(hardest, names)}, the most of a condition."
     )
+    return text if _has_limits(hardest, names) else name_lost_runs(text)
 
 
 def _describe_timing(scope: Scope, options: ReportOptions) -> str:

@@ -93,6 +93,20 @@ class BoardRow:
     cost_high: float = math.nan
 
 
+def show_row(row: BoardRow, *, has_limit: bool) -> dict[str, Any]:
+    """Return the values of a row for the page.
+
+    Args:
+        row: Row.
+        has_limit: Whether all scenarios of the view state a divergence threshold. Otherwise a run that is not lost
+            need not keep track: the share does not exist, and a filter without an error has lost runs.
+    """
+    values = dict(vars(row))
+    if not has_limit:
+        values |= {"track": math.nan, "words": row.words.replace("track not kept", "runs lost")}
+    return values
+
+
 class Scope(NamedTuple):
     """Filters in the conditions of a view, before a baseline is chosen.
 
