@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
 from pfbench.config.composition import JobConfig, compose, compose_tree
-from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import UntrustedConfigError, check_study
@@ -30,16 +30,43 @@ def check_words(words: Sequence[str]) -> JobConfig | None:
         ValueError: If a word is a flag that Hydra does not have.
     """
     args = _parse_flags(list(words))
-    if args.config_path or args.config_name:
-        raise UntrustedConfigError(
-            "--config-path and --config-name must not be used, since pfbench has its own main file. "
-            "Use --config-dir=FOLDER for more files."
-        )
     overrides = list(args.overrides)
-    if args.config_dir:
-        overrides.append(f"hydra.searchpath=[file://{args.config_dir}]")
-    check_files(overrides)
     return _check_sweep(overrides) if args.multirun else _check_composition(overrides)
+
+
+def replace_config_dir(words: Sequence[str]) -> list[str]:
+    """Write the flag `--config-dir` of Hydra as the search path that it stands for.
+
+    Args:
+        words: Overrides and flags of Hydra.
+
+    Returns:
+        The words in another order, without the flag.
+
+    Raises:
+        UntrustedConfigError: If a flag names another main file or a stored job, whose code would run.
+        ValueError: If a flag is not one of Hydra, or the search path is given twice.
+    """
+    args = _parse_flags(list(words))
+    if args.config_path or args.config_name or args.experimental_rerun:
+        raise UntrustedConfigError(
+            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
+            "own main file. Use --config-dir=FOLDER for more files."
+        )
+    if not args.config_dir:
+        return list(words)
+    if any(word.lstrip("+~").startswith("hydra.searchpath") for word in args.overrides):
+        raise ValueError(
+            f"hydra.searchpath must not be given beside --config-dir={args.config_dir}. Write both folders "
+            "as hydra.searchpath=[file://A,file://B]."
+        )
+    others = list(words)
+    for place, word in enumerate(words):
+        if re.fullmatch(r"(--config-dir|-cd)(=.*)?", word):
+            del others[place : place + (1 if "=" in word else 2)]
+            path = f"file://{args.config_dir}".replace("'", "\\'")
+            return [*others, f"hydra.searchpath=['{path}']"]
+    raise ValueError(f"--config-dir must be written in full. Use --config-dir={args.config_dir}")
 
 
 def _parse_flags(words: list[str]) -> Any:
