@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import stat
 import zipfile
 import zlib
@@ -29,7 +30,9 @@ INFLATED_RATIO = (
 )
 INFLATED_FREE = 64 * 2**20  # bytes that any file may inflate to
 
-_CHUNK = 2**20
+
+class LimitError(ValueError):
+    """A file exceeds a limit."""
 
 
 def check_is_file(path: Path, most: int) -> None:
@@ -41,23 +44,23 @@ def check_is_file(path: Path, most: int) -> None:
 
     Raises:
         OSError: If the file does not exist.
-        ValueError: If it is another kind of file, or too large.
+        LimitError: If it is another kind of file, or too large.
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
-        raise ValueError(
+        raise LimitError(
             f"{path} must be a file, got a folder, a pipe or a device. Give the path of a file."
         )
     if status.st_size > most:
-        raise ValueError(
+        raise LimitError(
             f"{path} must have at most {most} bytes, got {status.st_size}. Split the file."
         )
 
 
 def check_columns(path: Path, count: int) -> None:
-    """Raise ValueError if a table has too many columns."""
+    """Raise LimitError if a table has too many columns."""
     if count > TABLE_COLUMNS:
-        raise ValueError(
+        raise LimitError(
             f"{path.name} must have at most {TABLE_COLUMNS} columns, got {count}. "
             "Keep the columns that the reader names."
         )
@@ -71,13 +74,13 @@ def check_inflated(path: Path, size: int) -> None:
         size: Its size without compression in bytes.
 
     Raises:
-        ValueError: If it is much larger than the file.
+        LimitError: If it is much larger than the file.
     """
     most = _most_inflated(path)
     if size > most:
-        raise ValueError(
-            f"{path} must inflate to at most {most} bytes, {INFLATED_RATIO} times its size, got {size}. "
-            "The file is damaged or made to fill the memory. Delete it and write it again."
+        raise LimitError(
+            f"{path} must inflate to at most {most} bytes, {INFLATED_RATIO} times its size, got {size} or "
+            "more. The file is damaged or made to fill the memory. Delete it and write it again."
         )
 
 
@@ -88,7 +91,7 @@ def check_zip(path: Path) -> None:
         path: File. One that is not a zip file is left to its reader.
 
     Raises:
-        ValueError: If its content is much larger than the file.
+        LimitError: If its content is much larger than the file.
     """
     try:
         with zipfile.ZipFile(path) as file:
@@ -109,23 +112,18 @@ def read_gzip(path: Path) -> bytes:
 
     Raises:
         OSError: If the file does not exist.
-        ValueError: If the content is much larger than the file, or the file is damaged.
+        LimitError: If the content is much larger than the file.
+        ValueError: If the file is damaged.
     """
     check_is_file(path, TABLE_BYTES)
-    content, most, chunks, size = path.read_bytes(), _most_inflated(path), [], 0
+    most = _most_inflated(path)
     try:
-        while content:
-            stream = zlib.decompressobj(zlib.MAX_WBITS | 16)
-            while not stream.eof:
-                chunks.append(stream.decompress(content, _CHUNK))
-                content, size = stream.unconsumed_tail or stream.unused_data, size + len(chunks[-1])
-                if size > most:
-                    check_inflated(path, size)
-                if not chunks[-1] and not content and not stream.eof:
-                    raise EOFError("the file ends within its content")
-    except (zlib.error, EOFError) as error:
+        with gzip.open(path) as file:
+            content = file.read(most + 1)
+    except (zlib.error, EOFError, gzip.BadGzipFile) as error:
         raise ValueError(f"{path} must be a gzip file, got {error}. Write it again.") from error
-    return b"".join(chunks)
+    check_inflated(path, len(content))
+    return content
 
 
 def _most_inflated(path: Path) -> int:
