@@ -127,12 +127,13 @@ def _is_kind(root: Path, name: str, kind: int) -> bool:
     path = root / name
     if not os.path.lexists(path):
         return False
-    if os.path.realpath(path) != os.path.normpath(os.path.realpath(root) + os.sep + name):
+    mode = path.lstat().st_mode
+    inside = os.path.normpath(os.path.realpath(root) + os.sep + name)
+    if stat.S_ISLNK(mode) or os.path.realpath(path) != inside:
         raise UntrustedConfigError(
             f"{path} must be a file or a folder below {root}, got a link or a path out of it. "
             "Copy the file into the folder."
         )
-    mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise UntrustedConfigError(f"{path} must be a file, got a pipe or a device. Remove it.")
     return stat.S_IFMT(mode) == kind

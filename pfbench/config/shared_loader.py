@@ -203,6 +203,8 @@ class _SharedRepository(CachingConfigRepository):
         *others, schema = self.delegate.sources
         self.delegate.sources = [*others, *folders, schema]
         self.has_search_path = bool(folders)
+        for config_path in self.cache if folders else ():  # the main file, which Hydra loads before
+            self._find_source(config_path)
 
     def load_config(self, config_path: str) -> ConfigResult | None:
         """Return a file, the same object for each call in a composition."""

@@ -30,6 +30,11 @@ def check_words(words: Sequence[str]) -> JobConfig | None:
         ValueError: If a word is a flag that Hydra does not have.
     """
     args = _parse_flags(list(words))
+    if args.config_path or args.config_name or args.config_dir or args.experimental_rerun:
+        raise UntrustedConfigError(
+            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
+            "own main file. Use --config-dir=FOLDER for more files."
+        )
     overrides = list(args.overrides)
     return _check_sweep(overrides) if args.multirun else _check_composition(overrides)
 
@@ -41,32 +46,26 @@ def replace_config_dir(words: Sequence[str]) -> list[str]:
         words: Overrides and flags of Hydra.
 
     Returns:
-        The words in another order, without the flag.
+        The words without the flag.
 
     Raises:
-        UntrustedConfigError: If a flag names another main file or a stored job, whose code would run.
-        ValueError: If a flag is not one of Hydra, or the search path is given twice.
+        ValueError: If the flag has no folder, or the search path is given twice.
     """
-    args = _parse_flags(list(words))
-    if args.config_path or args.config_name or args.experimental_rerun:
-        raise UntrustedConfigError(
-            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
-            "own main file. Use --config-dir=FOLDER for more files."
-        )
-    if not args.config_dir:
+    place = next((i for i, w in enumerate(words) if re.match(r"(--config-dir|-cd)(=|$)", w)), None)
+    if place is None:
         return list(words)
-    if any(word.lstrip("+~").startswith("hydra.searchpath") for word in args.overrides):
+    _, equals, folder = words[place].partition("=")
+    after = place + 1 if equals else place + 2
+    folder = folder or "".join(words[place + 1 : after])
+    others = [*words[:place], *words[after:]]
+    is_twice = any(re.match(r"[+~]*hydra\.searchpath\b|--config-dir\b|-cd\b", w) for w in others)
+    if not folder or is_twice:
         raise ValueError(
-            f"hydra.searchpath must not be given beside --config-dir={args.config_dir}. Write both folders "
-            "as hydra.searchpath=[file://A,file://B]."
+            f"--config-dir must be given once, with a folder and without hydra.searchpath, got {folder!r}. "
+            "Write several folders as hydra.searchpath=[file://A,file://B]."
         )
-    others = list(words)
-    for place, word in enumerate(words):
-        if re.fullmatch(r"(--config-dir|-cd)(=.*)?", word):
-            del others[place : place + (1 if "=" in word else 2)]
-            path = f"file://{args.config_dir}".replace("'", "\\'")
-            return [*others, f"hydra.searchpath=['{path}']"]
-    raise ValueError(f"--config-dir must be written in full. Use --config-dir={args.config_dir}")
+    path = f"file://{folder}".replace("'", "\\'")
+    return [*others, f"hydra.searchpath=['{path}']"]
 
 
 def _parse_flags(words: list[str]) -> Any:
