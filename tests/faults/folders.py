@@ -193,7 +193,7 @@ def write_search_path(rng: random.Random, write: Write) -> list[str]:
         f"{group}/mine",
         header
         + key.replace("ENTRY", rng.choice(["file://OTHER", "pkg://os", "structured://os"]))
-        + rng.choice(["", f"\n{harmful(rng)}"]),
+        + rng.choice(["", *3 * [f"\n{harmful(rng)}"]]),
     )
     write("../outside/report/far", harmful(rng))
     return [
@@ -388,7 +388,7 @@ def limited() -> Iterator[None]:
         raise HangError
 
     timers = (
-        (signal.SIGVTALRM, signal.ITIMER_VIRTUAL, LIMIT_S),
+        (signal.SIGPROF, signal.ITIMER_PROF, LIMIT_S),
         (signal.SIGALRM, signal.ITIMER_REAL, 6 * LIMIT_S),
     )
     old = [signal.signal(name, stop) for name, _, _ in timers]
@@ -486,7 +486,9 @@ def accept(words: Sequence[str]) -> tuple[list[tuple[list[str], dict[str, Any]]]
         check(file, *rest, **options)
 
     with mock.patch.object(shared_loader, "check_content", trace):
-        given = replace_config_dir(words)
+        given = sorted(
+            replace_config_dir(words), key=lambda word: word != "-m"
+        )  # as the command does
         check_words(given)
         overrides = [word for word in given if not word.startswith("-")]
         jobs = [overrides]

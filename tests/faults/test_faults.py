@@ -142,6 +142,7 @@ def test_a_file_that_a_configuration_makes_is_reported(monkeypatch: pytest.Monke
 def plant_no_check(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("check_content", "check_defaults", "check_group", "check_place", "check_composed"):
         monkeypatch.setattr(f"pfbench.config.shared_loader.{name}", lambda *_, **__: None)
+    monkeypatch.setattr(folders, "LIMIT_S", 2)  # of a sweep that has no end
 
 
 def plant_follows_links(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,7 +165,7 @@ def plant_shadows(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def plant_python_tags(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("omegaconf.omegaconf.get_yaml_loader", lambda: yaml.UnsafeLoader)
+    monkeypatch.setattr("omegaconf._utils.get_yaml_loader", lambda: yaml.UnsafeLoader)
 
 
 HOLES: dict[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]] = {
