@@ -20,6 +20,7 @@ from pfbench.claims.measurements import (
 )
 from pfbench.claims.schema import Claim
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.files.table_file import check_parquet
 
 MEASUREMENTS = "measurements.parquet"
 JOBS = "jobs.json"
@@ -99,6 +100,7 @@ def _read_claim_data(folder: Path) -> ClaimData:
         return ClaimData(pd.DataFrame(columns=MEASURED_COLUMNS), {})
     path = table
     try:
+        check_parquet(table)
         rows = pd.read_parquet(table)[MEASURED_COLUMNS]
         rows = rows.astype({name: object for name in rows.select_dtypes("category")})
         path = jobs

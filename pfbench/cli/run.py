@@ -22,7 +22,7 @@ from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants
 from pfbench.cli.terminal import end_with_parent
 from pfbench.config.composition import JobConfig, register_experiments
 from pfbench.config.named_sets import expand_filter_sets
-from pfbench.config.sweep_check import check_words
+from pfbench.config.sweep_check import check_words, replace_config_dir
 from pfbench.config.trust import ENVIRONMENT
 from pfbench.files.work_start import start_work
 
@@ -61,6 +61,7 @@ def run_jobs(words: Sequence[str]) -> None:
     register_experiments()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    words = replace_config_dir(words)
     flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
     overrides = expand_filter_sets([word for word in words if word not in flags])
     overrides = delay_keys_of_swept_groups(overrides) if flags else overrides

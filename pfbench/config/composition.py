@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.group_checks import check_groups, resolve_values
 from pfbench.config.named_sets import check_tuned_seed, expand_filter_names
 from pfbench.config.paper_block import check_paper_blocks, remove_nested_blocks
-from pfbench.config.protected_keys import check_protected_keys
 from pfbench.config.trust import check_configuration, check_places, check_study, split_trust
 
 if TYPE_CHECKING:
@@ -83,23 +81,24 @@ def compose(overrides: Sequence[str] = ()) -> JobConfig:
     """
     words, trusted = split_trust(overrides)
     with _preserved_hydra_state():
-        composed = compose_tree(words)
+        composed = compose_tree(words, trusted)
         choices = {str(k): str(v) for k, v in composed.hydra.runtime.choices.items()}
         _move_hydra_node(composed)
         return resolve_config(composed, choices, trusted)
 
 
-def compose_tree(words: Sequence[str]) -> DictConfig:
-    """Compose a configuration with Hydra's own settings and check the keys that files may not set.
+def compose_tree(words: Sequence[str], trusted: Sequence[str] | None = None) -> DictConfig:
+    """Compose a configuration with Hydra's own settings, checked by the loader.
 
     Args:
         words: Hydra overrides.
+        trusted: Packages that the search path may name. Default: those of PFBENCH_TRUST.
 
     Returns:
         The configuration, not resolved, with the node `hydra`.
 
     Raises:
-        UntrustedConfigError: If a file sets a key that only the command line may set.
+        UntrustedConfigError: If a file sets what only the command line may set.
     """
     from hydra import version
     from hydra._internal.hydra import Hydra
@@ -108,19 +107,13 @@ def compose_tree(words: Sequence[str]) -> DictConfig:
 
     from pfbench.config.shared_loader import SharedLoader
 
-    def compose_words(some: Sequence[str]) -> DictConfig:
-        version.setbase("1.3")
-        loader = SharedLoader(create_config_search_path(str(conf_dir())))
-        return Hydra("app", loader).compose_config(
-            "config", list(some), RunMode.RUN, from_shell=False
-        )
-
     register_experiments()
-    check_files(words)
     with _preserved_hydra_state():
-        composed = compose_words(words)
-        check_protected_keys(composed, words, compose_words)
-    return composed
+        version.setbase("1.3")
+        loader = SharedLoader(create_config_search_path(str(conf_dir())), trusted)
+        return Hydra("app", loader).compose_config(
+            "config", list(words), RunMode.RUN, from_shell=False
+        )
 
 
 def resolve_config(

@@ -90,9 +90,4 @@ def format_choice_error(text: str, words: Sequence[str]) -> str:
         word = next((w for w in words if w.partition("=")[2] == "null"), "a group")
         group = word.lstrip("+").partition("=")[0]
         return f"{word} must name a file of the group. Choose one: pfbench list {group}"
-    if match := re.search(r"No config source registered for schema (\w+)", text):
-        return (
-            f"hydra.searchpath must have folders (file://FOLDER) or packages (pkg://MODULE), got "
-            f"{match[1]}://. Copy the files into a folder."
-        )
     return ""

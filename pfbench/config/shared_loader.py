@@ -19,18 +19,30 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import CachingConfigRepository, ConfigRepository
 from hydra._internal.defaults_list import Overrides
 from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.default_element import InputDefault, ResultDefault
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.plugins.config_source import ConfigResult, ConfigSource
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, flag_override
+
+from pfbench.config.file_rules import check_content, check_defaults, check_group, check_place
+from pfbench.config.foreign_folder import ForeignFolder, open_folder
+from pfbench.config.protected_keys import check_composed, to_plain
+from pfbench.config.trust import UntrustedConfigError, trusted_packages
+from pfbench.files import limits
 
 _Object = TypeVar("_Object")
 
+_SEARCH_PATH = "hydra.searchpath"  # start of the name that Hydra gives such a source
 _OWN_PACKAGE = "pkg://hydra.conf"  # files of Hydra itself, which do not change in a process
 # objects of Hydra by their name, with the version of their files. A composition changes its copy, and pickle copies fastest
 _kept: dict[Hashable, tuple[Hashable, bytes]] = {}
+_references: dict[
+    Hashable, DictConfig
+] = {}  # compositions of settings alone, which no file changes
 
 
 def _keep(key: Hashable, version: Hashable, make: Callable[[], _Object]) -> _Object:
@@ -50,14 +62,55 @@ def _keep(key: Hashable, version: Hashable, make: Callable[[], _Object]) -> _Obj
 
 
 class SharedLoader(ConfigLoaderImpl):
-    """Hydra's loader of configurations, which parses no file twice."""
+    """Hydra's loader of configurations, which parses no file twice and checks those of a search path.
+
+    All compositions of pfbench are its own: of a single job, of each job of a sweep in any process, and those of Python.
+
+    Attributes:
+        trusted: Packages that may be in a search path.
+    """
+
+    def __init__(self, config_search_path: Any, trusted: Sequence[str] | None = None) -> None:
+        super().__init__(config_search_path)
+        self.trusted = tuple(trusted_packages() if trusted is None else trusted)
+
+    def load_configuration(
+        self,
+        config_name: str | None,
+        overrides: list[str],
+        run_mode: RunMode,
+        from_shell: bool = True,
+        validate_sweep_overrides: bool = True,
+    ) -> DictConfig:
+        """Compose a configuration and check it."""
+        try:
+            tree = super().load_configuration(
+                config_name, overrides, run_mode, from_shell, validate_sweep_overrides
+            )
+        except RecursionError as error:
+            raise UntrustedConfigError(
+                "defaults must name files that do not name each other, got a circle. Remove one of the names."
+            ) from error
+
+        def compose_reference(words: list[str]) -> DictConfig:
+            key = config_name, tuple(words), run_mode
+            if key not in _references:
+                _references[key] = super(SharedLoader, self).load_configuration(
+                    config_name, words, run_mode, from_shell, validate_sweep_overrides
+                )
+            return _references[key]
+
+        sources = tree.hydra.runtime.config_sources
+        is_foreign = any(source.provider.startswith(_SEARCH_PATH) for source in sources)
+        check_composed(tree, overrides, compose_reference if is_foreign else None)
+        return tree
 
     def _parse_overrides_and_create_caching_repo(
         self, config_name: str | None, overrides: list[str]
     ) -> tuple[list[Override], CachingConfigRepository]:
         """Parse the overrides, and make the repository of one composition."""
         parsed = OverridesParser.create().parse_overrides(overrides=overrides)
-        repository = _SharedRepository(self.repository)
+        repository = _SharedRepository(self.repository, self.trusted)
         self._process_config_searchpath(config_name, parsed, repository)
         return parsed, repository
 
@@ -92,7 +145,20 @@ class SharedLoader(ConfigLoaderImpl):
         """Load a file into its package."""
         if isinstance(default, _MergedStart):
             return ConfigResult("", "", default.config, {})
-        load = super()._load_single_config
+
+        def load(default: ResultDefault, repo: Any) -> ConfigResult:
+            result = super(SharedLoader, self)._load_single_config(default, repo)
+            folder = repo.folders.get(default.config_path)
+            if folder is not None:
+                check_content(
+                    folder.file_of(default.config_path),
+                    to_plain(result.config),
+                    is_own=folder.is_own,
+                )
+            return result
+
+        if repo.has_search_path:
+            check_place(str(default.config_path), default.package)
         version = repo.versions.get(default.config_path)
         if version is None:
             return load(default, repo)
@@ -113,29 +179,80 @@ class _SharedRepository(CachingConfigRepository):
 
     Attributes:
         versions: Version of each file that can be kept, by its path.
+        folders: Folder of each file of a search path, by its path.
+        has_search_path: Whether there is a search path.
     """
 
-    def __init__(self, delegate: Any) -> None:
+    def __init__(self, delegate: Any, trusted: Sequence[str] = ()) -> None:
         # Hydra copies all nodes of its store. A search path replaces the list of sources, and no source changes.
         self.delegate: ConfigRepository = copy.copy(delegate)
         self.cache = {}
         self.versions: dict[str, Hashable] = {}
+        self.folders: dict[str, ForeignFolder] = {}
+        self.has_search_path = False
+        self._trusted = trusted
+        self._loaded = 0
+
+    def initialize_sources(self, config_search_path: ConfigSearchPath) -> None:
+        """Add the folders of a search path before the last source, the schemas."""
+        folders = [
+            open_folder(str(entry.provider), str(entry.path), self._trusted)
+            for entry in config_search_path.get_path()
+            if str(entry.provider).startswith(_SEARCH_PATH)
+        ]
+        *others, schema = self.delegate.sources
+        self.delegate.sources = [*others, *folders, schema]
+        self.has_search_path = bool(folders)
+        for config_path in self.cache if folders else ():  # the main file, which Hydra loads before
+            self._find_source(config_path)
 
     def load_config(self, config_path: str) -> ConfigResult | None:
         """Return a file, the same object for each call in a composition."""
         if config_path not in self.cache:
             self.cache[config_path] = self._load(config_path)
+        self._loaded += 1
+        if self.has_search_path and self._loaded > limits.LOADED_FILES:
+            raise UntrustedConfigError(
+                f"defaults lists must name at most {limits.LOADED_FILES} files in all, repetitions counted, "
+                f"got more at {config_path}. Shorten the lists of your files, which may name each other."
+            )
         return self.cache[config_path]
 
     def _load(self, config_path: str) -> ConfigResult | None:
         """Load a file, or copy it."""
-        source = next((s for s in self.delegate.sources if _has_file(s, config_path)), None)
+        source = self._find_source(config_path)
         schema = self.get_schema_source()
         version = _find_version(source, config_path, schema) if source else None
         if source is None or version is None:
-            return self.delegate.load_config(config_path)
+            return self._load_and_check(config_path)
         self.versions[config_path] = version = source.full_path(), source.provider, version
-        return _keep(config_path, version, lambda: self.delegate.load_config(config_path))
+        return _keep(config_path, version, lambda: self._load_and_check(config_path))
+
+    def _load_and_check(self, config_path: str) -> ConfigResult | None:
+        """Load a file, and check its defaults list if it is one of a search path."""
+        folder = self.folders.get(config_path)
+        if folder is not None:
+            check_group(folder.file_of(config_path), config_path, is_own=folder.is_own)
+        result = self.delegate.load_config(config_path)
+        if folder is not None and result is not None:
+            check_defaults(folder.file_of(config_path), result.defaults_list or ())
+        return result
+
+    def _find_source(self, config_path: str) -> ConfigSource | None:
+        """Return the source of a file, which must be the only one if it is in a search path."""
+        if not self.has_search_path:
+            return next((s for s in self.delegate.sources if _has_file(s, config_path)), None)
+        holders = [source for source in self.delegate.sources if _has_file(source, config_path)]
+        folder = next((source for source in holders if isinstance(source, ForeignFolder)), None)
+        if folder is not None:
+            self.folders[config_path] = folder
+        if folder is not None and len(holders) > 1:
+            other = next(source for source in holders if source is not folder)
+            raise UntrustedConfigError(
+                f"{folder.file_of(config_path)} must have another name than "
+                f"{_name_file(other, config_path)}, got the same. Rename your file."
+            )
+        return holders[0] if holders else None
 
 
 class _StoredNode:
@@ -149,6 +266,14 @@ class _StoredNode:
 
     def __hash__(self) -> int:
         return id(self._node)
+
+
+def _name_file(source: ConfigSource, config_path: str) -> str:
+    """Return the place of a file, for messages."""
+    group, _, name = config_path.rpartition("/")
+    is_shipped = not isinstance(source, ForeignFolder)
+    folder = f"pfbench's own {group or 'main file'}" if is_shipped else source.path
+    return f"{folder} {name}" if is_shipped else f"{source.path}/{config_path}"
 
 
 def _has_file(source: ConfigSource, config_path: str) -> bool:
@@ -173,7 +298,7 @@ def _find_version(source: ConfigSource, config_path: str, schema: ConfigSource) 
         return None
     if source.full_path() == _OWN_PACKAGE:
         return _OWN_PACKAGE
-    if source.scheme() == "file":
+    if source.scheme() in ("file", "own"):
         status = os.stat(os.path.join(source.path, name))
         return status.st_mtime_ns, status.st_size, status.st_ino
     return None

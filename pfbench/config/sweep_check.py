@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from typing import Any, NoReturn
 
 from pfbench.config.composition import JobConfig, compose, compose_tree
-from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.hydra_messages import format_flag
 from pfbench.config.trust import UntrustedConfigError, check_study
@@ -33,16 +33,42 @@ def check_words(words: Sequence[str]) -> JobConfig | None:
         ValueError: If a word is a flag that Hydra does not have.
     """
     args = _parse_flags(list(words))
-    if args.config_path or args.config_name:
+    if args.config_path or args.config_name or args.config_dir or args.experimental_rerun:
         raise UntrustedConfigError(
-            "--config-path and --config-name must not be used, since pfbench has its own main file. "
-            "Use --config-dir=FOLDER for more files."
+            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
+            "own main file. Use --config-dir=FOLDER for more files."
         )
     overrides = list(args.overrides)
-    if args.config_dir:
-        overrides.append(f"hydra.searchpath=[file://{args.config_dir}]")
-    check_files(overrides)
     return _check_sweep(overrides) if args.multirun else _check_composition(overrides)
+
+
+def replace_config_dir(words: Sequence[str]) -> list[str]:
+    """Write the flag `--config-dir` of Hydra as the search path that it stands for.
+
+    Args:
+        words: Overrides and flags of Hydra.
+
+    Returns:
+        The words without the flag.
+
+    Raises:
+        ValueError: If the flag has no folder, or the search path is given twice.
+    """
+    place = next((i for i, w in enumerate(words) if re.match(r"(--config-dir|-cd)(=|$)", w)), None)
+    if place is None:
+        return list(words)
+    _, equals, folder = words[place].partition("=")
+    after = place + 1 if equals else place + 2
+    folder = folder or "".join(words[place + 1 : after])
+    others = [*words[:place], *words[after:]]
+    is_twice = any(re.match(r"[+~]*hydra\.searchpath\b|--config-dir\b|-cd\b", w) for w in others)
+    if not folder or is_twice:
+        raise ValueError(
+            f"--config-dir must be given once, with a folder and without hydra.searchpath, got {folder!r}. "
+            "Write several folders as hydra.searchpath=[file://A,file://B]."
+        )
+    path = f"file://{folder}".replace("'", "\\'")
+    return [*others, f"hydra.searchpath=['{path}']"]
 
 
 def _parse_flags(words: list[str]) -> Any:

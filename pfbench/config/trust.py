@@ -15,7 +15,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
+from importlib.machinery import ModuleSpec, PathFinder
 from typing import Any
+
+from pfbench.files import limits
 
 ENVIRONMENT = "PFBENCH_TRUST"  # trusted packages, for the processes of a sweep
 FOLDERS = ("nav", "model", "noise", "scenario", "filter", "learn")
@@ -34,7 +37,7 @@ HARMLESS = ("pyro.distributions", "torch.distributions", "torch.nn")  # parts of
 HYDRA_KEYS = ("_target_", "_args_", "_partial_", "_convert_", "_recursive_")
 NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+")
 STUDY = re.compile(r"[A-Za-z0-9_][\w.+-]{0,99}", re.ASCII)
-DEEPEST = 40  # levels of a configuration
+_local: set[str] = set()  # trusted packages, which may lie in the current folder
 
 
 class UntrustedConfigError(ValueError):
@@ -59,6 +62,16 @@ def split_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
     return others, _parse_packages([*texts, os.environ.get(ENVIRONMENT, "")])
 
 
+class _CurrentFolder:
+    """Finder of trusted packages in the current folder, where nothing else is imported from."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        """Find a top-level package that the user trusts."""
+        is_trusted = path is None and name in {full.partition(".")[0] for full in _local}
+        return PathFinder.find_spec(name, [os.getcwd()]) if is_trusted else None
+
+
 def trusted_packages() -> tuple[str, ...]:
     """Return the packages that the environment variable names."""
     return _parse_packages([os.environ.get(ENVIRONMENT, "")])
@@ -79,6 +92,9 @@ def _parse_packages(texts: Sequence[str]) -> tuple[str, ...]:
                 f"trust must not be a general library, got {name!r}. It can run or delete files. "
                 "Name the package that defines your classes."
             )
+    _local.update(packages)
+    if packages and _CurrentFolder not in sys.meta_path:
+        sys.meta_path.append(_CurrentFolder)
     return packages
 
 
@@ -142,9 +158,9 @@ def check_places(values: Mapping[str, Any]) -> None:
 
 def _walk(node: Any, path: str, depth: int = 0) -> Iterator[tuple[str, Any]]:
     """Yield all nodes of a configuration with their keys."""
-    if depth > DEEPEST:
+    if depth > limits.CONFIG_DEPTH:
         raise UntrustedConfigError(
-            f"{path} must have at most {DEEPEST} levels, got more. Simplify the configuration."
+            f"{path} must have at most {limits.CONFIG_DEPTH} levels, got more. Simplify the configuration."
         )
     yield path, node
     if isinstance(node, Mapping):

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pfbench.files import limits
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -42,9 +44,10 @@ def read_table_file(file: Path) -> TableFile:
         The table. Columns of a CSV file can contain text.
 
     Raises:
-        ValueError: If the file is damaged, or pyarrow is not installed. The message names the file
-            and, for CSV, the line.
+        ValueError: If the file is damaged, larger than the limits of `pfbench.files.limits`, or
+            pyarrow is not installed. The message names the file and, for CSV, the line.
     """
+    limits.check_is_file(file, limits.TABLE_BYTES)
     return _read_parquet(file) if file.suffix == ".parquet" else _read_csv(file)
 
 
@@ -52,6 +55,7 @@ def _read_csv(file: Path) -> TableFile:
     import pandas as pd  # half a second that a run without tables does not need
 
     lines, notes = _whole_lines(file)
+    limits.check_columns(file, lines[0].count(",") + 1)
     names = [name.strip().strip('"') for name in lines[0].split(",")]
     _check_names(file, lines[0], names)
     repeated = sorted({name for name in names if names.count(name) > 1})
@@ -172,6 +176,7 @@ def _read_parquet(file: Path) -> TableFile:
         ) from error
     try:
         metadata = parquet.read_metadata(file)
+        check_parquet(file)
         table = parquet.read_table(file, page_checksum_verification=True, use_threads=False)
         table.validate(full=True)
         names = table.column_names
@@ -179,6 +184,8 @@ def _read_parquet(file: Path) -> TableFile:
         pairs = (table.schema.metadata or {}).items()
         stated = {key.decode(): value.decode() for key, value in pairs}
         damage = _disagreement(metadata, rows)
+    except limits.LimitError:
+        raise
     except (
         pa.lib.ArrowException,
         OSError,
@@ -199,6 +206,27 @@ def _read_parquet(file: Path) -> TableFile:
             f"got {damage or 'a column twice'}. The file is damaged: write it again."
         )
     return TableFile(rows, stated)
+
+
+def check_parquet(file: Path) -> None:
+    """Check the size of a Parquet file by its own counts, before it is read.
+
+    Args:
+        file: File.
+
+    Raises:
+        limits.LimitError: If it is no file, or has too many columns or much more content than bytes.
+        OSError, pyarrow.ArrowException: If it cannot be read.
+    """
+    from pyarrow import parquet
+
+    limits.check_is_file(file, limits.TABLE_BYTES)
+    metadata = parquet.read_metadata(file)
+    limits.check_columns(file, metadata.num_columns)
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    rows = max(metadata.num_rows, sum(group.num_rows for group in groups))
+    stated = sum(group.total_byte_size for group in groups)
+    limits.check_inflated(file, max(8 * rows * metadata.num_columns, stated))
 
 
 def _disagreement(metadata: Any, rows: pd.DataFrame) -> str:

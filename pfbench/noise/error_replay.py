@@ -15,6 +15,7 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
+from pfbench.files.table_file import check_parquet
 from pfbench.noise.base import NoiseRegime, make_no_distribution_error
 from pfbench.noise.distributions import ErrorDistribution
 from pfbench.noise.white import NominalNoise
@@ -118,6 +119,7 @@ class ErrorReplay(NoiseRegime):
                 f"data.root must be the folder that contains {self.folder}/, got {self.root}. "
                 f"The file {path} does not exist."
             )
+        check_parquet(path)
         table = pd.read_parquet(path)
         columns = ["utc_s", *_TRUTH, *_RECEIVER]
         missing = sorted(set(columns) - set(table.columns))

@@ -16,7 +16,9 @@ import pandas as pd
 import pyarrow as pa
 
 from pfbench.config.folders import name_run_command
+from pfbench.files import limits
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.files.table_file import check_parquet
 from pfbench.report.board.decided_parts import StudyFacts, decide_parts
 from pfbench.report.journal.references import renew_bibliography
 from pfbench.report.methods_facts import MethodsFacts
@@ -55,11 +57,13 @@ def read_page_data(folder: Path) -> dict[str, Any]:
     """
     path = folder / PAGE_DATA
     try:
-        pack: dict[str, Any] = json.loads(gzip.decompress(path.read_bytes()))
+        pack: dict[str, Any] = json.loads(limits.read_gzip(path))
         pack["facts"]["looks"]  # a file of an early version has none
         for name in _KEYED:
             keys = [tuple(key) for key in pack[name]["keys"]]
             pack[name] = dict(zip(keys, pack[name]["values"], strict=True))
+    except limits.LimitError:
+        raise
     except (OSError, EOFError, ValueError, TypeError, KeyError) as error:
         raise ValueError(
             f"{path} must be the data of a page, got {error}. Run the study and write its report again."
@@ -79,6 +83,7 @@ def decide_again(pack: Mapping[str, Any], runs: Path) -> dict[str, Any]:
         ValueError: If the file lacks runs of a filter of the page.
     """
     try:
+        check_parquet(runs)
         table = pd.read_parquet(runs)
         missing = {look["key"] for look in pack["facts"]["looks"]} - set(table["filter"])
         parts = {} if missing else decide_parts(table, StudyFacts.from_pack(pack))

@@ -18,6 +18,7 @@ import numpy as np
 
 from pfbench.files.atomic_write import remove_temporary_files, write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+from pfbench.files.limits import LimitError, check_zip
 from pfbench.files.work_start import start_work
 from pfbench.results.config_key import list_same_configuration
 from pfbench.results.result_format import FORMAT, check_arrays, check_metadata
@@ -205,6 +206,10 @@ def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
         raise DamagedResultError(
             f"{path} is damaged: it must be a file, got another kind. Delete it and run the job again."
         )
+    try:
+        check_zip(path)
+    except LimitError as error:
+        raise DamagedResultError(f"{error}") from error
     # opened here, since numpy leaves a damaged file open
     with path.open("rb") as raw:
         try:

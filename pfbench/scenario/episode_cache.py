@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pfbench.files.atomic_write import set_aside, write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+from pfbench.files.limits import check_zip
 from pfbench.kernels.generator_version import GENERATOR_VERSION
 
 Arrays = dict[str, Tensor]
@@ -63,6 +64,7 @@ def _read(path: Path) -> Arrays:
             Other errors are those of numpy.
     """
     # opened here, since numpy leaves a damaged file open
+    check_zip(path)
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         data = {name: file[name] for name in file.files}
     if not has_valid_digest(data):

@@ -122,7 +122,8 @@ def test_a_composition_changes_no_kept_file() -> None:
     assert is_same(words)
 
 
-def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
+def test_a_changed_file_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_loader, "check_defaults", lambda *_: None)  # of interpolations
     (tmp_path / "noise").mkdir()
     file = tmp_path / "noise" / "mine.yaml"
     words = [f"hydra.searchpath=[file://{tmp_path}]", "scenario=linear_walk", "noise=mine"]
@@ -143,7 +144,10 @@ def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
     assert composed.noise.paper.name == "second"
 
 
-def test_an_error_of_a_file_is_that_of_hydra(tmp_path: Path) -> None:
+def test_an_error_of_a_file_is_that_of_hydra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shared_loader, "check_defaults", lambda *_: None)  # of interpolations
     (tmp_path / "noise").mkdir()
     file = tmp_path / "noise" / "mine.yaml"
     words = [f"hydra.searchpath=[file://{tmp_path}]", "scenario=linear_walk", "noise=mine"]

@@ -9,6 +9,7 @@ import os
 import random
 import re
 import signal
+import stat
 import subprocess
 import sys
 from collections import Counter
@@ -19,11 +20,13 @@ from typing import IO, Any
 
 import pytest
 import torch
+import yaml
 from checkout import ROOT
 
 from faults import (
     clock,
     damage,
+    folders,
     hostile,
     kills,
     main,
@@ -36,6 +39,7 @@ from faults import (
 )
 from faults.sweeps import new_home, run_jobs, undisturbed
 from faults.tally import BAD, FINE, Tally
+from pfbench.config import shared_loader
 from pfbench.filter.loop import FilterResult
 from pfbench.results import store
 
@@ -80,6 +84,10 @@ def test_damaged_files_are_not_read_as_others(kind: str) -> None:
 def test_hostile_files_run_no_code() -> None:
     undisturbed()
     assert_fine(hostile.run(1, 0), 1)
+
+
+def test_hostile_folders_are_checked_by_what_hydra_loads() -> None:
+    assert_fine(folders.run(2 * len(folders.KINDS), 0), 2 * len(folders.KINDS))
 
 
 def test_a_kalman_filter_survives_extreme_numbers() -> None:
@@ -129,6 +137,59 @@ def test_a_file_that_a_configuration_makes_is_reported(monkeypatch: pytest.Monke
     monkeypatch.setattr("pfbench.cli.run.check_words", run_code)
     words = ("noise", hostile.text_of(hostile.NODES["path_write"]), "run")
     assert hostile.attempt(*words)[0] == "code run"
+
+
+def plant_no_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("check_content", "check_defaults", "check_group", "check_place", "check_composed"):
+        monkeypatch.setattr(f"pfbench.config.shared_loader.{name}", lambda *_, **__: None)
+    monkeypatch.setattr(folders, "LIMIT_S", 2)  # of a sweep that has no end
+
+
+def plant_follows_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    def is_kind(root: Path, name: str, kind: int) -> bool:
+        return (root / name).exists() and stat.S_IFMT((root / name).stat().st_mode) == kind
+
+    monkeypatch.setattr("pfbench.config.foreign_folder._is_kind", is_kind)
+    monkeypatch.setattr("os.O_NOFOLLOW", 0)
+
+
+def plant_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folders, "LIMIT_S", 0.02)
+
+
+def plant_shadows(monkeypatch: pytest.MonkeyPatch) -> None:
+    def find(self: Any, config_path: str) -> Any:
+        return next((s for s in self.delegate.sources if s.is_config(config_path)), None)
+
+    monkeypatch.setattr("pfbench.config.shared_loader._SharedRepository._find_source", find)
+
+
+def plant_python_tags(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("omegaconf._utils.get_yaml_loader", lambda: yaml.UnsafeLoader)
+
+
+HOLES: dict[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]] = {
+    plant_no_check: (
+        "headers", "several_headers", "late_headers", "defaults", "packages", "interpolations", "config_dir", "search_path",
+        "sweeps", "aliases", "names", "experiments", "groups_of_hydra", "data",
+    ),
+    plant_follows_links: ("links",),
+    plant_waits: ("large", "pipes"),
+    plant_shadows: ("same_names",),
+    plant_python_tags: ("tags",),
+}  # fmt: skip
+
+
+def test_each_kind_of_folder_finds_a_planted_hole(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert sorted(kind for kinds in HOLES.values() for kind in kinds) == sorted(folders.KINDS)
+    for plant, kinds in HOLES.items():
+        for kind in kinds:
+            with monkeypatch.context() as patch:
+                plant(patch)
+                shared_loader._kept.clear()
+                found = (folders.attempt(kind, seed)[0] for seed in range(60))
+                assert any(outcome in BAD for outcome in found), kind
+    shared_loader._kept.clear()
 
 
 def test_a_crash_is_counted_and_the_next_case_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:

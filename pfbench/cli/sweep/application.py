@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from pfbench.config.folders import conf_dir
@@ -33,9 +34,26 @@ def make_application(task: Callable[[Any], Any]) -> Callable[[], None]:
             overrides = [word for word in words if word not in flags]
             _run_overrides(task, overrides, is_multirun=bool(flags))
         else:
-            full()
+            with _shared_loader():
+                full()
 
     return run
+
+
+@contextmanager
+def _shared_loader() -> Iterator[None]:
+    """Let Hydra's own application load by the loader of pfbench, which checks what it loads."""
+    from hydra._internal import hydra as module
+
+    from pfbench.config.shared_loader import SharedLoader
+
+    hydra: Any = module
+    by_hydra = hydra.ConfigLoaderImpl
+    hydra.ConfigLoaderImpl = SharedLoader
+    try:
+        yield
+    finally:
+        hydra.ConfigLoaderImpl = by_hydra
 
 
 def _run_overrides(task: Callable[[Any], Any], overrides: list[str], *, is_multirun: bool) -> None:

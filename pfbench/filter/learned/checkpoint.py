@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from pfbench.files.atomic_write import write_atomically
 from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+from pfbench.files.limits import TABLE_BYTES, check_is_file, check_zip
 
 CHECKPOINT_FORMAT = "pfbench checkpoint 2"
 UNTRAINED = "untrained"
@@ -55,6 +56,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
             f"checkpoint must be an existing file, got {path}. Use the path that `pfbench train` "
             "prints, or checkpoint=untrained."
         )
+    check_is_file(Path(path), TABLE_BYTES)
+    check_zip(Path(path))
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files

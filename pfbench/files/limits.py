@@ -1,0 +1,131 @@
+"""Limits of the files that pfbench reads. A file of another person may be made to fill the memory or to take hours."""
+
+from __future__ import annotations
+
+import gzip
+import stat
+import zipfile
+import zlib
+from pathlib import Path
+
+# of a configuration file
+CONFIG_BYTES = 1_000_000
+CONFIG_VALUES = 10_000  # with its aliases expanded
+CONFIG_DEPTH = 40
+CONFIG_TEXT = 10_000  # characters of one text
+CONFIG_INTERPOLATED = 1_000  # characters of a text with interpolations
+# of a configuration
+RESOLVED_REFERENCES = 2_000
+RESOLVED_VALUES = 100_000  # that others refer to, each as often as it is referred to
+RESOLVED_TEXT = 1_000_000  # characters of all their values
+LOADED_FILES = (
+    300  # by the defaults lists of one configuration with a search path, repetitions counted
+)
+SWEPT_JOBS = 100_000  # of the sweep in a file
+# of tables and compressed files
+TABLE_BYTES = 4 * 2**30
+TABLE_COLUMNS = 1_000
+INFLATED_RATIO = (
+    200  # times the size of the file; numbers of runs and of sensors have a ratio below 20
+)
+INFLATED_FREE = 64 * 2**20  # bytes that any file may inflate to
+
+
+class LimitError(ValueError):
+    """A file exceeds a limit."""
+
+
+def check_is_file(path: Path, most: int) -> None:
+    """Check that a path is a file and no pipe or device, which may never end, and its size.
+
+    Args:
+        path: File, or a link to one.
+        most: Largest size in bytes.
+
+    Raises:
+        OSError: If the file does not exist.
+        LimitError: If it is another kind of file, or too large.
+    """
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise LimitError(
+            f"{path} must be a file, got a folder, a pipe or a device. Give the path of a file."
+        )
+    if status.st_size > most:
+        raise LimitError(
+            f"{path} must have at most {most} bytes, got {status.st_size}. Split the file."
+        )
+
+
+def check_columns(path: Path, count: int) -> None:
+    """Raise LimitError if a table has too many columns."""
+    if count > TABLE_COLUMNS:
+        raise LimitError(
+            f"{path.name} must have at most {TABLE_COLUMNS} columns, got {count}. "
+            "Keep the columns that the reader names."
+        )
+
+
+def check_inflated(path: Path, size: int) -> None:
+    """Check the size that a compressed file states, before it is read.
+
+    Args:
+        path: File.
+        size: Its size without compression in bytes.
+
+    Raises:
+        LimitError: If it is much larger than the file.
+    """
+    most = _most_inflated(path)
+    if size > most:
+        raise LimitError(
+            f"{path} must inflate to at most {most} bytes, {INFLATED_RATIO} times its size, got {size} or "
+            "more. The file is damaged or made to fill the memory. Delete it and write it again."
+        )
+
+
+def check_zip(path: Path) -> None:
+    """Check the sizes in a zip file such as a result or a checkpoint, before it is read.
+
+    Args:
+        path: File. One that is not a zip file is left to its reader.
+
+    Raises:
+        LimitError: If its content is much larger than the file.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            size = sum(member.file_size for member in file.infolist())
+    except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError, EOFError):
+        return
+    check_inflated(path, size)
+
+
+def read_gzip(path: Path) -> bytes:
+    """Read a gzip file, which does not state its size, up to the limit.
+
+    Args:
+        path: File.
+
+    Returns:
+        The content.
+
+    Raises:
+        OSError: If the file does not exist.
+        LimitError: If the content is much larger than the file.
+        ValueError: If the file is damaged.
+    """
+    check_is_file(path, TABLE_BYTES)
+    most = _most_inflated(path)
+    try:
+        with gzip.open(path) as file:
+            content = file.read(most + 1)
+    except (zlib.error, EOFError, gzip.BadGzipFile) as error:
+        raise ValueError(f"{path} must be a gzip file, got {error}. Write it again.") from error
+    check_inflated(path, len(content))
+    return content
+
+
+def _most_inflated(path: Path) -> int:
+    """Return the number of bytes that a compressed file may inflate to."""
+    return max(INFLATED_FREE, INFLATED_RATIO * path.stat().st_size)
