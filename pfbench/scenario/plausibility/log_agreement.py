@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pfbench.core import quaternion
 from pfbench.nav import attitude
 from pfbench.nav.plausible_limits import PlausibleLimits
-from pfbench.nav.preintegration import preintegrate
+from pfbench.scenario.plausibility.dead_reckoning import integrate_windows
 from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.plausibility.table_scales import (
     FEWEST_WINDOWS,
@@ -28,7 +28,7 @@ from pfbench.scenario.plausibility.table_scales import (
 )
 from pfbench.scenario.recorded.log_tables import Array
 from pfbench.scenario.recorded.navigation_log import GnssLog, ImuLog, ReferenceLog
-from pfbench.scenario.recorded.time_grid import interpolate, split_samples
+from pfbench.scenario.recorded.time_grid import interpolate
 
 _STRAIGHT = 1.5  # s; longest interval over which the velocity is taken as linear
 
@@ -117,9 +117,7 @@ def _compare_windows(
 ) -> tuple[str, ...]:
     """Compare dead reckoning between the rows `nodes` of the reference."""
     time = reference.time[nodes]
-    force, rate, spans = (torch.from_numpy(a) for a in split_samples(imu, time))
-    bias = spans.new_zeros(len(spans), 6)
-    rotation, velocity, _, _ = preintegrate(force, rate, spans, bias)
+    rotation, velocity = integrate_windows(imu, time)
     q = torch.from_numpy(reference.attitude[nodes])
     inverse = q[1:] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
     turned = quaternion.quaternion_multiply(q[:-1], rotation)

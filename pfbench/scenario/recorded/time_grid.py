@@ -222,15 +222,28 @@ def split_samples(imu: ImuLog, grid: Array) -> tuple[Array, Array, Array]:
     Returns:
         Mean force, m/s^2, and rate, rad/s, of the pieces, [T, S, 3], and their durations, s, [T, S].
     """
+    step, durations, mean = list_pieces(imu, grid)
+    piece_index = np.arange(len(step)) - np.searchsorted(step, step)
+    shape = (len(grid) - 1, int(piece_index.max()) + 1)
+    spans, pieces = np.zeros(shape), np.zeros((*shape, 6))
+    spans[step, piece_index], pieces[step, piece_index] = durations, mean
+    return pieces[..., :3], pieces[..., 3:], spans
+
+
+def list_pieces(imu: ImuLog, grid: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    """List the pieces between samples and grid points.
+
+    Args:
+        imu: IMU samples.
+        grid: Grid points, s, [T + 1].
+
+    Returns:
+        Step of each piece, [P], duration, s, [P], mean force, m/s^2, and rate, rad/s, [P, 6].
+    """
     inside = imu.time[(imu.time > grid[0]) & (imu.time < grid[-1])]
     nodes = np.union1d(inside, grid)
     values = np.stack(
         [np.interp(nodes, imu.time, column) for column in (*imu.force.T, *imu.rate.T)], axis=-1
     )
-    mean = 0.5 * (values[1:] + values[:-1])
     step = np.searchsorted(grid, nodes[:-1], side="right") - 1
-    piece_index = np.arange(len(step)) - np.searchsorted(step, step)
-    shape = (len(grid) - 1, int(piece_index.max()) + 1)
-    spans, pieces = np.zeros(shape), np.zeros((*shape, 6))
-    spans[step, piece_index], pieces[step, piece_index] = np.diff(nodes), mean
-    return pieces[..., :3], pieces[..., 3:], spans
+    return step, np.diff(nodes), 0.5 * (values[1:] + values[:-1])
