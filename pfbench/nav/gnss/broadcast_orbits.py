@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.files.reader_notes import announce_notes
 from pfbench.nav.gnss.broadcast_elements import broadcast_elements, mean_motion
 from pfbench.nav.gnss.ephemeris import describe_unhealthy, parse_epochs, read_ephemeris
 from pfbench.nav.gnss.ephemeris_checks import EphemerisSelection, check_ephemerides
@@ -140,6 +141,7 @@ class BroadcastConstellation(Constellation):
                 f"(GPS time {first:.0f} to {last:.0f} s), got {self.start_s} "
                 f"(GPS time {self.epoch:.0f} s). Give a time near them."
             )
+        announce_notes(self.path, self.notes)
         return table.drop_duplicates(["name", "toe"], keep="last").reset_index(drop=True)
 
     @cached_property

@@ -8,7 +8,7 @@ columns, each a Parquet or a CSV file:
 |---|---|
 | imu | t [s], fx, fy, fz [m/s^2] (about -9.8 on z when level), wx, wy, wz [rad/s] |
 | gnss | t, and lat_deg, lon_deg, h_m or pn, pe, pd [m] |
-| gnss, optional | vn, ve, vd [m/s]; fix (1: use the fix, other values: missing) |
+| gnss, optional | vn, ve, vd [m/s]; fix (1: use the fix, 0: missing; other codes by `fix_codes`) |
 | reference | t, pn, pe, pd (or lat_deg, lon_deg, h_m), vn, ve, vd, roll, pitch, yaw [rad] |
 
 A table can contain several flights and sensors. The columns `path` and `imu` identify them.
@@ -22,7 +22,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from pfbench.files.reader_notes import announce_notes
 from pfbench.nav import attitude, earth
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_changes
@@ -33,6 +35,7 @@ from pfbench.scenario.plausibility.log_agreement import (
     compare_times,
 )
 from pfbench.scenario.plausibility.log_table import LogTable
+from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes, select_usable
 from pfbench.scenario.recorded.log_checks import (
     STANDARD_GRAVITY,
     check_force,
@@ -69,6 +72,7 @@ def read_log(
     imu: int | None = None,
     origin: Sequence[float] | None = None,
     limits: PlausibleLimits | None = None,
+    fix_codes: FixCodes = None,
 ) -> NavigationLog:
     """Read and check the log in a folder.
 
@@ -80,6 +84,8 @@ def read_log(
         origin: lat_deg, lon_deg, h_m of pn = pe = pd = 0. Required only if one table has lat_deg,
             another has pn, and the metadata of the files do not contain it.
         limits: Limits of the platform. None for the default limits.
+        fix_codes: Meaning of the column `fix` of the fixes: the program that wrote it (nmea, rtklib,
+            ublox), the codes of the fixes to use, or None for 1 (use) and 0.
 
     Returns:
         The log in right-forward-up and East-North-Up axes.
@@ -95,7 +101,9 @@ def read_log(
     )
     sensors, notes = _samples(inertial)
     centre = _origin(origin, gnss, truth)
-    fixes, reference = _fixes(gnss, centre), _motion(truth, centre)
+    check_fix_codes(fix_codes)
+    usable, usable_notes = select_usable(gnss, fix_codes)
+    fixes, reference = _fixes(gnss, centre, usable), _motion(truth, centre)
     check_overlap(inertial.name, sensors.time, gnss.name, fixes.time)
     check_overlap(inertial.name, sensors.time, truth.name, reference.time)
     check_rotation(sensors, reference, inertial.name, truth.name)
@@ -111,7 +119,9 @@ def read_log(
     tables = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
     notes += (*fix_notes, *compare_times(tables))
     dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
-    return NavigationLog(sensors, fixes, reference, gravity, (*dropped, *notes))
+    notes = (*dropped, *usable_notes, *notes)
+    announce_notes(folder, notes)
+    return NavigationLog(sensors, fixes, reference, gravity, notes)
 
 
 def _samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
@@ -205,16 +215,16 @@ def _positions(table: LogTable, origin: tuple[float, ...] | None) -> Array:
     ).numpy()
 
 
-def _fixes(table: LogTable, origin: tuple[float, ...] | None) -> GnssLog:
+def _fixes(
+    table: LogTable, origin: tuple[float, ...] | None, usable: NDArray[np.bool_]
+) -> GnssLog:
     time, position = read_times(table, longest=100.0), _positions(table, origin)
     recorded = table.has(_VELOCITY)
     columns = _VELOCITY if recorded else _DERIVED
     velocity = np.full_like(position, np.nan)
     if recorded or table.has(_DERIVED):
         velocity = swap_frd_rfu(parse_numbers(table, columns))
-    if "fix" in table.rows:
-        missing_mask = parse_numbers(table, ("fix",))[:, 0] != 1.0
-        position[missing_mask], velocity[missing_mask] = np.nan, np.nan
+    position[~usable], velocity[~usable] = np.nan, np.nan
     return GnssLog(time, position, velocity)
 
 
