@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from pfbench.core import quaternion
+from pfbench.scenario.plausibility.time_order import find_overlap_remedy
 from pfbench.scenario.recorded.log_tables import Array
 from pfbench.scenario.recorded.navigation_log import ImuLog, ReferenceLog
 
@@ -60,7 +61,7 @@ def check_overlap(imu_name: str, imu_time: Array, name: str, time: Array) -> Non
         raise ValueError(
             f"{imu_name} and {name} must overlap in time, got t = {imu_time[0]:.3f} to "
             f"{imu_time[-1]:.3f} and t = {time[0]:.3f} to {time[-1]:.3f}. "
-            "Use the same clock in both (GPS seconds, or seconds from the same instant)."
+            f"{find_overlap_remedy(time, imu_time, name)}"
         )
 
 

@@ -160,7 +160,7 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
         raise ValueError(
             f"{table.name} must not have gaps, got a gap of {step[i]:.3f} s after {table.row(i)} "
             f"(t = {time[i]}), with samples every {typical:.4f} s. "
-            "Cut the log there and use the longer part."
+            f"{_longest_part(table, time, step > max(_MAX_GAP, 3 * typical))}"
         )
     slow = np.flatnonzero(step > 3 * typical)
     if slow.size:
@@ -169,6 +169,17 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
             f"{step[i]:.3f} s after {table.row(i)}. Samples were interpolated",
         )
     return time, notes
+
+
+def _longest_part(table: LogTable, time: Array, is_gap: NDArray[np.bool_]) -> str:
+    """Name the rows between two gaps that cover the longest time."""
+    borders = np.concatenate([[0], np.flatnonzero(is_gap) + 1, [len(time)]])
+    first, last = borders[:-1], borders[1:] - 1
+    i = int(np.argmax(time[last] - time[first]))
+    return (
+        f"Keep the longest part without a gap, {table.row(int(first[i]))} to {table.row(int(last[i]))} "
+        f"(t = {time[first[i]]:.3f} to {time[last[i]]:.3f})."
+    )
 
 
 def _origin(
@@ -215,9 +226,7 @@ def _positions(table: LogTable, origin: tuple[float, ...] | None) -> Array:
     ).numpy()
 
 
-def _fixes(
-    table: LogTable, origin: tuple[float, ...] | None, usable: NDArray[np.bool_]
-) -> GnssLog:
+def _fixes(table: LogTable, origin: tuple[float, ...] | None, usable: NDArray[np.bool_]) -> GnssLog:
     time, position = read_times(table, longest=100.0), _positions(table, origin)
     recorded = table.has(_VELOCITY)
     columns = _VELOCITY if recorded else _DERIVED

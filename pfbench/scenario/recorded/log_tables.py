@@ -15,6 +15,7 @@ from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_range
 from pfbench.scenario.plausibility.log_table import LogTable
+from pfbench.scenario.plausibility.time_order import find_order_remedy
 
 
 def find_dataset(root: str | None, folder: str) -> Path:
@@ -241,7 +242,7 @@ def check_increasing(table: LogTable, time: Array) -> None:
         raise ValueError(
             f"{table.name}: column t must increase, got {time[i]} after {time[i - 1]} in "
             f"{table.row(i)}, which {problem} ({back.size} such rows). "
-            "Sort the rows by t and keep one row for each time."
+            f"{find_order_remedy(time, table.row)}"
         )
 
 
