@@ -77,7 +77,7 @@ def _find_period(time: Array, back: Array) -> tuple[str, float] | None:
         for unit in _UNITS:
             fixed = time + period * unit * np.cumsum(restarts)
             new = np.diff(fixed)
-            if (new >= 0.0).all() and ((0.0 < new[back - 1]) & (new[back - 1] <= longest)).all():
+            if (new >= 0.0).all() and ((new[back - 1] > 0.0) & (new[back - 1] <= longest)).all():
                 return name, period * unit
     return None
 

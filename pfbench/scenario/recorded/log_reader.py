@@ -16,8 +16,9 @@ A table can contain several flights and sensors. The columns `path` and `imu` id
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from pfbench.files.reader_notes import announce_notes
 from pfbench.nav import attitude, earth
 from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.scenario.plausibility.clock_offsets import find_fix_offset, find_imu_offset
 from pfbench.scenario.plausibility.column_checks import check_changes
 from pfbench.scenario.plausibility.log_agreement import (
     compare_fixes,
@@ -106,7 +108,8 @@ def read_log(
     fixes, reference = _fixes(gnss, centre, usable), _motion(truth, centre)
     check_overlap(inertial.name, sensors.time, gnss.name, fixes.time)
     check_overlap(inertial.name, sensors.time, truth.name, reference.time)
-    check_rotation(sensors, reference, inertial.name, truth.name)
+    imu_offset = find_imu_offset(sensors, reference)
+    late = imu_offset.describe(inertial.name, truth.name) if imu_offset else ""
     gravity = STANDARD_GRAVITY
     if centre is None:
         notes += (f"gravity {gravity} m/s^2: the log does not contain its location",)
@@ -114,14 +117,30 @@ def read_log(
         latitude, height = torch.tensor([centre[0] * _DEGREE, centre[2]], dtype=torch.float64)
         gravity = float(earth.gravity(latitude, height))
     notes += compare_reference(truth, reference)
-    notes += compare_inertial(truth, sensors, reference, gravity)
-    fixes, fix_notes = compare_fixes(gnss, fixes, reference, limits)
+    with _explain(late):
+        check_rotation(sensors, reference, inertial.name, truth.name)
+        notes += compare_inertial(truth, sensors, reference, gravity)
+    fix_offset = find_fix_offset(fixes, reference) if names.gnss != names.reference else None
+    fixes_late = fix_offset.describe(gnss.name, truth.name) if fix_offset else ""
+    with _explain(fixes_late):
+        fixes, fix_notes = compare_fixes(gnss, fixes, reference, limits)
     tables = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
     notes += (*fix_notes, *compare_times(tables))
     dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
-    notes = (*dropped, *usable_notes, *notes)
+    notes = (*dropped, *filter(None, (late, fixes_late)), *usable_notes, *notes)
     announce_notes(folder, notes)
     return NavigationLog(sensors, fixes, reference, gravity, notes)
+
+
+@contextlib.contextmanager
+def _explain(offset: str) -> Iterator[None]:
+    """Add the offset of a clock to the error of a comparison, which it can cause."""
+    try:
+        yield
+    except ValueError as error:
+        if not offset:
+            raise
+        raise ValueError(f"{error} First correct the clock: {offset}.") from None
 
 
 def _samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pfbench.model.pseudorange_errors import UrbanInputs
 from pfbench.files.reader_notes import announce_notes
+from pfbench.model.pseudorange_errors import UrbanInputs
 from pfbench.nav import earth
 from pfbench.nav.gnss.orbits import LIGHT, azimuth_elevation
 from pfbench.nav.plausible_limits import PlausibleLimits
