@@ -108,8 +108,11 @@ def read_log(
     fixes, reference = _fixes(gnss, centre, usable), _motion(truth, centre)
     check_overlap(inertial.name, sensors.time, gnss.name, fixes.time)
     check_overlap(inertial.name, sensors.time, truth.name, reference.time)
+    check_force(sensors, reference, inertial.name)
     imu_offset = find_imu_offset(sensors, reference)
     late = imu_offset.describe(inertial.name, truth.name) if imu_offset else ""
+    both = (inertial.name, truth.name)
+    check_rotation(sensors, reference, both, lambda: _other_attitudes(truth, reference), late)
     gravity = STANDARD_GRAVITY
     if centre is None:
         notes += (f"gravity {gravity} m/s^2: the log does not contain its location",)
@@ -118,7 +121,6 @@ def read_log(
         gravity = float(earth.gravity(latitude, height))
     notes += compare_reference(truth, reference)
     with _explain(late):
-        check_rotation(sensors, reference, inertial.name, truth.name)
         notes += compare_inertial(truth, sensors, reference, gravity)
     fix_offset = find_fix_offset(fixes, reference) if names.gnss != names.reference else None
     fixes_late = fix_offset.describe(gnss.name, truth.name) if fix_offset else ""
@@ -150,7 +152,6 @@ def _samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
         parse_numbers(table, ("fx", "fy", "fz")),
         parse_numbers(table, ("wx", "wy", "wz")),
     )
-    check_force(force, table.name)
     check_changes(table, ("fx", "fy", "fz", "wx", "wy", "wz"), time, np.hstack([force, rate]))
     return ImuLog(time, swap_frd_rfu(force), swap_frd_rfu(rate)), notes
 
@@ -259,9 +260,7 @@ def _fixes(table: LogTable, origin: tuple[float, ...] | None, usable: NDArray[np
 def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
     time = read_times(table, longest=100.0)
     derived = "vn" not in table.rows and "vn_d" in table.rows
-    roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
-    euler = torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1))
-    q = attitude.quaternion_from_dcm(attitude.dcm_from_euler(euler)).numpy()
+    q = _quaternion(*parse_numbers(table, ("roll", "pitch", "yaw")).T)
     columns = _DERIVED if derived else _VELOCITY
     velocity = swap_frd_rfu(parse_numbers(table, columns))
     check_changes(table, columns, time, swap_frd_rfu(velocity))
@@ -271,3 +270,26 @@ def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
         velocity,
         _positions(table, origin),
     )
+
+
+def _quaternion(roll: Array, pitch: Array, yaw: Array) -> Array:
+    euler = torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1))
+    return attitude.quaternion_from_dcm(attitude.dcm_from_euler(euler)).numpy()
+
+
+def _other_attitudes(table: LogTable, reference: ReferenceLog) -> dict[str, ReferenceLog]:
+    """Return the reference as other units and signs of its attitude would give it."""
+    roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
+    angles = {
+        f"yaw is in degrees: multiply it by {_DEGREE:.10f}.": (roll, pitch, _DEGREE * yaw),
+        f"roll, pitch, yaw are in degrees: multiply them by {_DEGREE:.10f}.": (
+            _DEGREE * roll,
+            _DEGREE * pitch,
+            _DEGREE * yaw,
+        ),
+        "yaw is counted anticlockwise: negate it.": (roll, pitch, -yaw),
+    }
+    return {
+        f"{table.name}: {text}": reference._replace(attitude=_quaternion(*values))
+        for text, values in angles.items()
+    }

@@ -225,24 +225,27 @@ BAD: dict[str, tuple[Callable[[Log], None], str]] = {
     "gnss in ms": (scale("gnss", "t", 1e3), r"gnss\.csv: column t.*in ms"),
     "in g": (
         scale("imu", "fx fy fz", 1 / GRAVITY),
-        r"got a median norm of 1\.\d+, which is in g. Multiply by 9\.80665",
+        r"got a median norm of 1\.\d+ .*They are in g: multiply by 9\.80665\.",
     ),
     "odd force": (
         scale("imu", "fx fy fz", 100.0),
-        r"column fz must be between -400 and 400 m/s\^2, got -980\.665 .*Check the unit",
+        r"column fz must be between -400 and 400 m/s\^2, got -980\.665 .*in cm/s\^2, multiply by 0\.01",
     ),
-    "z up": (left_up, r"fz must be .*got a median of \+9\.81.*negate fy, fz, wy, wz"),
+    "z up": (
+        left_up,
+        r"fz when level .*a median fz of \+9\.81.*forward-left-up: negate fy, fz, wy, wz",
+    ),
     "fast in deg/s": (
-        scale("imu", "wx wy wz", 1e4),
-        r"column wz must be .*got 2400 in line 2.*in deg/s, multiply by 0\.01745",
+        scale("imu", "wx wy wz", 3e3),
+        r"column wz must be .*got 720 in line 2.*in deg/s, multiply by 0\.01745",
     ),
     "slow in deg/s": (
         scale("imu", "wx wy wz", 180 / np.pi),
-        r"got 57 times the rate of reference\.csv, so they are in deg/s",
+        r"must turn together, got rates .* 57\.3 times .*in deg/s: multiply by 0\.0174",
     ),
     "other sense": (
         scale("imu", "wz", -1.0),
-        r"imu\.csv and reference\.csv must turn together, got a slope of -1\.0",
+        r"imu\.csv and reference\.csv must turn together, got .* of -1 times",
     ),
     "yaw in degrees": (scale("reference", "yaw", 180 / np.pi), r"must turn together"),
     "pitch in degrees": (
