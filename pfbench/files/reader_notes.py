@@ -12,6 +12,8 @@ from pathlib import Path
 SWEEP_LOG = "PFBENCH_SWEEP_LOG"  # environment variable: file to which all jobs of a sweep append
 NOTE = "note"  # first word of a line of this file that is no outcome of a job
 
+_MOST = 12  # lines about one place
+
 log = logging.getLogger("pfbench")
 
 _told: set[tuple[str, ...]] = set()  # sweep, place and note
@@ -27,6 +29,9 @@ def announce_notes(place: str | Path, notes: Sequence[str]) -> None:
         notes: Notes.
     """
     sweep = os.environ.get(SWEEP_LOG, "")
+    if len(notes) > _MOST:
+        rest = f"{len(notes) - _MOST + 1} further notes, which the page of a study lists"
+        notes = [*notes[: _MOST - 1], rest]
     for note in notes:
         told = (sweep, str(place), note)
         if told in _told:

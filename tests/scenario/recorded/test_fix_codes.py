@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import logging
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from command_line import pfbench
+from recorded_data import believed
 from synthetic_log import tables, write
 
 from pfbench.files import reader_notes
+from pfbench.scenario.recorded.drive import RecordedDrive
 from pfbench.scenario.recorded.fix_codes import PROGRAMS, check_fix_codes
 from pfbench.scenario.recorded.log_reader import read_log
 
@@ -113,12 +116,12 @@ def test_the_console_says_it_once_before_the_first_job_of_a_sweep(tmp_path: Path
 
 def test_no_usable_fix_in_the_chosen_time_is_an_error(tmp_path: Path) -> None:
     write_codes(tmp_path / "log", [1.0] * 21 + [0.0] * 80)  # usable until t = 4 s
-    keys = (*KEYS, f"data.root={tmp_path}", "filter=ekf", "scenario.start_s=5")
-    said = pfbench("run", *keys, home=tmp_path)
-    assert said.code != 0
-    assert "must include a usable one, got none of 15" in said.err
-    assert "(t = 0.000 to 4.000)" in said.err
-    assert pfbench("run", *keys[:-1], "scenario.start_s=0", home=tmp_path).code == 0
+    drive = RecordedDrive(str(tmp_path), "log", believed([1.5, 1.5, 3.0], None), start_s=5.0)
+    with pytest.raises(
+        ValueError, match=r"must include a usable one, got none of 15.*\(t = 0\.000 to 4\.000\)"
+    ):
+        drive.read()
+    assert np.isfinite(replace(drive, start_s=0.0).read().fixes).any()
 
 
 def test_a_note_of_another_process_of_the_sweep_is_not_repeated(
@@ -135,3 +138,12 @@ def test_a_note_of_another_process_of_the_sweep_is_not_repeated(
     assert len(caplog.messages) == 1
     reader_notes.announce_notes(tmp_path / "walk", ["dropped"])
     assert caplog.messages[1:] == ["note      walk: dropped"]
+
+
+def test_many_notes_are_counted(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(reader_notes, "_told", set())
+    reader_notes.announce_notes("drive", [f"row {i}" for i in range(40)])
+    assert len(caplog.messages) == 12
+    assert caplog.messages[-1].startswith("note      drive: 29 further notes")
