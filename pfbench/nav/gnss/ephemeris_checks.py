@@ -170,7 +170,7 @@ def _compare(
             notes.append(f"{name}: {_label(table, rows[j])} changes the orbit or clock: {text}")
     dropped = np.flatnonzero(unconfirmed)
     notes += [
-        f"{name}: {_label(table, rows[i])} is ignored because its neighbours contradict it: {reason[i]}"
+        f"{name}: {_label(table, rows[i])} is ignored because its neighbours contradict it: {reason[int(i)]}"
         for i in dropped
     ]
     return [int(rows[i]) for i in dropped], notes, bool((agreeing + contradicted > 0).all())

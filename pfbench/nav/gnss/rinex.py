@@ -87,10 +87,9 @@ def read_rinex(file: Path) -> RinexFile:
             f"the file {file.name} must contain ephemerides of GPS or Galileo, got none{others and ' but '}"
             f"{others}. Choose another file."
         )
-    others = (
-        f"{file.name}: not read: {text}" for text in _describe_others(lines, body, version[0])
-    )
-    return RinexFile(pd.DataFrame(rows), (*dropped, *others))
+    systems = _describe_others(lines, body, version[0])
+    unread = (f"{file.name}: not read: {text}" for text in systems)
+    return RinexFile(pd.DataFrame(rows), (*dropped, *unread))
 
 
 def _describe_kind(lines: Sequence[str]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pfbench.files.table_file import Array
 
@@ -63,7 +64,7 @@ def find_order_remedy(time: Array, row: Callable[[int], str]) -> str:
     )
 
 
-def _find_period(time: Array, back: Array) -> tuple[str, float] | None:
+def _find_period(time: Array, back: NDArray[np.intp]) -> tuple[str, float] | None:
     """Return the counter, and its period in units of t, after which all steps are usual."""
     restarts = np.zeros(len(time))
     restarts[back] = 1.0
@@ -94,7 +95,7 @@ def _is_regular(in_order: Array, time: Array) -> bool:
     return bool(step.min() >= shortest and step.max() <= max(longest, usual.max()))
 
 
-def _fewest_wrong(time: Array) -> Array:
+def _fewest_wrong(time: Array) -> NDArray[np.intp]:
     """Return the rows without which the times increase: the late ones, or the early ones if these are fewer."""
     late = np.flatnonzero(time[1:] <= np.maximum.accumulate(time)[:-1]) + 1
     early = np.flatnonzero(time[:-1] >= np.minimum.accumulate(time[::-1])[::-1][1:])
