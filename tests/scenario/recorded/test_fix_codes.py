@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from checkout import ROOT
 from command_line import pfbench
 from recorded_data import believed
 from synthetic_log import tables, write
@@ -147,3 +149,12 @@ def test_many_notes_are_counted(
     reader_notes.announce_notes("drive", [f"row {i}" for i in range(40)])
     assert len(caplog.messages) == 12
     assert caplog.messages[-1].startswith("note      drive: 29 further notes")
+
+
+def test_the_page_lists_the_codes() -> None:
+    page = (ROOT / "docs" / "use_your_data.md").read_text()
+    for program, codes in PROGRAMS.items():
+        row = re.search(rf"^\| `{program}`.*$", page, re.MULTILINE)
+        listed = [", ".join(f"{code} {name}" for code, name in part.items()) for part in codes]
+        assert row
+        assert row[0].split(" | ")[1:] == [listed[0], f"{listed[1]} |"]
