@@ -190,6 +190,7 @@ def test_a_spoilt_rinex_record_is_dropped_and_named_with_its_line(
 
 HARMLESS = {
     "spare field": (9, LINES[9][:42] + "0.499063314480-269", ()),
+    "field that nobody uses": (3, f"{LINES[3][:4]}{'unknown':>19}{LINES[3][23:]}", ()),
     "three digits of an exponent": (2, LINES[2][:61] + " 0.000000000000-269", ()),
     "other letter of the exponent": (4, LINES[4].replace("D", "e"), ()),
     "comment": (1, "M\xfcnchen" + " " * 53 + "COMMENT\n" + LINES[1], ()),
