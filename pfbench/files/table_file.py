@@ -57,7 +57,7 @@ def _read_csv(file: Path) -> TableFile:
     lines, notes = _whole_lines(file)
     limits.check_columns(file, lines[0].count(",") + 1)
     names = [name.strip().strip('"') for name in lines[0].split(",")]
-    _check_names(file, lines[0], names)
+    _check_names(file, lines, names)
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated or not all(names):
         problem = f"{', '.join(repeated)} twice" if repeated else "an empty name"
@@ -70,7 +70,7 @@ def _read_csv(file: Path) -> TableFile:
         if fields != len(names) or line.count('"') % 2:
             raise ValueError(
                 f"{file.name}: line {number} must have {len(names)} fields separated by commas, "
-                f"got {fields} in {line[:80]!r}. Repair or remove this line."
+                f"got {fields} in {line[:80]!r}. {_field_remedy(lines, len(names))}"
             )
     try:
         rows = pd.read_csv(
@@ -94,19 +94,34 @@ def _read_csv(file: Path) -> TableFile:
     return TableFile(rows, {}, notes)
 
 
-def _check_names(file: Path, line: str, names: Sequence[str]) -> None:
+def _field_remedy(lines: Sequence[str], names: int) -> str:
+    """Return what makes all lines have as many fields as there are names."""
+    rows = [line for line in lines[1:] if line.strip()]
+    counts = [line.count(",") + 1 for line in rows]
+    if all(line.endswith(",") and n == names + 1 for line, n in zip(rows, counts, strict=True)):
+        return "Remove the comma at the end of the lines, or add one to line 1."
+    if counts and min(counts) == 2 * names == max(counts):
+        return "The numbers have decimal commas: write them with points."
+    if counts and min(counts) == max(counts) != names:
+        return f"All others have {counts[0]} fields: give line 1 as many names."
+    return "Repair or remove this line."
+
+
+def _check_names(file: Path, lines: Sequence[str], names: Sequence[str]) -> None:
     """Raise ValueError if line 1 is a comment, has other separators, or has numbers instead of names."""
-    problem, remedy = "", ""
+    problem, remedy, line = "", "", lines[0]
     separator = next((s for s in _SEPARATORS if s in line), "")
     if line.lstrip().startswith(("#", "%")):
-        problem, remedy = "a comment", "Remove it, or the sign of the comment before the names."
+        has_names = len(lines) > 1 and line.count(",") == lines[1].count(",") > 0
+        problem = "a comment"
+        remedy = (
+            "Remove the sign of the comment before the names." if has_names else "Remove this line."
+        )
     elif len(names) == 1 and (separator or len(line.split()) > 2):
         pattern = separator or r"\s+"
         problem = f"{_SEPARATORS.get(separator, 'blanks')} as separators"
-        remedy = (
-            f"In pandas, read_csv({file.name!r}, sep={pattern!r}).to_csv(..., index=False) writes commas. "
-            "Add decimal=',' if the numbers have decimal commas."
-        )
+        decimal = ", decimal=','" if any("," in text for text in lines[1:2]) else ""
+        remedy = _convert(file, f"sep={pattern!r}{decimal}", "commas")
     elif all(map(_is_number, names)):
         problem, remedy = "numbers alone", "Insert a line with the names."
     if problem:
@@ -114,6 +129,11 @@ def _check_names(file: Path, line: str, names: Sequence[str]) -> None:
             f"{file.name}: line 1 must be names of columns separated by commas, got {problem} in "
             f"{line[:80]!r}. {remedy}"
         )
+
+
+def _convert(file: Path, options: str, result: str) -> str:
+    words = ", ".join(filter(None, (repr(file.name), options)))
+    return f"In pandas, read_csv({words}).to_csv({file.name!r}, index=False) writes {result}."
 
 
 def _is_number(text: str) -> bool:
@@ -131,16 +151,24 @@ def _whole_lines(file: Path) -> tuple[list[str], tuple[str, ...]]:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         position = content[: error.start].count(b"\n") + 1
+        remedy = "Repair or remove this line."
+        if position == 1:  # without the names the rest is no table
+            encoding = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1"
+            remedy = _convert(file, f"encoding={encoding!r}", "UTF-8")
         raise ValueError(
             f"{file.name}: line {position} must be text in UTF-8, got the byte "
-            f"{content[error.start]:#04x}. Repair or remove this line."
+            f"{content[error.start]:#04x}. {remedy}"
         ) from None
     lines = text.replace("\r\n", "\n").split("\n")
+    is_old_mac = len(lines) == 1 and "\r" in text
     for number, line in enumerate(lines, 1):
         if not _CONTROL.isdisjoint(line):
+            remedy = (
+                _convert(file, "", "line ends") if is_old_mac else "Repair or remove this line."
+            )
             raise ValueError(
                 f"{file.name}: line {number} must not contain control characters, "
-                f"got {line[:80]!r}. Repair or remove this line."
+                f"got {line[:80]!r}. {remedy}"
             )
     last = lines.pop()
     if not lines:

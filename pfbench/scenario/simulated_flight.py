@@ -94,6 +94,8 @@ class SimulatedFlight(Scenario):
             if self.closed_loop
             else ()
         )
+        # of orbits that were read from a file
+        notes += getattr(getattr(self.receiver, "constellation", None), "notes", ())
         tracks = track.expand(len(runs), -1, -1)
         return Episode(
             Record(y, aiding.u, feedback=feedback),

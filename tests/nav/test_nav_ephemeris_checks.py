@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -52,13 +53,17 @@ def test_a_record_that_its_neighbours_contradict_is_ignored_and_named(
     assert (satellites.at(TIMES)[0] - clean).norm(dim=-1).max() < POSITION_TOLERANCE
 
 
-def test_two_records_without_a_third_must_agree(tmp_path: Path) -> None:
+def test_a_satellite_whose_two_records_contradict_each_other_is_dropped(tmp_path: Path) -> None:
     table = three().iloc[:4].copy()
     table.loc[2, "M0"] += 1e-4
-    with pytest.raises(
-        ValueError, match=r"must agree, got an ephemeris of G07 at t = 0 s .*positions \d{4} m"
-    ):
-        _ = constellation(tmp_path, table).names
+    satellites = constellation(tmp_path, table)
+    assert satellites.names == ("E14",)
+    assert [note[:40] for note in satellites.notes] == [
+        "eph.parquet: an ephemeris of G07 at t = "
+    ] * 2
+    assert "its neighbours contradict it: positions 2" in satellites.notes[0]
+    with pytest.raises(ValueError, match=r"must contain ephemerides that agree, got none of 2"):
+        _ = constellation(tmp_path, table[table["sys"] == "G"]).names
 
 
 def test_a_manoeuvre_between_confirmed_orbits_is_a_note(tmp_path: Path) -> None:
@@ -158,24 +163,61 @@ SPOILT = {
     "missing exponent": (4, LINES[4].replace("D-02", "    ", 1), "expected a number like"),
     "date": (2, LINES[2].replace("2016", "2015"), "week and toe must be near the date"),
     "month": (2, LINES[2].replace("2016 06", "2016 16"), "month must be in"),
-    "system": (2, "X" + LINES[2][1:], "the system must be one of"),
     "text after the numbers": (4, LINES[4] + "   1", "no text after the last number"),
-    "missing line": (5, None, "expected 8 lines, got 7"),
-    "repeated line": (5, LINES[5] + "\n" + LINES[5], "expected 8 lines, got 9"),
+    "missing line": (5, None, "must have 8 lines, got 7"),
+    "repeated line": (5, LINES[5] + "\n" + LINES[5], "must have 8 lines, got 9"),
+    "number of the satellite": (2, "G\xb2\xb2" + LINES[2][3:], "must begin with a satellite"),
 }
 
 
-@pytest.mark.parametrize("name", SPOILT)
-def test_a_spoilt_rinex_record_is_an_error_with_its_line(tmp_path: Path, name: str) -> None:
-    number, line, message = SPOILT[name]
+def write_lines(folder: Path, number: int, line: str | None) -> Path:
     lines = list(LINES)
     lines[number : number + 1] = [] if line is None else [line]
-    (tmp_path / "nav.rnx").write_text("\n".join(lines) + "\n")
-    with pytest.raises(ValueError, match=f"nav.rnx: line 3, .*{message}"):
-        read_rinex(tmp_path / "nav.rnx")
+    (folder / "nav.rnx").write_text("\n".join(lines) + "\n", encoding="latin-1")
+    return folder / "nav.rnx"
 
 
-def test_a_byte_that_is_not_text_is_named(tmp_path: Path) -> None:
-    (tmp_path / "nav.rnx").write_bytes("\n".join(LINES).encode().replace(b"G07", b"G\xff7"))
-    with pytest.raises(ValueError, match=r"got the byte 0xff in line 3"):
+@pytest.mark.parametrize("name", SPOILT)
+def test_a_spoilt_rinex_record_is_dropped_and_named_with_its_line(
+    tmp_path: Path, name: str
+) -> None:
+    number, line, message = SPOILT[name]
+    read = read_rinex(write_lines(tmp_path, number, line))
+    assert read.rows["sys"].tolist() == ["E"]
+    (note,) = read.notes
+    assert re.search(f"nav.rnx: the record in line 3, .* is dropped: .*{message}", note), note
+
+
+HARMLESS = {
+    "spare field": (9, LINES[9][:42] + "0.499063314480-269", ()),
+    "field that nobody uses": (3, f"{LINES[3][:4]}{'unknown':>19}{LINES[3][23:]}", ()),
+    "three digits of an exponent": (2, LINES[2][:61] + " 0.000000000000-269", ()),
+    "other letter of the exponent": (4, LINES[4].replace("D", "e"), ()),
+    "comment": (1, "M\xfcnchen" + " " * 53 + "COMMENT\n" + LINES[1], ()),
+    "byte order mark": (0, "\xef\xbb\xbf" + LINES[0], ()),
+    "carriage returns": (3, LINES[3] + "\r", ()),
+    "new system": (
+        2,
+        "X" + LINES[2][1:],
+        ("nav.rnx: not read: records 1 of the unknown system 'X'",),
+    ),
+    "other system": (2, "C" + LINES[2][1:], ("nav.rnx: not read: records 1 of BeiDou",)),
+}
+
+
+@pytest.mark.parametrize("name", HARMLESS)
+def test_what_no_satellite_needs_does_not_decide(tmp_path: Path, name: str) -> None:
+    number, line, notes = HARMLESS[name]
+    clean = read_rinex(write_lines(tmp_path, 0, LINES[0])).rows
+    read = read_rinex(write_lines(tmp_path, number, line))
+    assert read.notes == notes
+    expected = clean[clean["sys"] == "E"] if notes else clean
+    names = ["toe", "e", "M0", "af0", "tgd", "ttx"]
+    assert read.rows[names].to_numpy().tolist() == expected[names].to_numpy().tolist()
+
+
+def test_most_records_that_cannot_be_read_refuse_a_file(tmp_path: Path) -> None:
+    text = as_rinex(3, three()).replace("D-0", "X-0")
+    (tmp_path / "nav.rnx").write_text(text)
+    with pytest.raises(ValueError, match=r"line 3, .* expected a number .* and so 9 of 9 records"):
         read_rinex(tmp_path / "nav.rnx")

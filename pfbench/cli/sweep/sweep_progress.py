@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pfbench.cli.sweep.study_plan import StudyPlan
+from pfbench.files.reader_notes import NOTE, SWEEP_LOG, append_line
 from pfbench.files.work_start import start_work
 
 SWEEP_JOBS = "PFBENCH_SWEEP_JOBS"  # environment variable: number of jobs, for the counter
-SWEEP_LOG = "PFBENCH_SWEEP_LOG"  # environment variable: file to which each job appends its outcome
 
 
 @dataclass
@@ -90,7 +90,8 @@ class SweepProgress:
         outcomes = defaultdict(set)  # a job that a retry skips has two
         for line in lines:
             number, _, status = line.partition(" ")
-            outcomes[number].add(status)
+            if number != NOTE:
+                outcomes[number].add(status)
         finished = sum("finished" in of_job for of_job in outcomes.values())
         failed = sum(of_job == {"failed"} for of_job in outcomes.values())
         skipped = len(outcomes) - finished - failed
@@ -123,9 +124,4 @@ def note_outcome(number: int | None, status: str) -> None:
     if path is None or number is None:
         return
     with contextlib.suppress(OSError):  # of a full disk: the job reports it
-        os.makedirs(os.path.dirname(path), exist_ok=True)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        try:
-            os.write(descriptor, f"{number} {status}\n".encode())
-        finally:
-            os.close(descriptor)
+        append_line(path, f"{number} {status}")

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.files.reader_notes import announce_notes
 from pfbench.nav.gnss.broadcast_elements import broadcast_elements, mean_motion
 from pfbench.nav.gnss.ephemeris import describe_unhealthy, parse_epochs, read_ephemeris
 from pfbench.nav.gnss.ephemeris_checks import EphemerisSelection, check_ephemerides
 from pfbench.nav.gnss.orbits import LIGHT, Constellation, eccentric_anomaly
-from pfbench.nav.gnss.rinex import CLOCK, EPOCH, ORBIT
+from pfbench.nav.gnss.rinex import CLOCK, EPOCH, ORBIT, RinexFile
 
 
 @dataclass(frozen=True)
@@ -132,12 +133,18 @@ class BroadcastConstellation(Constellation):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Messages about ignored, changed and unconfirmed ephemerides, for a report."""
-        return (*self._selection.notes, *describe_unhealthy(self._file, self.path))
+        unhealthy = describe_unhealthy(self._file.rows, self.path)
+        return (*self._file.notes, *self._selection.notes, *unhealthy)
 
     @cached_property
     def _table(self) -> pd.DataFrame:
         """The ephemerides in use, one row each. Of each `toe` the last transmission is used."""
         table = self._healthy[self._selection.mask]
+        if table.empty:
+            raise ValueError(
+                f"{self.path} must contain ephemerides that agree, got none of {len(self._file.rows)}: "
+                f"{next(iter(self.notes), 'no healthy satellite')}. Choose another file of this day."
+            )
         if not (table["toe"].abs() <= self.validity).any():
             first, last = (self.epoch + table["toe"].agg(["min", "max"])).tolist()
             raise ValueError(
@@ -145,6 +152,7 @@ class BroadcastConstellation(Constellation):
                 f"(GPS time {first:.0f} to {last:.0f} s), got {self.start_s} "
                 f"(GPS time {self.epoch:.0f} s). Give a time near them."
             )
+        announce_notes(self.path, self.notes)
         return table.drop_duplicates(["name", "toe"], keep="last").reset_index(drop=True)
 
     @cached_property
@@ -154,8 +162,8 @@ class BroadcastConstellation(Constellation):
     @cached_property
     def _healthy(self) -> pd.DataFrame:
         """Ephemerides of healthy satellites, times from t = 0."""
-        return parse_epochs(self._file, self.epoch)
+        return parse_epochs(self._file.rows, self.epoch)
 
     @cached_property
-    def _file(self) -> pd.DataFrame:
+    def _file(self) -> RinexFile:
         return read_ephemeris(self.root, self.path)

@@ -10,12 +10,12 @@ import pandas as pd
 
 from pfbench.files.table_file import read_table_file
 from pfbench.nav import earth
-from pfbench.nav.gnss.rinex import CLOCK, LINES, ORBIT, WEEK, read_rinex
+from pfbench.nav.gnss.rinex import CLOCK, LINES, ORBIT, WEEK, RinexFile, read_rinex
 
 GM_GPS = 3.986005e14  # [IS-GPS-200, table 20-IV], Galileo uses earth.GM [OS SIS ICD]
 
 
-def read_ephemeris(root: str | None, path: str) -> pd.DataFrame:
+def read_ephemeris(root: str | None, path: str) -> RinexFile:
     """Read the ephemerides of a RINEX navigation file or a Parquet table, a row each.
 
     Args:
@@ -23,7 +23,7 @@ def read_ephemeris(root: str | None, path: str) -> pd.DataFrame:
         path: File in `root`. A Parquet table has the RINEX names as columns.
 
     Returns:
-        Table of ephemerides.
+        Table of ephemerides, and notes on what was not read.
 
     Raises:
         ValueError: If `root` is None, or the file is missing or faulty.
@@ -36,8 +36,10 @@ def read_ephemeris(root: str | None, path: str) -> pd.DataFrame:
     file = Path(root) / path
     if not file.is_file():
         raise ValueError(f"data.root must contain {path}, got {root} without {file}. {remedy}")
-    table = read_table_file(file).rows if file.suffix == ".parquet" else read_rinex(file)
-    return check_numbers(table, path)
+    if file.suffix == ".parquet":
+        return RinexFile(check_numbers(read_table_file(file).rows, path), ())
+    content = read_rinex(file)
+    return content._replace(rows=check_numbers(content.rows, path))
 
 
 def check_numbers(table: pd.DataFrame, name: str) -> pd.DataFrame:

@@ -81,8 +81,7 @@ def check_ephemerides(table: pd.DataFrame, name: str) -> EphemerisSelection:
         The selection.
 
     Raises:
-        ValueError: If more than a fifth of the records is out of range, or the ephemerides of a
-            satellite contradict each other so that none of them is confirmed.
+        ValueError: If more than a fifth of the records is out of range.
     """
     reasons = [_reason(row) for row in table.to_dict("records")]
     share = sum(map(bool, reasons)) / max(len(reasons), 1)
@@ -162,20 +161,16 @@ def _compare(
         agreeing[[i, j]] += distance <= 1.0
         contradicted[[i, j]] += distance > 1.0
     unconfirmed = (contradicted > 0) & (agreeing == 0)
-    notes: list[str] = []
+    notes, reason = [], {}
     for (i, j), (distance, text) in zip(pairs, distances, strict=True):
         if distance <= 1.0:
             continue
-        if unconfirmed[i] and unconfirmed[j] and agreeing.max(initial=0) == 0:
-            raise ValueError(
-                f"{name}: neighbouring ephemerides must agree, got {_label(table, rows[i])} and "
-                f"{_label(table, rows[j])} with {text}. Remove the wrong record."
-            )
+        reason[i], reason[j] = text, text
         if not (unconfirmed[i] or unconfirmed[j]) and j == i + 1:
             notes.append(f"{name}: {_label(table, rows[j])} changes the orbit or clock: {text}")
     dropped = np.flatnonzero(unconfirmed)
     notes += [
-        f"{name}: {_label(table, rows[i])} is ignored because its neighbours contradict it"
+        f"{name}: {_label(table, rows[i])} is ignored because its neighbours contradict it: {reason[int(i)]}"
         for i in dropped
     ]
     return [int(rows[i]) for i in dropped], notes, bool((agreeing + contradicted > 0).all())

@@ -1,13 +1,15 @@
-"""Ephemerides from RINEX 2 and 3 navigation files. A field that cannot be read is an error."""
+"""Ephemerides from RINEX 2 and 3 navigation files. A record that cannot be read is dropped with a note."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
@@ -30,109 +32,152 @@ LINES = (
     "ttx",
 )  # record in RINEX order
 _REQUIRED = {*CLOCK, *ORBIT, "week", "health", "ttx"}
-_RECORD_LINES = {"G": 8, "E": 8, "C": 8, "J": 8, "I": 8, "R": (4, 5), "S": 4}
-_NUMBER = re.compile(r"[-+]?\d*\.\d{1,14}[DdEe][-+]\d\d")
+_BY_SYSTEM = {"G": {"tgd"}, "E": {"codes", "iodc"}}  # other fields that are used
+_RECORD_LINES = 8
+_SYSTEMS = {
+    "G": "GPS", "R": "GLONASS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "I": "NavIC", "S": "SBAS",
+}  # fmt: skip
+_KINDS = {
+    "N": "GPS navigation", "G": "GLONASS navigation", "H": "SBAS navigation", "L": "Galileo navigation",
+    "O": "observation", "M": "meteorological", "C": "clock", "B": "SBAS broadcast",
+}  # fmt: skip
+# some programs write an exponent of three digits without its letter
+_NUMBER = re.compile(r"([-+]?\d*\.\d{1,14})(?:[DdEe]([-+]\d{2,3})|([-+]\d{3}))")
 _SAME_DATE = 3 * 7200.0  # s; longest time between clock and orbit
 
 
-def read_rinex(file: Path) -> pd.DataFrame:
+class RinexFile(NamedTuple):
+    """Ephemerides of a RINEX file.
+
+    Attributes:
+        rows: One row per ephemeris, with `toc` in seconds of the week, and `line`.
+        notes: Records and systems that were not read.
+    """
+
+    rows: pd.DataFrame
+    notes: tuple[str, ...]
+
+
+def read_rinex(file: Path) -> RinexFile:
     """Read GPS and Galileo (I/NAV) ephemerides from a RINEX 2 or 3 navigation file.
 
-    One row per ephemeris, with `toc` in seconds of the week, and `line`.
+    A record that cannot be read is dropped, and a note names its line.
 
     Raises:
-        ValueError: If the file is of another kind, or a record cannot be read (names the line).
+        ValueError: If the file is of another kind, or most of its records cannot be read.
     """
     lines = _lines(file)
     version = lines[0][:9].strip() if lines and "RINEX VERSION" in lines[0] else ""
     if version[:1] not in ("2", "3") or lines[0][20:21] != "N":
-        first = lines[0][:60] if lines else ""
         raise ValueError(
-            f"the file {file.name} must be a RINEX 2 or 3 navigation file, "
-            f"got first line {first!r}. Choose another file."
+            f"the file {file.name} must be a RINEX 2 or 3 navigation file, {_describe_kind(lines)}"
         )
     body = next((i + 1 for i, line in enumerate(lines) if "END OF HEADER" in line), len(lines))
-    table = pd.DataFrame(list(_records(lines, body, 3 if version[0] == "3" else 2, file.name)))
-    if table.empty:
+    records = list(_records(lines, body, 3 if version[0] == "3" else 2))
+    rows = [record for record in records if isinstance(record, dict)]
+    dropped = [f"{file.name}: {record}" for record in records if isinstance(record, str)]
+    if len(dropped) > len(rows):
         raise ValueError(
-            f"the file {file.name} must contain ephemerides of GPS or Galileo, got none. "
-            "Choose another file."
+            f"{dropped[0]}, and so {len(dropped)} of {len(dropped) + len(rows)} records of the file cannot "
+            "be read. Choose another file of this day."
         )
-    return table
+    if not rows:
+        others = "".join(_describe_others(lines, body, version[0]))
+        raise ValueError(
+            f"the file {file.name} must contain ephemerides of GPS or Galileo, got none{others and ' but '}"
+            f"{others}. Choose another file."
+        )
+    systems = _describe_others(lines, body, version[0])
+    unread = (f"{file.name}: not read: {text}" for text in systems)
+    return RinexFile(pd.DataFrame(rows), (*dropped, *unread))
+
+
+def _describe_kind(lines: Sequence[str]) -> str:
+    """Describe a file that is no navigation file of RINEX 2 or 3, and its remedy."""
+    first = lines[0] if lines else ""
+    if first.startswith("\x1f"):
+        return "got a compressed file. Unpack it with gunzip, or gzip -d."
+    if "RINEX VERSION" not in first:
+        return f"got first line {first[:60]!r}. Choose another file."
+    version, kind = first[:9].strip(), _KINDS.get(first[20:21], "unknown")
+    same_day = "Choose the GPS or mixed navigation file (type N) of RINEX 2 or 3 of the same day."
+    return f"got a {kind} file of RINEX {version}. {same_day}"
 
 
 def _lines(file: Path) -> list[str]:
-    content = file.read_bytes()
-    try:
-        text = content.decode("ascii")
-    except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        raise ValueError(
-            f"the file {file.name} must be ASCII text, got the byte {content[error.start]:#04x} in "
-            f"line {line}. Repair or remove the record."
-        ) from None
+    # names and comments contain other letters, which are read but not used
+    text = file.read_bytes().removeprefix(b"\xef\xbb\xbf").decode("latin-1")
     return [line.rstrip() for line in text.split("\n")]
 
 
-def _records(
-    lines: Sequence[str], body: int, version: int, name: str
-) -> Iterator[dict[str, float | str]]:
-    """Yield records from line `body` on. Numbers have columns of 19 after an indent."""
-    indent = version + 1
+def _first_lines(lines: Sequence[str], body: int, version: int) -> list[int]:
+    """Return the first line of each record, and the end of the text."""
     end_of_text = len(lines)
     while end_of_text > body and not lines[end_of_text - 1]:
         end_of_text -= 1
-    first_lines = [i for i in range(body, end_of_text) if lines[i][:indent].strip()]
-    if end_of_text > body and (not first_lines or first_lines[0] != body):
-        raise ValueError(
-            f"{name}: line {body + 1}, {lines[body][:23]!r} is not the first line of a record. "
-            "Repair or remove it."
-        )
-    for begin, end in pairwise([*first_lines, end_of_text]):
-        label = f"{name}: line {begin + 1}, {lines[begin][:23]!r}"
+    return [*(i for i in range(body, end_of_text) if lines[i][: version + 1].strip()), end_of_text]
+
+
+def _describe_others(lines: Sequence[str], body: int, version: str) -> list[str]:
+    """Describe the satellites of other systems, in one text, or none."""
+    if version != "3":
+        return []
+    letters = Counter(lines[i][0] for i in _first_lines(lines, body, 3)[:-1])
+    texts = [
+        f"{count} of {_SYSTEMS.get(letter, f'the unknown system {letter!r}')}"
+        for letter, count in sorted(letters.items())
+        if letter not in "GE"
+    ]
+    return [f"records {', '.join(texts)}"] if texts else []
+
+
+def _records(
+    lines: Sequence[str], body: int, version: int
+) -> Iterator[dict[str, float | str] | str]:
+    """Yield records from line `body` on, or why one is dropped. Numbers have columns of 19 after an indent."""
+    indent = version + 1
+    borders = _first_lines(lines, body, version)
+    if borders[0] > body:
+        yield f"line {body + 1}, {lines[body][:23]!r} is not the first line of a record"
+    for begin, end in pairwise(borders):
         system = lines[begin][0] if version == 3 else "G"
+        if system not in "GE":
+            continue
         try:
-            _check_size(system, end - begin)
-            if system not in "GE":
-                continue
+            prn = lines[begin][version - 2 : indent].strip()
+            if not (prn.isascii() and prn.isdigit()):
+                raise ValueError(f"it must begin with a satellite, got {prn!r}")
+            if end - begin != _RECORD_LINES:
+                raise ValueError(f"it must have {_RECORD_LINES} lines, got {end - begin}")
             record = _parse_record(lines[begin:end], system, version)
         except ValueError as error:
-            raise ValueError(
-                f"{label} is not a valid record: {error}. Repair or remove it."
-            ) from None
+            yield f"the record in line {begin + 1}, {lines[begin][:23]!r}, is dropped: {error}"
+            continue
         if (
             system == "E" and not int(record["codes"]) & 0b101
         ):  # F/NAV: clocks of another pair of frequencies
             continue
         if system == "E":
             record["tgd"] = record["iodc"]  # the group delay of E1 and E5b goes with I/NAV
-        prn = lines[begin][version - 2 : indent].strip()
-        if not prn.isdigit():
-            raise ValueError(f"{label} must begin with a satellite, got {prn!r}. Remove it.")
         yield {**record, "sys": system, "prn": float(prn), "line": begin + 1.0}
-
-
-def _check_size(system: str, size: int) -> None:
-    expected = _RECORD_LINES.get(system)
-    if expected is None:
-        raise ValueError(f"the system must be one of {', '.join(_RECORD_LINES)}, got {system!r}")
-    if size not in (expected if isinstance(expected, tuple) else (expected,)):
-        raise ValueError(f"not a complete record, expected {expected} lines, got {size}")
 
 
 def _parse_record(lines: Sequence[str], system: str, version: int) -> dict[str, float]:
     """Parse the fields of a GPS or Galileo record."""
     indent = version + 1
     date = _parse_date(lines[0][indent : 19 + indent].split())
-    numbers = [_parse_number(lines[0], 19 + indent + 19 * k) for k in range(3)]
-    numbers += [_parse_number(line, indent + 19 * k) for line in lines[1:] for k in range(4)]
-    for line, fields in ((lines[0], 4), *((line, 4) for line in lines[1:])):
-        if line[indent + 19 * fields :].strip():
-            raise ValueError(
-                f"expected no text after the last number, got {line[indent + 19 * fields :]!r}"
-            )
-    record = dict(zip(LINES, [date % WEEK, *numbers], strict=False))
-    required = _REQUIRED | ({"codes", "iodc"} if system == "E" else {"tgd"})
+    for line in lines:
+        if line[indent + 76 :].strip():
+            raise ValueError(f"expected no text after the last number, got {line[indent + 76 :]!r}")
+    fields = [lines[0][19 + indent + 19 * k :][:19] for k in range(3)]
+    fields += [line[indent + 19 * k :][:19] for line in lines[1:] for k in range(4)]
+    required = _REQUIRED | _BY_SYSTEM[system]
+    # a field that is not used does not decide about a record
+    record = {
+        name: _parse_number(text) if name in required else math.nan
+        for name, text in zip(LINES[1:], fields, strict=False)
+    }
+    record["toc"] = date % WEEK
     blank = [field for field in LINES if field in required and math.isnan(record[field])]
     if blank:
         raise ValueError(f"expected numbers, got blank fields {', '.join(blank)}")
@@ -144,19 +189,21 @@ def _parse_record(lines: Sequence[str], system: str, version: int) -> dict[str, 
     return record
 
 
-def _parse_number(line: str, start: int) -> float:
+def _parse_number(field: str) -> float:
     """Parse a field of 19 characters. A blank field is NaN."""
-    text = line[start : start + 19].strip()
+    text = field.strip()
     if not text:
         return math.nan
-    if not _NUMBER.fullmatch(text):
+    match = _NUMBER.fullmatch(text)
+    if not match:
         raise ValueError(f"expected a number like 0.123456789012D-04, got {text!r}")
-    return float(text.replace("D", "e").replace("d", "e"))
+    digits, exponent, bare = match.groups()
+    return float(f"{digits}e{exponent or bare}")
 
 
 def _parse_date(fields: Sequence[str]) -> float:
     """Return the GPS time of a date, s since 1980-01-06."""
-    if len(fields) != 6 or not all(field.isdigit() for field in fields[:5]):
+    if len(fields) != 6 or not all(f.isascii() and f.isdigit() for f in fields[:5]):
         raise ValueError(f"expected year, month, day, hour, minute and second, got {fields}")
     year, month, day, hour, minute = (int(field) for field in fields[:5])
     if year < 100:

@@ -8,6 +8,7 @@ one rule for notes and errors.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from pfbench.core import quaternion
 from pfbench.nav import attitude
 from pfbench.nav.plausible_limits import PlausibleLimits
-from pfbench.nav.preintegration import preintegrate
+from pfbench.scenario.plausibility.dead_reckoning import integrate_windows
 from pfbench.scenario.plausibility.log_table import LogTable
 from pfbench.scenario.plausibility.table_scales import (
     FEWEST_WINDOWS,
@@ -28,8 +29,9 @@ from pfbench.scenario.plausibility.table_scales import (
 )
 from pfbench.scenario.recorded.log_tables import Array
 from pfbench.scenario.recorded.navigation_log import GnssLog, ImuLog, ReferenceLog
-from pfbench.scenario.recorded.time_grid import interpolate, split_samples
+from pfbench.scenario.recorded.time_grid import interpolate
 
+_FIX_LIMITS = (2e3, 5e3, 1e4, 2e4, 5e4, 1e5)  # m; offered limits of the error of a fix
 _STRAIGHT = 1.5  # s; longest interval over which the velocity is taken as linear
 
 
@@ -117,9 +119,7 @@ def _compare_windows(
 ) -> tuple[str, ...]:
     """Compare dead reckoning between the rows `nodes` of the reference."""
     time = reference.time[nodes]
-    force, rate, spans = (torch.from_numpy(a) for a in split_samples(imu, time))
-    bias = spans.new_zeros(len(spans), 6)
-    rotation, velocity, _, _ = preintegrate(force, rate, spans, bias)
+    rotation, velocity = integrate_windows(imu, time)
     q = torch.from_numpy(reference.attitude[nodes])
     inverse = q[1:] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
     turned = quaternion.quaternion_multiply(q[:-1], rotation)
@@ -159,29 +159,31 @@ def compare_fixes(
         The fixes, without those that `limits.drop_fixes` drops, and notes.
 
     Raises:
-        ValueError: If a fix is beyond the limits and is not to be dropped.
+        ValueError: If a fix is beyond the limits and is not to be dropped, or no fix would be left.
     """
     true = interpolate(reference, fixes.time)
     position_error = np.linalg.norm(fixes.position - true[:, 7:], axis=1)
     velocity_error = np.linalg.norm(fixes.velocity - true[:, 4:7], axis=1)
     step = np.linalg.norm(np.diff(fixes.position, axis=0), axis=1)
-    reach = limits.speed_m_s * np.diff(fixes.time) + 2.0 * limits.fix_error_m
-    jump_mask = np.concatenate([[False], step > reach])
-    # a jump after a wrong fix is not an error of the next one, which the reference confirms
-    jump_mask &= np.isnan(position_error)
-    wrong_mask = (position_error > limits.fix_error_m) | jump_mask
+
+    def is_wrong(largest: float) -> NDArray[np.bool_]:
+        reach = limits.speed_m_s * np.diff(fixes.time) + 2.0 * largest
+        # a jump after a wrong fix is not an error of the next one, which the reference confirms
+        jump_mask = np.concatenate([[False], step > reach]) & np.isnan(position_error)
+        return (position_error > largest) | jump_mask
+
+    wrong_mask = is_wrong(limits.fix_error_m)
     notes: tuple[str, ...] = ()
     if wrong_mask.any():
         rows = np.flatnonzero(wrong_mask)
         i = int(rows[0])
         distance = position_error[i] if np.isfinite(position_error[i]) else step[i - 1]
         text = f"{distance:.0f} m in {table.row(i)}"
-        if not limits.drop_fixes:
+        if not (limits.drop_fixes and _usable(fixes, wrong_mask)):
             raise ValueError(
                 f"{table.name}: fixes must be at most {limits.fix_error_m:g} m from the reference "
                 f"and from neighbouring fixes at {limits.speed_m_s:g} m/s, got {text} "
-                f"({len(rows)} such rows). Correct or remove these rows, set "
-                "scenario.limits.fix_error_m, or set scenario.limits.drop_fixes=true."
+                f"({len(rows)} such rows). {_fix_remedy(fixes, wrong_mask, is_wrong)}"
             )
         notes = (f"{table.name}: {len(rows)} fixes dropped, the first off by {text}",)
         position, velocity = fixes.position.copy(), fixes.velocity.copy()
@@ -195,6 +197,27 @@ def compare_fixes(
     notes += _note_offset(table, fixes.position - true[:, 7:])
     notes += _judge(FIX, position_error, table, rows)
     return fixes, (*notes, *_judge(FIX_VELOCITY, velocity_error, table, rows))
+
+
+def _usable(fixes: GnssLog, wrong_mask: NDArray[np.bool_]) -> int:
+    return int((np.isfinite(fixes.position[:, 0]) & ~wrong_mask).sum())
+
+
+def _fix_remedy(
+    fixes: GnssLog, wrong_mask: NDArray[np.bool_], is_wrong: Callable[[float], NDArray[np.bool_]]
+) -> str:
+    """Advise to drop wrong fixes if others remain, and to widen the limit if that accepts all."""
+    largest = next((limit for limit in _FIX_LIMITS if not is_wrong(limit).any()), None)
+    remedies = []
+    if _usable(fixes, wrong_mask) > int(wrong_mask.sum()):
+        remedies.append("Correct or remove these rows, or set scenario.limits.drop_fixes=true.")
+    else:
+        remedies.append(
+            "Check the origin, axes and clock of the fixes, which are wrong in most rows."
+        )
+    if largest is not None:
+        remedies.append(f"If fixes can be so wrong, set scenario.limits.fix_error_m={largest:g}.")
+    return " ".join(remedies)
 
 
 def _note_offset(table: LogTable, difference: Array) -> tuple[str, ...]:

@@ -16,12 +16,14 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
+from pfbench.files.reader_notes import announce_notes
 from pfbench.model.strapdown.tuning import StrapdownTuning
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.nav.preintegration import PreintegratedImu
 from pfbench.noise.base import NoiseRegime
 from pfbench.scenario.base import Scenario, check_duration
 from pfbench.scenario.recorded.assembly import FixReceiver, assemble
+from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes
 from pfbench.scenario.recorded.fix_holdout import FixHoldout
 from pfbench.scenario.recorded.log_reader import read_log
 from pfbench.scenario.recorded.log_tables import find_dataset, list_tables
@@ -49,6 +51,7 @@ class RecordedDrive(Scenario):
         limits: Limits of the platform for the checks of the log. None for the default limits.
         holdout: Selection of withheld fixes, which are the truth instead of the reference. None
             withholds no fixes.
+        fix_codes: Meaning of the column `fix` of the fixes, see `read_log`.
 
     Raises:
         ValueError: If a step, an interval or the threshold is not positive. `draw` raises it for a
@@ -66,6 +69,7 @@ class RecordedDrive(Scenario):
     origin: Sequence[float] | None = None
     limits: PlausibleLimits | None = None
     holdout: FixHoldout | None = None
+    fix_codes: FixCodes = None
     input_type = PreintegratedImu
 
     @property
@@ -75,6 +79,7 @@ class RecordedDrive(Scenario):
 
     def __post_init__(self) -> None:
         check_duration("scenario.filter_step_s", self.filter_step_s)
+        check_fix_codes(self.fix_codes)
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
@@ -87,8 +92,14 @@ class RecordedDrive(Scenario):
     def read(self) -> ResampledLog:
         """Read the log and resample it to filter steps."""
         folder = find_dataset(self.root, self.folder)
-        log = read_log(folder, self.files, origin=self.origin, limits=self.limits)
-        return resample_log(
+        log = read_log(
+            folder,
+            self.files,
+            origin=self.origin,
+            limits=self.limits,
+            fix_codes=self.fix_codes,
+        )
+        leg = resample_log(
             log,
             self.receiver.fix_interval_s,
             self.filter_step_s,
@@ -96,6 +107,8 @@ class RecordedDrive(Scenario):
             self.start_s,
             self.end_s,
         )
+        announce_notes(folder, leg.notes)
+        return leg
 
     def over(self, leg: ResampledLog, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         """Draw the errors of some runs over a resampled log.
@@ -136,6 +149,7 @@ class RecordedFlights(Scenario):
         files: Names of the tables.
         origin: lat_deg, lon_deg, h_m of the local frame. None if the files contain it.
         limits: Limits of the platform for the checks of the log. None for the default limits.
+        fix_codes: Meaning of the column `fix` of the fixes, see `read_log`.
 
     Raises:
         ValueError: If the step or the threshold is not positive, or no flight is selected. `draw`
@@ -153,6 +167,7 @@ class RecordedFlights(Scenario):
     files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
     origin: Sequence[float] | None = None
     limits: PlausibleLimits | None = None
+    fix_codes: FixCodes = None
     input_type = PreintegratedImu
 
     @property
@@ -162,6 +177,7 @@ class RecordedFlights(Scenario):
 
     def __post_init__(self) -> None:
         check_duration("scenario.filter_step_s", self.filter_step_s)
+        check_fix_codes(self.fix_codes)
         if not self.flights:
             raise ValueError("scenario.flights must not be empty, got []. Select a flight.")
 
@@ -178,7 +194,15 @@ class RecordedFlights(Scenario):
         # only flights of the requested runs are read
         used = torch.unique(runs % len(self.flights)).tolist()
         logs = [
-            read_log(folder, self.files, self.flights[i], self.imu_index, self.origin, self.limits)
+            read_log(
+                folder,
+                self.files,
+                self.flights[i],
+                self.imu_index,
+                self.origin,
+                self.limits,
+                self.fix_codes,
+            )
             for i in used
         ]
         legs = [

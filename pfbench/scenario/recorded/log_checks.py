@@ -3,45 +3,111 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
 
 from pfbench.core import quaternion
+from pfbench.nav.preintegration import rotate
+from pfbench.scenario.plausibility.dead_reckoning import integrate_windows
+from pfbench.scenario.plausibility.time_order import find_overlap_remedy
 from pfbench.scenario.recorded.log_tables import Array
 from pfbench.scenario.recorded.navigation_log import ImuLog, ReferenceLog
 
 STANDARD_GRAVITY = 9.80665
+_AGREEING_TURN = 0.3  # part of the rates of the reference that noise may leave [ours]
 _DEGREE = math.pi / 180.0
+_AGREEING_FORCE = 0.5  # part of the force that biases and vibration may hide [ours]
+_LEAST_FORCE = 1.0  # m/s^2; a force that biases do not hide [ours]
 
 
-def check_force(force: Array, name: str) -> None:
-    """Check unit and axes of the specific force.
+def check_force(imu: ImuLog, reference: ReferenceLog, name: str) -> None:
+    """Check unit, gravity and axes of the specific force.
 
     Args:
-        force: Specific force in forward, right, down, [n, 3].
+        imu: IMU samples.
+        reference: Reference motion, with which the remedies are tried.
         name: Name of the table, for the message.
 
     Raises:
-        ValueError: If the force is in another unit, or its down axis points up.
+        ValueError: If gravity does not have its size in the force, or points the wrong way.
     """
-    typical = float(np.median(np.linalg.norm(force, axis=1)))
-    if 0.8 < typical < 1.25:
-        raise ValueError(
-            f"{name}: fx, fy, fz must be in m/s^2, got a median norm of {typical:.3f}, which is in g. "
-            f"Multiply by {STANDARD_GRAVITY}."
+    typical = float(np.median(np.linalg.norm(imu.force, axis=1)))
+    up = float(np.median(imu.force[:, 2]))
+    has_gravity = 5.0 < typical < 20.0
+    if has_gravity and up >= 0.5 * typical:
+        return
+    if has_gravity and _force_error(imu, reference) <= _AGREEING_FORCE:
+        return  # not level for most of the time
+    remedy = _find_force_remedy(imu, reference)
+    if has_gravity and up >= -0.5 * typical and not remedy:
+        return  # nothing is known to be wrong
+    remedy = remedy or (
+        "No other unit, sign or axes of fx, fy, fz agree with the reference. Check this table."
+    )
+    got = f"got a median norm of {typical:.3g} and a median fz of {-up:+.3g}"
+    raise ValueError(
+        f"{name}: fx, fy, fz must be the specific force in m/s^2, about 9.8 in size, and -9.8 on fz when "
+        f"level (forward-right-down axes), {got}. {remedy}"
+    )
+
+
+_FORCE_REMEDIES: dict[str, tuple[Sequence[float], Sequence[float], float]] = {
+    # signs of force and rate on right, forward, up, and the factor of the force
+    f"They are in g: multiply by {STANDARD_GRAVITY}.": ((1, 1, 1), (1, 1, 1), STANDARD_GRAVITY),
+    "The axes are forward-left-up: negate fy, fz, wy, wz.": ((-1, 1, -1), (-1, 1, -1), 1.0),
+    "They have the other sign: negate fx, fy, fz.": ((-1, -1, -1), (1, 1, 1), 1.0),
+    f"They are in g and forward-left-up: multiply by {STANDARD_GRAVITY}, and negate fy, fz, wy, wz.": (
+        (-1, 1, -1), (-1, 1, -1), STANDARD_GRAVITY,
+    ),
+    f"They are in g and have the other sign: multiply by -{STANDARD_GRAVITY}.": (
+        (-1, -1, -1), (1, 1, 1), STANDARD_GRAVITY,
+    ),
+}  # fmt: skip
+
+
+def _find_force_remedy(imu: ImuLog, reference: ReferenceLog) -> str:
+    """Return the change with which the velocity of the reference changes as the force says, or ''."""
+    found = {
+        remedy: _force_error(
+            imu._replace(
+                force=factor * np.array(of_force) * imu.force, rate=np.array(of_rate) * imu.rate
+            ),
+            reference,
         )
-    if not 5.0 < typical < 20.0:
-        raise ValueError(
-            f"{name}: fx, fy, fz must have a median norm near 9.8 m/s^2 from gravity, "
-            f"got {typical:g}. Check the unit."
-        )
-    down = float(np.median(force[:, 2]))
-    if down > 0.5 * typical:
-        raise ValueError(
-            f"{name}: fz must be about -9.8 when level (forward-right-down axes), "
-            f"got a median of {down:+.2f}. If axes are forward-left-up, negate fy, fz, wy, wz."
-        )
+        for remedy, (of_force, of_rate, factor) in _FORCE_REMEDIES.items()
+    }
+    for factor, unit in ((1.0, ""), (STANDARD_GRAVITY, f"multiply by {STANDARD_GRAVITY}, and ")):
+        error = _force_error(imu._replace(force=factor * imu.force), reference, gravity=0.0)
+        found[_without_gravity(unit)] = error
+    remedy = min(found, key=lambda text: found[text])
+    return remedy if found[remedy] <= _AGREEING_FORCE else ""
+
+
+def _without_gravity(unit: str) -> str:
+    g = STANDARD_GRAVITY
+    return (
+        "Gravity is missing, as in a linear acceleration. Record the specific force, or "
+        f"{unit}add {g} sin(pitch) to fx, and subtract {g} cos(pitch) sin(roll) from fy and "
+        f"{g} cos(pitch) cos(roll) from fz."
+    )
+
+
+def _force_error(imu: ImuLog, reference: ReferenceLog, gravity: float = STANDARD_GRAVITY) -> float:
+    """Return the part of the force that the reference needs over about a second which the IMU does not show."""
+    inside = (reference.time >= imu.time[0]) & (reference.time <= imu.time[-1])
+    stride = max(1, round(1.0 / float(np.median(np.diff(reference.time)))))
+    time = reference.time[inside][::stride]
+    if len(time) < 3:
+        return math.inf
+    _, increment = integrate_windows(imu, time)
+    q = torch.from_numpy(reference.attitude[inside][::stride][:-1])
+    level = rotate(q, increment).numpy() / np.diff(time)[:, None] - [0.0, 0.0, gravity]
+    change = np.diff(reference.velocity[inside][::stride], axis=0) / np.diff(time)[:, None]
+    needed = float(np.median(np.linalg.norm(change + np.array([0.0, 0.0, gravity]), axis=1)))
+    error = float(np.median(np.linalg.norm(change - level, axis=1)))
+    return error / max(needed, _LEAST_FORCE)
 
 
 def check_overlap(imu_name: str, imu_time: Array, name: str, time: Array) -> None:
@@ -60,11 +126,17 @@ def check_overlap(imu_name: str, imu_time: Array, name: str, time: Array) -> Non
         raise ValueError(
             f"{imu_name} and {name} must overlap in time, got t = {imu_time[0]:.3f} to "
             f"{imu_time[-1]:.3f} and t = {time[0]:.3f} to {time[-1]:.3f}. "
-            "Use the same clock in both (GPS seconds, or seconds from the same instant)."
+            f"{find_overlap_remedy(time, imu_time, name)}"
         )
 
 
-def check_rotation(imu: ImuLog, reference: ReferenceLog, name: str, reference_name: str) -> None:
+def check_rotation(
+    imu: ImuLog,
+    reference: ReferenceLog,
+    names: tuple[str, str],
+    others: Callable[[], Mapping[str, ReferenceLog]],
+    offset: str = "",
+) -> None:
     """Compare angular rates with the reference.
 
     Rates of slow vehicles in deg/s pass all absolute limits.
@@ -72,8 +144,10 @@ def check_rotation(imu: ImuLog, reference: ReferenceLog, name: str, reference_na
     Args:
         imu: IMU samples.
         reference: Reference motion.
-        name: Name of the IMU table, for the message.
-        reference_name: Name of the reference table, for the message.
+        names: Names of the tables of IMU and reference, for the message.
+        others: Returns references with other units and signs of the attitude, by the change that
+            makes the table so.
+        offset: Offset of the clock, which explains the rates if no unit and no sign does.
 
     Raises:
         ValueError: If the rates have another scale or sign than the reference.
@@ -85,17 +159,42 @@ def check_rotation(imu: ImuLog, reference: ReferenceLog, name: str, reference_na
     if np.sqrt(np.mean(true**2)) < 0.02:
         return  # at low angular rates the comparison contains mostly noise
     slope = float((measured * true).sum() / (true * true).sum())
-    if slope > 20.0:
+    if slope > 20.0 or slope < 0.05:
         raise ValueError(
-            f"{name}: wx, wy, wz must be in rad/s, got {slope:.0f} times the rate of {reference_name}, "
-            f"so they are in deg/s. Multiply by {_DEGREE:.10f}."
+            f"{names[0]} and {names[1]} must turn together, got rates wx, wy, wz of {slope:.3g} times "
+            f"those of roll, pitch, yaw. {_find_turn_remedy(imu, reference, others(), offset)}"
         )
-    if slope < 0.05:
-        raise ValueError(
-            f"{name} and {reference_name} must turn together, got a slope of {slope:.3f}. Check that "
-            "roll, pitch, yaw are in rad (0.017: in degrees), that axes are forward-right-down, "
-            "yaw clockwise from North, and that both have the same clock."
-        )
+
+
+def _find_turn_remedy(
+    imu: ImuLog, reference: ReferenceLog, others: Mapping[str, ReferenceLog], offset: str
+) -> str:
+    """Return the change with which IMU and reference turn together."""
+    changes = {
+        f"wx, wy, wz are in deg/s: multiply by {_DEGREE:.10f}.": (imu._replace(rate=_DEGREE * imu.rate), reference),
+        "wx, wy, wz have the other sign: negate them.": (imu._replace(rate=-imu.rate), reference),
+        "The gyroscope is forward-left-up: negate wy and wz.": (imu._replace(rate=imu.rate * [-1, 1, -1]), reference),
+        **{text: (imu, other) for text, other in others.items()},
+    }  # fmt: skip
+    found = {text: _turn_error(*pair) for text, pair in changes.items()}
+    agreeing = [text for text, error in found.items() if error <= _AGREEING_TURN]
+    if agreeing:  # a heading and rates of the other sign turn alike, but the force differs
+        return min(agreeing, key=lambda text: _force_error(*changes[text]))
+    if offset:
+        return f"{offset}."
+    return (
+        "No other unit or sign of either makes them agree. Check that axes are forward-right-down, yaw "
+        "clockwise from North, and that both have the same clock."
+    )
+
+
+def _turn_error(imu: ImuLog, reference: ReferenceLog) -> float:
+    """Return the part of the rates of the reference that those of the IMU do not explain."""
+    rates = _mean_rates(imu, reference)
+    if rates is None:
+        return math.inf
+    measured, true = rates
+    return float(np.square(measured - true).sum() / np.square(true).sum())
 
 
 def _mean_rates(imu: ImuLog, reference: ReferenceLog) -> tuple[Array, Array] | None:

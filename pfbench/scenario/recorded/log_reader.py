@@ -8,7 +8,7 @@ columns, each a Parquet or a CSV file:
 |---|---|
 | imu | t [s], fx, fy, fz [m/s^2] (about -9.8 on z when level), wx, wy, wz [rad/s] |
 | gnss | t, and lat_deg, lon_deg, h_m or pn, pe, pd [m] |
-| gnss, optional | vn, ve, vd [m/s]; fix (1: use the fix, other values: missing) |
+| gnss, optional | vn, ve, vd [m/s]; fix (1: use the fix, 0: missing; other codes by `fix_codes`) |
 | reference | t, pn, pe, pd (or lat_deg, lon_deg, h_m), vn, ve, vd, roll, pitch, yaw [rad] |
 
 A table can contain several flights and sensors. The columns `path` and `imu` identify them.
@@ -16,15 +16,19 @@ A table can contain several flights and sensors. The columns `path` and `imu` id
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from pfbench.files.reader_notes import announce_notes
 from pfbench.nav import attitude, earth
 from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.scenario.plausibility.clock_offsets import find_fix_offset, find_imu_offset
 from pfbench.scenario.plausibility.column_checks import check_changes
 from pfbench.scenario.plausibility.log_agreement import (
     compare_fixes,
@@ -33,6 +37,7 @@ from pfbench.scenario.plausibility.log_agreement import (
     compare_times,
 )
 from pfbench.scenario.plausibility.log_table import LogTable
+from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes, select_usable
 from pfbench.scenario.recorded.log_checks import (
     STANDARD_GRAVITY,
     check_force,
@@ -69,6 +74,7 @@ def read_log(
     imu: int | None = None,
     origin: Sequence[float] | None = None,
     limits: PlausibleLimits | None = None,
+    fix_codes: FixCodes = None,
 ) -> NavigationLog:
     """Read and check the log in a folder.
 
@@ -80,6 +86,8 @@ def read_log(
         origin: lat_deg, lon_deg, h_m of pn = pe = pd = 0. Required only if one table has lat_deg,
             another has pn, and the metadata of the files do not contain it.
         limits: Limits of the platform. None for the default limits.
+        fix_codes: Meaning of the column `fix` of the fixes: the program that wrote it (nmea, rtklib,
+            ublox), the codes of the fixes to use, or None for 1 (use) and 0.
 
     Returns:
         The log in right-forward-up and East-North-Up axes.
@@ -95,10 +103,16 @@ def read_log(
     )
     sensors, notes = _samples(inertial)
     centre = _origin(origin, gnss, truth)
-    fixes, reference = _fixes(gnss, centre), _motion(truth, centre)
+    check_fix_codes(fix_codes)
+    usable, usable_notes = select_usable(gnss, fix_codes)
+    fixes, reference = _fixes(gnss, centre, usable), _motion(truth, centre)
     check_overlap(inertial.name, sensors.time, gnss.name, fixes.time)
     check_overlap(inertial.name, sensors.time, truth.name, reference.time)
-    check_rotation(sensors, reference, inertial.name, truth.name)
+    check_force(sensors, reference, inertial.name)
+    imu_offset = find_imu_offset(sensors, reference)
+    late = imu_offset.describe(inertial.name, truth.name) if imu_offset else ""
+    both = (inertial.name, truth.name)
+    check_rotation(sensors, reference, both, lambda: _other_attitudes(truth, reference), late)
     gravity = STANDARD_GRAVITY
     if centre is None:
         notes += (f"gravity {gravity} m/s^2: the log does not contain its location",)
@@ -106,12 +120,29 @@ def read_log(
         latitude, height = torch.tensor([centre[0] * _DEGREE, centre[2]], dtype=torch.float64)
         gravity = float(earth.gravity(latitude, height))
     notes += compare_reference(truth, reference)
-    notes += compare_inertial(truth, sensors, reference, gravity)
-    fixes, fix_notes = compare_fixes(gnss, fixes, reference, limits)
+    with _explain(late):
+        notes += compare_inertial(truth, sensors, reference, gravity)
+    fix_offset = find_fix_offset(fixes, reference) if names.gnss != names.reference else None
+    fixes_late = fix_offset.describe(gnss.name, truth.name) if fix_offset else ""
+    with _explain(fixes_late):
+        fixes, fix_notes = compare_fixes(gnss, fixes, reference, limits)
     tables = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
     notes += (*fix_notes, *compare_times(tables))
     dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
-    return NavigationLog(sensors, fixes, reference, gravity, (*dropped, *notes))
+    notes = (*dropped, *filter(None, (late, fixes_late)), *usable_notes, *notes)
+    announce_notes(folder, notes)
+    return NavigationLog(sensors, fixes, reference, gravity, notes)
+
+
+@contextlib.contextmanager
+def _explain(offset: str) -> Iterator[None]:
+    """Add the offset of a clock to the error of a comparison, which it can cause."""
+    try:
+        yield
+    except ValueError as error:
+        if not offset:
+            raise
+        raise ValueError(f"{error} First correct the clock: {offset}.") from None
 
 
 def _samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
@@ -121,7 +152,6 @@ def _samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
         parse_numbers(table, ("fx", "fy", "fz")),
         parse_numbers(table, ("wx", "wy", "wz")),
     )
-    check_force(force, table.name)
     check_changes(table, ("fx", "fy", "fz", "wx", "wy", "wz"), time, np.hstack([force, rate]))
     return ImuLog(time, swap_frd_rfu(force), swap_frd_rfu(rate)), notes
 
@@ -150,7 +180,7 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
         raise ValueError(
             f"{table.name} must not have gaps, got a gap of {step[i]:.3f} s after {table.row(i)} "
             f"(t = {time[i]}), with samples every {typical:.4f} s. "
-            "Cut the log there and use the longer part."
+            f"{_longest_part(table, time, step > max(_MAX_GAP, 3 * typical))}"
         )
     slow = np.flatnonzero(step > 3 * typical)
     if slow.size:
@@ -159,6 +189,17 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
             f"{step[i]:.3f} s after {table.row(i)}. Samples were interpolated",
         )
     return time, notes
+
+
+def _longest_part(table: LogTable, time: Array, is_gap: NDArray[np.bool_]) -> str:
+    """Name the rows between two gaps that cover the longest time."""
+    borders = np.concatenate([[0], np.flatnonzero(is_gap) + 1, [len(time)]])
+    first, last = borders[:-1], borders[1:] - 1
+    i = int(np.argmax(time[last] - time[first]))
+    return (
+        f"Keep the longest part without a gap, {table.row(int(first[i]))} to {table.row(int(last[i]))} "
+        f"(t = {time[first[i]]:.3f} to {time[last[i]]:.3f})."
+    )
 
 
 def _origin(
@@ -205,25 +246,21 @@ def _positions(table: LogTable, origin: tuple[float, ...] | None) -> Array:
     ).numpy()
 
 
-def _fixes(table: LogTable, origin: tuple[float, ...] | None) -> GnssLog:
+def _fixes(table: LogTable, origin: tuple[float, ...] | None, usable: NDArray[np.bool_]) -> GnssLog:
     time, position = read_times(table, longest=100.0), _positions(table, origin)
     recorded = table.has(_VELOCITY)
     columns = _VELOCITY if recorded else _DERIVED
     velocity = np.full_like(position, np.nan)
     if recorded or table.has(_DERIVED):
         velocity = swap_frd_rfu(parse_numbers(table, columns))
-    if "fix" in table.rows:
-        missing_mask = parse_numbers(table, ("fix",))[:, 0] != 1.0
-        position[missing_mask], velocity[missing_mask] = np.nan, np.nan
+    position[~usable], velocity[~usable] = np.nan, np.nan
     return GnssLog(time, position, velocity)
 
 
 def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
     time = read_times(table, longest=100.0)
     derived = "vn" not in table.rows and "vn_d" in table.rows
-    roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
-    euler = torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1))
-    q = attitude.quaternion_from_dcm(attitude.dcm_from_euler(euler)).numpy()
+    q = _quaternion(*parse_numbers(table, ("roll", "pitch", "yaw")).T)
     columns = _DERIVED if derived else _VELOCITY
     velocity = swap_frd_rfu(parse_numbers(table, columns))
     check_changes(table, columns, time, swap_frd_rfu(velocity))
@@ -233,3 +270,26 @@ def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
         velocity,
         _positions(table, origin),
     )
+
+
+def _quaternion(roll: Array, pitch: Array, yaw: Array) -> Array:
+    euler = torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1))
+    return attitude.quaternion_from_dcm(attitude.dcm_from_euler(euler)).numpy()
+
+
+def _other_attitudes(table: LogTable, reference: ReferenceLog) -> dict[str, ReferenceLog]:
+    """Return the reference as other units and signs of its attitude would give it."""
+    roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
+    angles = {
+        f"yaw is in degrees: multiply it by {_DEGREE:.10f}.": (roll, pitch, _DEGREE * yaw),
+        f"roll, pitch, yaw are in degrees: multiply them by {_DEGREE:.10f}.": (
+            _DEGREE * roll,
+            _DEGREE * pitch,
+            _DEGREE * yaw,
+        ),
+        "yaw is counted anticlockwise: negate it.": (roll, pitch, -yaw),
+    }
+    return {
+        f"{table.name}: {text}": reference._replace(attitude=_quaternion(*values))
+        for text, values in angles.items()
+    }

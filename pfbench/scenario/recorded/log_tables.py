@@ -15,6 +15,7 @@ from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.plausibility.column_checks import check_range
 from pfbench.scenario.plausibility.log_table import LogTable
+from pfbench.scenario.plausibility.time_order import find_order_remedy
 
 _SUFFIXES = (".parquet", ".csv")
 
@@ -43,6 +44,9 @@ def find_dataset(root: str | None, folder: str) -> Path:
     return path
 
 
+_USUAL_INTERVAL = 10.0  # s
+_DATA_REMEDY = "Remove rows without data."
+_COLUMN_REMEDY = "Fill this column. Of fixes, vn, ve, vd and fix can be left out."
 # largest satellite number of each system in its interface document; QZSS and SBAS count from 193 and 120, too
 _LARGEST_NUMBERS = {"G": 63, "R": 32, "E": 36, "C": 63, "J": 202, "I": 14, "S": 158}
 
@@ -180,7 +184,7 @@ def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
             raise ValueError(
                 f"{table.name}: column {column} must have finite numbers, got "
                 f"{table.rows[column].iloc[bad[0]]} in {table.row(int(bad[0]))} ({bad.size} such rows). "
-                "Remove rows without data."
+                f"{_DATA_REMEDY if bad.size < len(values) else _COLUMN_REMEDY}"
             )
         check_range(table, column, values)
         out[:, i] = values
@@ -271,7 +275,7 @@ def check_increasing(table: LogTable, time: Array) -> None:
         raise ValueError(
             f"{table.name}: column t must increase, got {time[i]} after {time[i - 1]} in "
             f"{table.row(i)}, which {problem} ({back.size} such rows). "
-            "Sort the rows by t and keep one row for each time."
+            f"{find_order_remedy(time, table.row)}"
         )
 
 
@@ -290,8 +294,16 @@ def check_seconds(table: LogTable, time: Array, longest: float) -> None:
     if typical <= longest:
         return
     units = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
-    unit, scale = next(((u, s) for u, s in units if typical * s <= longest), units[-1])
+    # the largest unit that gives a usual interval, else one that is accepted at all
+    usual = [
+        (u, f)
+        for limit in (min(longest, _USUAL_INTERVAL), longest)
+        for u, f in units
+        if typical * f <= limit
+    ]
+    remedy = f"Use a table with an interval of at most {longest:g} s."
+    if usual:
+        remedy = f"If it is in {usual[0][0]}, multiply by {usual[0][1]:g}."
     raise ValueError(
-        f"{table.name}: column t must be in s, got a median interval of {typical:g}. "
-        f"If it is in {unit}, multiply by {scale:g}."
+        f"{table.name}: column t must be in s, got a median interval of {typical:g}. {remedy}"
     )

@@ -18,6 +18,7 @@ from typing_extensions import override
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.strapdown.tight import StrapdownTight
+from pfbench.files.reader_notes import announce_notes
 from pfbench.model.strapdown.tuning import TightTuning
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.noise.base import NoiseRegime, check_unit_process
@@ -29,6 +30,7 @@ from pfbench.scenario.base import (
 )
 from pfbench.scenario.plausibility.sky_checks import check_sky
 from pfbench.scenario.recorded.assembly import FixReceiver, assemble, encode_names
+from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes
 from pfbench.scenario.recorded.log_reader import read_log
 from pfbench.scenario.recorded.log_tables import find_dataset, list_tables
 from pfbench.scenario.recorded.navigation_log import LogFiles
@@ -104,6 +106,7 @@ class RecordedWalk(Scenario):
         files: Names of the tables. Steps end at the times of `gnss`.
         origin: lat_deg, lon_deg, h_m of the local frame. None if the files contain it.
         limits: Limits of the platform for the checks of the log. None for the default limits.
+        fix_codes: Meaning of the column `fix` of the fixes, see `read_log`.
 
     Raises:
         ValueError: If the step or the threshold is not positive. `draw` raises it for a missing root
@@ -121,10 +124,12 @@ class RecordedWalk(Scenario):
     files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
     origin: Sequence[float] | None = None
     limits: PlausibleLimits | None = None
+    fix_codes: FixCodes = None
     channel_names, input_type = StrapdownTight.channel_names, StrapdownTight.input_type
 
     def __post_init__(self) -> None:
         check_duration("scenario.filter_step_s", self.filter_step_s)
+        check_fix_codes(self.fix_codes)
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
@@ -184,7 +189,13 @@ class RecordedWalk(Scenario):
     def _read(self) -> tuple[ResampledLog, RawGnssLog]:
         """Read the log on filter steps and the raw measurements relative to the start."""
         folder = find_dataset(self.root, self.folder)
-        log = read_log(folder, self.files, origin=self.origin, limits=self.limits)
+        log = read_log(
+            folder,
+            self.files,
+            origin=self.origin,
+            limits=self.limits,
+            fix_codes=self.fix_codes,
+        )
         leg = resample_log(
             log,
             self.receiver.fix_interval_s,
@@ -199,5 +210,6 @@ class RecordedWalk(Scenario):
         motion = interpolate(log.reference, time)
         notes = check_sky(gnss_log, time, motion, self.limits or PlausibleLimits())
         leg = leg._replace(notes=(*leg.notes, *notes))
+        announce_notes(folder, leg.notes)
         start = motion[0, 7:]
         return leg, gnss_log._replace(satellite_position=gnss_log.satellite_position - start)

@@ -90,8 +90,8 @@ def resample_log(
         The log on filter steps.
 
     Raises:
-        ValueError: If the common time contains fewer than two fixes, required velocities are not
-            recorded, or the reference has a gap at the start.
+        ValueError: If the common time contains fewer than two fixes or no usable one, required
+            velocities are not recorded, or the reference has a gap at the start.
     """
     low = max(log.imu.time[0], log.reference.time[0], -np.inf if start is None else start)
     high = min(log.imu.time[-1], log.reference.time[-1], np.inf if end is None else end)
@@ -119,9 +119,17 @@ def resample_log(
     origin = truth[0, 7:].copy()
     fixes[:, :3] -= origin
     truth[:, 7:] -= origin
-    missing, total = int(np.isnan(fixes[fix_mask, 0][1:]).sum()), int(fix_mask.sum()) - 1
+    usable, total = int(np.isfinite(fixes[fix_mask, 0][1:]).sum()), int(fix_mask.sum()) - 1
+    if not usable:
+        raise ValueError(
+            f"the fixes from t = {grid[0]:.3f} to {grid[-1]:.3f} must include a usable one, got none of "
+            f"{total}: column fix excludes them, or they were dropped. Set scenario.start_s and "
+            f"scenario.end_s to a time with usable fixes{_usable_times(log)}."
+        )
     notes = log.notes + (
-        (f"{missing} of {total} fixes not used (fix is not 1)",) if missing else ()
+        (f"{usable} of {total} selected fixes used, the others are missing",)
+        if usable < total
+        else ()
     )
     pieces = split_samples(log.imu, grid)
     return ResampledLog(
@@ -135,6 +143,11 @@ def resample_log(
         log.gravity,
         notes,
     )
+
+
+def _usable_times(log: NavigationLog) -> str:
+    time = log.fixes.time[np.isfinite(log.fixes.position[:, 0])]
+    return f" (t = {time[0]:.3f} to {time[-1]:.3f})" if time.size else ""
 
 
 def select_fixes(time: Array, interval: float, low: float, high: float) -> NDArray[np.intp]:
@@ -222,15 +235,28 @@ def split_samples(imu: ImuLog, grid: Array) -> tuple[Array, Array, Array]:
     Returns:
         Mean force, m/s^2, and rate, rad/s, of the pieces, [T, S, 3], and their durations, s, [T, S].
     """
+    step, durations, mean = list_pieces(imu, grid)
+    piece_index = np.arange(len(step)) - np.searchsorted(step, step)
+    shape = (len(grid) - 1, int(piece_index.max()) + 1)
+    spans, pieces = np.zeros(shape), np.zeros((*shape, 6))
+    spans[step, piece_index], pieces[step, piece_index] = durations, mean
+    return pieces[..., :3], pieces[..., 3:], spans
+
+
+def list_pieces(imu: ImuLog, grid: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    """List the pieces between samples and grid points.
+
+    Args:
+        imu: IMU samples.
+        grid: Grid points, s, [T + 1].
+
+    Returns:
+        Step of each piece, [P], duration, s, [P], mean force, m/s^2, and rate, rad/s, [P, 6].
+    """
     inside = imu.time[(imu.time > grid[0]) & (imu.time < grid[-1])]
     nodes = np.union1d(inside, grid)
     values = np.stack(
         [np.interp(nodes, imu.time, column) for column in (*imu.force.T, *imu.rate.T)], axis=-1
     )
-    mean = 0.5 * (values[1:] + values[:-1])
     step = np.searchsorted(grid, nodes[:-1], side="right") - 1
-    piece_index = np.arange(len(step)) - np.searchsorted(step, step)
-    shape = (len(grid) - 1, int(piece_index.max()) + 1)
-    spans, pieces = np.zeros(shape), np.zeros((*shape, 6))
-    spans[step, piece_index], pieces[step, piece_index] = np.diff(nodes), mean
-    return pieces[..., :3], pieces[..., 3:], spans
+    return step, np.diff(nodes), 0.5 * (values[1:] + values[:-1])

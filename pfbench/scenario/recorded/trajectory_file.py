@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from pfbench.files.digest import hash_file
+from pfbench.files.reader_notes import announce_notes
 from pfbench.nav import attitude, earth
 from pfbench.nav.motion_spline import MotionSpline, RecordedMotion
 from pfbench.nav.trajectory import TrajectoryData
@@ -122,6 +123,7 @@ def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> Recor
             f"got {list(origin)}. Set the point pn = pe = pd = 0."
         )
     table = read_table(Path(folder), name, {})
+    announce_notes(folder, table.notes)
     time = torch.from_numpy(read_times(table, longest=1.0))
     enu, vel = (
         torch.from_numpy(swap_frd_rfu(parse_numbers(table, columns)))

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pfbench.files.reader_notes import announce_notes
 from pfbench.model.pseudorange_errors import UrbanInputs
 from pfbench.nav import earth
 from pfbench.nav.gnss.orbits import LIGHT, azimuth_elevation
@@ -115,7 +116,9 @@ def read_drive(folder: Path, limits: PlausibleLimits | None = None) -> UrbanLog:
     drive = UrbanLog(
         time, speed, yaw_rate, position, reference[:, 4:], tuple(satellites.tolist()), *sky_columns
     )
-    return drive._replace(notes=_check_drive(drive, (pseudoranges, wheels, truth)))
+    notes = _check_drive(drive, (pseudoranges, wheels, truth))
+    announce_notes(folder, notes)
+    return drive._replace(notes=notes)
 
 
 def _check_drive(drive: UrbanLog, tables: tuple[LogTable, LogTable, LogTable]) -> tuple[str, ...]:

@@ -207,7 +207,7 @@ def check_outcomes(reader: str, count: int, seed: int) -> None:
     every_row = {o: n for o, n in bad.items() if o.startswith(EVERY_ROW)}
     assert {o: n for o, n in bad.items() if o not in every_row} == {}
     assert sum(every_row.values()) < 0.03 * count
-    assert outcomes[ERROR] > 0.2 * count
+    assert outcomes[ERROR] + outcomes[NOTED] > 0.2 * count  # a satellite is dropped with a note
 
 
 @pytest.mark.parametrize("reader", READERS)

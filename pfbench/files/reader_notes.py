@@ -1,0 +1,72 @@
+"""Notes of readers on the console: each once, before the first job that uses the file."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+SWEEP_LOG = "PFBENCH_SWEEP_LOG"  # environment variable: file to which all jobs of a sweep append
+NOTE = "note"  # first word of a line of this file that is no outcome of a job
+
+_MOST = 12  # lines about one place
+
+log = logging.getLogger("pfbench")
+
+_told: set[tuple[str, ...]] = set()  # sweep, place and note
+
+
+def announce_notes(place: str | Path, notes: Sequence[str]) -> None:
+    """Log notes on what was read, dropped or assumed.
+
+    A note is logged once by a process, and once by all processes of a sweep.
+
+    Args:
+        place: Folder or file of the data.
+        notes: Notes.
+    """
+    sweep = os.environ.get(SWEEP_LOG, "")
+    if len(notes) > _MOST:
+        rest = f"{len(notes) - _MOST + 1} further notes, which the page of a study lists"
+        notes = [*notes[: _MOST - 1], rest]
+    for note in notes:
+        told = (sweep, str(place), note)
+        if told in _told:
+            continue
+        _told.add(told)
+        if _is_first(sweep, told):
+            log.warning("note      %s: %s", Path(place).name, note)
+
+
+def append_line(path: str | Path, line: str) -> None:
+    """Append a line to the file of a sweep, whole beside those of other processes.
+
+    Args:
+        path: File. Its folder is made if it is missing.
+        line: Text without a line end.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    try:
+        os.write(descriptor, f"{line}\n".encode())
+    finally:
+        os.close(descriptor)
+
+
+def _is_first(sweep: str, told: Sequence[str]) -> bool:
+    """Return whether this process is the first of a sweep to tell a note, by the first line about it."""
+    if not sweep:
+        return True
+    digest = hashlib.sha256("\n".join(told[1:]).encode()).hexdigest()[:16]
+    line = f"{NOTE} {digest} {os.getpid()}"
+    with contextlib.suppress(OSError):  # of a full disk: the job reports it
+        append_line(sweep, line)
+        lines = Path(sweep).read_text().splitlines()
+        return next((text for text in lines if f" {digest} " in text), line) == line
+    return True
