@@ -14,13 +14,14 @@ from pfbench.judge.readers.trajectory_table import (
     TrajectoryTable,
 )
 from pfbench.judge.reference_track import ReferenceTrack
+from pfbench.judge.unit_checks import find_angle_factor
 from pfbench.results.error_measures import Array
 
-_FACTORS = {  # ratio of two units: the unit of the column, for positions, velocities and angles
-    "m": {3.28084: "feet", 1e3: "mm", 1e-3: "km", 0.3048: "m while the reference is in feet"},
-    "m/s": {3.28084: "feet/s", 3.6: "km/h", 1.943844: "knots", 0.277778: "m/s and the reference in km/h"},
-    "rad": {57.29578: "degrees", 0.01745329: "rad while the reference is in degrees"},
-    "deg": {0.01745329: "radians", 57.29578: "degrees while the reference is in radians"},
+_FACTORS = {  # ratio of two units: the unit of the column, or of that of the reference
+    "m": {3.28084: "feet", 1e3: "mm, or reference in km", 1e-3: "km", 0.3048: "reference in feet"},
+    "m/s": {3.28084: "feet/s", 3.6: "km/h", 1.943844: "knots", 0.277778: "reference in km/h"},
+    "rad": {57.29578: "degrees", 0.01745329: "reference in degrees"},
+    "deg": {0.01745329: "radians", 57.29578: "reference in radians"},
 }  # fmt: skip
 _CLOSE = 0.045  # relative difference from a factor
 _USUAL = 0.97  # share of the increments of an angle that are compared
@@ -98,11 +99,20 @@ def check_units(table: TrajectoryTable, reference: ReferenceTrack) -> None:
         for factor, wrong in _FACTORS[unit].items():
             if abs(ratio / factor - 1) < _CLOSE:
                 if unit == "rad" and table.angle_unit == "deg":  # the reader has converted them
-                    unit, wrong = "deg", "radians, or degrees while the reference is in degrees"
+                    unit, wrong = "deg", "radians, or reference in degrees"
                 raise ValueError(
                     f"{table.file}: column {column} must be in {unit}, got values {ratio:.4g} times "
-                    f"those of {reference.file}: {wrong}. Multiply the column by {1 / factor:.6g}."
+                    f"those of {reference.file}: {wrong}. {_unit_remedy(column, factor, wrong)}"
                 )
+
+
+def _unit_remedy(column: str, factor: float, wrong: str) -> str:
+    """Return the remedy of a column, or of that of the reference, in another unit."""
+    mine = f"Multiply the column by {1 / factor:.6g}: NAME.scale={column}:{1 / factor:.6g}."
+    theirs = f"set reference.scale={column}:{factor:.6g}."
+    if wrong.startswith("reference"):
+        return f"{theirs.capitalize()}"
+    return f"{mine[:-1]}, or {theirs}" if "reference" in wrong else mine
 
 
 def _common_columns(
@@ -127,11 +137,13 @@ def _common_columns(
 
 
 def _ratio(mine: Array, theirs: Array, unit: str, column: str) -> float:
-    """Return the ratio of two columns: of medians, or the slope if they correlate; else 1."""
+    """Return the ratio of two columns: of medians, of units of yaw, or the slope if they correlate; else 1."""
     if unit == "deg" or column == "h_m":
         middle = float(np.median(theirs))
         return float(np.median(mine)) / middle if abs(middle) > 0.5 else 1.0
-    slope, share = regress_column(mine, theirs, unit == "rad")
+    if column == "yaw":
+        return 1 / find_angle_factor(mine, theirs)
+    slope, share = regress_column(mine, theirs)
     return slope if share >= 0.9 else 1.0
 
 

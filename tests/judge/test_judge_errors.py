@@ -69,7 +69,7 @@ def test_bad_input_is_refused(home: Path, case: str) -> None:
     said = judge(home)
     assert said.code == 2
     assert problem in said.err
-    assert remedy.replace("mine.columns", "NAME.columns") in said.err
+    assert remedy in said.err
     assert "mine.csv" in said.err or "truth.csv" in said.err
     assert not (home / "reports").exists()
 

@@ -75,6 +75,11 @@ class TrajectoryTable:
         """Return whether a group of columns is present."""
         return group[0] in self.values
 
+    def scale_columns(self, factors: Mapping[str, float]) -> TrajectoryTable:
+        """Return the table with columns, or t, multiplied by factors."""
+        values = {name: value * factors.get(name, 1.0) for name, value in self.values.items()}
+        return replace(self, time=self.time * factors.get("t", 1.0), values=values)
+
     def keep_rows(self, mask: np.ndarray) -> TrajectoryTable:
         """Return the rows of a mask [T]."""
         values = {name: value[mask] for name, value in self.values.items()}
