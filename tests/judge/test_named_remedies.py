@@ -101,7 +101,8 @@ def test_wrong_axes_of_a_tum_file_name_the_frame(home: Path) -> None:
     np.savetxt(home / "mine.tum", rows)
     said = judge(home, f"mine={home / 'mine.tum'}", "mine.frame=enu")
     assert said.code == 2
-    assert "Check NAME.frame, enu or ned, and the order t x y z qx qy qz qw." in said.err
+    assert "Set mine.frame=ned." in said.err
+    assert judge(home, f"mine={home / 'mine.tum'}", "mine.frame=ned").code == 0
 
 
 def test_trajectories_that_all_stop_early_are_named(home: Path) -> None:

@@ -77,7 +77,7 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     if options.frame == "enu":
         position, rotation = position @ _TO_NED.T, _TO_NED @ rotation @ _TO_FRD
     values = _by_name(LOCAL, position) | _by_name(ATTITUDE_COLUMNS, euler_angles(rotation))
-    return [TrajectoryTable(file.name, numbers[:, 0], values, lines, notes)]
+    return [TrajectoryTable(file.name, numbers[:, 0], values, lines, notes, frame=options.frame)]
 
 
 def find_pose_columns(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[int]:
