@@ -171,7 +171,7 @@ def _convert_source(key: str, option: str, value: str) -> Any:
         return _split_pairs(key, value, "NAME:NAME_IN_FILE", "t:time,pn:north")
     if option == "scale":
         factors = _split_pairs(key, value, "NAME:FACTOR", "t:0.001")
-        return {name: _convert(f"{key} of {name}", text, 0.0) for name, text in factors.items()}
+        return {name: _convert(key, text, 0.0) for name, text in factors.items()}
     if option not in ("frame", "format", "sd"):
         raise ValueError(
             f"{key} must be an option of a program, got {option}. Choose from frame, format, shift, columns, "

@@ -14,6 +14,7 @@ from pfbench.results.error_measures import Array
 
 CLOCK_LIMIT = 0.5  # s, offset above which clocks are refused
 _TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes"}
+_REFERENCE_UNITS = {1 / factor: unit for factor, unit in _TIME_UNITS.items() if factor > 1}
 _EXPLAINED = 0.2  # share of the differences that remain at the offset of a wrong clock
 _CLEAR = 0.05  # share below which the clock alone explains them
 _SAMPLE, _COARSE_SAMPLE = 1500, 300  # epochs of the search for the clock
@@ -90,8 +91,9 @@ def check_common_time(
     if last > clock[0] and first < clock[-1] and not factor:
         return
     if factor:
-        unit = _TIME_UNITS[factor]
-        remedy = f"The column is in {unit}: set NAME.scale=t:{1 / factor:.6g}."
+        remedy = f"The column is in {_TIME_UNITS.get(factor)}: set NAME.scale=t:{1 / factor:.6g}."
+        if factor in _REFERENCE_UNITS:
+            remedy = f"That of the reference is in {_REFERENCE_UNITS[factor]}: set reference.scale=t:{factor:.6g}."
     else:
         motion = _Motion(table, reference, np.arange(len(table.time)))
         search_result = motion.search_all()
@@ -112,7 +114,8 @@ def _find_unit(table: TrajectoryTable, reference: ReferenceTrack) -> float:
     """
     clock = reference.table.time
     length, span = table.time[-1] - table.time[0], clock[-1] - clock[0]
-    factor = next((f for f in _TIME_UNITS if 0.5 < length / f / span < 2), 0.0)
+    units = (*_TIME_UNITS, *_REFERENCE_UNITS)
+    factor = next((f for f in units if 0.5 < length / f / span < 2), 0.0)
     inside = int(((table.time >= clock[0]) & (table.time <= clock[-1])).sum())
     if factor and (factor < 1 or inside >= _LEAST_ROWS):
         scaled = replace(table, time=table.time / factor)

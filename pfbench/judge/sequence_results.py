@@ -129,8 +129,7 @@ def _check_run(
 ) -> tuple[TrajectoryTable, float]:
     """Check a run against the reference and by itself; return it with its notes and its clock offset."""
     check_common_time(table, reference, source.shift)
-    check_units(table, reference)
-    table = check_consistent_units(table)
+    table = check_consistent_units(check_units(table, reference))
     if align == "none":
         check_distance(table, reference)
     if align == "yaw":

@@ -39,6 +39,7 @@ _LEAST_ROWS, _WINDOWS = 20, 10
 _EXPLAINED = 0.9  # share of the change of positions that the velocities explain
 _LEAST_SPEED, _LEAST_MOVE = 1.0, 3.0  # m/s, m: the direction of motion is clear
 _SLOW, _FAST, _LONG = 0.05, 2000.0, 100.0  # m/s, m/s, m
+_USUAL = (0.5, 500.0)  # m/s
 _SCATTER, _SHARE, _STRAIGHT = 0.05, 0.1, 0.2  # circular variance; share of another one; rad
 _BEYOND = 2.1 * math.pi  # rad, above a turn
 _EQUATOR = 0.02  # deg, where simulations start
@@ -63,28 +64,30 @@ def check_consistent_units(table: TrajectoryTable) -> TrajectoryTable:
     return replace(table, notes=(*table.notes, *_describe_doubts(table, position)))
 
 
-def find_angle_factor(mine: Array, theirs: Array) -> float:
+def find_angle_factor(mine: Array, theirs: Array) -> tuple[float, bool]:
     """Find the factor that turns an angle to another one: pi / 180 for degrees, 180 / pi, or 1.
 
-    The factor must leave a tenth of the circular variance that the angle leaves as it is, and of that which no
-    angle would leave. An angle without variance must also pass a turn, as 63 for 1.1 rad.
+    The factor is certain if it leaves a tenth of the circular variance that the angle leaves as it is, and of
+    that which no angle would leave. It is certain for a constant angle beyond a turn too, as 63 for 1.1 rad. A
+    constant angle within a turn is a doubt, since it can be wrong in rad.
 
     Args:
         mine: Angle, [T], rad if the unit is right.
-        theirs: Angle that it should have, up to a constant, [T], rad.
+        theirs: Angle that it should have, [T], rad.
 
     Returns:
-        The factor.
+        The factor, and whether it is certain.
     """
     scatter, zero = _scatter(mine - theirs)
     nothing, _ = _scatter(theirs)
     for factor in (_DEGREE, 1 / _DEGREE):
         rest, offset = _scatter(factor * mine - theirs)
-        is_straight = np.median(np.abs(mine)) > _BEYOND and abs(offset) < _STRAIGHT < abs(zero)
-        is_better = max(rest, 1e-4) < _SHARE * min(scatter, nothing)
-        if rest < _SCATTER and (is_better or (is_straight and factor < 1)):
-            return factor
-    return 1.0
+        if rest < _SCATTER and max(rest, 1e-4) < _SHARE * min(scatter, nothing):
+            return factor, True
+        is_near = abs(offset) < _STRAIGHT < abs(zero) and abs(offset) < _SHARE * abs(zero)
+        if factor < 1 and rest < _SCATTER and is_near:
+            return factor, bool(np.median(np.abs(mine)) > _BEYOND)
+    return 1.0, True
 
 
 def _scatter(angle: Array) -> tuple[float, float]:
@@ -172,8 +175,8 @@ def _check_yaw(table: TrajectoryTable, position: Array) -> None:
     direction, is_moving = _course(table, position)
     if yaw is None or is_moving.sum() < _LEAST_ROWS:
         return
-    factor = find_angle_factor(yaw[is_moving], direction[is_moving])
-    if factor != 1:
+    factor, is_certain = find_angle_factor(yaw[is_moving], direction[is_moving])
+    if factor != 1 and is_certain:
         unit = {True: "degrees", False: "rad, converted twice"}[factor < 1]
         if table.angle_unit == "deg":  # the reader has converted it
             unit = "rad" if factor > 1 else "degrees, in 1/57.3 of its unit"
@@ -216,8 +219,8 @@ def _describe_doubts(table: TrajectoryTable, position: Array) -> Iterator[str]:
                 f"NAME.scale=lat_deg:{factor:.6g},lon_deg:{factor:.6g} converts them"
             )
     if extent > _LONG and speed < _SLOW:
-        yield (
-            f"the largest speed is {speed:.3g} m/s. If t is in milliseconds, set NAME.scale=t:0.001"
-        )
+        usual = {f: u for f, u in _TIME.items() if _USUAL[0] < speed / f < _USUAL[1]}
+        hint = "".join(f". If t is in {u}, set NAME.scale=t:{f:g}" for f, u in usual.items())
+        yield f"the largest speed is {speed:.3g} m/s{hint or '. Check the unit of t'}"
     if speed > _FAST:
         yield f"the largest speed is {speed:.4g} m/s. Check the units of t and of the positions"

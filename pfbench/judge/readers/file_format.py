@@ -17,7 +17,8 @@ from pfbench.judge.readers.text_trajectory import (
 from pfbench.judge.readers.trajectory_table import GEODETIC, LOCAL
 from pfbench.results.error_measures import Array
 
-_SIGNATURES = {b"PAR1": "table", b"PK\x03\x04": "result"}
+_PARQUET = b"PAR1"
+_SIGNATURES = {_PARQUET: "table", b"PK\x03\x04": "result"}
 _SUFFIXES = {
     ".csv": "table",
     ".parquet": "table",
@@ -26,7 +27,7 @@ _SUFFIXES = {
     ".nmea": "nmea",
     ".npz": "result",
 }
-_SENTENCE = re.compile(rb"^[^\n$]{0,80}\$[A-Z]{2}[A-Z]{3},", re.MULTILINE)
+_SENTENCE = re.compile(rb"^[^\n$]{0,80}\$[A-Z][A-Z0-9]{2,9},", re.MULTILINE)
 _RTKLIB = re.compile(rb"^\d{4}/\d\d/\d\d +\d\d:|^% *(program|GPST|UTC|\(lat)", re.MULTILINE)
 _HEAD = 1 << 16  # bytes
 
@@ -46,6 +47,11 @@ def find_format(file: Path, has_names: bool) -> str:
     """
     with file.open("rb") as content:
         head = content.read(_HEAD)
+    if head[:4] == _PARQUET and file.suffix != ".parquet":
+        raise ValueError(
+            f"{file.name} must have the suffix .parquet, got a Parquet file. Rename it to "
+            f"{file.with_suffix('.parquet').name}."
+        )
     if head[:4] in _SIGNATURES:
         return _SIGNATURES[head[:4]]
     if _SENTENCE.search(head):

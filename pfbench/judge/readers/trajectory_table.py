@@ -194,7 +194,7 @@ def _order_remedy(table: TrajectoryTable, rows: np.ndarray) -> str:
     for period in _PERIODS:
         seam = max(_SEAM_STEPS * usual, _SEAM_SHARE * period)
         before, after = table.time[rows - 1], table.time[rows]
-        if ((0 <= after) & (before <= period) & (0 < after - before + period)).all() and (
+        if ((after >= 0) & (before <= period) & (after - before + period > 0)).all() and (
             after - before + period <= seam
         ).all():
             again = ", and once more from each further line" if len(rows) > 1 else ""
