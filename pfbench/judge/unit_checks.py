@@ -34,6 +34,7 @@ _POSITION = {1e3: "km", 1e-3: "mm", 1e-2: "cm", 0.3048: "feet"}  # factors to m
 _VELOCITY = {1e-3: "mm/s", 1e-2: "cm/s", 0.277778: "km/h", 0.514444: "knots", 0.3048: "feet/s"}
 _DEGREE = math.pi / 180
 _CLOSE = 0.03  # relative difference from a factor
+_NO_UNIT = (0.8, 1.25)  # ratios that errors of a program explain
 _SHORTEST_STEP = 1e-3  # s
 _LEAST_ROWS, _WINDOWS = 20, 10
 _EXPLAINED = 0.9  # share of the change of positions that the velocities explain
@@ -59,9 +60,15 @@ def check_consistent_units(table: TrajectoryTable) -> TrajectoryTable:
     """
     _check_largest_time(table)
     position = _horizontal(table)
-    _check_velocities(table, position)
+    ratio = _velocity_ratio(table, position)
+    _check_velocities(table, ratio)
     _check_yaw(table, position)
-    return replace(table, notes=(*table.notes, *_describe_doubts(table, position)))
+    doubts = list(_describe_doubts(table, position))
+    if not _NO_UNIT[0] < ratio < _NO_UNIT[1]:
+        doubts.append(
+            f"positions change by {ratio:.4g} times what the velocities say, as in no unit"
+        )
+    return replace(table, notes=(*table.notes, *doubts))
 
 
 def find_angle_factor(mine: Array, theirs: Array) -> tuple[float, bool]:
@@ -136,9 +143,8 @@ def _velocity_ratio(table: TrajectoryTable, position: Array) -> float:
     return common / sizes[1]
 
 
-def _check_velocities(table: TrajectoryTable, position: Array) -> None:
+def _check_velocities(table: TrajectoryTable, ratio: float) -> None:
     """Raise ValueError if positions change by a known factor more or less than velocities say."""
-    ratio = _velocity_ratio(table, position)
     if abs(ratio - 1) < _CLOSE:
         return
     remedies = []

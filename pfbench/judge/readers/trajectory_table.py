@@ -232,14 +232,15 @@ def _check_range(table: TrajectoryTable, name: str, value: Array) -> None:
 
 
 def _unit_remedy(name: str, value: Array, hint: str) -> str:
-    """Return the option for a factor of units that brings all values into their range, if there is one."""
-    for factor, unit in _UNITS.get(LIMIT_COLUMNS.get(name, ""), {}).items():
-        if all(
-            ((factor * value >= least) & (factor * value <= largest)).all()
-            for least, largest, _, _ in _ranges(name)
-        ):
-            return f"If in {unit}, set NAME.scale={name}:{factor:.8g}."
-    return hint or _CHECK_ORDER
+    """Return the options for factors of units that bring all values into their range."""
+    units = {
+        unit: factor
+        for factor, unit in _UNITS.get(LIMIT_COLUMNS.get(name, ""), {}).items()
+        for least, largest, _, _ in _ranges(name)
+        if least <= (factor * value).min() and (factor * value).max() <= largest
+    }
+    options = [f"if in {unit}, set NAME.scale={name}:{f:.8g}" for unit, f in units.items()]
+    return f"I{'; '.join(options)[1:]}." if options else hint or _CHECK_ORDER
 
 
 def _ranges(name: str) -> Iterator[tuple[float, float, str, str]]:
