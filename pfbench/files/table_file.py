@@ -56,7 +56,7 @@ def _read_csv(file: Path) -> TableFile:
     lines, notes = _whole_lines(file)
     if _has_names_in_comment(lines):
         lines[0] = lines[0].lstrip(_COMMENT + " ")
-    names = [name.strip().strip('"') for name in _split_fields(lines[0])]
+    names = [name.strip() for name in _split_fields(lines[0])]
     _check_names(file, lines[0], names)
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated or not all(names):

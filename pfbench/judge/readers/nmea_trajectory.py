@@ -20,7 +20,7 @@ _KNOT, _KM_H = 1852 / 3600, 1 / 3.6  # m/s
 _DAY, _HOUR = 86400.0, 3600.0  # s
 _POSITIONS = ("GGA", "GNS")
 _SENTENCE = re.compile(  # of a talker of two letters: proprietary ones start with P
-    r"[$!](?P<body>(?:[A-OQ-Z][A-Z0-9](?P<kind>[A-Z]{3})|[A-Z][A-Z0-9]+),[^$*!]*)"
+    r"(?P<sign>[$!])(?P<body>(?:[A-OQ-Z][A-Z0-9](?P<kind>[A-Z]{3})|[A-Z][A-Z0-9]+),[^$*!]*)"
     r"(?P<star>\*(?P<checksum>[0-9A-Fa-f]{2})?)?"
 )
 _WITHOUT_SIGN = re.compile(r"^[^$]*\b[A-Z]{2}(?:GGA|GNS|RMC|VTG|GST),")
@@ -104,7 +104,7 @@ class _Clock:
         if time < self.time - _DAY / 2:
             self.days += 1
             time += _DAY
-        elif 0 < self.time + _DAY - time < _HOUR:
+        elif max(abs(time - _DAY - self.time), abs(_DAY * self.days - self.time)) < _HOUR:
             time -= _DAY
         self.time = time
 
@@ -176,6 +176,8 @@ def _read_sentences(file: Path, counts: Counter[str]) -> list[_Sentence]:
             if (match["checksum"] or "").upper() == _compute_checksum(match["body"]):
                 checksum = "valid"
             kind = match["kind"] if match["kind"] in _READERS else ""
+            if match["sign"] == "!":  # of other systems, as AIS
+                kind, checksum = "", "none"
             sentences.append(_Sentence(number, kind, match["body"].split(","), checksum))
     while sentences and sentences[-1].line > len(lines) and sentences[-1].checksum != "valid":
         counts["damaged sentences in the last line, which has no end"] += 1
