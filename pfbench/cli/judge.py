@@ -186,9 +186,9 @@ def _split_pairs(key: str, value: str, form: str, example: str) -> dict[str, str
         if value.startswith(first) and value.endswith(last):
             value = value[1:-1]
     pairs: dict[str, str] = {}
-    place = 0
-    while place < len(value):
-        match = _PAIR.match(value, place)
+    start = 0
+    while start < len(value):
+        match = _PAIR.match(value, start)
         if not match or match["name"] in pairs:
             raise ValueError(
                 f"{key} must be {form},..., each name once, got {value}. Use {example}, and quotes around "
@@ -196,5 +196,5 @@ def _split_pairs(key: str, value: str, form: str, example: str) -> dict[str, str
             )
         quoted = match["quoted"]
         pairs[match["name"]] = match["plain"] if quoted is None else quoted.replace('""', '"')
-        place = match.end()
+        start = match.end()
     return pairs

@@ -74,9 +74,9 @@ def check_consistent_units(table: TrajectoryTable) -> TrajectoryTable:
 def find_angle_factor(mine: Array, theirs: Array) -> tuple[float, bool]:
     """Find the factor that turns an angle to another one: pi / 180 for degrees, 180 / pi, or 1.
 
-    The factor is certain if it leaves a tenth of the circular variance that the angle leaves as it is, and of
-    that which no angle would leave. It is certain for a constant angle beyond a turn too, as 63 for 1.1 rad. A
-    constant angle within a turn is a doubt, since it can be wrong in rad.
+    The factor is certain if it leaves a tenth of the circular variance without it, and of that without an
+    angle. It is certain for a constant angle beyond a turn too, as 63 for 1.1 rad. A constant angle within a
+    turn is a doubt, since it can be wrong in rad.
 
     Args:
         mine: Angle, [T], rad if the unit is right.
@@ -135,9 +135,9 @@ def _velocity_ratio(table: TrajectoryTable, position: Array) -> float:
     steps = (velocity[1:] + velocity[:-1]) / 2 * np.diff(table.time)[:, None]
     path = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     lag = count // _WINDOWS
-    moved, integral = position[lag:] - position[:-lag], path[lag:] - path[:-lag]
-    common = float((moved * integral).sum())
-    sizes = float((moved**2).sum()), float((integral**2).sum())
+    change, integral = position[lag:] - position[:-lag], path[lag:] - path[:-lag]
+    common = float((change * integral).sum())
+    sizes = float((change**2).sum()), float((integral**2).sum())
     if not (min(sizes) > 0 and common > 0 and common**2 > _EXPLAINED * sizes[0] * sizes[1]):
         return 1.0
     return common / sizes[1]

@@ -62,19 +62,7 @@ def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     content = read_table_file(file)
     rows = content.rows.rename(columns=str)
     lines = np.arange(len(rows)) + (1 if file.suffix == ".parquet" else 2)
-    for name, in_file in options.columns.items():
-        if in_file not in rows or name not in ALL_COLUMNS:
-            absent = in_file not in rows
-            wrong, choices = (in_file, map(str, rows)) if absent else (name, ALL_COLUMNS)
-            raise ValueError(
-                f"{file.name}: columns must exist, got {wrong}. Choose from {', '.join(choices)}. Write a name "
-                "with commas in quotes."
-            )
-    _check_stated_units(file, options)
-    used = options.columns.items()
-    hidden = [name for name in options.columns if name in rows]
-    rows = rows.drop(columns=[name for name in hidden if name not in options.columns.values()])
-    rows = rows.rename(columns={in_file: name for name, in_file in used})
+    rows = _rename_columns(file, rows, options)
     if "t" not in rows:
         raise ValueError(
             f"{file.name} must have the column t (time, s), got {', '.join(map(str, rows))}."
@@ -91,6 +79,23 @@ def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     origin = _stated_origin(content.stated)
     table_notes = (*content.notes, *notes)
     return [TrajectoryTable(file.name, time, values, lines, table_notes, origin=origin)]
+
+
+def _rename_columns(file: Path, rows: pd.DataFrame, options: SourceOptions) -> pd.DataFrame:
+    """Return the rows with the names of pfbench."""
+    for name, in_file in options.columns.items():
+        if in_file not in rows or name not in ALL_COLUMNS:
+            absent = in_file not in rows
+            wrong, choices = (in_file, map(str, rows)) if absent else (name, ALL_COLUMNS)
+            raise ValueError(
+                f"{file.name}: columns must exist, got {wrong}. Choose from {', '.join(choices)}. Write a name "
+                "with commas in quotes."
+            )
+    _check_stated_units(file, options)
+    used = options.columns.items()
+    hidden = [name for name in options.columns if name in rows]
+    rows = rows.drop(columns=[name for name in hidden if name not in options.columns.values()])
+    return rows.rename(columns={in_file: name for name, in_file in used})
 
 
 def _check_stated_units(file: Path, options: SourceOptions) -> None:

@@ -56,34 +56,40 @@ def read_nmea_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryT
     counts: Counter[str] = Counter()
     sentences = _read_sentences(file, counts)
     notes = _check_checksums(file, sentences)
-    epochs: dict[str, list[_Epoch]] = {kind: [] for kind in _POSITIONS}
-    lines: dict[str, list[int]] = {kind: [] for kind in _POSITIONS}
+    kinds = Counter(f"{s.kind} sentences" for s in sentences if s.kind)
     extras: dict[float, _Epoch] = {}
-    previous: dict[str, _Sentence] = {}
-    clock = _Clock()
-    for sentence in (s for s in sentences if s.kind):
-        values, problem = _read_values(file, sentence, clock)
-        before = previous.get(sentence.kind, sentence)
-        if problem:
-            counts[f"{sentence.kind} sentences {problem}"] += 1
-        elif sentence.kind not in _POSITIONS:
-            extras.setdefault(clock.time, {}).update(values)
-        elif before is not sentence and _is_repetition(sentence.fields, before.fields):
-            counts[f"{sentence.kind} sentences of another talker or twice"] += 1
-        else:
-            epochs[sentence.kind].append({"t": clock.time, **values})
-            lines[sentence.kind].append(sentence.line)
-            previous[sentence.kind] = sentence
-    kind = next((kind for kind in _POSITIONS if epochs[kind]), "")
-    if not kind:
-        kinds = Counter(f"{s.kind} sentences" for s in sentences if s.kind) + counts
-        present = ", ".join(f"{n} {name}" for name, n in sorted(kinds.items())) or "none"
+    positions = _read_positions(file, sentences, extras, counts)
+    if not positions:
+        present = ", ".join(f"{n} {name}" for name, n in sorted((kinds + counts).items())) or "none"
         raise ValueError(
             f"{file.name} must have GGA or GNS sentences with a fix and a height, got {present}. "
             "Let the receiver write GGA."
         )
-    merged = [{**epoch, **extras.get(epoch["t"], {})} for epoch in epochs[kind]]
-    return [_make_table(file, merged, np.array(lines[kind]), counts, notes)]
+    merged = [{**epoch, **extras.get(epoch["t"], {})} for _, epoch in positions]
+    lines = np.array([line for line, _ in positions])
+    return [_make_table(file, merged, lines, counts, notes)]
+
+
+def _read_positions(
+    file: Path, sentences: list[_Sentence], extras: dict[float, _Epoch], counts: Counter[str]
+) -> list[tuple[int, _Epoch]]:
+    """Return line and position of all epochs; velocities and deviations by time are added to `extras`."""
+    positions: dict[str, list[tuple[int, _Epoch]]] = {kind: [] for kind in _POSITIONS}
+    previous: dict[str, _Sentence] = {}
+    clock = _Clock()
+    for sentence in (s for s in sentences if s.kind):
+        values, problem = _read_values(file, sentence, clock)
+        before = previous.get(sentence.kind)
+        if problem:
+            counts[f"{sentence.kind} sentences {problem}"] += 1
+        elif sentence.kind not in _POSITIONS:
+            extras.setdefault(clock.time, {}).update(values)
+        elif before and _is_repetition(sentence.fields, before.fields):
+            counts[f"{sentence.kind} sentences of another talker or twice"] += 1
+        else:
+            positions[sentence.kind].append((sentence.line, {"t": clock.time, **values}))
+            previous[sentence.kind] = sentence
+    return next((p for p in positions.values() if p), [])
 
 
 def _is_repetition(fields: list[str], before: list[str]) -> bool:

@@ -71,7 +71,7 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
             f"got length {length[row]:.3g}. Check the order of the columns: {' '.join(_TUM_COLUMNS)}."
         )
     if width > len(_TUM_COLUMNS):
-        used = ", ".join(str(place + 1) for place in places)
+        used = ", ".join(str(index + 1) for index in places)
         notes = (*notes, f"columns {used} of {width} are read as {' '.join(_TUM_COLUMNS)}")
     position, rotation = numbers[:, 1:4], rotation_from_quaternion(numbers[:, 4:])
     if options.frame == "enu":
@@ -233,7 +233,7 @@ def _read_numbers(
             notes = [f"line {number} is read as names of columns: {text[:80]}"]
             continue
         try:
-            row = [float(fields[place]) for place in places or range(width)]
+            row = [float(fields[k]) for k in places or range(width)]
         except (ValueError, IndexError):
             row = []
         if not row or len(fields) != width:
