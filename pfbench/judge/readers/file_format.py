@@ -28,7 +28,10 @@ _SUFFIXES = {
     ".npz": "result",
 }
 _SENTENCE = re.compile(rb"^[^\n$]{0,80}\$[A-Z][A-Z0-9]{2,9},", re.MULTILINE)
-_RTKLIB = re.compile(rb"^\d{4}/\d\d/\d\d +\d\d:|^% *(program|GPST|UTC|\(lat)", re.MULTILINE)
+_RTKLIB = re.compile(
+    rb"^\d{4}/\d\d/\d\d +\d\d:|^% *(program *: *(RTK|rnx2rtkp)|(GPST|UTC|JST) .*(latitude|ecef|baseline))",
+    re.MULTILINE,
+)
 _HEAD = 1 << 16  # bytes
 
 
