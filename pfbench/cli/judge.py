@@ -21,8 +21,8 @@ Compare trajectories of any programs with a reference and with each other, and w
   pfbench judge reference=truth.csv mine=a.csv theirs=b.tum theirs.frame=enu
   pfbench judge reference=truth/{sequence}.csv 'mine=mine/{sequence}_{run}.csv' 'theirs=theirs/{sequence}.nav'
 
-Formats: .csv and .parquet with the columns t, pn, pe, pd (or lat_deg, lon_deg, h_m), optional vn, ve, vd,
-roll, pitch, yaw, sd_pn, ..., cov_nn, ...; .tum; .nmea; .nav and .txt of KF-GINS; .npz of pfbench.
+Formats, found by content: CSV and .parquet with the columns t, pn, pe, pd (or lat_deg, lon_deg, h_m), optional
+vn, ve, vd, roll, pitch, yaw, sd_pn, ..., cov_nn, ...; TUM; NMEA; KF-GINS; .npz of pfbench.
 
   study=NAME             name of the report (judge)        reports_dir=FOLDER   folder of reports (reports)
   from=S to=S every=S    scored time and distance of epochs
@@ -35,13 +35,17 @@ roll, pitch, yaw, sd_pn, ..., cov_nn, ...; .tum; .nmea; .nav and .txt of KF-GINS
   block=S                mean length of the blocks of time (by rule)
   baseline=NAME          compare all with one program (all pairs)
   alpha=0.05 margin=0.05 level of the tests, margin of equivalence
-  NAME.frame=enu|ned     axes of a .tum file               NAME.shift=S   time added to a clock
-  NAME.columns=t:time,pn:north,...   names of columns      NAME.sd=FILE   deviations of KF-GINS"""
+  NAME.frame=enu|ned     axes of a TUM file                NAME.shift=S   time added to a clock
+  NAME.columns=t:time,pn:north,...   names of columns      NAME.sd=FILE   deviations of KF-GINS
+  NAME.scale=t:0.001,yaw:0.0174533   factors of columns    NAME.format=table|tum|kf_gins|nmea|result"""
 
 _RENAMED = {"from": "start", "to": "end"}  # words of the command line that Python reserves
 _OTHER_PAGES = ("claims", "datasheets")  # folders of reports
 _LONGEST_NAME = 100
 _NAME = re.compile(r"[A-Za-z][\w+-]*")
+_PAIR = re.compile(
+    r'\s*(?P<name>\w+)\s*:\s*(?:"(?P<quoted>(?:[^"]|"")+)"|(?P<plain>[^,"\s](?:[^,]*[^,\s])?))\s*(?:,|$)'
+)
 
 
 def judge_trajectories(words: Sequence[str]) -> None:
@@ -93,7 +97,7 @@ def _sort_words(
     values: Mapping[str, str],
 ) -> tuple[Any, dict[str, SourceOptions], dict[str, str]]:
     """Return options, options of sources, and patterns of the reference and the programs."""
-    from pfbench.judge.judge_options import JudgeOptions, SourceOptions
+    from pfbench.judge.judge_options import JudgeOptions, SourceOptions, name_program
 
     types = {field.name: field.default for field in fields(JudgeOptions)}
     keys = {new: old for old, new in _RENAMED.items()}
@@ -111,7 +115,11 @@ def _sort_words(
         elif key not in ("study", "reports_dir"):
             programs[key] = value
     _check_programs(programs, sources, [*option_keys, "study", "reports_dir"])
-    return JudgeOptions(**options), {n: SourceOptions(**v) for n, v in sources.items()}, programs
+    of_programs = {}
+    for name, values_of_program in sources.items():
+        with name_program(name):
+            of_programs[name] = SourceOptions(**values_of_program)
+    return JudgeOptions(**options), of_programs, programs
 
 
 def _check_programs(
@@ -165,14 +173,33 @@ def _convert_source(key: str, option: str, value: str) -> Any:
     if option == "shift":
         return _convert(key, value, 0.0)
     if option == "columns":
-        pairs = [text.partition(":")[::2] for text in value.strip("{}[]").split(",")]
-        if not all(name and in_file for name, in_file in pairs):
-            raise ValueError(
-                f"{key} must be NAME:NAME_IN_FILE,..., got {value}. Use t:time,pn:north."
-            )
-        return {name.strip(): in_file.strip() for name, in_file in pairs}
-    if option not in ("frame", "sd"):
+        return _split_pairs(key, value, "NAME:NAME_IN_FILE", "t:time,pn:north")
+    if option == "scale":
+        factors = _split_pairs(key, value, "NAME:FACTOR", "t:0.001")
+        return {name: _convert(key, text, 0.0) for name, text in factors.items()}
+    if option not in ("frame", "format", "sd"):
         raise ValueError(
-            f"{key} must be an option of a program, got {option}. Choose from frame, shift, columns, sd."
+            f"{key} must be an option of a program, got {option}. Choose from frame, format, shift, columns, "
+            "scale, sd."
         )
     return value
+
+
+def _split_pairs(key: str, value: str, form: str, example: str) -> dict[str, str]:
+    """Return what follows the colon by name; quotes enclose a text with commas, brackets are its own."""
+    for first, last in ("{}", "[]"):  # of the list as a whole, since no name of pfbench starts so
+        if value.startswith(first) and value.endswith(last):
+            value = value[1:-1]
+    pairs: dict[str, str] = {}
+    start = 0
+    while start < len(value):
+        match = _PAIR.match(value, start)
+        if not match or match["name"] in pairs:
+            raise ValueError(
+                f"{key} must be {form},..., each name once, got {value}. Use {example}, and quotes around "
+                "a name with commas."
+            )
+        quoted = match["quoted"]
+        pairs[match["name"]] = match["plain"] if quoted is None else quoted.replace('""', '"')
+        start = match.end()
+    return pairs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]  # of columns
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+_COMMENT = "#%"
 _CONTROL = frozenset(map(chr, range(32))) - {"\t"}
 
 
@@ -55,8 +57,10 @@ def _read_csv(file: Path) -> TableFile:
     import pandas as pd  # half a second that a run without tables does not need
 
     lines, notes = _whole_lines(file)
+    if _has_names_in_comment(lines):
+        lines[0] = lines[0].lstrip(_COMMENT + " ")
     limits.check_columns(file, lines[0].count(",") + 1)
-    names = [name.strip().strip('"') for name in lines[0].split(",")]
+    names = [name.strip() for name in _split_fields(lines[0])]
     _check_names(file, lines, names)
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated or not all(names):
@@ -66,7 +70,7 @@ def _read_csv(file: Path) -> TableFile:
             "Rename or remove a column. In pandas, to_csv(index_label=NAME) names the index."
         )
     for number, line in enumerate(lines, 1):
-        fields = line.count(",") + 1 if line.strip() else 0
+        fields = len(_split_fields(line)) if line.strip() else 0
         if fields != len(names) or line.count('"') % 2:
             raise ValueError(
                 f"{file.name}: line {number} must have {len(names)} fields separated by commas, "
@@ -107,11 +111,26 @@ def _field_remedy(lines: Sequence[str], names: int) -> str:
     return "Repair or remove this line."
 
 
+def _split_fields(line: str) -> list[str]:
+    """Return the fields of a line; one in quotes can contain commas."""
+    if '"' not in line or len(line) > csv.field_size_limit():
+        return line.split(",")
+    return next(csv.reader([line], skipinitialspace=True))
+
+
+def _has_names_in_comment(lines: Sequence[str]) -> bool:
+    """Return whether line 1 is a comment with a name for each field of line 2."""
+    if not lines[0].lstrip().startswith(tuple(_COMMENT)) or len(lines) < 2:
+        return False
+    names, fields = _split_fields(lines[0]), _split_fields(lines[1])
+    return len(names) == len(fields) > 1 and all(map(_is_number, filter(str.strip, fields)))
+
+
 def _check_names(file: Path, lines: Sequence[str], names: Sequence[str]) -> None:
     """Raise ValueError if line 1 is a comment, has other separators, or has numbers instead of names."""
     problem, remedy, line = "", "", lines[0]
     separator = next((s for s in _SEPARATORS if s in line), "")
-    if line.lstrip().startswith(("#", "%")):
+    if line.lstrip().startswith(tuple(_COMMENT)):
         has_names = len(lines) > 1 and line.count(",") == lines[1].count(",") > 0
         problem = "a comment"
         remedy = (

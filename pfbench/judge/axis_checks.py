@@ -46,17 +46,33 @@ def check_axes(table: TrajectoryTable, reference: ReferenceTrack) -> None:
     if rows.sum() < 20:
         return
     time, clock = table.time[rows], reference.table.time
-    is_tum = table.file.lower().endswith(".tum")
     for group in _GROUPS:
         shared = [n for n in group if n in table.values and n in reference.table.values]
         theirs = {n: np.interp(time, clock, reference.table.values[n]) for n in shared}
-        for column in shared:
-            fault = _find_fault(column, table.values[column][rows], theirs)
-            if fault:
-                raise ValueError(
-                    f"{table.file}: column {fault.column} must be that of axes North, East, Down, got "
-                    f"{fault.problem} in {reference.file}. {fault.remedy if not is_tum else _TUM_REMEDY}"
-                )
+        mine = {n: table.values[n][rows] for n in shared}
+        fault = _find_first_fault(mine, theirs)
+        if fault:
+            remedy = _frame_remedy(table.frame, mine, theirs) if table.frame else fault.remedy
+            raise ValueError(
+                f"{table.file}: column {fault.column} must be that of axes North, East, Down, got "
+                f"{fault.problem} in {reference.file}. {remedy}"
+            )
+
+
+def _find_first_fault(mine: Mapping[str, Array], theirs: Mapping[str, Array]) -> _Fault | None:
+    """Return what is wrong with the first of several columns that is wrong, or None."""
+    faults = (_find_fault(column, values, theirs) for column, values in mine.items())
+    return next((fault for fault in faults if fault), None)
+
+
+def _frame_remedy(frame: str, mine: Mapping[str, Array], theirs: Mapping[str, Array]) -> str:
+    """Return the other frame of a TUM file if positions agree in it."""
+    if set(LOCAL) <= set(mine):
+        north, east, down = (mine[name] for name in LOCAL)
+        turned = dict(zip(LOCAL, (east, north, -down), strict=True))
+        if not _find_first_fault(turned, theirs):
+            return f"Set NAME.frame={'ned' if frame == 'enu' else 'enu'}."
+    return _TUM_REMEDY
 
 
 def _find_fault(column: str, mine: Array, theirs: Mapping[str, Array]) -> _Fault | None:

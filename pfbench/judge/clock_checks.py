@@ -14,6 +14,7 @@ from pfbench.results.error_measures import Array
 
 CLOCK_LIMIT = 0.5  # s, offset above which clocks are refused
 _TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 1 / 60: "minutes"}
+_REFERENCE_UNITS = {1 / factor: unit for factor, unit in _TIME_UNITS.items() if factor > 1}
 _EXPLAINED = 0.2  # share of the differences that remain at the offset of a wrong clock
 _CLEAR = 0.05  # share below which the clock alone explains them
 _SAMPLE, _COARSE_SAMPLE = 1500, 300  # epochs of the search for the clock
@@ -73,46 +74,48 @@ class _Motion:
 
 
 def check_common_time(
-    table: TrajectoryTable, reference: ReferenceTrack, name: str, applied: float = 0.0
+    table: TrajectoryTable, reference: ReferenceTrack, applied: float = 0.0
 ) -> None:
     """Check that a trajectory and the reference share time.
 
     Args:
         table: Trajectory.
         reference: Reference.
-        name: Name of the program, for the remedy.
         applied: Shift that its clock already has, s.
 
     Raises:
         ValueError: If they do not overlap. The message proposes a unit or a shift.
     """
     (first, last), clock = (table.time[0], table.time[-1]), reference.table.time
-    unit = _find_unit(table, reference)
-    if last > clock[0] and first < clock[-1] and not unit:
+    factor = _find_unit(table, reference)
+    if last > clock[0] and first < clock[-1] and not factor:
         return
-    if unit:
-        remedy = f"The column is in {unit}: convert it to s."
+    if factor:
+        remedy = f"The column is in {_TIME_UNITS.get(factor)}: set NAME.scale=t:{1 / factor:.6g}."
+        if factor in _REFERENCE_UNITS:
+            remedy = f"That of the reference is in {_REFERENCE_UNITS[factor]}: set reference.scale=t:{factor:.6g}."
     else:
         motion = _Motion(table, reference, np.arange(len(table.time)))
         search_result = motion.search_all()
         shift, remedy = clock[0] - first, "If both start together, set"
         if search_result.spread < _EXPLAINED * motion.extent:
             shift, remedy = _round_whole(search_result.shift), "The motion agrees at"
-        remedy = f"{remedy} {name}.shift={applied + shift:.10g}."
+        remedy = f"{remedy} NAME.shift={applied + shift:.10g}."
     raise ValueError(
         f"{table.file}: column t must overlap {reference.file} ({clock[0]:.10g} to {clock[-1]:.10g} "
         f"s), got {first:.10g} to {last:.10g} s. {remedy}"
     )
 
 
-def _find_unit(table: TrajectoryTable, reference: ReferenceTrack) -> str:
-    """Return the unit of a time of 0.5 to 2 times the length of the reference; empty for seconds.
+def _find_unit(table: TrajectoryTable, reference: ReferenceTrack) -> float:
+    """Return the unit of a time of 0.5 to 2 times the length of the reference, 0 for seconds.
 
     A trajectory that shares 20 rows with the reference needs a motion that agrees in the unit alone.
     """
     clock = reference.table.time
     length, span = table.time[-1] - table.time[0], clock[-1] - clock[0]
-    factor = next((f for f in _TIME_UNITS if 0.5 < length / f / span < 2), 0.0)
+    units = (*_TIME_UNITS, *_REFERENCE_UNITS)
+    factor = next((f for f in units if 0.5 < length / f / span < 2), 0.0)
     inside = int(((table.time >= clock[0]) & (table.time <= clock[-1])).sum())
     if factor and (factor < 1 or inside >= _LEAST_ROWS):
         scaled = replace(table, time=table.time / factor)
@@ -120,12 +123,10 @@ def _find_unit(table: TrajectoryTable, reference: ReferenceTrack) -> str:
         best = min(motion.spread(0.0), motion.search_all().spread)
         is_seconds = motion.extent == 0 or best > _EXPLAINED * motion.extent
         factor = 0.0 if is_seconds else factor
-    return _TIME_UNITS.get(factor, "")
+    return factor
 
 
-def check_clock(
-    table: TrajectoryTable, reference: ReferenceTrack, name: str, applied: float = 0.0
-) -> float:
+def check_clock(table: TrajectoryTable, reference: ReferenceTrack, applied: float = 0.0) -> float:
     """Estimate the offset of the clock from the motion, and refuse a large one.
 
     The offset minimises the median distance of the positions from the reference, after removal of
@@ -135,7 +136,6 @@ def check_clock(
     Args:
         table: Trajectory.
         reference: Reference.
-        name: Name of the program, for the remedy.
         applied: Shift that its clock already has, s.
 
     Returns:
@@ -161,7 +161,7 @@ def check_clock(
         raise ValueError(
             f"{table.file}: column t must have the clock of {reference.file}, got an offset of "
             f"{shift:.2f} s: with it the median difference falls from {at_zero:.3g} to {best.spread:.3g} m. "
-            f"Set {name}.shift={applied + _round_whole(shift):.10g}. GPS time is 18 s ahead of UTC since 2017."
+            f"Set NAME.shift={applied + _round_whole(shift):.10g}. GPS time is 18 s ahead of UTC since 2017."
         )
     least = _SHOWN if abs(shift) <= CLOCK_LIMIT else _LARGE_SHOWN
     is_shown = (best.spread < least * at_zero and abs(shift) <= _NEAR_S) or abs(shift) < 0.02

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -26,7 +27,7 @@ _AXES = ("North", "East", "Down")
 
 
 def describe_notes(judgement: Judgement, options: JudgeOptions) -> Iterator[str]:
-    """Yield notes on alignment, lost and missing runs, clocks, epochs, the reference and offsets.
+    """Yield notes on alignment, files, lost and missing runs, clocks, epochs, the reference and offsets.
 
     Args:
         judgement: Judgement.
@@ -35,6 +36,7 @@ def describe_notes(judgement: Judgement, options: JudgeOptions) -> Iterator[str]
     if options.align in _ALIGNED:
         yield _ALIGNED[options.align]
     programs = list(dict.fromkeys(run.program for s in judgement.sequences for run in s.runs))
+    yield from _describe_files(judgement.sequences)
     for sequence in judgement.sequences:
         yield from _describe_missing(sequence, programs)
         yield from _describe_epochs(sequence)
@@ -42,6 +44,18 @@ def describe_notes(judgement: Judgement, options: JudgeOptions) -> Iterator[str]
         yield from _describe_offsets(sequence)
         yield from _describe_trends(sequence)
         yield from _describe_runs(sequence, options)
+
+
+def _describe_files(sequences: Sequence[SequenceResults]) -> Iterator[str]:
+    """Yield the notes of the readers, once for all files of a program with the same note."""
+    counts: Counter[tuple[str, str]] = Counter()
+    for sequence in sequences:
+        counts.update(("reference", note) for note in sequence.reference.table.notes)
+        for run in sequence.runs:
+            counts.update((run.program, note) for note in run.table.notes)
+    for (program, note), count in counts.items():
+        files = f" ({count} files)" if count > 1 else ""
+        yield f"File of {program}: {note.replace('NAME.', f'{program}.')}{files}."
 
 
 def _describe_runs(sequence: SequenceResults, options: JudgeOptions) -> Iterator[str]:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from pfbench.judge.readers.trajectory_table import ALL_COLUMNS
+
 FRAMES = ("", "ned", "enu")
+FORMATS = ("", "table", "tum", "kf_gins", "nmea", "result")
 ALIGNMENTS = ("none", "offset", "yaw")
 _LARGEST_TIME = 1e10  # s, above the GPS and Unix times of this century
 _ORIGIN_LIMITS = (90.0, 360.0, 1e5)  # deg, deg, m
@@ -19,21 +23,35 @@ class SourceOptions:
     """Options of one program, `NAME.key=value` on the command line.
 
     Attributes:
-        frame: Axes of a .tum file, "ned" or "enu".
+        frame: Axes of a TUM file, "ned" or "enu".
         shift: Time added to the clock of the file, s.
         columns: Name in a CSV file by name of pfbench.
+        scale: Factor by name of pfbench, for a column in another unit; before `shift`.
+        format: One of `FORMATS`; empty to find it from the content.
         sd: Pattern of the KF-GINS file of standard deviations; empty for none.
     """
 
     frame: str = ""
     shift: float = 0.0
     columns: Mapping[str, str] = field(default_factory=dict)
+    scale: Mapping[str, float] = field(default_factory=dict)
+    format: str = ""
     sd: str = ""
 
     def __post_init__(self) -> None:
         _require(
-            "shift", abs(self.shift) <= _LARGEST_TIME, f"at most {_LARGEST_TIME:g} s", self.shift
+            "NAME.shift",
+            abs(self.shift) <= _LARGEST_TIME,
+            f"at most {_LARGEST_TIME:g} s",
+            self.shift,
         )
+        _require("NAME.frame", self.frame in FRAMES, "ned or enu", self.frame)
+        _require("NAME.format", self.format in FORMATS, ", ".join(FORMATS[1:]), self.format)
+        for name, factor in self.scale.items():
+            _require(
+                "NAME.scale", math.isfinite(factor) and factor != 0, "finite and not 0", factor
+            )
+            _require("NAME.scale", name in ALL_COLUMNS, f"of {', '.join(ALL_COLUMNS)}", name)
 
 
 @dataclass(frozen=True)
@@ -92,6 +110,19 @@ class JudgeOptions:
         )
         for value, limit in zip(self.origin, _ORIGIN_LIMITS, strict=False):
             _require("origin", abs(value) <= limit, f"within {limit:g}", value)
+
+
+@contextmanager
+def name_program(program: str) -> Iterator[None]:
+    """Write the name of the program in the messages of readers, which call it NAME.
+
+    Args:
+        program: Name of the program, or "reference".
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(str(error).replace("NAME.", f"{program}.")) from error
 
 
 def _require(name: str, is_valid: bool, requirement: str, value: Any) -> None:

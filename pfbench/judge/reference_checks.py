@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from pfbench.judge.readers.trajectory_table import (
     ATTITUDE_COLUMNS,
+    COLUMN_GROUPS,
     GEODETIC,
     LOCAL,
     VELOCITY_COLUMNS,
     TrajectoryTable,
 )
 from pfbench.judge.reference_track import ReferenceTrack
+from pfbench.judge.unit_checks import find_angle_factor
 from pfbench.results.error_measures import Array
 
-_FACTORS = {  # ratio of two units: the unit of the column, for positions, velocities and angles
-    "m": {3.28084: "feet", 1e3: "mm", 1e-3: "km", 0.3048: "m while the reference is in feet"},
-    "m/s": {3.28084: "feet/s", 3.6: "km/h", 1.943844: "knots", 0.277778: "m/s and the reference in km/h"},
-    "rad": {57.29578: "degrees", 0.01745329: "rad while the reference is in degrees"},
-    "deg": {0.01745329: "radians", 57.29578: "degrees while the reference is in radians"},
+_FACTORS = {  # ratio of two units: the unit of the column, or of that of the reference
+    "m": {3.28084: "feet", 1e3: "mm, or reference in km", 1e-3: "km", 0.3048: "reference in feet"},
+    "m/s": {3.28084: "feet/s", 3.6: "km/h", 1.943844: "knots", 0.277778: "reference in km/h"},
+    "rad": {57.29578: "degrees", 0.01745329: "rad converted twice, or reference in degrees"},
+    "deg": {0.01745329: "radians", 57.29578: "reference in radians"},
 }  # fmt: skip
+_Column = tuple[str, str, Array, Array]  # name, unit, values of the program and of the reference
 _CLOSE = 0.045  # relative difference from a factor
 _USUAL = 0.97  # share of the increments of an angle that are compared
 _NEAR = 1000.0  # m, smallest distance of a trajectory of the same place
@@ -79,35 +83,67 @@ def check_interpolation(
         )
 
 
-def check_units(table: TrajectoryTable, reference: ReferenceTrack) -> None:
+def check_units(table: TrajectoryTable, reference: ReferenceTrack) -> TrajectoryTable:
     """Compare each column with that of the reference, and refuse a ratio of two units.
 
     Args:
         table: Trajectory.
         reference: Reference.
 
+    Returns:
+        The trajectory, with a note if yaw may be in degrees.
+
     Raises:
         ValueError: If a column is a constant times that of the reference, as feet for metres.
     """
     rows = reference.is_bridged(table.time)
     if rows.sum() < 10:
-        return
-    time = table.time[rows]
-    for column, unit, mine, theirs in _common_columns(table.keep_rows(rows), reference, time):
+        return table
+    columns = list(_common_columns(table.keep_rows(rows), reference, table.time[rows]))
+    for column, unit, mine, theirs in columns:
+        if column == "yaw" and not find_angle_factor(mine, theirs)[1]:
+            note = f"yaw agrees with {reference.file} if it is in degrees: NAME.scale=yaw:0.0174533"
+            return replace(table, notes=(*table.notes, note))
         ratio = _ratio(mine, theirs, unit, column)
         for factor, wrong in _FACTORS[unit].items():
             if abs(ratio / factor - 1) < _CLOSE:
                 if unit == "rad" and table.angle_unit == "deg":  # the reader has converted them
-                    unit, wrong = "deg", "radians, or degrees while the reference is in degrees"
+                    unit, wrong = "deg", "radians, or reference in degrees"
                 raise ValueError(
                     f"{table.file}: column {column} must be in {unit}, got values {ratio:.4g} times "
-                    f"those of {reference.file}: {wrong}. Multiply the column by {1 / factor:.6g}."
+                    f"those of {reference.file}: {wrong}. {_unit_remedy(column, columns, factor, wrong)}"
                 )
+    return table
+
+
+def _unit_remedy(column: str, columns: list[_Column], factor: float, wrong: str) -> str:
+    """Return the remedy of all columns of a group that come nearer to the reference with a factor."""
+    group = next(group for group in COLUMN_GROUPS if column in group)
+    names = [
+        name
+        for name, _, mine, theirs in columns
+        if name in group
+        and (name == column or _distance(mine / factor, theirs) < _distance(mine, theirs))
+    ]
+    mine = ",".join(f"{name}:{1 / factor:.6g}" for name in names)
+    theirs = ",".join(f"{name}:{factor:.6g}" for name in names)
+    remedies = [
+        f"Multiply the column by {1 / factor:.6g}: set NAME.scale={mine}",
+        f"multiply that of the reference by {factor:.6g}: set reference.scale={theirs}",
+    ]
+    if wrong.startswith("reference"):
+        return f"{remedies[1].replace('m', 'M', 1)}."
+    return f"{', or '.join(remedies if 'reference' in wrong else remedies[:1])}."
+
+
+def _distance(mine: Array, theirs: Array) -> float:
+    """Return the sum of squares of the differences of two columns."""
+    return float(((mine - theirs) ** 2).sum())
 
 
 def _common_columns(
     table: TrajectoryTable, reference: ReferenceTrack, time: Array
-) -> Iterator[tuple[str, str, Array, Array]]:
+) -> Iterator[_Column]:
     """Yield column, unit, values of the program and of the reference at the same times."""
     units = {
         **dict.fromkeys((*LOCAL, "h_m"), "m"),
@@ -127,11 +163,13 @@ def _common_columns(
 
 
 def _ratio(mine: Array, theirs: Array, unit: str, column: str) -> float:
-    """Return the ratio of two columns: of medians, or the slope if they correlate; else 1."""
+    """Return the ratio of two columns: of medians, of units of yaw, or the slope if they correlate; else 1."""
     if unit == "deg" or column == "h_m":
         middle = float(np.median(theirs))
         return float(np.median(mine)) / middle if abs(middle) > 0.5 else 1.0
-    slope, share = regress_column(mine, theirs, unit == "rad")
+    if column == "yaw":
+        return 1 / find_angle_factor(mine, theirs)[0]
+    slope, share = regress_column(mine, theirs)
     return slope if share >= 0.9 else 1.0
 
 

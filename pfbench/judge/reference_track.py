@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pfbench.judge.judge_options import JudgeOptions, SourceOptions
+from pfbench.judge.judge_options import JudgeOptions, SourceOptions, name_program
 from pfbench.judge.readers.local_frame import to_north_east_down, wrap_to_half_turn
 from pfbench.judge.readers.trajectory_files import read_trajectories
 from pfbench.judge.readers.trajectory_table import (
@@ -17,6 +17,7 @@ from pfbench.judge.readers.trajectory_table import (
     VELOCITY_COLUMNS,
     TrajectoryTable,
 )
+from pfbench.judge.unit_checks import check_consistent_units
 from pfbench.results.error_measures import Array
 
 _SAME_TRUTH = 0.5  # m, largest difference of one truth that two files interpolate
@@ -180,7 +181,8 @@ def read_reference(path: Path, options: JudgeOptions, source: SourceOptions) -> 
     Raises:
         ValueError: If the file is not valid, has several runs, or has a hole.
     """
-    tables = read_trajectories(path, source)
+    with name_program("reference"):
+        tables = [check_consistent_units(table) for table in read_trajectories(path, source)]
     if len(tables) != 1:
         raise ValueError(
             f"reference must be one trajectory, got {len(tables)} runs in {path.name}. Use a .csv file."

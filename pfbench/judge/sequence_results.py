@@ -20,7 +20,7 @@ from pfbench.judge.alignment import (
 from pfbench.judge.axis_checks import check_axes
 from pfbench.judge.clock_checks import check_clock, check_common_time
 from pfbench.judge.epoch_holes import fill_holes
-from pfbench.judge.judge_options import JudgeOptions, SourceOptions
+from pfbench.judge.judge_options import JudgeOptions, SourceOptions, name_program
 from pfbench.judge.readers.trajectory_files import TrajectoryFile, read_trajectories
 from pfbench.judge.readers.trajectory_table import (
     ATTITUDE_SD,
@@ -34,6 +34,7 @@ from pfbench.judge.readers.trajectory_table import (
 )
 from pfbench.judge.reference_checks import check_distance, check_units
 from pfbench.judge.reference_track import ReferenceTrack
+from pfbench.judge.unit_checks import check_consistent_units
 from pfbench.results.error_measures import Array
 from pfbench.results.store import JobResult
 
@@ -114,19 +115,28 @@ def read_runs(
     for file in files:
         names = {"sequence": file.sequence, "run": file.run}
         sd = Path(source.sd.format(**names)) if source.sd else None
-        tables = read_trajectories(file.path, source, sd)
-        for table in map(reference.place, tables):
-            check_common_time(table, reference, program, source.shift)
-            check_units(table, reference)
-            if align == "none":
-                check_distance(table, reference)
-            offset = math.nan
-            if align != "yaw":
-                offset = check_clock(table, reference, program, source.shift)
-                check_axes(table, reference)
+        with name_program(program):
+            tables = read_trajectories(file.path, source, sd)
+            checked = [_check_run(reference.place(t), reference, source, align) for t in tables]
+        for table, offset in checked:
             number = f"{table.run:09d}" if len(tables) > 1 else ""
             runs.append(JudgedRun(program, f"{file.run}{number}", file.path, table, offset))
     return runs
+
+
+def _check_run(
+    table: TrajectoryTable, reference: ReferenceTrack, source: SourceOptions, align: str
+) -> tuple[TrajectoryTable, float]:
+    """Check a run against the reference and by itself; return it with its notes and its clock offset."""
+    check_common_time(table, reference, source.shift)
+    table = check_consistent_units(check_units(table, reference))
+    if align == "none":
+        check_distance(table, reference)
+    if align == "yaw":
+        return table, math.nan
+    offset = check_clock(table, reference, source.shift)
+    check_axes(table, reference)
+    return table, offset
 
 
 def score_sequence(

@@ -159,7 +159,7 @@ def test_radians_in_a_file_of_kf_gins(tmp_path: Path, column: slice, message: st
     ("words", "message"),
     [
         (("kf.sd=none.txt",), "sd must be a file, got none.txt for KF_GINS_Navresult.nav"),
-        ((f"kf={SD}",), "got the suffix .txt and 22 columns. Use the navigation result"),
+        ((f"kf={SD}",), "got 22 fields in the first row. Use the navigation result"),
     ],
 )
 def test_other_files_of_kf_gins_are_refused(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,6 +20,30 @@ from pfbench.judge.readers.trajectory_table import (
     SD_GROUPS,
     TrajectoryTable,
 )
+from pfbench.nav.plausible_limits import LIMIT_COLUMNS
+
+_STATED_UNIT = re.compile(r"[\[(]\s*([^\[(\])]+?)\s*[\])]\s*$")  # at the end of a name
+_RADIAN = {"rad": 57.29577951, "radians": 57.29577951}
+_DEGREE = dict.fromkeys(("deg", "degrees", "°"), 0.01745329252)
+_FACTORS: dict[str, dict[str, float]] = {  # of units in names of columns, by quantity
+    "time": {
+        "ms": 1e-3,
+        "msec": 1e-3,
+        "us": 1e-6,
+        "µs": 1e-6,
+        "ns": 1e-9,
+        "min": 60.0,
+        "h": 3600.0,
+    },
+    "local position": {"km": 1e3, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048},
+    "height": {"km": 1e3, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048},
+    "velocity": {"km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3, "ft/s": 0.3048, "kn": 1852 / 3600},
+    "latitude": _RADIAN,
+    "longitude": _RADIAN,
+    "roll": _DEGREE,
+    "pitch": _DEGREE,
+    "yaw": _DEGREE,
+}
 
 
 def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
@@ -37,17 +62,7 @@ def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     content = read_table_file(file)
     rows = content.rows.rename(columns=str)
     lines = np.arange(len(rows)) + (1 if file.suffix == ".parquet" else 2)
-    for name, in_file in options.columns.items():
-        if in_file not in rows or name not in ALL_COLUMNS:
-            absent = in_file not in rows
-            wrong, choices = (in_file, map(str, rows)) if absent else (name, ALL_COLUMNS)
-            raise ValueError(
-                f"{file.name}: columns must exist, got {wrong}. Choose from {', '.join(choices)}."
-            )
-    used = options.columns.items()
-    hidden = [name for name in options.columns if name in rows]
-    rows = rows.drop(columns=[name for name in hidden if name not in options.columns.values()])
-    rows = rows.rename(columns={in_file: name for name, in_file in used})
+    rows = _rename_columns(file, rows, options)
     if "t" not in rows:
         raise ValueError(
             f"{file.name} must have the column t (time, s), got {', '.join(map(str, rows))}."
@@ -64,6 +79,42 @@ def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     origin = _stated_origin(content.stated)
     table_notes = (*content.notes, *notes)
     return [TrajectoryTable(file.name, time, values, lines, table_notes, origin=origin)]
+
+
+def _rename_columns(file: Path, rows: pd.DataFrame, options: SourceOptions) -> pd.DataFrame:
+    """Return the rows with the names of pfbench."""
+    for name, in_file in options.columns.items():
+        if in_file not in rows or name not in ALL_COLUMNS:
+            absent = in_file not in rows
+            wrong, choices = (in_file, map(str, rows)) if absent else (name, ALL_COLUMNS)
+            raise ValueError(
+                f"{file.name}: columns must exist, got {wrong}. Choose from {', '.join(choices)}. Write a name "
+                "with commas in quotes."
+            )
+    _check_stated_units(file, options)
+    used = options.columns.items()
+    hidden = [name for name in options.columns if name in rows]
+    rows = rows.drop(columns=[name for name in hidden if name not in options.columns.values()])
+    return rows.rename(columns={in_file: name for name, in_file in used})
+
+
+def _check_stated_units(file: Path, options: SourceOptions) -> None:
+    """Raise ValueError if names state other units, as time [ms], that no factor converts."""
+    factors: dict[str, float] = {}
+    for name, in_file in options.columns.items():
+        match = _STATED_UNIT.search(in_file)
+        factor = _FACTORS.get(LIMIT_COLUMNS.get(name, ""), {}).get(match[1] if match else "", 1.0)
+        if factor != 1 and name not in options.scale:
+            factors[name] = factor
+    if factors:
+        names = ", ".join(f"{name} from {options.columns[name]}" for name in factors)
+        word = ",".join(
+            f"{name}:{factor:.8g}" for name, factor in {**options.scale, **factors}.items()
+        )
+        raise ValueError(
+            f"{file.name}: columns must be in s, m, m/s and rad, latitude and longitude in deg, got {names}. "
+            f"Set NAME.scale={word}."
+        )
 
 
 def _stated_origin(stated: Mapping[str, str]) -> tuple[float, ...]:

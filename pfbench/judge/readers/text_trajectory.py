@@ -1,7 +1,9 @@
-"""Readers of text without column names: .tum and KF-GINS."""
+"""Readers of text with columns of a fixed order: TUM and KF-GINS."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,16 +25,22 @@ from pfbench.results.error_measures import Array
 
 _TUM_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _KF_GINS_COLUMNS = ("week", "t", *GEODETIC, *VELOCITY_COLUMNS, "roll", "pitch", "yaw")
-_KF_GINS_SD = 22  # columns of the file of standard deviations: time, 9 of navigation, 12 of sensors
+KF_GINS_SD = 22  # columns of the file of standard deviations: time, 9 of navigation, 12 of sensors
+_WEEK = 604800.0  # s
 _TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # from East, North, Up
 _TO_FRD = np.diag([1.0, -1.0, -1.0])  # a body with forward, left, up
+_COMMENTS, _BOM = ("#", "%"), "\ufeff"
+_LONGEST_HEAD = 100_000  # characters of a line, or lines before the first row
+_UNIT = re.compile(r"[\[(][^\])]*[\])]")  # as in time [s]
+_QUATERNION = re.compile(r"(?:.*\W)?(?:q|quat|quaternion|orientation|rot|rotation)\w*?_?([wxyz])")
 
 
 def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
     """Read lines `t x y z qx qy qz qw` (s, m, rotation from body to world).
 
     With frame=enu, the world is East, North, Up and the body forward, left, up [REP 103]. With
-    frame=ned they are North, East, Down and forward, right, down.
+    frame=ned they are North, East, Down and forward, right, down. A line of names can state another
+    order of the quaternion and further columns, and an index can precede the time.
 
     Args:
         file: File.
@@ -45,12 +53,15 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
         ValueError: If the frame is not stated, a line has other columns, or a quaternion is not of
             unit length.
     """
-    if options.frame not in ("ned", "enu"):
+    if not options.frame:
         raise ValueError(
-            f"NAME.frame must be ned or enu for {file.name}, got {options.frame or 'none'}: a .tum file "
-            "does not state its axes. Set NAME.frame=enu if z points up."
+            f"NAME.frame must be ned or enu for {file.name}, got none: a TUM file does not state its "
+            "axes. Set NAME.frame=enu if z points up."
         )
-    numbers, lines, notes = _read_numbers(file, _TUM_COLUMNS)
+    names, rows = read_head(file)
+    places = find_pose_columns(names, rows) or list(range(len(_TUM_COLUMNS)))
+    width = len(names) or (to_numbers(rows).shape[1] if places[0] else len(places))
+    numbers, lines, notes = _read_numbers(file, _TUM_COLUMNS, places, width)
     length = np.linalg.norm(numbers[:, 4:], axis=1)
     bad = np.abs(length - 1) > 0.01
     if bad.any():
@@ -59,11 +70,37 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
             f"{file.name}: line {lines[row]}, columns qx ... qw must be a quaternion of length 1, "
             f"got length {length[row]:.3g}. Check the order of the columns: {' '.join(_TUM_COLUMNS)}."
         )
+    if width > len(_TUM_COLUMNS):
+        used = ", ".join(str(index + 1) for index in places)
+        notes = (*notes, f"columns {used} of {width} are read as {' '.join(_TUM_COLUMNS)}")
     position, rotation = numbers[:, 1:4], rotation_from_quaternion(numbers[:, 4:])
     if options.frame == "enu":
         position, rotation = position @ _TO_NED.T, _TO_NED @ rotation @ _TO_FRD
     values = _by_name(LOCAL, position) | _by_name(ATTITUDE_COLUMNS, euler_angles(rotation))
-    return [TrajectoryTable(file.name, numbers[:, 0], values, lines, notes)]
+    return [TrajectoryTable(file.name, numbers[:, 0], values, lines, notes, frame=options.frame)]
+
+
+def find_pose_columns(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[int]:
+    """Find the columns of time, position and quaternion (x, y, z, w).
+
+    Args:
+        names: Names of the columns, empty if the file has none.
+        rows: Fields of the first lines.
+
+    Returns:
+        Index of each column of a TUM file; empty if they are not of this kind.
+    """
+    axes = {m[1]: k for k, name in enumerate(names) if (m := _QUATERNION.fullmatch(name.lower()))}
+    first = min(axes.values(), default=0)
+    if len(axes) == 4 and max(axes.values()) == first + 3 and first > 3:
+        return [0, first - 3, first - 2, first - 1, *(axes[axis] for axis in "xyzw")]
+    numbers = to_numbers(rows)
+    width = numbers.shape[1]
+    is_unit = np.abs(np.linalg.norm(numbers[:, -4:], axis=1) - 1) < 0.01
+    if width not in (8, 9) or is_unit.mean() < 0.5:
+        return []
+    has_index = width == 9 and bool((np.diff(numbers[:, 0]) == 1).all())
+    return list(range(width - 8, width)) if width == 8 or has_index else []
 
 
 def read_kf_gins_trajectory(
@@ -79,7 +116,7 @@ def read_kf_gins_trajectory(
         sd: File of standard deviations with 22 columns (m, m/s, deg), or None.
 
     Returns:
-        One table; the time is the second of the week.
+        One table; the time is the second of the first week.
 
     Raises:
         ValueError: If a line has other columns, or the times of both files differ.
@@ -90,16 +127,19 @@ def read_kf_gins_trajectory(
         | _by_name(VELOCITY_COLUMNS, numbers[:, 5:8])
         | _by_name(ATTITUDE_COLUMNS, np.radians(numbers[:, 8:11]))
     )
-    time = numbers[:, 1]
+    second = numbers[:, 1]
+    time = (
+        second if (np.diff(second) > 0).all() else second + _WEEK * (numbers[:, 0] - numbers[0, 0])
+    )
     if sd is not None:
-        names = ("t", *(f"column {k}" for k in range(2, _KF_GINS_SD + 1)))
+        names = ("t", *(f"column {k}" for k in range(2, KF_GINS_SD + 1)))
         if not sd.is_file():
             raise ValueError(f"sd must be a file, got {sd} for {file.name}. Check the path.")
         deviations, _, _ = _read_numbers(sd, names)
-        if deviations.shape[0] != len(time) or (np.abs(deviations[:, 0] - time) > 1e-4).any():
+        if deviations.shape[0] != len(time) or (np.abs(deviations[:, 0] - second) > 1e-4).any():
             raise ValueError(
                 f"{sd.name} must have the times of {file.name}, got {len(deviations)} rows from "
-                f"{deviations[0, 0]} s for {len(time)} rows from {time[0]} s. Use files of one run."
+                f"{deviations[0, 0]} s for {len(time)} rows from {second[0]} s. Use files of one run."
             )
         values |= _by_name(POSITION_SD, deviations[:, 1:4])
         values |= _by_name(VELOCITY_SD, deviations[:, 4:7])
@@ -107,41 +147,102 @@ def read_kf_gins_trajectory(
     return [TrajectoryTable(file.name, time, values, lines, notes, angle_unit="deg")]
 
 
-def count_fields(file: Path) -> int:
-    """Return the number of fields of the first line with numbers; 0 without one."""
-    with file.open(encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            if line.strip() and not line.lstrip().startswith(("#", "%")):
-                return len(line.split())
-    return 0
+def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
+    """Read names of columns and the first rows of a text; a line of names can be a comment.
+
+    Args:
+        file: File.
+        rows: Largest number of rows.
+
+    Returns:
+        Names without units, empty if there are none, and fields of the first rows.
+    """
+    heads: list[list[str]] = []
+    fields: list[list[str]] = []
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        for line in map(str.strip, lines):
+            if line.startswith(_COMMENTS) or (not fields and _has_no_number(line)):
+                heads.append(split_line(_UNIT.sub("", line.lstrip("#% "))))
+            elif line:
+                fields.append(split_line(line))
+            if len(fields) == rows or len(line) + len(heads) > _LONGEST_HEAD:
+                break
+    width = len(fields[0]) if fields else 0
+    return next((names for names in reversed(heads) if len(names) == width), []), fields
+
+
+def to_numbers(rows: Sequence[Sequence[str]]) -> Array:
+    """Convert the rows of the most common width to numbers [T, K], without damaged ones.
+
+    Args:
+        rows: Fields of lines.
+    """
+    widths = [len(row) for row in rows]
+    width = max(widths, key=widths.count, default=0)
+    valid = [row for row in rows if len(row) == width and all(map(_is_number, row))]
+    return np.array(valid, dtype=np.float64).reshape(len(valid), width if valid else 0)
+
+
+def split_line(line: str) -> list[str]:
+    """Split a line at commas or semicolons, else at blanks and tabs.
+
+    Args:
+        line: Line of a text.
+    """
+    separator = next((s for s in ",;" if s in line), None)
+    fields = [field.strip() for field in line.strip().split(separator)]
+    return fields[:-1] if separator and not fields[-1] else fields
+
+
+def _has_no_number(line: str) -> bool:
+    """Return whether a line consists of names."""
+    return not any(map(_is_number, split_line(line)))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _by_name(names: tuple[str, ...], columns: Array) -> dict[str, Array]:
     return {name: columns[:, k] for k, name in enumerate(names)}
 
 
-def _read_numbers(file: Path, names: tuple[str, ...]) -> tuple[Array, np.ndarray, tuple[str, ...]]:
-    """Return numbers [T, K], their lines [T], and notes; comments start with # or %.
+def _read_numbers(
+    file: Path, names: tuple[str, ...], places: Sequence[int] = (), width: int = 0
+) -> tuple[Array, np.ndarray, tuple[str, ...]]:
+    """Return numbers [T, K] of some columns or of all, their lines [T], and notes.
 
-    A last line without an end may lack digits, so it is dropped with a note.
+    Comments start with # or %, and names can precede the first row. A last line without an end may
+    lack digits, so it is dropped with a note.
     """
-    rows, lines = [], []
-    *complete, last = file.read_text(encoding="utf-8", errors="replace").split("\n")
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    notes: list[str] = []
+    width = width or len(names)
+    content = file.read_text(encoding="utf-8", errors="replace").removeprefix(_BOM)
+    *complete, last = content.split("\n")
     for number, line in enumerate(complete, 1):
-        fields = line.split()
-        if not fields or fields[0].startswith(("#", "%")):
+        text, fields = line.strip(), split_line(line)
+        if not text or text.startswith(_COMMENTS):
+            continue
+        if not (rows or notes) and len(fields) == width and _has_no_number(text):
+            notes = [f"line {number} is read as names of columns: {text[:80]}"]
             continue
         try:
-            row = [float(text) for text in fields]
-        except ValueError:
+            row = [float(fields[k]) for k in places or range(width)]
+        except (ValueError, IndexError):
             row = []
-        if len(row) != len(names):
+        if not row or len(fields) != width:
             raise ValueError(
-                f"{file.name}: line {number} must have {len(names)} numbers ({' '.join(names[:11])}), "
+                f"{file.name}: line {number} must have {width} numbers ({' '.join(names[:11])}), "
                 f"got {line[:80]!r}. Repair or remove this line."
             )
         rows.append(row)
         lines.append(number)
-    notes = (describe_cut(file, len(complete) + 1),) if last.strip() else ()
-    numbers = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
-    return numbers, np.array(lines), notes
+    notes += [describe_cut(file, len(complete) + 1)] if last.strip() else []
+    numbers = np.array(rows, dtype=np.float64).reshape(len(rows), len(places) or width)
+    return numbers, np.array(lines), tuple(notes)

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from pfbench.judge.judge_options import SourceOptions
 from pfbench.judge.readers.csv_trajectory import read_csv_trajectory
+from pfbench.judge.readers.file_format import find_format
 from pfbench.judge.readers.nmea_trajectory import read_nmea_trajectory
 from pfbench.judge.readers.result_trajectory import read_result_trajectories
-from pfbench.judge.readers.text_trajectory import (
-    count_fields,
-    read_kf_gins_trajectory,
-    read_tum_trajectory,
-)
+from pfbench.judge.readers.text_trajectory import read_kf_gins_trajectory, read_tum_trajectory
 from pfbench.judge.readers.trajectory_table import TrajectoryTable, check_trajectory
 
 ONE = "recording"  # name of the sequence of a pattern without {sequence}
 _FIELDS = {"sequence": r"(?P<sequence>[^/]+?)", "run": r"(?P<run>[^/]+?)"}
-_TABLES, _NMEA, _TEXT = (".csv", ".parquet"), (".nmea", ".ubx.nmea"), (".nav", ".txt")
+_READERS: dict[str, Callable[[Path, SourceOptions], list[TrajectoryTable]]] = {
+    "table": read_csv_trajectory,
+    "tum": read_tum_trajectory,
+    "nmea": read_nmea_trajectory,
+    "result": read_result_trajectories,
+}
 
 
 class TrajectoryFile(NamedTuple):
@@ -82,10 +84,10 @@ def list_trajectory_files(pattern: str) -> list[TrajectoryFile]:
 def read_trajectories(
     path: Path, options: SourceOptions, sd: Path | None = None
 ) -> list[TrajectoryTable]:
-    """Read and check a file; the clock is shifted.
+    """Read and check a file; columns are multiplied by their factors, then the clock is shifted.
 
     Args:
-        path: File: .csv, .parquet, .tum, .nmea, .npz, or text of KF-GINS.
+        path: File: table, TUM, NMEA, text of KF-GINS, or result of pfbench.
         options: Options of the program.
         sd: KF-GINS file of standard deviations, or None.
 
@@ -95,35 +97,35 @@ def read_trajectories(
     Raises:
         ValueError: If the format is unknown or a check fails.
     """
-    suffix = path.suffix.lower()
-    if sd is not None and suffix not in _TEXT:
+    kind = options.format or find_format(path, bool(options.columns))
+    if sd is not None and kind != "kf_gins":
         raise ValueError(
             f"sd must belong to a text file of KF-GINS, got {sd.name} for {path.name}. Remove the option, "
             "and add columns sd_pn, sd_pe and sd_pd to the file."
         )
-    for name, is_read in (("frame", suffix == ".tum"), ("columns", suffix in _TABLES)):
+    for name, is_read in (("frame", kind == "tum"), ("columns", kind == "table")):
         if getattr(options, name) and not is_read:
-            formats = ".tum file" if name == "frame" else "table with named columns"
+            formats = "TUM file" if name == "frame" else "table with named columns"
             raise ValueError(
                 f"{name} must belong to a {formats}, got {path.name}. Remove the option: the axes of "
                 "all other formats are North, East, Down or latitude, longitude, height."
             )
-    tables: Sequence[TrajectoryTable]
-    if suffix in _TABLES:
-        tables = read_csv_trajectory(path, options)
-    elif suffix == ".tum":
-        tables = read_tum_trajectory(path, options)
-    elif suffix in _NMEA:
-        tables = read_nmea_trajectory(path, options)
-    elif suffix == ".npz":
-        tables = read_result_trajectories(path, options)
-    elif suffix in _TEXT and count_fields(path) == 11:
-        tables = read_kf_gins_trajectory(path, options, sd)
+    if kind == "kf_gins":
+        tables: Sequence[TrajectoryTable] = read_kf_gins_trajectory(path, options, sd)
     else:
-        fields = f" and {count_fields(path)} columns" if suffix in _TEXT else ""
-        raise ValueError(
-            f"{path.name} must be .csv, .parquet, .tum, .nmea, .npz, or .nav or .txt with the 11 columns "
-            f"of KF-GINS, got the suffix {suffix or 'none'}{fields}. "
-            f"{'Use the navigation result of the program.' if fields else 'Rename or convert the file.'}"
-        )
-    return [replace(check_trajectory(t), time=t.time + options.shift) for t in tables]
+        tables = _READERS[kind](path, options)
+    return [
+        replace(table, time=table.time + options.shift)
+        for table in (check_trajectory(_scale_columns(t, options.scale)) for t in tables)
+    ]
+
+
+def _scale_columns(table: TrajectoryTable, factors: Mapping[str, float]) -> TrajectoryTable:
+    """Multiply columns by the factors of the option scale."""
+    for name in factors:
+        if name != "t" and name not in table.values:
+            raise ValueError(
+                f"NAME.scale must be factors of columns of {table.file}, got {name}. Choose from t, "
+                f"{', '.join(table.values)}."
+            )
+    return table.scale_columns(factors)

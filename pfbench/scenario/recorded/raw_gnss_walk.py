@@ -17,8 +17,8 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
-from pfbench.model.strapdown.tight import StrapdownTight
 from pfbench.files.reader_notes import announce_notes
+from pfbench.model.strapdown.tight import StrapdownTight
 from pfbench.model.strapdown.tuning import TightTuning
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.noise.base import NoiseRegime, check_unit_process
