@@ -138,7 +138,22 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
             "expand what all particles share."
         )
     check_measurement_resolution(observed, record.y, name)
+    _check_likelihood(step_model, first, next_x)
     _check_support(model, record, observed, next_x)
+
+
+def _check_likelihood(model: StateSpaceModel, record: Record, x: Tensor) -> None:
+    """Check that some of the tried states have a log likelihood."""
+    with torch.no_grad():
+        log_likelihood = model.log_likelihood(record.y, x, record.u)
+    is_undefined = torch.isnan(log_likelihood) | torch.isposinf(log_likelihood)
+    if bool(is_undefined.all()):
+        raise ValueError(
+            f"{type(model).__name__}.log_likelihood must be a number or -inf, got NaN or infinity for "
+            "all states that were tried at the first step. Check mean and spread of the measurement "
+            "for NaN, and its noise: a component without noise, or two that are copies of each "
+            "other, have no density."
+        )
 
 
 def _check_support(model: StateSpaceModel, record: Record, first: Any, x: Tensor) -> None:
@@ -205,7 +220,17 @@ def _observe(model: StateSpaceModel, x: Tensor, u: Any) -> Any:
     inner = model
     while isinstance(inner, ModelWrapper) and type(inner).observation is ModelWrapper.observation:
         inner = inner.model  # a wrapper with an observation of its own has inputs of its own
-    return type(inner).observation(inner, x, u)
+    try:
+        return type(inner).observation(inner, x, u)
+    except (ValueError, torch.linalg.LinAlgError) as error:  # torch checks the parameters
+        if isinstance(error, ValueError) and "Expected parameter" not in str(error):
+            raise
+        raise ValueError(
+            f"{type(inner).__name__}.observation must return a distribution whose spread is positive "
+            "and whose covariance is positive definite, got parameters that torch refuses. Check "
+            "mean and spread for NaN, and the noise: a component without noise, or two that are "
+            "copies of each other, have no density."
+        ) from error
 
 
 def _named_inputs(u: Any, name: str = "") -> list[tuple[str, Tensor]]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import pfbench
-from pfbench.filter.exactness import has_covariance, has_evidence
+from pfbench.filter.exactness import has_bounded_weights, has_covariance, has_evidence
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.job.plan import JobPlan
 from pfbench.model.base import StateSpaceModel
@@ -51,6 +51,7 @@ def make_metadata(
         "device": device if device == "cpu" else torch.cuda.get_device_name(device),
         "threads": values["threads"],
         "is_exact": method.is_exact or is_exact_kalman,
+        "has_bounded_weights": has_bounded_weights(method),
         "has_evidence": has_evidence(method),
         "has_covariance": has_covariance(method),
         "oracle_noise": values["oracle_noise"],
