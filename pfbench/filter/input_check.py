@@ -222,7 +222,7 @@ def _observe(model: StateSpaceModel, x: Tensor, u: Any) -> Any:
         inner = inner.model  # a wrapper with an observation of its own has inputs of its own
     try:
         return type(inner).observation(inner, x, u)
-    except (ValueError, torch.linalg.LinAlgError) as error:  # torch checks the parameters
+    except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
         if isinstance(error, ValueError) and "Expected parameter" not in str(error):
             raise
         raise ValueError(

@@ -78,8 +78,9 @@ def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
     if count.diverged and threshold is not None:
         limit = f"{threshold * group.scale:.3g} {group.unit}".rstrip()
         text += f" (diverged: error above {limit}, five times that of raw measurements)"
-    hints = [_HINTS[name] for name in count.marked if name in present]
-    return ". ".join([f"{rmse}; {text}", *hints]).format(k=_largest_k(outputs))
+    k = _largest_k(outputs)
+    hints = [_HINTS[name].format(k=k) for name in count.marked if name in present]
+    return ". ".join([f"{rmse}; {text}", *hints])
 
 
 def _largest_k(outputs: Mapping[str, Array]) -> str:

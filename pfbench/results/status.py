@@ -53,7 +53,7 @@ class StatusCounts(NamedTuple):
     runs: int
     overconfident: int = 0
     collapsed: int = 0
-    marked: Mapping[str, int] = {}  # noqa: RUF012
+    marked: Mapping[str, int] = {}
 
 
 def is_diverged(error: Array, lost: Flags, threshold: float) -> Flags:
