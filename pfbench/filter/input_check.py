@@ -138,8 +138,22 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
             "expand what all particles share."
         )
     check_measurement_resolution(observed, record.y, name)
+    _check_counts(step_model, observed)
     _check_likelihood(step_model, first, next_x)
     _check_support(model, record, observed, next_x)
+
+
+def _check_counts(model: StateSpaceModel, observed: Any) -> None:
+    """Check that a model states whether its measurements are discrete."""
+    base = observed.base_dist if isinstance(observed, Independent) else observed
+    support = getattr(base, "support", None)
+    if getattr(support, "is_discrete", False) and not model.has_counts:
+        name = type(model).__name__
+        raise ValueError(
+            f"{name}.has_counts must be True for discrete measurements, got False with a support of "
+            f"{support}. Set `has_counts = True` in the class: its evidence is a probability, "
+            "which is not compared with densities."
+        )
 
 
 def _check_likelihood(model: StateSpaceModel, record: Record, x: Tensor) -> None:

@@ -53,6 +53,7 @@ def make_metadata(
         "is_exact": method.is_exact or is_exact_kalman,
         "has_bounded_weights": has_bounded_weights(method),
         "has_evidence": has_evidence(method),
+        "has_counts": model.has_counts,
         "has_covariance": has_covariance(method),
         "oracle_noise": values["oracle_noise"],
         "modelling_choices": [*model.choices, *notes],
