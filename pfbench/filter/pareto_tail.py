@@ -45,8 +45,8 @@ def fit_pareto_k(log_w: Tensor) -> Tensor:
     w = torch.exp(largest)
     k = _fit_shape(w[:, 1:] - w[:, :1])
     quartile = largest[:, _quartile(size) + 1]
-    k = torch.where(quartile < math.log(torch.finfo(w.dtype).tiny), torch.inf, k)
-    return torch.where(quartile > largest[:, 0], k, torch.nan)  # NaN if all are inactive, too
+    k = torch.where(quartile > largest[:, 0], k, torch.nan)  # NaN if all are inactive, too
+    return torch.where(quartile < math.log(torch.finfo(w.dtype).tiny), torch.inf, k)
 
 
 def _quartile(size: int) -> int:

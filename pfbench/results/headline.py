@@ -29,7 +29,7 @@ def main_rmse(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> float:
     return math.sqrt(np.nanmean(square)) if np.isfinite(square).any() else math.inf
 
 
-_HINTS = {
+HINTS = {
     "heavy-tailed": "Unbounded weights: k-hat {k}, at most 0.7 is reliable. Set a defensive_fraction "
     "above 0 in the proposal or the auxiliary weights, or compare with filter=sir",
     "implausible": "A measurement is more than 1000 standard deviations from every prediction. "
@@ -79,7 +79,7 @@ def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
         limit = f"{threshold * group.scale:.3g} {group.unit}".rstrip()
         text += f" (diverged: error above {limit}, five times that of raw measurements)"
     k = _largest_k(outputs)
-    hints = [_HINTS[name].format(k=k) for name in count.marked if name in present]
+    hints = [HINTS[name].format(k=k) for name in count.marked if name in present]
     return ". ".join([f"{rmse}; {text}", *hints])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -145,7 +145,13 @@ def check_bounded_weights(method: ParticleFilter, limit: float = 1000.0) -> LawC
         model = linear_walk(1.0, 1.0, sd)
         y = torch.tensor([0.0, 1.0, -3.0, 10.0, -30.0, 100.0, 300.0, -1000.0]).double()
         record = Record(y[:, None])
-        belief = method.init(model, len(runs), draws.at_step(0))
+        if method.initial_proposal is not None:
+            first = method.initial_proposal(
+                model, Record(y[:, None, None]), method.particles, draws
+            )
+            largest = max(largest, float(first[1].amax()))
+        later = replace(method, initial_proposal=None)
+        belief = later.init(model, len(runs), draws.at_step(0))
         log_w = 3.0 * draws.normal("weights", belief.x.shape[1], 1)[..., 0]
         belief = belief._replace(log_w=torch.log_softmax(log_w, -1))
         log_a = method.auxiliary_weights(model, belief, record)
