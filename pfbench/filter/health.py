@@ -39,7 +39,7 @@ from torch import Tensor
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo
 from pfbench.filter.misfit import compute_misfit, compute_misfits, uncounted_observation
-from pfbench.filter.pareto_tail import LIMIT, fit_pareto_k
+from pfbench.filter.pareto_tail import RELIABLE_K, fit_pareto_k
 from pfbench.filter.particle.particle_moments import compute_once
 from pfbench.filter.resolution import is_coarse, is_ill_conditioned, starts_certain
 from pfbench.filter.run_batches import join_runs
@@ -155,14 +155,18 @@ class HealthMonitor:
         if self._fits_tails:
             self._tails.append(fit_pareto_k(join_runs([belief.log_w for belief in beliefs])))
 
-    def check_evidence(self, log_evidence: Tensor) -> None:
+    def check_evidence(self, log_evidence: Tensor) -> Tensor:
         """Mark the runs that a measurement is far from in some step.
 
         Args:
             log_evidence: Log evidence up to each step, [R, T].
+
+        Returns:
+            Steps in which a run is not lost, [R, T].
         """
         gain = torch.diff(log_evidence, prepend=torch.zeros_like(log_evidence[:, :1]))
         self._implausible = ((gain < _IMPLAUSIBLE) & torch.isfinite(gain)).any(1)
+        return torch.isfinite(log_evidence)
 
     @property
     def pareto_k(self) -> Tensor:
@@ -227,7 +231,7 @@ class HealthMonitor:
             collapsed = (is_impossible | diverged) & _in_majority(at_floor, observed > 0)
             collapsed |= ~is_finite.all(0) | _in_majority(coarse, is_finite)
             for name, mask in (
-                ("heavy-tailed", self.pareto_k > LIMIT),
+                ("heavy-tailed", self.pareto_k > RELIABLE_K),
                 ("implausible", self._implausible),
                 ("overconfident", is_impossible),
                 ("diverged", diverged),

@@ -137,10 +137,15 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
             f"{[runs, _STATES]}, got {list(observed.batch_shape)}. Compute it from the states x, and "
             "expand what all particles share."
         )
-    check_measurement_resolution(observed, record.y, name)
-    _check_counts(step_model, observed)
-    _check_likelihood(step_model, first, next_x)
-    _check_support(model, record, observed, next_x)
+    _check_measurements(model, record, observed, next_x)
+
+
+def _check_measurements(model: StateSpaceModel, record: Record, first: Any, x: Tensor) -> None:
+    """Check the measurements against their distribution in the first step, at states after it."""
+    check_measurement_resolution(first, record.y, type(model).__name__)
+    _check_counts(model.at_step(0), first)
+    _check_likelihood(model.at_step(0), record.at_step(0), x)
+    _check_support(model, record, first, x)
 
 
 def _check_counts(model: StateSpaceModel, observed: Any) -> None:

@@ -246,12 +246,10 @@ def run_filter(
         if on_step:
             on_step()
     trace = {name: torch.stack([row[name] for row in traces], 1) for name in traces[0]}
-    log_evidence = torch.stack(evidences, 1)
-    valid = torch.isfinite(log_evidence).unsqueeze(-1)
+    valid = monitor.check_evidence(torch.stack(evidences, 1)).unsqueeze(-1)
     mean, variance = (
         torch.where(valid, torch.stack(rows, 1), torch.nan) for rows in (means, variances)
     )
-    monitor.check_evidence(log_evidence)
     monitor.check_moments(model, prepared, mean, variance, trace.get("ess"))
     health = monitor.classify(~torch.isfinite(evidences[-1]))
     return FilterResult(mean, variance, evidences[-1], trace, health, monitor.pareto_k)

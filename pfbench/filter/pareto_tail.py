@@ -17,7 +17,7 @@ import math
 import torch
 from torch import Tensor
 
-LIMIT = 0.7  # of k-hat [Vehtari et al.]
+RELIABLE_K = 0.7  # largest k-hat of a reliable estimate [Vehtari et al.]
 
 _FEWEST = 5  # weights in a tail
 _PRIOR_K, _PRIOR_COUNT = 0.5, 10.0  # k-hat is shrunk as by ten weights of this shape

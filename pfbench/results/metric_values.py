@@ -218,8 +218,7 @@ def compute_log_probability(data: MetricInput) -> ByComponent:
     """Return the log probability of the counts of each run; empty for other measurements."""
     if not _has_evidence(data.result, of_counts=True):
         return {}
-    arrays = data.result.data
-    return {"": np.where(arrays["lost"], np.nan, arrays["log_evidence"])}
+    return {"": np.where(data.lost, np.nan, data.result.data["log_evidence"])}
 
 
 def _has_evidence(result: store.JobResult, of_counts: bool) -> bool:

@@ -31,7 +31,7 @@ from pfbench.results.state_groups import main_component_group
 DIVERGED_SHARE = 0.1  # of the steps with truth, beyond the threshold
 # in the array `health`, see `pfbench.filter.health.HEALTH`
 COLLAPSED = 2
-MARKS = {5: "heavy-tailed", 6: "implausible", 7: "undefined"}
+HEALTH_MARKS = {5: "heavy-tailed", 6: "implausible", 7: "undefined"}
 
 
 class StatusCounts(NamedTuple):
@@ -44,7 +44,7 @@ class StatusCounts(NamedTuple):
         runs: All runs.
         overconfident: Overconfident runs, severely overconfident ones included.
         collapsed: Collapsed runs that are not lost.
-        marked: Runs by the other marks of the filter, see `MARKS`.
+        marked: Runs by the other marks of the filter, see `HEALTH_MARKS`.
     """
 
     lost: int
@@ -184,5 +184,5 @@ def count_statuses(data: Mapping[str, Array], meta: Mapping[str, Any]) -> Status
         int(lost.size),
         int(narrow.sum()),
         int(((health == COLLAPSED) & ~lost).sum()),
-        {name: int(((health == value) & ~lost).sum()) for value, name in MARKS.items()},
+        {name: int(((health == value) & ~lost).sum()) for value, name in HEALTH_MARKS.items()},
     )

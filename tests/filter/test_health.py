@@ -152,8 +152,10 @@ def test_results_name_a_collapsed_run_as_the_filter_does() -> None:
 
 
 def test_results_name_the_marks_as_the_filter_does() -> None:
-    assert {HEALTH.index(name): name for name in status.MARKS.values()} == status.MARKS
-    assert set(headline.HINTS) == set(status.MARKS.values())
+    assert {
+        HEALTH.index(name): name for name in status.HEALTH_MARKS.values()
+    } == status.HEALTH_MARKS
+    assert set(headline.HINTS) == set(status.HEALTH_MARKS.values())
 
 
 UNBOUNDED = LookAheadWeights(defensive_fraction=0.0)

@@ -140,9 +140,9 @@ class GuidedNoiseProposal(Proposal):
             selection = choose_defensive_particles(
                 self.defensive_fraction, active_mask, draws, "guide.kept"
             )
-            kept, mask = draw_standardised_noise(model, z, draws), selection.mask.unsqueeze(-1)
-            xi = torch.where(mask, kept, xi)
-            z = torch.where(mask, posterior.to_standard(kept), z)
+            mask, prior_xi = selection.mask.unsqueeze(-1), draw_standardised_noise(model, z, draws)
+            xi = torch.where(mask, prior_xi, xi)
+            z = torch.where(mask, posterior.to_standard(prior_xi), z)
         w = scale_noise(model, xi)
         log_q = log_standard_normal(z) - posterior.log_det
         log_ratio = log_noise_density(model, w, xi) - log_q

@@ -28,7 +28,17 @@ def fit_frame(
     belief: ParticleBelief,
     record: Record,
 ) -> NoisePosterior | None:
-    """Return the map from noise of the network to standardised noise, None for the identity."""
+    """Return the map from noise of the network to standardised noise.
+
+    Args:
+        guide: Guided proposal, or None.
+        model: State-space model.
+        belief: Belief before the step.
+        record: Record of the step.
+
+    Returns:
+        The map, None for the identity.
+    """
     return None if guide is None else guide.fit_posterior(model, belief, record)
 
 

@@ -163,9 +163,12 @@ class LearnedProposal(nn.Module):
             selection = choose_defensive_particles(
                 self.defensive_fraction, belief.log_w > -torch.inf, draws, "learned.kept"
             )
-            mask, kept = selection.mask.unsqueeze(-1), draw_standardised_noise(model, z, draws)
-            xi = torch.where(mask, kept, xi)
-            zeta = torch.where(mask, kept if frame is None else frame.to_standard(kept), zeta)
+            mask = selection.mask.unsqueeze(-1)
+            prior_xi = draw_standardised_noise(model, z, draws)
+            xi = torch.where(mask, prior_xi, xi)
+            zeta = torch.where(
+                mask, prior_xi if frame is None else frame.to_standard(prior_xi), zeta
+            )
         w = scale_noise(model, xi)
         log_ratio = log_noise_density(model, w, xi) - distribution.log_prob(zeta)
         if frame is not None:

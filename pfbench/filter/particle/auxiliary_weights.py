@@ -117,8 +117,9 @@ class LookAheadWeights(AuxiliaryWeights):
         if self.defensive_fraction == 0.0:
             return log_a
         c = self.defensive_fraction
-        kept = belief.log_w + math.log(c)
-        return torch.logaddexp(log_a + math.log1p(-c), kept) if c < 1.0 else belief.log_w
+        if c == 1.0:
+            return belief.log_w
+        return torch.logaddexp(log_a + math.log1p(-c), belief.log_w + math.log(c))
 
 
 class Tempering(Protocol):
