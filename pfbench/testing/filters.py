@@ -124,9 +124,9 @@ class _WideStream(PhiloxStream):
 def check_bounded_weights(method: ParticleFilter, limit: float = 1000.0) -> LawCheck:
     """Check that ratios of densities are bounded, where an adversary chooses noise and measurement.
 
-    Normal numbers are five times as far out as drawn, weights differ by several powers of ten, and
-    measurements are up to a thousand standard deviations away and up to 50 times as sharp as
-    the noise. Ratios without a bound are then above e^20.
+    Normal numbers are five times as far out as drawn. Weights differ by several powers of ten.
+    Measurements are up to a thousand standard deviations away, and 50 times as sharp as the noise or
+    as wide as it. Ratios without a bound are then above e^20.
 
     Args:
         method: Particle filter.

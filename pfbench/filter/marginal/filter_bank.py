@@ -33,9 +33,10 @@ class FilterBank(HypothesisFilter):
 
     The initial normal distribution is split in a group of states into a mixture with the same mean
     and covariance. The components are equally spaced along each axis of the Cholesky factor. Of n
-    components the outermost ones are at sqrt(n) standard deviations, or nearer if n is below 6, so
-    that a denser bank has narrower components and is closer to the normal distribution. Each is the start of a filter under the first hypothesis on the noise. The estimate is the mean
-    of the mixture.
+    components the outermost ones are at sqrt(n) standard deviations, or nearer if n is below 6. A
+    denser bank thus has narrower components, and is closer to the normal distribution. Each is the
+    start of a filter under the first hypothesis on the noise. The estimate is the mean of the
+    mixture.
 
     Attributes:
         branches: Largest number K of filters. Each of k axes has the largest whole number of components
