@@ -125,11 +125,10 @@ def share(log_v: Tensor) -> Tensor:
 def nats(model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
     """Information of the measurement about the noise of the step, [R], by linearisation at the mean of the particles."""
     mean = model.chart.mean(belief.x, normalise_log_weights(belief.log_w)).unsqueeze(1)
-    z = torch.zeros(*mean.shape[:2], model.noise_dim).to(mean)
     guide = GuidedNoiseProposal(GaussianFilter(TaylorLinearisation()))
-    information: Tensor = -guide.map_to_posterior(
-        model, belief._replace(x=mean, log_w=mean.new_zeros(mean.shape[:2])), record, z
-    )[1]
+    information: Tensor = -guide.fit_posterior(
+        model, belief._replace(x=mean, log_w=mean.new_zeros(mean.shape[:2])), record
+    ).log_det
     return information[:, 0]
 
 

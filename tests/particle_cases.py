@@ -11,7 +11,7 @@ import oracles
 import torch
 from pyro.distributions import Laplace, Normal
 from torch import Tensor
-from torch.distributions import Distribution, Independent
+from torch.distributions import Distribution, Independent, Uniform
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.belief import ParticleBelief
@@ -32,12 +32,14 @@ def by_grid(
     return FilterMoments(mean[-1:], variance[-1:] + mean[-1:] ** 2, log_z)
 
 
-def growth_case() -> tuple[StateSpaceModel, Tensor, FilterMoments]:
+def growth_case(
+    measurement_sd: float = 4.0, steps: int = 6
+) -> tuple[StateSpaceModel, Tensor, FilterMoments]:
     """Measurements of a path that the model might take, in noise that leaves both signs of the state possible."""
     rng, x, rows = np.random.default_rng(3), 0.5, []
-    for t in range(1, 7):
+    for t in range(1, steps + 1):
         x = x / 2 + 25 * x / (1 + x**2) + 8 * np.cos(1.2 * t) + math.sqrt(10) * rng.normal()
-        rows.append([x**2 / 20 + 4.0 * rng.normal()])
+        rows.append([x**2 / 20 + measurement_sd * rng.normal()])
     y, grid = torch.tensor(rows), np.linspace(-45, 45, 1501)
 
     def transition(t: int) -> np.ndarray:
@@ -45,11 +47,12 @@ def growth_case() -> tuple[StateSpaceModel, Tensor, FilterMoments]:
         return oracles.normal_density(grid[:, None], centre[None], math.sqrt(10.0))
 
     def log_likelihood(t: int) -> np.ndarray:
-        return -0.5 * ((y[t].item() - grid**2 / 20) / 4.0) ** 2 - 0.5 * math.log(2 * math.pi * 16.0)
+        z = (y[t].item() - grid**2 / 20) / measurement_sd
+        return -0.5 * z**2 - 0.5 * math.log(2 * math.pi * measurement_sd**2)
 
     prior = oracles.normal_density(grid, 0.0, math.sqrt(2.0))
     return (
-        UnivariateGrowth(measurement_sd=4.0),
+        UnivariateGrowth(measurement_sd=measurement_sd),
         y,
         by_grid(grid, prior, y, transition, log_likelihood),
     )
@@ -122,6 +125,57 @@ class Spiky(LinearGaussian):
     @property
     def noise(self) -> Distribution:
         return Independent(Laplace(self.m0.new_tensor([0.4]), self.m0.new_tensor([1.5])), 1)
+
+
+class BoundedErrors(LinearGaussian):
+    """Its measurement errors are uniform, and the noise is normal."""
+
+    linear = False
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        width = 0.5 * self.r
+        return Independent(Uniform(x - width, x + width, validate_args=False), 1)
+
+
+class BoundedNoise(LinearGaussian):
+    """Its noise is uniform, of variance 1, and the measurement errors are normal."""
+
+    linear = False
+
+    @property
+    def noise(self) -> Distribution:
+        end = self.m0.new_tensor([math.sqrt(3.0)])
+        return Independent(Uniform(-end, end, validate_args=False), 1)
+
+    def transition(self, x: Tensor, u: Any) -> None:
+        return None
+
+
+def bounded_case(kind: type[LinearGaussian]) -> tuple[StateSpaceModel, Tensor, FilterMoments]:
+    """One state with x' = 0.9 x + w, against a grid."""
+    model = kind([[0.9]], [[1.0]], [[1.0]], [1.6 if kind is BoundedErrors else 0.4], [0.0], [1.0])
+    y, grid = torch.tensor([[1.5], [-1.2], [0.4]]).double(), np.linspace(-12, 12, 4801)
+    step = grid[:, None] - 0.9 * grid[None]
+    if kind is BoundedErrors:
+        moved = oracles.normal_density(step, 0.0, 1.0)
+    else:
+        moved = (abs(step) < math.sqrt(3.0)) / (2 * math.sqrt(3.0))
+
+    def log_likelihood(t: int) -> np.ndarray:
+        error = y[t].item() - grid
+        if kind is BoundedErrors:
+            return np.where(abs(error) < 0.8, -math.log(1.6), -np.inf)
+        return np.log(oracles.normal_density(error, 0.0, 0.4))
+
+    prior = oracles.normal_density(grid, 0.0, 1.0)
+    return model, y, by_grid(grid, prior, y, lambda t: moved, log_likelihood)
+
+
+HARD: dict[str, Callable[[], tuple[StateSpaceModel, Tensor, FilterMoments]]] = {
+    "bounded errors": lambda: bounded_case(BoundedErrors),
+    "bounded noise": lambda: bounded_case(BoundedNoise),
+    "two modes": lambda: growth_case(1.0, 3),
+}
 
 
 def belief(model: StateSpaceModel, n: int = 40, runs: int = 3) -> ParticleBelief:

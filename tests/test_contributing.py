@@ -7,6 +7,7 @@ import shlex
 import sys
 import tomllib
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from checkout import ROOT
 from command_line import pfbench
 
 import pfbench as package
+from pfbench.core.lazy_import import lazy_attributes
 from pfbench.report.plots.paper import paper_catalogue
 from pfbench.results import metrics, store
 
@@ -127,6 +129,22 @@ def small_study(home: Path) -> None:
     words = "run -m scenario=local_level scenario.steps=5 runs=3 particles=50 filter=sir,ekf study=small"
     printed = pfbench(*words.split(), home=home)
     assert printed.code == 0, printed.err
+
+
+@pytest.mark.parametrize("title", [title for title, body in RECIPES.items() if "_target_" in body])
+def test_the_named_door_makes_the_class_of_a_recipe_public(
+    title: str, folder: Path, tmp_path: Path
+) -> None:
+    """One line in the stub that the last sentence names, and the short `_target_` finds the class."""
+    body = RECIPES[title]
+    (door,) = re.findall(r"`(pfbench/\w+/__init__\.\w+)`", body.partition("To contribute it")[2])
+    home, name = re.findall(r"_target_: (mylab\.\w+)\.(\w+)", body)[0]
+    stub = (ROOT / door).read_text() + f"from {home} import {name} as {name}\n"
+    (tmp_path / Path(door).name).write_text(stub)
+    package_name = str(Path(door).parent).replace("/", ".")
+    get, _, names = lazy_attributes(package_name, str(tmp_path / "__init__.py"))
+    assert get(name).__module__ == home
+    assert names == sorted({*import_module(package_name).__all__, name})
 
 
 def test_every_kind_of_part_has_a_recipe() -> None:

@@ -1,4 +1,12 @@
-"""Public names of `pfbench.filter` and the modules that define them."""
+"""Public names of `pfbench.filter` and the modules that define them.
+
+A file of conf/filter whose name ends in `_printed` keeps what a paper states, with its errors. What the
+papers leave open is completed, see the table in docs/methods/README.md: the resampling scheme of
+`sir_printed` and `rpf_printed`, the acceptance ratio of `mcmc_rpf_printed`, the cells of
+`qmc_polymerised_printed`, the adaptive factor of `fm_mssrckf_printed`, the noise matrices of
+`cofm_mssrckf_printed`, proposal and entropy of `cofm_amssrcpf_printed`, the numbers of
+`dmc_reconstructed_printed`, and fitness and coefficients of `cpso_escape_printed`.
+"""
 
 from pfbench.filter.belief import (
     Filter as Filter,

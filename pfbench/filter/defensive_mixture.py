@@ -40,6 +40,17 @@ class DefensiveSelection(NamedTuple):
             log_p + torch.log(self.fraction), log_q + torch.log1p(-self.fraction)
         )
 
+    def bound_log_ratio(self, log_ratio: Tensor) -> Tensor:
+        """Compute log p minus the log density of the mixture, which is at most -log fraction.
+
+        Args:
+            log_ratio: log p - log q, [R, N].
+
+        Returns:
+            Log ratio, [R, N].
+        """
+        return -torch.logaddexp(torch.log(self.fraction), torch.log1p(-self.fraction) - log_ratio)
+
 
 def choose_defensive_particles(
     fraction: float, active_mask: Tensor, draws: RandomStream, purpose: str
@@ -60,20 +71,24 @@ def choose_defensive_particles(
     count = active_mask.sum(1, keepdim=True).clamp(min=1).to(draws.dtype)
     u = draws.uniform(purpose, active_mask.shape[1], 1).squeeze(-1)
     rank = torch.where(active_mask, u, torch.inf).argsort(1).argsort(1)
-    target = torch.round(fraction * count)
+    # one particle at least, since the weights of a few would have no bound otherwise
+    target = torch.round(fraction * count).clamp(min=1.0 if fraction > 0.0 else 0.0)
     return DefensiveSelection((rank < target) | ~active_mask, target / count)
 
 
-def check_fraction(name: str, value: float) -> None:
+def check_fraction(name: str, value: float, below_one: bool = False) -> None:
     """Check that a value is a fraction.
 
     Args:
         name: Configuration key.
         value: Its value.
+        below_one: Whether 1 is refused.
 
     Raises:
-        ValueError: If it is outside [0, 1].
+        ValueError: If it is outside [0, 1], or [0, 1).
     """
+    if below_one and value == 1.0:
+        raise ValueError(f"{name} must be below 1, got {value}. Use BootstrapProposal for 1.")
     if not 0.0 <= value <= 1.0:
         raise ValueError(f"{name} must be from 0 to 1, got {value}. Choose a fraction.")
 

@@ -1,4 +1,7 @@
-"""Asymptotic exactness of a filter, which each of its parts states."""
+"""What a filter states of its weights: asymptotically exact, bounded, and evidence that is a density.
+
+Each part of a filter states it, and the filter states what all of its parts do.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import warnings
 from dataclasses import fields, is_dataclass
 
 _BEHAVIOUR = ("__call__", "__getattr__", "__getattribute__")  # other dunder names are data
+_STATEMENTS = ("is_exact", "has_bounded_weights", "has_evidence", "has_covariance")
 _OF_THE_TYPE_SYSTEM = ("_abc_impl", "_is_protocol", "_is_runtime_protocol")
 
 
@@ -41,11 +45,11 @@ def _is_stated_exact(key: str, stage: object) -> bool:
     return False
 
 
-def _overrides_silently(stage: object) -> bool:
-    """Return whether a class overrides behaviour of the class whose `is_exact` it inherits."""
+def _overrides_silently(stage: object, flag: str = "is_exact") -> bool:
+    """Return whether a class overrides behaviour of the class whose statement it inherits."""
     classes = type(stage).__mro__
-    home = next((i for i, cls in enumerate(classes) if "is_exact" in vars(cls)), 0)
-    if "is_exact" in getattr(stage, "__dict__", {}):
+    home = next((i for i, cls in enumerate(classes) if flag in vars(cls)), 0)
+    if flag in getattr(stage, "__dict__", {}):
         return False
     defaults = {field.name for field in fields(stage)} if is_dataclass(stage) else set()
     inherited = {name for cls in classes[home:-1] for name in vars(cls)} - defaults
@@ -58,7 +62,7 @@ def _is_behaviour(name: str) -> bool:
     """Return whether a name of a class can change what it computes."""
     if name.startswith("__"):
         return name in _BEHAVIOUR
-    return name not in _OF_THE_TYPE_SYSTEM
+    return name not in (*_STATEMENTS, *_OF_THE_TYPE_SYSTEM)
 
 
 def _warn_silence(key: str, stage: object) -> None:
@@ -70,6 +74,25 @@ def _warn_silence(key: str, stage: object) -> None:
         "`is_exact = False`) and test it with pfbench.testing.",
         stacklevel=5,
     )
+
+
+def has_bounded_weights(method: object) -> bool | None:
+    """Return whether no particle can have a larger weight than a constant times its likelihood.
+
+    Weights without a bound may have an infinite variance. Estimates then converge, but too slowly
+    for any number of particles at hand, and a run does not see what it misses. A stage that is
+    silent counts as unbounded, and so does one that overrides behaviour of the class that states it.
+
+    Args:
+        method: Filter or stage. It may define `has_bounded_weights: bool`.
+
+    Returns:
+        None for a filter that weighs no particles.
+    """
+    value = getattr(method, "has_bounded_weights", None)
+    if value is None:
+        return False if hasattr(method, "proposal") else None
+    return bool(value) and not _overrides_silently(method, "has_bounded_weights")
 
 
 def has_evidence(method: object) -> bool:

@@ -13,6 +13,14 @@ The definitions need no truth:
   deviation, in more than half of the checked steps or in the last four.
 - **overconfident**: the normalised innovation squared (NIS) exceeds the 0.999 quantile of its
   distribution in more than half of the checked steps.
+- **heavy-tailed**: no stage bounds the weights (`has_bounded_weights`), and their Pareto k-hat
+  exceeds 0.7 in two of the checked steps. k-hat of a run is the second largest of these steps. A
+  filter that states a bound is not judged: its weights are few where measurements are sharp, which
+  the effective sample size shows. Weights that no particle has reached are not seen.
+- **implausible**: in some step even the best prediction is a thousand standard deviations from the
+  measurement: the log evidence of the step is below -5e5.
+- **undefined**: the log likelihood of the model is NaN for a valid state. It counts as 0 probability, and
+  the estimate belongs to another model. Sixteen particles of each checked step are tried.
 
 A filter without a covariance is judged by its estimates: lost, diverged, or collapsed if they are
 not finite. Measurement outliers rarely reach these limits: with 10 % of outliers in 0.02 % of runs. They are ours. Where a
@@ -21,25 +29,34 @@ truth exists, `pfbench.results.status` decides by the error instead.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from scipy.special import chdtri
 from torch import Tensor
 
 from pfbench.core.record import Record
-from pfbench.filter.belief import StepInfo
+from pfbench.filter.belief import ParticleBelief, StepInfo
 from pfbench.filter.misfit import compute_misfit, compute_misfits, uncounted_observation
+from pfbench.filter.pareto_tail import RELIABLE_K, fit_pareto_k
 from pfbench.filter.particle.particle_moments import compute_once
 from pfbench.filter.resolution import is_coarse, is_ill_conditioned, starts_certain
+from pfbench.filter.run_batches import join_runs
 from pfbench.model.base import StateSpaceModel
 
-HEALTH = ("ok", "lost", "collapsed", "diverged", "overconfident")
+HEALTH = (
+    *("ok", "lost", "collapsed", "diverged", "overconfident"),
+    *("heavy-tailed", "implausible", "undefined"),
+)
 
 _CHECKS = 10  # steps: the ones that `job` scores by default, so that nothing is computed twice
 _MISFIT = 5.0  # standard deviations of the raw measurement, as in the divergence threshold
 _LAST = 4  # checked steps that decide at the end
 _MIN_ESS = 1.5
+_IMPLAUSIBLE = -0.5 * 1000.0**2  # log evidence of a step: at a thousand standard deviations
+_TAILS = 2  # checked steps with a heavy tail that mark a run
+_TRIED = 16  # particles of a checked step whose likelihood is tried
 _ROUNDING = 64.0  # of a weighted mean of equal particles, in units of the last place
 
 
@@ -68,12 +85,13 @@ class HealthMonitor:
 
     Args:
         record: Prepared record, which decides the checked steps.
+        fits_tails: Whether the weights of particles have no bound, so that their tails are fitted.
 
     Attributes:
         steps: Checked steps, at most ten of those with a measurement.
     """
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: Record, fits_tails: bool = False) -> None:
         observed = (~torch.isnan(record.y)).any(2).any(0).nonzero().flatten().tolist()
         count = len(observed)
         self.steps = frozenset(
@@ -90,9 +108,19 @@ class HealthMonitor:
         self._has_particles, self._has_covariance = False, True
         self._checks: HealthCheck | None = None
         self._collapsed = torch.zeros(len(record.y), dtype=torch.bool, device=record.y.device)
+        self._undefined = torch.zeros_like(self._collapsed)
+        self._implausible = torch.zeros_like(self._collapsed)
+        self._fits_tails, self._tails = fits_tails, list[Tensor]()
         self._first = observed[0] if observed else -1
 
-    def check(self, t: int, model: StateSpaceModel, record: Record, info: StepInfo) -> None:
+    def check(
+        self,
+        t: int,
+        model: StateSpaceModel,
+        record: Record,
+        info: StepInfo,
+        beliefs: Sequence[Any] = (),
+    ) -> None:
         """Check a step, if it is one of `steps`.
 
         Args:
@@ -100,8 +128,11 @@ class HealthMonitor:
             model: State-space model; `at_step` gives the model of the step.
             record: Prepared record of all steps.
             info: Estimate of the step.
+            beliefs: Beliefs after the step of all batches of runs.
         """
         if t in self.steps:
+            if beliefs and isinstance(beliefs[0], ParticleBelief):
+                self._check_particles(model.at_step(t), record.at_step(t), beliefs)
             self._has_particles, self._has_covariance = info.cloud is not None, info.has_covariance
             with uncounted_observation(model):
                 nis = info.nis()[0] if info.nis is not None else None
@@ -110,6 +141,43 @@ class HealthMonitor:
         is_judged = info.cloud is None and info.has_covariance and info.mean.dtype != torch.float64
         if is_judged and (t in self.steps or t == self._first):
             self._collapsed |= is_ill_conditioned(info.covariance())
+
+    def _check_particles(
+        self, model: StateSpaceModel, record: Record, beliefs: Sequence[ParticleBelief]
+    ) -> None:
+        """Try the likelihood of some particles, and fit the tail of their weights."""
+        spacing = max(1, beliefs[0].x.shape[1] // _TRIED)
+        x = join_runs([belief.x[:, ::spacing] for belief in beliefs])
+        with uncounted_observation(model):
+            log_likelihood = model.log_likelihood(record.y, x, record.u)
+        is_undefined = torch.isnan(log_likelihood) & torch.isfinite(x).all(-1)
+        self._undefined |= is_undefined.any(1)
+        if self._fits_tails:
+            self._tails.append(fit_pareto_k(join_runs([belief.log_w for belief in beliefs])))
+
+    def check_evidence(self, log_evidence: Tensor) -> Tensor:
+        """Mark the runs that a measurement is far from in some step.
+
+        Args:
+            log_evidence: Log evidence up to each step, [R, T].
+
+        Returns:
+            Steps in which a run is not lost, [R, T].
+        """
+        gain = torch.diff(log_evidence, prepend=torch.zeros_like(log_evidence[:, :1]))
+        self._implausible = ((gain < _IMPLAUSIBLE) & torch.isfinite(gain)).any(1)
+        return torch.isfinite(log_evidence)
+
+    @property
+    def pareto_k(self) -> Tensor:
+        """k-hat of each run, float64 [R]; NaN where no tail was fitted."""
+        if not self._tails:
+            return torch.full(self._collapsed.shape, torch.nan, dtype=torch.float64).to(
+                self._collapsed.device
+            )
+        k = torch.stack(self._tails).nan_to_num(nan=-torch.inf, posinf=torch.inf)
+        k = k.topk(min(_TAILS, len(k)), 0).values[-1]
+        return torch.where(k > -torch.inf, k, torch.nan)
 
     def check_moments(
         self,
@@ -163,12 +231,15 @@ class HealthMonitor:
             collapsed = (is_impossible | diverged) & _in_majority(at_floor, observed > 0)
             collapsed |= ~is_finite.all(0) | _in_majority(coarse, is_finite)
             for name, mask in (
+                ("heavy-tailed", self.pareto_k > RELIABLE_K),
+                ("implausible", self._implausible),
                 ("overconfident", is_impossible),
                 ("diverged", diverged),
                 ("collapsed", collapsed),
             ):
                 health[mask] = HEALTH.index(name)
         health[self._collapsed] = HEALTH.index("collapsed")
+        health[self._undefined] = HEALTH.index("undefined")
         health[lost] = HEALTH.index("lost")
         return health
 

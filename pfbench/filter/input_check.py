@@ -137,8 +137,42 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
             f"{[runs, _STATES]}, got {list(observed.batch_shape)}. Compute it from the states x, and "
             "expand what all particles share."
         )
-    check_measurement_resolution(observed, record.y, name)
-    _check_support(model, record, observed, next_x)
+    _check_measurements(model, record, observed, next_x)
+
+
+def _check_measurements(model: StateSpaceModel, record: Record, first: Any, x: Tensor) -> None:
+    """Check the measurements against their distribution in the first step, at states after it."""
+    check_measurement_resolution(first, record.y, type(model).__name__)
+    _check_counts(model.at_step(0), first)
+    _check_likelihood(model.at_step(0), record.at_step(0), x)
+    _check_support(model, record, first, x)
+
+
+def _check_counts(model: StateSpaceModel, observed: Any) -> None:
+    """Check that a model states whether its measurements are discrete."""
+    base = observed.base_dist if isinstance(observed, Independent) else observed
+    support = getattr(base, "support", None)
+    if getattr(support, "is_discrete", False) and not model.has_counts:
+        name = type(model).__name__
+        raise ValueError(
+            f"{name}.has_counts must be True for discrete measurements, got False with a support of "
+            f"{support}. Set `has_counts = True` in the class: its evidence is a probability, "
+            "which is not compared with densities."
+        )
+
+
+def _check_likelihood(model: StateSpaceModel, record: Record, x: Tensor) -> None:
+    """Check that some of the tried states have a log likelihood."""
+    with torch.no_grad():
+        log_likelihood = model.log_likelihood(record.y, x, record.u)
+    is_undefined = torch.isnan(log_likelihood) | torch.isposinf(log_likelihood)
+    if bool(is_undefined.all()):
+        raise ValueError(
+            f"{type(model).__name__}.log_likelihood must be a number or -inf, got NaN or infinity for "
+            "all states that were tried at the first step. Check mean and spread of the measurement "
+            "for NaN, and its noise: a component without noise, or two that are copies of each "
+            "other, have no density."
+        )
 
 
 def _check_support(model: StateSpaceModel, record: Record, first: Any, x: Tensor) -> None:
@@ -205,7 +239,17 @@ def _observe(model: StateSpaceModel, x: Tensor, u: Any) -> Any:
     inner = model
     while isinstance(inner, ModelWrapper) and type(inner).observation is ModelWrapper.observation:
         inner = inner.model  # a wrapper with an observation of its own has inputs of its own
-    return type(inner).observation(inner, x, u)
+    try:
+        return type(inner).observation(inner, x, u)
+    except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
+        if isinstance(error, ValueError) and "Expected parameter" not in str(error):
+            raise
+        raise ValueError(
+            f"{type(inner).__name__}.observation must return a distribution whose spread is positive "
+            "and whose covariance is positive definite, got parameters that torch refuses. Check "
+            "mean and spread for NaN, and the noise: a component without noise, or two that are "
+            "copies of each other, have no density."
+        ) from error
 
 
 def _named_inputs(u: Any, name: str = "") -> list[tuple[str, Tensor]]:

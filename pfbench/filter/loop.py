@@ -14,6 +14,7 @@ from torch import Tensor
 from pfbench.core.random_stream import BatchRandomStream, RandomStream
 from pfbench.core.record import FeedbackRun, Record, iterate_steps
 from pfbench.filter.belief import Filter, StepInfo
+from pfbench.filter.exactness import has_bounded_weights
 from pfbench.filter.feedback import apply_feedback, correctable_groups
 from pfbench.filter.health import HealthMonitor, with_cached_nis
 from pfbench.filter.input_check import check_is_filter, check_model, check_record
@@ -37,7 +38,10 @@ class FilterResult(NamedTuple):
         trace: Diagnostics per run and step, {name: [R, T]}: `ess`, `resampled` and the results of
             `watch`.
         health: Health of each run as an index in `pfbench.filter.health.HEALTH`, int8 [R]: ok, lost,
-            collapsed, diverged or overconfident. It is computed without the truth.
+            collapsed, diverged, overconfident, heavy-tailed, implausible or undefined. It is
+            computed without the truth.
+        pareto_k: Pareto k-hat of the weights, [R], the second largest of ten checked steps. NaN if
+            the filter states that its weights are bounded, or weighs no particles.
     """
 
     mean: Tensor
@@ -45,6 +49,7 @@ class FilterResult(NamedTuple):
     log_evidence: Tensor
     trace: dict[str, Tensor]
     health: Tensor
+    pareto_k: Tensor
 
     @property
     def lost(self) -> Tensor:
@@ -230,7 +235,7 @@ def run_filter(
     prepared = prepare_record(model, record)
     check_model(model, prepared)
     batches = split_runs(prepared, draws, None if feedback is not None else run_batch)
-    monitor = HealthMonitor(prepared)
+    monitor = HealthMonitor(prepared, fits_tails=has_bounded_weights(method) is False)
     passes = [FilterPass(method, model, *batch, feedback) for batch in batches]
     means, variances, evidences, traces = [], [], [], []
     for t, infos in enumerate(zip(*[run.iterate_infos() for run in passes], strict=True)):
@@ -239,14 +244,14 @@ def run_filter(
         variances.append(info.variance)
         evidences.append(join_runs([run.belief.log_evidence for run in passes]))
         traces.append(info.trace | (watch(t, info) if watch else {}))
-        monitor.check(t, model, prepared, info)
+        monitor.check(t, model, prepared, info, [run.belief for run in passes])
         if on_step:
             on_step()
     trace = {name: torch.stack([row[name] for row in traces], 1) for name in traces[0]}
-    valid = torch.isfinite(torch.stack(evidences, 1)).unsqueeze(-1)
+    valid = monitor.check_evidence(torch.stack(evidences, 1)).unsqueeze(-1)
     mean, variance = (
         torch.where(valid, torch.stack(rows, 1), torch.nan) for rows in (means, variances)
     )
     monitor.check_moments(model, prepared, mean, variance, trace.get("ess"))
     health = monitor.classify(~torch.isfinite(evidences[-1]))
-    return FilterResult(mean, variance, evidences[-1], trace, health)
+    return FilterResult(mean, variance, evidences[-1], trace, health, monitor.pareto_k)

@@ -79,6 +79,7 @@ class TimedFilterPass(NamedTuple):
             "log_evidence": estimate.log_evidence.double(),
             "lost": estimate.lost,
             "health": estimate.health,
+            "pareto_k": estimate.pareto_k.float(),
             **{name: a if a.dtype == torch.bool else a.float() for name, a in trace.items()},
         }
         scores = self.recorder.arrays()

@@ -15,7 +15,7 @@ import torch
 
 import pfbench
 from pfbench.config.source_digest import hash_package
-from pfbench.filter.exactness import has_covariance, has_evidence
+from pfbench.filter.exactness import has_bounded_weights, has_covariance, has_evidence
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.job.inputs import describe_unnamed_files
 from pfbench.job.plan import JobPlan
@@ -55,7 +55,9 @@ def make_metadata(
         "device": device if device == "cpu" else torch.cuda.get_device_name(device),
         "threads": values["threads"],
         "is_exact": method.is_exact or is_exact_kalman,
+        "has_bounded_weights": has_bounded_weights(method),
         "has_evidence": has_evidence(method),
+        "has_counts": model.has_counts,
         "has_covariance": has_covariance(method),
         "oracle_noise": values["oracle_noise"],
         "modelling_choices": [*model.choices, *notes, *unnamed],

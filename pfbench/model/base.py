@@ -59,6 +59,8 @@ class StateSpaceModel(nn.Module, ABC):
         linear_given: Components of a difference in which, together with the noise, map and
             measurement are linear given all others, with normal distributions. A Kalman filter of
             each particle can estimate them. A linear model need not set it.
+        has_counts: Whether a component of the measurement is discrete, such as a Poisson count. The
+            evidence is then a probability, which is not compared with a density.
         choices: Modelling choices that a report must list.
         channel_names: Quantity, frame and unit of each component of y, as `position North [m]`. Empty if the
             model does not state them: a scenario is then compared by its number of components only.
@@ -72,6 +74,7 @@ class StateSpaceModel(nn.Module, ABC):
     observes_initial: bool = False
     linear: bool = False
     linear_given: tuple[int, ...] = ()
+    has_counts: bool = False
     choices: tuple[str, ...] = ()
     channel_names: tuple[str, ...] = ()
     input_type: type | None = None
@@ -286,6 +289,7 @@ class ModelWrapper(StateSpaceModel):
         self.model = model
         self.names, self.units = model.names, model.units
         self.groups, self.noise_dim = model.groups, model.noise_dim
+        self.has_counts = model.has_counts
 
     @property
     @override

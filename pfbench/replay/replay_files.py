@@ -86,6 +86,7 @@ def describe_status(result: store.JobResult) -> str:
         "collapsed": count.collapsed,
         "severely overconfident": count.severely_overconfident,
         "overconfident": count.overconfident and not count.severely_overconfident,
+        **count.marked,
     }
     present = [word for word, number in words.items() if number]
     if count.lost or count.diverged:

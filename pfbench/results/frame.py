@@ -18,7 +18,7 @@ from pfbench.results.study_decisions.independent_runs import select_independent_
 
 log = logging.getLogger("pfbench")
 
-_WHOLE_RUN_ARRAYS = ("log_evidence", "lost", "health", "run")
+_WHOLE_RUN_ARRAYS = ("log_evidence", "lost", "health", "pareto_k", "run")
 _SHARED_ARRAYS = ("time", "pcrb", "range")  # without an axis of runs
 
 

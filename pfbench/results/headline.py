@@ -29,6 +29,16 @@ def main_rmse(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> float:
     return math.sqrt(np.nanmean(square)) if np.isfinite(square).any() else math.inf
 
 
+HINTS = {
+    "heavy-tailed": "Unbounded weights: k-hat {k}, at most 0.7 is reliable. Set a defensive_fraction "
+    "above 0 in the proposal or the auxiliary weights, or compare with filter=sir",
+    "implausible": "A measurement is more than 1000 standard deviations from every prediction. "
+    "Check its unit and the noise of the model, or choose a filter that rejects outliers, such as gate",
+    "undefined": "The log likelihood of the model is NaN for valid states, which count as impossible. "
+    "Return -inf where a state is impossible",
+}
+
+
 def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
     """Describe error and status of the runs, such as "position RMSE 833 m; 100 of 100 runs diverged".
 
@@ -47,6 +57,7 @@ def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
         "diverged": count.diverged,
         "collapsed": count.collapsed,
         "overconfident": count.overconfident,
+        **count.marked,
     }
     present = {name: number for name, number in kinds.items() if number}
     value = main_rmse(outputs, meta)
@@ -67,4 +78,12 @@ def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
     if count.diverged and threshold is not None:
         limit = f"{threshold * group.scale:.3g} {group.unit}".rstrip()
         text += f" (diverged: error above {limit}, five times that of raw measurements)"
-    return f"{rmse}; {text}"
+    k = _largest_k(outputs)
+    hints = [HINTS[name].format(k=k) for name in count.marked if name in present]
+    return ". ".join([f"{rmse}; {text}", *hints])
+
+
+def _largest_k(outputs: Mapping[str, Array]) -> str:
+    """Return the largest Pareto k-hat of the runs, as text."""
+    k = np.asarray(outputs.get("pareto_k", np.nan), dtype=float)
+    return f"{np.nanmax(k):.2g}" if np.isfinite(k).any() else "unknown"

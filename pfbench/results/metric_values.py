@@ -203,15 +203,28 @@ def compute_acceptance(data: MetricInput) -> ByComponent:
 
 
 def run_log_evidence(result: store.JobResult) -> Array:
-    """Return the log evidence [R]; NaN for lost runs, and for a filter without an evidence."""
-    hidden = result.data["lost"] | (not result.meta.get("has_evidence", True))
+    """Return the log evidence [R]; NaN for lost runs, and without a density of the measurements."""
+    hidden = result.data["lost"] | (not _has_evidence(result, of_counts=False))
     return np.where(hidden, np.nan, result.data["log_evidence"])
 
 
 def compute_log_evidence(data: MetricInput) -> ByComponent:
-    """Return the log evidence of each run; empty for a filter without an evidence."""
-    is_density = data.result.meta.get("has_evidence", True)
+    """Return the log evidence of each run; empty without a density of the measurements."""
+    is_density = _has_evidence(data.result, of_counts=False)
     return {"": run_log_evidence(data.result)} if is_density else {}
+
+
+def compute_log_probability(data: MetricInput) -> ByComponent:
+    """Return the log probability of the counts of each run; empty for other measurements."""
+    if not _has_evidence(data.result, of_counts=True):
+        return {}
+    return {"": np.where(data.lost, np.nan, data.result.data["log_evidence"])}
+
+
+def _has_evidence(result: store.JobResult, of_counts: bool) -> bool:
+    """Return whether the filter has an evidence, and the model measurements of this kind."""
+    meta = result.meta
+    return meta.get("has_evidence", True) and bool(meta.get("has_counts")) == of_counts
 
 
 def count_trace(result: store.JobResult, name: str) -> Array:

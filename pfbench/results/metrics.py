@@ -26,6 +26,7 @@ from pfbench.results.metric_values import (
     compute_energy_score,
     compute_interval_coverage,
     compute_log_evidence,
+    compute_log_probability,
     compute_log_score,
     compute_max_error,
     compute_mean_nees,
@@ -212,6 +213,11 @@ METRICS: tuple[Metric, ...] = (
         "log_evidence", compute_log_evidence, "job", "", "higher",
         "Logarithm of the estimated marginal likelihood of a run. A filter whose weights or noise "
         "depend on the measurement does not estimate it.",
+    ),
+    Metric(
+        "log_probability", compute_log_probability, "job", "", "higher",
+        "Logarithm of the estimated probability of the counts of a run. It is not compared with the "
+        "log evidence, which is a density.",
     ),
     Metric("log_score", compute_log_score, "job", "", "higher", "Log evidence per step."),
     Metric(

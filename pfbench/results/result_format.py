@@ -24,13 +24,14 @@ _OPTIONAL = {
     "pcrb": "TD",
     "range": "T",
     "health": "R",
+    "pareto_k": "R",
     "run": "R",
 }
 
 _META = ("key", "study", "choices", "config", "label", "seed", "runs", "state")
 _LONGEST = 2000  # characters of a name; a label lists the settings in which it differs
 _LARGEST = 1 << 63
-_HEALTH = 5  # classes of `pfbench.filter.health`
+_HEALTH = 8  # classes of `pfbench.filter.health`
 
 
 def _is_text(value: Any) -> bool:

@@ -11,6 +11,8 @@
 - **severely overconfident**: it exceeds 100 times the degrees of freedom in some group [ours].
 - **collapsed**: the filter itself reports impossible innovations at a spread or effective sample
   size at the floor, see `pfbench.filter.health`.
+- **heavy-tailed**, **implausible**, **undefined**: the filter reports weights without a bound, a
+  measurement a thousand standard deviations away, or a likelihood of NaN, see there.
 - **overconfident filter**: NEES averaged over runs and time exceeds the upper chi-square limit;
   **underconfident** is below the lower one.
 """
@@ -27,7 +29,9 @@ from pfbench.results.error_measures import Array, Flags, finite_mean
 from pfbench.results.state_groups import main_component_group
 
 DIVERGED_SHARE = 0.1  # of the steps with truth, beyond the threshold
-COLLAPSED = 2  # in the array `health`, see `pfbench.filter.health.HEALTH`
+# in the array `health`, see `pfbench.filter.health.HEALTH`
+COLLAPSED = 2
+HEALTH_MARKS = {5: "heavy-tailed", 6: "implausible", 7: "undefined"}
 
 
 class StatusCounts(NamedTuple):
@@ -40,6 +44,7 @@ class StatusCounts(NamedTuple):
         runs: All runs.
         overconfident: Overconfident runs, severely overconfident ones included.
         collapsed: Collapsed runs that are not lost.
+        marked: Runs by the other marks of the filter, see `HEALTH_MARKS`.
     """
 
     lost: int
@@ -48,6 +53,7 @@ class StatusCounts(NamedTuple):
     runs: int
     overconfident: int = 0
     collapsed: int = 0
+    marked: Mapping[str, int] = {}
 
 
 def is_diverged(error: Array, lost: Flags, threshold: float) -> Flags:
@@ -170,12 +176,13 @@ def count_statuses(data: Mapping[str, Array], meta: Mapping[str, Any]) -> Status
     narrow = is_overconfident(nees, len(groups[name]), lost) | severe
     has_threshold = divergence_threshold(meta) is not None
     diverged = int((~keeps_track(data, meta) & ~lost).sum()) if has_threshold else None
-    collapsed = np.asarray(data.get("health", np.zeros(lost.shape))) == COLLAPSED
+    health = np.asarray(data.get("health", np.zeros(lost.shape)))
     return StatusCounts(
         int(lost.sum()),
         diverged,
         int(severe.sum()),
         int(lost.size),
         int(narrow.sum()),
-        int((collapsed & ~lost).sum()),
+        int(((health == COLLAPSED) & ~lost).sum()),
+        {name: int(((health == value) & ~lost).sum()) for value, name in HEALTH_MARKS.items()},
     )

@@ -6,6 +6,7 @@ from pfbench.testing.averages import (
     filter_record as filter_record,
 )
 from pfbench.testing.filters import (
+    check_bounded_weights as check_bounded_weights,
     check_causality as check_causality,
     check_filter as check_filter,
     check_independence as check_independence,

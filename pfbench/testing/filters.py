@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,15 +13,18 @@ from torch import Tensor
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
+from pfbench.filter.exactness import has_bounded_weights
 from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.base import StateSpaceModel
+from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing.averages import (
     check_convergence,
     check_evidence,
     filter_record,
     has_particles,
 )
-from pfbench.testing.reference import case_or_default
+from pfbench.testing.reference import bounded_case, case_or_default
 from pfbench.testing.results import LawCheck
 from pfbench.testing.subjects import check_count, check_subject, compute_twice
 
@@ -108,11 +113,65 @@ def check_independence(
     return LawCheck(statement, largest, tolerance)
 
 
+@dataclass(frozen=True, eq=False)
+class _WideStream(PhiloxStream):
+    """A stream of normal numbers that are five times as far out: an adversary of a density ratio."""
+
+    def normal(self, purpose: str, n: int, w: int) -> Tensor:
+        return 5.0 * super().normal(purpose, n, w)
+
+
+def check_bounded_weights(method: ParticleFilter, limit: float = 1000.0) -> LawCheck:
+    """Check that ratios of densities are bounded, where an adversary chooses noise and measurement.
+
+    Normal numbers are five times as far out as drawn. Weights differ by several powers of ten.
+    Measurements are up to a thousand standard deviations away, and 50 times as sharp as the noise or
+    as wide as it. Ratios without a bound are then above e^20.
+
+    Args:
+        method: Particle filter.
+        limit: Largest ratio.
+
+    Returns:
+        The largest ratio, of proposals and of weights to resampling probabilities.
+
+    Raises:
+        AssertionError: If a ratio exceeds the limit.
+    """
+    statement, runs = "density ratios are bounded", torch.arange(8)
+    draws = _WideStream(1, runs)
+    largest = -math.inf
+    for sd in (0.02, 1.0):
+        model = linear_walk(1.0, 1.0, sd)
+        y = torch.tensor([0.0, 1.0, -3.0, 10.0, -30.0, 100.0, 300.0, -1000.0]).double()
+        record = Record(y[:, None])
+        if method.initial_proposal is not None:
+            first = method.initial_proposal(
+                model, Record(y[:, None, None]), method.particles, draws
+            )
+            largest = max(largest, float(first[1].amax()))
+        later = replace(method, initial_proposal=None)
+        belief = later.init(model, len(runs), draws.at_step(0))
+        log_w = 3.0 * draws.normal("weights", belief.x.shape[1], 1)[..., 0]
+        belief = belief._replace(log_w=torch.log_softmax(log_w, -1))
+        log_a = method.auxiliary_weights(model, belief, record)
+        sample = method.proposal(model, belief, record, draws.at_step(1))
+        for log_ratio in (belief.log_w - log_a, sample.log_ratio):
+            largest = max(largest, float(log_ratio.amax()))
+    assert largest <= math.log(limit), (
+        f"{statement}: the largest ratio must be at most {limit:g}, got e^{largest:.1f}. Mix the "
+        "proposal or the probabilities with those of the model, or state has_bounded_weights = False"
+    )
+    return LawCheck(statement, math.exp(largest), limit)
+
+
 def check_filter(method: Any, runs: int = 1000) -> dict[str, LawCheck]:
-    """Run all checks that apply to a filter on a linear-Gaussian model.
+    """Run all checks that apply to a filter, on models with a known answer.
 
     Causality and independence apply to every filter. Evidence and convergence apply to particle
-    filters that state that they are asymptotically exact.
+    filters that state that they are asymptotically exact: on a linear-Gaussian model, and with
+    measurement errors of bounded support unless the filter refuses them. Filters that state that
+    their weights are bounded are searched for a large one.
 
     Args:
         method: Filter to test.
@@ -130,7 +189,21 @@ def check_filter(method: Any, runs: int = 1000) -> dict[str, LawCheck]:
     if has_particles(method) and method.is_exact:
         results["evidence"] = check_evidence(method, runs=runs)
         results["convergence"] = check_convergence(method, runs=max(40, runs // 10), faster=True)
+        model, y, exact = bounded_case()
+        if _takes(method, model, y):
+            results["bounded errors"] = check_evidence(method, model, y, exact, runs)
+    if isinstance(method, ParticleFilter) and has_bounded_weights(method):
+        results["bounded weights"] = check_bounded_weights(method)
     return results
+
+
+def _takes(method: Any, model: StateSpaceModel, y: Tensor) -> bool:
+    """Return whether a filter takes a model, instead of a refusal in words."""
+    try:
+        filter_record(method, model, y)
+    except ValueError:
+        return False
+    return True
 
 
 def _estimates(result: FilterResult) -> dict[str, Tensor]:

@@ -7,11 +7,15 @@ The Kalman filter uses the covariance form and picks out the observed components
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy import stats
 from torch import Tensor
+from torch.distributions import Distribution, Independent, Uniform
+from typing_extensions import override
 
 from pfbench.files.table_file import Array
 from pfbench.model.base import StateSpaceModel
@@ -147,6 +151,38 @@ def reference_moments(model: LinearGaussian, y: Tensor) -> FilterMoments:
     return FilterMoments(
         mean, np.diagonal(result.covariance[-1]) + mean**2, float(result.log_evidence.sum())
     )
+
+
+class BoundedErrors(LinearGaussian):
+    """The model x_1 = x_0 + w, y = x_1 + v with v uniform on [-0.5, 0.5], one state.
+
+    A parent whose noise-free prediction is farther than 0.5 from y may have a child that is not.
+    """
+
+    linear = False
+    half_width = 0.5
+
+    def __init__(self) -> None:
+        super().__init__([[1.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0])
+
+    @override
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        low, high = x - self.half_width, x + self.half_width
+        return Independent(Uniform(low, high, validate_args=False), 1)
+
+
+def bounded_case() -> tuple[BoundedErrors, Tensor, FilterMoments]:
+    """Return a model with measurement errors of bounded support, one measurement, and the exact answer."""
+    model, y, sd = BoundedErrors(), 1.5, math.sqrt(2.0)
+    ends = [(y - model.half_width) / sd, (y + model.half_width) / sd]
+    posterior = stats.truncnorm(*ends, scale=sd)
+    mean, mass = posterior.mean(), stats.norm.cdf(ends[1]) - stats.norm.cdf(ends[0])
+    answer = FilterMoments(
+        np.array([mean]),
+        np.array([posterior.var() + mean**2]),
+        float(np.log(mass / (2.0 * model.half_width))),
+    )
+    return model, torch.tensor([[y]], dtype=torch.float64), answer
 
 
 def case_or_default(

@@ -211,7 +211,7 @@ def test_false_estimates_are_told_from_sane_ones() -> None:
 
     def outcome(marked: bool = False, certain: bool = False, **changes: torch.Tensor) -> str:
         result = FilterResult(
-            mean, variance, evidence, {}, torch.zeros(1, dtype=torch.int8)
+            mean, variance, evidence, {}, torch.zeros(1, dtype=torch.int8), torch.zeros(1)
         )._replace(**changes)
         return numerics.class_of(result, 0, marked, bound, case._replace(is_certain=certain))[0]
 

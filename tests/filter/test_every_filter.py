@@ -6,12 +6,14 @@ import math
 import re
 from collections import Counter
 from dataclasses import dataclass, field, is_dataclass, replace
+from functools import cache
 from typing import Any
 
 import pytest
 import torch
 from config_cases import CONF, GROUPS, RECORDED, composed, truncated, world
 from filter_cases import NAMES, ON_ANY_MODEL, SLOTS, TEXTS, method_of, refusal
+from particle_cases import HARD
 from recorded_data import DATA
 from torch import Tensor
 
@@ -20,14 +22,17 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter import loop
 from pfbench.filter.belief import ParticleBelief, StepInfo
+from pfbench.filter.exactness import has_bounded_weights
 from pfbench.filter.input_check import check_model
 from pfbench.filter.loop import prepare_record, run_filter
+from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
 from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.swarm.swarm_proposal import SwarmProposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.testing import (
+    check_bounded_weights,
     check_causality,
     check_evidence,
     check_independence,
@@ -53,6 +58,14 @@ EXACT = (
     *("sir", "sir_printed", "apf", "sqmc", "rbpf"), *("ckf_pf", "ekf_pf", "ukf_pf"), *("mcmc_tail", "mcmc_bridge", "mcmc_rpf_printed"),
     *("dmc_density", "dmc_noise", "dmc_optimal"), "guided_start", "interval_pf",
 )  # fmt: skip
+
+
+REFUSING = {
+    "bounded errors": ("rbpf",),
+    "bounded noise": ("rbpf", "dmc_density", "mcmc_tail", "mcmc_bridge", "mcmc_rpf_printed"),
+    "two modes": ("rbpf",),
+}
+UNBOUNDED = ("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf")
 
 
 # on every world
@@ -243,6 +256,64 @@ def test_filters_that_say_so_are_unbiased_with_any_number_and_what_is_missing(na
     check_evidence(
         method, model, Y, reference_moments(model, Y), runs=400
     ) if name != "rbpf" else check_kalman(method, model)
+
+
+@cache
+def hard_case(case: str) -> Any:
+    return HARD[case]()
+
+
+@pytest.mark.parametrize("case", HARD)
+@pytest.mark.parametrize("name", EXACT)
+def test_filters_that_say_so_are_unbiased_where_support_or_modes_are_hard(
+    name: str, case: str
+) -> None:
+    """Errors or noise of bounded support, and y = x^2 / 20, against a grid; or a refusal in words."""
+    model, y, exact = hard_case(case)
+    method = method_of(name)
+    if name in REFUSING[case]:
+        with pytest.raises(ValueError, match=r" must .*\. [A-Z]"):
+            filter_record(method, model, y)
+        return
+    check_evidence(replace(method, particles=200), model, y, exact, runs=400)
+
+
+@pytest.mark.parametrize("name", PARTICLES)
+def test_weights_are_bounded_where_a_filter_says_so(name: str) -> None:
+    """Exactly where: an adversary finds a ratio of more than e^20 in each of the others."""
+    method = method_of(name)
+    assert has_bounded_weights(method) == (name not in UNBOUNDED)
+    if name in UNBOUNDED:
+        with pytest.raises(AssertionError, match=r"got e\^[1-9][0-9]"):
+            check_bounded_weights(method)
+    elif name != "cpso_escape":  # N^2 kernels: 5 s, for the mixture of `dmc_reconstructed`
+        check_bounded_weights(method)
+
+
+PUBLISHED = {
+    "apf": lambda m: replace(m, auxiliary_weights=LookAheadWeights(defensive_fraction=0.0)),
+    **{
+        name: lambda m: replace(m, proposal=replace(m.proposal, defensive_fraction=0.0))
+        for name in ("ekf_pf", "ukf_pf", "ckf_pf", "dmc_optimal", "dmc_noise")
+    },
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_published_form_without_a_share_of_the_model_states_no_bound(name: str) -> None:
+    method = PUBLISHED[name](method_of(name))
+    assert not has_bounded_weights(method)
+    assert method.is_exact == name.endswith("_pf")  # normal noise of a guide is everywhere
+    with pytest.raises(AssertionError, match=r"ratios are bounded: .* got e\^[1-9][0-9]"):
+        check_bounded_weights(method)
+
+
+def test_the_published_auxiliary_filter_converges_to_a_wrong_answer_with_bounded_errors() -> None:
+    """What the default form is held to above fails for the published one, with any number."""
+    model, y, exact = hard_case("bounded errors")
+    method = replace(PUBLISHED["apf"](method_of("apf")), particles=2000)
+    z = filter_record(method, model, y, runs=50).log_evidence - exact.log_evidence
+    assert float(z.exp().mean()) < 0.95
 
 
 @pytest.mark.parametrize("name", ON_ANY_MODEL)

@@ -1,25 +1,31 @@
-"""Health of runs: ok, lost, collapsed, diverged or overconfident, without the truth."""
+"""Health of runs: ok, or what a filter sees of its own failures, without the truth."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 from torch import Tensor
+from torch.distributions import Distribution, MultivariateNormal
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter import (
     EssResampler,
     GaussianFilter,
+    GuidedNoiseProposal,
+    LookAheadWeights,
     ParticleFilter,
     Systematic,
     TaylorLinearisation,
 )
 from pfbench.filter.health import HEALTH, HealthMonitor, count_health
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.model import LinearGaussian, linear_walk
+from pfbench.filter.loop import FilterPass, FilterResult, prepare_record, run_filter
+from pfbench.filter.pareto_tail import fit_pareto_k
+from pfbench.model import LinearGaussian, UnivariateGrowth, linear_walk
+from pfbench.noise import NominalNoise
 from pfbench.ppl.prior_predictive import simulate
-from pfbench.results import status
+from pfbench.results import headline, status
+from pfbench.scenario import ModelSimulation
 
 RUNS, STEPS = 200, 60
 KALMAN = GaussianFilter(TaylorLinearisation())
@@ -143,3 +149,113 @@ def test_one_run_alone_and_in_batches_has_the_same_health() -> None:
 
 def test_results_name_a_collapsed_run_as_the_filter_does() -> None:
     assert HEALTH[status.COLLAPSED] == "collapsed"
+
+
+def test_results_name_the_marks_as_the_filter_does() -> None:
+    assert {
+        HEALTH.index(name): name for name in status.HEALTH_MARKS.values()
+    } == status.HEALTH_MARKS
+    assert set(headline.HINTS) == set(status.HEALTH_MARKS.values())
+
+
+UNBOUNDED = LookAheadWeights(defensive_fraction=0.0)
+
+
+def growth(method: object, steps: int = 30, runs: int = 20) -> FilterResult:
+    """Filter y = x^2 / 20, where look-ahead and guides miss one of two modes."""
+    model, numbers = UnivariateGrowth(), torch.arange(runs)
+    episode = ModelSimulation(model, steps).draw(NominalNoise(), numbers, seed=3)
+    return run_filter(method, model, episode.record, PhiloxStream(1, numbers))  # type: ignore[arg-type]
+
+
+def test_weights_without_a_bound_are_marked_where_their_tails_are_heavy() -> None:
+    """k-hat is the second largest of the checked steps; a filter with a bound is not judged."""
+    published = growth(ParticleFilter(1000, auxiliary_weights=UNBOUNDED))
+    heavy = published.health == HEALTH.index("heavy-tailed")
+    assert (heavy == (published.pareto_k > 0.7)).all()
+    assert int(heavy.sum()) >= 14
+    for method in (
+        ParticleFilter(1000),
+        ParticleFilter(1000, auxiliary_weights=LookAheadWeights()),
+    ):
+        mixed = growth(method)
+        assert mixed.pareto_k.isnan().all()
+        assert (mixed.health == HEALTH.index("ok")).all()
+    assert growth(GaussianFilter(TaylorLinearisation()), 10, 2).pareto_k.isnan().all()
+
+
+def test_light_tails_are_healthy_without_a_stated_bound() -> None:
+    """On a linear model a guide is optimal: its weights are densities of the measurement."""
+    guide = GuidedNoiseProposal(KALMAN, defensive_fraction=0.0)
+    result = filtered(ParticleFilter(300, proposal=guide), measurements()[:50])
+    assert result.pareto_k.isfinite().all()
+    assert (result.health == HEALTH.index("ok")).double().mean() >= 0.95
+
+
+def test_k_hat_is_the_second_largest_of_the_checked_steps() -> None:
+    """And the same for runs in batches."""
+    method = ParticleFilter(200, auxiliary_weights=UNBOUNDED)
+    model, y = UnivariateGrowth(), torch.full((5, 12, 1), 3.0).double()
+    draws = PhiloxStream(1, torch.arange(5))
+    run = FilterPass(method, model, prepare_record(model, Record(y)), draws)
+    steps = HealthMonitor(Record(y)).steps
+    k = [fit_pareto_k(run.belief.log_w) for step in run if step.t in steps]
+    expected = torch.stack(k).nan_to_num(nan=-torch.inf).sort(0).values[-2]
+    for batch in (None, 2):
+        result = run_filter(method, model, Record(y), draws, run_batch=batch)
+        torch.testing.assert_close(result.pareto_k, expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", [KALMAN, PARTICLES], ids=["ekf", "sir"])
+@pytest.mark.parametrize("all_steps", [False, True])
+def test_measurements_a_million_sd_away_are_named(method: object, all_steps: bool) -> None:
+    """Once, or always: the run is not ok, though all its numbers are finite."""
+    y = measurements()[:6].clone()
+    y[3:, :, 0][:, slice(None) if all_steps else 30] += 1e6
+    result = filtered(method, y)
+    names = [HEALTH[value] for value in result.health.tolist()]
+    assert names[:3] == ["ok"] * 3
+    assert set(names[3:]) <= {"implausible", "collapsed", "diverged"}
+
+
+class Undefined(LinearGaussian):
+    """Its log likelihood is NaN for positive states."""
+
+    where = 0.0
+
+    def log_likelihood(self, y: Tensor, x: Tensor, u: object) -> Tensor:
+        value = super().log_likelihood(y, x, u)
+        return torch.where(x[..., 0] > self.where, torch.nan, value)
+
+
+def test_a_likelihood_of_nan_is_named() -> None:
+    """It counts as impossible, so that the numbers are those of another model."""
+    model = Undefined([[1.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0])
+    y = torch.zeros(8, STEPS, 1, dtype=torch.float64)
+    result = filtered(PARTICLES, y, model)
+    assert {HEALTH[value] for value in result.health.tolist()} == {"undefined"}
+    model.where = torch.inf
+    assert (filtered(PARTICLES, y, model).health == 0).all()
+    model.where = -torch.inf
+    with pytest.raises(ValueError, match=r"Undefined\.log_likelihood must be a number or -inf"):
+        filtered(PARTICLES, y, model)
+
+
+class Singular(LinearGaussian):
+    """Two sensors with the same error."""
+
+    validates: bool | None = None
+
+    def observation(self, x: Tensor, u: object) -> Distribution:
+        r = torch.ones(2, 2, dtype=x.dtype).expand(*x.shape[:2], 2, 2)
+        mean = x @ self.h.mT
+        return MultivariateNormal(mean, covariance_matrix=r, validate_args=self.validates)
+
+
+@pytest.mark.parametrize("validates", [None, False])
+def test_a_singular_noise_is_refused_before_the_first_step(validates: bool | None) -> None:
+    model = Singular([[1.0]], [[1.0]], [[1.0], [1.0]], [1.0, 1.0], [0.0], [1.0])
+    model.validates = validates
+    for method in (KALMAN, PARTICLES):
+        with pytest.raises(ValueError, match=r"Singular\.\w+ must .*copies of each other"):
+            filtered(method, measurements()[:2].expand(-1, -1, 2), model)

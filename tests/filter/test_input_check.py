@@ -314,6 +314,12 @@ def test_a_measurement_outside_the_support_is_refused(
     }
     model, y = law_model(kinds[law]), Y + 1.0
     y[2, 1] = torch.nan
+    if law == "Poisson":
+        with pytest.raises(
+            ValueError, match=r"Law\.has_counts must be True .* Set `has_counts = True`"
+        ):
+            run_filter(ParticleFilter(8), model, Record(y), DRAWS)
+        model.has_counts = True
     run_filter(ParticleFilter(8), model, Record(y), DRAWS)
     y[1, 3] = wrong
     message = rf"support of {law} \(.*Than.*\), got {wrong:g} at step 3 of run 1\. Mark "

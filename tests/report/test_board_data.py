@@ -11,6 +11,7 @@ import synthetic_results as synthetic
 from pfbench.report import provenance
 from pfbench.report.board import build_pack
 from pfbench.report.board.decided_parts import select_baselines
+from pfbench.report.board.method_notes import MethodNotes
 from pfbench.report.board.pack_entries import describe_uncommitted
 from pfbench.report.board.sweeps import read_settings
 from pfbench.report.board.tracks import select_telling_runs
@@ -18,6 +19,7 @@ from pfbench.report.journal.methods_text import write_methods
 from pfbench.report.looks import find_looks
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import Condition, JobFile, load_conditions
+from pfbench.results.store import JobResult
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +97,21 @@ def test_notes_state_exactness_failures_and_choices(results: Path) -> None:
         assert note["lost"] == sum(int(job.load().data["lost"].sum()) for job in jobs)
         assert note["particles"] in ("200", "")
         assert note["is_exact"] == all(bool(job.meta.get("is_exact")) for job in jobs)
+        assert note["has_bounded_weights"] is None  # results that do not state it
     (choice,) = pack["choices"]
     assert choice["text"].startswith("initial heading error")
     assert choice["filters"] == "all filters"
+
+
+def test_weights_are_bounded_if_every_job_states_it(results: Path) -> None:
+    job = load_conditions("demo", results)[0].jobs[0].load()
+    for stated, common in (((True, True), True), ((True, False), False), ((False, None), None)):
+        notes = MethodNotes()
+        for value in stated:
+            meta = {**job.meta, "has_bounded_weights": value}
+            notes.add("sir", JobResult(meta, job.data))
+        (note,) = notes.to_entries({})["filter_notes"]
+        assert note["has_bounded_weights"] is common
 
 
 @pytest.mark.parametrize("alpha", [0.05, 0.2])

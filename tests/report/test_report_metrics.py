@@ -50,6 +50,22 @@ def test_one_entry_adds_a_metric_to_the_frame_the_summary_and_the_definitions(re
     assert "final error: Error at the last step." in metrics.metric_definitions()
 
 
+def test_probabilities_of_counts_are_not_compared_with_densities(results):
+    """A model of counts has another metric: no row of it stands beside a log evidence."""
+    (condition,) = conditions.load_conditions("demo", results)
+    job = next(job.load() for job in condition.jobs if job.label == "sir")
+    names = ("log_evidence", "log_score", "log_probability")
+    for has_counts, present in ((None, names[:2]), (False, names[:2]), (True, names[2:])):
+        result = job._replace(meta={**job.meta, "has_counts": has_counts})
+        data = metrics.data_by_scope(result, "job")[0]
+        found = [m.name for m in metrics.METRICS if m.name in names and m.compute(data)]
+        assert tuple(found) in (present, tuple(reversed(present)))
+        values = next(m for m in metrics.METRICS if m.name == present[0]).compute(data)[""]
+        np.testing.assert_array_equal(
+            values, np.where(job.data["lost"], np.nan, job.data["log_evidence"])
+        )
+
+
 def test_the_table_of_metrics_is_complete():
     names = [metric.name for metric in metrics.METRICS]
     assert len(names) == len(set(names))

@@ -188,6 +188,16 @@ def test_first_lines_name_severely_overconfident_runs(tmp_path):
     assert sentence in lines[:8]
 
 
+def test_a_page_tells_exact_filters_from_bounded_weights(tmp_path):
+    """A dash for what an older result does not state, and for a page stored before there was the flag."""
+    pack = page_packs.build_pack(6)
+    del pack["filter_notes"][4]["has_bounded_weights"]
+    page = write(pack, tmp_path).read_text()
+    rows = re.findall(r"<td>(yes|no)</td><td>(yes|no|–)</td>", page)
+    bounded = ["yes", "no", "–", "yes", "–", "–"]
+    assert rows == list(zip(["yes", "no"] * 3, bounded, strict=True))
+
+
 def test_a_page_says_in_words_why_a_budget_is_missing(tmp_path):
     elements = write(page_packs.build_pack(), tmp_path).read_text()
     assert "Same time: This study has no runs of that budget.</p>" in elements

@@ -46,6 +46,9 @@ def test_a_job_that_diverged_says_so_with_the_limit() -> None:
     [
         ("lost", {"lost": np.arange(RUNS) < 2}),
         ("collapsed", {"health": np.where(np.arange(RUNS) < 2, 2, 0)}),
+        ("heavy-tailed", {"health": np.where(np.arange(RUNS) < 2, 5, 0)}),
+        ("implausible", {"health": np.where(np.arange(RUNS) < 2, 6, 0)}),
+        ("undefined", {"health": np.where(np.arange(RUNS) < 2, 7, 0)}),
         ("overconfident", {"nees": np.where(np.arange(RUNS) < 2, 40.0, 3.0)[:, None, None]}),
     ],
 )
@@ -54,6 +57,23 @@ def test_each_kind_is_counted(kind: str, change: dict[str, np.ndarray]) -> None:
     for name, value in change.items():
         arrays[name] = np.broadcast_to(value, arrays[name].shape).copy()
     assert f"; 2 of 10 runs {kind}" in describe_runs(arrays, meta)
+
+
+@pytest.mark.parametrize(
+    ("value", "remedy"),
+    [
+        (5, "Unbounded weights: k-hat 0.93, at most 0.7 is reliable. Set a defensive_fraction"),
+        (6, "more than 1000 standard deviations from every prediction. Check its unit"),
+        (7, "is NaN for valid states, which count as impossible. Return -inf"),
+    ],
+)
+def test_marks_of_the_filter_say_what_to_do(value: int, remedy: str) -> None:
+    arrays, meta = job_result()
+    arrays["health"][3] = value
+    arrays["pareto_k"] = np.where(np.arange(RUNS) < 5, 0.93, np.nan)
+    assert remedy in describe_runs(arrays, meta)
+    arrays["lost"][3] = True
+    assert remedy not in describe_runs(arrays, meta)
 
 
 def test_several_kinds_are_listed_and_a_job_without_valid_runs_has_no_finite_error() -> None:

@@ -78,7 +78,7 @@ ARRAYS: dict[str, Change] = {
     "sd must not be negative": lambda d: d.update(sd=-d["sd"]),
     "time must increase": lambda d: d.update(time=d["time"][::-1].copy()),
     "lost must be booleans": lambda d: d.update(lost=np.array([0.5, 0.0])),
-    "health must be from 0 to 4": lambda d: d.update(health=np.array([0, 99], np.int8)),
+    "health must be from 0 to 7": lambda d: d.update(health=np.array([0, 99], np.int8)),
 }
 
 

@@ -20,13 +20,21 @@ import pfbench.testing
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.exactness import has_bounded_weights
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
+from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.learned.differentiable_resampling import SoftResampler, StopGradientResampler
 from pfbench.filter.loop import FilterResult
 from pfbench.filter.moves.flow_kernels import NoiseFlowKernel, NoiseFlowStatKernel
 from pfbench.filter.moves.metropolis import KernelCycle, MetropolisHastings
 from pfbench.filter.moves.path_block_kernels import LastStateKernel, PathBlockKernel
 from pfbench.filter.moves.path_proposals import SmoothedSegment
-from pfbench.filter.particle.auxiliary_weights import TemperedPosterior, TemperedWeights
+from pfbench.filter.particle.auxiliary_weights import (
+    LookAheadWeights,
+    TemperedPosterior,
+    TemperedWeights,
+)
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
@@ -49,6 +57,8 @@ from pfbench.testing import (
     check_resampling,
     filter_record,
 )
+
+EKF = GaussianFilter(TaylorLinearisation())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,9 +209,61 @@ def test_a_filter_is_checked_in_one_line() -> None:
         "independence",
         "evidence",
         "convergence",
+        "bounded errors",
+        "bounded weights",
     }
     inexact = ParticleFilter(50, RegularisedResampler(EssResampler(Systematic())))
-    assert set(check_filter(inexact)) == {"causality", "independence"}
+    assert set(check_filter(inexact)) == {"causality", "independence", "bounded weights"}
+    guided = ParticleFilter(50, proposal=GuidedNoiseProposal(EKF, defensive_fraction=0.0))
+    assert "bounded weights" not in check_filter(guided, runs=400)
+
+
+class Excluding(LookAheadWeights):
+    """The published look-ahead, which states more than it holds."""
+
+    is_exact = True
+    has_bounded_weights = True
+
+
+class Unbounded(GuidedNoiseProposal):
+    """A guide without a share of the model that states a bound."""
+
+    has_bounded_weights = True
+
+
+FALSE_STATEMENTS = {
+    "the evidence is unbiased": ParticleFilter(
+        200, auxiliary_weights=Excluding(defensive_fraction=0.0)
+    ),
+    "density ratios are bounded": ParticleFilter(
+        100, proposal=Unbounded(EKF, defensive_fraction=0.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("statement", FALSE_STATEMENTS)
+def test_false_statements_on_support_and_weights_fail(statement: str) -> None:
+    with pytest.raises(AssertionError, match=statement):
+        check_filter(FALSE_STATEMENTS[statement], runs=400)
+
+
+def test_a_silent_part_has_no_bound_and_an_override_is_silent() -> None:
+    """Without a warning: silence is an answer. A filter without particles has no weights."""
+
+    class Own(BootstrapProposal):
+        def __call__(self, *inputs: Any) -> Any:
+            return super().__call__(*inputs)
+
+        is_exact = True
+
+    class Stated(Own):
+        has_bounded_weights = True
+
+    assert has_bounded_weights(ParticleFilter(10))
+    assert has_bounded_weights(ParticleFilter(10, proposal=Own())) is False
+    assert has_bounded_weights(ParticleFilter(10, proposal=Stated()))
+    assert ParticleFilter(10, proposal=Stated()).is_exact
+    assert has_bounded_weights(EKF) is None
 
 
 # planted faults fail

@@ -55,6 +55,7 @@ class GuidedInitialProposal(InitialProposal):
     covariance_factor: float = 1.5
     passes: int = 3
     is_exact = True
+    has_bounded_weights = True
 
     def __post_init__(self) -> None:
         check_covariance_factor(self.covariance_factor)

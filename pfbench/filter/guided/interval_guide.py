@@ -72,6 +72,11 @@ class GuidedIntervalProposal(Proposal):
     is_exact = True
     stores_path = True  # of each particle since the last measurement
 
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return self.prior_fraction > 0.0
+
     def __post_init__(self) -> None:
         check_whole_number("proposal.steps", self.steps, 1, "Use 1000 for the whole interval.")
         check_covariance_factor(self.covariance_factor)

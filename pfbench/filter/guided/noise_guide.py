@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,23 +15,63 @@ from pfbench.core.covariance import distribution_covariance, factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.defensive_mixture import check_fraction, choose_defensive_particles
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import (
     AffineApproximation,
     DifferenceSpace,
     around_first,
 )
-from pfbench.filter.guided.guide_memory import (
-    check_covariance_factor,
-    check_normal_guide,
-    compute_log_ratio,
-    standardise_noise,
-)
+from pfbench.filter.guided.guide_memory import check_covariance_factor, check_normal_guide
 from pfbench.filter.linearisation import mask_covariance, mean_noise, unwrap_independent
 from pfbench.filter.particle.point_sets import IidPoints, PointSet
-from pfbench.filter.particle.proposals import Proposal, ProposalSample
-from pfbench.filter.whitening import LOG_2PI, compute_half_square, log_determinant
+from pfbench.filter.particle.proposals import (
+    Proposal,
+    ProposalSample,
+    draw_standardised_noise,
+    log_noise_density,
+    log_standard_normal,
+    scale_noise,
+)
+from pfbench.filter.whitening import log_determinant
 from pfbench.model.base import StateSpaceModel
+
+
+class NoisePosterior(NamedTuple):
+    """Normal distribution of the standardised noise, xi = U (shift + scale z) with z ~ N(0, I).
+
+    Attributes:
+        lower: Transposed inverse of U, lower triangular, [R, 1 or N, W, W].
+        root: U, [R, 1 or N, W, W].
+        shift: [R, 1, W, N] if all particles of a run share U, else [R, N, W, 1].
+        scale: Root of the covariance factor.
+        log_det: log |det scale U|, [R, 1 or N].
+    """
+
+    lower: Tensor
+    root: Tensor
+    shift: Tensor
+    scale: float
+    log_det: Tensor
+
+    def from_standard(self, z: Tensor) -> Tensor:
+        """Map standard normal numbers [R, N, W] to standardised noise [R, N, W]."""
+        return self._as_rows(self.root @ (self.shift + self.scale * self._as_columns(z)))
+
+    def to_standard(self, xi: Tensor) -> Tensor:
+        """Map standardised noise [R, N, W] to standard normal numbers [R, N, W]."""
+        return self._as_rows((self.lower.mT @ self._as_columns(xi) - self.shift) / self.scale)
+
+    # with a common U the particles of a run are columns of one matrix, else one matrix per particle
+    def _as_columns(self, a: Tensor) -> Tensor:
+        return a.mT.unsqueeze(1) if self._is_shared else a.unsqueeze(-1)
+
+    def _as_rows(self, a: Tensor) -> Tensor:
+        return a.squeeze(1).mT if self._is_shared else a.squeeze(-1)
+
+    @property
+    def _is_shared(self) -> bool:
+        return self.root.shape[1] == 1
 
 
 @dataclass(frozen=True)
@@ -40,7 +80,9 @@ class GuidedNoiseProposal(Proposal):
 
     y = h(f(parent, w)) + v is linearised in w by the guide's rule. The proposal is
     w ~ N(m, U U') and the ratio p(w) / q(w), which does not need a transition density. On
-    linear-Gaussian models it is the optimal proposal [Doucet, Godsill, Andrieu 2000].
+    linear-Gaussian models it is the optimal proposal [Doucet, Godsill, Andrieu 2000]. On others it
+    may miss a part of the posterior, where p / q has no bound. Some particles are therefore drawn
+    from the model, and q is the density of the mixture [Hesterberg 1995].
 
     Attributes:
         guide_filter: Gaussian filter whose rule linearises. It starts from each parent and
@@ -51,19 +93,28 @@ class GuidedNoiseProposal(Proposal):
         covariance_factor: Factor on the proposal covariance. Values above 1 protect against an
             overconfident proposal.
         points: Source of z.
+        defensive_fraction: Fraction c of the particles that are drawn from the model's noise, in
+            [0, 1). A ratio is then at most 1 / c. 0 is as published, without a bound.
 
     Raises:
-        ValueError: If the guide has adaptations, gains or iterations, or the factor is not
-            positive.
+        ValueError: If the guide has adaptations, gains or iterations, the factor is not
+            positive, or the fraction is outside [0, 1).
     """
 
     guide_filter: GaussianFilter
     shared_by_particles: bool = False
     covariance_factor: float = 1.0
     points: PointSet = field(default_factory=IidPoints)
+    defensive_fraction: float = 0.1
     is_exact = True
 
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return self.defensive_fraction > 0.0
+
     def __post_init__(self) -> None:
+        check_fraction("proposal.defensive_fraction", self.defensive_fraction, below_one=True)
         check_covariance_factor(self.covariance_factor)
         check_normal_guide(self.guide_filter)
         if (
@@ -80,33 +131,37 @@ class GuidedNoiseProposal(Proposal):
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
-        noise = model.noise
         z = self.points(draws).normal("guide", belief.x.shape[1], model.noise_dim)
-        xi, log_det = self.map_to_posterior(model, belief, record, z)
-        w, log_ratio = xi, compute_log_ratio(xi, z, log_det, self.covariance_factor)
-        if not standardise_noise(noise):
-            w = noise.mean + noise.stddev * xi
-            log_ratio = (
-                log_ratio
-                + noise.log_prob(w)
-                + compute_half_square(xi)
-                + (noise.stddev.log() + 0.5 * LOG_2PI).sum()
+        posterior = self.fit_posterior(model, belief, record)
+        xi = posterior.from_standard(z)
+        selection = None
+        if self.defensive_fraction > 0.0:
+            active_mask = belief.log_w > -torch.inf
+            selection = choose_defensive_particles(
+                self.defensive_fraction, active_mask, draws, "guide.kept"
             )
+            mask, prior_xi = selection.mask.unsqueeze(-1), draw_standardised_noise(model, z, draws)
+            xi = torch.where(mask, prior_xi, xi)
+            z = torch.where(mask, posterior.to_standard(prior_xi), z)
+        w = scale_noise(model, xi)
+        log_q = log_standard_normal(z) - posterior.log_det
+        log_ratio = log_noise_density(model, w, xi) - log_q
+        if selection is not None:
+            log_ratio = selection.bound_log_ratio(log_ratio)
         return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
 
-    def map_to_posterior(
-        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, z: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Map standard normal numbers to the posterior of the whitened noise.
+    def fit_posterior(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record
+    ) -> NoisePosterior:
+        """Fit a normal distribution to the posterior of the standardised noise.
 
         Args:
             model: State-space model.
             belief: Particles at t-1.
             record: Record of step t.
-            z: Standard normal numbers, [R, N, W].
 
         Returns:
-            xi = m + sqrt(covariance_factor) U z, [R, N, W], and log |det U|, [R, N or 1].
+            The distribution, that of the model where it cannot be fitted.
         """
         shared = self.shared_by_particles or model.linear
         x = (
@@ -127,19 +182,17 @@ class GuidedNoiseProposal(Proposal):
         white = torch.linalg.solve_triangular(
             noise_root, torch.where(observed_mask.unsqueeze(-1), m, 0.0), upper=False
         )
-        # shared: the particles of a run are columns of one matrix, else one matrix per particle
-        r, z = (a.mT.unsqueeze(1) if shared else a.unsqueeze(-1) for a in (r, z))
+        r = r.mT.unsqueeze(1) if shared else r.unsqueeze(-1)
         score = white.mT @ torch.linalg.solve_triangular(noise_root, r, upper=False)
         # the information matrix is cheaper than QR, and the ratio includes its rounding errors
         eye = torch.eye(m.shape[-1], dtype=r.dtype, device=r.device)
         lower, info = torch.linalg.cholesky_ex(eye + white.mT @ white)
         ok = (ok & (info == 0) & torch.isfinite(score).all(-1).all(-1))[..., None, None]
-        root = torch.linalg.solve_triangular(
-            torch.where(ok, lower, eye).mT, eye.expand_as(lower), upper=True
-        )
-        # not ok: the prior, which is also exact
-        xi = root @ (root.mT @ torch.where(ok, score, 0.0) + math.sqrt(self.covariance_factor) * z)
-        return xi.squeeze(1).mT if shared else xi.squeeze(-1), log_determinant(root)
+        lower = torch.where(ok, lower, eye)  # not ok: the prior, which is also exact
+        root = torch.linalg.solve_triangular(lower.mT, eye.expand_as(lower), upper=True)
+        log_det = log_determinant(root) + 0.5 * len(eye) * math.log(self.covariance_factor)
+        shift = root.mT @ torch.where(ok, score, 0.0)
+        return NoisePosterior(lower, root, shift, math.sqrt(self.covariance_factor), log_det)
 
     def _linearised(self, model: StateSpaceModel, x: Tensor, u: Any) -> AffineApproximation:
         """Linearise the measurement of a child of each x [R, M, D] in its whitened noise."""

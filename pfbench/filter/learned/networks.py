@@ -8,7 +8,6 @@ The others start close to it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, cast
@@ -217,8 +216,3 @@ class ZukoFlowHead(nn.Module):
             steps,
             validate_args=False,
         )
-
-
-def log_standard_normal(z: Tensor) -> Tensor:
-    """Compute log N(z; 0, I) of z [..., W] as [...]."""
-    return -0.5 * (z * z).sum(-1) - 0.5 * z.shape[-1] * math.log(2.0 * math.pi)

@@ -23,17 +23,19 @@ from pfbench.filter.defensive_mixture import check_fraction, choose_defensive_pa
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.learned.features import Feature, FeatureStack, make_feature_context
 from pfbench.filter.learned.network_builder import CheckpointSpec, build_networks
-from pfbench.filter.learned.networks import log_standard_normal
 from pfbench.filter.learned.noise_frame import (
     append_states,
     describe_frame,
-    from_frame,
-    log_noise_density,
-    scale_noise,
+    fit_frame,
     to_frame,
 )
 from pfbench.filter.learned.reparameterised_sampling import sample_from
-from pfbench.filter.particle.proposals import ProposalSample
+from pfbench.filter.particle.proposals import (
+    ProposalSample,
+    draw_standardised_noise,
+    log_noise_density,
+    scale_noise,
+)
 from pfbench.model.base import StateSpaceModel, StaticModel
 
 PAST = "learned.past"  # hidden state of a recurrent network in the belief's memory, [R, 1, H]
@@ -67,9 +69,8 @@ class LearnedProposal(nn.Module):
         features: Input features, by default innovation, parent and spread of the particles.
         guide_filter: Guided proposal of each particle's noise that is corrected. None corrects the
             model's noise.
-        defensive_fraction: Fraction of particles drawn from the frame's distribution instead
-            [Hesterberg 1995]. It limits each weight to 1 / fraction times its value there. 0 draws
-            none.
+        defensive_fraction: Fraction of particles drawn from the model's noise instead, whatever the
+            guide [Hesterberg 1995]. It limits each ratio to 1 / fraction. 0 draws none.
         memory: Hidden size of a recurrent network (GRU) over past records, one state per run. 0
             uses none.
         checkpoint: File of trained weights, or `untrained`. None raises on use.
@@ -82,6 +83,11 @@ class LearnedProposal(nn.Module):
 
     is_exact = True
     checkpoint_key = "proposal"
+
+    @property
+    def has_bounded_weights(self) -> bool:
+        """True if some particles are drawn from the model."""
+        return self.defensive_fraction > 0.0
 
     def __init__(
         self,
@@ -143,29 +149,33 @@ class LearnedProposal(nn.Module):
     ) -> ProposalSample:
         distribution, memory = self.compute_distribution(model, belief, record)
         # the label of the corrected proposal: an untrained network then gives the same particles
-        z = draws.normal(
-            "noise" if self.guide_filter is None else "guide", belief.x.shape[1], model.noise_dim
-        )
+        n, is_free = belief.x.shape[1], self.guide_filter is None
+        z = draws.normal("noise" if is_free else "guide", n, model.noise_dim)
         zeta = sample_from(distribution, z, draws)
         if isinstance(model, StaticModel):  # no transition in this step
             return ProposalSample(
                 belief.x, torch.zeros_like(belief.log_w), memory, scale_noise(model, z)
             )
-        log_q = distribution.log_prob(zeta)
+        frame = fit_frame(self.guide_filter, model, belief, record)
+        xi = zeta if frame is None else frame.from_standard(zeta)
+        selection = None
         if self.defensive_fraction:
-            stay = choose_defensive_particles(
+            selection = choose_defensive_particles(
                 self.defensive_fraction, belief.log_w > -torch.inf, draws, "learned.kept"
             )
-            zeta = torch.where(stay.mask.unsqueeze(-1), z, zeta)
-            log_q = stay.log_mixture(log_standard_normal(zeta), distribution.log_prob(zeta))
-        xi, log_det = from_frame(self.guide_filter, model, belief, record, zeta)
+            mask = selection.mask.unsqueeze(-1)
+            prior_xi = draw_standardised_noise(model, z, draws)
+            xi = torch.where(mask, prior_xi, xi)
+            zeta = torch.where(
+                mask, prior_xi if frame is None else frame.to_standard(prior_xi), zeta
+            )
         w = scale_noise(model, xi)
-        return ProposalSample(
-            model.propagate(belief.x, record.u, w),
-            log_noise_density(model, w, xi) - log_q + log_det,
-            memory,
-            w,
-        )
+        log_ratio = log_noise_density(model, w, xi) - distribution.log_prob(zeta)
+        if frame is not None:
+            log_ratio = log_ratio + frame.log_det
+        if selection is not None:
+            log_ratio = selection.bound_log_ratio(log_ratio)
+        return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, memory, w)
 
     def compute_distribution(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record

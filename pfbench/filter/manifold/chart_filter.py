@@ -17,7 +17,7 @@ from pfbench.filter.belief import (
     StepInfo,
     normalise_log_weights,
 )
-from pfbench.filter.exactness import has_evidence
+from pfbench.filter.exactness import has_bounded_weights, has_evidence
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.manifold.chart_model import ChartModel, change_covariance, find_group_chart
 from pfbench.filter.particle.particle_filter import ParticleFilter
@@ -61,6 +61,11 @@ class InvariantFilter:
     def is_exact(self) -> bool:
         """True if the inner filter is exact: the chart does not change the model."""
         return self.filter.is_exact
+
+    @property
+    def has_bounded_weights(self) -> bool | None:
+        """What the inner filter states of its weights."""
+        return has_bounded_weights(self.filter)
 
     @property
     def has_evidence(self) -> bool:

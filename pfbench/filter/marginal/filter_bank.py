@@ -9,6 +9,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -23,8 +24,7 @@ from pfbench.filter.robust.hypotheses import Branches
 from pfbench.filter.robust.hypothesis_filter import OFFSET, HypothesisFilter, branch_memory
 from pfbench.model.base import StateSpaceModel
 
-REACH, SPACING = 2.5, 1.0  # of the outermost components, and largest distance, standard deviations
-OVERLAP = 0.6  # standard deviation of a component divided by the distance of two
+SPACING = 1.0  # largest distance of two components, standard deviations
 
 
 @dataclass(frozen=True)
@@ -32,24 +32,33 @@ class FilterBank(HypothesisFilter):
     """Gaussian filters from a grid of initial means, weighed by their evidence.
 
     The initial normal distribution is split in a group of states into a mixture with the same mean
-    and covariance. The components are equally spaced along each axis of the Cholesky factor. Each
-    is the start of a filter under the first hypothesis on the noise. The estimate is the mean
-    of the mixture.
+    and covariance. The components are equally spaced along each axis of the Cholesky factor. Of n
+    components the outermost ones are at sqrt(n) standard deviations, or nearer if n is below 6. A
+    denser bank thus has narrower components, and is closer to the normal distribution. Each is the
+    start of a filter under the first hypothesis on the noise. The estimate is the mean of the
+    mixture.
 
     Attributes:
         branches: Largest number K of filters. Each of k axes has the largest whole number of components
             that is not above K^(1/k).
         group: Component group that is split. None for the position, or the first group of a model
             without one.
+        overlap: Standard deviation of a component before the variance is matched, in distances of
+            two components.
 
     Raises:
-        ValueError: If the number of filters is below 1. `init` raises it for an unknown group.
+        ValueError: If the number of filters is below 1, or the overlap is outside (0, 1). `init` raises it for an unknown group.
     """
 
     branches: int = 81
     group: str | None = None
+    overlap: float = 0.6
 
     def __post_init__(self) -> None:
+        if not 0.0 < self.overlap < 1.0:
+            raise ValueError(
+                f"filter.overlap must be above 0 and below 1, got {self.overlap}. Use 0.6."
+            )
         check_whole_number("filter.branches", self.branches, 1, "Use 81.")
 
     @override
@@ -66,7 +75,7 @@ class FilterBank(HypothesisFilter):
         points = round(self.branches ** (1.0 / len(axes)))
         points -= points ** len(axes) > self.branches
         count = points ** len(axes)
-        node, log_w, sd = split_normal(points, belief.covariance)
+        node, log_w, sd = split_normal(points, belief.covariance, self.overlap)
         grid = torch.cartesian_prod(*[node] * len(axes)).reshape(count, len(axes))
         weights = torch.cartesian_prod(*[log_w] * len(axes)).reshape(count, len(axes)).sum(-1)
         root, is_valid = factor(belief.covariance)  # a run without a root is lost
@@ -121,7 +130,9 @@ class FilterBank(HypothesisFilter):
         return branch_memory(offset, covariance, log_w, torch.zeros_like(log_w).unsqueeze(-1))
 
 
-def split_normal(points: int, template: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def split_normal(
+    points: int, template: Tensor, overlap: float = 0.6
+) -> tuple[Tensor, Tensor, Tensor]:
     """Split the standard normal distribution into equally spaced components.
 
     Weights are those of the density at the means with the variance that the components leave. The
@@ -130,15 +141,17 @@ def split_normal(points: int, template: Tensor) -> tuple[Tensor, Tensor, Tensor]
     Args:
         points: Number n of components.
         template: Tensor of the dtype and device.
+        overlap: Standard deviation of a component at first, in distances of two.
 
     Returns:
         Means [n], log weights [n], and the standard deviation of every component.
     """
     if points == 1:
         return template.new_zeros(1), template.new_zeros(1), template.new_ones(())
-    reach = min(REACH, 0.5 * SPACING * (points - 1))
+    # with the root of n both the tails left out and the width of the components shrink
+    reach = min(math.sqrt(points), 0.5 * SPACING * (points - 1))
     node = torch.linspace(-reach, reach, points, dtype=torch.float64)
-    first = OVERLAP * 2.0 * reach / (points - 1)
+    first = overlap * 2.0 * reach / (points - 1)
     log_w = (-0.5 * node.square() / (1.0 - first**2)).log_softmax(0)
     variance = 1.0 - (log_w.exp() * node.square()).sum()
     return node.to(template), log_w.to(template), variance.sqrt().to(template)

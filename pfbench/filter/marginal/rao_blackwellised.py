@@ -73,6 +73,7 @@ class MarginalisedProposal(Proposal):
 
     split: StatePartition
     is_exact = True  # if l is linear and normal given s
+    has_bounded_weights = True  # the particles are those of the model
 
     @override
     def __call__(
@@ -135,6 +136,11 @@ class RaoBlackwellisedFilter:
         This is not claimed for components that are selected by name.
         """
         return is_every_part_exact(self, resampler=self.resampler) and self.sampled_states is None
+
+    @property
+    def has_bounded_weights(self) -> bool:
+        """True: the sampled part is drawn from the model."""
+        return True
 
     def init(
         self,

@@ -6,6 +6,7 @@ The weights after resampling correct for the probabilities, so the filter stays 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -15,7 +16,8 @@ from typing_extensions import override
 
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.defensive_mixture import check_fraction
+from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
 from pfbench.filter.particle.weight_update import BayesWeightUpdate, WeightUpdate
 from pfbench.model.base import StateSpaceModel
 
@@ -26,6 +28,11 @@ class AuxiliaryWeights(Protocol):
     @property
     def is_exact(self) -> bool:
         """True if every particle of positive weight has a positive probability."""
+
+    @property
+    def has_bounded_weights(self) -> bool:
+        """True if weights divided by probabilities have a bound. Silence counts as False."""
+        return False
 
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
         """Compute log resampling probabilities.
@@ -45,6 +52,7 @@ class PosteriorWeights(AuxiliaryWeights):
     """The weights themselves, as in the plain particle filter."""
 
     is_exact = True
+    has_bounded_weights = True
 
     @override
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
@@ -55,20 +63,40 @@ class PosteriorWeights(AuxiliaryWeights):
 class LookAheadWeights(AuxiliaryWeights):
     """First-stage weights of the auxiliary particle filter.
 
-    w p(y | f(x)), with f(x) the state propagated with mean noise.
+    (1 - c) a + c w, with a ~ w p(y | f(x)) and f(x) the state propagated with mean noise. A parent
+    whose prediction the measurement excludes may have children that it does not exclude. The part
+    c w keeps such parents, and bounds the second-stage weights by 1 / c times the likelihood.
 
     Attributes:
         likelihood_power: Exponent of the look-ahead likelihood. 1 is as published. A smaller one
             avoids heavy-tailed second-stage weights if the look-ahead is overconfident.
+        defensive_fraction: Fraction c of the probabilities that ignores the measurement, in [0, 1].
+            0 is as published. The filter then converges to a wrong distribution if measurement
+            errors are bounded, and its second-stage weights have no bound.
+
+    Raises:
+        ValueError: If the exponent is outside (0, 1], or the fraction is outside [0, 1].
 
     References:
-        Pitt and Shephard 1999.
+        Pitt and Shephard 1999. Hesterberg 1995 (defensive mixture).
     """
 
     likelihood_power: float = 1.0
-    is_exact = True
+    defensive_fraction: float = 0.1
+
+    @property
+    @override
+    def is_exact(self) -> bool:
+        """True if no parent is excluded."""
+        return self.defensive_fraction > 0.0
+
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return self.defensive_fraction > 0.0
 
     def __post_init__(self) -> None:
+        check_fraction("auxiliary_weights.defensive_fraction", self.defensive_fraction)
         if not 0.0 < self.likelihood_power <= 1.0:
             raise ValueError(
                 "auxiliary_weights.likelihood_power must be in (0, 1], got "
@@ -85,7 +113,13 @@ class LookAheadWeights(AuxiliaryWeights):
             torch.isnan(ahead), -torch.inf, ahead
         )
         total = log_a.logsumexp(1, keepdim=True)
-        return torch.where(torch.isfinite(total), log_a - total, belief.log_w)
+        log_a = torch.where(torch.isfinite(total), log_a - total, belief.log_w)
+        if self.defensive_fraction == 0.0:
+            return log_a
+        c = self.defensive_fraction
+        if c == 1.0:
+            return belief.log_w
+        return torch.logaddexp(log_a + math.log1p(-c), belief.log_w + math.log(c))
 
 
 class Tempering(Protocol):
@@ -94,6 +128,11 @@ class Tempering(Protocol):
     @property
     def is_exact(self) -> bool:
         """True if positive weights stay positive."""
+
+    @property
+    def has_bounded_weights(self) -> bool:
+        """True if weights divided by tempered ones have a bound. Silence counts as False."""
+        return False
 
     def __call__(self, log_w: Tensor) -> Tensor:
         """Temper log weights [R, N], logsumexp 0; -inf marks an inactive slot."""
@@ -110,6 +149,7 @@ class PowerTempering(Tempering):
 
     strength: float = 0.5
     is_exact = True
+    has_bounded_weights = True  # tempering flattens
 
     def __post_init__(self) -> None:
         _check_strength(self.strength, torch.inf)
@@ -131,6 +171,7 @@ class AdditiveTempering(Tempering):
 
     strength: float = 0.5
     is_exact = True
+    has_bounded_weights = True  # tempering flattens
 
     def __post_init__(self) -> None:
         _check_strength(self.strength, torch.inf)
@@ -153,6 +194,11 @@ class UniformTempering(Tempering):
 
     strength: float = 0.5
     is_exact = True
+
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return self.strength < 1.0
 
     def __post_init__(self) -> None:
         _check_strength(self.strength, 1.0)
@@ -181,6 +227,11 @@ class TemperedWeights(AuxiliaryWeights):
     @override
     def is_exact(self) -> bool:
         return is_every_part_exact(**{"preference.form": self.tempering})
+
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return bool(has_bounded_weights(self.tempering))
 
     @override
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:

@@ -60,6 +60,11 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         return self.method.is_exact
 
     @property
+    def has_bounded_weights(self) -> bool:
+        """True if the filter states it."""
+        return self.method.has_bounded_weights
+
+    @property
     def is_active(self) -> bool:
         """True if a kind of step runs compiled."""
         return any(graph is not None for graph in self.graphs.values())

@@ -81,6 +81,7 @@ class GaussianPredictionProposal(Proposal):
 
     points: PointSet = field(default_factory=IidPoints)
     redraw_after_prediction: bool = True
+    has_bounded_weights = True  # the ratio is 0
 
     @property
     @override

@@ -20,7 +20,7 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
 from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
-from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
 from pfbench.filter.log_weights import (
     ComputedWeights,
     is_equal_for_all,
@@ -146,6 +146,12 @@ class ParticleFilter(Filter):
         )
         moves = {f"moves[{i}]": move for i, move in enumerate(self.moves)}
         return is_every_part_exact(self, **{name: getattr(self, name) for name in stages}, **moves)
+
+    @property
+    def has_bounded_weights(self) -> bool:
+        """True if every stage that weighs by a ratio states that the ratio has a bound."""
+        initial = () if self.initial_proposal is None else (self.initial_proposal,)
+        return all(map(has_bounded_weights, (self.auxiliary_weights, self.proposal, *initial)))
 
     @property
     def history(self) -> PathHistory | None:

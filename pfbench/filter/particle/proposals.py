@@ -45,6 +45,11 @@ class Proposal(Protocol):
     def is_exact(self) -> bool:
         """True if the ratio is that of the densities."""
 
+    @property
+    def has_bounded_weights(self) -> bool:
+        """True if the ratio has a bound for any model. Silence counts as False."""
+        return False
+
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
@@ -67,6 +72,11 @@ class InitialProposal(Protocol):
     @property
     def is_exact(self) -> bool:
         """True if the ratio is that of the densities."""
+
+    @property
+    def has_bounded_weights(self) -> bool:
+        """True if the ratio has a bound for any model. Silence counts as False."""
+        return False
 
     @property
     def steps(self) -> int:
@@ -114,6 +124,7 @@ class BootstrapProposal(Proposal):
     """
 
     is_exact = True
+    has_bounded_weights = True
 
     @override
     def __call__(
@@ -157,9 +168,65 @@ def draw_noise(model: StateSpaceModel, n: int, draws: RandomStream) -> Tensor:
     Raises:
         ValueError: If the distribution cannot be drawn, see `draw_values`.
     """
-    if type(model).noise is StateSpaceModel.noise:  # standard normal: not built at each step
+    if has_standard_noise(model):
         return draws.normal("noise", n, model.noise_dim)
+    return draw_values(model.noise, draws, "noise", n).to(model.anchor.dtype)
+
+
+def has_standard_noise(model: StateSpaceModel) -> bool:
+    """Return whether the noise of a model is standard normal."""
+    if type(model).noise is StateSpaceModel.noise:  # not built at each step
+        return True
     distribution = model.noise
-    if isinstance(getattr(distribution, "base_dist", distribution), StandardNormal):
-        return draws.normal("noise", n, model.noise_dim)
-    return draw_values(distribution, draws, "noise", n).to(model.anchor.dtype)
+    return isinstance(getattr(distribution, "base_dist", distribution), StandardNormal)
+
+
+def draw_standardised_noise(model: StateSpaceModel, z: Tensor, draws: RandomStream) -> Tensor:
+    """Draw standardised noise from the model's noise distribution.
+
+    Args:
+        model: State-space model.
+        z: Standard normal numbers at hand, [R, N, W]. They are the noise if it is standard normal.
+        draws: Random stream for other noise.
+
+    Returns:
+        Noise minus its mean, divided by its standard deviation, [R, N, W].
+    """
+    if has_standard_noise(model):
+        return z
+    return (draw_noise(model, z.shape[1], draws) - model.noise.mean) / model.noise.stddev
+
+
+def scale_noise(model: StateSpaceModel, xi: Tensor) -> Tensor:
+    """Convert standardised noise to the noise of the model.
+
+    Args:
+        model: State-space model.
+        xi: Standardised noise, [R, N, W].
+
+    Returns:
+        Noise, [R, N, W].
+    """
+    return xi if has_standard_noise(model) else model.noise.mean + model.noise.stddev * xi
+
+
+def log_noise_density(model: StateSpaceModel, w: Tensor, xi: Tensor) -> Tensor:
+    """Compute log p(w) as a density of the standardised noise.
+
+    Args:
+        model: State-space model.
+        w: Noise of the model, [R, N, W].
+        xi: The same noise, standardised, [R, N, W].
+
+    Returns:
+        Log density, [R, N].
+    """
+    if has_standard_noise(model):
+        return log_standard_normal(xi)
+    value: Tensor = model.noise.log_prob(w) + model.noise.stddev.log().sum()
+    return value
+
+
+def log_standard_normal(z: Tensor) -> Tensor:
+    """Compute log N(z; 0, I) of z [..., W] as [...]."""
+    return -0.5 * (z * z).sum(-1) - 0.5 * z.shape[-1] * math.log(2.0 * math.pi)

@@ -92,6 +92,8 @@ class SqmcProposal(Proposal):
 
     points: PointSet = field(default_factory=SobolPoints)
 
+    has_bounded_weights = True  # the noise is that of the model
+
     @property
     @override
     def is_exact(self) -> bool:

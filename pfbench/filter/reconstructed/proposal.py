@@ -19,7 +19,7 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.defensive_mixture import AffineMap, check_fraction
-from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
 from pfbench.filter.linearisation import (
     batch_product,
     derivative,
@@ -62,6 +62,11 @@ class ReconstructedProposal(Proposal):
             **{"proposal.base": self.base, "proposal.correction": self.weight_correction}
         )
 
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return all(map(has_bounded_weights, (self.base, self.weight_correction)))
+
     @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
@@ -81,12 +86,14 @@ class ReconstructedNoiseProposal(Proposal):
 
     Deterministic, S = P: narrower than the posterior. If A A' exceeds R_v, the variance of the
     weights is infinite unless `defensive_fraction` is positive. Stochastic, S S' = P: the optimal
-    proposal if the measurement is linear [Doucet et al. 2000].
+    proposal if the measurement is linear [Doucet et al. 2000]. If it is not, the weights have no
+    bound without a defensive fraction, either.
 
     Attributes:
         base: Source of the noise.
         sample_noise: Draw from the posterior of the noise. False shifts deterministically.
-        defensive_fraction: Fraction that is not shifted.
+        defensive_fraction: Fraction c that is not shifted, which bounds the ratio by 1 / c. With 0
+            it has no bound, and noise of bounded support is not covered.
         linearise_per_particle: Linearise at each parent's prediction. False linearises once, at
             their mean.
 
@@ -96,7 +103,7 @@ class ReconstructedNoiseProposal(Proposal):
 
     base: Proposal = field(default_factory=BootstrapProposal)
     sample_noise: bool = True
-    defensive_fraction: float = 0.0
+    defensive_fraction: float = 0.1
     linearise_per_particle: bool = True
 
     def __post_init__(self) -> None:
@@ -105,7 +112,13 @@ class ReconstructedNoiseProposal(Proposal):
     @property
     @override
     def is_exact(self) -> bool:
-        return is_every_part_exact(**{"proposal.base": self.base})
+        exact_base = is_every_part_exact(**{"proposal.base": self.base})
+        return exact_base and self.defensive_fraction > 0.0
+
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return self.defensive_fraction > 0.0 and bool(has_bounded_weights(self.base))
 
     @override
     def __call__(

@@ -19,7 +19,12 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.defensive_mixture import AffineMap, check_fraction
-from pfbench.filter.linearisation import batch_product, linearised_innovation, measurement_jacobian
+from pfbench.filter.linearisation import (
+    batch_product,
+    is_normal,
+    linearised_innovation,
+    measurement_jacobian,
+)
 from pfbench.filter.particle.proposals import ProposalSample
 from pfbench.filter.reconstructed.defensive_shift import (
     keep_selected,
@@ -38,6 +43,11 @@ class WeightCorrection(Protocol):
     @property
     def is_exact(self) -> bool:
         """True if the weighted particles are asymptotically exact."""
+
+    @property
+    def has_bounded_weights(self) -> bool:
+        """True if the correction has a bound for any model. Silence counts as False."""
+        return False
 
     def __call__(
         self,
@@ -79,6 +89,7 @@ class NoWeightCorrection(WeightCorrection):
     linearise_per_particle: bool = True
     regressed_states: Sequence[str] = ()
     is_exact = False
+    has_bounded_weights = True  # there is no ratio
 
     @override
     def __call__(
@@ -107,7 +118,7 @@ class NoWeightCorrection(WeightCorrection):
 class TransitionRatioCorrection(WeightCorrection):
     """Ratio of transition densities after and before the shift [ours].
 
-    For additive noise. The shift of x = f (+) xi, with f the noise-free prediction of each parent,
+    For additive normal noise. The shift of x = f (+) xi, with f the noise-free prediction of each parent,
     is xi -> xi + K (y - h(f) - H xi). It is affine, so its Jacobian is known also for a nonlinear
     measurement. A singular transition has a density on the span of its noise, and the shift is
     projected on that span. Exact, but useful only with wide noise. Increase the model's noise for
@@ -115,16 +126,25 @@ class TransitionRatioCorrection(WeightCorrection):
 
     Attributes:
         defensive_fraction: Fraction c that is not shifted. Weights are then at most 1/c times the
-            likelihood.
+            likelihood. With 0 they have no bound, or a shift may leave out a part of the noise.
         linearise_per_particle: As for `NoWeightCorrection`, but at the noise-free predictions.
 
     Raises:
-        ValueError: At the first step, if the model's noise is not additive.
+        ValueError: At the first step, if the model's noise is not additive or not normal.
     """
 
-    defensive_fraction: float = 0.0
+    defensive_fraction: float = 0.1
     linearise_per_particle: bool = True
-    is_exact = True
+
+    @property
+    @override
+    def is_exact(self) -> bool:
+        return self.defensive_fraction > 0.0
+
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return self.defensive_fraction > 0.0
 
     def __post_init__(self) -> None:
         check_fraction("weight_correction.defensive_fraction", self.defensive_fraction)
@@ -142,10 +162,10 @@ class TransitionRatioCorrection(WeightCorrection):
         if isinstance(model, StaticModel):  # no transition in this step
             return sample
         chart, noise_gain = model.chart, model.noise_gain(record.u)
-        if noise_gain is None:
+        if noise_gain is None or not is_normal(model.noise):
             raise ValueError(
                 "proposal.weight_correction TransitionRatioCorrection must have a model with "
-                f"additive noise, got {type(model).__name__}. "
+                f"additive noise that is normal, got {type(model).__name__}. "
                 "Choose MarginalRatioCorrection or ReconstructedNoiseProposal."
             )
         prediction, w = predict_without_noise(model, belief, record)
@@ -191,6 +211,11 @@ class MarginalRatioCorrection(WeightCorrection):
 
     defensive_fraction: float = 0.5
     is_exact = False
+
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return self.defensive_fraction > 0.0
 
     def __post_init__(self) -> None:
         check_fraction("weight_correction.defensive_fraction", self.defensive_fraction)

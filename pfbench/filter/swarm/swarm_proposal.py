@@ -18,7 +18,7 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
-from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
 from pfbench.filter.particle.proposals import Proposal, ProposalSample, draw_noise
 from pfbench.filter.particle.weight_update import deactivate_invalid_particles
 from pfbench.filter.swarm.chaotic_sequences import (
@@ -102,6 +102,11 @@ class SwarmProposal(Proposal):
         return is_every_part_exact(
             **{"proposal.start": self.swarm_start, "proposal.weights": self.weighting}
         )
+
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return bool(has_bounded_weights(self.weighting))
 
     @override
     def __call__(

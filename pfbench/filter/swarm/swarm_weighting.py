@@ -61,6 +61,7 @@ class PrintedWeighting(SwarmWeighting):
     """
 
     is_exact = False
+    has_bounded_weights = True  # there is no ratio
 
     @override
     def __call__(
@@ -133,6 +134,8 @@ class MixtureWeighting(SwarmWeighting):
     def is_exact(self) -> bool:
         """True if the proposal is the bootstrap one."""
         return self.defensive_fraction == 1.0
+
+    has_bounded_weights = True
 
     @override
     def __call__(

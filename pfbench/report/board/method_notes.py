@@ -20,6 +20,7 @@ class MethodNotes:
         self._counts: dict[str, Counter[str]] = {}
         self._particles: dict[str, dict[str, None]] = {}
         self._exact: dict[str, bool] = {}
+        self._bounded: dict[str, set[bool | None]] = {}
         self._choices: dict[str, dict[str, None]] = {}
 
     def add(self, label: str, result: JobResult) -> None:
@@ -37,6 +38,7 @@ class MethodNotes:
         particles = meta.get("particles")
         self._particles.setdefault(label, {})[str(particles)] = None
         self._exact[label] = self._exact.get(label, True) and bool(meta.get("is_exact"))
+        self._bounded.setdefault(label, set()).add(meta.get("has_bounded_weights"))
         for text in meta.get("modelling_choices", ()):
             self._choices.setdefault(str(text), {})[label] = None
 
@@ -55,6 +57,7 @@ class MethodNotes:
             has_limit = counts["limited_runs"] > 0
             notes.append({
                 "filter": label, "particles": " or ".join(particles), "is_exact": self._exact[label],
+                "has_bounded_weights": _common(self._bounded[label]),
                 **{name: counts[name] for name in _COUNTS},
                 "diverged": counts["diverged"] if has_limit else None,
             })  # fmt: skip
@@ -63,6 +66,11 @@ class MethodNotes:
             for text, labels in sorted(self._choices.items())
         ]
         return {"filter_notes": notes, "choices": choices}
+
+
+def _common(statements: set[bool | None]) -> bool | None:
+    """Return whether weights are bounded in all jobs, None if a job does not state it."""
+    return None if None in statements else all(statements)
 
 
 def _name_filters(labels: Mapping[str, None], looks: Mapping[str, MethodLook]) -> str:

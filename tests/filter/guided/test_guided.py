@@ -172,7 +172,7 @@ def test_guided_noise_is_optimal_on_linear_models(shared: bool, guide: GaussianF
     model, _, _ = CASES["singular"]()
     assert isinstance(model, LinearGaussian)
     model.linear = shared
-    stage = GuidedNoiseProposal(guide)
+    stage = GuidedNoiseProposal(guide, defensive_fraction=0.0)
     cloud, draws = cloud_of(ParticleFilter(50, proposal=stage), model, 3)
     y = torch.tensor([[2.0, 1.0], [0.5, math.nan], [math.nan, math.nan]], dtype=torch.float64)
     x, log_ratio, _, w, _ = stage(model, cloud, Record(y), draws)
@@ -214,7 +214,7 @@ def test_guiding_the_noise_gains_what_the_noise_can_learn_and_no_more(
     found = {}
     for proposal, s, b in (
         (BootstrapProposal(), r, moved + stirred),
-        (GuidedNoiseProposal(EKF), r + stirred, moved),
+        (GuidedNoiseProposal(EKF, defensive_fraction=0.0), r + stirred, moved),
     ):
         once = Normal(0.5, math.sqrt(s + b)).log_prob(torch.tensor(y)).item()
         twice = Normal(0.5, math.sqrt(s / 2 + b)).log_prob(torch.tensor(y)).item() - 0.5 * math.log(
@@ -252,7 +252,7 @@ def test_a_guide_without_a_root_proposes_from_the_prior() -> None:
                 1,
             )
 
-    stage = GuidedNoiseProposal(EKF)
+    stage = GuidedNoiseProposal(EKF, defensive_fraction=0.0)
     cloud, draws = cloud_of(ParticleFilter(50, proposal=stage), Broken(), 2)
     sent = stage(
         Broken(),

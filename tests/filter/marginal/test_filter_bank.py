@@ -48,6 +48,22 @@ def test_the_mixture_is_close_to_the_normal_distribution_and_has_its_moments(poi
     assert np.trapezoid(np.abs(density - stats.norm.pdf(x)), x) / 2 < 0.02
 
 
+def distance(points: int) -> tuple[float, float]:
+    """Kullback-Leibler divergence from the normal distribution, and the spread of a component."""
+    node, log_w, sd = (a.numpy() for a in split_normal(points, torch.zeros(1, dtype=torch.float64)))
+    x = np.linspace(-8.0, 8.0, 4001)
+    normal, mixture = stats.norm.pdf(x), stats.norm.pdf(x[:, None], node, sd) @ np.exp(log_w)
+    return float(np.trapezoid(normal * np.log(normal / mixture), x)), float(sd)
+
+
+def test_a_denser_bank_is_closer_and_has_narrower_components() -> None:
+    """81 filters on two axes are 9 points, 400 are 20. From 4 points on, each one more is closer."""
+    distances, widths = zip(*map(distance, range(4, 41)), strict=True)
+    assert (np.diff(distances) < 0.0).all()
+    assert (np.diff(widths) < 0.0).all()
+    assert distance(20)[0] < 0.1 * distance(9)[0] < 1e-5
+
+
 def numpy_bank(points: int, axes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, float]:
     """Kalman filters from the components, weighed by their evidence, with loops."""
     node, log_w, sd = (a.numpy() for a in split_normal(points, torch.zeros(1, dtype=torch.float64)))
@@ -138,3 +154,9 @@ def test_a_bank_that_is_not_possible_is_refused() -> None:
         FilterBank(branches=0)
     with pytest.raises(ValueError, match=r"filter\.group must be of .*, got wheel\. Choose"):
         run(FilterBank(group="wheel"))
+
+
+@pytest.mark.parametrize("overlap", [0.0, 1.0, math.nan])
+def test_the_overlap_is_a_fraction(overlap: float) -> None:
+    with pytest.raises(ValueError, match=r"filter\.overlap must be above 0 and below 1.* Use 0\.6"):
+        FilterBank(overlap=overlap)
