@@ -24,7 +24,7 @@ from pfbench.filter.learned.checkpoint import hash_checkpoints
 from pfbench.results.config_key import Inputs
 from pfbench.results.inputs import list_changed
 
-CODE = "code of "  # start of the names of source files of a user's classes
+CODE_OF = "code of "  # start of the names of source files of a user's classes
 _MISSING = "missing"
 
 
@@ -47,7 +47,7 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
     for group in CHOICES:
         node = values.get(group)
         entries = _hash_files(_list_files(node, trusted), values.get("data", {}).get("root"))
-        entries |= {f"{CODE}{name}": value for name, value in hash_user_code(node).items()}
+        entries |= {f"{CODE_OF}{name}": value for name, value in hash_user_code(node).items()}
         if group == "filter":
             weights = hash_checkpoints(node)
             entries |= {f"weights of {name}": value for name, value in weights.items()}
@@ -65,7 +65,7 @@ def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence
         trusted: Packages that it may name.
     """
     changed = list_changed(before, find_inputs(values, trusted))
-    files = [name for name in changed if not name.startswith(CODE)]  # loaded before
+    files = [name for name in changed if not name.startswith(CODE_OF)]  # loaded before
     if files:
         raise ValueError(
             f"{' and '.join(files)} must not change while a job reads it, got other content at its end. "

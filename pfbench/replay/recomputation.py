@@ -11,7 +11,7 @@ import numpy as np
 
 from pfbench.config.composition import CHOICES, JobConfig
 from pfbench.config.trust import UntrustedConfigError, trusted_packages
-from pfbench.job.inputs import CODE, find_inputs
+from pfbench.job.inputs import CODE_OF, find_inputs
 from pfbench.job.plan import build_plan
 from pfbench.job.run_job import compute_job
 from pfbench.replay.run_selection import StoredRun
@@ -99,7 +99,7 @@ def describe_changed_code(meta: Mapping[str, Any]) -> str:
     if not meta.get("trusted"):
         return ""
     changed = _list_changed_inputs(meta, find_inputs(meta["config"], trusted_packages()))
-    code = [name for name in changed if name.startswith(CODE)]
+    code = [name for name in changed if name.startswith(CODE_OF)]
     if not code:
         return ""
     return f"the {' and the '.join(code)} has changed since {meta['label']} was run: its numbers may differ"
@@ -152,7 +152,7 @@ def _check_inputs(meta: Mapping[str, Any], present: Inputs) -> None:
 
     Another code of a user's classes is told, since it may be a mended message.
     """
-    changed = [name for name in _list_changed_inputs(meta, present) if not name.startswith(CODE)]
+    changed = [name for name in _list_changed_inputs(meta, present) if not name.startswith(CODE_OF)]
     if changed:
         raise ValueError(
             f"{' and '.join(changed)} must be as it was when the result was computed, got other content. "

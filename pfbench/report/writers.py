@@ -7,7 +7,7 @@ import gzip
 import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -161,13 +161,14 @@ def template_environment(home: Path, *, is_html: bool) -> jinja2.Environment:
         keep_trailing_newline=True,
         finalize=None if is_html else _escape_value,
     )
-    environment.filters |= {
+    filters: dict[str, Callable[..., Any]] = {
         "table": lambda table: Markup(table_formats.format_html(table)),
         "pipe": lambda table: Markup(table_formats.format_markdown(table)),
         "code": lambda text: Markup(escape_code_block(text)),
         "number": table_formats.format_number,
         "name_build": provenance.name_build,
     }
+    environment.filters |= filters
     return environment
 
 

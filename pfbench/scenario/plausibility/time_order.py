@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pfbench.files.table_file import Array
+from pfbench.nav.gnss.rinex import WEEK
 
-WEEK, DAY = 604800.0, 86400.0  # s
+DAY = 86400.0  # s
 UNIX_TO_GPS = -315964782.0  # s; GPS time of 1980-01-06 in Unix time, and 18 leap seconds since 2017
 # counters that start again, s
 _PERIODS = {
