@@ -166,8 +166,8 @@ def template_environment(home: Path, *, is_html: bool) -> jinja2.Environment:
         "pipe": lambda table: Markup(table_formats.format_markdown(table)),
         "code": lambda text: Markup(escape_code_block(text)),
         "number": table_formats.format_number,
-        "name_build": provenance.name_build,
     }
+    environment.filters["name_build"] = provenance.name_build
     return environment
 
 
