@@ -64,17 +64,12 @@ def hash_package() -> str:
             )
             for file in sorted(files):
                 if not file.endswith(_COMPILED):
-                    content = _read(f"{folder}/{file}")
+                    content = Path(folder, file).read_bytes()
                     sha256.update(
                         f"{name}{folder.removeprefix(home)}/{file} {len(content)};".encode()
                     )
                     sha256.update(content)
     return sha256.hexdigest()[:12]
-
-
-def _read(path: str) -> bytes:
-    with open(path, "rb", buffering=0) as file:
-        return file.read()
 
 
 def list_user_packages(values: Any, trusted: Sequence[str]) -> list[str]:

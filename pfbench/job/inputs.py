@@ -94,7 +94,7 @@ def _list_files(node: Any, trusted: Sequence[str]) -> Iterator[Path]:
     for reader in _list_readers(node, trusted):
         try:
             built = _build(json.dumps(reader, sort_keys=True, default=str), tuple(trusted))
-        except Exception:
+        except Exception:  # the plan of the job builds it again, and raises with its full key
             continue
         for entry in built.input_files():
             path = Path(entry)

@@ -7,7 +7,7 @@ import gzip
 import itertools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -161,14 +161,13 @@ def template_environment(home: Path, *, is_html: bool) -> jinja2.Environment:
         keep_trailing_newline=True,
         finalize=None if is_html else _escape_value,
     )
-    filters: dict[str, Callable[..., Any]] = {
+    environment.filters |= {
         "table": lambda table: Markup(table_formats.format_html(table)),
         "pipe": lambda table: Markup(table_formats.format_markdown(table)),
         "code": lambda text: Markup(escape_code_block(text)),
         "number": table_formats.format_number,
-        "name_build": provenance.name_build,
     }
-    environment.filters |= filters
+    environment.filters["name_build"] = provenance.name_build
     return environment
 
 

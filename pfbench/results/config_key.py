@@ -11,9 +11,8 @@ from typing import Any
 
 from pfbench.kernels.generator_version import GENERATOR_VERSION
 
-Inputs = dict[
-    str, dict[str, str]
-]  # digests by name, for the groups of a configuration, see `pfbench.job.inputs`
+# digests by name, for the groups of a configuration, see `pfbench.job.inputs`
+Inputs = dict[str, dict[str, str]]
 _HALF = 8  # digits of a key that depend on the configuration alone
 # folders of files whose content is part of the key, see `pfbench.job.inputs`
 DATA_FOLDERS = (

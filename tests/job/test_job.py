@@ -98,7 +98,7 @@ def test_a_job_leaves_one_file_that_numpy_reads(twice: Any) -> None:
         "groups": {"state": [0, 1]},
     }
     assert meta["seconds"]["filter"] > 0
-    assert {"pfbench", "commit", "python", "torch", "numpy"} == meta["versions"].keys()
+    assert {"pfbench", "commit", "build", "python", "torch", "numpy"} == meta["versions"].keys()
     assert meta["is_exact"] is True
     assert meta["has_evidence"] is True
 
