@@ -12,20 +12,20 @@ from pathlib import Path
 SWEEP_LOG = "PFBENCH_SWEEP_LOG"  # environment variable: file to which all jobs of a sweep append
 NOTE = "note"  # first word of a line of this file that is no outcome of a job
 
-_MOST = 12  # lines about one place
+_MOST = 12  # lines about one source
 
 log = logging.getLogger("pfbench")
 
-_told: set[tuple[str, ...]] = set()  # sweep, place and note
+_announced: set[tuple[str, ...]] = set()  # sweep, source and note
 
 
-def announce_notes(place: str | Path, notes: Sequence[str]) -> None:
+def announce_notes(source: str | Path, notes: Sequence[str]) -> None:
     """Log notes on what was read, dropped or assumed.
 
     A note is logged once by a process, and once by all processes of a sweep.
 
     Args:
-        place: Folder or file of the data.
+        source: Folder or file of the data.
         notes: Notes.
     """
     sweep = os.environ.get(SWEEP_LOG, "")
@@ -33,12 +33,12 @@ def announce_notes(place: str | Path, notes: Sequence[str]) -> None:
         rest = f"{len(notes) - _MOST + 1} further notes, which the page of a study lists"
         notes = [*notes[: _MOST - 1], rest]
     for note in notes:
-        told = (sweep, str(place), note)
-        if told in _told:
+        entry = (sweep, str(source), note)
+        if entry in _announced:
             continue
-        _told.add(told)
-        if _is_first(sweep, told):
-            log.warning("note      %s: %s", Path(place).name, note)
+        _announced.add(entry)
+        if _is_first(sweep, entry):
+            log.warning("note      %s: %s", Path(source).name, note)
 
 
 def append_line(path: str | Path, line: str) -> None:
@@ -59,11 +59,11 @@ def append_line(path: str | Path, line: str) -> None:
         os.close(descriptor)
 
 
-def _is_first(sweep: str, told: Sequence[str]) -> bool:
+def _is_first(sweep: str, entry: Sequence[str]) -> bool:
     """Return whether this process is the first of a sweep to tell a note, by the first line about it."""
     if not sweep:
         return True
-    digest = hashlib.sha256("\n".join(told[1:]).encode()).hexdigest()[:16]
+    digest = hashlib.sha256("\n".join(entry[1:]).encode()).hexdigest()[:16]
     line = f"{NOTE} {digest} {os.getpid()}"
     with contextlib.suppress(OSError):  # of a full disk: the job reports it
         append_line(sweep, line)

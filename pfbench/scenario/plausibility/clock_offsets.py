@@ -66,18 +66,11 @@ def find_imu_offset(imu: ImuLog, reference: ReferenceLog) -> ClockOffset | None:
     Returns:
         The offset of the IMU, or None if no lag explains the turns much better than none.
     """
-    nodes = _thin(reference.time, _WINDOW)
-    time, q = reference.time[nodes], torch.from_numpy(reference.attitude[nodes])
-    inverse = q[:-1] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
-    true = quaternion.rotation_vector_from_quaternion(
-        quaternion.quaternion_multiply(inverse, q[1:])
-    ).numpy()
+    time, true = _reference_turns(reference)
     step = np.diff(time)
     short = step < max(1.6 * _WINDOW, 2.5 * float(np.median(step))) if len(step) else step > 0.0
-    angle = np.vstack([
-        np.zeros(3),
-        np.cumsum(0.5 * np.diff(imu.time)[:, None] * (imu.rate[1:] + imu.rate[:-1]), axis=0),
-    ])  # fmt: skip
+    summed = np.cumsum(0.5 * np.diff(imu.time)[:, None] * (imu.rate[1:] + imu.rate[:-1]), axis=0)
+    angle = np.vstack([np.zeros(3), summed])
 
     def unexplained(lag: float) -> tuple[float, int]:
         at = time + lag
@@ -90,19 +83,27 @@ def find_imu_offset(imu: ImuLog, reference: ReferenceLog) -> ClockOffset | None:
         if not square > 0.0:
             return 1.0, 0
         correlation = float((x * y).sum()) / math.sqrt(square)
-        return 1.0 - max(correlation, 0.0) ** 2, int(used.sum())
+        return max(0.0, 1.0 - max(correlation, 0.0) ** 2), int(used.sum())
 
     lag = _best_lag(unexplained)
     best, count = unexplained(lag)
     plain = unexplained(0.0)[0]
-    if abs(lag) < LEAST_IMU_LAG or best > 1.0 - _LEAST_CORRELATION**2:
+    evidence = count * math.log(max(plain, 1e-12) / max(best, 1e-12))
+    if abs(lag) < LEAST_IMU_LAG or best > 1.0 - _LEAST_CORRELATION**2 or evidence < EVIDENCE:
         return None
-    if count * math.log(plain / max(best, 1e-12)) < EVIDENCE:
-        return None
-    correlations = (math.sqrt(1.0 - part) for part in (best, plain))
+    correlations = (math.sqrt(1.0 - value) for value in (best, plain))
     return ClockOffset(
         lag, "turns then correlate to {:.3f} instead of {:.3f}".format(*correlations)
     )
+
+
+def _reference_turns(reference: ReferenceLog) -> tuple[Array, Array]:
+    """Return times about a window apart, s, [n + 1], and the rotation vectors between them, rad, [n, 3]."""
+    nodes = _thin(reference.time, _WINDOW)
+    q = torch.from_numpy(reference.attitude[nodes])
+    inverse = q[:-1] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
+    turn = quaternion.quaternion_multiply(inverse, q[1:])
+    return reference.time[nodes], quaternion.rotation_vector_from_quaternion(turn).numpy()
 
 
 def find_fix_offset(fixes: GnssLog, reference: ReferenceLog) -> ClockOffset | None:
@@ -135,16 +136,13 @@ def find_fix_offset(fixes: GnssLog, reference: ReferenceLog) -> ClockOffset | No
         )
 
     coarse = _best_lag(spread)
-    if not math.isfinite(spread(coarse)[0]):
-        return None
-    fit = _fit_lag(time - coarse, *difference(coarse), reference)
+    is_found = math.isfinite(spread(coarse)[0])
+    fit = _fit_lag(time - coarse, *difference(coarse), reference) if is_found else None
     if fit is None:
         return None
-    lag, sd = coarse + fit[0], fit[1]
-    if abs(lag) < LEAST_FIX_LAG or abs(lag) < math.sqrt(EVIDENCE) * sd:
-        return None
+    lag = coarse + fit[0]
     after, before = spread(lag)[0], spread(0.0)[0]
-    if not after < before:
+    if abs(lag) < max(LEAST_FIX_LAG, math.sqrt(EVIDENCE) * fit[1]) or not after < before:
         return None
     instead = f" instead of {before:.3g} m" if math.isfinite(before) else ""
     return ClockOffset(lag, f"positions then agree to {after:.3g} m{instead}")

@@ -17,7 +17,7 @@ from pfbench.scenario.recorded.time_grid import list_pieces
 def integrate_windows(imu: ImuLog, time: Array) -> tuple[Tensor, Tensor]:
     """Integrate the samples in each window.
 
-    Neighbouring pieces of a window are joined in pairs until one is left, so that memory grows with
+    Neighbouring pieces of a window are joined in pairs until one is begin, so that memory grows with
     the samples alone. `preintegrate` joins them in the order of time and gives the same to rounding.
 
     Args:
@@ -36,20 +36,18 @@ def integrate_windows(imu: ImuLog, time: Array) -> tuple[Tensor, Tensor]:
     velocity = rotate(quaternion.quaternion_from_rotation_vector(0.5 * rate * dt), force * dt)
     while len(window) > len(time) - 1:
         first, has_partner = _pairs(window)
-        left, right = torch.from_numpy(first), torch.from_numpy(first[has_partner] + 1)
+        begin, end = torch.from_numpy(first), torch.from_numpy(first[has_partner] + 1)
         mask = torch.from_numpy(has_partner)
-        joined_rotation, joined_velocity = rotation[left], velocity[left]
-        joined_velocity[mask] += rotate(joined_rotation[mask], velocity[right])
-        joined_rotation[mask] = quaternion.quaternion_multiply(
-            joined_rotation[mask], rotation[right]
-        )
+        joined_rotation, joined_velocity = rotation[begin], velocity[begin]
+        joined_velocity[mask] += rotate(joined_rotation[mask], velocity[end])
+        joined_rotation[mask] = quaternion.quaternion_multiply(joined_rotation[mask], rotation[end])
         window, rotation, velocity = window[first], joined_rotation, joined_velocity
     return rotation, velocity
 
 
 def _pairs(window: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return every second piece of each window, and whether the next piece is of the same window."""
-    place = np.arange(len(window)) - np.searchsorted(window, window)
-    first = np.flatnonzero(place % 2 == 0)
+    number = np.arange(len(window)) - np.searchsorted(window, window)
+    first = np.flatnonzero(number % 2 == 0)
     after = np.minimum(first + 1, len(window) - 1)
     return first, (window[after] == window[first]) & (after > first)

@@ -189,14 +189,16 @@ def compare_fixes(
         position, velocity = fixes.position.copy(), fixes.velocity.copy()
         position[wrong_mask] = velocity[wrong_mask] = np.nan
         fixes = fixes._replace(position=position, velocity=velocity)
-    rows = np.arange(len(fixes.time))
     position_error, velocity_error = (
         np.where(wrong_mask | np.isnan(error), 0.0, error)
         for error in (position_error, velocity_error)
     )
-    notes += _note_offset(table, fixes.position - true[:, 7:])
-    notes += _judge(FIX, position_error, table, rows)
-    return fixes, (*notes, *_judge(FIX_VELOCITY, velocity_error, table, rows))
+    return fixes, (
+        *notes,
+        *_note_offset(table, fixes.position - true[:, 7:]),
+        *_judge(FIX, position_error, table, np.arange(len(fixes.time))),
+        *_judge(FIX_VELOCITY, velocity_error, table, np.arange(len(fixes.time))),
+    )
 
 
 def _usable(fixes: GnssLog, wrong_mask: NDArray[np.bool_]) -> int:

@@ -110,26 +110,26 @@ def _longest_part(time: Array) -> tuple[int, int]:
     return int(borders[i]), int(borders[i + 1]) - 1
 
 
-def find_overlap_remedy(time: Array, other: Array, name: str) -> str:
-    """Find the shift of one table that makes it overlap another.
+def find_overlap_remedy(time: Array, reference: Array, name: str) -> str:
+    """Find the shift of one table that makes it overlap a second one.
 
     Args:
         time: Times of the table, s, [n].
-        other: Times of the other table, s, [m].
+        reference: Times of the second table, s, [m].
         name: Name of the table.
 
     Returns:
         A sentence. With the shift that it names, the shorter table overlaps by half or more.
     """
-    apart = 0.5 * float(other[0] + other[-1] - time[0] - time[-1])
-    shortest = min(time[-1] - time[0], other[-1] - other[0])
+    distance = 0.5 * float(reference[0] + reference[-1] - time[0] - time[-1])
+    shortest = min(time[-1] - time[0], reference[-1] - reference[0])
     shifts = {
-        f"{abs(round(apart / WEEK))} GPS weeks": WEEK * round(apart / WEEK),
-        "Unix time and GPS time": UNIX_TO_GPS if apart < 0.0 else -UNIX_TO_GPS,
-        f"{abs(round(apart / DAY))} days": DAY * round(apart / DAY),
+        f"{abs(round(distance / WEEK))} GPS weeks": WEEK * round(distance / WEEK),
+        "Unix time and GPS time": UNIX_TO_GPS if distance < 0.0 else -UNIX_TO_GPS,
+        f"{abs(round(distance / DAY))} days": DAY * round(distance / DAY),
     }
     for reason, shift in shifts.items():
-        common = min(time[-1] + shift, other[-1]) - max(time[0] + shift, other[0])
+        common = min(time[-1] + shift, reference[-1]) - max(time[0] + shift, reference[0])
         if shift and common >= 0.5 * shortest:
             return f"Add {shift:.10g} to t of {name} ({reason} apart), then they overlap."
     return "Use the same clock in both (GPS seconds, or seconds from the same instant)."

@@ -46,10 +46,10 @@ def check_fix_codes(codes: FixCodes) -> None:
     if codes is None or (isinstance(codes, str) and codes in PROGRAMS):
         return
     if not (is_list and all(type(code) is int and code >= 0 for code in codes)):
-        shown = codes if isinstance(codes, str) else list(codes)
+        value = codes if isinstance(codes, str) else list(codes)
         raise ValueError(
             f"scenario.fix_codes must be {', '.join(PROGRAMS)}, null or whole numbers of at least 0, "
-            f"got {shown}. Set the program that wrote the column fix, or the codes to use, such as [4,5]."
+            f"got {value}. Set the program that wrote the column fix, or the codes to use, such as [4,5]."
         )
 
 
@@ -114,8 +114,8 @@ def _describe_unknown(
         usable = sum(n for number, n in counts.items() if number in used)
         if usable and all(number in used or number in unused for number in counts):
             remedies.append(f"{program} (uses {usable} of {total})")
-    whole = [f"{number:g}" for number in counts if number == int(number) and number > 0]
-    example = f"to the codes to use, such as [{','.join(whole or ['1'])}]"
+    positive = [f"{number:g}" for number in counts if number == int(number) and number > 0]
+    example = f"to the codes to use, such as [{','.join(positive or ['1'])}]"
     required = f"be a code of {codes}" if codes else "be 0 or 1 (1: use the fix)"
     return (
         f"{table.name}: column fix must {required}, got {code:g} in {counts[code]} of {total} rows. "

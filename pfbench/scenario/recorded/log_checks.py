@@ -69,7 +69,7 @@ _FORCE_REMEDIES: dict[str, tuple[Sequence[float], Sequence[float], float]] = {
 
 def _find_force_remedy(imu: ImuLog, reference: ReferenceLog) -> str:
     """Return the change with which the velocity of the reference changes as the force says, or ''."""
-    found = {
+    errors = {
         remedy: _force_error(
             imu._replace(
                 force=factor * np.array(of_force) * imu.force, rate=np.array(of_rate) * imu.rate
@@ -80,9 +80,9 @@ def _find_force_remedy(imu: ImuLog, reference: ReferenceLog) -> str:
     }
     for factor, unit in ((1.0, ""), (STANDARD_GRAVITY, f"multiply by {STANDARD_GRAVITY}, and ")):
         error = _force_error(imu._replace(force=factor * imu.force), reference, gravity=0.0)
-        found[_without_gravity(unit)] = error
-    remedy = min(found, key=lambda text: found[text])
-    return remedy if found[remedy] <= _AGREEING_FORCE else ""
+        errors[_without_gravity(unit)] = error
+    remedy = min(errors, key=lambda text: errors[text])
+    return remedy if errors[remedy] <= _AGREEING_FORCE else ""
 
 
 def _without_gravity(unit: str) -> str:
@@ -174,10 +174,10 @@ def _find_turn_remedy(
         f"wx, wy, wz are in deg/s: multiply by {_DEGREE:.10f}.": (imu._replace(rate=_DEGREE * imu.rate), reference),
         "wx, wy, wz have the other sign: negate them.": (imu._replace(rate=-imu.rate), reference),
         "The gyroscope is forward-left-up: negate wy and wz.": (imu._replace(rate=imu.rate * [-1, 1, -1]), reference),
-        **{text: (imu, other) for text, other in others.items()},
+        **{text: (imu, variant) for text, variant in others.items()},
     }  # fmt: skip
-    found = {text: _turn_error(*pair) for text, pair in changes.items()}
-    agreeing = [text for text, error in found.items() if error <= _AGREEING_TURN]
+    errors = {text: _turn_error(*pair) for text, pair in changes.items()}
+    agreeing = [text for text, error in errors.items() if error <= _AGREEING_TURN]
     if agreeing:  # a heading and rates of the other sign turn alike, but the force differs
         return min(agreeing, key=lambda text: _force_error(*changes[text]))
     if offset:

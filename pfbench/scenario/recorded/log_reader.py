@@ -111,27 +111,49 @@ def read_log(
     check_force(sensors, reference, inertial.name)
     imu_offset = find_imu_offset(sensors, reference)
     late = imu_offset.describe(inertial.name, truth.name) if imu_offset else ""
-    both = (inertial.name, truth.name)
-    check_rotation(sensors, reference, both, lambda: _other_attitudes(truth, reference), late)
-    gravity = STANDARD_GRAVITY
-    if centre is None:
-        notes += (f"gravity {gravity} m/s^2: the log does not contain its location",)
-    else:
-        latitude, height = torch.tensor([centre[0] * _DEGREE, centre[2]], dtype=torch.float64)
-        gravity = float(earth.gravity(latitude, height))
-    notes += compare_reference(truth, reference)
+    check_rotation(
+        sensors,
+        reference,
+        (inertial.name, truth.name),
+        lambda: _other_attitudes(truth, reference),
+        late,
+    )
+    gravity, gravity_notes = _gravity(centre)
+    notes += (*gravity_notes, *compare_reference(truth, reference))
     with _explain(late):
         notes += compare_inertial(truth, sensors, reference, gravity)
-    fix_offset = find_fix_offset(fixes, reference) if names.gnss != names.reference else None
-    fixes_late = fix_offset.describe(gnss.name, truth.name) if fix_offset else ""
-    with _explain(fixes_late):
-        fixes, fix_notes = compare_fixes(gnss, fixes, reference, limits)
+    fixes, fix_notes = _compare_fixes(gnss, fixes, (truth, reference), limits)
     tables = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
-    notes += (*fix_notes, *compare_times(tables))
     dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
-    notes = (*dropped, *filter(None, (late, fixes_late)), *usable_notes, *notes)
+    offsets = (late,) if late else ()
+    notes = (*dropped, *offsets, *usable_notes, *notes, *fix_notes, *compare_times(tables))
     announce_notes(folder, notes)
     return NavigationLog(sensors, fixes, reference, gravity, notes)
+
+
+def _compare_fixes(
+    table: LogTable,
+    fixes: GnssLog,
+    truth: tuple[LogTable, ReferenceLog],
+    limits: PlausibleLimits,
+) -> tuple[GnssLog, tuple[str, ...]]:
+    """Compare fixes with the reference, and name the offset of a clock that is not its own."""
+    reference_table, reference = truth
+    is_own = table.name == reference_table.name
+    offset = None if is_own else find_fix_offset(fixes, reference)
+    late = offset.describe(table.name, reference_table.name) if offset else ""
+    with _explain(late):
+        fixes, notes = compare_fixes(table, fixes, reference, limits)
+    return fixes, ((late, *notes) if late else notes)
+
+
+def _gravity(centre: tuple[float, ...] | None) -> tuple[float, tuple[str, ...]]:
+    """Return the gravity at the origin, m/s^2, and a note if the origin is not known."""
+    if centre is None:
+        text = f"gravity {STANDARD_GRAVITY} m/s^2: the log does not contain its location"
+        return STANDARD_GRAVITY, (text,)
+    latitude, height = torch.tensor([centre[0] * _DEGREE, centre[2]], dtype=torch.float64)
+    return float(earth.gravity(latitude, height)), ()
 
 
 @contextlib.contextmanager

@@ -131,11 +131,11 @@ def test_a_note_of_another_process_of_the_sweep_is_not_repeated(
 ) -> None:
     caplog.set_level(logging.INFO, "pfbench")
     monkeypatch.setenv(reader_notes.SWEEP_LOG, str(tmp_path / "sweep"))
-    monkeypatch.setattr(reader_notes, "_told", set())
+    monkeypatch.setattr(reader_notes, "_announced", set())
     reader_notes.announce_notes(tmp_path / "drive", ["dropped"])
     assert caplog.messages == ["note      drive: dropped"]
     monkeypatch.setattr(os, "getpid", lambda: -1)  # another process, which knows nothing of it
-    monkeypatch.setattr(reader_notes, "_told", set())
+    monkeypatch.setattr(reader_notes, "_announced", set())
     reader_notes.announce_notes(tmp_path / "drive", ["dropped"])
     assert len(caplog.messages) == 1
     reader_notes.announce_notes(tmp_path / "walk", ["dropped"])
@@ -145,7 +145,7 @@ def test_a_note_of_another_process_of_the_sweep_is_not_repeated(
 def test_many_notes_are_counted(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(reader_notes, "_told", set())
+    monkeypatch.setattr(reader_notes, "_announced", set())
     reader_notes.announce_notes("drive", [f"row {i}" for i in range(40)])
     assert len(caplog.messages) == 12
     assert caplog.messages[-1].startswith("note      drive: 29 further notes")
