@@ -130,7 +130,7 @@ def check_study(name: Any) -> str:
     Raises:
         UntrustedConfigError: If it is not a plain name.
     """
-    name = str(name) if type(name) in (int, float) else name
+    name = str(name) if isinstance(name, int | float) else name
     if not isinstance(name, str) or not STUDY.fullmatch(name) or set(name) == {"."}:
         raise UntrustedConfigError(
             f"study must be a name of letters, digits, '_', '-', '+' and '.', got {name!r}. "

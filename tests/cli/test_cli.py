@@ -112,7 +112,6 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("results_dir must be a folder, got 5. Set results_dir=results",),
     ),
     "no folder": (("results_dir=null",), ("results_dir must be a folder, got None",)),
-    "a study that is a truth": (("study=true",), ("study must be a name of letters", "got True")),
     "endless memory": (("memory_limit_gib=inf",), ("memory_limit_gib must be the GiB", "got inf")),
     "a device beyond all": (
         ("device=cuda:99999999999999999999",),

@@ -144,7 +144,7 @@ def test_the_workers_of_a_sweep_end_with_it(name: str, tmp_path: Path) -> None:
         time.sleep(0.2)
     assert len(processes_of(tmp_path, "loky")) >= 2
     sweep.send_signal(getattr(signal, name))
-    code = sweep.wait(60)
+    code, end = sweep.wait(60), time.monotonic() + 30
     while processes_of(tmp_path, "loky") and time.monotonic() < end:
         time.sleep(0.2)
     assert processes_of(tmp_path, "loky") == []
