@@ -1,4 +1,4 @@
-"""What a file of a search path may set, checked for each file that Hydra loads at the place where Hydra puts it.
+"""Rules of what a file of a search path may set, for each file that Hydra loads at the place where Hydra puts it.
 
 A scenario, an experiment or another file may belong to a stranger. It may describe a world, a filter or a
 sweep. Folders, data of the user, the environment and Hydra's own settings are the user's.
@@ -90,15 +90,23 @@ def check_defaults(file: Path, defaults: Sequence[Any]) -> None:
         in_hydra = any(re.split(r"[/.]", text.lstrip("/"))[0] == "hydra" for text in texts)
         leaves = any(".." in text or "${" in text for text in texts)
         if leaves or (in_hydra and not is_launcher):
-            shown = "@".join(filter(None, [group or texts[0], entry.package]))
+            choice = "@".join(filter(None, [group or texts[0], entry.package]))
             raise UntrustedConfigError(
                 f"{file}: defaults must name files of a group directly and outside hydra, or one of the "
-                f"launchers {', '.join(_launchers())}, got {shown}: {value}. Choose it on the command line."
+                f"launchers {', '.join(_launchers())}, got {choice}: {value}. Choose it on the command line."
             )
 
 
 def check_place(config_path: str, package: str | None) -> None:
-    """Check that no file is placed in the node `hydra` but those of Hydra's own groups."""
+    """Check that no file is placed in the node `hydra` but those of Hydra's own groups.
+
+    Args:
+        config_path: File as Hydra names it.
+        package: Package that Hydra gives it.
+
+    Raises:
+        UntrustedConfigError: If it is placed there.
+    """
     in_hydra = (package or "").partition(".")[0].partition("[")[0] == "hydra"
     if in_hydra and not config_path.lstrip("/").startswith("hydra/"):
         raise UntrustedConfigError(
@@ -108,7 +116,16 @@ def check_place(config_path: str, package: str | None) -> None:
 
 
 def check_group(file: Path, config_path: str, *, is_own: bool) -> None:
-    """Check that a file of a search path is none of Hydra's settings; the user's own may be a launcher."""
+    """Check that a file of a search path is none of Hydra's settings.
+
+    Args:
+        file: File, for messages.
+        config_path: File as Hydra names it.
+        is_own: Whether the folder is the user's own, so that it may hold launchers.
+
+    Raises:
+        UntrustedConfigError: If the file is one of them.
+    """
     is_launcher = is_own and config_path.startswith("hydra/launcher/")
     if config_path.lstrip("./").startswith("hydra") and not is_launcher:
         raise UntrustedConfigError(
@@ -203,7 +220,7 @@ def _check_interpolation(file: Path, path: tuple[Any, ...], text: str, is_own: b
             )  # fmt: skip
 
 
-def _list_interpolations(tree: Any, *, is_inside: bool = False) -> Iterator[tuple[str, str]]:
+def _list_interpolations(tree: Any) -> Iterator[tuple[str, str]]:
     """Yield resolver and key of each interpolation in a tree of OmegaConf's grammar.
 
     One inside of another has no plain key, and so the outer one is refused.
@@ -215,9 +232,8 @@ def _list_interpolations(tree: Any, *, is_inside: bool = False) -> Iterator[tupl
         yield tree.resolverName().getText(), key.strip()
     elif kind == "InterpolationNodeContext":
         yield "", tree.getText().removeprefix("${").removesuffix("}").strip()
-    is_inside = is_inside or kind.startswith("Interpolation")
     for child in getattr(tree, "children", None) or ():
-        yield from _list_interpolations(child, is_inside=is_inside)
+        yield from _list_interpolations(child)
 
 
 def _check_sweep(file: Path, params: Any, is_own: bool) -> None:
@@ -250,8 +266,8 @@ def _check_sweep(file: Path, params: Any, is_own: bool) -> None:
             )  # fmt: skip
         for single in values:
             nested: Any = _to_plain(single)
-            for part in reversed(key):
-                nested = {part: nested}
+            for name_of_node in reversed(key):
+                nested = {name_of_node: nested}
             check_content(file, nested, is_own=is_own)
 
 

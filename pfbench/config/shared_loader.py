@@ -82,7 +82,21 @@ class SharedLoader(ConfigLoaderImpl):
         from_shell: bool = True,
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
-        """Compose a configuration and check it."""
+        """Compose a configuration and check it.
+
+        Args:
+            config_name: Main file.
+            overrides: Words.
+            run_mode: Mode of Hydra.
+            from_shell: Whether messages are for a shell.
+            validate_sweep_overrides: Whether a sweep in the words is an error.
+
+        Returns:
+            The configuration, not resolved.
+
+        Raises:
+            UntrustedConfigError: If a file sets what only the command line may set.
+        """
         try:
             tree = super().load_configuration(
                 config_name, overrides, run_mode, from_shell, validate_sweep_overrides
@@ -247,10 +261,10 @@ class _SharedRepository(CachingConfigRepository):
         if folder is not None:
             self.folders[config_path] = folder
         if folder is not None and len(holders) > 1:
-            other = next(source for source in holders if source is not folder)
+            second = next(source for source in holders if source is not folder)
             raise UntrustedConfigError(
                 f"{folder.file_of(config_path)} must have another name than "
-                f"{_name_file(other, config_path)}, got the same. Rename your file."
+                f"{_name_file(second, config_path)}, got the same. Rename your file."
             )
         return holders[0] if holders else None
 
@@ -271,9 +285,9 @@ class _StoredNode:
 def _name_file(source: ConfigSource, config_path: str) -> str:
     """Return the place of a file, for messages."""
     group, _, name = config_path.rpartition("/")
-    is_shipped = not isinstance(source, ForeignFolder)
-    folder = f"pfbench's own {group or 'main file'}" if is_shipped else source.path
-    return f"{folder} {name}" if is_shipped else f"{source.path}/{config_path}"
+    if isinstance(source, ForeignFolder):
+        return f"{source.file_of(config_path)}"
+    return f"pfbench's own {group or 'main file'} {name}"
 
 
 def _has_file(source: ConfigSource, config_path: str) -> bool:

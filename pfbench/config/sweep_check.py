@@ -54,13 +54,13 @@ def replace_config_dir(words: Sequence[str]) -> list[str]:
     Raises:
         ValueError: If the flag has no folder, or the search path is given twice.
     """
-    place = next((i for i, w in enumerate(words) if re.match(r"(--config-dir|-cd)(=|$)", w)), None)
-    if place is None:
+    index = next((i for i, w in enumerate(words) if re.match(r"(--config-dir|-cd)(=|$)", w)), None)
+    if index is None:
         return list(words)
-    _, equals, folder = words[place].partition("=")
-    after = place + 1 if equals else place + 2
-    folder = folder or "".join(words[place + 1 : after])
-    others = [*words[:place], *words[after:]]
+    _, equals, folder = words[index].partition("=")
+    after = index + 1 if equals else index + 2
+    folder = folder or "".join(words[index + 1 : after])
+    others = [*words[:index], *words[after:]]
     is_twice = any(re.match(r"[+~]*hydra\.searchpath\b|--config-dir\b|-cd\b", w) for w in others)
     if not folder or is_twice:
         raise ValueError(

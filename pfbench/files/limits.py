@@ -58,7 +58,15 @@ def check_is_file(path: Path, most: int) -> None:
 
 
 def check_columns(path: Path, count: int) -> None:
-    """Raise LimitError if a table has too many columns."""
+    """Check the number of columns of a table.
+
+    Args:
+        path: File.
+        count: Number of its columns.
+
+    Raises:
+        LimitError: If there are too many.
+    """
     if count > TABLE_COLUMNS:
         raise LimitError(
             f"{path.name} must have at most {TABLE_COLUMNS} columns, got {count}. "
