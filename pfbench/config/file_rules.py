@@ -223,7 +223,7 @@ def _check_interpolation(file: Path, path: tuple[Any, ...], text: str, is_own: b
 def _list_interpolations(tree: Any) -> Iterator[tuple[str, str]]:
     """Yield resolver and key of each interpolation in a tree of OmegaConf's grammar.
 
-    One inside of another has no plain key, and so the outer one is refused.
+    A nested one makes the key of the outer one no plain key, which is an error.
     """
     kind = type(tree).__name__
     if kind == "InterpolationResolverContext":

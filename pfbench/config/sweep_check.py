@@ -43,7 +43,7 @@ def check_words(words: Sequence[str]) -> JobConfig | None:
 
 
 def replace_config_dir(words: Sequence[str]) -> list[str]:
-    """Write the flag `--config-dir` of Hydra as the search path that it stands for.
+    """Replace the flag `--config-dir` of Hydra by the search path with this folder.
 
     Args:
         words: Overrides and flags of Hydra.
@@ -52,7 +52,7 @@ def replace_config_dir(words: Sequence[str]) -> list[str]:
         The words without the flag.
 
     Raises:
-        ValueError: If the flag has no folder, or the search path is given twice.
+        ValueError: If the flag is without a folder, or the search path is given twice.
     """
     index = next((i for i, w in enumerate(words) if re.match(r"(--config-dir|-cd)(=|$)", w)), None)
     if index is None:

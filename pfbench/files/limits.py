@@ -15,8 +15,8 @@ CONFIG_DEPTH = 40
 CONFIG_TEXT = 10_000  # characters of one text
 CONFIG_INTERPOLATED = 1_000  # characters of a text with interpolations
 # of a configuration
-RESOLVED_REFERENCES = 2_000
-RESOLVED_VALUES = 100_000  # that others refer to, each as often as it is referred to
+RESOLVED_REFERENCES = 1_000
+RESOLVED_VALUES = 100_000  # that others refer to, counted at each reference
 RESOLVED_TEXT = 1_000_000  # characters of all their values
 LOADED_FILES = (
     300  # by the defaults lists of one configuration with a search path, repetitions counted

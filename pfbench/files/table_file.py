@@ -262,7 +262,7 @@ def check_parquet(file: Path) -> None:
         file: File.
 
     Raises:
-        limits.LimitError: If it is no file, or has too many columns or much more content than bytes.
+        limits.LimitError: If it is a pipe or a folder, or has too many columns or much more content than bytes.
         OSError, pyarrow.ArrowException: If it cannot be read.
     """
     from pyarrow import parquet

@@ -49,7 +49,7 @@ REFUSED: dict[str, tuple[str, str, str]] = {  # place, text, message
     "many files": ("train/a", f"defaults: [{','.join(f'/filter@a{i}: sir' for i in range(400))}]\n", "at most 300 files"),
     "bomb of texts": (
         "noise/a", NOISE + "b0: xxxxxxxx\n" + "".join(f"b{i + 1}: ${{noise.b{i}}}${{noise.b{i}}}\n" for i in range(40)),
-        "at most 2000 references",
+        "at most 1000 references",
     ),
     "values": ("train/a", f"b: [{'1,' * 10_001}]\n", "at most 10000 values"),
     "depth": ("train/a", f"b: {'[' * 60}{']' * 60}\n", "at most 40 levels"),
