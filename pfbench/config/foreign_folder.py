@@ -183,7 +183,7 @@ def _measure(text: str) -> Iterator[tuple[yaml.Event, int, int]]:
     values, starts = 0, list[tuple[str | None, int]]()
     sizes: dict[str | None, int] = {}
     for event in yaml.parse(text, yaml.SafeLoader):
-        if isinstance(event, yaml.AliasEvent):  # an alias within its own node has no size yet
+        if isinstance(event, yaml.AliasEvent):  # one inside of its own node expands for ever
             values += sizes.get(event.anchor, limits.CONFIG_VALUES)
         elif isinstance(event, yaml.ScalarEvent):
             values, sizes[event.anchor] = values + 1, 1

@@ -87,8 +87,11 @@ def test_only_files_of_the_user_s_own_folder_name_data(tmp_path: Path) -> None:
     for line in ("cache_dir: /home/a", "d: ${oc.env:HOME}"):
         with pytest.raises(UntrustedConfigError, match="must"):
             compose(tmp_path, "noise/a", f"{text}{line}\n", scheme="own")
-    launcher = "hydra/launcher/mine", "defaults: [joblib]\nn_jobs: 3\n"
-    assert compose(tmp_path, *launcher, "hydra/launcher=mine", scheme="own").values
+    (tmp_path / "hydra" / "launcher").mkdir(parents=True)
+    (tmp_path / "hydra" / "launcher" / "mine.yaml").write_text("defaults: [joblib]\nn_jobs: 3\n")
+    assert compose(tmp_path, "noise/a", text, "hydra/launcher=mine", scheme="own").values
+    with pytest.raises(UntrustedConfigError, match="must not be a setting of hydra"):
+        compose(tmp_path, "noise/a", NOISE, "hydra/launcher=mine")
 
 
 @pytest.mark.parametrize(
