@@ -51,12 +51,7 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
         return "memory must be enough for the command, got an array that is too large. Reduce runs, particles or steps."
     text = f"{error}".strip() or type(error).__name__
     if match := re.search(r"Could not override '([^']*)'", text):
-        if not match[1]:
-            return "each word must be key=value, got one without a key. Write the key before the equals sign."
-        if match[1] == "experiment":
-            name = next((w.partition("=")[2] for w in words if w.startswith("experiment=")), "NAME")
-            return f"experiment={name} must be added with a plus sign. Use +experiment={name}"
-        return _format_unknown_key(match[1], words)
+        return _format_override(match[1], words)
     launchers = "|".join(_EXTRAS)
     if match := re.search(rf"[Cc]ould not (?:find|load) 'hydra/launcher/({launchers})", text):
         launcher = next((word for word in words if word.startswith("hydra/launcher=")), "launcher")
@@ -71,6 +66,16 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
         text = describe_unknown(error)
     renamed = next((find_renamed(word) for word in words if find_renamed(word)), None)
     return f"{text} {renamed[0]}: renamed to {renamed[1]}" if renamed else text
+
+
+def _format_override(key: str, words: Sequence[str]) -> str:
+    """Format the error of a word whose key the configuration lacks."""
+    if not key:
+        return "each word must be key=value, got one without a key. Write the key before the equals sign."
+    if key == "experiment":
+        name = next((w.partition("=")[2] for w in words if w.startswith("experiment=")), "NAME")
+        return f"experiment={name} must be added with a plus sign. Use +experiment={name}"
+    return _format_unknown_key(key, words)
 
 
 def _format_storage(error: OSError) -> str:

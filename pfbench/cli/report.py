@@ -106,11 +106,11 @@ def make_report_options(config: JobConfig) -> Any:
     from pfbench.report.options import ReportOptions
 
     values = config.values.get("report")
-    known = [field.name for field in fields(ReportOptions)]
-    if not isinstance(values, Mapping) or not set(values) <= {*known}:
-        given = ", ".join(map(str, values)) if isinstance(values, Mapping) else str(values)
+    names = [field.name for field in fields(ReportOptions)]
+    if not isinstance(values, Mapping) or not set(values) <= {*names}:
+        text = ", ".join(map(str, values)) if isinstance(values, Mapping) else str(values)
         raise ValueError(
-            f"report must have keys of {', '.join(known)}, got {given}. Choose a file: pfbench list report"
+            f"report must have keys of {', '.join(names)}, got {text}. Choose a file: pfbench list report"
         )
     options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     return ReportOptions(**options, planned=count_planned_jobs(config.values["study"]))

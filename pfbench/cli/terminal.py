@@ -118,21 +118,21 @@ def _opened(stream: Any) -> Any:
 def stopped_by_signals() -> Iterator[None]:
     """Raise SignalStop for the signals that end a process, unless the program around handles or ignores them."""
 
-    def stop(number: int, frame: object) -> None:
-        for each in taken:
-            signal.signal(each, signal.SIG_IGN)  # a second one must not interrupt the tidying
-        raise SignalStop(number)
+    def stop(received: int, frame: object) -> None:
+        for number in signals:
+            signal.signal(number, signal.SIG_IGN)  # a second one must not interrupt the tidying
+        raise SignalStop(received)
 
-    taken: list[int] = []
+    signals: list[int] = []
     if threading.current_thread() is threading.main_thread():
-        taken += [each for each in _SIGNALS if signal.getsignal(each) == signal.SIG_DFL]
-    for each in taken:
-        signal.signal(each, stop)
+        signals += [number for number in _SIGNALS if signal.getsignal(number) == signal.SIG_DFL]
+    for number in signals:
+        signal.signal(number, stop)
     try:
         yield
     finally:
-        for each in taken:
-            signal.signal(each, signal.SIG_DFL)
+        for number in signals:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def stop_workers() -> None:

@@ -1,4 +1,4 @@
-"""Errors that pfbench does not name: stage and file by the place on the stack, and the file of the trace.
+"""Errors that pfbench does not name: stage and file by the entry on the stack, and the file of the trace.
 
 A sentence is written where an error is expected: pfbench raises it by a `raise` statement. All other errors are of Python or of
 a library. They are reported with what was being done, their class and text, and a file with the whole trace.
@@ -41,13 +41,13 @@ def is_named(error: BaseException) -> bool:
     """
     if any(base.__module__.partition(".")[0] == "pfbench" for base in type(error).__mro__):
         return True
-    place = error.__traceback__
-    while place is not None and place.tb_next is not None:
-        place = place.tb_next
-    if place is None:
+    entry = error.__traceback__
+    while entry is not None and entry.tb_next is not None:
+        entry = entry.tb_next
+    if entry is None:
         return True
-    is_raised = place.tb_frame.f_code.co_code[place.tb_lasti] == _RAISE
-    return is_raised and _module(place.tb_frame)[0] == "pfbench"
+    is_raised = entry.tb_frame.f_code.co_code[entry.tb_lasti] == _RAISE
+    return is_raised and _module(entry.tb_frame)[0] == "pfbench"
 
 
 def describe_unknown(error: BaseException) -> str:
@@ -60,15 +60,15 @@ def describe_unknown(error: BaseException) -> str:
         Stage or file, class and text of the error, and a remedy.
     """
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    own = [frame for frame in reversed(frames) if _module(frame)[0] == "pfbench"]
-    folders = [_module(frame)[1] for frame in own]
+    package_frames = [frame for frame in reversed(frames) if _module(frame)[0] == "pfbench"]
+    folders = [_module(frame)[1] for frame in package_frames]
     stage = next((_STAGES[name] for name in folders if name in _STAGES), "running the command")
-    files = [frame.f_locals.get(name) for frame in own[:3] for name in _FILE_NAMES]
+    files = [frame.f_locals.get(name) for frame in package_frames[:3] for name in _FILE_NAMES]
     path = next((value for value in files if isinstance(value, Path)), None)
-    place = f"{stage} ({path})" if path else stage
+    name = f"{stage} ({path})" if path else stage
     reason = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
     subject = str(path) if path else "the words of the command and the files that they name"
-    return f"{place} must succeed, got {reason.rstrip('.')}. Check {subject}."
+    return f"{name} must succeed, got {reason.rstrip('.')}. Check {subject}."
 
 
 def keep_trace(error: BaseException, words: Sequence[str]) -> Path | None:

@@ -134,9 +134,7 @@ def compilable(
             return (_find_cuda_kernel(operator, args) or function)(*args)
         _check(operator, args)
         # tangents do not pass an operator: a derivative through it would be zero
-        if in_graph is None or not _plain(args) or not fits_graph(*args):
-            return function(*args)
-        return in_graph(*args)
+        return (in_graph if in_graph and _plain(args) and fits_graph(*args) else function)(*args)
 
     return cast(F, call)
 

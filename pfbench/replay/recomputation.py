@@ -80,9 +80,9 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
     trusted = trusted_packages()
     packages = meta.get("trusted", [])
     if not set(packages) <= set(trusted):
-        given = f"trust=[{','.join(trusted)}]" if trusted else "none of them"
+        text = f"trust=[{','.join(trusted)}]" if trusted else "none of them"
         raise UntrustedConfigError(
-            f"trust must name the packages whose classes the run used, {', '.join(packages)}, got {given}. Nothing was "
+            f"trust must name the packages whose classes the run used, {', '.join(packages)}, got {text}. Nothing was "
             f"run. If you still trust them, add trust=[{','.join(packages)}] to the command."
         )
     return JobConfig(
