@@ -44,7 +44,12 @@ class ClockOffset(NamedTuple):
     agreement: str
 
     def describe(self, name: str, reference: str) -> str:
-        """Return a note with the change that removes the offset."""
+        """Return a note with the change that removes the offset.
+
+        Args:
+            name: Table with the offset.
+            reference: Table that is taken as right.
+        """
         size, is_late = abs(self.late_s), self.late_s > 0.0
         is_leap = abs(size - LEAP_SECONDS) < 0.1
         size = LEAP_SECONDS if is_leap else size
