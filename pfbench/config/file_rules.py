@@ -51,13 +51,13 @@ def check_content(file: Path, values: Mapping[str, Any], *, is_own: bool) -> Non
     for path, value in _walk(values):
         key = path[-1]
         if path[0] == "hydra":
-            _check_hydra_value(file, path, value)
+            _check_hydra_value(file, path, value, is_own)
         elif key in WRITTEN or key in SETTINGS or key in READ:
             _check_protected(file, path, value, is_own)
         if isinstance(key, str) and "${" in key:
-            _refuse(file, path, "must be a plain name", key, "Write the name itself.")
+            _refuse(file, path, "be a plain name", key, "Write the name itself.")
         if isinstance(value, str) and not is_own and _PATH.search(value):
-            _refuse(file, path, "must not be a path", value, _own_remedy(file))
+            _refuse(file, path, "not be a path", value, _own_remedy(file))
         if isinstance(value, str) and "${" in value and not _is_reference(path, value):
             _check_interpolation(file, path, value, is_own)
     params = _find(values, "hydra", "sweeper", "params")
@@ -84,7 +84,7 @@ def check_defaults(file: Path, defaults: Sequence[Any]) -> None:
         is_launcher = (
             group is not None
             and group.strip("/") == "hydra/launcher"
-            and value in _launchers()
+            and value in launchers()
             and entry.package is None
         )
         in_hydra = any(re.split(r"[/.]", text.lstrip("/"))[0] == "hydra" for text in texts)
@@ -93,7 +93,7 @@ def check_defaults(file: Path, defaults: Sequence[Any]) -> None:
             choice = "@".join(filter(None, [group or texts[0], entry.package]))
             raise UntrustedConfigError(
                 f"{file}: defaults must name files of a group directly and outside hydra, or one of the "
-                f"launchers {', '.join(_launchers())}, got {choice}: {value}. Choose it on the command line."
+                f"launchers {', '.join(launchers())}, got {choice}: {value}. Choose it on the command line."
             )
 
 
@@ -130,12 +130,12 @@ def check_group(file: Path, config_path: str, *, is_own: bool) -> None:
     if config_path.lstrip("./").startswith("hydra") and not is_launcher:
         raise UntrustedConfigError(
             f"{file} must not be a setting of hydra. Choose a launcher of pfbench "
-            f"({', '.join(_launchers())}), or write own:// before a folder of your own launchers."
+            f"({', '.join(launchers())}), or write own:// before a folder of your own launchers."
         )
 
 
 @cache
-def _launchers() -> tuple[str, ...]:
+def launchers() -> tuple[str, ...]:
     """Return the names of the launchers of pfbench, and Hydra's own."""
     return "basic", *sorted(
         path.stem for path in (conf_dir() / "hydra" / "launcher").glob("*.yaml")
@@ -160,13 +160,15 @@ def _find(node: Any, *path: str) -> Any:
     return node
 
 
-def _check_hydra_value(file: Path, path: tuple[Any, ...], value: Any) -> None:
+def _check_hydra_value(file: Path, path: tuple[Any, ...], value: Any, is_own: bool) -> None:
     """Check that a value below `hydra` belongs to the values of a sweep."""
-    allowed = ("hydra", "sweeper", "params")
-    is_between = path == allowed[: len(path)] and (len(path) == 3 or isinstance(value, Mapping))
-    if not is_between and path[:3] != allowed:
+    allowed = [("hydra", "sweeper", "params")]
+    if is_own:  # a launcher of the user, which the command line chooses
+        allowed.append(("hydra", "launcher", *path[2:3]))
+    is_between = isinstance(value, Mapping) and any(path == keys[: len(path)] for keys in allowed)
+    if not is_between and path[:3] not in allowed:
         _refuse(
-            file, path[:2], "must not be set: hydra must have sweeper.params only", value,
+            file, path[:2], "not be set: hydra must have sweeper.params only", value,
             "Set the settings of hydra on the command line.",
         )  # fmt: skip
 
@@ -184,7 +186,7 @@ def _check_protected(file: Path, path: tuple[Any, ...], value: Any, is_own: bool
     remedy = _own_remedy(file) if key in READ else ""
     name = _join(path)
     _refuse(
-        file, path, "must be set on the command line", value,
+        file, path, "be set on the command line", value,
         f"Remove the key from the file, and add {name}=... to the command. {remedy}".rstrip(),
     )  # fmt: skip
 
@@ -203,19 +205,19 @@ def _check_interpolation(file: Path, path: tuple[Any, ...], text: str, is_own: b
 
     if len(text) > limits.CONFIG_INTERPOLATED:
         _refuse(
-            file, path, f"must have at most {limits.CONFIG_INTERPOLATED} characters with an interpolation",
+            file, path, f"have at most {limits.CONFIG_INTERPOLATED} characters with an interpolation",
             len(text), "Give the value on the command line.",
         )  # fmt: skip
     try:
         tree = grammar_parser.parse(text)
     except GrammarParseError as error:
-        _refuse(file, path, "must be a valid interpolation", text, f"{error}".splitlines()[0])
+        _refuse(file, path, "be a valid interpolation", text, f"{error}".splitlines()[0])
     for resolver, key in _list_interpolations(tree):
         names_user = not is_own and {*WRITTEN, *READ, "hydra"} & set(re.findall(r"\w+", key))
         if resolver not in _RESOLVERS or not _PLAIN_KEY.fullmatch(key) or names_user:
             got = f"the resolver {resolver} in {text}" if resolver not in _RESOLVERS else text
             _refuse(
-                file, path, "must have interpolations of plain keys, and none of the user's folders",
+                file, path, "have interpolations of plain keys, and none of the user's folders",
                 got, "Give the value on the command line.",
             )  # fmt: skip
 
@@ -247,7 +249,7 @@ def _check_sweep(file: Path, params: Any, is_own: bool) -> None:
         is_plain = isinstance(value, str | int | float | bool) or value is None
         if not is_plain or re.search(r"[@~]", str(name)) or "${" in f"{name}{value}":
             _refuse(
-                file, ("hydra", "sweeper", "params"), "must be plain keys and values",
+                file, ("hydra", "sweeper", "params"), "be plain keys and values",
                 f"{name}={value}", "Give it on the command line.",
             )  # fmt: skip
         word = OverridesParser.create().parse_override(f"{name}={value}")
@@ -255,13 +257,13 @@ def _check_sweep(file: Path, params: Any, is_own: bool) -> None:
         jobs *= max(1, len(values))
         if jobs > limits.SWEPT_JOBS:
             _refuse(
-                file, ("hydra", "sweeper", "params"), f"must have at most {limits.SWEPT_JOBS} jobs",
+                file, ("hydra", "sweeper", "params"), f"have at most {limits.SWEPT_JOBS} jobs",
                 "more", "Give the sweep on the command line.",
             )  # fmt: skip
         key = re.split(r"[./]", word.key_or_group)
         if key[0] == "hydra":
             _refuse(
-                file, ("hydra", "sweeper", "params"), f"must not set {word.key_or_group}", value,
+                file, ("hydra", "sweeper", "params"), f"not set {word.key_or_group}", value,
                 f"Give {word.key_or_group} on the command line.",
             )  # fmt: skip
         for single in values:
@@ -303,4 +305,6 @@ def _join(path: Sequence[Any]) -> str:
 
 def _refuse(file: Path, path: Sequence[Any], requirement: str, value: Any, remedy: str) -> Any:
     """Raise the error of a value of a file."""
-    raise UntrustedConfigError(f"{file}: {_join(path)} {requirement}, got {value!r:.80}. {remedy}")
+    raise UntrustedConfigError(
+        f"{file}: {_join(path)} must {requirement}, got {value!r:.80}. {remedy}"
+    )

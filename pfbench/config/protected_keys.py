@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from pfbench.config.file_rules import launchers
 from pfbench.config.trust import UntrustedConfigError, check_study
 
 FOLDER_KEYS = ("results_dir", "reports_dir", "episode_cache_dir")
@@ -44,11 +45,16 @@ def check_composed(
     if compose_reference is None:
         return
     launcher = tree.hydra.runtime.choices.get("hydra/launcher")
-    reference = compose_reference([*_list_setting_words(words), f"hydra/launcher={launcher}"])
+    is_shipped = launcher in launchers()  # another one is of a folder of the user's own
+    pattern = r"[+~]*hydra/launcher" if is_shipped else r"[+~]*hydra[/.]launcher"
+    others = [word for word in _list_setting_words(words) if not re.match(pattern, word)]
+    reference = compose_reference(
+        [*others, f"hydra/launcher={launcher if is_shipped else 'basic'}"]
+    )
     for (key, value), (_, expected) in zip(
         _list_settings(tree, words), _list_settings(reference, words), strict=True
     ):
-        if value != expected:
+        if value != expected and (is_shipped or key != "hydra.launcher"):
             raise UntrustedConfigError(
                 f"{key} must be set on the command line, got {value!r:.200} from a file. "
                 f"Remove the key from the file, and add {key}=... to the command."

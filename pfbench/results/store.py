@@ -209,7 +209,9 @@ def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
     try:
         check_zip(path)
     except LimitError as error:
-        raise DamagedResultError(f"{error}") from error
+        raise DamagedResultError(
+            f"{path} is damaged: its size must be plausible ({error}). Delete it and run the job again."
+        ) from error
     # opened here, since numpy leaves a damaged file open
     with path.open("rb") as raw:
         try:
