@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pfbench.config.file_scan import check_files
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.group_checks import check_groups, resolve_values
-from pfbench.config.named_sets import check_tuned_seed, expand_filter_names
+from pfbench.config.named_sets import expand_filter_names
 from pfbench.config.paper_block import check_paper_blocks, remove_nested_blocks
 from pfbench.config.protected_keys import check_protected_keys
 from pfbench.config.trust import check_configuration, check_study, split_trust
+from pfbench.config.tuned_knobs import TUNED, check_tuned_seed, mark_foreign, select_knobs
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 CHOICES = ("scenario", "noise", "filter", "model")  # groups that name a job
-TUNED = "tuned"  # group of the knobs that `pfbench tune` chose, which no job stores
 
 _HYDRA_STATE = threading.RLock()  # Hydra has one state for all threads of a process
 
@@ -149,13 +149,13 @@ def resolve_config(
     is_shared = "particles" in tree["filter"] and OmegaConf.is_interpolation(
         tree["filter"], "particles"
     )
-    values = resolve_values(tree)
     names = {str(group): str(name) for group, name in (choices or {}).items()}
     _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
-    values = remove_nested_blocks(values)
-    check_tuned_seed(
-        values, names.get("scenario"), values.pop(TUNED, {})
-    )  # the filter has its knobs
+    select_knobs(tree, names, trusted)
+    values = remove_nested_blocks(resolve_values(tree))
+    knobs = values.pop(TUNED, {})  # the filter has them
+    check_tuned_seed(values, names.get("scenario"), knobs)
+    mark_foreign(values, names, knobs.get("world", {}))
     return JobConfig(values, names, is_shared, packages)
 
 
