@@ -19,8 +19,8 @@ AUTO, NOMINAL = "auto", "nominal"  # choices that look up the world of the job
 OWN_WORLD = "the world of each job"  # data of a tuned filter before a job chooses them
 _NOT_A_WORLD = ("scenario.root", "scenario.cache_dir")  # where data lie
 _REFERENCE = re.compile(r"\$\{\.*tuned\.(\w+)")
-_DATA = re.compile(r"(?P<scenario>\w+) \(model (?P<model>\w+)[,)]")  # as `describe_world` writes it
-_MARK = re.compile(r" \(tuned[^()]*\)$")
+_DATA = re.compile(r"(?:^|\), )(\w+) \(model (\w+)[,)]")  # as `describe_world` writes it
+_MARK = re.compile(r" \(tuned(?: on ([^()]*))?\)")
 
 
 def select_knobs(tree: DictConfig, choices: Mapping[str, str], trusted: Sequence[str]) -> None:
@@ -137,10 +137,32 @@ def add_world(name: str, world: str) -> str:
         name: Name such as "Gated EKF (tuned)".
         world: Words for the world.
     """
-    return f"{_MARK.sub('', name)} (tuned on {world})"
+    settings = _MARK.search(name)
+    tail = name[settings.end() :] if settings else ""
+    head = name[: settings.start()] if settings else name
+    return f"{head} (tuned on {world}){tail}"
 
 
-def find_foreign_world(data: str, scenario: str, model: str) -> str:
+def read_world(name: str) -> str:
+    """Return the words for the world in the name of a filter, empty for one without.
+
+    Args:
+        name: Name, as `add_world` makes it.
+    """
+    stated = _MARK.search(name)
+    return (stated[1] or "") if stated else ""
+
+
+def list_tuned_worlds(data: str) -> dict[str, str]:
+    """List the worlds that the data of a tuning state: models by scenario.
+
+    Args:
+        data: Data of a tuning, as a result stores them; several are separated by commas.
+    """
+    return dict(_DATA.findall(data))
+
+
+def find_foreign_world(data: str, scenario: str, model: str = "") -> str:
     """Return the words for the world of a tuning, empty if it is that of the job or not stated.
 
     Args:
@@ -148,10 +170,11 @@ def find_foreign_world(data: str, scenario: str, model: str) -> str:
         scenario: Scenario of the job.
         model: Model of the job, empty if it is not known.
     """
-    stated = _DATA.match(data)
-    if stated is None or (stated["scenario"] == scenario and model in ("", stated["model"])):
+    stated = list_tuned_worlds(data)
+    if not stated or (scenario in stated and model in ("", stated[scenario])):
         return ""
-    return _name_world(stated.groupdict(), {"scenario": scenario})
+    name = scenario if scenario in stated else min(stated)
+    return _name_world({"scenario": name, "model": stated[name]}, {"scenario": scenario})
 
 
 def _has_settings(values: Mapping[str, Any], settings: Sequence[str]) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 
 from pfbench.config.paper_block import MARKERS
 from pfbench.config.paper_files import list_named_parts, read_paper_block
+from pfbench.config.tuned_knobs import add_world, find_foreign_world, read_world
 from pfbench.report.setting_names import name_settings
 from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.conditions import Condition
@@ -118,16 +119,45 @@ def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
     """
     blocks: dict[str, Mapping[str, Any]] = {}
     worlds: dict[str, dict[str, None]] = {}  # distinct, in the order of the conditions
-    for job in (job for c in conditions for job in c.jobs):
-        blocks[job.label] = block = _stored_block(job.meta, "filter")
-        worlds.setdefault(job.label, {}).update(
-            {str(block["tuning"]): None} if block.get("tuning") else {}
-        )
+    foreign: dict[str, dict[str, None]] = {}
+    for condition in conditions:
+        for job in condition.jobs:
+            blocks[job.label] = block = _stored_block(job.meta, "filter")
+            data = str(block.get("tuning") or "")
+            worlds.setdefault(job.label, {}).update({data: None} if data else {})
+            model = str(job.meta.get("choices", {}).get("model", ""))
+            text = find_other_world(str(block.get("name")), data, [condition.scenario], model)
+            foreign.setdefault(job.label, {}).update({text: None} if text else {})
     looks = find_looks(sorted(blocks), blocks)
     return {
-        label: replace(look, tuning=", ".join(worlds[label])) if worlds[label] else look
+        label: add_tuning(look, ", ".join(worlds[label]), ", ".join(foreign[label]))
         for label, look in looks.items()
     }
+
+
+def find_other_world(name: str, data: str, scenarios: Collection[str], model: str = "") -> str:
+    """Return the words for the world on which a filter was tuned, empty if it is that of all scenarios.
+
+    Args:
+        name: Stored name of the filter, which may state the world.
+        data: Data of its tuning, empty for a filter without knobs.
+        scenarios: Keys of scenarios.
+        model: Model of the jobs, empty if it is not known.
+    """
+    worlds = (find_foreign_world(data, parse_label(key)[0], model) for key in scenarios)
+    return read_world(name) or next(filter(None, worlds), "")
+
+
+def add_tuning(look: MethodLook, data: str, foreign: str) -> MethodLook:
+    """Return the look of a tuned filter with the data of its tuning and the name of another world.
+
+    Args:
+        look: Look of a filter.
+        data: Data of its tuning, empty for the installed words.
+        foreign: Words for the world if it is not that of all conditions, else empty.
+    """
+    names = {key: add_world(getattr(look, key), foreign) for key in ("name", "long_name")}
+    return replace(look, tuning=data or look.tuning, **(names if foreign else {}))
 
 
 def study_part_names(conditions: Sequence[Condition], group: str) -> dict[str, PartName]:

@@ -22,6 +22,7 @@ from pfbench.results.state_groups import main_component_group
 from pfbench.results.status import is_diverged
 
 SEED_SHIFT = 1000  # seed of a tuning minus seed of the study
+_RUNS_AT_ONCE = 400  # of all candidates and regimes in one pass, which bounds its memory
 TIE = 0.01  # relative difference of two scores that calibration decides
 OBJECTIVE = (
     "mean over regimes of log(median RMSE / median RMSE of the EKF), smallest; within 1 % the candidate whose "
@@ -118,7 +119,7 @@ class CandidateSearch:
         self.batches = draw_batches({r: self.compose("ekf", r) for r in self.regimes})
         _check_start(self.batches[0].episode.time, start_time_s)
         start_work()
-        self.reference = self._score(self.compose("ekf", self.regimes[0]))
+        (self.reference,) = self._score([self.compose("ekf", self.regimes[0])])
 
     def tune(self, method: str, grid: Sequence[dict[str, float]]) -> TuningResult:
         """Search the knobs of a filter.
@@ -132,15 +133,18 @@ class CandidateSearch:
         """
         candidates, self.seconds = [], 0.0
         config = self.compose(method, self.regimes[0])
-        for values in grid:
-            self.progress(f"{method} {' '.join(f'{k}={v:g}' for k, v in values.items())}")
-            candidates.append(self._try(config, values))
+        at_once = max(1, _RUNS_AT_ONCE // max(len(batch.runs) for batch in self.batches))
+        for first in range(0, len(grid), at_once):
+            some = grid[first : first + at_once]
+            self.progress(f"{method}, candidates {first + 1} to {first + len(some)} of {len(grid)}")
+            scores = self._score([with_candidate(config, values) for values in some])
+            candidates += [self._rate(*pair) for pair in zip(some, scores, strict=True)]
         choice, seconds = choose_candidate(candidates), self.seconds
-        return TuningResult(method, choice, self._try(config, {}), tuple(candidates), seconds)
+        untuned = self._rate({}, *self._score([config]))
+        return TuningResult(method, choice, untuned, tuple(candidates), seconds)
 
-    def _try(self, config: JobConfig, values: dict[str, float]) -> Candidate:
-        """Run a candidate in all regimes."""
-        scores = self._score(with_candidate(config, values))
+    def _rate(self, values: dict[str, float], scores: Mapping[str, RegimeScore]) -> Candidate:
+        """Rate a candidate by its scores in all regimes."""
         logs = [math.log(s.error / self.reference[r].error) for r, s in scores.items()]
         ratios = [math.log(s.nees_ratio) for s in scores.values()]
         return Candidate(
@@ -156,7 +160,7 @@ class CandidateSearch:
         Args:
             method: Name of the filter.
         """
-        return self._try(self.compose(method, self.regimes[0]), {})
+        return self._rate({}, *self._score([self.compose(method, self.regimes[0])]))
 
     def pass_alone(self, config: JobConfig, threshold: float = math.inf) -> Array:
         """Run a filter in one regime and return the RMSE of each run [R], infinite for a lost or diverged run.
@@ -181,15 +185,19 @@ class CandidateSearch:
         """
         return compose([*self.words, f"filter={method}", f"noise={regime}", *words])
 
-    def _score(self, config: JobConfig) -> dict[str, RegimeScore]:
-        """Run a filter in all regimes and compute its scores by regime."""
-        scores = {}
+    def _score(self, configs: Sequence[JobConfig]) -> list[dict[str, RegimeScore]]:
+        """Run filters in all regimes and compute the scores of each by regime."""
+        scores: list[dict[str, RegimeScore]] = [{} for _ in configs]
         for batch in self.batches:
-            result = batch.pass_filter(config)
+            is_alone = len(configs) == 1
+            result = batch.pass_filter(configs[0]) if is_alone else batch.pass_candidates(configs)
             self.seconds += sum(result.seconds.get(name, 0.0) for name in ("scores", "filter"))
             data = result.arrays(batch.episode, None)
-            for regime, runs in batch.list_runs():
-                scores[regime] = score_runs(data, result.model, runs, self.start_time_s)
+            for k, own in enumerate(scores):
+                for regime, runs in batch.list_runs():
+                    start = k * len(batch.runs)
+                    places = slice(start + runs.start, start + runs.stop)
+                    own[regime] = score_runs(data, result.model, places, self.start_time_s)
         return scores
 
 
