@@ -338,8 +338,15 @@ def learned_gain() -> str:
     return f"{format_table(head, rows)}\n\nKalmanNet with most training runs:\n\n{pairs}"
 
 
+def tuned_worlds() -> str:
+    """Table of all tuned worlds."""
+    table: str = import_module("tuned_worlds").tuned_worlds()
+    return table
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
-    block.__name__: block for block in (claims, all_seven, equal_time, learned_gain, speed, gpu)
+    block.__name__: block
+    for block in (claims, all_seven, equal_time, learned_gain, speed, gpu, tuned_worlds)
 }
 
 

@@ -9,25 +9,31 @@ from typing import Any
 
 from pfbench.config.composition import JobConfig, compose
 from pfbench.config.named_sets import TUNED_METHODS
+from pfbench.config.tuned_knobs import AUTO, NOMINAL
 
 HELP = """\
 pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
 
-Tune the baselines of a study of robustness: a factor on R and one knob of the method, 16 candidates
-each, in three noise regimes, with the seed of the study plus 1000. Write the chosen knobs and the
-record of all candidates into one file, FOLDER/tuned/NAME.yaml. In a study `tuned=NAME` gives the
-knobs to the filters that end in _tuned.
+Tune the conventional filters of a world, a scenario with a model: a factor on R and one knob of the
+method, 16 candidates each, in three noise regimes, with the seed of the study plus 1000. Write the
+chosen knobs and the record of all candidates into one file, FOLDER/tuned/NAME.yaml, which a study
+finds by its scenario and model and gives to the filters that end in _tuned. The file states the best
+of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world (`kalman_fits`).
 
   pfbench tune scenario=passive_1 folder=conf
-  pfbench run -m 'hydra.searchpath=[file://conf]' scenario=passive_1 tuned=passive_1 filter=tuned_baselines
+  pfbench run -m 'hydra.searchpath=[file://conf]' scenario=passive_1 filter=tuned_baselines
 
   filter=...         filters to tune, default ekf_scaled,gate,huber,student
   runs=20 seed=1     runs of a candidate, and seed of the study
-  noise=...          noise regimes, default nominal,outliers,student
+  noise=...          noise regimes, default nominal,outliers,student. noise=nominal for a study of
+                     nominal noise alone, whose choice is tuned=nominal
   r_factors=1,2,4,8  factors on R of the candidates, for all filters alike
+  fit_runs=RUNS      runs of sir and rpf in the first noise regime, which decide on kalman_fits
+  fit_particles=10000     their particles
   report.start_time_s=0   time before which errors do not count, as in the report of the study
-  name=SCENARIO      name of the file; a file of this name is replaced
-  folder=conf        folder of the file; use it with 'hydra.searchpath=[file://conf]'"""
+  name=...           name of the file, default SCENARIO, SCENARIO_with_MODEL, and _nominal behind it;
+                     a file of this name is replaced
+  folder=conf        folder of the file, default that of hydra.searchpath if there is one"""
 
 _OPTIONS = {
     "filter": ",".join(TUNED_METHODS), "name": "", "folder": "", "noise": "nominal,outliers,student",
@@ -35,7 +41,7 @@ _OPTIONS = {
 }  # fmt: skip
 _DEFAULTS = {"runs": "runs=20", "fit_runs": "fit_runs=RUNS", "fit_particles": "fit_particles=10000"}
 _FEWEST_RUNS = 2  # a median of one run is that run
-_TAKEN = ("auto", "nominal")  # choices that look for a file
+_TAKEN = (AUTO, NOMINAL)  # choices that look for a file
 _OWN = ("seed", "runs", "study", "results_dir", "report.start_time_s")  # not settings of the world
 
 
@@ -58,7 +64,7 @@ def tune_filters(words: Sequence[str]) -> None:
     others = [word for word in words if word.partition("=")[0] not in _OPTIONS]
     grids = {method: list_candidates(method, _numbers(lists["r_factors"])) for method in lists["filter"]}  # fmt: skip
     study = _compose_world(others)
-    name = options["name"] or _name_file(study.choices, lists["noise"])
+    name = options["name"] or _name_file(study.choices, lists["noise"], others)
     runs = study.values["runs"]
     _check_choices(name, runs)
     fit_runs = _count("fit_runs", options["fit_runs"] or str(runs), runs)
@@ -67,7 +73,9 @@ def tune_filters(words: Sequence[str]) -> None:
     settings = [word for word in others if word.partition("=")[0] not in _OWN]
     world = {
         **{key: study.choices[key] for key in ("scenario", "model")},
-        "settings": [word for word in settings if re.match(r"\+{0,2}(scenario|model|noise)\.", word)],
+        "settings": [
+            word for word in settings if re.match(r"\+{0,2}(scenario|model|noise)\.", word)
+        ],
         "seed": study.values["seed"] + SEED_SHIFT,
         "runs": runs,
         "start_time_s": float(study.values["report"]["start_time_s"]),
@@ -92,7 +100,10 @@ def _search(
     from pfbench.job.tuning.world_fit import measure_fit
 
     fixed = [f"seed={world['seed']}", f"runs={world['runs']}", "pcrb=false", "score_steps=0"]
-    fixed += ["budget=particles", "engine=kernels"]  # those of an experiment do not change the search
+    fixed += [
+        "budget=particles",
+        "engine=kernels",
+    ]  # those of an experiment do not change the search
     search = CandidateSearch([*settings, *fixed], world["regimes"], print, world["start_time_s"])
     results, unsupported = [], {}
     for method, grid in grids.items():
@@ -111,12 +122,13 @@ def _search(
     return write_tuned_file(results, folder, name, world, fit, unsupported)
 
 
-def _name_file(choices: Mapping[str, str], regimes: Sequence[str]) -> str:
+def _name_file(choices: Mapping[str, str], regimes: Sequence[str], words: Sequence[str]) -> str:
     """Name the file by the scenario, by the model if it is not that of the scenario, and by nominal noise alone."""
     scenario, model = choices["scenario"], choices["model"]
-    own = compose([f"scenario={scenario}"]).choices["model"]
+    places = [word for word in words if re.match(r"[+]*(hydra\.searchpath|trust)=", word)]
+    own = compose([f"scenario={scenario}", *places]).choices["model"]
     name = scenario if model == own else f"{scenario}_with_{model}"
-    return f"{name}_nominal" if regimes == ["nominal"] else name
+    return f"{name}_{NOMINAL}" if list(regimes) == [NOMINAL] else name
 
 
 def _own_folder(words: Sequence[str]) -> str:
@@ -130,7 +142,9 @@ def _describe_use(folder: Path, words: Sequence[str]) -> str:
     from pfbench.config.folders import conf_dir
 
     is_found = folder.resolve() == conf_dir() or any("hydra.searchpath" in word for word in words)
-    return "" if is_found else f"\nAdd to the words of a study: 'hydra.searchpath=[file://{folder}]'"
+    return (
+        "" if is_found else f"\nAdd to the words of a study: 'hydra.searchpath=[file://{folder}]'"
+    )
 
 
 def _check_choices(name: str, runs: int) -> None:

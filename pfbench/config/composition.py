@@ -155,7 +155,7 @@ def resolve_config(
     values = remove_nested_blocks(resolve_values(tree))
     knobs = values.pop(TUNED, {})  # the filter has them
     check_tuned_seed(values, names.get("scenario"), knobs)
-    mark_foreign(values, names, knobs.get("world", {}))
+    mark_foreign(values, names, knobs.get("world", {}), trusted)
     return JobConfig(values, names, is_shared, packages)
 
 

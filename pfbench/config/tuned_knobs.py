@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
 TUNED = "tuned"  # group of the knobs that `pfbench tune` chose, which no job stores
 AUTO, NOMINAL = "auto", "nominal"  # choices that look up the world of the job
 OWN_WORLD = "the world of each job"  # data of a tuned filter before a job chooses them
-_NOT_A_WORLD = ("scenario.root", "scenario.cache_dir")  # where data lie
+_WORLD = ("scenario", "model")  # groups that a tuning and its jobs have in common
+# names, places of data, and the part of a recording: a tuning takes another part than the scored one
+_NOT_A_SETTING = (PAPER, "root", "cache_dir", "start_s", "end_s")
 _REFERENCE = re.compile(r"\$\{\.*tuned\.(\w+)")
 _DATA = re.compile(r"(?:^|\), )(\w+) \(model (\w+)[,)]")  # as `describe_world` writes it
 _MARK = re.compile(r" \(tuned(?: on ([^()]*))?\)")
@@ -68,7 +71,7 @@ def _find_world(node: DictConfig, choices: Mapping[str, str]) -> dict[str, Any]:
 
 def _is_of(world: Mapping[str, Any], choices: Mapping[str, str]) -> bool:
     """Return whether scenario and model of a tuning are those of a job."""
-    return all(world.get(group) == choices.get(group) for group in ("scenario", "model"))
+    return all(world.get(group) == choices.get(group) for group in _WORLD)
 
 
 def _refuse(choices: Mapping[str, str], trusted: Sequence[str]) -> str:
@@ -82,11 +85,11 @@ def _refuse(choices: Mapping[str, str], trusted: Sequence[str]) -> str:
     words += [f"hydra.searchpath=[{','.join(folders)}]"] if folders else []
     command = shlex.join(["pfbench", "tune", f"scenario={scenario}", f"model={model}", *words])
     is_found = folders or Path("conf").resolve() == conf_dir()
-    again = "" if is_found else " Then add 'hydra.searchpath=[file://conf]' to the words of the run."
+    again = "" if is_found else " and add 'hydra.searchpath=[file://conf]' to the words of the run"
     return (
         f"{TUNED}={chosen or AUTO} must find the knobs of filter={choices.get('filter')} for scenario={scenario} "
-        f"with model={model}, got none. Make them: {command}.{again} Or choose {TUNED}=WORLD "
-        f"(pfbench list {TUNED}): names then say \"tuned on WORLD\"."
+        f"with model={model}, got none. Choose {TUNED}=WORLD (pfbench list {TUNED}), which the names of the "
+        f"filters then state, or make them{again}: {command}"
     )
 
 
@@ -104,13 +107,19 @@ def _read_command() -> tuple[list[str], list[str]]:
     return folders, [str(word) for word in state.hydra.overrides.task]
 
 
-def mark_foreign(values: Mapping[str, Any], choices: Mapping[str, str], world: Mapping[str, Any]) -> None:
+def mark_foreign(
+    values: Mapping[str, Any],
+    choices: Mapping[str, str],
+    world: Mapping[str, Any],
+    trusted: Sequence[str] = (),
+) -> None:
     """Say in the name of a tuned filter on which other world it was tuned.
 
     Args:
         values: Resolved configuration of the job, whose filter is renamed.
         choices: Names of the chosen files by group.
         world: World of the tuning, as its file states it.
+        trusted: Packages that the command line trusts.
     """
     block = values["filter"].get(PAPER) or {}
     if not block.get("tuning"):
@@ -118,7 +127,7 @@ def mark_foreign(values: Mapping[str, Any], choices: Mapping[str, str], world: M
     text = ""
     if not _is_of(world, choices):
         text = _name_world(world, choices)
-    elif not _has_settings(values, world.get("settings", ())):
+    elif not _has_settings(values, world, trusted):
         text = f"{world['scenario']} with other settings"
     if text:
         block |= {key: add_world(block[key], text) for key in ("name", "long_name") if key in block}
@@ -177,22 +186,28 @@ def find_foreign_world(data: str, scenario: str, model: str = "") -> str:
     return _name_world({"scenario": name, "model": stated[name]}, {"scenario": scenario})
 
 
-def _has_settings(values: Mapping[str, Any], settings: Sequence[str]) -> bool:
-    """Return whether a job has the settings of a tuning, and sets nothing else of its scenario or model."""
-    import yaml
+def _has_settings(
+    values: Mapping[str, Any], world: Mapping[str, Any], trusted: Sequence[str]
+) -> bool:
+    """Return whether scenario and model of a job have the settings of a tuning."""
+    words = [f"scenario={world['scenario']}", f"model={world['model']}", *world.get("settings", ())]
+    words += [f"hydra.searchpath=[{','.join(folders)}]"] if (folders := _read_command()[0]) else []
+    words += [f"trust=[{','.join(trusted)}]"] if trusted else []
+    tuned = _compose_world(tuple(words))
+    return all(_list_settings(values[group]) == _list_settings(tuned[group]) for group in _WORLD)
 
-    stated = dict(word.lstrip("+").split("=", 1) for word in settings)
-    words = [word.lstrip("+") for word in _read_command()[1]]
-    changed = [word.split("=")[0] for word in words if re.match(r"(scenario|model)\.[^=]+=", word)]
-    if not {*changed} - {*_NOT_A_WORLD} <= set(stated):
-        return False
-    for path, text in stated.items():
-        node: Any = values
-        for key in path.split("."):
-            node = node.get(key) if isinstance(node, Mapping) else None
-        if node != yaml.safe_load(text):
-            return False
-    return True
+
+@cache
+def _compose_world(words: tuple[str, ...]) -> Mapping[str, Any]:
+    """Compose the world of a tuning."""
+    from pfbench.config.composition import compose  # which imports this module
+
+    return compose([*words, "filter=ekf"]).values
+
+
+def _list_settings(node: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a scenario or model, without where and which part of its data it takes."""
+    return {key: value for key, value in node.items() if key not in _NOT_A_SETTING}
 
 
 def check_tuned_seed(

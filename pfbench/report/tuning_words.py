@@ -43,7 +43,9 @@ def describe_foreign_knobs(tunings: Collection[str], worlds: Collection[str]) ->
     """
     scenarios = sorted({parse_label(key)[0] for key in worlds})
     stated = {text: list_tuned_worlds(text) for text in tunings}
-    foreign = {text: [s for s in scenarios if s not in known] for text, known in stated.items() if known}
+    foreign = {
+        text: [s for s in scenarios if s not in known] for text, known in stated.items() if known
+    }
     number = sum(bool(lacking) for lacking in (foreign.get(text) for text in tunings))
     if not number:
         return ""
@@ -53,7 +55,11 @@ def describe_foreign_knobs(tunings: Collection[str], worlds: Collection[str]) ->
     )  # fmt: skip
     several = len({name for lacking in foreign.values() for name in lacking})
     is_single = len(scenarios) == 1
-    where = "the world of this study" if is_single else f"at least {several} of {len(scenarios)} scenarios"
+    where = (
+        "the world of this study"
+        if is_single
+        else f"at least {several} of {len(scenarios)} scenarios"
+    )
     return (
         f"{NOT_TUNED_HERE} {number} filters have the knobs of {', '.join(names)}, which are not those of {where}. "
         "What is said of them holds for these knobs, until the study has run again with its own."

@@ -242,7 +242,9 @@ def score_runs(
     number = list(state["groups"]).index(group.state_group)
     nees = mean_per_run(data["nees"][runs][:, steps, number].astype(float), lost)
     size = len(state["groups"][group.state_group])
-    return RegimeScore(float(np.median(rmse_per_run(error, lost))), float(np.nanmedian(nees)) / size)
+    return RegimeScore(
+        float(np.median(rmse_per_run(error, lost))), float(np.nanmedian(nees)) / size
+    )
 
 
 def select_errors(

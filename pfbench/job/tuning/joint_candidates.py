@@ -55,7 +55,9 @@ class JointAdaptation(NoiseAdaptation):
         joined = {
             name: torch.cat([getattr(part, name) for part, _ in parts])[back] for name in _CHANGED
         }
-        memory = {name: torch.cat([carried[name] for _, carried in parts])[back] for name in parts[0][1]}
+        memory = {
+            name: torch.cat([carried[name] for _, carried in parts])[back] for name in parts[0][1]
+        }
         return scaled._replace(**joined), memory
 
 

@@ -48,7 +48,9 @@ class RegimeBatch(NamedTuple):
             configs: Configurations that differ in the knobs of the filter.
         """
         methods = [build_plan(config).method for config in configs]
-        plan = replace(self.plan, config=configs[0], method=join_candidates(methods, len(self.runs)))
+        plan = replace(
+            self.plan, config=configs[0], method=join_candidates(methods, len(self.runs))
+        )
         return pass_filter(plan, *self.repeat(len(configs)), "candidates")
 
     def repeat(self, times: int) -> tuple[Episode, Tensor]:

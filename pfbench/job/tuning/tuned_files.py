@@ -80,7 +80,9 @@ def _list_fit(fit: WorldFit) -> Iterator[str]:
 
 def _has_no_effect(result: TuningResult) -> bool:
     """Return whether all candidates have the score of the filter without tuned knobs."""
-    return len({(c.log_ratio, *c.errors.values()) for c in (*result.candidates, result.untuned)}) == 1
+    return (
+        len({(c.log_ratio, *c.errors.values()) for c in (*result.candidates, result.untuned)}) == 1
+    )
 
 
 def _list_rows(result: TuningResult) -> Iterator[list[str]]:

@@ -20,10 +20,12 @@ from pfbench.job.tuning.candidate_search import (
 )
 from pfbench.results.error_measures import Array
 
-UNTUNED = ("ekf", "ukf")  # conventional filters without knobs
-PARTICLE_FILTERS = ("sir", "rpf")
-LIMIT = 0.95  # of the error of the best conventional filter, below which Kalman filters do not fit
-LEVEL = 0.05  # of the two intervals together
+_UNTUNED = ("ekf", "ukf")  # conventional filters without knobs
+_PARTICLE_FILTERS = ("sir", "rpf")
+FIT_LIMIT = (
+    0.95  # of the error of the best conventional filter, below which Kalman filters do not fit
+)
+_LEVEL = 0.05  # of the two intervals together
 FIT_RULE = (
     "false if SIR or RPF has less than 0.95 of the error of the best filter: geometric mean over runs, "
     "Student interval without 0.95, 95 % for both together; errors are at most the cap, which a lost run has"
@@ -81,7 +83,7 @@ def decide_fit(ratios: Mapping[str, Ratio]) -> bool:
     Args:
         ratios: Ratios by particle filter.
     """
-    return not any(ratio.high < LIMIT for ratio in ratios.values())
+    return not any(ratio.high < FIT_LIMIT for ratio in ratios.values())
 
 
 def compare_errors(errors: Array, reference: Array, cap: float, filters: int = 1) -> Ratio:
@@ -95,7 +97,7 @@ def compare_errors(errors: Array, reference: Array, cap: float, filters: int = 1
     """
     difference = np.log(np.fmin(errors, cap)) - np.log(np.fmin(reference, cap))
     mean, runs = float(difference.mean()), len(difference)
-    half = float(stats.t.ppf(1 - LEVEL / filters / 2, runs - 1) * difference.std(ddof=1))
+    half = float(stats.t.ppf(1 - _LEVEL / filters / 2, runs - 1) * difference.std(ddof=1))
     half /= math.sqrt(runs)
     return Ratio(math.exp(mean), math.exp(mean - half), math.exp(mean + half))
 
@@ -136,17 +138,17 @@ def measure_fit(
     regime = search.regimes[0]
     first = [f"runs={runs}", f"particles={particles}"]
     tuned = {f"{result.method}_{SUFFIX}": result.choice for result in results}
-    errors = {name: _errors_of(search, name) for name in UNTUNED}
+    errors = {name: _errors_of(search, name) for name in _UNTUNED}
     errors = {name: e for name, e in errors.items() if e}
     errors |= {name: choice.errors for name, choice in tuned.items()}
     cap, source, threshold = _find_cap(search, first)
     best, objectives = find_best(errors, cap)
     reference = _run(search, best, first, tuned.get(best), threshold)
     ratios = {}
-    for name in PARTICLE_FILTERS:
+    for name in _PARTICLE_FILTERS:
         search.progress(f"{name} particles={particles}")
         own = _run(search, name, first, threshold=threshold)
-        ratios[name] = compare_errors(own, reference, cap, len(PARTICLE_FILTERS))
+        ratios[name] = compare_errors(own, reference, cap, len(_PARTICLE_FILTERS))
     return WorldFit(best, objectives, cap, source, regime, particles, runs, ratios)
 
 

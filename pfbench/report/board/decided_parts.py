@@ -97,9 +97,7 @@ class StudyFacts(NamedTuple):
         worlds = [entry["key"] for entry in pack["worlds"]]
         return cls(
             {
-                key: add_tuning(
-                    look, old.tuning, find_other_world(old.name, old.tuning, worlds)
-                )
+                key: add_tuning(look, old.tuning, find_other_world(old.name, old.tuning, worlds))
                 for (key, look), old in zip(present.items(), stored, strict=True)
             },
             {entry["key"]: PartName(**entry) for entry in pack["worlds"]},
