@@ -68,7 +68,9 @@ def read_tuning(world: str, data: str) -> dict[str, Any]:
 
 def read_files() -> dict[str, dict[str, Any]]:
     """Read all files of tunings, by name; `auto` and `nominal` only refer to them."""
-    contents = {path.stem: yaml.safe_load(path.read_text()) for path in sorted(TUNED.glob("*.yaml"))}
+    contents = {
+        path.stem: yaml.safe_load(path.read_text()) for path in sorted(TUNED.glob("*.yaml"))
+    }
     return {name: content for name, content in contents.items() if "world" in content}
 
 
@@ -76,10 +78,13 @@ def tuned_worlds() -> str:
     """Table of all tuned worlds: the best conventional filter, and whether Kalman filters fit."""
     lines = markdown_head("file", "tuned on", "best", "Kalman filters fit", "SIR", "RPF", "runs")
     for name, content in read_files().items():
-        fit = content["fit"]
-        ratios = ("{:.2f} [{:.2f}, {:.2f}]".format(*fit["ratios"][key]) for key in ("sir", "rpf"))
-        cells = (f"`{content['best']}`", "yes" if content["kalman_fits"] else "no", *ratios)
-        lines.append(markdown_row(f"`{name}`", content["data"], *cells, str(fit["runs"])))
+        if fit := content.get("fit"):  # an early file states none
+            ratios = ("{:.2f} [{:.2f}, {:.2f}]".format(*fit["ratios"][k]) for k in ("sir", "rpf"))
+            word = "yes" if content["kalman_fits"] else "no"
+            cells = (f"`{content['best']}`", word, *ratios, str(fit["runs"]))
+        else:
+            cells = ("–", "–", "–", "–", "–")
+        lines.append(markdown_row(f"`{name}`", content["data"], *cells))
     return "\n".join(lines)
 
 

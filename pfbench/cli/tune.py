@@ -126,8 +126,8 @@ def _name_file(choices: Mapping[str, str], regimes: Sequence[str], words: Sequen
     """Name the file by the scenario, by the model if it is not that of the scenario, and by nominal noise alone."""
     scenario, model = choices["scenario"], choices["model"]
     places = [word for word in words if re.match(r"[+]*(hydra\.searchpath|trust)=", word)]
-    own = compose([f"scenario={scenario}", *places]).choices["model"]
-    name = scenario if model == own else f"{scenario}_with_{model}"
+    default = compose([f"scenario={scenario}", *places]).choices["model"]
+    name = scenario if model == default else f"{scenario}_with_{model}"
     return f"{name}_{NOMINAL}" if list(regimes) == [NOMINAL] else name
 
 

@@ -7,13 +7,10 @@ import shlex
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pfbench.config.folders import conf_dir
 from pfbench.config.paper_block import PAPER
-
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
 
 TUNED = "tuned"  # group of the knobs that `pfbench tune` chose, which no job stores
 AUTO, NOMINAL = "auto", "nominal"  # choices that look up the world of the job
@@ -26,7 +23,7 @@ _DATA = re.compile(r"(?:^|\), )(\w+) \(model (\w+)[,)]")  # as `describe_world` 
 _MARK = re.compile(r" \(tuned(?: on ([^()]*))?\)")
 
 
-def select_knobs(tree: DictConfig, choices: Mapping[str, str], trusted: Sequence[str]) -> None:
+def select_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) -> None:
     """Replace the node `tuned` by the knobs of one world.
 
     Args:
@@ -43,30 +40,30 @@ def select_knobs(tree: DictConfig, choices: Mapping[str, str], trusted: Sequence
         return
     plain = OmegaConf.to_container(tree["filter"], resolve=False)
     needed = sorted({*_REFERENCE.findall(repr(plain))} - {"data"})
-    found = _find_world(tree[TUNED], choices) if needed else {}
-    lacking = [name for name in needed if "r_factor" not in found.get(name, {})]
+    knobs = _find_world(tree[TUNED], choices) if needed else {}
+    lacking = [name for name in needed if "r_factor" not in knobs.get(name, {})]
     if lacking:
-        reason = (found.get(lacking[0]) or {}).get("unsupported")
+        reason = (knobs.get(lacking[0]) or {}).get("unsupported")
         raise ValueError(
             f"filter={choices['filter']} must have knobs of {choices['scenario']}, got none, since {reason} "
             "Choose another filter." if reason else _refuse(choices, trusted)
         )  # fmt: skip
     with flag_override(tree, ["struct", "readonly"], [False, False]):
-        tree[TUNED] = found
+        tree[TUNED] = knobs
 
 
-def _find_world(node: DictConfig, choices: Mapping[str, str]) -> dict[str, Any]:
+def _find_world(node: Any, choices: Mapping[str, str]) -> dict[str, Any]:
     """Return the content of the chosen file, or of the first one of the world of the job."""
     from omegaconf import OmegaConf
 
-    chosen = choices.get(TUNED, AUTO)
+    choice = choices.get(TUNED, AUTO)
     content: Any = OmegaConf.to_container(node, resolve=False)
-    if chosen not in (AUTO, NOMINAL):
-        return {"world": {"scenario": chosen}, "data": chosen, **content}
-    own = [world for world in content.values() if _is_of(world["world"], choices)]
-    if chosen == NOMINAL:
-        own = [world for world in own if world["world"]["regimes"] == [NOMINAL]]
-    return dict(own[0]) if own else {}
+    if choice not in (AUTO, NOMINAL):
+        return {"world": {"scenario": choice}, "data": choice, **content}
+    worlds = [world for world in content.values() if _is_of(world["world"], choices)]
+    if choice == NOMINAL:
+        worlds = [world for world in worlds if world["world"]["regimes"] == [NOMINAL]]
+    return dict(worlds[0]) if worlds else {}
 
 
 def _is_of(world: Mapping[str, Any], choices: Mapping[str, str]) -> bool:
@@ -76,18 +73,18 @@ def _is_of(world: Mapping[str, Any], choices: Mapping[str, str]) -> bool:
 
 def _refuse(choices: Mapping[str, str], trusted: Sequence[str]) -> str:
     """Word the refusal of a job without knobs, with the command that makes them."""
-    scenario, model, chosen = (choices.get(key, "") for key in ("scenario", "model", TUNED))
+    scenario, model, choice = (choices.get(key, "") for key in ("scenario", "model", TUNED))
     folders, words = _read_command()
     words = [word for word in words if re.match(r"\+{0,2}(scenario|model|experiment)[.=]", word)]
     words = [word for word in words if not re.match(r"\+*(scenario|model)=", word)]
     words += [f"trust=[{','.join(trusted)}]"] if trusted else []
-    words += ["noise=nominal"] if chosen == NOMINAL else []
+    words += ["noise=nominal"] if choice == NOMINAL else []
     words += [f"hydra.searchpath=[{','.join(folders)}]"] if folders else []
     command = shlex.join(["pfbench", "tune", f"scenario={scenario}", f"model={model}", *words])
     is_found = folders or Path("conf").resolve() == conf_dir()
     again = "" if is_found else " and add 'hydra.searchpath=[file://conf]' to the words of the run"
     return (
-        f"{TUNED}={chosen or AUTO} must find the knobs of filter={choices.get('filter')} for scenario={scenario} "
+        f"{TUNED}={choice or AUTO} must find the knobs of filter={choices.get('filter')} for scenario={scenario} "
         f"with model={model}, got none. Choose {TUNED}=WORLD (pfbench list {TUNED}), which the names of the "
         f"filters then state, or make them{again}: {command}"
     )

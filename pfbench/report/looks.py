@@ -48,6 +48,7 @@ class MethodLook:
         cite: Key of the reference, empty without one.
         baselines: Labels of the methods with which its paper compares it.
         tuning: Data on which its parameters were chosen, empty if they were not tuned.
+        tuned_on: Words for another world than that of its jobs on which they were chosen, else empty.
     """
 
     key: str
@@ -61,6 +62,7 @@ class MethodLook:
     cite: str = ""
     baselines: tuple[str, ...] = ()
     tuning: str = ""
+    tuned_on: str = ""
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,8 @@ def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
             data = str(block.get("tuning") or "")
             worlds.setdefault(job.label, {}).update({data: None} if data else {})
             model = str(job.meta.get("choices", {}).get("model", ""))
-            text = find_other_world(str(block.get("name")), data, [condition.scenario], model)
+            foreign_world = find_foreign_world(data, parse_label(condition.scenario)[0], model)
+            text = read_world(str(block.get("name"))) or foreign_world
             foreign.setdefault(job.label, {}).update({text: None} if text else {})
     looks = find_looks(sorted(blocks), blocks)
     return {
@@ -135,17 +138,15 @@ def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
     }
 
 
-def find_other_world(name: str, data: str, scenarios: Collection[str], model: str = "") -> str:
-    """Return the words for the world on which a filter was tuned, empty if it is that of all scenarios.
+def find_stored_world(look: Mapping[str, Any], scenarios: Collection[str]) -> str:
+    """Return the words for another world on which a filter of a stored page was tuned, else empty.
 
     Args:
-        name: Stored name of the filter, which may state the world.
-        data: Data of its tuning, empty for a filter without knobs.
-        scenarios: Keys of scenarios.
-        model: Model of the jobs, empty if it is not known.
+        look: Look of the filter. An early page does not state the world, which then follows from the data.
+        scenarios: Keys of the scenarios of the page.
     """
-    worlds = (find_foreign_world(data, parse_label(key)[0], model) for key in scenarios)
-    return read_world(name) or next(filter(None, worlds), "")
+    worlds = (find_foreign_world(look["tuning"], parse_label(key)[0]) for key in scenarios)
+    return str(look.get("tuned_on", next(filter(None, worlds), "")))
 
 
 def add_tuning(look: MethodLook, data: str, foreign: str) -> MethodLook:
@@ -156,8 +157,11 @@ def add_tuning(look: MethodLook, data: str, foreign: str) -> MethodLook:
         data: Data of its tuning, empty for the installed words.
         foreign: Words for the world if it is not that of all conditions, else empty.
     """
-    names = {key: add_world(getattr(look, key), foreign) for key in ("name", "long_name")}
-    return replace(look, tuning=data or look.tuning, **(names if foreign else {}))
+    look = replace(look, tuning=data or look.tuning, tuned_on=foreign)
+    if not foreign:
+        return look
+    name, long_name = (add_world(text, foreign) for text in (look.name, look.long_name))
+    return replace(look, name=name, long_name=long_name)
 
 
 def study_part_names(conditions: Sequence[Condition], group: str) -> dict[str, PartName]:

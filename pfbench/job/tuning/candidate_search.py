@@ -193,11 +193,11 @@ class CandidateSearch:
             result = batch.pass_filter(configs[0]) if is_alone else batch.pass_candidates(configs)
             self.seconds += sum(result.seconds.get(name, 0.0) for name in ("scores", "filter"))
             data = result.arrays(batch.episode, None)
-            for k, own in enumerate(scores):
+            for k, by_regime in enumerate(scores):
                 for regime, runs in batch.list_runs():
                     start = k * len(batch.runs)
                     places = slice(start + runs.start, start + runs.stop)
-                    own[regime] = score_runs(data, result.model, places, self.start_time_s)
+                    by_regime[regime] = score_runs(data, result.model, places, self.start_time_s)
         return scores
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,18 +48,23 @@ class JointAdaptation(NoiseAdaptation):
         scaled = innovation.with_noise(innovation.noise * self.r_factor[:, None, None])
         if not self.updates:
             return scaled, {}
-        parts = [
-            update.noise_adapt(_select(scaled, places), _select(belief, places))
-            for update, places in self.updates
-        ]
+        innovations, memories = zip(
+            *(
+                update.noise_adapt(_select(scaled, places), _select(belief, places))
+                for update, places in self.updates
+            ),
+            strict=True,
+        )
         back = torch.cat([places for _, places in self.updates]).argsort()
-        joined = {
-            name: torch.cat([getattr(part, name) for part, _ in parts])[back] for name in _CHANGED
-        }
+        r, observed_mask, m, omega, noise = (
+            torch.cat([getattr(several, name) for several in innovations])[back]
+            for name in _CHANGED
+        )
         memory = {
-            name: torch.cat([carried[name] for _, carried in parts])[back] for name in parts[0][1]
+            name: torch.cat([several[name] for several in memories])[back] for name in memories[0]
         }
-        return scaled._replace(**joined), memory
+        adapted = scaled._replace(r=r, observed_mask=observed_mask, m=m, omega=omega, noise=noise)
+        return adapted, memory
 
 
 def join_candidates(filters: Sequence[GaussianFilter], runs: int) -> GaussianFilter:
@@ -82,11 +88,11 @@ def join_candidates(filters: Sequence[GaussianFilter], runs: int) -> GaussianFil
     return replace(filters[0], noise_adaptations=(JointAdaptation(r_factor, q_factor, updates),))
 
 
-def _select(parts: Innovation | GaussianBelief, places: Tensor) -> Innovation | GaussianBelief:
-    """Return the values of some runs; values that all runs share stay."""
+def _select(parts: Any, places: Tensor) -> Any:
+    """Return an innovation or a belief of some runs; values that all runs share stay."""
     runs = len(parts[0])
 
-    def select(value: Tensor | dict[str, Tensor] | tuple[Tensor, ...]) -> object:
+    def select(value: Any) -> Any:
         if isinstance(value, dict):
             return {name: select(entry) for name, entry in value.items()}
         if isinstance(value, tuple):

@@ -8,8 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pfbench.files.atomic_write import write_atomically
 from pfbench.job.tuning.candidate_search import OBJECTIVE, Candidate, TuningResult
 from pfbench.job.tuning.world_fit import FIT_RULE, WorldFit
@@ -71,11 +69,11 @@ def _list_fit(fit: WorldFit) -> Iterator[str]:
         yield f"  {key}: {value}"
     yield f"  cap: {fit.cap:.{_DIGITS}g}"
     yield f"  cap_source: {json.dumps(fit.cap_source)}"
-    for title, table in (("objectives", fit.objectives), ("ratios", fit.ratios)):
-        yield f"  {title}:"
-        for name, value in table.items():
-            numbers = [float(f"{v:.{_DIGITS}g}") for v in np.atleast_1d(value)]
-            yield f"    {name}: {numbers if len(numbers) > 1 else numbers[0]}"
+    yield "  objectives:"
+    yield from (f"    {name}: {score:.{_DIGITS}g}" for name, score in fit.objectives.items())
+    yield "  ratios:  # with both ends of the interval"
+    for name, ratio in fit.ratios.items():
+        yield f"    {name}: [{', '.join(f'{number:.{_DIGITS}g}' for number in ratio)}]"
 
 
 def _has_no_effect(result: TuningResult) -> bool:

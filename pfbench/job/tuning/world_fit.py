@@ -147,8 +147,8 @@ def measure_fit(
     ratios = {}
     for name in _PARTICLE_FILTERS:
         search.progress(f"{name} particles={particles}")
-        own = _run(search, name, first, threshold=threshold)
-        ratios[name] = compare_errors(own, reference, cap, len(_PARTICLE_FILTERS))
+        errors_of_runs = _run(search, name, first, threshold=threshold)
+        ratios[name] = compare_errors(errors_of_runs, reference, cap, len(_PARTICLE_FILTERS))
     return WorldFit(best, objectives, cap, source, regime, particles, runs, ratios)
 
 

@@ -21,7 +21,7 @@ from pfbench.report.board.study_views import build_views
 from pfbench.report.board.sweeps import list_sweeps
 from pfbench.report.board.view import BEST, EQUAL, MISSING, NOT_KEPT, OPEN
 from pfbench.report.journal.study_pack import ALL
-from pfbench.report.looks import MethodLook, PartName, add_tuning, find_looks, find_other_world
+from pfbench.report.looks import MethodLook, PartName, add_tuning, find_looks, find_stored_world
 from pfbench.report.options import ReportOptions
 from pfbench.results.comparison.baselines import REFERENCES
 from pfbench.results.decisions.words import WORSE
@@ -97,8 +97,8 @@ class StudyFacts(NamedTuple):
         worlds = [entry["key"] for entry in pack["worlds"]]
         return cls(
             {
-                key: add_tuning(look, old.tuning, find_other_world(old.name, old.tuning, worlds))
-                for (key, look), old in zip(present.items(), stored, strict=True)
+                key: add_tuning(look, old["tuning"], find_stored_world(old, worlds))
+                for (key, look), old in zip(present.items(), facts["looks"], strict=True)
             },
             {entry["key"]: PartName(**entry) for entry in pack["worlds"]},
             {entry["key"]: PartName(**entry) for entry in facts["regimes"]},

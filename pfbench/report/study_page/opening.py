@@ -9,6 +9,7 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
+from pfbench.report.looks import find_stored_world
 from pfbench.report.tuning_words import describe_foreign_knobs
 
 SIGNS = {
@@ -105,7 +106,7 @@ def describe_page_knobs(pack: Mapping[str, Any]) -> str:
     """
     looks = pack.get("facts", {}).get("looks", ())
     worlds = [world["key"] for world in pack["worlds"]]
-    return describe_foreign_knobs([look["tuning"] for look in looks], worlds)
+    return describe_foreign_knobs([find_stored_world(look, worlds) for look in looks])
 
 
 def describe_overconfidence(pack: Mapping[str, Any]) -> str:

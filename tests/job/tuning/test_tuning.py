@@ -373,9 +373,7 @@ def test_the_name_says_on_which_other_world_a_filter_was_tuned(words: list[str],
 
 def test_a_world_without_knobs_refuses_tuned_filters_alone(tmp_path: Path) -> None:
     assert job.compose(["scenario=benes", "filter=ekf"]).choices["tuned"] == AUTO
-    with pytest.raises(
-        ValueError, match=r"pfbench tune scenario=benes model=benes noise=nominal$"
-    ):
+    with pytest.raises(ValueError, match=r"pfbench tune scenario=benes model=benes noise=nominal$"):
         job.compose(["scenario=benes", "filter=gate_tuned", "tuned=nominal"])
     folder = tmp_path / "tuned"
     folder.mkdir()
