@@ -90,6 +90,12 @@ def _digits(value: float) -> str:
     return f"{float(f'{value:.3g}'):.15g}"
 
 
+def describe_knobs(study: str) -> str:
+    """Line of a published page on tuned filters with the knobs of another world, empty without one."""
+    lines = (TOP / "reports" / study / "report.md").read_text(encoding="utf-8").splitlines()
+    return next((f"\n\n{line}" for line in lines if line.startswith("Not tuned here:")), "")
+
+
 def board_table(study: str) -> str:
     """Table of the opening view of a published study, from verdicts.csv. Rows with equal numbers are joined.
 
@@ -127,7 +133,8 @@ def board_table(study: str) -> str:
     )
     body = [(", ".join(labels), *cells) for cells, labels in filters_by_cells.items()]
     kept = [i for i in range(len(head)) if any(row[i] != "–" for row in body)]
-    return format_table((head[i] for i in kept), ([row[i] for i in kept] for row in body))
+    table = format_table((head[i] for i in kept), ([row[i] for i in kept] for row in body))
+    return f"{table}{describe_knobs(study)}"
 
 
 def claims() -> str:
@@ -176,7 +183,7 @@ def all_seven() -> str:
     count = f"{len(pack['worlds'])} of {len(scenarios[1].split(','))}" if scenarios else ""
     text = (folder / "report.md").read_text()
     _, first, second, *_ = text.split("\n\n")
-    return f"The report has {count} scenarios: {names}.\n\n{first}\n\n{second}\n\n{_planned_table(pack)}"
+    return f"The report has {count} scenarios: {names}.\n\n{first}\n\n{second}\n\n{_planned_table(pack)}{describe_knobs('all_seven')}"
 
 
 def _planned_table(pack: Mapping[str, Any]) -> str:
@@ -331,8 +338,15 @@ def learned_gain() -> str:
     return f"{format_table(head, rows)}\n\nKalmanNet with most training runs:\n\n{pairs}"
 
 
+def tuned_worlds() -> str:
+    """Table of all tuned worlds."""
+    table: str = import_module("tuned_worlds").tuned_worlds()
+    return table
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
-    block.__name__: block for block in (claims, all_seven, equal_time, learned_gain, speed, gpu)
+    block.__name__: block
+    for block in (claims, all_seven, equal_time, learned_gain, speed, gpu, tuned_worlds)
 }
 
 

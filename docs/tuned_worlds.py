@@ -1,4 +1,4 @@
-"""Parameters of tier B in each world: the block `tuned` of docs/robustness.md, from the files that `pfbench tune` wrote."""
+"""Files that `pfbench tune` wrote: the block `tuned` of docs/robustness.md, and `tuned_worlds` of docs/methods/robust.md."""
 
 from __future__ import annotations
 
@@ -57,14 +57,35 @@ def read_tuning(world: str, data: str) -> dict[str, Any]:
     Raises:
         ValueError: If there is no such file.
     """
-    contents = [yaml.safe_load(path.read_text()) for path in sorted(TUNED.glob("*.yaml"))]
-    named = [content for content in contents if content["data"] in data]
+    named = [content for content in read_files().values() if content["data"] in data]
     named.sort(key=lambda content: content["world"]["scenario"] != world)
     if not named:
         raise ValueError(
             f"{TUNED} must have a file of the tuning on {data}, got none. Run pfbench tune."
         )
     return dict(named[0])
+
+
+def read_files() -> dict[str, dict[str, Any]]:
+    """Read all files of tunings, by name; `auto` and `nominal` only refer to them."""
+    contents = {
+        path.stem: yaml.safe_load(path.read_text()) for path in sorted(TUNED.glob("*.yaml"))
+    }
+    return {name: content for name, content in contents.items() if "world" in content}
+
+
+def tuned_worlds() -> str:
+    """Table of all tuned worlds: the best conventional filter, and whether Kalman filters fit."""
+    lines = markdown_head("file", "tuned on", "best", "Kalman filters fit", "SIR", "RPF", "runs")
+    for name, content in read_files().items():
+        if fit := content.get("fit"):  # an early file states none
+            ratios = ("{:.2f} [{:.2f}, {:.2f}]".format(*fit["ratios"][k]) for k in ("sir", "rpf"))
+            word = "yes" if content["kalman_fits"] else "no"
+            cells = (f"`{content['best']}`", word, *ratios, str(fit["runs"]))
+        else:
+            cells = ("–", "–", "–", "–", "–")
+        lines.append(markdown_row(f"`{name}`", content["data"], *cells))
+    return "\n".join(lines)
 
 
 def describe_choice(node: Mapping[str, Any]) -> str:

@@ -3,93 +3,168 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pfbench.config.composition import JobConfig, compose
 from pfbench.config.named_sets import TUNED_METHODS
+from pfbench.config.tuned_knobs import AUTO, NOMINAL
 
 HELP = """\
 pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
 
-Tune the baselines of a study of robustness: a factor on R and one knob of the method, 16 candidates
-each, in three noise regimes, with the seed of the study plus 1000. Write the chosen knobs and the
-record of all candidates into one file, FOLDER/tuned/NAME.yaml. In a study `tuned=NAME` gives the
-knobs to the filters that end in _tuned.
+Tune the conventional filters of a world, a scenario with a model: a factor on R and one knob of the
+method, 16 candidates each, in three noise regimes, with the seed of the study plus 1000. Write the
+chosen knobs and the record of all candidates into one file, FOLDER/tuned/NAME.yaml, which a study
+finds by its scenario and model and gives to the filters that end in _tuned. The file states the best
+of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world (`kalman_fits`).
 
   pfbench tune scenario=passive_1 folder=conf
-  pfbench run -m 'hydra.searchpath=[file://conf]' scenario=passive_1 tuned=passive_1 filter=tuned_baselines
+  pfbench run -m 'hydra.searchpath=[file://conf]' scenario=passive_1 filter=tuned_baselines
 
   filter=...         filters to tune, default ekf_scaled,gate,huber,student
   runs=20 seed=1     runs of a candidate, and seed of the study
-  noise=...          noise regimes, default nominal,outliers,student
+  noise=...          noise regimes, default nominal,outliers,student. noise=nominal for a study of
+                     nominal noise alone, whose choice is tuned=nominal
   r_factors=1,2,4,8  factors on R of the candidates, for all filters alike
+  fit_runs=RUNS      runs of sir and rpf in the first noise regime, which decide on kalman_fits
+  fit_particles=10000     their particles
   report.start_time_s=0   time before which errors do not count, as in the report of the study
-  name=SCENARIO      name of the file; a file of this name is replaced
-  folder=conf        folder of the file; use it with 'hydra.searchpath=[file://conf]'"""
+  name=...           name of the file, default SCENARIO, SCENARIO_with_MODEL, and _nominal behind it;
+                     a file of this name is replaced
+  folder=conf        folder of the file, default that of hydra.searchpath if there is one"""
 
 _OPTIONS = {
-    "filter": ",".join(TUNED_METHODS), "name": "", "folder": "conf", "noise": "nominal,outliers,student",
-    "r_factors": "1,2,4,8",
+    "filter": ",".join(TUNED_METHODS), "name": "", "folder": "", "noise": "nominal,outliers,student",
+    "r_factors": "1,2,4,8", "fit_runs": "", "fit_particles": "10000",
 }  # fmt: skip
+_DEFAULTS = {"runs": "runs=20", "fit_runs": "fit_runs=RUNS", "fit_particles": "fit_particles=10000"}
 _FEWEST_RUNS = 2  # a median of one run is that run
+_TAKEN = (AUTO, NOMINAL)  # choices that look for a file
 _OWN = ("seed", "runs", "study", "results_dir", "report.start_time_s")  # not settings of the world
 
 
 def tune_filters(words: Sequence[str]) -> None:
-    """Tune filters and write their knobs.
+    """Tune filters, and write their knobs with the best filter of the world.
 
     Args:
         words: Words `key=value`.
 
     Raises:
-        ValueError: If a filter is without a knob, a list is empty, a value is not valid, or a study scores
-            the seed of the tuning.
+        ValueError: If a filter is without a knob, a list is empty, a value is not valid, no filter can be
+            tuned, or a study scores the seed of the tuning.
     """
-    from pfbench.job.tuning.candidate_search import SEED_SHIFT, CandidateSearch
+    from pfbench.job.tuning.candidate_search import SEED_SHIFT
     from pfbench.job.tuning.knobs import list_candidates
     from pfbench.job.tuning.scored_seeds import check_seed
-    from pfbench.job.tuning.tuned_files import write_tuned_file
 
     options = _OPTIONS | {k: v for k, _, v in (w.partition("=") for w in words) if k in _OPTIONS}
     lists = {key: _split_list(key, options[key]) for key in ("filter", "noise", "r_factors")}
     others = [word for word in words if word.partition("=")[0] not in _OPTIONS]
     grids = {method: list_candidates(method, _numbers(lists["r_factors"])) for method in lists["filter"]}  # fmt: skip
     study = _compose_world(others)
-    name = options["name"] or study.choices["scenario"]
-    _check_choices(name, study.values["runs"])
-    seed, start_time_s = (
-        study.values["seed"] + SEED_SHIFT,
-        float(study.values["report"]["start_time_s"]),
-    )
-    check_seed(study, seed)
+    name = options["name"] or _name_file(study.choices, lists["noise"], others)
+    runs = study.values["runs"]
+    _check_choices(name, runs)
+    fit_runs = _count("fit_runs", options["fit_runs"] or str(runs), runs)
+    particles = _count("fit_particles", options["fit_particles"])
+    check_seed(study, study.values["seed"] + SEED_SHIFT)
     settings = [word for word in others if word.partition("=")[0] not in _OWN]
-    fixed = [f"seed={seed}", f"runs={study.values['runs']}", "pcrb=false", "score_steps=0"]
-    search = CandidateSearch([*settings, *fixed], lists["noise"], print, start_time_s)
     world = {
         **{key: study.choices[key] for key in ("scenario", "model")},
-        "settings": [word for word in settings if re.match(r"(scenario|model|noise)\.", word)],
-        **{"seed": seed, "runs": study.values["runs"], "start_time_s": start_time_s},
+        "settings": [
+            word for word in settings if re.match(r"\+{0,2}(scenario|model|noise)\.", word)
+        ],
+        "seed": study.values["seed"] + SEED_SHIFT,
+        "runs": runs,
+        "start_time_s": float(study.values["report"]["start_time_s"]),
         "regimes": lists["noise"],
     }
-    results = [search.tune(method, grid) for method, grid in grids.items()]
+    folder = Path(options["folder"] or _own_folder(words))
+    path = _search(settings, grids, world, (fit_runs, particles), folder, name)
+    print(f"tuned={name}: {path.resolve()}{_describe_use(folder, words)}")
+
+
+def _search(
+    settings: Sequence[str],
+    grids: Mapping[str, Sequence[dict[str, float]]],
+    world: Mapping[str, Any],
+    fit_size: tuple[int, int],
+    folder: Path,
+    name: str,
+) -> Path:
+    """Search the knobs of all filters, judge the world, and write the file."""
+    from pfbench.job.tuning.candidate_search import CandidateSearch
+    from pfbench.job.tuning.tuned_files import write_tuned_file
+    from pfbench.job.tuning.world_fit import measure_fit
+
+    fixed = [f"seed={world['seed']}", f"runs={world['runs']}", "pcrb=false", "score_steps=0"]
+    fixed += [
+        "budget=particles",
+        "engine=kernels",
+    ]  # those of an experiment do not change the search
+    search = CandidateSearch([*settings, *fixed], world["regimes"], print, world["start_time_s"])
+    results, unsupported = [], {}
+    for method, grid in grids.items():
+        try:
+            results.append(search.tune(method, grid))
+        except ValueError as error:
+            unsupported[method] = f"{error}"
+            print(f"{method} cannot be tuned: {error}")
+    if not results:
+        raise ValueError(next(iter(unsupported.values())))
     for result in results:
         values = ", ".join(f"{key}={value:g}" for key, value in result.choice.values.items())
         print(f"{result.method}: {values}")
-    path = write_tuned_file(results, Path(options["folder"]), name, world)
-    print(f"tuned={name}: {path.resolve()}")
+    fit = measure_fit(search, results, *fit_size)
+    print(f"best: {fit.best}\nkalman_fits: {str(fit.kalman_fits).lower()}")
+    return write_tuned_file(results, folder, name, world, fit, unsupported)
+
+
+def _name_file(choices: Mapping[str, str], regimes: Sequence[str], words: Sequence[str]) -> str:
+    """Name the file by the scenario, by the model if it is not that of the scenario, and by nominal noise alone."""
+    scenario, model = choices["scenario"], choices["model"]
+    places = [word for word in words if re.match(r"[+]*(hydra\.searchpath|trust)=", word)]
+    default = compose([f"scenario={scenario}", *places]).choices["model"]
+    name = scenario if model == default else f"{scenario}_with_{model}"
+    return f"{name}_{NOMINAL}" if list(regimes) == [NOMINAL] else name
+
+
+def _own_folder(words: Sequence[str]) -> str:
+    """Return the first folder of the search path, where the composition finds the file, else conf."""
+    paths = (re.match(r"[+]*hydra\.searchpath=\[?file://([^],]+)", word) for word in words)
+    return next((path[1] for path in paths if path), "conf")
+
+
+def _describe_use(folder: Path, words: Sequence[str]) -> str:
+    """Say how a study finds the file, if it does not by itself."""
+    from pfbench.config.folders import conf_dir
+
+    is_found = folder.resolve() == conf_dir() or any("hydra.searchpath" in word for word in words)
+    return (
+        "" if is_found else f"\nAdd to the words of a study: 'hydra.searchpath=[file://{folder}]'"
+    )
 
 
 def _check_choices(name: str, runs: int) -> None:
     """Check the name of the file, and that there are runs for a median."""
-    if not re.fullmatch(r"\w+", name):
+    if not re.fullmatch(r"\w+", name) or name in _TAKEN:
         raise ValueError(
-            f"name must consist of letters, digits and underscores, got {name!r}. It is a file of folder=."
+            f"name must consist of letters, digits and underscores and not be {' or '.join(_TAKEN)}, got {name!r}. "
+            "It is a file of folder=."
         )
-    if runs < _FEWEST_RUNS:
+    _count("runs", str(runs))
+
+
+def _count(key: str, text: str, most: int | None = None) -> int:
+    """Return a number of runs or particles, at least two."""
+    upper = "" if most is None else f" and at most runs={most}"
+    if not text.isdecimal() or int(text) < _FEWEST_RUNS or (most is not None and int(text) > most):
         raise ValueError(
-            f"runs must be at least {_FEWEST_RUNS} for a tuning, got {runs}. Default: runs=20."
+            f"{key} must be at least {_FEWEST_RUNS}{upper} for a tuning, got {text}. Default: {_DEFAULTS[key]}."
         )
+    return int(text)
 
 
 def _compose_world(words: Sequence[str]) -> JobConfig:

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pfbench.config.folders import conf_dir, experiments_dir
 from pfbench.config.group_checks import check_groups, resolve_values
-from pfbench.config.named_sets import check_tuned_seed, expand_filter_names
+from pfbench.config.named_sets import expand_filter_names
 from pfbench.config.paper_block import check_paper_blocks, remove_nested_blocks
 from pfbench.config.trust import check_configuration, check_places, check_study, split_trust
+from pfbench.config.tuned_knobs import TUNED, check_tuned_seed, mark_foreign, select_knobs
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 CHOICES = ("scenario", "noise", "filter", "model")  # groups that name a job
-TUNED = "tuned"  # group of the knobs that `pfbench tune` chose, which no job stores
 
 _HYDRA_STATE = threading.RLock()  # Hydra has one state for all threads of a process
 
@@ -144,20 +144,20 @@ def resolve_config(
     is_shared = "particles" in tree["filter"] and OmegaConf.is_interpolation(
         tree["filter"], "particles"
     )
+    names = {str(group): str(name) for group, name in (choices or {}).items()}
+    _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
+    select_knobs(tree, names, trusted)
     try:
-        values = resolve_values(tree)
+        values = remove_nested_blocks(resolve_values(tree))
     except InterpolationKeyError as error:
         if not str(error.full_key).startswith("model."):
             raise
         from pfbench.config.model_fit import explain_error
 
         raise explain_error(error, tree, trusted) from error
-    names = {str(group): str(name) for group, name in (choices or {}).items()}
-    _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
-    values = remove_nested_blocks(values)
-    check_tuned_seed(
-        values, names.get("scenario"), values.pop(TUNED, {})
-    )  # the filter has its knobs
+    knobs = values.pop(TUNED, {})  # the filter has them
+    check_tuned_seed(values, names.get("scenario"), knobs)
+    mark_foreign(values, names, knobs.get("world", {}), trusted)
     return JobConfig(values, names, is_shared, packages)
 
 

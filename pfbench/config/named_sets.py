@@ -1,10 +1,9 @@
-"""Named sets of filters, which a sweep may name in place of a list, and the seed of tuned ones."""
+"""Named sets of filters, which a sweep may name in place of a list."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 SUFFIX = "tuned"  # end of the names of the tuned filters
 TUNED_METHODS = ("ekf_scaled", "gate", "huber", "student")
@@ -39,25 +38,3 @@ def expand_filter_sets(words: Sequence[str]) -> list[str]:
         else word
         for word in words
     ]
-
-
-def check_tuned_seed(
-    values: Mapping[str, Any], scenario: str | None, tuned: Mapping[str, Any]
-) -> None:
-    """Check that a job with a tuned filter does not score the seed of the tuning in the same scenario.
-
-    Args:
-        values: Configuration of the job.
-        scenario: Name of its scenario.
-        tuned: Content of the file of the tuning.
-
-    Raises:
-        ValueError: If it does.
-    """
-    world = tuned.get("world", {})
-    is_tuned = bool((values["filter"].get("paper") or {}).get("tuning"))
-    if is_tuned and (world.get("scenario"), world.get("seed")) == (scenario, values.get("seed")):
-        raise ValueError(
-            f"seed must not be that of the tuning of the filter in {scenario}, got {values['seed']}. "
-            "Set another seed."
-        )

@@ -12,6 +12,7 @@ import yaml
 
 from pfbench.config.folders import conf_dir
 from pfbench.config.paper_block import PAPER
+from pfbench.config.tuned_knobs import OWN_WORLD
 from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.job_labels import parse_label
 
@@ -37,16 +38,7 @@ def read_paper_block(group: str, name: str) -> Mapping[str, Any]:
     node = _NODE.search(path.read_text(encoding="utf-8"))
     block = (yaml.safe_load(node.group())[PAPER] or {}) if node else {}
     is_open = block.get("tuning") == _TUNED_DATA
-    return {**block, "tuning": _read_default_world()} if is_open else block
-
-
-@cache
-def _read_default_world() -> str:
-    """Read the data on which tuned filters were tuned unless a job chooses another world."""
-    main = yaml.safe_load((conf_dir() / "config.yaml").read_text(encoding="utf-8"))
-    (name,) = (entry["tuned"] for entry in main["defaults"] if "tuned" in entry)
-    knobs = yaml.safe_load((conf_dir() / "tuned" / f"{name}.yaml").read_text(encoding="utf-8"))
-    return str(knobs["data"])
+    return {**block, "tuning": OWN_WORLD} if is_open else block
 
 
 def list_named_parts(group: str) -> list[str]:

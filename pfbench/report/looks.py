@@ -14,6 +14,7 @@ from typing import Any
 
 from pfbench.config.paper_block import MARKERS
 from pfbench.config.paper_files import list_named_parts, read_paper_block
+from pfbench.config.tuned_knobs import add_world, find_foreign_world, read_world
 from pfbench.report.setting_names import name_settings
 from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.conditions import Condition
@@ -47,6 +48,7 @@ class MethodLook:
         cite: Key of the reference, empty without one.
         baselines: Labels of the methods with which its paper compares it.
         tuning: Data on which its parameters were chosen, empty if they were not tuned.
+        tuned_on: Words for another world than that of its jobs on which they were chosen, else empty.
     """
 
     key: str
@@ -60,6 +62,7 @@ class MethodLook:
     cite: str = ""
     baselines: tuple[str, ...] = ()
     tuning: str = ""
+    tuned_on: str = ""
 
 
 @dataclass(frozen=True)
@@ -118,16 +121,47 @@ def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
     """
     blocks: dict[str, Mapping[str, Any]] = {}
     worlds: dict[str, dict[str, None]] = {}  # distinct, in the order of the conditions
-    for job in (job for c in conditions for job in c.jobs):
-        blocks[job.label] = block = _stored_block(job.meta, "filter")
-        worlds.setdefault(job.label, {}).update(
-            {str(block["tuning"]): None} if block.get("tuning") else {}
-        )
+    foreign: dict[str, dict[str, None]] = {}
+    for condition in conditions:
+        for job in condition.jobs:
+            blocks[job.label] = block = _stored_block(job.meta, "filter")
+            data = str(block.get("tuning") or "")
+            worlds.setdefault(job.label, {}).update({data: None} if data else {})
+            model = str(job.meta.get("choices", {}).get("model", ""))
+            foreign_world = find_foreign_world(data, parse_label(condition.scenario)[0], model)
+            text = read_world(str(block.get("name"))) or foreign_world
+            foreign.setdefault(job.label, {}).update({text: None} if text else {})
     looks = find_looks(sorted(blocks), blocks)
     return {
-        label: replace(look, tuning=", ".join(worlds[label])) if worlds[label] else look
+        label: add_tuning(look, ", ".join(worlds[label]), ", ".join(foreign[label]))
         for label, look in looks.items()
     }
+
+
+def find_stored_world(look: Mapping[str, Any], scenarios: Collection[str]) -> str:
+    """Return the words for another world on which a filter of a stored page was tuned, else empty.
+
+    Args:
+        look: Look of the filter. An early page does not state the world, which then follows from the data.
+        scenarios: Keys of the scenarios of the page.
+    """
+    worlds = (find_foreign_world(look["tuning"], parse_label(key)[0]) for key in scenarios)
+    return str(look.get("tuned_on", next(filter(None, worlds), "")))
+
+
+def add_tuning(look: MethodLook, data: str, foreign: str) -> MethodLook:
+    """Return the look of a tuned filter with the data of its tuning and the name of another world.
+
+    Args:
+        look: Look of a filter.
+        data: Data of its tuning, empty for the installed words.
+        foreign: Words for the world if it is not that of all conditions, else empty.
+    """
+    look = replace(look, tuning=data or look.tuning, tuned_on=foreign)
+    if not foreign:
+        return look
+    name, long_name = (add_world(text, foreign) for text in (look.name, look.long_name))
+    return replace(look, name=name, long_name=long_name)
 
 
 def study_part_names(conditions: Sequence[Condition], group: str) -> dict[str, PartName]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from pfbench.report.looks import MethodLook
+
+NOT_TUNED_HERE = "Not tuned here:"  # start of the line on knobs of another world
 
 
 def count_tuned(looks: Mapping[str, MethodLook]) -> dict[str, int]:
@@ -28,3 +30,18 @@ def describe_tuning(tuned: Mapping[str, int], filters: int) -> str:
         f"Parameters of {number} of {filters} filters were tuned on {data}."
         for data, number in tuned.items()
     )
+
+
+def describe_foreign_knobs(worlds: Collection[str]) -> str:
+    """Say that tuned filters of a page were tuned on other worlds; empty if none was.
+
+    Args:
+        worlds: Words for the other world of each filter, empty for one that was not tuned on another.
+    """
+    names = sorted({world for world in worlds if world})
+    number = sum(bool(world) for world in worlds)
+    return (
+        f"{NOT_TUNED_HERE} {number} filters have the knobs of another world, {', '.join(names)}. What is said of "
+        "them holds for these knobs, until the study has run again with its own."
+        if names else ""
+    )  # fmt: skip

@@ -10,6 +10,7 @@ from pfbench.results.config_key import DATA_FOLDERS
 
 _DATA_SETTINGS = ("scenario", "noise")  # settings that decide the data of a filter
 _NOT_DATA = "scenario.paper."  # names and thresholds
+_WORDS = "filter.paper."  # names of a filter, which differ with the world of its tuning
 _LOCATION_SETTINGS = ("scenario.cache_dir", *DATA_FOLDERS)  # settings that do not
 
 
@@ -39,7 +40,7 @@ def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, An
     if len(twins) == 1:
         return str(meta["label"])
     flat = [flatten_settings(twin["config"]) for twin in twins]
-    names = list_differing(flat)
+    names = [name for name in list_differing(flat) if not name.startswith(_WORDS)]
     of_filter = [name for name in names if name.startswith("filter.")]
     if len({tuple(repr(config.get(name)) for name in of_filter) for config in flat}) == len(flat):
         names = of_filter

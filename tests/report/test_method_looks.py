@@ -13,6 +13,7 @@ from config_cases import CONF
 from pfbench.config.composition import compose
 from pfbench.config.paper_block import FAMILIES, check_paper_blocks, remove_nested_blocks
 from pfbench.config.paper_files import list_named_parts, plan_installed_pairs, read_paper_block
+from pfbench.config.tuned_knobs import OWN_WORLD
 from pfbench.report.looks import MethodLook, find_looks, study_looks
 from pfbench.report.plots.plotting import line_styles
 from pfbench.report.setting_names import describe_settings
@@ -101,7 +102,26 @@ def test_a_study_of_several_worlds_names_the_data_of_all_tunings() -> None:
         for conditions in (worlds, [*worlds, *worlds], [*worlds, condition("c", "")])
     }
     assert tunings == {"a (seed 1001), b (seed 1001)"}
-    assert find_looks(["gate_tuned"])["gate_tuned"].tuning.startswith("flight_500s (model ")
+    assert find_looks(["gate_tuned"])["gate_tuned"].tuning == OWN_WORLD
+
+
+def test_the_name_of_a_filter_says_on_which_other_world_it_was_tuned() -> None:
+    """From the data that a result stores: results of earlier versions have the same name everywhere."""
+
+    def name(
+        scenario: str, tuning: str, model: str = "m", stored: str = "Gated EKF (tuned)"
+    ) -> str:
+        filter_node = {"paper": {"name": stored, "tuning": tuning}}
+        meta = {"config": {"filter": filter_node}, "choices": {"model": model}}
+        job = JobFile(Path("a"), "gate_tuned", meta)
+        return study_looks([Condition(scenario, "nominal", "", (job,))])["gate_tuned"].name
+
+    data = "a (model m, seed 1001, 20 runs; noise: nominal)"
+    assert name("a", data) == name("a[x=1]", data) == "Gated EKF (tuned)"
+    assert name("b", data) == "Gated EKF (tuned on a)"
+    assert name("a", data, "n") == "Gated EKF (tuned on a with m)"
+    said = "Gated EKF (tuned on a with other settings)"
+    assert name("a", data, stored=said) == said
 
 
 def test_no_two_methods_share_colour_and_marker() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,8 @@ def study(effects: dict[str, tuple[float, float]], runs: int = 20, worlds: int =
 
 def describe(data: pd.DataFrame, alpha: float = 0.05) -> str:
     looks = find_looks(sorted(data["filter"].unique()))
+    if CONTROL in looks:
+        looks[CONTROL] = replace(looks[CONTROL], tuning="flight_500s (model ins_gnss18, seed 1001)")
     return describe_robustness(data, looks, ReportOptions(alpha=alpha))
 
 

@@ -17,10 +17,12 @@ from pfbench.job.metadata import describe_state
 from pfbench.job.tuning.joint_regimes import draw_batches
 from pfbench.job.tuning.knobs import apply_candidate
 from pfbench.model.base import StateSpaceModel
-from pfbench.results.error_measures import mean_per_run, rmse_per_run
+from pfbench.results.error_measures import Array, Flags, mean_per_run, rmse_per_run
 from pfbench.results.state_groups import main_component_group
+from pfbench.results.status import is_diverged
 
 SEED_SHIFT = 1000  # seed of a tuning minus seed of the study
+_RUNS_AT_ONCE = 400  # of all candidates and regimes in one pass, which bounds its memory
 TIE = 0.01  # relative difference of two scores that calibration decides
 OBJECTIVE = (
     "mean over regimes of log(median RMSE / median RMSE of the EKF), smallest; within 1 % the candidate whose "
@@ -114,10 +116,10 @@ class CandidateSearch:
     ) -> None:
         self.words, self.regimes, self.progress = tuple(words), tuple(regimes), progress
         self.start_time_s, self.seconds = start_time_s, 0.0
-        self.batches = draw_batches({r: self._compose("ekf", r) for r in self.regimes})
+        self.batches = draw_batches({r: self.compose("ekf", r) for r in self.regimes})
         _check_start(self.batches[0].episode.time, start_time_s)
         start_work()
-        self.reference = self._score(self._compose("ekf", self.regimes[0]))
+        (self.reference,) = self._score([self.compose("ekf", self.regimes[0])])
 
     def tune(self, method: str, grid: Sequence[dict[str, float]]) -> TuningResult:
         """Search the knobs of a filter.
@@ -130,16 +132,19 @@ class CandidateSearch:
             The result.
         """
         candidates, self.seconds = [], 0.0
-        config = self._compose(method, self.regimes[0])
-        for values in grid:
-            self.progress(f"{method} {' '.join(f'{k}={v:g}' for k, v in values.items())}")
-            candidates.append(self._try(config, values))
+        config = self.compose(method, self.regimes[0])
+        at_once = max(1, _RUNS_AT_ONCE // max(len(batch.runs) for batch in self.batches))
+        for first in range(0, len(grid), at_once):
+            some = grid[first : first + at_once]
+            self.progress(f"{method}, candidates {first + 1} to {first + len(some)} of {len(grid)}")
+            scores = self._score([with_candidate(config, values) for values in some])
+            candidates += [self._rate(*pair) for pair in zip(some, scores, strict=True)]
         choice, seconds = choose_candidate(candidates), self.seconds
-        return TuningResult(method, choice, self._try(config, {}), tuple(candidates), seconds)
+        untuned = self._rate({}, *self._score([config]))
+        return TuningResult(method, choice, untuned, tuple(candidates), seconds)
 
-    def _try(self, config: JobConfig, values: dict[str, float]) -> Candidate:
-        """Run a candidate in all regimes."""
-        scores = self._score(_with_candidate(config, values))
+    def _rate(self, values: dict[str, float], scores: Mapping[str, RegimeScore]) -> Candidate:
+        """Rate a candidate by its scores in all regimes."""
         logs = [math.log(s.error / self.reference[r].error) for r, s in scores.items()]
         ratios = [math.log(s.nees_ratio) for s in scores.values()]
         return Candidate(
@@ -149,19 +154,50 @@ class CandidateSearch:
             {regime: s.error for regime, s in scores.items()},
         )
 
-    def _compose(self, method: str, regime: str) -> JobConfig:
-        """Compose the configuration of a filter."""
-        return compose([*self.words, f"filter={method}", f"noise={regime}"])
+    def score_method(self, method: str) -> Candidate:
+        """Run a filter without knobs in all regimes.
 
-    def _score(self, config: JobConfig) -> dict[str, RegimeScore]:
-        """Run a filter in all regimes and compute its scores by regime."""
-        scores = {}
+        Args:
+            method: Name of the filter.
+        """
+        return self._rate({}, *self._score([self.compose(method, self.regimes[0])]))
+
+    def pass_alone(self, config: JobConfig, threshold: float = math.inf) -> Array:
+        """Run a filter in one regime and return the RMSE of each run [R], infinite for a lost or diverged run.
+
+        Args:
+            config: Configuration of the filter with its runs.
+            threshold: Divergence threshold.
+        """
+        (batch,) = draw_batches({config.choices["noise"]: config})
+        result = batch.pass_filter(config)
+        data = result.arrays(batch.episode, None)
+        error, lost = select_errors(data, result.model, slice(None), self.start_time_s)
+        return rmse_per_run(error, lost | is_diverged(error, lost, threshold))
+
+    def compose(self, method: str, regime: str, words: Sequence[str] = ()) -> JobConfig:
+        """Compose the configuration of a filter.
+
+        Args:
+            method: Name of the filter.
+            regime: Noise regime.
+            words: Overrides that replace those of the search.
+        """
+        return compose([*self.words, f"filter={method}", f"noise={regime}", *words])
+
+    def _score(self, configs: Sequence[JobConfig]) -> list[dict[str, RegimeScore]]:
+        """Run filters in all regimes and compute the scores of each by regime."""
+        scores: list[dict[str, RegimeScore]] = [{} for _ in configs]
         for batch in self.batches:
-            result = batch.pass_filter(config)
+            is_alone = len(configs) == 1
+            result = batch.pass_filter(configs[0]) if is_alone else batch.pass_candidates(configs)
             self.seconds += sum(result.seconds.get(name, 0.0) for name in ("scores", "filter"))
             data = result.arrays(batch.episode, None)
-            for regime, runs in batch.list_runs():
-                scores[regime] = score_runs(data, result.model, runs, self.start_time_s)
+            for k, by_regime in enumerate(scores):
+                for regime, runs in batch.list_runs():
+                    start = k * len(batch.runs)
+                    places = slice(start + runs.start, start + runs.stop)
+                    by_regime[regime] = score_runs(data, result.model, places, self.start_time_s)
         return scores
 
 
@@ -174,8 +210,13 @@ def _check_start(time: Tensor, start_time_s: float) -> None:
         )
 
 
-def _with_candidate(config: JobConfig, values: Mapping[str, float]) -> JobConfig:
-    """Return a configuration with the knobs of a candidate."""
+def with_candidate(config: JobConfig, values: Mapping[str, float]) -> JobConfig:
+    """Return a configuration with the knobs of a candidate.
+
+    Args:
+        config: Configuration of a filter.
+        values: Values by knob, empty for the filter as its file states it.
+    """
     if not values:
         return config
     changed = copy.deepcopy(config.values)
@@ -197,10 +238,26 @@ def score_runs(
     """
     state = describe_state(model)
     group, steps = main_component_group(state), data["time"] >= start_time_s
-    lost = np.asarray(data["lost"][runs], dtype=bool)
-    error = data["error"][runs][:, steps][..., group.places].astype(float) * group.scale
-    rmse = np.where(lost, np.inf, rmse_per_run(error, lost))
+    error, lost = select_errors(data, model, runs, start_time_s)
     number = list(state["groups"]).index(group.state_group)
     nees = mean_per_run(data["nees"][runs][:, steps, number].astype(float), lost)
     size = len(state["groups"][group.state_group])
-    return RegimeScore(float(np.median(rmse)), float(np.nanmedian(nees)) / size)
+    return RegimeScore(
+        float(np.median(rmse_per_run(error, lost))), float(np.nanmedian(nees)) / size
+    )
+
+
+def select_errors(
+    data: Mapping[str, np.ndarray], model: StateSpaceModel, runs: slice, start_time_s: float
+) -> tuple[Array, Flags]:
+    """Select the errors of the main group in displayed units [R, T, K], and the lost runs [R].
+
+    Args:
+        data: Arrays of a job, see `store.JobResult`.
+        model: Model of the filter.
+        runs: Places of the runs.
+        start_time_s: Time before which errors do not count [s].
+    """
+    group, steps = main_component_group(describe_state(model)), data["time"] >= start_time_s
+    error = data["error"][runs][:, steps][..., group.places].astype(float) * group.scale
+    return error, np.asarray(data["lost"][runs], dtype=bool)

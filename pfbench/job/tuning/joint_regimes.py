@@ -14,6 +14,7 @@ from pfbench.config.composition import JobConfig
 from pfbench.core.record import Episode, Record
 from pfbench.job.filter_pass import TimedFilterPass, pass_filter
 from pfbench.job.plan import JobPlan, build_plan
+from pfbench.job.tuning.joint_candidates import join_candidates
 
 
 class RegimeBatch(NamedTuple):
@@ -39,6 +40,26 @@ class RegimeBatch(NamedTuple):
         """
         plan = replace(self.plan, config=config, method=build_plan(config).method)
         return pass_filter(plan, self.episode, self.runs, "candidate")
+
+    def pass_candidates(self, configs: Sequence[JobConfig]) -> TimedFilterPass:
+        """Run several candidates of a filter over all runs in one pass, one candidate behind another.
+
+        Args:
+            configs: Configurations that differ in the knobs of the filter.
+        """
+        methods = [build_plan(config).method for config in configs]
+        plan = replace(
+            self.plan, config=configs[0], method=join_candidates(methods, len(self.runs))
+        )
+        return pass_filter(plan, *self.repeat(len(configs)), "candidates")
+
+    def repeat(self, times: int) -> tuple[Episode, Tensor]:
+        """Return the episode and the numbers of the runs several times behind one another.
+
+        Args:
+            times: Number of times.
+        """
+        return join_episodes([self.episode] * times), self.runs.repeat(times)
 
     def list_runs(self) -> Iterator[tuple[str, slice]]:
         """Yield each regime with the places of its runs."""

@@ -10,13 +10,20 @@ from typing import Any
 
 from pfbench.files.atomic_write import write_atomically
 from pfbench.job.tuning.candidate_search import OBJECTIVE, Candidate, TuningResult
+from pfbench.job.tuning.world_fit import FIT_RULE, WorldFit
 
+_NO_EFFECT = "All candidates have the same errors: the knobs change nothing in this world."
 _ERROR = "error_"  # start of the columns of a record with the error in a regime
 _DIGITS = 6
 
 
 def write_tuned_file(
-    results: Sequence[TuningResult], folder: Path, name: str, world: Mapping[str, Any]
+    results: Sequence[TuningResult],
+    folder: Path,
+    name: str,
+    world: Mapping[str, Any],
+    fit: WorldFit | None = None,
+    unsupported: Mapping[str, str] | None = None,
 ) -> Path:
     """Write the knobs of tuned filters with the record of their search.
 
@@ -25,6 +32,8 @@ def write_tuned_file(
         folder: Folder of configuration files.
         name: Name of the file, which `tuned=NAME` chooses.
         world: Scenario, model, settings, seed, runs, start time and regimes of the search.
+        fit: Best conventional filter, and whether Kalman filters fit the world.
+        unsupported: Reason by filter that has no knobs in the world.
 
     Returns:
         The file, `FOLDER/tuned/NAME.yaml`.
@@ -35,15 +44,43 @@ def write_tuned_file(
         f"objective: {json.dumps(OBJECTIVE)}",
         "world:",
         *(f"  {key}: {json.dumps(value)}" for key, value in world.items()),
+        *(_list_fit(fit) if fit else ()),
     ]
+    for method, reason in (unsupported or {}).items():
+        lines += [f"{method}:", f"  unsupported: {json.dumps(reason)}"]
     for result in results:
         lines += [f"{result.method}:"]
         lines += [f"  {key}: {json.dumps(value)}" for key, value in result.choice.values.items()]
+        lines += [f"  note: {json.dumps(_NO_EFFECT)}"] if _has_no_effect(result) else []
         lines += [f"  seconds: {result.seconds:.1f}", "  candidates: |"]
         lines += [f"    {' '.join(row)}" for row in _list_rows(result)]
     path = folder / "tuned" / f"{name}.yaml"
     write_atomically(path, lambda file: file.write(("\n".join(lines) + "\n").encode()))
     return path
+
+
+def _list_fit(fit: WorldFit) -> Iterator[str]:
+    """Yield the lines of the best conventional filter, and of the fit of Kalman filters with its numbers."""
+    yield f"best: {fit.best}"
+    yield f"kalman_fits: {json.dumps(fit.kalman_fits)}"
+    yield "fit:"
+    yield f"  rule: {json.dumps(FIT_RULE)}"
+    for key, value in (("noise", fit.regime), ("runs", fit.runs), ("particles", fit.particles)):
+        yield f"  {key}: {value}"
+    yield f"  cap: {fit.cap:.{_DIGITS}g}"
+    yield f"  cap_source: {json.dumps(fit.cap_source)}"
+    yield "  objectives:"
+    yield from (f"    {name}: {score:.{_DIGITS}g}" for name, score in fit.objectives.items())
+    yield "  ratios:  # with both ends of the interval"
+    for name, ratio in fit.ratios.items():
+        yield f"    {name}: [{', '.join(f'{number:.{_DIGITS}g}' for number in ratio)}]"
+
+
+def _has_no_effect(result: TuningResult) -> bool:
+    """Return whether all candidates have the score of the filter without tuned knobs."""
+    return (
+        len({(c.log_ratio, *c.errors.values()) for c in (*result.candidates, result.untuned)}) == 1
+    )
 
 
 def _list_rows(result: TuningResult) -> Iterator[list[str]]:

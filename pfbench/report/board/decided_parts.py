@@ -6,7 +6,7 @@ A published study keeps its runs and these facts, so that its page is decided ag
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from pfbench.report.board.study_views import build_views
 from pfbench.report.board.sweeps import list_sweeps
 from pfbench.report.board.view import BEST, EQUAL, MISSING, NOT_KEPT, OPEN
 from pfbench.report.journal.study_pack import ALL
-from pfbench.report.looks import MethodLook, PartName, find_looks
+from pfbench.report.looks import MethodLook, PartName, add_tuning, find_looks, find_stored_world
 from pfbench.report.options import ReportOptions
 from pfbench.results.comparison.baselines import REFERENCES
 from pfbench.results.decisions.words import WORSE
@@ -94,8 +94,12 @@ class StudyFacts(NamedTuple):
         is_installed = methods <= set(list_named_parts("filter"))
         looks = {look.key: look for look in stored}
         present = find_looks(labels) if is_installed else looks
+        worlds = [entry["key"] for entry in pack["worlds"]]
         return cls(
-            {key: replace(look, tuning=looks[key].tuning) for key, look in present.items()},
+            {
+                key: add_tuning(look, old["tuning"], find_stored_world(old, worlds))
+                for (key, look), old in zip(present.items(), facts["looks"], strict=True)
+            },
             {entry["key"]: PartName(**entry) for entry in pack["worlds"]},
             {entry["key"]: PartName(**entry) for entry in facts["regimes"]},
             ReportOptions(**facts["options"]),

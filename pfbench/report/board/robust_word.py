@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtr
 
+from pfbench.config.tuned_knobs import list_tuned_worlds
 from pfbench.report.board.levels import (
     FilterLevels,
     StudyArrays,
@@ -27,6 +28,7 @@ from pfbench.report.looks import MethodLook, find_looks
 from pfbench.report.options import ReportOptions
 from pfbench.results.comparison.baselines import REFERENCES
 from pfbench.results.error_measures import Flags
+from pfbench.results.job_labels import parse_label
 from pfbench.results.statistics.paired_effects import MIN_RUNS, ConditionEffects
 from pfbench.results.statistics.signed_rank import holm
 from pfbench.results.statistics.world_effects import EffectEstimate
@@ -78,7 +80,8 @@ def describe_robustness(
     names = {label: looks[label].name for label in evidence}
     text = describe_robust_filters(names, find_robust_filters(evidence, options.alpha))
     tuning = looks[CONTROL].tuning
-    is_foreign = tuning and not any(f", {key} (" in f", {tuning}" for key in common)
+    stated = list_tuned_worlds(tuning)
+    is_foreign = stated and not any(parse_label(key)[0] in stated for key in common)
     return f"{text} The control was tuned in another world, {tuning}." if is_foreign else text
 
 

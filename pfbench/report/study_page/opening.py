@@ -9,6 +9,9 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
+from pfbench.report.looks import find_stored_world
+from pfbench.report.tuning_words import describe_foreign_knobs
+
 SIGNS = {
     "best": "★", "equal": "≈", "better": "▲", "open": "?", "worse": "▼", "not_kept": "✕", "missing": "–",
 }  # fmt: skip
@@ -86,12 +89,24 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         "small_print": view["small_print"],
         "robustness": format_sentence(robustness),
         "robustness_text": _remove_marks(robustness),
+        "foreign_knobs": describe_page_knobs(pack),
         "overconfidence": describe_overconfidence(pack),
         "caption": f"{'; '.join(parts)}.",
         "heads": _heads(names[baseline]["name"]),
         "rows": [_row(row, names[row["filter"]]) for row in view["rows"]],
         "has_costs": any(row.get("cost") is not None for row in view["rows"]),
     }
+
+
+def describe_page_knobs(pack: Mapping[str, Any]) -> str:
+    """Say which filters of a page were tuned on other worlds; empty for none, or for a page without the data.
+
+    Args:
+        pack: Data of the page.
+    """
+    looks = pack.get("facts", {}).get("looks", ())
+    worlds = [world["key"] for world in pack["worlds"]]
+    return describe_foreign_knobs([find_stored_world(look, worlds) for look in looks])
 
 
 def describe_overconfidence(pack: Mapping[str, Any]) -> str:

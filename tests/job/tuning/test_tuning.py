@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +16,30 @@ from pfbench import job
 from pfbench.cli.compose import read_sweep
 from pfbench.cli.messages import format_error
 from pfbench.cli.tune import tune_filters
-from pfbench.config.named_sets import FILTER_SETS, expand_filter_sets
+from pfbench.config.named_sets import FILTER_SETS, TUNED_METHODS, expand_filter_sets
 from pfbench.config.paper_files import list_named_parts
+from pfbench.config.tuned_knobs import AUTO, NOMINAL, list_tuned_worlds
 from pfbench.job.tuning import knobs
 from pfbench.job.tuning.candidate_search import (
-    SEED_SHIFT,
     Candidate,
     CandidateSearch,
     choose_candidate,
     score_runs,
+    with_candidate,
 )
 from pfbench.job.tuning.knobs import KNOBS, Knob, apply_candidate, list_candidates
 from pfbench.job.tuning.scored_seeds import check_seed
 from pfbench.job.tuning.tuned_files import read_candidates
+from pfbench.job.tuning.world_fit import Ratio, compare_errors, decide_fit, find_best
 from pfbench.report.looks import find_looks
 from pfbench.report.tuning_words import count_tuned, describe_tuning
 from pfbench.results import store
 
-TUNED = sorted(path.stem for path in (job.conf_dir() / "tuned").glob("*.yaml"))
+TUNED = sorted(
+    path.stem
+    for path in (job.conf_dir() / "tuned").glob("*.yaml")
+    if path.stem not in (AUTO, NOMINAL)
+)
 
 
 def candidate(log_ratio: float, nees_ratio: float, r: float = 1.0) -> Candidate:
@@ -97,19 +105,11 @@ def stated_knobs(words: list[str]) -> dict[str, Any]:
     return stated
 
 
-def test_tuned_filters_were_not_tuned_on_scored_seeds() -> None:
-    scored = job.compose(["+experiment=quickstart"])
-    world = read_tuned(scored.choices["tuned"])["world"]
-    assert world["seed"] == scored.values["seed"] + SEED_SHIFT
-    assert world["scenario"] == scored.choices["scenario"]
-    assert world["model"] == scored.choices["model"]
-
-
 @pytest.mark.parametrize("name", TUNED)
 def test_stored_knobs_are_the_choice_among_the_stored_candidates(name: str) -> None:
     """All filters of a file had the same number of candidates with the same factors on R."""
     content = read_tuned(name)
-    methods = sorted(set(content) & set(KNOBS))
+    methods = [method for method in TUNED_METHODS if "unsupported" not in content[method]]
     assert "ekf_scaled" in methods  # the control
     for method in methods:
         candidates, untuned = read_candidates(content[method])
@@ -126,24 +126,70 @@ def test_stored_knobs_are_the_choice_among_the_stored_candidates(name: str) -> N
         assert "tuned" not in config  # else the key of every job would change with the record
 
 
-def test_robust_studies_use_the_knobs_of_their_own_world() -> None:
-    studies = [path.stem for path in job.experiments_dir().glob("robust_*.yaml")]
-    assert len(studies) >= 5
-    for study in studies:
-        sweep = dict(word.split("=") for word in read_sweep(study))
-        for scenario in sweep.get("scenario", "").split(","):
-            chosen = [f"scenario={scenario}"] if scenario else []
-            config = job.compose([f"+experiment={study}", *chosen, "filter=gate_tuned"])
-            world = read_tuned(config.choices["tuned"])["world"]
-            assert world["scenario"] == config.choices["scenario"]
-            assert world["model"] == config.choices["model"]
-            # no run of the study, and of a recording no scored step or another draw of the errors
-            assert world["seed"] != config.values["seed"]
+@pytest.mark.parametrize("name", TUNED)
+def test_a_file_states_the_best_filter_of_its_world_and_whether_kalman_filters_fit(
+    name: str,
+) -> None:
+    content = read_tuned(name)
+    fit = content["fit"]
+    errors = {}
+    for method in TUNED_METHODS:
+        if "unsupported" not in content[method]:
+            candidates, _ = read_candidates(content[method])
+            errors[f"{method}_tuned"] = choose_candidate(candidates)
+    for method, choice in errors.items():  # unless a cap is below an error
+        if max(choice.errors.values()) < fit["cap"]:
+            assert fit["objectives"][method] == pytest.approx(choice.log_ratio, abs=1e-5)
+    assert {"ekf", *errors} <= set(fit["objectives"]) <= {"ekf", "ukf", *errors}
+    assert fit["objectives"][content["best"]] == min(fit["objectives"].values())
+    ratios = {key: Ratio(*values) for key, values in fit["ratios"].items()}
+    assert set(ratios) == {"sir", "rpf"}
+    assert content["kalman_fits"] == all(ratio.high >= 0.95 for ratio in ratios.values())
+    assert all(ratio.low <= ratio.value <= ratio.high for ratio in ratios.values())
+
+
+@pytest.mark.parametrize("name", TUNED)
+def test_a_file_has_the_name_under_which_its_world_is_found(name: str) -> None:
+    world = read_tuned(name)["world"]
+    words = [f"{key}={world[key]}" for key in ("scenario", "model")]
+    is_nominal = world["regimes"] == [NOMINAL]
+    choices = [NOMINAL] if is_nominal else [AUTO]
+    found = [job.compose([*words, f"tuned={c}", "filter=ekf_scaled_tuned"]) for c in choices]
+    assert {c.values["filter"]["paper"]["tuning"] for c in found} == {read_tuned(name)["data"]}
+
+
+def list_tuned_studies() -> list[tuple[str, str, bool]]:
+    """Experiments with tuned filters, each scenario, and whether its noise is nominal alone."""
+    studies = []
+    for path in sorted(job.experiments_dir().glob("*.yaml")):
+        sweep = dict(word.split("=", 1) for word in read_sweep(path.stem))
+        if "gate_tuned" in sweep.get("filter", "").split(","):
+            is_nominal = set(sweep.get("noise", NOMINAL).split(",")) == {NOMINAL}
+            scenarios = sweep.get("scenario", "").split(",")
+            studies += [(path.stem, scenario, is_nominal) for scenario in scenarios]
+    return studies
+
+
+@pytest.mark.parametrize(("study", "scenario", "is_nominal"), list_tuned_studies())
+def test_studies_use_the_knobs_of_their_own_world(
+    study: str, scenario: str, is_nominal: bool
+) -> None:
+    """Tuned on other seeds, and for a study of nominal noise in nominal noise alone."""
+    chosen = [f"scenario={scenario}"] if scenario else []
+    config = job.compose([f"+experiment={study}", *chosen, "filter=gate_tuned"])
+    paper = config.values["filter"]["paper"]
+    own = {key: config.choices[key] for key in ("scenario", "model")}
+    assert list_tuned_worlds(paper["tuning"]) == {own["scenario"]: own["model"]}
+    assert "tuned on" not in paper["name"] or "with other settings" in paper["name"]
+    assert paper["tuning"].endswith("noise: nominal)") == is_nominal
+    assert f"seed {config.values['seed']}," not in paper["tuning"]
 
 
 def test_reports_say_on_which_data_filters_were_tuned() -> None:
-    world = read_tuned("flight_500s")["world"]
-    looks = find_looks(["ekf", "gate_tuned", "huber_tuned"])
+    content = read_tuned("flight_500s")
+    world, looks = content["world"], find_looks(["ekf", "gate_tuned", "huber_tuned"])
+    for key in ("gate_tuned", "huber_tuned"):
+        looks[key] = replace(looks[key], tuning=content["data"])
     said = describe_tuning(count_tuned(looks), len(looks))
     assert said.startswith("Parameters of 2 of 3 filters were tuned on flight_500s (")
     for value in (world["model"], f"seed {world['seed']}", f"{world['runs']} runs"):
@@ -162,6 +208,7 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     tune_filters([
         "scenario=linear_walk", "scenario.steps=60", "runs=20", "filter=ekf_scaled",
         "noise=outliers", "name=walk", "folder=lab", "r_factors=1,4", "report.start_time_s=5",
+        "fit_runs=10", "fit_particles=200",
     ])  # fmt: skip
     written = yaml.safe_load((tmp_path / "lab/tuned/walk.yaml").read_text())
     assert written["ekf_scaled"]["r_factor"] == 4.0
@@ -173,6 +220,10 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
         "scenario": "linear_walk", "model": "linear_walk", "settings": ["scenario.steps=60"],
         "seed": 1001, "runs": 20, "start_time_s": 5.0, "regimes": ["outliers"],
     }  # fmt: skip
+    assert written["best"] == "ekf_scaled_tuned"  # the EKF and the UKF without knobs believe R
+    assert written["kalman_fits"] is True
+    fit = written["fit"]
+    assert (fit["noise"], fit["runs"], fit["particles"], fit["cap"]) == ("outliers", 10, 200, 4.3)
     words = [f"hydra.searchpath=[file://{tmp_path}/lab]", "tuned=walk", "filter=ekf_scaled_tuned"]
     assert stated_knobs(words)["r_factor"] == 4.0
     # the errors once more, from a job of its own for each filter
@@ -206,6 +257,9 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
         (["scenario=linear_walk", "r_factors=1,-2"], r"r_factors must be positive numbers, got 1,-2"),
         (["scenario=linear_walk", "r_factors=1,many"], r"r_factors must be positive numbers, got 1,many"),
         (["scenario=linear_walk", "name=../x"], r"name must consist of letters.*got '../x'\. It"),
+        (["scenario=linear_walk", "name=auto"], r"name must.*not be auto or nominal, got 'auto'\. It"),
+        (["scenario=linear_walk", "fit_runs=21"], r"fit_runs must be at least 2 and at most runs=20.*got 21\. Default"),
+        (["scenario=linear_walk", "fit_particles=1"], r"fit_particles must be at least 2.*got 1\. Default"),
         (["scenario=linear_walk", "runs=1"], r"runs must be at least 2 for a tuning, got 1\. Default"),
         (["scenario=passiv_1"], r"scenario=passiv_1 does not exist. Similar: passive_1"),
         (["scenario=flight_500s", "seed=-999"], r"a seed that no study scores in flight_500s, got 1, which \w+ scores"),
@@ -266,3 +320,120 @@ def test_a_seed_of_a_stored_study_is_refused(
         check_seed(world, 1001)
     check_seed(world, 1002)
     check_seed(job.compose(["scenario=linear_walk", "scenario.steps=6"]), 1001)
+
+
+OWN_SCENARIO = """\
+defaults:
+  - linear_walk
+  - _self_
+steps: 12
+"""
+
+
+def test_a_tuned_filter_takes_the_knobs_of_its_world_or_prints_the_command_that_makes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The printed command is tried, in the folder of the user's own scenario."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lab" / "scenario").mkdir(parents=True)
+    (tmp_path / "lab" / "scenario" / "stroll.yaml").write_text(OWN_SCENARIO)
+    words = [f"hydra.searchpath=[file://{tmp_path}/lab]", "scenario=stroll"]
+    assert job.compose([*words, "filter=sir"]).values["runs"] == 100  # has no knobs
+    with pytest.raises(
+        ValueError, match=r"tuned=auto must find the knobs of filter=gate_tuned"
+    ) as e:
+        job.compose([*words, "filter=gate_tuned"])
+    command = re.search(r"make them: (pfbench tune .*)$", str(e.value))
+    assert command is not None
+    made = shlex.split(command[1])[2:]
+    assert made == ["scenario=stroll", "model=linear_walk", words[0]]
+    small = ["filter=gate", "runs=3", "fit_particles=20", "r_factors=1", "noise=nominal,outliers"]
+    tune_filters([*made, *small])
+    assert "hydra.searchpath" not in capsys.readouterr().out.splitlines()[-1]  # it is found
+    named = job.compose([*words, "filter=gate_tuned"]).values["filter"]["paper"]
+    assert named["name"] == "Gated EKF (tuned)"
+    assert named["tuning"].startswith("stroll (model linear_walk, seed 1001, 3 runs")
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["scenario=passive_1"], "Gated EKF (tuned)"),
+        (["scenario=passive_1", "tuned=flight_300s"], "Gated EKF (tuned on flight_300s)"),
+        (["scenario=passive_1", "tuned=nominal"], "Gated EKF (tuned)"),
+        (["scenario=passive_1", "scenario.steps=50"], "Gated EKF (tuned on passive_1 with other settings)"),
+        (["scenario=flight_500s", "model=ins_gnss_inflated"], "Gated EKF (tuned)"),
+        (["scenario=flight_500s", "tuned=flight_500s"], "Gated EKF (tuned on flight_500s with ins_gnss_inflated)"),
+        (["scenario=recorded_berlin"], "Gated EKF (tuned)"),  # on another part of the drive
+    ],
+)  # fmt: skip
+def test_the_name_says_on_which_other_world_a_filter_was_tuned(words: list[str], name: str) -> None:
+    assert job.compose([*words, "filter=gate_tuned"]).values["filter"]["paper"]["name"] == name
+
+
+def test_a_world_without_knobs_refuses_tuned_filters_alone(tmp_path: Path) -> None:
+    assert job.compose(["scenario=benes", "filter=ekf"]).choices["tuned"] == AUTO
+    with pytest.raises(ValueError, match=r"pfbench tune scenario=benes model=benes noise=nominal$"):
+        job.compose(["scenario=benes", "filter=gate_tuned", "tuned=nominal"])
+    folder = tmp_path / "tuned"
+    folder.mkdir()
+    world = "world: {scenario: benes, model: benes, regimes: [nominal]}\n"
+    (folder / "benes.yaml").write_text(f"{world}gate: {{unsupported: The model has no R.}}\n")
+    words = [f"hydra.searchpath=[file://{tmp_path}]", "scenario=benes", "filter=gate_tuned"]
+    with pytest.raises(
+        ValueError, match=r"knobs of benes, got none, since The model has no R\. Choose"
+    ):
+        job.compose(words)
+
+
+@pytest.mark.parametrize("method", TUNED_METHODS)
+def test_candidates_side_by_side_have_the_numbers_of_each_alone(method: str) -> None:
+    """Bit for bit: a knob never reaches the runs of another candidate."""
+    words = ["scenario=linear_walk", "scenario.steps=30", "runs=3", "seed=1001", "engine=kernels"]
+    search = CandidateSearch(words, ("nominal", "outliers"))
+    grid = list_candidates(method)
+    result = search.tune(method, grid)
+    config = search.compose(method, "nominal")
+    for values, joint in zip(grid[::5], result.candidates[::5], strict=True):
+        (scores,) = search._score([with_candidate(config, values)])
+        assert joint.errors == {regime: score.error for regime, score in scores.items()}
+    assert len({c.log_ratio for c in result.candidates}) > 4
+
+
+def test_kalman_filters_that_fit_are_not_called_unfit_beyond_the_level() -> None:
+    """At the limit itself: both particle filters have 0.95 of the error, with heavy tails and a common reference."""
+    rng, studies = np.random.default_rng(3), 2000
+    false = 0
+    for _ in range(studies):
+        reference = np.exp(0.3 * rng.standard_t(3, 20))
+        errors = [0.95 * np.exp(0.3 * rng.standard_t(3, 20)) for _ in range(2)]
+        ratios = [compare_errors(e, reference, 1e9, filters=2) for e in errors]
+        false += not decide_fit(dict(zip(("sir", "rpf"), ratios, strict=True)))
+    assert false / studies <= 0.025 + 3 * np.sqrt(0.025 * 0.975 / studies)
+
+
+def test_a_particle_filter_that_halves_the_error_shows_that_kalman_filters_do_not_fit() -> None:
+    rng = np.random.default_rng(4)
+    reference = np.exp(rng.normal(size=20))
+    ratio = compare_errors(0.5 * reference * np.exp(0.2 * rng.normal(size=20)), reference, 1e9, 2)
+    assert not decide_fit({"sir": Ratio(1.0, 0.9, 1.1), "rpf": ratio})
+    assert decide_fit({"sir": Ratio(0.9, 0.8, 0.95)})  # the interval has 0.95
+    lost = np.where(np.arange(20) < 15, np.inf, 0.5 * reference)
+    assert compare_errors(lost, reference, 10.0).value > 1.0  # a lost run has the cap
+    assert np.isfinite(compare_errors(lost, reference, 10.0))[0]
+
+
+def test_the_best_filter_has_the_smallest_objective_with_capped_errors() -> None:
+    errors = {
+        "ekf": {"a": 2.0, "b": 4.0},
+        "ukf": {"a": 1.0, "b": float("inf")},
+        "gate_tuned": {"a": 2.0, "b": 2.0},
+    }
+    best, objectives = find_best(errors, cap=4.0)
+    assert objectives == pytest.approx(
+        {"ekf": 0.0, "ukf": np.log(0.5) / 2, "gate_tuned": np.log(0.5) / 2}
+    )
+    assert best == "ukf"  # the first of equal ones
+    assert find_best(errors, cap=8.0)[0] == "gate_tuned"
+    lost = {"ekf": {"a": float("inf")}, "ukf": {"a": 1.0}}
+    assert find_best(lost, cap=2.0) == ("ukf", {"ekf": 0.0, "ukf": np.log(0.5)})

@@ -1,0 +1,229 @@
+"""Knobs of tuned filters: those of the job's own world, or of another world, which the filter's name then says."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pfbench.config.folders import conf_dir
+from pfbench.config.paper_block import PAPER
+
+TUNED = "tuned"  # group of the knobs that `pfbench tune` chose, which no job stores
+AUTO, NOMINAL = "auto", "nominal"  # choices that look up the world of the job
+OWN_WORLD = "the world of each job"  # data of a tuned filter before a job chooses them
+_WORLD = ("scenario", "model")  # groups that a tuning and its jobs have in common
+# names, places of data, and the part of a recording: a tuning takes another part than the scored one
+_NOT_A_SETTING = (PAPER, "root", "cache_dir", "start_s", "end_s")
+_REFERENCE = re.compile(r"\$\{\.*tuned\.(\w+)")
+_DATA = re.compile(r"(?:^|\), )(\w+) \(model (\w+)[,)]")  # as `describe_world` writes it
+_MARK = re.compile(r" \(tuned(?: on ([^()]*))?\)")
+
+
+def select_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) -> None:
+    """Replace the node `tuned` by the knobs of one world.
+
+    Args:
+        tree: Configuration of a job, not resolved. A filter without knobs leaves the node empty.
+        choices: Names of the chosen files by group.
+        trusted: Packages that the command line trusts.
+
+    Raises:
+        ValueError: If the filter needs knobs that no file of the world states.
+    """
+    from omegaconf import OmegaConf, flag_override
+
+    if TUNED not in tree:
+        return
+    plain = OmegaConf.to_container(tree["filter"], resolve=False)
+    needed = sorted({*_REFERENCE.findall(repr(plain))} - {"data"})
+    knobs = _find_world(tree[TUNED], choices) if needed else {}
+    lacking = [name for name in needed if "r_factor" not in knobs.get(name, {})]
+    if lacking:
+        reason = (knobs.get(lacking[0]) or {}).get("unsupported")
+        raise ValueError(
+            f"filter={choices['filter']} must have knobs of {choices['scenario']}, got none, since {reason} "
+            "Choose another filter." if reason else _refuse(choices, trusted)
+        )  # fmt: skip
+    with flag_override(tree, ["struct", "readonly"], [False, False]):
+        tree[TUNED] = knobs
+
+
+def _find_world(node: Any, choices: Mapping[str, str]) -> dict[str, Any]:
+    """Return the content of the chosen file, or of the first one of the world of the job."""
+    from omegaconf import OmegaConf
+
+    choice = choices.get(TUNED, AUTO)
+    content: Any = OmegaConf.to_container(node, resolve=False)
+    if choice not in (AUTO, NOMINAL):
+        return {"world": {"scenario": choice}, "data": choice, **content}
+    worlds = [world for world in content.values() if _is_of(world["world"], choices)]
+    if choice == NOMINAL:
+        worlds = [world for world in worlds if world["world"]["regimes"] == [NOMINAL]]
+    return dict(worlds[0]) if worlds else {}
+
+
+def _is_of(world: Mapping[str, Any], choices: Mapping[str, str]) -> bool:
+    """Return whether scenario and model of a tuning are those of a job."""
+    return all(world.get(group) == choices.get(group) for group in _WORLD)
+
+
+def _refuse(choices: Mapping[str, str], trusted: Sequence[str]) -> str:
+    """Word the refusal of a job without knobs, with the command that makes them."""
+    scenario, model, choice = (choices.get(key, "") for key in ("scenario", "model", TUNED))
+    folders, words = _read_command()
+    words = [word for word in words if re.match(r"\+{0,2}(scenario|model|experiment)[.=]", word)]
+    words = [word for word in words if not re.match(r"\+*(scenario|model)=", word)]
+    words += [f"trust=[{','.join(trusted)}]"] if trusted else []
+    words += ["noise=nominal"] if choice == NOMINAL else []
+    words += [f"hydra.searchpath=[{','.join(folders)}]"] if folders else []
+    command = shlex.join(["pfbench", "tune", f"scenario={scenario}", f"model={model}", *words])
+    is_found = folders or Path("conf").resolve() == conf_dir()
+    again = "" if is_found else " and add 'hydra.searchpath=[file://conf]' to the words of the run"
+    return (
+        f"{TUNED}={choice or AUTO} must find the knobs of filter={choices.get('filter')} for scenario={scenario} "
+        f"with model={model}, got none. Choose {TUNED}=WORLD (pfbench list {TUNED}), which the names of the "
+        f"filters then state, or make them{again}: {command}"
+    )
+
+
+def _read_command() -> tuple[list[str], list[str]]:
+    """Return the folders of the search path and the words of the composition, as Hydra holds them."""
+    from hydra.core.hydra_config import HydraConfig
+
+    state: Any = HydraConfig.instance().cfg
+    if state is None:
+        return [], []
+    folders = [
+        f"file://{source.path}" for source in state.hydra.runtime.config_sources
+        if source.schema == "file" and Path(source.path) != conf_dir()
+    ]  # fmt: skip
+    return folders, [str(word) for word in state.hydra.overrides.task]
+
+
+def mark_foreign(
+    values: Mapping[str, Any],
+    choices: Mapping[str, str],
+    world: Mapping[str, Any],
+    trusted: Sequence[str] = (),
+) -> None:
+    """Say in the name of a tuned filter on which other world it was tuned.
+
+    Args:
+        values: Resolved configuration of the job, whose filter is renamed.
+        choices: Names of the chosen files by group.
+        world: World of the tuning, as its file states it.
+        trusted: Packages that the command line trusts.
+    """
+    block = values["filter"].get(PAPER) or {}
+    if not block.get("tuning"):
+        return
+    text = ""
+    if not _is_of(world, choices):
+        text = _name_world(world, choices)
+    elif not _has_settings(values, world, trusted):
+        text = f"{world['scenario']} with other settings"
+    if text:
+        block |= {key: add_world(block[key], text) for key in ("name", "long_name") if key in block}
+
+
+def _name_world(world: Mapping[str, Any], choices: Mapping[str, str]) -> str:
+    """Name the world of a tuning; its model only where the scenario is the same."""
+    scenario, model = world.get("scenario", ""), world.get("model", "another model")
+    return f"{scenario} with {model}" if scenario == choices.get("scenario") else f"{scenario}"
+
+
+def add_world(name: str, world: str) -> str:
+    """Return the name of a tuned filter with the world of its tuning.
+
+    Args:
+        name: Name such as "Gated EKF (tuned)".
+        world: Words for the world.
+    """
+    settings = _MARK.search(name)
+    tail = name[settings.end() :] if settings else ""
+    head = name[: settings.start()] if settings else name
+    return f"{head} (tuned on {world}){tail}"
+
+
+def read_world(name: str) -> str:
+    """Return the words for the world in the name of a filter, empty for one without.
+
+    Args:
+        name: Name, as `add_world` makes it.
+    """
+    stated = _MARK.search(name)
+    return (stated[1] or "") if stated else ""
+
+
+def list_tuned_worlds(data: str) -> dict[str, str]:
+    """List the worlds that the data of a tuning state: models by scenario.
+
+    Args:
+        data: Data of a tuning, as a result stores them; several are separated by commas.
+    """
+    return dict(_DATA.findall(data))
+
+
+def find_foreign_world(data: str, scenario: str, model: str = "") -> str:
+    """Return the words for the world of a tuning, empty if it is that of the job or not stated.
+
+    Args:
+        data: Data of the tuning, as a result stores them.
+        scenario: Scenario of the job.
+        model: Model of the job, empty if it is not known.
+    """
+    stated = list_tuned_worlds(data)
+    if not stated or (scenario in stated and model in ("", stated[scenario])):
+        return ""
+    name = scenario if scenario in stated else min(stated)
+    return _name_world({"scenario": name, "model": stated[name]}, {"scenario": scenario})
+
+
+def _has_settings(
+    values: Mapping[str, Any], world: Mapping[str, Any], trusted: Sequence[str]
+) -> bool:
+    """Return whether scenario and model of a job have the settings of a tuning."""
+    words = [f"scenario={world['scenario']}", f"model={world['model']}", *world.get("settings", ())]
+    words += [f"hydra.searchpath=[{','.join(folders)}]"] if (folders := _read_command()[0]) else []
+    words += [f"trust=[{','.join(trusted)}]"] if trusted else []
+    tuned = _compose_world(tuple(words))
+    return all(_list_settings(values[group]) == _list_settings(tuned[group]) for group in _WORLD)
+
+
+@cache
+def _compose_world(words: tuple[str, ...]) -> Mapping[str, Any]:
+    """Compose the world of a tuning."""
+    from pfbench.config.composition import compose  # which imports this module
+
+    return compose([*words, "filter=ekf"]).values
+
+
+def _list_settings(node: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a scenario or model, without where and which part of its data it takes."""
+    return {key: value for key, value in node.items() if key not in _NOT_A_SETTING}
+
+
+def check_tuned_seed(
+    values: Mapping[str, Any], scenario: str | None, tuned: Mapping[str, Any]
+) -> None:
+    """Check that a job with a tuned filter does not score the seed of the tuning in the same scenario.
+
+    Args:
+        values: Configuration of the job.
+        scenario: Name of its scenario.
+        tuned: Content of the file of the tuning.
+
+    Raises:
+        ValueError: If it does.
+    """
+    world = tuned.get("world", {})
+    is_tuned = bool((values["filter"].get(PAPER) or {}).get("tuning"))
+    if is_tuned and (world.get("scenario"), world.get("seed")) == (scenario, values.get("seed")):
+        raise ValueError(
+            f"seed must not be that of the tuning of the filter in {scenario}, got {values['seed']}. "
+            "Set another seed."
+        )
