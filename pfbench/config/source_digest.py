@@ -44,31 +44,28 @@ def hash_user_code(values: Any) -> dict[str, str]:
 
 @cache
 def hash_package() -> str:
-    """Compute a digest of the sources and the configuration files of the installed pfbench.
+    """Compute a digest of the sources of the installed pfbench.
 
-    It depends on the names and contents of the files only, not on times or compiled files.
+    It depends on the names and contents of the files only, not on times or compiled files. Configuration
+    files do not count: what a job takes from them is part of its key.
 
     Returns:
         Hexadecimal digits.
     """
     sha256 = hashlib.sha256()
-    homes = {
-        str(PACKAGE): "pfbench",
-        str(conf_dir()): "conf",
-        str(experiments_dir()): "experiments",
-    }
-    for home, name in homes.items():
-        for folder, below, files in os.walk(home):  # an order of its own for each file system
-            below[:] = sorted(
-                {*below} - {"__pycache__"} - {b for b in below if f"{folder}/{b}" in homes}
-            )
-            for file in sorted(files):
-                if not file.endswith(_COMPILED):
-                    content = Path(folder, file).read_bytes()
-                    sha256.update(
-                        f"{name}{folder.removeprefix(home)}/{file} {len(content)};".encode()
-                    )
-                    sha256.update(content)
+    configurations = {str(conf_dir()), str(experiments_dir())}  # inside of the package in a wheel
+    for folder, below, files in os.walk(PACKAGE):  # an order of its own for each file system
+        below[:] = sorted(
+            name
+            for name in below
+            if name != "__pycache__" and f"{folder}/{name}" not in configurations
+        )
+        for file in sorted(files):
+            if not file.endswith(_COMPILED):
+                with open(f"{folder}/{file}", "rb", buffering=0) as source:
+                    content = source.read()
+                name = f"{folder.removeprefix(str(PACKAGE))}/{file}"
+                sha256.update(f"{name} {len(content)};".encode() + content)
     return sha256.hexdigest()[:12]
 
 

@@ -62,8 +62,8 @@ def test_the_repository_of_another_project_is_not_that_of_pfbench(tmp_path: Path
         ("kernels/operators_avx2.so", "other", True),
         ("a.py", "x = 2\n", False),
         ("kernels/b.cpp", "int x;", False),
-        ("conf/noise/n.yaml", "sd: 2", False),
-        ("experiments/e.yaml", "runs: 2", False),
+        ("conf/noise/n.yaml", "sd: 2", True),
+        ("experiments/e.yaml", "runs: 2", True),
     ],
 )
 def test_two_wheels_of_other_sources_are_other_builds(
