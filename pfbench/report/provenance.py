@@ -17,6 +17,7 @@ _SHARED = (
     ("numpy", "versions.numpy"),
     ("host", "host"),
     ("device", "device"),
+    ("engine", "engine"),
     ("number type", "dtype"),
     ("threads", "threads"),
     ("seed", "seed"),
