@@ -49,6 +49,7 @@ SWEEP = (
     "scenario=linear_walk",
     "filter=sir",
     "seed=1,2,3,4,5,6",
+    "report.allow_mixed_versions=true",  # no report is made of these cells
     "particles=1000",
     "pcrb=false",
     "engine=eager",

@@ -50,6 +50,16 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
     if isinstance(error, MemoryError):
         return "memory must be enough for the command, got an array that is too large. Reduce runs, particles or steps."
     text = f"{error}".strip() or type(error).__name__
+    if message := _format_hydra_error(text, words):
+        return message
+    if not is_named(error):
+        text = describe_unknown(error)
+    renamed = next((find_renamed(word) for word in words if find_renamed(word)), None)
+    return f"{text} {renamed[0]}: renamed to {renamed[1]}" if renamed else text
+
+
+def _format_hydra_error(text: str, words: Sequence[str]) -> str:
+    """Format an error of Hydra; empty for other errors."""
     if match := re.search(r"Could not override '([^']*)'", text):
         return _format_override(match[1], words)
     launchers = "|".join(_EXTRAS)
@@ -60,12 +70,7 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
         return message
     if match := re.search(r"Could not find '(.+)/([^/']*)'", text):
         return _format_unknown_choice(match[1], match[2], re.findall(r"^\t(\w+)$", text, re.M))
-    if message := format_value_error(text):
-        return message
-    if not is_named(error):
-        text = describe_unknown(error)
-    renamed = next((find_renamed(word) for word in words if find_renamed(word)), None)
-    return f"{text} {renamed[0]}: renamed to {renamed[1]}" if renamed else text
+    return format_value_error(text)
 
 
 def _format_override(key: str, words: Sequence[str]) -> str:

@@ -123,15 +123,15 @@ def test_a_signal_that_the_program_around_ignores_stays_ignored() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGKILL"])
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
 def test_the_workers_of_a_sweep_end_with_it(name: str, tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = (
         "scenario=linear_walk",
-        "scenario.steps=20000",
+        "scenario.steps=5,30000",
         "runs=50",
-        "particles=2000",
-        "filter=sir,rpf",
+        "particles=1000",
+        "filter=sir",
     )
     launcher = ("hydra/launcher=cores", "hydra.launcher.n_jobs=2")
     said, end = tmp_path / "said", time.monotonic() + 120
@@ -140,8 +140,8 @@ def test_the_workers_of_a_sweep_end_with_it(name: str, tmp_path: Path) -> None:
             [sys.executable, "-m", "pfbench", "run", "-m", *words, *launcher],
             env=os.environ | environment(tmp_path), cwd=tmp_path, stdout=file, stderr=file,
         )  # fmt: skip
-    while said.read_text().count("engine=auto") < 2 and time.monotonic() < end:  # both work
-        time.sleep(0.2)
+    while not list((tmp_path / "results").rglob("*.npz")) and time.monotonic() < end:
+        time.sleep(0.2)  # until one job is done: the other worker is at the long one
     assert len(processes_of(tmp_path, "loky")) >= 2
     sweep.send_signal(getattr(signal, name))
     code, end = sweep.wait(60), time.monotonic() + 30

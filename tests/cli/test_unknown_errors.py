@@ -19,6 +19,7 @@ from pfbench.cli.messages import format_error
 from pfbench.cli.unknown_errors import describe_unknown, is_named
 from pfbench.config.trust import check_study
 from pfbench.results.conditions import natural_sort_key
+from pfbench.results.job_labels import parse_label
 
 SENTENCE = re.compile(r"error (\w+): \S.* (must|is not|does not|exists already)\b.*[^\s:]$")
 DEMO = ("study=demo", "report.figure_formats=[svg]")
@@ -109,7 +110,7 @@ def test_only_what_pfbench_raises_itself_counts_as_a_sentence() -> None:
 
     assert is_named(error_of(check_study, []))
     assert is_named(ValueError("of another process"))
-    for call, argument in ((natural_sort_key, 3), (int, "x"), (torch.zeros(2).reshape, 3), (np.zeros, -1)):  # fmt: skip
+    for call, argument in ((parse_label, 3), (natural_sort_key, 3), (int, "x"), (torch.zeros(2).reshape, 3), (np.zeros, -1)):  # fmt: skip
         assert not is_named(error_of(call, argument))
     text = describe_unknown(error_of(natural_sort_key, 3))
     assert text.startswith("reading the results must succeed, got TypeError: expected string or")
