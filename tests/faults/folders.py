@@ -433,7 +433,10 @@ def find_faults(words: Sequence[str], folder: Path, checked: set[Path]) -> str:
     launcher = tree.hydra.runtime.choices["hydra/launcher"]
     settings = [word for word in words if word.startswith("hydra") and "searchpath" not in word]
     words = [*WALK, *settings, f"hydra/launcher={launcher}"]
-    base: Any = OmegaConf.to_container(compose_alone(words)[0], resolve=False)
+    try:
+        base: Any = OmegaConf.to_container(compose_alone(words)[0], resolve=False)
+    except HydraException:
+        return "a setting of hydra lies in the folder"
     for content in (values, base):
         for key in ("overrides", "runtime", "searchpath"):
             del content["hydra"][key]

@@ -59,7 +59,7 @@ CLASSES: dict[str, FaultClass] = {
         for kind in damage.KINDS
     },
     "hostile files": FaultClass(hostile.run, hostile.CASES, hostile.BATCH),
-    "hostile folders": FaultClass(folders.run, 10_000, 500, 2 * len(folders.KINDS)),
+    "hostile folders": FaultClass(folders.run, 10_000, 100, 2 * len(folders.KINDS)),
     **{
         f"extreme numbers, {engine}": FaultClass(
             partial(numerics.run, engine), numerics.number_of_trials(engine), numerics.BATCH
