@@ -92,7 +92,8 @@ def _digits(value: float) -> str:
 
 def describe_knobs(study: str) -> str:
     """Line of a published page on tuned filters with the knobs of another world, empty without one."""
-    lines = (TOP / "reports" / study / "report.md").read_text(encoding="utf-8").splitlines()
+    page = TOP / "reports" / study / "report.md"
+    lines = page.read_text(encoding="utf-8").splitlines() if page.is_file() else []
     return next((f"\n\n{line}" for line in lines if line.startswith("Not tuned here:")), "")
 
 

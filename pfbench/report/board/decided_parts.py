@@ -21,7 +21,7 @@ from pfbench.report.board.study_views import build_views
 from pfbench.report.board.sweeps import list_sweeps
 from pfbench.report.board.view import BEST, EQUAL, MISSING, NOT_KEPT, OPEN
 from pfbench.report.journal.study_pack import ALL
-from pfbench.report.looks import MethodLook, PartName, add_tuning, find_looks, find_stored_world
+from pfbench.report.looks import MethodLook, PartName, add_tuning, find_looks
 from pfbench.report.options import ReportOptions
 from pfbench.results.comparison.baselines import REFERENCES
 from pfbench.results.decisions.words import WORSE
@@ -94,11 +94,10 @@ class StudyFacts(NamedTuple):
         is_installed = methods <= set(list_named_parts("filter"))
         looks = {look.key: look for look in stored}
         present = find_looks(labels) if is_installed else looks
-        worlds = [entry["key"] for entry in pack["worlds"]]
         return cls(
             {
-                key: add_tuning(look, old["tuning"], find_stored_world(old, worlds))
-                for (key, look), old in zip(present.items(), facts["looks"], strict=True)
+                key: add_tuning(look, looks[key].tuning, looks[key].tuned_on)
+                for key, look in present.items()
             },
             {entry["key"]: PartName(**entry) for entry in pack["worlds"]},
             {entry["key"]: PartName(**entry) for entry in facts["regimes"]},

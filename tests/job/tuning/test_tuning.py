@@ -31,9 +31,10 @@ from pfbench.job.tuning.knobs import KNOBS, Knob, apply_candidate, list_candidat
 from pfbench.job.tuning.scored_seeds import check_seed
 from pfbench.job.tuning.tuned_files import read_candidates
 from pfbench.job.tuning.world_fit import Ratio, compare_errors, decide_fit, find_best
-from pfbench.report.looks import find_looks
-from pfbench.report.tuning_words import count_tuned, describe_tuning
+from pfbench.report.looks import find_looks, find_stored_world
+from pfbench.report.tuning_words import count_tuned, describe_foreign_knobs, describe_tuning
 from pfbench.results import store
+from pfbench.results.job_labels import make_distinct_label
 
 TUNED = sorted(
     path.stem
@@ -197,6 +198,30 @@ def test_reports_say_on_which_data_filters_were_tuned() -> None:
     assert ", ".join(world["regimes"]) in said
     assert count_tuned(find_looks(["ekf", "gate"])) == {}
     assert describe_tuning({}, 2) == ""
+
+
+def test_a_page_says_that_filters_have_the_knobs_of_another_world() -> None:
+    """An early page stores the data of a tuning alone; a later one the words for the world."""
+    early = {"tuning": "a (model m, seed 1001, 20 runs; noise: nominal)"}
+    assert find_stored_world(early, ["a[x=1]"]) == ""
+    assert find_stored_world(early, ["a", "b"]) == find_stored_world(early, ["b"]) == "a"
+    assert find_stored_world({"tuning": ""}, ["b"]) == ""
+    assert find_stored_world({**early, "tuned_on": ""}, ["b"]) == ""  # of another label's world
+    assert describe_foreign_knobs(["", ""]) == ""
+    said = describe_foreign_knobs(["a", "", "a", "c with m"])
+    assert said.startswith(
+        "Not tuned here: 3 filters have the knobs of another world, a, c with m. "
+    )
+
+
+def test_labels_of_two_tunings_differ_in_their_knobs_alone() -> None:
+    def meta(r_factor: float, world: str) -> dict[str, Any]:
+        block = {"name": f"Gated EKF (tuned on {world})", "tuning": world}
+        config = {"filter": {"r_factor": r_factor, "paper": block}}
+        return {"label": "gate_tuned", "key": "k", "config": config}
+
+    twins = [meta(1.0, "a"), meta(2.0, "b")]
+    assert make_distinct_label(twins[0], twins) == "gate_tuned[r_factor=1.0]"
 
 
 def test_a_search_finds_that_errors_are_larger_than_the_model_says(
