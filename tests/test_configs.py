@@ -30,6 +30,7 @@ from recorded_data import DATA
 from pfbench import job
 from pfbench.cli.compose import read_description
 from pfbench.config.named_sets import expand_filter_names
+from pfbench.config.tuned_knobs import select_knobs
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.filter.exactness import has_covariance
@@ -263,6 +264,7 @@ def test_the_choices_of_every_experiment_compose(experiment: str) -> None:
                 return_hydra_config=True,
             )
         HydraConfig.instance().set_config(cfg)  # an experiment may look up what was chosen
+        select_knobs(cfg, cfg.hydra.runtime.choices, ())
         with open_dict(cfg):
             del cfg["hydra"]
         config: Any = OmegaConf.to_container(cfg, resolve=True)
