@@ -18,6 +18,7 @@ OWN_WORLD = "the world of each job"  # data of a tuned filter before a job choos
 _WORLD = ("scenario", "model")  # groups that a tuning and its jobs have in common
 # names, places of data, and the part of a recording: a tuning takes another part than the scored one
 _NOT_A_SETTING = (PAPER, "root", "cache_dir", "start_s", "end_s")
+_PLACES = ("own", "with_model", "own_nominal", "with_model_nominal")  # of conf/tuned/auto.yaml
 _REFERENCE = re.compile(r"\$\{\.*tuned\.(\w+)")
 _DATA = re.compile(r"(?:^|\), )(\w+) \(model (\w+)[,)]")  # as `describe_world` writes it
 _MARK = re.compile(r" \(tuned(?: on ([^()]*))?\)")
@@ -41,7 +42,7 @@ def select_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) 
     plain = OmegaConf.to_container(tree["filter"], resolve=False)
     needed = sorted({*_REFERENCE.findall(repr(plain))} - {"data"})
     knobs = _find_world(tree[TUNED], choices) if needed else {}
-    lacking = [name for name in needed if "r_factor" not in knobs.get(name, {})]
+    lacking = [name for name in needed if "unsupported" in knobs.get(name, {"unsupported": ""})]
     if lacking:
         reason = (knobs.get(lacking[0]) or {}).get("unsupported")
         raise ValueError(
@@ -60,9 +61,14 @@ def _find_world(node: Any, choices: Mapping[str, str]) -> dict[str, Any]:
     content: Any = OmegaConf.to_container(node, resolve=False)
     if choice not in (AUTO, NOMINAL):
         return {"world": {"scenario": choice}, "data": choice, **content}
-    worlds = [world for world in content.values() if _is_of(world["world"], choices)]
+    if loose := sorted({*content} - {*_PLACES}):
+        raise ValueError(
+            f"{TUNED}.{loose[0]} must stand in a file, got a value beside {TUNED}={choice}. Choose the file that it "
+            f"changes: {TUNED}=NAME (pfbench list {TUNED})."
+        )
+    worlds = [world for world in content.values() if _is_of(world.get("world", {}), choices)]
     if choice == NOMINAL:
-        worlds = [world for world in worlds if world["world"]["regimes"] == [NOMINAL]]
+        worlds = [world for world in worlds if world["world"].get("regimes") == [NOMINAL]]
     return dict(worlds[0]) if worlds else {}
 
 
@@ -119,7 +125,7 @@ def mark_foreign(
         trusted: Packages that the command line trusts.
     """
     block = values["filter"].get(PAPER) or {}
-    if not block.get("tuning"):
+    if not world or not block.get("tuning"):  # a filter may state its own factors and their data
         return
     text = ""
     if not _is_of(world, choices):

@@ -390,10 +390,11 @@ def test_a_tuned_filter_takes_the_knobs_of_its_world_or_prints_the_command_that_
         (["scenario=flight_500s", "model=ins_gnss_inflated"], "Gated EKF (tuned)"),
         (["scenario=flight_500s", "tuned=flight_500s"], "Gated EKF (tuned on flight_500s with ins_gnss_inflated)"),
         (["scenario=recorded_berlin"], "Gated EKF (tuned)"),  # on another part of the drive
+        (["scenario=terrain_fixed_wing", "filter=ekf_scaled_terrain"], "Scaled EKF (terrain)"),
     ],
 )  # fmt: skip
 def test_the_name_says_on_which_other_world_a_filter_was_tuned(words: list[str], name: str) -> None:
-    assert job.compose([*words, "filter=gate_tuned"]).values["filter"]["paper"]["name"] == name
+    assert job.compose(["filter=gate_tuned", *words]).values["filter"]["paper"]["name"] == name
 
 
 def test_a_world_without_knobs_refuses_tuned_filters_alone(tmp_path: Path) -> None:
@@ -409,6 +410,23 @@ def test_a_world_without_knobs_refuses_tuned_filters_alone(tmp_path: Path) -> No
         ValueError, match=r"knobs of benes, got none, since The model has no R\. Choose"
     ):
         job.compose(words)
+
+
+def test_knobs_beside_those_of_a_file_are_refused_and_a_file_by_hand_is_named(
+    tmp_path: Path,
+) -> None:
+    words = ["scenario=passive_1", "filter=gate_tuned"]
+    with pytest.raises(
+        ValueError, match=r"tuned\.gate must stand in a file, got a value beside tuned=auto"
+    ):
+        job.compose([*words, "+tuned.gate.r_factor=3.0"])
+    changed = job.compose([*words, "tuned=passive_1", "tuned.gate.r_factor=3.0"])
+    assert changed.values["filter"]["noise_adaptations"][0]["r_factor"] == 3.0
+    (tmp_path / "tuned").mkdir()
+    (tmp_path / "tuned" / "mine.yaml").write_text("gate: {r_factor: 3.0, probability: 0.9}\n")
+    path = f"hydra.searchpath=[file://{tmp_path}]"
+    paper = job.compose([*words, path, "tuned=mine"]).values["filter"]["paper"]
+    assert (paper["name"], paper["tuning"]) == ("Gated EKF (tuned on mine)", "mine")
 
 
 @pytest.mark.parametrize("method", TUNED_METHODS)
