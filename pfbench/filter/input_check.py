@@ -13,6 +13,7 @@ from pfbench.core.density import check_event_dimension
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
+from pfbench.filter.misfit import uncounted_observation
 from pfbench.filter.model_jacobians import check_noise_gain
 from pfbench.filter.resolution import check_measurement_resolution
 from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law, named_inputs
@@ -163,7 +164,7 @@ def _check_counts(model: StateSpaceModel, observed: Any) -> None:
 
 def _check_likelihood(model: StateSpaceModel, record: Record, x: Tensor) -> None:
     """Check that some of the tried states have a log likelihood."""
-    with torch.no_grad():
+    with torch.no_grad(), uncounted_observation(model):
         log_likelihood = model.log_likelihood(record.y, x, record.u)
     is_undefined = torch.isnan(log_likelihood) | torch.isposinf(log_likelihood)
     if bool(is_undefined.all()):

@@ -15,6 +15,7 @@ import torch
 from command_line import environment, pfbench
 
 from pfbench import job
+from pfbench.config import instantiation
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
 from pfbench.filter.loop import run_filter
@@ -212,7 +213,7 @@ def test_a_job_is_instantiated_once_and_drawn_once(
     """Under a budget and a memory limit; if the episodes do not fit together, each batch is drawn once, two for the trial."""
     built, drawn = [], []
     monkeypatch.setattr(
-        plan,
+        instantiation,
         "instantiate",
         lambda node, trusted=(): built.append(node._target_) or instantiate(node, trusted),
     )
