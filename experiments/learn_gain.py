@@ -91,7 +91,7 @@ def build(world: str, method: str = "sir", particles: int = PARTICLES) -> Any:
     """The configuration of a filter in a world."""
     scenario, noise = world.split(", ")
     words = [f"scenario={scenario}", f"noise={noise}", f"filter={method}", f"particles={particles}"]
-    words += ["tuned=flight_500s"]  # another world, as the page says
+    words += ["tuned=flight_500s_with_ins_gnss_inflated"]  # another world, as the page says
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         return compose("config", words)
 

@@ -74,7 +74,9 @@ def tune_filters(words: Sequence[str]) -> None:
     world = {
         **{key: study.choices[key] for key in ("scenario", "model")},
         "settings": [
-            word for word in settings if re.match(r"\+{0,2}(scenario|model|noise)\.", word)
+            word
+            for word in settings
+            if re.match(r"\+{0,2}(scenario\.|model\.|noise\.|experiment=)", word)
         ],
         "seed": study.values["seed"] + SEED_SHIFT,
         "runs": runs,
@@ -100,10 +102,7 @@ def _search(
     from pfbench.job.tuning.world_fit import measure_fit
 
     fixed = [f"seed={world['seed']}", f"runs={world['runs']}", "pcrb=false", "score_steps=0"]
-    fixed += [
-        "budget=particles",
-        "engine=kernels",
-    ]  # those of an experiment do not change the search
+    fixed += ["budget=particles", "engine=kernels"]  # whatever an experiment sets
     search = CandidateSearch([*settings, *fixed], world["regimes"], print, world["start_time_s"])
     results, unsupported = [], {}
     for method, grid in grids.items():

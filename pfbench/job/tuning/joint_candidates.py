@@ -14,6 +14,7 @@ from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.innovation import Innovation, NoiseAdaptation
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
+from pfbench.filter.robust.robust_update import RobustUpdate
 from pfbench.filter.robust.scaled_noise import ScaledNoise, scale_process_noise
 
 _CHANGED = ("r", "observed_mask", "m", "omega", "noise")  # fields that an adaptation of R replaces
@@ -39,13 +40,22 @@ class JointAdaptation(NoiseAdaptation):
     def predict_scale(
         self, predicted: AffineApproximation, belief: GaussianBelief
     ) -> AffineApproximation:
-        return scale_process_noise(predicted, self.q_factor)
+        scaled = scale_process_noise(predicted, self.q_factor.to(predicted.noise))
+        if all(isinstance(update, RobustUpdate) for update, _ in self.updates):
+            return scaled  # which they leave as it is
+        parts = [
+            update.predict_scale(_select(scaled, places), _select(belief, places))
+            for update, places in self.updates
+        ]
+        return AffineApproximation(*(self._join(fields) for fields in zip(*parts, strict=True)))
 
     @override
     def noise_adapt(
         self, innovation: Innovation, belief: GaussianBelief
     ) -> tuple[Innovation, dict[str, Tensor]]:
-        scaled = innovation.with_noise(innovation.noise * self.r_factor[:, None, None])
+        scaled = innovation.with_noise(
+            innovation.noise * self.r_factor.to(innovation.noise)[:, None, None]
+        )
         if not self.updates:
             return scaled, {}
         innovations, memories = zip(
@@ -55,16 +65,16 @@ class JointAdaptation(NoiseAdaptation):
             ),
             strict=True,
         )
-        back = torch.cat([places for _, places in self.updates]).argsort()
         r, observed_mask, m, omega, noise = (
-            torch.cat([getattr(several, name) for several in innovations])[back]
-            for name in _CHANGED
+            self._join([getattr(several, name) for several in innovations]) for name in _CHANGED
         )
-        memory = {
-            name: torch.cat([several[name] for several in memories])[back] for name in memories[0]
-        }
+        memory = {name: self._join([several[name] for several in memories]) for name in memories[0]}
         adapted = scaled._replace(r=r, observed_mask=observed_mask, m=m, omega=omega, noise=noise)
         return adapted, memory
+
+    def _join(self, parts: Sequence[Tensor]) -> Tensor:
+        """Join the values of the runs of all updates in the order of the runs."""
+        return torch.cat(list(parts))[torch.cat([places for _, places in self.updates]).argsort()]
 
 
 def join_candidates(filters: Sequence[GaussianFilter], runs: int) -> GaussianFilter:
