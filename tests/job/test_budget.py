@@ -130,7 +130,9 @@ def test_filters_of_a_study_evaluate_the_likelihood_equally_often(tmp_path: Path
         200,
         None,
     )  # has a number of its own
-    assert (said := pfbench("report", "study=adhoc", home=tmp_path)).code == 0, said.err
+    assert (
+        said := pfbench("report", "study=adhoc", f"reports_dir={tmp_path}", home=tmp_path)
+    ).code == 0, said.err
 
 
 def test_a_number_that_was_given_to_a_filter_stays(tmp_path: Path) -> None:
