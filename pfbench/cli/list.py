@@ -62,4 +62,5 @@ def _list_fitting(group: str, words: Sequence[str]) -> Collection[str]:
         raise ValueError(f"words must be {example}, got {' '.join(words)}. See pfbench list --help")
     if group == "scenario":
         return list_fitting_scenarios(words)
-    return list_fitting_models(compose_tree(words))
+    tree = compose_tree(words)
+    return list_fitting_models(tree, scenario=tree.hydra.runtime.choices["scenario"])

@@ -20,8 +20,8 @@ chosen knobs and the record of all candidates into one file, FOLDER/tuned/NAME.y
 finds by its scenario and model and gives to the filters that end in _tuned. The file states the best
 of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world (`kalman_fits`).
 
-  pfbench tune scenario=passive_1 folder=conf
-  pfbench run -m 'hydra.searchpath=[file://conf]' scenario=passive_1 filter=tuned_baselines
+  pfbench tune scenario=benes folder=conf
+  pfbench run -m 'hydra.searchpath=[file://conf]' scenario=benes filter=tuned_baselines
 
   filter=...         filters to tune, default ekf_scaled,gate,huber,student
   runs=20 seed=1     runs of a candidate, and seed of the study
@@ -84,6 +84,7 @@ def tune_filters(words: Sequence[str]) -> None:
         "regimes": lists["noise"],
     }
     folder = Path(options["folder"] or _own_folder(words))
+    _check_new_name(name, folder)
     path = _search(settings, grids, world, (fit_runs, particles), folder, name)
     print(f"tuned={name}: {path.resolve()}{_describe_use(folder, words)}")
 
@@ -144,6 +145,17 @@ def _describe_use(folder: Path, words: Sequence[str]) -> str:
     return (
         "" if is_found else f"\nAdd to the words of a study: 'hydra.searchpath=[file://{folder}]'"
     )
+
+
+def _check_new_name(name: str, folder: Path) -> None:
+    """Check that a file of a user's own folder has no name of pfbench's own, which a run would refuse."""
+    from pfbench.config.folders import conf_dir
+
+    if folder.resolve() != conf_dir() and (conf_dir() / "tuned" / f"{name}.yaml").is_file():
+        raise ValueError(
+            f"name must differ from pfbench's own tuned={name}, got the same for a file of {folder}. "
+            f"Add name=my_{name}, and tuned=my_{name} to the words of the run."
+        )
 
 
 def _check_choices(name: str, runs: int) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pfbench.config.folders import conf_dir, experiments_dir
-from pfbench.config.group_checks import check_groups, resolve_values
+from pfbench.config.group_checks import check_groups, check_simulated_model, resolve_values
 from pfbench.config.named_sets import expand_filter_names
 from pfbench.config.paper_block import check_paper_blocks, remove_nested_blocks
 from pfbench.config.trust import check_configuration, check_places, check_study, split_trust
@@ -56,6 +56,7 @@ class JobConfig:
                 f"{', '.join(missing)}, or build the configuration with job.compose([...])."
             )
         check_groups(self.values, CHOICES)
+        check_simulated_model(self.values, self.choices)
         check_configuration(self.values, self.trusted)
         check_paper_blocks(self.values)
         check_places(self.values)
@@ -154,7 +155,10 @@ def resolve_config(
             raise
         from pfbench.config.model_fit import explain_error
 
-        raise explain_error(error, tree, trusted) from error
+        explained = explain_error(error, tree, trusted, names.get("scenario", ""))
+        if explained is error:
+            raise
+        raise explained from error
     knobs = values.pop(TUNED, {})  # the filter has them
     check_tuned_seed(values, names.get("scenario"), knobs)
     mark_foreign(values, names, knobs.get("world", {}), trusted)

@@ -18,7 +18,7 @@ from pfbench.config.trust import UntrustedConfigError
 from pfbench.files import limits
 
 WRITTEN = ("results_dir", "reports_dir", "episode_cache_dir", "cache_dir", "checkpoint_path")
-READ = ("data", "root", "folder", "checkpoint")  # keys of the user's data at any depth
+READ = ("data", "root", "folder", "checkpoint")  # keys of the user's data: at any depth, but `data`
 SETTINGS = ("trust", "overwrite", "memory_limit_gib", "hydra")
 # what a file may give such keys: nothing, or what the command line gives
 _REFERENCES = {
@@ -52,7 +52,7 @@ def check_content(file: Path, values: Mapping[str, Any], *, is_own: bool) -> Non
         key = path[-1]
         if path[0] == "hydra":
             _check_hydra_value(file, path, value, is_own)
-        elif key in WRITTEN or key in SETTINGS or key in READ:
+        elif path[0] == "data" or key in WRITTEN or key in SETTINGS or key in READ[1:]:
             _check_protected(file, path, value, is_own)
         if isinstance(key, str) and "${" in key:
             _refuse(file, path, "be a plain name", key, "Write the name itself.")
@@ -181,9 +181,10 @@ def _check_protected(file: Path, path: tuple[Any, ...], value: Any, is_own: bool
         return  # the same name elsewhere is none of them
     is_nothing = value is None or value == "???" or (key == "overwrite" and value is False)
     is_whole = isinstance(value, Mapping) and key in READ  # its own keys are checked
-    if is_nothing or is_whole or _is_reference(path, value) or (is_own and key in READ):
+    is_data = key in READ or path[0] == "data"
+    if is_nothing or is_whole or _is_reference(path, value) or (is_own and is_data):
         return
-    remedy = _own_remedy(file) if key in READ else ""
+    remedy = _own_remedy(file) if is_data else ""
     name = _join(path)
     _refuse(
         file, path, "be set on the command line", value,

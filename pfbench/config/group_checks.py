@@ -8,6 +8,7 @@ from contextvars import ContextVar
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from pfbench.config.folders import conf_dir
 from pfbench.config.trust import UntrustedConfigError
 from pfbench.files import limits
 from pfbench.results.config_key import list_not_finite
@@ -127,3 +128,34 @@ def check_groups(values: Mapping[str, Any], groups: Sequence[str]) -> None:
             )
         for key, value in list_not_finite(node, group):
             raise ValueError(f"{key} must be finite, got {value}. Set {key} to a number.")
+
+
+def check_simulated_model(values: Mapping[str, Any], choices: Mapping[str, str]) -> None:
+    """Check that a shipped world that is simulated from its model has this model, since it is named by it.
+
+    Args:
+        values: Resolved configuration.
+        choices: Names of the chosen files by group.
+
+    Raises:
+        ValueError: If another model is chosen. The world would be another one under the same name.
+    """
+    scenario, model = choices.get("scenario", ""), choices.get("model", "")
+    if is_simulated_from(values.get("scenario"), scenario) and model != scenario:
+        raise ValueError(
+            f"model must be {scenario} for scenario={scenario}, which is simulated from it, got {model}. "
+            f"Choose scenario={model} if it exists (pfbench list scenario), or write a scenario of your own with "
+            "_target_: pfbench.scenario.ModelSimulation."
+        )
+
+
+def is_simulated_from(scenario: Any, name: str) -> bool:
+    """Return whether a scenario is a shipped one that is simulated from the model of the same name.
+
+    Args:
+        scenario: Node of the scenario.
+        name: Name of its file.
+    """
+    target = scenario.get("_target_") if isinstance(scenario, Mapping) else None
+    is_shipped = (conf_dir() / "scenario" / f"{name}.yaml").is_file()
+    return target == "pfbench.scenario.ModelSimulation" and is_shipped

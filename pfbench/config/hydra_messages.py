@@ -34,7 +34,10 @@ def format_value_error(text: str) -> str:
     if match := re.search(r"Missing mandatory value: (\S+)", text):
         return f"{match[1]} must be set. Set {match[1]}=..."
     if "LexerNoViableAlt" in text or text.startswith(_GRAMMAR):
-        return "each word must be key=value. Quote a value with spaces or signs."
+        return (
+            "each word must be key=value. Quote a value with spaces or signs; names consist of a-z, A-Z, "
+            "0-9 and underscores."
+        )
     if match := re.search(r"tried to allocate (\d+) bytes", text):
         size = int(match[1]) / 2**30
         return f"memory must hold an array of {size:.3g} GiB. Reduce runs, particles or steps."
@@ -87,7 +90,10 @@ def format_choice_error(text: str, words: Sequence[str]) -> str:
             f"or choose a name: pfbench list {group}"
         )
     if "Config group override must be a string or a list" in text:
-        word = next((w for w in words if w.partition("=")[2] == "null"), "a group")
+        is_name = re.compile(r"[+~]*[\w/]+=(null|true|false|[-+.\d].*)", re.IGNORECASE)
+        word = next((w for w in words if is_name.fullmatch(w) and "." not in w.split("=")[0]), None)
+        if word is None:
+            return "each group must have the name of a file. List the groups: pfbench list"
         group = word.lstrip("+").partition("=")[0]
         return f"{word} must name a file of the group. Choose one: pfbench list {group}"
     return ""

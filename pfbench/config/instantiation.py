@@ -72,7 +72,10 @@ def instantiate_parts(
         except Exception as error:
             if name != "model" or isinstance(error, UntrustedConfigError):
                 raise
-            raise explain_error(error, values, trusted) from error
+            explained = explain_error(error, values, trusted)
+            if explained is error:
+                raise
+            raise explained from error
     if {"model", "scenario"} <= parts.keys():
         check_fit(parts["model"], parts["scenario"], values, trusted)
     return tuple(parts.values())

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pfbench.config.composition import compose_tree, list_groups
+from pfbench.config.group_checks import is_simulated_from
 from pfbench.config.instantiation import instantiate
 from pfbench.config.trust import UntrustedConfigError
 
@@ -34,19 +35,25 @@ def check_fit(model: Any, scenario: Any, tree: Mapping[str, Any], trusted: Seque
         raise _refusal(difference, list_fitting_models(tree, trusted))
 
 
-def explain_error(error: Exception, tree: Mapping[str, Any], trusted: Sequence[str]) -> Exception:
+def explain_error(
+    error: Exception, tree: Mapping[str, Any], trusted: Sequence[str], scenario: str = ""
+) -> Exception:
     """Explain an error of a shipped model that has another scenario than it is made for.
 
     Args:
         error: Error while the model was resolved or built.
         tree: Configuration of model and scenario.
         trusted: Packages that the configuration may name besides pfbench.
+        scenario: Name of the file of the scenario, if it is known.
 
     Returns:
         A refusal with the shipped models that fit. The error itself if there is none, or if the class of
         the model fits this scenario, so that one of its values is wrong.
     """
-    target, fitting = str(tree["model"].get("_target_")), list_fitting_models(tree, trusted)
+    target, fitting = (
+        str(tree["model"].get("_target_")),
+        list_fitting_models(tree, trusted, scenario),
+    )
     if not fitting or target in fitting.values() or not target.startswith("pfbench."):
         return error
     cause = error.__cause__ if type(error).__name__ == "InstantiationException" else error
@@ -56,12 +63,15 @@ def explain_error(error: Exception, tree: Mapping[str, Any], trusted: Sequence[s
     return _refusal(text.partition(". ")[0], fitting)
 
 
-def list_fitting_models(tree: Mapping[str, Any], trusted: Sequence[str] = ()) -> dict[str, str]:
+def list_fitting_models(
+    tree: Mapping[str, Any], trusted: Sequence[str] = (), scenario: str = ""
+) -> dict[str, str]:
     """List the shipped models that fit the scenario of a configuration.
 
     Args:
         tree: Configuration, resolved or not. Its model is not used.
         trusted: Packages that the scenario may name besides pfbench.
+        scenario: Name of the file of the scenario, if it is known.
 
     Returns:
         Class of each model by the name of its file.
@@ -70,6 +80,8 @@ def list_fitting_models(tree: Mapping[str, Any], trusted: Sequence[str] = ()) ->
     # one composition for all: each costs as much as a hundred files
     nodes = compose_tree([f"+model@shipped.{name}={name}" for name in names])["shipped"]
     plain, models = _plain_values(tree), _plain_values(nodes)
+    if is_simulated_from(plain["scenario"], scenario):
+        names = [scenario]
     fitting = [name for name in names if is_fitting({**plain, "model": models[name]}, trusted)]
     return {name: str(models[name]["_target_"]) for name in fitting}
 
@@ -83,8 +95,13 @@ def list_fitting_scenarios(words: Sequence[str]) -> list[str]:
     Returns:
         Names of their files.
     """
-    names = [path.stem for path in list_groups()["scenario"]]
-    return [name for name in names if is_fitting(compose_tree([f"scenario={name}", *words]))]
+    fitting = []
+    for name in (path.stem for path in list_groups()["scenario"]):
+        tree = compose_tree([f"scenario={name}", *words])
+        is_own = tree.hydra.runtime.choices.get("model") == name
+        if (is_own or not is_simulated_from(tree["scenario"], name)) and is_fitting(tree):
+            fitting.append(name)
+    return fitting
 
 
 def is_fitting(tree: Mapping[str, Any], trusted: Sequence[str] = ()) -> bool:

@@ -81,7 +81,11 @@ def _refuse(choices: Mapping[str, str], trusted: Sequence[str]) -> str:
     """Word the refusal of a job without knobs, with the command that makes them."""
     scenario, model, choice = (choices.get(key, "") for key in ("scenario", "model", TUNED))
     folders, words = _read_command()
-    words = [word for word in words if re.match(r"\+{0,2}(scenario|model|experiment)[.=]", word)]
+    words = [
+        word
+        for word in words
+        if re.match(r"\+{0,2}((scenario|model|experiment)[.=]|data\.root=)", word)
+    ]
     words = [word for word in words if not re.match(r"\+*(scenario|model)=", word)]
     words += [f"trust=[{','.join(trusted)}]"] if trusted else []
     words += ["noise=nominal"] if choice == NOMINAL else []
@@ -134,6 +138,16 @@ def mark_foreign(
         text = f"{world['scenario']} with other settings"
     if text:
         block |= {key: add_world(block[key], text) for key in ("name", "long_name") if key in block}
+
+
+def describe_foreign(values: Mapping[str, Any]) -> str:
+    """Return "tuned on WORLD" for a filter with the knobs of another world; empty for another filter.
+
+    Args:
+        values: Resolved configuration of a job.
+    """
+    words = _MARK.search((values["filter"].get(PAPER) or {}).get("name", ""))
+    return f"tuned on {words[1]}" if words and words[1] else ""
 
 
 def _name_world(world: Mapping[str, Any], choices: Mapping[str, str]) -> str:

@@ -20,7 +20,6 @@ from pfbench.config.paper_block import remove_all_blocks
 from pfbench.config.source_digest import hash_user_code
 from pfbench.config.trust import check_configuration, trusted_packages
 from pfbench.files.digest import hash_file
-from pfbench.filter.learned.checkpoint import hash_checkpoints
 from pfbench.results.config_key import Inputs
 from pfbench.results.inputs import list_changed
 
@@ -40,7 +39,7 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
         is named by its folder and its name, as in "my_log/imu.csv", wherever the folder is.
 
     Raises:
-        ValueError: If an object names a folder or a device as a file, or a checkpoint is damaged.
+        ValueError: If an object names a folder or a device as a file.
     """
     trusted = (*trusted, *trusted_packages())
     digests = {}
@@ -48,9 +47,6 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
         node = values.get(group)
         entries = _hash_files(_list_files(node, trusted), values.get("data", {}).get("root"))
         entries |= {f"{CODE_OF}{name}": value for name, value in hash_user_code(node).items()}
-        if group == "filter":
-            weights = hash_checkpoints(node)
-            entries |= {f"weights of {name}": value for name, value in weights.items()}
         if entries:
             digests[group] = entries
     return digests

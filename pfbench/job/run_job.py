@@ -14,6 +14,7 @@ from torch import Tensor
 from pfbench.config.composition import CHOICES, JobConfig, resolve_config
 from pfbench.config.source_digest import list_user_packages
 from pfbench.config.trust import trusted_packages
+from pfbench.config.tuned_knobs import describe_foreign
 from pfbench.core.record import Episode
 from pfbench.files.atomic_write import set_aside
 from pfbench.files.work_start import start_work
@@ -84,6 +85,8 @@ def run(
     path = _result_path(values, inputs)
     job_choices = {group: config.choices[group] for group in CHOICES}
     name = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
+    if foreign := describe_foreign(values):
+        name += f" ({foreign})"
     result = None if values["overwrite"] else _read_finished(path, values)
     if result is not None:
         check_settings(values)

@@ -68,6 +68,7 @@ def apply_global_settings(values: Mapping[str, Any]) -> None:
     keep_freed_memory()
 
 
+_LARGEST = 1_000_000_000  # a number that is advised
 _INTEGERS = {"runs": 1, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}  # with minimum
 _EXAMPLES = {"runs": 100, "first_run": 0, "threads": 1, "seed": 1, "score_steps": 10}
 # threads beyond the cores only wait, and OpenMP ends the process with a fault if there are many
@@ -95,6 +96,8 @@ def _advise_integer(key: str, value: Any) -> str:
     """Return how a whole number is written that was given as 1e9 or 10.0; empty for other values."""
     if key not in _INTEGERS or not isinstance(value, float) or not value.is_integer():
         return ""
+    if abs(value) > _LARGEST:
+        return f"Choose at most {_LARGEST}."
     return f"Write it without exponent and without a decimal point: {key}={int(value)}."
 
 

@@ -41,7 +41,7 @@ def describe_foreign_knobs(worlds: Collection[str]) -> str:
     names = sorted({world for world in worlds if world})
     number = sum(bool(world) for world in worlds)
     return (
-        f"{NOT_TUNED_HERE} {number} filters have the knobs of another world, {', '.join(names)}. What is said of "
-        "them holds for these knobs, until the study has run again with its own."
+        f"{NOT_TUNED_HERE} {number} {'filter has' if number == 1 else 'filters have'} the knobs of another world, "
+        f"{', '.join(names)}. What is said of them holds for these knobs, until the study has run again with its own."
         if names else ""
     )  # fmt: skip

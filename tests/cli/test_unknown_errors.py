@@ -50,7 +50,7 @@ MISTAKES: dict[tuple[str, ...], str] = {
     ("cost", "study=demo", "rounds=²"): "rounds must be a whole number from 5 to 1000, got ²",
     ("claims", "results_dir=null"): "results_dir must be a folder, got None",
     ("datasheet", "scenario="): "scenario= does not exist",
-    ("list", "filter", "more"): "group must be one of filter,",
+    ("list", "filter", "more"): "words must be pfbench list filter, got more",
     ("list", ""): "got an empty word",
     ("check", "more"): "check must have no words, got more",
     ("judge", "reference=/etc", "mine=/etc"): "/etc must be a file, got none",

@@ -48,7 +48,8 @@ def test_other_separators_are_named(home: Path, separator: str, name: str, decim
         f"line 1 must be names of columns separated by commas, got {name} as separators" in said.err
     )
     pattern = {" ": r"\s+"}.get(separator, separator)
-    assert f"read_csv('mine.csv', sep={pattern!r})" in said.err
+    options = f"sep={pattern!r}" + (", decimal=','" if decimal == "," else "")
+    assert f"read_csv('mine.csv', {options})" in said.err
     again = pd.read_csv(home / "mine.csv", sep=pattern, decimal=decimal)
     cases.write(again, home / "mine.csv")
     assert judge(home).code == 0

@@ -256,7 +256,8 @@ def test_it_starts_about_its_origin_where_no_record_says_otherwise() -> None:
     assert law.stddev[0].tolist() == [1e4, 2e4, 5.0, 6.0]
     truth = {"position": torch.ones(1, 2, 2), "velocity": 2 * torch.ones(1, 2, 2)}
     assert model.assemble(truth)[0, 0].tolist() == [1.0, 1.0, 2.0, 2.0]
-    assert model.prepare(Record(torch.zeros(1, 1, 5))).u == ()
+    with pytest.raises(ValueError, match=r"record\.u must be PlatformInputs .*, got no inputs"):
+        model.prepare(Record(torch.zeros(1, 1, 5)))
 
 
 @pytest.mark.parametrize(

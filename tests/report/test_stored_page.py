@@ -178,6 +178,6 @@ def test_warnings_stand_first_in_each_view_that_is_decided_again(study: Path) ->
     pack["facts"] |= {"warning": "Runs are copies.", "differing": "Jobs differ."}
     pack["facts"]["options"]["baseline"] = pack["baselines"][0]
     for view in decide_again(pack, study / "runs.parquet")["views"].values():
-        start = "2 jobs failed and are missing from all tables. Runs are copies. "
+        start = "2 jobs have no valid result and are missing from all tables. Runs are copies. "
         assert view["sentence"].startswith(start)
         assert view["small_print"].endswith(" Jobs differ.")

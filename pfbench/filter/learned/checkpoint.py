@@ -107,18 +107,6 @@ def replace_checkpoint_by_hash(config: Any) -> Any:
     return config
 
 
-def hash_checkpoints(config: Any) -> dict[str, str]:
-    """Return the hash of the weights of each checkpoint in a filter's configuration, by the name of its file.
-
-    Raises:
-        ValueError: As for `read_checkpoint`.
-    """
-    return {
-        Path(path).name: hash_weights(read_checkpoint(path)["networks"])
-        for path in _checkpoints(config)
-    }
-
-
 def checkpoint_provenance(
     config: Any, scenario: str, seed: int, runs: Tensor
 ) -> dict[str, Any] | None:

@@ -158,7 +158,11 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
 
 def _count_failures(number: int) -> str:
     """State how many jobs failed; empty if none did."""
-    jobs = "1 job failed and is" if number == 1 else f"{number} jobs failed and are"
+    jobs = (
+        "1 job has no valid result and is"
+        if number == 1
+        else f"{number} jobs have no valid result and are"
+    )
     return f"{jobs} missing from all tables." if number else ""
 
 
