@@ -28,6 +28,8 @@ def refuse_own_files(event: str, arguments: tuple[Any, ...]) -> None:
     """
     if event not in _EVENTS or not isinstance(arguments[0], str | os.PathLike):
         return
+    if event == "open" and arguments[1] is None and not os.path.isabs(arguments[0]):
+        return  # os.open may name a file relative to an open folder, as shutil.rmtree does
     path = os.path.abspath(arguments[0])
     if not path.startswith(_OWN):
         return

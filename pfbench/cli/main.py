@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     Raises:
         SystemExit: With code 1 if the command failed, 2 if it was refused before its work started
-            (`pfbench.files.work_start`), 128 and its number if a signal ended it, such as 130 of an interruption.
+            (`pfbench.files.work_start`). With 128 and its number if a signal ended it, such as 130.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     before = os.environ.get(ENVIRONMENT), sys.argv

@@ -56,8 +56,8 @@ class JobConfig:
                 f"{', '.join(missing)}, or build the configuration with job.compose([...])."
             )
         check_groups(self.values, CHOICES)
-        check_simulated_model(self.values, self.choices)
         check_configuration(self.values, self.trusted)
+        check_simulated_model(self.values, self.choices)
         check_paper_blocks(self.values)
         check_places(self.values)
         if "study" in self.values:

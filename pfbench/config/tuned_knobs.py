@@ -141,13 +141,13 @@ def mark_foreign(
 
 
 def describe_foreign(values: Mapping[str, Any]) -> str:
-    """Return "tuned on WORLD" for a filter with the knobs of another world; empty for another filter.
+    """Return " (tuned on WORLD)" for a filter with the knobs of another world; empty for another filter.
 
     Args:
         values: Resolved configuration of a job.
     """
     words = _MARK.search((values["filter"].get(PAPER) or {}).get("name", ""))
-    return f"tuned on {words[1]}" if words and words[1] else ""
+    return f" (tuned on {words[1]})" if words and words[1] else ""
 
 
 def _name_world(world: Mapping[str, Any], choices: Mapping[str, str]) -> str:

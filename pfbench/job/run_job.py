@@ -84,9 +84,8 @@ def run(
     inputs = find_inputs(values, config.trusted)
     path = _result_path(values, inputs)
     job_choices = {group: config.choices[group] for group in CHOICES}
-    name = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
-    if foreign := describe_foreign(values):
-        name += f" ({foreign})"
+    title = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
+    name = title + describe_foreign(values)
     result = None if values["overwrite"] else _read_finished(path, values)
     if result is not None:
         check_settings(values)

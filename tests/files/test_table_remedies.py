@@ -39,7 +39,6 @@ CASES: dict[str, tuple[bytes, str, Callable[[Path, str], None]]] = {
     "latin-1": (TEXT.replace("b", "\xb0", 1).encode("latin-1"), "line 1 must be text", by_pandas),
     "utf-16": (TEXT.encode("utf-16"), "line 1 must be text", by_pandas),
     "old line ends": (TEXT.replace("\n", "\r").encode(), "writes line ends", by_pandas),
-    "sign of a comment": (f"# {TEXT}".encode(), "Remove the sign of the comment", edit("^# ", "")),
     "comment": (f"# by a logger\n{TEXT}".encode(), "Remove this line", edit("^#.*\n", "")),
     "comma at the end": (
         "\n".join([NAMES, *(f"{row}," for row in ROWS), ""]).encode(),

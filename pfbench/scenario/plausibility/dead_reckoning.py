@@ -25,8 +25,8 @@ def integrate_windows(imu: ImuLog, time: Array) -> tuple[Tensor, Tensor]:
         time: Borders of the windows, s, [n + 1].
 
     Returns:
-        Rotation from the body at the end to that at the start of each window, quaternion, [n, 4],
-        and velocity increment in body axes at the start, without gravity, m/s, [n, 3].
+        Rotation from the body at the end of each window to that at its start, quaternion, [n, 4].
+        Velocity increment in body axes at the start, without gravity, m/s, [n, 3].
     """
     window, spans, mean = list_pieces(imu, time)
     force, rate = torch.from_numpy(mean).split(3, -1)
