@@ -79,6 +79,11 @@ def read_study(name: str) -> Study:
     return Study(pd.read_parquet(folder / "runs.parquet"), rows, facts)
 
 
+def _percent(share: float) -> str:
+    """Return a share in percent, a dash where the world states no limit."""
+    return "–" if np.isnan(share) else f"{100 * share:.0f}"
+
+
 def _digits(value: float) -> str:
     """Format a number with three significant digits and no exponent."""
     return f"{float(f'{value:.3g}'):.15g}" if np.isfinite(value) else "–"
@@ -113,7 +118,7 @@ def _world_table(study: Study, world: str) -> str:
     for label in sorted(order, key=lambda label: order[label]):
         present = [(regime, label) for regime in regimes if (regime, label) in errors]
         cells = {
-            key: f"{format_median(errors[key])}, {100 * rows[key]['track']:.0f} / {100 * rows[key]['coverage']:.0f} %"
+            key: f"{format_median(errors[key])}, {_percent(rows[key]['track'])} / {_percent(rows[key]['coverage'])} %"
             for key in present
         }
         times = float(np.median([rows[key]["ms"] for key in present]))

@@ -90,9 +90,13 @@ def format_choice_error(text: str, words: Sequence[str]) -> str:
             f"or choose a name: pfbench list {group}"
         )
     if "Config group override must be a string or a list" in text:
-        is_name = re.compile(r"[+~]*[\w/]+=(null|true|false|[-+.\d].*)", re.IGNORECASE)
-        word = next((w for w in words if is_name.fullmatch(w) and "." not in w.split("=")[0]), None)
-        if word is None:
+        from pfbench.config.composition import list_groups
+
+        is_number = re.compile(r"[+~]*(\w+)=(null|true|false|[-+.\d].*)", re.IGNORECASE)
+        chosen = (
+            word for word in words if (m := is_number.fullmatch(word)) and m[1] in list_groups()
+        )
+        if (word := next(chosen, None)) is None:
             return "each group must have the name of a file. List the groups: pfbench list"
         group = word.lstrip("+").partition("=")[0]
         return f"{word} must name a file of the group. Choose one: pfbench list {group}"
