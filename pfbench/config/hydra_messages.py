@@ -93,10 +93,10 @@ def format_choice_error(text: str, words: Sequence[str]) -> str:
         from pfbench.config.composition import list_groups
 
         is_number = re.compile(r"[+~]*(\w+)=(null|true|false|[-+.\d].*)", re.IGNORECASE)
-        chosen = (
+        numbers = (
             word for word in words if (m := is_number.fullmatch(word)) and m[1] in list_groups()
         )
-        if (word := next(chosen, None)) is None:
+        if (word := next(numbers, None)) is None:
             return "each group must have the name of a file. List the groups: pfbench list"
         group = word.lstrip("+").partition("=")[0]
         return f"{word} must name a file of the group. Choose one: pfbench list {group}"

@@ -177,7 +177,7 @@ def test_a_filter_of_the_user_is_replayed_and_timed_with_the_trust_of_its_run(
     words = ("filter=ekf", "filter._target_=replaylab.filters.Mine", "trust=[replaylab]")
     assert pfbench("run", *WALK, "study=walks", *words, home=tmp_path).code == 0
     (result,) = store.list_results(tmp_path / "results/walks")
-    assert result.meta["trusted"]["packages"] == ["replaylab"]
+    assert result.meta["trusted"] == ["replaylab"]
     again = ("run=12", "filter=ekf")
     said = replay(tmp_path, *again)
     assert said.code == 2
@@ -201,4 +201,4 @@ def test_a_filter_of_the_user_is_replayed_and_timed_with_the_trust_of_its_run(
 
 
 def test_a_filter_of_pfbench_needs_no_trust(home: Path) -> None:
-    assert all("trusted" not in r.meta for r in store.list_results(home / "results/walks"))
+    assert all(r.meta["trusted"] == [] for r in store.list_results(home / "results/walks"))

@@ -102,7 +102,7 @@ def test_one_report_that_fails_stops_no_other(made: dict[str, Any], tmp_path: Pa
     said = pfbench("report", "all", home=tmp_path)
     assert said.code == 1
     assert "mine" in made
-    assert "broken: failed: the cell holds results that differ" in said.err
+    assert "got ValueError: the cell holds results that differ" in said.err
     assert "all 2 reports must be written, got 1 failures: broken" in said.err
 
 
