@@ -1,4 +1,4 @@
-"""What surrounds a command: outputs that may close while it works, and signals that end it."""
+"""Surroundings of a command: outputs that may close while it works, and signals that end it."""
 
 from __future__ import annotations
 

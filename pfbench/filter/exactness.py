@@ -1,4 +1,4 @@
-"""What a filter states of its weights: asymptotically exact, bounded, and evidence that is a density.
+"""Statements of a filter on its weights: asymptotically exact, bounded, and evidence that is a density.
 
 Each part of a filter states it, and the filter states what all of its parts do.
 """

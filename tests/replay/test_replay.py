@@ -191,7 +191,7 @@ def test_a_filter_of_the_user_is_replayed_and_timed_with_the_trust_of_its_run(
     assert "equal in every digit" in said.out
     assert "has changed" not in said.out
     (tmp_path / "replaylab" / "filters.py").write_text(f"{OWN}\n# another\n")
-    changed = "the code of replaylab has changed since ekf was run: its numbers may differ"
+    changed = "the code of replaylab.filters has changed since ekf was run: its numbers may differ"
     assert changed in replay(tmp_path, *again, remedy).out
     cost = ("cost", "study=walks", "rounds=5", "seconds=0.001")
     assert f"add {remedy} to the command" in pfbench(*cost, home=tmp_path).err

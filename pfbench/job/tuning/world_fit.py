@@ -1,4 +1,4 @@
-"""What a world needs: the best conventional filter in it, and whether Kalman filters fit it."""
+"""Needs of a world: the best conventional filter in it, and whether Kalman filters fit it."""
 
 from __future__ import annotations
 
