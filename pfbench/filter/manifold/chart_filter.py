@@ -64,7 +64,7 @@ class InvariantFilter:
 
     @property
     def has_bounded_weights(self) -> bool | None:
-        """What the inner filter states of its weights."""
+        """Statement of the inner filter on its weights."""
         return has_bounded_weights(self.filter)
 
     @property

@@ -73,7 +73,7 @@ class WorldFit:
 
     @property
     def kalman_fits(self) -> bool:
-        """Whether no particle filter is shown to have less than 0.95 of the error."""
+        """True if no particle filter is shown to have less than 0.95 of the error."""
         return decide_fit(self.ratios)
 
 
