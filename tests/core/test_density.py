@@ -108,6 +108,8 @@ LAWS: dict[str, tuple[Any, Any]] = {
 
 def observed(name: str, kind: type[Walk] = Walk) -> Walk:
     class Observed(kind):  # type: ignore[misc, valid-type]
+        has_counts = name in ("poisson", "negative binomial")
+
         def observation(self, x: Tensor, u: Any) -> Distribution:
             law: Distribution = LAWS[name][0](x)
             return law
