@@ -154,7 +154,7 @@ def plant_follows_links(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def plant_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(folders, "LIMIT_S", 0.02)
+    monkeypatch.setattr(folders, "LIMIT_S", 0.001)
 
 
 def plant_shadows(monkeypatch: pytest.MonkeyPatch) -> None:
