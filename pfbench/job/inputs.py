@@ -42,8 +42,6 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
         ValueError: If an object names a folder or a device as a file.
     """
     trusted = (*trusted, *trusted_packages())
-    # with the names of the groups, which a message about a part alone would lack
-    check_configuration({group: values.get(group) for group in CHOICES}, trusted)
     digests = {}
     for group in CHOICES:
         node = values.get(group)
