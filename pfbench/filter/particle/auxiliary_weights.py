@@ -72,7 +72,7 @@ class LookAheadWeights(AuxiliaryWeights):
             avoids heavy-tailed second-stage weights if the look-ahead is overconfident.
         defensive_fraction: Fraction c of the probabilities that ignores the measurement, in [0, 1].
             0 is as published. The filter then converges to a wrong distribution if measurement
-            errors are bounded, and its second-stage weights have no bound.
+            errors are bounded, and its second-stage weights are unbounded.
 
     Raises:
         ValueError: If the exponent is outside (0, 1], or the fraction is outside [0, 1].

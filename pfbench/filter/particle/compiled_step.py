@@ -132,7 +132,7 @@ def compile_step(
 
     Raises:
         Exception: If the step cannot be recorded or compiled, or if its numbers are not those of
-            the step as it is. torch raises many kinds.
+            the uncompiled step. torch raises many kinds.
     """
     names: list[list[str]] = []
     step = _make_tensor_function(method, model, belief, record, draws, names)
@@ -166,7 +166,7 @@ def _make_tensor_function(
     names: list[list[str]],
     record_step: bool = True,
 ) -> Callable[..., list[Tensor]]:
-    """Return a step as a function of tensors, to be recorded or as it is. It writes its memory and trace names."""
+    """Return a step as a function of tensors, to be recorded or uncompiled. It writes its memory and trace names."""
     carried_count = len(_belief_to_storage(belief))
 
     def step(*flat: Tensor) -> list[Tensor]:
@@ -187,7 +187,7 @@ def _make_tensor_function(
 
 
 def _check_agreement(out: Sequence[Tensor], expected: Sequence[Tensor], carried: int) -> None:
-    """Raise ArithmeticError unless a compiled step gives the numbers of the step as it is.
+    """Raise ArithmeticError unless a compiled step gives the numbers of the uncompiled step.
 
     The tensors that the step carries are compared, component by component over all particles, with
     their spread as the scale. Sums that are rounded in another order may choose other ancestors, so a
@@ -195,7 +195,7 @@ def _check_agreement(out: Sequence[Tensor], expected: Sequence[Tensor], carried:
 
     Args:
         out: Results of the compiled step, in storage layout [..., R, N].
-        expected: Those of the step as it is.
+        expected: Those of the uncompiled step.
         carried: Number of tensors that the step carries.
     """
     for k, (a, b) in enumerate(zip(out[:carried], expected[:carried], strict=True)):
