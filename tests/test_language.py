@@ -307,7 +307,11 @@ def violations() -> dict[str, list[str]]:
     return results
 
 
-WAITING = {"archaic phrases": 45}  # sentences that wait for other words; the number only falls
+WAITING = {
+    "archaic phrases": 45,
+    "messages": 3,
+    "long sentences in documents": 3,
+}  # sentences that wait for other words; the number only falls
 
 
 def test_package_and_documents_follow_the_rules() -> None:
