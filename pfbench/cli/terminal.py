@@ -61,7 +61,7 @@ class LastingOutput:
                 self._leave(error)
 
     def tell(self) -> None:
-        """Print once that the output is closed, if the command has work that goes on."""
+        """Print once that the output is closed, if the command still works."""
         if self.error is not None and has_work_started() and not self._is_quiet:
             self._is_quiet = True
             print(
@@ -109,7 +109,7 @@ def _opened(stream: Any) -> Any:
     """Return a stream that can write each character; one to nowhere if the process has none."""
     if stream is None:
         return open(os.devnull, "w")
-    with contextlib.suppress(AttributeError, OSError):  # a word may have bytes that are no text
+    with contextlib.suppress(AttributeError, OSError):  # a word may have bytes that do not decode
         stream.reconfigure(errors="backslashreplace")
     return stream
 

@@ -148,7 +148,7 @@ def _describe_use(folder: Path, words: Sequence[str]) -> str:
 
 
 def _check_new_name(name: str, folder: Path) -> None:
-    """Check that a file of a user's own folder has no name of pfbench's own, which a run would refuse."""
+    """Check that the name of a file of a user's own folder differs from those of pfbench, since a run refuses it."""
     from pfbench.config.folders import conf_dir
 
     if folder.resolve() != conf_dir() and (conf_dir() / "tuned" / f"{name}.yaml").is_file():

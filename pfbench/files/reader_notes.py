@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 SWEEP_LOG = "PFBENCH_SWEEP_LOG"  # environment variable: file to which all jobs of a sweep append
-NOTE = "note"  # first word of a line of this file that is no outcome of a job
+NOTE = "note"  # first word of a line of this file that is not an outcome of a job
 
 _MOST = 12  # lines about one source
 
@@ -42,7 +42,7 @@ def announce_notes(source: str | Path, notes: Sequence[str]) -> None:
 
 
 def append_line(path: str | Path, line: str) -> None:
-    """Append a line to the file of a sweep, whole beside those of other processes.
+    """Append a line to the file of a sweep, whole among those of other processes.
 
     Args:
         path: File. Its folder is made if it is missing.

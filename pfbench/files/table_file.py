@@ -171,7 +171,7 @@ def _whole_lines(file: Path) -> tuple[list[str], tuple[str, ...]]:
     except UnicodeDecodeError as error:
         position = content[: error.start].count(b"\n") + 1
         remedy = "Repair or remove this line."
-        if position == 1:  # without the names the rest is no table
+        if position == 1:  # without the names the rest is not a table
             encoding = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1"
             remedy = _convert(file, f"encoding={encoding!r}", "UTF-8")
         raise ValueError(

@@ -71,7 +71,7 @@ def choose_defensive_particles(
     count = active_mask.sum(1, keepdim=True).clamp(min=1).to(draws.dtype)
     u = draws.uniform(purpose, active_mask.shape[1], 1).squeeze(-1)
     rank = torch.where(active_mask, u, torch.inf).argsort(1).argsort(1)
-    # one particle at least, since the weights of a few would have no bound otherwise
+    # one particle at least, since the weights of a few would be unbounded otherwise
     target = torch.round(fraction * count).clamp(min=1.0 if fraction > 0.0 else 0.0)
     return DefensiveSelection((rank < target) | ~active_mask, target / count)
 

@@ -85,7 +85,7 @@ class HealthMonitor:
 
     Args:
         record: Prepared record, which decides the checked steps.
-        fits_tails: Whether the weights of particles have no bound, so that their tails are fitted.
+        fits_tails: Whether the weights of particles are unbounded, so that their tails are fitted.
 
     Attributes:
         steps: Checked steps, at most ten of those with a measurement.

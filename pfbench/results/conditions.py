@@ -158,7 +158,7 @@ def list_stored_studies(results: Path) -> list[str]:
 
 
 def _read_undamaged(path: Path) -> tuple[Path, dict[str, Any]] | None:
-    """Read the metadata of a result. A damaged file is set aside and left out, one that is no result is left out."""
+    """Read the metadata of a result. A damaged file is set aside and left out, one that is not a result is left out."""
     try:
         return path, store.read_result(path).meta
     except store.DamagedResultError as error:

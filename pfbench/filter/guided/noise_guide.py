@@ -81,7 +81,7 @@ class GuidedNoiseProposal(Proposal):
     y = h(f(parent, w)) + v is linearised in w by the guide's rule. The proposal is
     w ~ N(m, U U') and the ratio p(w) / q(w), which does not need a transition density. On
     linear-Gaussian models it is the optimal proposal [Doucet, Godsill, Andrieu 2000]. On others it
-    may miss a part of the posterior, where p / q has no bound. Some particles are therefore drawn
+    may miss a part of the posterior, where p / q is unbounded. Some particles are therefore drawn
     from the model, and q is the density of the mixture [Hesterberg 1995].
 
     Attributes:

@@ -93,7 +93,7 @@ class ReconstructedNoiseProposal(Proposal):
         base: Source of the noise.
         sample_noise: Draw from the posterior of the noise. False shifts deterministically.
         defensive_fraction: Fraction c that is not shifted, which bounds the ratio by 1 / c. With 0
-            it has no bound, and noise of bounded support is not covered.
+            it is unbounded, and noise of bounded support is not covered.
         linearise_per_particle: Linearise at each parent's prediction. False linearises once, at
             their mean.
 

@@ -89,7 +89,7 @@ class NoWeightCorrection(WeightCorrection):
     linearise_per_particle: bool = True
     regressed_states: Sequence[str] = ()
     is_exact = False
-    has_bounded_weights = True  # there is no ratio
+    has_bounded_weights = True  # without a ratio
 
     @override
     def __call__(
@@ -126,7 +126,7 @@ class TransitionRatioCorrection(WeightCorrection):
 
     Attributes:
         defensive_fraction: Fraction c that is not shifted. Weights are then at most 1/c times the
-            likelihood. With 0 they have no bound, or a shift may leave out a part of the noise.
+            likelihood. With 0 they are unbounded, or a shift may leave out a part of the noise.
         linearise_per_particle: As for `NoWeightCorrection`, but at the noise-free predictions.
 
     Raises:

@@ -61,7 +61,7 @@ class PrintedWeighting(SwarmWeighting):
     """
 
     is_exact = False
-    has_bounded_weights = True  # there is no ratio
+    has_bounded_weights = True  # without a ratio
 
     @override
     def __call__(

@@ -42,7 +42,7 @@ class JointAdaptation(NoiseAdaptation):
     ) -> AffineApproximation:
         scaled = scale_process_noise(predicted, self.q_factor.to(predicted.noise))
         if all(isinstance(update, RobustUpdate) for update, _ in self.updates):
-            return scaled  # which they leave as it is
+            return scaled  # which they do not change
         parts = [
             update.predict_scale(_select(scaled, places), _select(belief, places))
             for update, places in self.updates

@@ -33,7 +33,7 @@ def write_tuned_file(
         name: Name of the file, which `tuned=NAME` chooses.
         world: Scenario, model, settings, seed, runs, start time and regimes of the search.
         fit: Best conventional filter, and whether Kalman filters fit the world.
-        unsupported: Reason by filter that has no knobs in the world.
+        unsupported: Reason by filter without knobs in the world.
 
     Returns:
         The file, `FOLDER/tuned/NAME.yaml`.

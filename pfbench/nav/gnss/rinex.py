@@ -93,7 +93,7 @@ def read_rinex(file: Path) -> RinexFile:
 
 
 def _describe_kind(lines: Sequence[str]) -> str:
-    """Describe a file that is no navigation file of RINEX 2 or 3, and its remedy."""
+    """Describe a file that is not a navigation file of RINEX 2 or 3, and its remedy."""
     first = lines[0] if lines else ""
     if first.startswith("\x1f"):
         return "got a compressed file. Unpack it with gunzip, or gzip -d."

@@ -12,7 +12,7 @@ from pfbench.files.table_file import Array
 from pfbench.nav.plausible_limits import LIMIT_COLUMNS, Quantity
 from pfbench.scenario.plausibility.log_table import LogTable
 
-_MANY_ROWS = 4  # wrong rows that are no accident
+_MANY_ROWS = 4  # wrong rows that are not an accident
 _FEW = 0.01  # share of rows that can be removed
 _NEIGHBOUR = 0.1  # least share of a value that a neighbour has, unless the value is a single error
 _LARGEST_WIDENING = 100.0  # times the limit

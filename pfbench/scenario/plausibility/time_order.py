@@ -85,9 +85,9 @@ def _find_period(time: Array, back: NDArray[np.intp]) -> tuple[str, float] | Non
 
 
 def _is_regular(in_order: Array, time: Array) -> bool:
-    """Return whether sorting puts rows beside their neighbours: without short steps or new gaps."""
+    """Return whether sorting puts rows next to their neighbours: without short steps or new gaps."""
     step, before = np.diff(in_order), np.diff(time)
-    # a jump beside a step back is that of a row in the wrong place
+    # a jump next to a step back is that of a row in the wrong place
     beside_back = np.convolve(before <= 0.0, np.ones(3), "same") > 0.0
     usual = before[~beside_back]
     if not (usual.size and step.size):

@@ -40,7 +40,7 @@ def check_fix_codes(codes: FixCodes) -> None:
         codes: Name of a program, codes of the fixes to use, or None for 0 and 1.
 
     Raises:
-        ValueError: If the program is not known, or the codes are no whole numbers.
+        ValueError: If the program is not known, or the codes are not whole numbers.
     """
     is_list = not isinstance(codes, str | None) and len(codes) > 0
     if codes is None or (isinstance(codes, str) and codes in PROGRAMS):
