@@ -27,7 +27,7 @@ def check_installation(words: Sequence[str]) -> None:
         ValueError: If there are words, or a configuration does not compose.
     """
     if words:
-        raise ValueError(f"check must have no words, got {' '.join(words)}. Use: pfbench check")
+        raise ValueError(f"check must be without words, got {' '.join(words)}. Use: pfbench check")
     import torch
 
     from pfbench import job

@@ -63,7 +63,7 @@ def _find_world(node: Any, choices: Mapping[str, str]) -> dict[str, Any]:
         return {"world": {"scenario": choice}, "data": choice, **content}
     if loose := sorted({*content} - {*_PLACES}):
         raise ValueError(
-            f"{TUNED}.{loose[0]} must stand in a file, got a value beside {TUNED}={choice}. Choose the file that it "
+            f"{TUNED}.{loose[0]} must be in a file, got a value with {TUNED}={choice}. Choose the file that it "
             f"changes: {TUNED}=NAME (pfbench list {TUNED})."
         )
     worlds = [world for world in content.values() if _is_of(world.get("world", {}), choices)]

@@ -165,7 +165,7 @@ def _check_counts(model: StateSpaceModel, observed: Any) -> None:
 def _check_likelihood(model: StateSpaceModel, record: Record, x: Tensor) -> None:
     """Check that some of the tried states have a log likelihood, unless a component is missing.
 
-    A Gaussian filter takes laws that have no density of some of their components.
+    A Gaussian filter takes laws without a density of some of their components.
     """
     if bool(torch.isnan(record.y).any()):
         return
@@ -177,7 +177,7 @@ def _check_likelihood(model: StateSpaceModel, record: Record, x: Tensor) -> None
             f"{type(model).__name__}.log_likelihood must be a number or -inf, got NaN or infinity for "
             "all states that were tried at the first step. Check mean and spread of the measurement "
             "for NaN, and its noise: a component without noise, or two that are copies of each "
-            "other, have no density."
+            "other, are without a density."
         )
 
 
@@ -254,7 +254,7 @@ def _observe(model: StateSpaceModel, x: Tensor, u: Any) -> Any:
             f"{type(inner).__name__}.observation must return a distribution whose spread is positive "
             "and whose covariance is positive definite, got parameters that torch refuses. Check "
             "mean and spread for NaN, and the noise: a component without noise, or two that are "
-            "copies of each other, have no density."
+            "copies of each other, are without a density."
         ) from error
 
 

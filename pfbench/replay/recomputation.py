@@ -91,7 +91,7 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
 
 
 def describe_changed_code(meta: Mapping[str, Any]) -> str:
-    """Describe that the classes of a user are no longer those of a stored job; empty if they are.
+    """Describe a change of a user's classes since a stored job; empty without one.
 
     Args:
         meta: Metadata of the job, whose packages are trusted.
@@ -150,7 +150,7 @@ def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobRes
 def _check_inputs(meta: Mapping[str, Any], present: Inputs) -> None:
     """Raise ValueError if a job cannot be computed again, since a file that it read has changed.
 
-    Another code of a user's classes is told, since it may be a mended message.
+    Another code of a user's classes is printed, since it may be a mended message.
     """
     changed = [name for name in _list_changed_inputs(meta, present) if not name.startswith(CODE_OF)]
     if changed:

@@ -52,7 +52,7 @@ MISTAKES: dict[tuple[str, ...], str] = {
     ("datasheet", "scenario="): "scenario= does not exist",
     ("list", "filter", "more"): "words must be pfbench list filter, got more",
     ("list", ""): "got an empty word",
-    ("check", "more"): "check must have no words, got more",
+    ("check", "more"): "check must be without words, got more",
     ("judge", "reference=/etc", "mine=/etc"): "/etc must be a file, got none",
     ("judge", "reference=a.csv", "mine=b.csv", "tolerance=inf"): "tolerance must be positive, got inf",
     ("judge", "reference=a.csv", "mine=b.csv", "margin=1e-300"): "margin must be from 1e-6 to 1e6",
