@@ -177,5 +177,5 @@ def test_a_compiled_step_with_other_numbers_is_not_used(
         result = run_filter(step, model, Record(Y.to(dtype)), draws)
         expected = run_filter(step.method, model, Record(Y.to(dtype)), draws)
     assert step.is_active == (fault == "none")
-    assert ("differ from those of the uncompiled step" in caplog.text) == (fault != "none")
+    assert ("its numbers must be those of the uncompiled step" in caplog.text) == (fault != "none")
     assert_results_agree(result, expected)

@@ -200,7 +200,9 @@ def _check_agreement(out: Sequence[Tensor], expected: Sequence[Tensor], carried:
     """
     for k, (a, b) in enumerate(zip(out[:carried], expected[:carried], strict=True)):
         if a.shape != b.shape:
-            raise ArithmeticError(f"the shape of tensor {k} is {a.shape}, uncompiled {b.shape}")
+            raise ArithmeticError(
+                f"its tensor {k} must have the shape {list(b.shape)}, got {list(a.shape)}. Use engine=kernels."
+            )
         is_double = b.dtype == torch.float64
         a, b, axes = a.double(), b.double(), tuple(range(max(b.dim() - 2, 0), b.dim()))
         finite = torch.where(torch.isfinite(b), b, torch.zeros_like(b))
@@ -210,7 +212,7 @@ def _check_agreement(out: Sequence[Tensor], expected: Sequence[Tensor], carried:
         share = float(agrees.double().mean())
         if share < (0.999 if is_double else 0.8):
             raise ArithmeticError(
-                f"its numbers differ from those of the uncompiled step in {1 - share:.1%} of tensor {k}"
+                f"its numbers must be those of the uncompiled step, got others in {1 - share:.1%} of tensor {k}. Use engine=kernels."
             )
 
 

@@ -36,7 +36,7 @@ class ClockOffset(NamedTuple):
     """Offset of a clock.
 
     Attributes:
-        late_s: Time by which t is later than in the reference, s.
+        late_s: Delay of t against the reference, s.
         agreement: What agrees better with the offset than without.
     """
 

@@ -164,7 +164,8 @@ def _explain(offset: str) -> Iterator[None]:
     except ValueError as error:
         if not offset:
             raise
-        raise ValueError(f"{error} First correct the clock: {offset}.") from None
+        text = f"{error} First correct the clock: {offset}."
+        raise ValueError(text) from None
 
 
 def _samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
