@@ -123,7 +123,7 @@ def _has_names_in_comment(lines: Sequence[str]) -> bool:
     if not lines[0].lstrip().startswith(tuple(_COMMENT)) or len(lines) < 2:
         return False
     names, fields = _split_fields(lines[0]), _split_fields(lines[1])
-    return len(names) == len(fields) > 1 and all(map(_is_number, filter(str.strip, fields)))
+    return len(names) == len(fields) > 1 and all(map(is_number_text, filter(str.strip, fields)))
 
 
 def _check_names(file: Path, lines: Sequence[str], names: Sequence[str]) -> None:
@@ -141,7 +141,7 @@ def _check_names(file: Path, lines: Sequence[str], names: Sequence[str]) -> None
         problem = f"{_SEPARATORS.get(separator, 'blanks')} as separators"
         decimal = ", decimal=','" if any("," in text for text in lines[1:2]) else ""
         remedy = _convert(file, f"sep={pattern!r}{decimal}", "commas")
-    elif all(map(_is_number, names)):
+    elif all(map(is_number_text, names)):
         problem, remedy = "numbers alone", "Insert a line with the names."
     if problem:
         raise ValueError(
@@ -155,7 +155,12 @@ def _convert(file: Path, options: str, result: str) -> str:
     return f"In pandas, read_csv({words}).to_csv({file.name!r}, index=False) writes {result}."
 
 
-def _is_number(text: str) -> bool:
+def is_number_text(text: str) -> bool:
+    """Return whether a field of a text file is a number.
+
+    Args:
+        text: Field.
+    """
     try:
         float(text)
     except ValueError:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pfbench.files.table_file import describe_cut
+from pfbench.files.table_file import describe_cut, is_number_text
 from pfbench.judge.judge_options import SourceOptions
 from pfbench.judge.readers.local_frame import euler_angles, rotation_from_quaternion
 from pfbench.judge.readers.trajectory_table import (
@@ -179,7 +179,7 @@ def to_numbers(rows: Sequence[Sequence[str]]) -> Array:
     """
     widths = [len(row) for row in rows]
     width = max(widths, key=widths.count, default=0)
-    valid = [row for row in rows if len(row) == width and all(map(_is_number, row))]
+    valid = [row for row in rows if len(row) == width and all(map(is_number_text, row))]
     return np.array(valid, dtype=np.float64).reshape(len(valid), width if valid else 0)
 
 
@@ -196,15 +196,7 @@ def split_line(line: str) -> list[str]:
 
 def _has_no_number(line: str) -> bool:
     """Return whether a line consists of names."""
-    return not any(map(_is_number, split_line(line)))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    return not any(map(is_number_text, split_line(line)))
 
 
 def _by_name(names: tuple[str, ...], columns: Array) -> dict[str, Array]:

@@ -295,7 +295,8 @@ def test_a_named_limit_accepts_the_row(
     key, limit = re.search(r"set scenario\.limits\.(\w+)=([\d.e+]+\d)", said).groups()  # type: ignore[union-attr]
     if key == "drop_fixes":
         key, limit = re.search(r"set scenario\.limits\.(fix_error_m)=([\d.e+]+\d)", said).groups()  # type: ignore[union-attr]
-    read_log(write(tmp_path, log), limits=PlausibleLimits(**{key: float(limit)}))
+    again = read_log(write(tmp_path, log), limits=PlausibleLimits(**{key: float(limit)}))
+    assert len(again.imu.time) == len(log["imu"])
 
 
 def test_a_lasting_jump_is_cut(tmp_path: Path) -> None:
