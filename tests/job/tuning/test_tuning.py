@@ -433,7 +433,7 @@ def test_knobs_beside_those_of_a_file_are_refused_and_a_file_by_hand_is_named(
 ) -> None:
     words = ["scenario=passive_1", "filter=gate_tuned"]
     with pytest.raises(
-        ValueError, match=r"tuned\.gate must stand in a file, got a value beside tuned=auto"
+        ValueError, match=r"tuned\.gate must be in a file, got a value with tuned=auto"
     ):
         job.compose([*words, "+tuned.gate.r_factor=3.0"])
     changed = job.compose([*words, "tuned=passive_1", "tuned.gate.r_factor=3.0"])
