@@ -12,7 +12,7 @@ import yaml
 
 from pfbench.config.folders import conf_dir
 from pfbench.config.paper_block import PAPER
-from pfbench.config.tuned_knobs import OWN_WORLD
+from pfbench.config.tuning_names import OWN_WORLD
 from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.job_labels import parse_label
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from pfbench.config.composition import CHOICES, JobConfig, resolve_config
 from pfbench.config.source_digest import list_user_packages
 from pfbench.config.trust import trusted_packages
-from pfbench.config.tuned_knobs import describe_foreign
+from pfbench.config.tuning_names import describe_foreign
 from pfbench.core.record import Episode
 from pfbench.files.atomic_write import set_aside
 from pfbench.files.work_start import start_work

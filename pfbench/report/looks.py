@@ -14,7 +14,7 @@ from typing import Any
 
 from pfbench.config.paper_block import MARKERS
 from pfbench.config.paper_files import list_named_parts, read_paper_block
-from pfbench.config.tuned_knobs import add_world, find_foreign_world, read_world
+from pfbench.config.tuning_names import add_world, find_foreign_world, read_world
 from pfbench.report.setting_names import name_settings
 from pfbench.results.comparison.baselines import list_planned_pairs
 from pfbench.results.conditions import Condition

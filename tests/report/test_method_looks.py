@@ -13,7 +13,7 @@ from config_cases import CONF
 from pfbench.config.composition import compose
 from pfbench.config.paper_block import FAMILIES, check_paper_blocks, remove_nested_blocks
 from pfbench.config.paper_files import list_named_parts, plan_installed_pairs, read_paper_block
-from pfbench.config.tuned_knobs import OWN_WORLD
+from pfbench.config.tuning_names import OWN_WORLD
 from pfbench.report.looks import MethodLook, find_looks, study_looks
 from pfbench.report.plots.plotting import line_styles
 from pfbench.report.setting_names import describe_settings

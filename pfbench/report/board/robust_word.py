@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtr
 
-from pfbench.config.tuned_knobs import list_tuned_worlds
+from pfbench.config.tuning_names import list_tuned_worlds
 from pfbench.report.board.levels import (
     FilterLevels,
     StudyArrays,

@@ -18,7 +18,8 @@ from pfbench.cli.messages import format_error
 from pfbench.cli.tune import tune_filters
 from pfbench.config.named_sets import FILTER_SETS, TUNED_METHODS, expand_filter_sets
 from pfbench.config.paper_files import list_named_parts
-from pfbench.config.tuned_knobs import AUTO, NOMINAL, list_tuned_worlds
+from pfbench.config.tuned_knobs import AUTO, NOMINAL
+from pfbench.config.tuning_names import list_tuned_worlds
 from pfbench.job.tuning import knobs
 from pfbench.job.tuning.candidate_search import (
     Candidate,
